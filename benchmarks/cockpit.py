@@ -50,10 +50,10 @@ _WATCH = """() => {
     addEventListener("keydown", (event) => {
         if (event.repeat) return;
         pressed = event.timeStamp;
-        before = cockpit.shown.inserted_mm;
+        before = cockpit.shown.inserted_length_mm;
     }, true);
     const look = () => {
-        if (pressed !== null && Math.abs(cockpit.shown.inserted_mm - before) > 0.002) {
+        if (pressed !== null && Math.abs(cockpit.shown.inserted_length_mm - before) > 0.002) {
             found.push(performance.now() - pressed);
             pressed = null;
         }

@@ -36,7 +36,7 @@ class ScriptedHand:
 
 def drive_session(number: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Return what the scripted hand saw in one training patient, and what it did."""
-    navigation = TASK.navigation(TASK.patient(TASK.training, number), start_rotation=0.6 * number)
+    navigation = TASK.navigation(TASK.patient(TASK.training, number), start_rotation_rad=0.6 * number)
     record = endopilot.NavigationLoop(replace(navigation, seconds=20.0), ScriptedHand(), seed=number).run()
     left_mm = navigation.target.abscissa - record.tip.abscissa[:-1, 0]
     return features(left_mm, record.tip.offset[:-1, 0]), torch.tensor(record.control[:-1, 0] / SCALE).float()

@@ -27,13 +27,13 @@ class TurnBack:
         self.turn_to_rad: float | None = None
 
     def decide(self, observation: endopilot.Observation) -> endopilot.Decision:
-        tip, (inserted_mm, rotation_rad) = observation.tip, observation.devices[0]  # of the wire
+        tip, (inserted_length_mm, rotation_rad) = observation.tip, observation.devices[0]  # of the wire
         if tip is not None and math.isfinite(fork := float(self.fork_mm[tip.branch])):
             # The wire lies in a wrong branch: this much of it has to come out.
-            self.pull_to_mm = inserted_mm - (tip.abscissa - fork) - BEFORE_FORK_MM
+            self.pull_to_mm = inserted_length_mm - (tip.abscissa - fork) - BEFORE_FORK_MM
             self.turn_to_rad = rotation_rad + 2 * math.pi / 3
         if self.pull_to_mm is not None:
-            if inserted_mm > max(self.pull_to_mm, 0.0):
+            if inserted_length_mm > max(self.pull_to_mm, 0.0):
                 return endopilot.Decision(((PULL_MM_S, 0.0),))
             self.pull_to_mm = None
         if self.turn_to_rad is not None:

@@ -96,4 +96,4 @@ def found(vessel):
     from endopilot.control.plan import plan
     from endopilot.control.plan_config import PlanConfig
 
-    return plan(vessel, "0,0,33", config=PlanConfig(seconds=30.0, start_rotation=0.1, seed=4))
+    return plan(vessel, "0,0,33", config=PlanConfig(seconds=30.0, start_rotation_rad=0.1, seed=4))

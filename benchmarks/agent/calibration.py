@@ -73,7 +73,7 @@ KINDS: dict[KindName, Kind] = {
     "images": Kind(
         config=AgentConfig(),
         version=NEWEST,
-        tasks=tuple(task for task in list_tasks() if task.anatomy in ("rca", "lca")),
+        tasks=tuple(task for task in list_tasks() if task.vessel in ("rca", "lca")),
         roles={"calibrate": range(2)},
         folder=CALIBRATIONS["images", 1],
         mark="agent-images",
@@ -131,7 +131,7 @@ def measure(path: Path, name: KindName) -> None:
         navigation = task.ladder_navigation(number)
     else:
         turn = np.random.default_rng([task.training.seed, number]).uniform(0.0, 2 * np.pi)
-        navigation = task.navigation(task.patient(task.training, number), start_rotation=turn)
+        navigation = task.navigation(task.patient(task.training, number), start_rotation_rad=turn)
     policy = MonitoredAgent(replace(kind.config, tries=2), calibration=NO_BANDS)
     seed = 1000 + 100 * task.level + number
     record = NavigationLoop(

@@ -92,7 +92,9 @@ class _Search:
     def __post_init__(self) -> None:
         navigation = self.navigation
         self.simulator = Simulator(navigation.anatomy, navigation.device, worlds=TRIES, config=CORE)
-        self.simulator.reset(inserted_length=np.full(TRIES, navigation.start_inserted_mm), rotation=np.zeros(TRIES))
+        self.simulator.reset(
+            inserted_length=np.full(TRIES, navigation.start_inserted_length_mm), rotation=np.zeros(TRIES)
+        )
         self.deepest = float(navigation.anatomy.tree.longest_path().abscissa[-1]) + 19.0
         self.peak, self.seconds = np.zeros(TRIES), np.zeros(TRIES)
 
@@ -169,7 +171,7 @@ def wire_alone_fails(navigation: Navigation) -> bool:
     count = 8
     simulator = Simulator(navigation.anatomy, navigation.device, worlds=count, config=CORE)
     turn = 2 * np.pi * np.arange(count) / count
-    simulator.reset(inserted_length=np.full(count, navigation.start_inserted_mm), rotation=turn)
+    simulator.reset(inserted_length=np.full(count, navigation.start_inserted_length_mm), rotation=turn)
     longest = float(navigation.anatomy.tree.longest_path().abscissa[-1]) + 19.0
     deepest, arrived = min(navigation.target.abscissa + 20.0, longest), np.zeros(count, dtype=bool)
     for _ in range(round(deepest / (PUSH_MM_S * PERIOD_S))):

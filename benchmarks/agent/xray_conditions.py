@@ -111,7 +111,7 @@ def drive_under_conditions(
     Raises:
         InputError: the folder belongs to another run.
     """
-    tasks = [task for task in list_tasks() if task.anatomy in ("rca", "lca")]
+    tasks = [task for task in list_tasks() if task.vessel in ("rca", "lca")]
     wanted = {
         name: [FOLDER / name / task.name / f"{place:02d}.json" for place in range(patients) for task in tasks]
         for name in only

@@ -69,7 +69,7 @@ def make_scenes(worlds: int = WORLDS, samples: int = SAMPLES) -> list[Scene]:
     """
     scenes = []
     for place, (name, kind) in enumerate(KINDS.items()):
-        anatomy = with_world_zero(make_patient(AtlasConfig(anatomy=kind, seed=SEED, population="textbook"), 0))
+        anatomy = with_world_zero(make_patient(AtlasConfig(vessel=kind, seed=SEED, population="textbook"), 0))
         initial, control = random_controls(
             ControlConfig(),
             n_sequences=worlds,

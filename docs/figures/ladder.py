@@ -33,7 +33,7 @@ def tasks() -> list[str]:
     for task in list_tasks():
         tip = f"{task.device}, {task.tip_bend_deg:g}° over {task.tip_bend_mm:g} mm"
         what = f"{task.title}: {task.depth_mm:g} mm into {task.section}"
-        row = (task.level, task.name, what, task.anatomy, tip, f"{task.seconds:g}", task.chosen_for)
+        row = (task.level, task.name, what, task.vessel, tip, f"{task.seconds:g}", task.chosen_for)
         lines.append("| " + " | ".join(str(cell) for cell in row) + " |")
     return lines
 
@@ -45,7 +45,7 @@ def coaxial_tasks() -> list[str]:
     for task in list_tasks("coaxial"):
         tip = f"{task.device}, {task.tip_bend_deg:g}° over {task.tip_bend_mm:g} mm; {task.catheter}"
         what = f"{task.title}: {task.depth_mm:g} mm into {task.section}"
-        row = (task.level, task.name, what, task.anatomy, tip, f"{task.seconds:g}", task.force_limit_n, task.chosen_for)
+        row = (task.level, task.name, what, task.vessel, tip, f"{task.seconds:g}", task.force_limit_n, task.chosen_for)
         lines.append("| " + " | ".join(str(cell) for cell in row) + " |")
     return lines
 

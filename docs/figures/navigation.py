@@ -30,7 +30,7 @@ def main() -> None:
     command = [sys.executable, "-m", "endopilot.cli"]
     patients = ROOT / "runs" / "patients"
     if not (patients / "lca-41-0000").exists():
-        subprocess.run([*command, "atlas", "-o", patients, "--anatomy", "lca", "--seed", "41"], check=True)
+        subprocess.run([*command, "atlas", "-o", patients, "--vessel", "lca", "--seed", "41"], check=True)
     navigate = [*command, "navigate", patients / "lca-41-0000", "--target", "12", "--mismatch", "0.2"]
     pair = ("--catheter", "microcatheter-2.4f", "--arrives", "catheter")
     for options, folder, picture, part in (

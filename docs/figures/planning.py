@@ -56,7 +56,7 @@ def drive(name: str, navigation: Navigation, truth: ModelMismatch) -> tuple[bool
 
 def measure() -> list[str]:
     """Return the rows of the table."""
-    patients = [make_patient(AtlasConfig(anatomy=kind, seed=SEED), number) for kind, number in PATIENTS]
+    patients = [make_patient(AtlasConfig(vessel=kind, seed=SEED), number) for kind, number in PATIENTS]
     rows = ["| tip | policy | safe success | exposures | processor, s |", "|---|---|---|---|---|"]
     for angle_deg, length_mm in TIPS:
         for name in POLICIES:

@@ -13,7 +13,7 @@ import numpy as np
 
 import endopilot
 
-anatomy = next(endopilot.make_atlas(config=endopilot.AtlasConfig(anatomy="lca", seed=41, population="textbook")))
+anatomy = next(endopilot.make_atlas(config=endopilot.AtlasConfig(vessel="lca", seed=41, population="textbook")))
 worlds, samples = 16, 24
 start = np.column_stack([np.full(worlds, 2.0), np.linspace(0, 2 * np.pi, worlds, endpoint=False)])
 push = np.tile([5.0, 0.0], (worlds, samples, 1))

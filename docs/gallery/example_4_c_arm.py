@@ -11,7 +11,7 @@ import numpy as np
 
 import endopilot
 
-anatomy = next(endopilot.make_atlas(config=endopilot.AtlasConfig(anatomy="rca", seed=0, population="textbook")))
+anatomy = next(endopilot.make_atlas(config=endopilot.AtlasConfig(vessel="rca", seed=0, population="textbook")))
 device = endopilot.read_wire("workhorse-014")
 push = np.tile([5.0, 0.0], (1, 16, 1))
 rollout = endopilot.simulate(anatomy, device, push)

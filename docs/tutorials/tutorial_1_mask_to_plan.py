@@ -23,7 +23,7 @@ import numpy as np
 import endopilot
 
 folder = Path(tempfile.mkdtemp())
-patient = next(endopilot.make_atlas(config=endopilot.AtlasConfig(anatomy="rca", seed=0, population="textbook")))
+patient = next(endopilot.make_atlas(config=endopilot.AtlasConfig(vessel="rca", seed=0, population="textbook")))
 ct = endopilot.make_phantom(patient, config=endopilot.PhantomConfig(), seed=0)
 print(f"{patient.name}: {ct.voxels.shape[::-1]} voxels of {ct.spacing_mm} mm")
 

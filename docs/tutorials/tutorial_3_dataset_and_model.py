@@ -23,7 +23,7 @@ import endopilot
 folder = Path(tempfile.mkdtemp())
 patients = []
 for anatomy in endopilot.make_atlas(
-    config=endopilot.AtlasConfig(anatomy="rca", count=10, seed=7, population="textbook")
+    config=endopilot.AtlasConfig(vessel="rca", count=10, seed=7, population="textbook")
 ):
     patients.append(folder / anatomy.name)
     endopilot.write_anatomy(anatomy, output=patients[-1])

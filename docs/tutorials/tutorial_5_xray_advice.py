@@ -22,7 +22,7 @@ import numpy as np
 
 import endopilot
 
-anatomy = next(endopilot.make_atlas(config=endopilot.AtlasConfig(anatomy="rca", seed=0, population="textbook")))
+anatomy = next(endopilot.make_atlas(config=endopilot.AtlasConfig(vessel="rca", seed=0, population="textbook")))
 
 # %%
 # Before the navigation
@@ -33,7 +33,7 @@ anatomy = next(endopilot.make_atlas(config=endopilot.AtlasConfig(anatomy="rca", 
 
 config = endopilot.PlanConfig(force_limit_n=0.3)
 route = endopilot.plan(anatomy, "4", config=config)
-needed = endopilot.plan_xray(route, calibration=endopilot.read_calibration(config, None))
+needed = endopilot.plan_xray(route)
 print(f"{int(needed.exposure.sum())} exposures are due in {0.5 * len(route.control):.1f} s, if all goes as planned")
 
 # %%

@@ -167,7 +167,7 @@ def test_a_row_holds_medians_and_percentiles_of_both_sets():
 
 
 def test_anatomies_are_compared_with_the_atlas_of_their_kind(tmp_path):
-    config = AtlasConfig(anatomy="lca", seed=3, count=2)
+    config = AtlasConfig(vessel="lca", seed=3, count=2)
     for index in range(2):
         write_anatomy(make_patient(config, index), output=tmp_path / str(index))
     rows = compare_with_atlas([tmp_path], replace(config, anatomy="rca"))

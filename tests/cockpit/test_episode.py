@@ -33,8 +33,8 @@ def test_an_episode_holds_the_wire_as_it_was(session, tmp_path):
     ends = [world.snapshot() for world, _ in replayed(read_recording(path)) if world.cycle and world.cycle % 40 == 0]
     assert data.inserted_length.shape == (1, 4, 1) == (1, len(ends), 1)
     np.testing.assert_allclose(data.tip_position[0, :, 0], [end.nodes[0] for end in ends], atol=1e-4)
-    np.testing.assert_allclose(data.inserted_length[0, :, 0], [end.inserted_mm for end in ends], atol=1e-4)
-    moved = np.diff([5.0 - 3.0, *(end.inserted_mm for end in ends)]) / 0.5
+    np.testing.assert_allclose(data.inserted_length[0, :, 0], [end.inserted_length_mm for end in ends], atol=1e-4)
+    moved = np.diff([5.0 - 3.0, *(end.inserted_length_mm for end in ends)]) / 0.5
     np.testing.assert_allclose(data.control[0, 1:, 0, 0], moved[1:], atol=1e-3)
     assert data.manifest["settings"]["target_mm"] == 14.0
 

@@ -59,7 +59,7 @@ def test_a_rollout_is_driven_again(fork, wire, vessel, tmp_path):
     film = driven(open_film(tmp_path / "r.npz", vessel, world=1))
     assert len(film.frames) == 31
     last = film.frames[-1].snapshot
-    assert last.inserted_mm == pytest.approx(rollout.inserted_length[1, -1, 0], abs=1e-9)
+    assert last.inserted_length_mm == pytest.approx(rollout.inserted_length[1, -1, 0], abs=1e-9)
     np.testing.assert_allclose(last.nodes[0], rollout.tip_position[1, -1, 0], atol=0.02)
     with pytest.raises(InputError, match="worlds 0 to 1"):
         open_film(tmp_path / "r.npz", vessel, world=2)

@@ -81,7 +81,7 @@ def test_a_course_is_what_the_simulator_does_under_its_controls(side_branch, kno
     policy.start(side_branch, 0)
     course = policy.find_course(side_branch.seconds)
     assert course.reached == 1.0
-    moved = side_branch.start_inserted_mm + 0.5 * np.cumsum(course.control[:, 0, 0])
+    moved = side_branch.start_inserted_length_mm + 0.5 * np.cumsum(course.control[:, 0, 0])
     assert np.allclose(course.proximal[:, 0, 0], moved, atol=1e-9)
     simulator = Belief(side_branch, np.array([[1.0, 1.0, 0.0]]), QUICK.belief).simulator
     for k in range(len(course.control)):
@@ -392,7 +392,7 @@ def test_a_course_may_begin_with_a_turn(side_branch) -> None:
     policy = OraclePolicy(config=QUICK)
     policy.start(side_branch, 0)
     course = policy._search.find_turned(policy.belief, np.pi, seconds=20.0)
-    assert course.proximal[1, 0, 1] - side_branch.start_rotation == pytest.approx(np.pi)
+    assert course.proximal[1, 0, 1] - side_branch.start_rotation_rad == pytest.approx(np.pi)
     assert (course.control[:2, 0, 0] == 0.0).all() and course.reached == 1.0
 
 

@@ -30,7 +30,7 @@ CONFIG = PlanConfig(arrives="catheter", seconds=40.0, tip="own")
 @pytest.fixture(scope="module")
 def pair(vessel) -> Plan:
     """Return a plan that brings the tip of a microcatheter along the vessel."""
-    return plan(vessel, "0,0,25", config=CONFIG, catheters=[CATHETER])
+    return plan(vessel, "0,0,25", config=CONFIG, device=Stack.of("workhorse-014", CATHETER))
 
 
 def test_the_catheter_s_tip_arrives_with_the_wire_no_deeper_in_it_than_allowed(pair):
@@ -64,9 +64,9 @@ def test_a_written_plan_is_read_back_and_drives_both_devices(pair, vessel, tmp_p
 
 
 def test_the_agent_s_ensemble_forecasts_the_x_ray_of_both(pair):
-    own = read_calibration(pair.config, None, devices=2)
-    assert own == Calibration.read(CALIBRATIONS["assumed", 2]) != read_calibration(pair.config, None)
-    xray = plan_xray(pair, calibration=own)
+    own = read_calibration(pair.config.method, None, 2)
+    assert own == Calibration.read(CALIBRATIONS["assumed", 2]) != read_calibration(pair.config.method, None, 1)
+    xray = plan_xray(pair)
     assert (xray.half_width > 0).all() and xray.exposure.sum() < len(pair.control) / 2
 
 

@@ -153,9 +153,9 @@ def test_the_agents_wires_follow_the_plan_and_observe_its_tip(found, monkeypatch
 
 
 def test_the_agents_own_calibration_asks_seldom_along_a_straight_vessel(found):
-    own = read_calibration(found.config, None)
+    own = read_calibration("search", None, 1)
     assert own == Calibration.read(CALIBRATIONS["assumed", 1])
-    xray = plan_xray(found, calibration=own)
+    xray = plan_xray(found)
     assert (xray.half_width > 0).all()
     assert xray.exposure.sum() < len(found.control) / 3
 
@@ -182,7 +182,7 @@ def test_it_is_written_beside_the_plan(found, vessel, tmp_path):
 def test_a_model_without_calibration_is_refused(tmp_path):
     (tmp_path / "run").mkdir()
     with pytest.raises(InputError, match=r"run: the model has no calibration.*endopilot advise"):
-        read_calibration(PlanConfig(method="inverse"), tmp_path / "run")
-    assert read_calibration(PlanConfig(method="search"), tmp_path / "run") == read_calibration(PlanConfig(), None)
+        read_calibration("inverse", tmp_path / "run", 1)
+    assert read_calibration("search", tmp_path / "run", 1) == read_calibration("search", None, 1)
     with pytest.raises(InputError, match="no such run"):
-        read_calibration(PlanConfig(method="mppi"), Path("nowhere"))
+        read_calibration("mppi", Path("nowhere"), 1)

@@ -38,8 +38,8 @@ def side_branch(fork, wire) -> Navigation:
         target=Target(branch=side, abscissa=28.0),
         catheters=(read_catheter("microcatheter-1.7f"),),
         arrives="catheter",
-        start_inserted_mm=10.0,
-        start_rotation=np.pi,
+        start_inserted_length_mm=10.0,
+        start_rotation_rad=np.pi,
         seconds=60.0,
         force_limit_n=0.3,
     )
@@ -166,7 +166,7 @@ def test_the_agent_goes_on_after_hands_that_drove_both(side_branch) -> None:
 
 
 def test_a_ladder_counts_the_events_that_the_agent_misses(side_branch) -> None:
-    beside = replace(side_branch, target=Target(branch=0, abscissa=16.0), start_inserted_mm=14.0)
+    beside = replace(side_branch, target=Target(branch=0, abscissa=16.0), start_inserted_length_mm=14.0)
     result = attempt("agent", beside, seed=1)
     events, missed = result["events"]
     assert result["success"] and 0 <= missed <= events

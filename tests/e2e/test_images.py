@@ -135,7 +135,7 @@ def test_a_straightened_ct_is_told_by_every_command(patient, tmp_path, capsys, m
     figures = run(capsys, "segment", skewed, "-o", tmp_path / "mask.nii.gz", *method)
     assert figures["warnings"][0].startswith(note)
     assert read_mask(tmp_path / "mask.nii.gz").warnings[0].startswith(note)
-    image = run(capsys, "xray", patient, "-o", tmp_path / "image.png", "--ct", skewed, "--inserted-mm", "10")
+    image = run(capsys, "xray", patient, "-o", tmp_path / "image.png", "--ct", skewed, "--inserted-length-mm", "10")
     assert image["ct_notes"][0].startswith(note)
     monkeypatch.setattr(study, "_study", lambda run, anatomies: {"notes": list(run.notes)})
     figures = run(capsys, "run", skewed, "-o", tmp_path / "run", *method)

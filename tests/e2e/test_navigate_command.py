@@ -12,10 +12,11 @@ from command import refused, run
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cli import main
-from endopilot.control.navigate import NavigateConfig, navigate_patient, set_up_navigation
+from endopilot.control.navigate import NavigateConfig, navigate, set_up_navigation
 from endopilot.control.outcome import tell_outcome
 from endopilot.dataset.loader import read_dataset
 from endopilot.devices.catheter import read_catheter
+from endopilot.devices.stack import Stack
 from endopilot.files import read_json
 from endopilot.pipeline import navigation
 from endopilot.report.navigation_figure import navigation_figure
@@ -32,7 +33,7 @@ def patient(tmp_path_factory):
     """Return the folder of a synthetic patient."""
     folder = tmp_path_factory.mktemp("atlas")
     with pytest.raises(SystemExit) as leaving:
-        main(["atlas", "-o", str(folder), "--anatomy", "rca", "--count", "1", "--seed", "41"])
+        main(["atlas", "-o", str(folder), "--vessel", "rca", "--count", "1", "--seed", "41"])
     assert leaving.value.code == 0
     return folder / "rca-41-0000"
 
@@ -177,10 +178,9 @@ def test_a_catheter_follows_its_wire_and_both_are_written(patient, capsys, tmp_p
 
 
 def test_the_picture_shows_wire_and_catheter(patient):
-    config = NavigateConfig(
-        tip="own", seconds=6.0, policy="in-turn", catheter=("microcatheter-1.7f",), arrives="catheter"
-    )
-    found = navigate_patient(set_up_navigation(patient, "2", config=config))
+    config = NavigateConfig(tip="own", seconds=6.0, arrives="catheter")
+    stack = Stack.of("workhorse-014", "microcatheter-1.7f")
+    found = navigate(patient, "2", policy="in-turn", device=stack, config=config)
     record, motion = found.record, found.record.trajectory
     np.testing.assert_array_equal(record.tip_position[1:], motion.tip_position[0])
     outcome = tell_outcome(found)
@@ -200,7 +200,7 @@ def test_the_picture_shows_wire_and_catheter(patient):
 
 
 def test_the_replayed_wire_is_the_navigations_to_the_bit(patient):
-    found = navigate_patient(set_up_navigation(patient, "2", config=NavigateConfig(tip="own", seconds=20.0, seed=3)))
+    found = navigate(patient, "2", config=NavigateConfig(tip="own", seconds=20.0, seed=3))
     samples = len(found.record.time_s) - 1
     motion, again = found.record.trajectory, found.record.cycles.replay()
     np.testing.assert_array_equal(motion.tip_position[0], found.record.tip_position[1:])
@@ -261,7 +261,7 @@ def test_an_interrupted_navigation_is_finished_by_the_same_command(patient, caps
     monkeypatch.setattr(navigation, "_manifest", lambda *_: 1 / 0)  # dies late, after most files
     with pytest.raises(ZeroDivisionError):
         navigation.navigate_into(
-            patient, "1", output=output, config=NavigateConfig(policy="forward", tip="own", seconds=20.0)
+            patient, "1", output=output, policy="forward", config=NavigateConfig(tip="own", seconds=20.0)
         )
     monkeypatch.undo()
     assert not (output / "manifest.json").exists() and not (output / "navigation.html").exists()

@@ -30,7 +30,7 @@ SIZE = ("--sequences", "5", "--seconds", "20", "--training-seconds", "0.5")
 def case(tmp_path_factory):
     """Return a folder with the CT of a patient, a wire's file, and a run on both that was killed on its way."""
     folder = tmp_path_factory.mktemp("case")
-    patient = make_patient(AtlasConfig(anatomy="rca", count=1, seed=1), 0)
+    patient = make_patient(AtlasConfig(vessel="rca", count=1, seed=1), 0)
     write_volume(
         make_phantom(patient, config=PhantomConfig(in_plane_mm=0.6, slice_mm=0.7), seed=1), folder / "ct.nii.gz"
     )

@@ -92,7 +92,7 @@ def test_the_left_tree_is_another_one(heart):
 
 def test_an_artery_beside_a_chamber_is_not_taken_for_a_part_of_it():
     """A Gaussian of 1 mm closes the fat between them, and another vessel, 36 mm away, is taken for the right artery."""
-    patient = make_patient(AtlasConfig(anatomy="rca", seed=0, population="textbook"), 0)
+    patient = make_patient(AtlasConfig(vessel="rca", seed=0, population="textbook"), 0)
     ct = make_phantom(patient, config=PhantomConfig(in_plane_mm=1.0, slice_mm=1.0), seed=0)
     found = segment(ct, config=SegmentConfig(method="coronary", vessel="rca"))
     assert np.linalg.norm(found.ostium.position - patient.insertion.position) < 0.5

@@ -114,8 +114,8 @@ def test_a_catheter_that_leans_in_reality_leads_the_wire_elsewhere(straight) -> 
 
 @pytest.mark.parametrize("xray", ["assumed", "images"])
 def test_xray_shows_how_the_guiding_catheter_leans_before_the_wire_is_shaped(fork, xray) -> None:
-    config = NavigateConfig(tip="own", policy="forward", true_axis_deg=20.0, xray=xray)
-    set_up = set_up_navigation(fork, "0,0,33", config=config)
+    config = NavigateConfig(tip="own", true_axis_deg=20.0, xray=xray)
+    set_up = set_up_navigation(fork, "0,0,33", policy="forward", config=config)
     seen, real = set_up.navigation.anatomy.insertion.direction, set_up.true_anatomy.insertion.direction
     off_deg = [float(np.degrees(np.arccos(axis @ real))) for axis in (fork.insertion.direction, seen)]
     assert off_deg[0] == pytest.approx(20.0, abs=1e-6)

@@ -151,7 +151,7 @@ def test_bright_veins_touch_the_artery(anatomy, quiet):
 
 
 def test_a_larger_appendage_comes_to_the_left_artery():
-    left = make_patient(AtlasConfig(anatomy="lca", seed=1000), 1)
+    left = make_patient(AtlasConfig(vessel="lca", seed=1000), 1)
     usual, larger = (make_phantom(left, config=replace(QUIET, appendage_mm=a), seed=0) for a in (0.0, 5.0))
     more = (larger.voxels.astype(int) - usual.voxels) > 150
     assert np.count_nonzero(more) * usual.spacing_mm.prod() > 1500.0
@@ -162,7 +162,7 @@ def test_a_larger_appendage_comes_to_the_left_artery():
 
 @pytest.mark.parametrize("vessel", ["rca", "lca"])
 def test_a_graft_joins_the_aorta_to_the_artery(vessel):
-    patient = make_patient(AtlasConfig(anatomy=vessel, seed=1000), 1)
+    patient = make_patient(AtlasConfig(vessel=vessel, seed=1000), 1)
     volume = make_phantom(patient, config=replace(QUIET, graft=True), seed=0)
     graft = chest.bypass_graft(chest.place(patient.tree), patient.tree)
     assert np.quantile(at(volume, graft.points[5:-5]), 0.1) > 330

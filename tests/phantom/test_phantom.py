@@ -190,7 +190,7 @@ def test_the_right_heart_is_as_bright_as_requested(anatomy):
 
 @pytest.fixture(scope="module")
 def left():
-    return make_patient(AtlasConfig(anatomy="lca", seed=1000), 1)
+    return make_patient(AtlasConfig(vessel="lca", seed=1000), 1)
 
 
 def test_a_left_tree_leaves_the_aorta_and_runs_on_its_own_heart(left):

@@ -351,7 +351,7 @@ def test_pulling_out_stops_at_the_ostium(anatomy: Anatomy) -> None:
             "control: world 1: 1000: translation in mm/s exceeds workhorse-014's limit of 40; slow",
         ),
         (np.array([[40.0, 0], [0, 0]]), 60.0, "world 0: may insert .* laid out for .* push less"),
-        (np.zeros((2, 2)), 0.0, "duration: 0.0; give a positive"),
+        (np.zeros((2, 2)), 0.0, "duration_s: 0.0; give a positive"),
     ],
 )
 def test_bad_controls_move_no_world(anatomy: Anatomy, control: np.ndarray, duration: float, message: str) -> None:

@@ -48,12 +48,16 @@ def test_coaxial_tasks_are_done_by_the_tip_of_a_catheter():
     for each in tasks:
         tree, _ = make_patient_tree(each.atlas(each.ladder.seed), each.ladder.numbers[0])
         target = find_target(tree, each.section, depth_mm=each.depth_mm)
-        assert each.start_catheter_mm < each.start_inserted_mm < target.abscissa
+        assert each.start_catheter_mm < each.start_inserted_length_mm < target.abscissa
     navigation = find_task("follow", version="coaxial").ladder_navigation(0)
     assert navigation.arrives == "catheter" and [c.name for c in navigation.catheters] == ["microcatheter-1.7f"]
     alone = without_catheter(navigation)
-    assert alone.arrives == "wire" and not alone.catheters and alone.start_inserted_mm == navigation.start_inserted_mm
-    assert (alone.target, alone.start_rotation) == (navigation.target, navigation.start_rotation)
+    assert (
+        alone.arrives == "wire"
+        and not alone.catheters
+        and alone.start_inserted_length_mm == navigation.start_inserted_length_mm
+    )
+    assert (alone.target, alone.start_rotation_rad) == (navigation.target, navigation.start_rotation_rad)
 
 
 def test_the_side_branch_leaves_at_ninety_degrees_or_more():
@@ -75,7 +79,11 @@ def test_the_target_lies_in_its_section(name):
 
 def test_a_ladder_navigation_is_the_same_every_time():
     one, other = (find_task("straight").ladder_navigation(3) for _ in range(2))
-    assert one.start_rotation == other.start_rotation != find_task("straight").ladder_navigation(4).start_rotation
+    assert (
+        one.start_rotation_rad
+        == other.start_rotation_rad
+        != find_task("straight").ladder_navigation(4).start_rotation_rad
+    )
     assert one.target == other.target
     assert np.array_equal(one.anatomy.distance_map.values, other.anatomy.distance_map.values)
     assert one.device.tip_bend_rad == pytest.approx(np.deg2rad(find_task("straight").tip_bend_deg))
@@ -87,7 +95,7 @@ def test_a_ladder_navigation_is_the_same_every_time():
         ("level: 6", "level: 17", "level: 17; give a whole number from 1 to 16"),
         ("seconds: 90", "seconds: -1", "seconds: -1; give a number above 0, at most 86400"),
         ("force_limit_n: 0.2", "force_limit_n: .nan", "force_limit_n: nan; give a positive number"),
-        ("anatomy: rca", "anatomy: knee", "anatomy: 'knee'; choose from"),
+        ("vessel: rca", "vessel: knee", "vessel: 'knee'; choose from"),
         ("device: workhorse-014", "device: rope", "device: 'rope'; choose from"),
         ("level: 6", "level: 6\nlength: 3", "length: no such field; the fields are name, level,"),
         ("name: crux", "name: [", "line 4: not valid YAML"),

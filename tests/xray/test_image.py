@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
 from endopilot.devices.catheter import read_catheter
+from endopilot.devices.stack import Stack
 from endopilot.types import Insertion, Volume
 from endopilot.xray.absorbers import (
     CATHETER_MM,

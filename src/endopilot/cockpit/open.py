@@ -202,7 +202,7 @@ def _start_of(anatomy: Anatomy, stack: Stack) -> Navigation:
     line = tree.branches[leaf].centerline.abscissa
     target = Target(branch=leaf, abscissa=float(max(_DEEP * line[-1], line[0])))
     return Navigation(
-        anatomy=anatomy, device=stack.wire, target=target, catheters=stack.catheters, start_inserted_mm=_START_MM
+        anatomy=anatomy, device=stack.wire, target=target, catheters=stack.catheters, start_inserted_length_mm=_START_MM
     )
 
 

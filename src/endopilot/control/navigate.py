@@ -57,9 +57,9 @@ class NavigateConfig:
     """Time in which the target is to be reached, s."""
     force_limit_n: Positive = 0.5
     """Largest force of the wall on one node that is safe, N."""
-    start_inserted_mm: Annotated[float, Within(0, 5000)] = 2.0
+    start_inserted_length_mm: Annotated[float, Within(0, 5000)] = 2.0
     """Inserted length at the start, mm."""
-    start_rotation: Finite = 0.0
+    start_rotation_rad: Finite = 0.0
     """Rotation at the start, rad."""
     xray: XrayKind = "assumed"
     """What an exposure is: assumed (the tip, with the C-arm's errors of detection) or images (the tip is found in X-ray
@@ -223,8 +223,8 @@ def set_up_navigation(
         target=goal,
         catheters=stack.catheters,
         arrives=config.arrives,
-        start_inserted_mm=config.start_inserted_mm,
-        start_rotation=config.start_rotation,
+        start_inserted_length_mm=config.start_inserted_length_mm,
+        start_rotation_rad=config.start_rotation_rad,
         seconds=config.seconds,
         force_limit_n=config.force_limit_n,
         known_motion=_known_motion(config),

@@ -75,7 +75,9 @@ def plan(
         _check_for_stack(config, target, model)
     wire = _wire(model, device, config.method)
     tips = (
-        read_tips(Path(target), wire.max_velocity_mm_s, config.start_inserted_mm) if target.endswith(".csv") else None
+        read_tips(Path(target), wire.max_velocity_mm_s, config.start_inserted_length_mm)
+        if target.endswith(".csv")
+        else None
     )
     goal = find_target(vessel.tree, target) if tips is None else last_place(vessel, tips, target)
     navigation = Navigation(
@@ -84,8 +86,8 @@ def plan(
         target=goal,
         catheters=catheters,
         arrives=config.arrives,
-        start_inserted_mm=config.start_inserted_mm,
-        start_rotation=config.start_rotation,
+        start_inserted_length_mm=config.start_inserted_length_mm,
+        start_rotation_rad=config.start_rotation_rad,
         seconds=config.seconds if tips is None else len(tips) * DECISION_PERIOD_S,
         force_limit_n=config.force_limit_n,
     )
@@ -107,7 +109,7 @@ def plan(
         desired = tips_along(
             route,
             wire.tip_radius_mm,
-            start_mm=config.start_inserted_mm,
+            start_mm=config.start_inserted_length_mm,
             speed_mm_s=config.speed_mm_s,
             seconds=config.seconds,
             safe_ratio=config.cost.safe_ratio,
@@ -186,7 +188,7 @@ def _wire(model: Path | None, device: Wire | Stack | str | Path | None, method: 
 
 
 def _check_time(navigation: Navigation, config: PlanConfig) -> None:
-    length_mm = navigation.target.abscissa - navigation.start_inserted_mm
+    length_mm = navigation.target.abscissa - navigation.start_inserted_length_mm
     fastest = min(navigation.device.max_velocity_mm_s, config.speed_mm_s)
     if length_mm / fastest > navigation.seconds:
         raise InputError(
@@ -208,7 +210,7 @@ def _search(navigation: Navigation, config: PlanConfig, trial: int) -> tuple[Con
         course = policy.find_course(navigation.seconds, advance)
     names = " in ".join(device.name for device in navigation.devices)
     if course.reached < 0.5:
-        came = float(course.tip.abscissa[-1, 0]) if len(course.control) else navigation.start_inserted_mm
+        came = float(course.tip.abscissa[-1, 0]) if len(course.control) else navigation.start_inserted_length_mm
         raise InputError(
             f"target: no path found to branch {navigation.target.branch} of {navigation.anatomy.name} in "
             f"{navigation.seconds:g} s under {navigation.force_limit_n:g} N with {names}; the tip came to "
@@ -257,7 +259,7 @@ def _track(navigation: Navigation, desired: Steps) -> tuple[Steps, Steps]:
         navigation.anatomy,
         [navigation.device],
         friction=np.array([navigation.device.friction]),
-        start=np.array([[navigation.start_inserted_mm, navigation.start_rotation]]),
+        start=np.array([[navigation.start_inserted_length_mm, navigation.start_rotation_rad]]),
         given=np.zeros((1, 0, 2)),
         desired=desired[None],
         config=core,
@@ -305,13 +307,13 @@ def _checked(
     )
 
 
-def within_limits(control: Steps, limits: DriveLimits, inserted_mm: float) -> Steps:
+def within_limits(control: Steps, limits: DriveLimits, inserted_length_mm: float) -> Steps:
     """Return controls that are finite and within the drive's limits and its travel, whatever a model proposes.
 
     Args:
         control: mm/s and rad/s of each period.
         limits: of the drive.
-        inserted_mm: inserted length at the start, mm.
+        inserted_length_mm: inserted length at the start, mm.
     """
     finite = np.isfinite(control).all(axis=1, keepdims=True)
-    return limits.clip_sequence(np.where(finite, control, 0.0), inserted_mm, DECISION_PERIOD_S)
+    return limits.clip_sequence(np.where(finite, control, 0.0), inserted_length_mm, DECISION_PERIOD_S)

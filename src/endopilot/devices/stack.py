@@ -101,15 +101,15 @@ def column_prefixes(devices: int) -> tuple[str, ...]:
 
 
 def lines_from_tips(
-    nodes: Float[np.ndarray, "n 3"], inserted_mm: Float[np.ndarray, "devices"]
+    nodes: Float[np.ndarray, "n 3"], inserted_length_mm: Float[np.ndarray, "devices"]
 ) -> list[Float[np.ndarray, "_ 3"]]:
     """Return the line that telescoping devices share, as each of them has it: from its own tip on.
 
     Args:
         nodes: of the line, from the foremost tip on, LPS mm.
-        inserted_mm: inserted length of each device; the foremost tip is that of the largest.
+        inserted_length_mm: inserted length of each device; the foremost tip is that of the largest.
     """
-    behind = inserted_mm.max() - inserted_mm
+    behind = inserted_length_mm.max() - inserted_length_mm
     along = _along(nodes)
     return [
         nodes if at == 0 else np.vstack([_at(nodes, along, at), nodes[along > at + _APART_MM]])

@@ -119,9 +119,12 @@ class SubmissionCheck:
 
 def task_digest(task: Task) -> str:
     """Return the SHA-256 of what a task's navigations follow from: its definition and its devices."""
-    # Older tasks had no such fields: their hashes stay.
+    # Older tasks had no such fields, or named them otherwise: their hashes stay.
+    older = {"vessel": "anatomy", "start_inserted_length_mm": "start_inserted_mm"}
     definition = {
-        name: value for name, value in asdict(task).items() if (name, value) != ("version", 1) and value is not None
+        older.get(name, name): value
+        for name, value in asdict(task).items()
+        if (name, value) != ("version", 1) and value is not None
     }
     content = json_text(definition) + json_text(read_wire(task.device))
     content += json_text(read_catheter(task.catheter)) if task.catheter else ""
@@ -161,7 +164,7 @@ def write_submission(
     write_json(path, submission)
 
 
-def check_submission(path: Path) -> SubmissionCheck:
+def check_submission(path: str | Path) -> SubmissionCheck:
     """Drive all recordings of a submission file again, without the policy, and compare every figure to the bit.
 
     Args:
@@ -170,6 +173,7 @@ def check_submission(path: Path) -> SubmissionCheck:
     Raises:
         InputError: the file is no submission, or its tasks or seeds are not those of this ladder.
     """
+    path = Path(path)
     submission = read_settings(path, Submission, remedy="give a submission.json of `endopilot ladder`")
     _refuse_another_ladder(path, submission)
     with tempfile.TemporaryDirectory(prefix="endopilot-") as folder:

@@ -70,14 +70,14 @@ def navigate_into(
     return _write(drive(set_up), Path(output), {"policy": policy, "device": device, "catheter": tuple(catheter)})
 
 
-def write_navigation(navigation: PatientNavigation, *, output: str | Path) -> dict[str, Any]:
+def write_navigation(driven: PatientNavigation, *, output: str | Path) -> dict[str, Any]:
     """Write a navigation in a patient into a folder: page, picture, table, trajectory, episode and manifest.
 
     The anatomy is written beside them if the navigation was given it in memory. A page of the documentation, Navigate
     in a patient, describes the files.
 
     Args:
-        navigation: made by `navigate`.
+        driven: what `navigate` returned.
         output: the folder.
 
     Returns:
@@ -87,8 +87,8 @@ def write_navigation(navigation: PatientNavigation, *, output: str | Path) -> di
         InputError: a library is missing, or the folder belongs to another run.
     """
     require_extras("learn", "report")
-    _claim(Path(output), navigation.set_up)
-    return _write(navigation, Path(output), None)
+    _claim(Path(output), driven.set_up)
+    return _write(driven, Path(output), None)
 
 
 def _claim(output: Path, set_up: SetUp) -> None:
@@ -259,7 +259,7 @@ def _commands(
 def _line(set_up: SetUp, output: Path, asked: Mapping[str, Any]) -> list[str]:
     """Return the command that made a navigation, with the options that are not at their defaults."""
     default = {"policy": "agent", "device": "workhorse-014", "catheter": (), **asdict(NavigateConfig())}
-    options = [(name, value) for name, value in (asked | asdict(set_up.config)).items() if value != default[name]]
+    options = [(name, value) for name, value in {**asked, **asdict(set_up.config)}.items() if value != default[name]]
     changed = [
         part
         for name, value in options

@@ -178,7 +178,7 @@ def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
         command="endopilot demo",
         navigation=output / "navigation",
     )
-    atlas = AtlasConfig(anatomy="rca", count=config.patients, seed=config.seed)
+    atlas = AtlasConfig(vessel="rca", count=config.patients, seed=config.seed)
     truths = [output / "truth" / f"patient-{index + 1}" for index in range(config.patients)]
     draw = partial(_make_patient, config=atlas, truths=truths)
     scan = partial(_make_volume, output=output, seed=config.seed, truths=truths)

@@ -78,7 +78,7 @@ class SimulatorState:
     def write(self, path: Path | str) -> None:
         """Write the state to an .npz file, whole or not at all."""
         arrays = {f"values_{k}": v for k, v in enumerate(self.values)}
-        with writing(path) as temporary, temporary.open("wb") as file:
+        with writing(Path(path)) as temporary, temporary.open("wb") as file:
             about = {"fingerprint": np.array(self.fingerprint), "format_version": np.array(self.format_version)}
             np.savez(file, **about, **arrays)  # pyright: ignore[reportArgumentType]
 

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from endopilot.anatomy.catheter_axis import with_world_zero
-from endopilot.atlas.atlas import ANATOMIES, AtlasConfig, make_patient
+from endopilot.atlas.atlas import VESSELS, AtlasConfig, make_patient
 from endopilot.devices.catheter import list_catheters, read_catheter
 from endopilot.devices.device import read_wire
 from endopilot.devices.device_files import list_wires
@@ -54,13 +54,13 @@ class Task:
         name: short name.
         level: place on the ladder, 1 to 12, or 13 to 16 of those with a catheter.
         title: what is to be done, in a few words.
-        anatomy: kind of vessel tree of the atlas.
+        vessel: kind of vessel tree of the atlas.
         device: shipped device.
         tip_bend_deg: angle to which its tip is shaped for this task, degrees.
         tip_bend_mm: length from the tip over which it is bent, mm.
         section: section that the target lies in.
         depth_mm: distance of the target from the section's begin, along the centerline, mm.
-        start_inserted_mm: inserted length at the start, mm.
+        start_inserted_length_mm: inserted length at the start, mm.
         seconds: time limit, s.
         force_limit_n: largest force of the wall on one node that is safe, N.
         stenosis_share: share of the atlas' patients that have a stenosis.
@@ -76,13 +76,13 @@ class Task:
     name: str
     level: Annotated[int, Within(1, 16)]
     title: str
-    anatomy: str
+    vessel: str
     device: str
     tip_bend_deg: Annotated[float, Within(0, 180)]
     tip_bend_mm: Positive
     section: str
     depth_mm: Positive
-    start_inserted_mm: NonNegative
+    start_inserted_length_mm: NonNegative
     seconds: Seconds
     force_limit_n: Positive
     stenosis_share: Share
@@ -97,7 +97,7 @@ class Task:
     @model_validator(mode="after")
     def _consistent(self) -> Task:
         known_catheters = (*list_catheters(), None)
-        for name, known in (("anatomy", ANATOMIES), ("device", list_wires()), ("catheter", known_catheters)):
+        for name, known in (("vessel", VESSELS), ("device", list_wires()), ("catheter", known_catheters)):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name}: {getattr(self, name)!r}; choose from {', '.join(filter(None, known))}")
         return self
@@ -114,7 +114,7 @@ class Task:
     def atlas(self, seed: int) -> AtlasConfig:
         """Return the atlas of a seed that the task's patients come from."""
         return AtlasConfig(
-            anatomy=self.anatomy,
+            vessel=self.vessel,
             seed=seed,
             stenosis_share=self.stenosis_share,
             population="textbook" if self.version == 1 else "patients",
@@ -123,9 +123,9 @@ class Task:
     def ladder_navigation(self, place: int) -> Navigation:
         """Return the task in one of the patients that the ladder is scored on, with its own first rotation."""
         turn = np.random.default_rng([self.ladder.seed, self.ladder.numbers[place]]).uniform(0.0, 2 * np.pi)
-        return self.navigation(self.patient(self.ladder, place), start_rotation=turn)
+        return self.navigation(self.patient(self.ladder, place), start_rotation_rad=turn)
 
-    def navigation(self, anatomy: Anatomy, *, start_rotation: float = 0.0) -> Navigation:
+    def navigation(self, anatomy: Anatomy, *, start_rotation_rad: float = 0.0) -> Navigation:
         """Return what is to be done in one of the task's patients.
 
         Raises:
@@ -136,8 +136,8 @@ class Task:
             anatomy=anatomy,
             device=replace(read_wire(self.device), **bend),
             target=find_target(anatomy.tree, self.section, depth_mm=self.depth_mm),
-            start_inserted_mm=self.start_inserted_mm,
-            start_rotation=start_rotation,
+            start_inserted_length_mm=self.start_inserted_length_mm,
+            start_rotation_rad=start_rotation_rad,
             seconds=self.seconds,
             force_limit_n=self.force_limit_n,
             catheters=(read_catheter(self.catheter),) if self.catheter else (),
@@ -217,6 +217,6 @@ def reference_navigation() -> Navigation:
         anatomy=anatomy,
         device=read_wire("workhorse-014"),
         target=find_target(anatomy.tree, "4", depth_mm=15.0),
-        start_inserted_mm=5.0,
+        start_inserted_length_mm=5.0,
         seconds=60.0,
     )

@@ -109,7 +109,7 @@ def draw_scenes(config: SceneConfig, image: ImageConfig | None = None) -> Iterat
     with progress("Patients on the table", patients) as advance:
         for index in range(patients):
             random = np.random.default_rng([config.seed, index, 0x7363656E])
-            atlas = AtlasConfig(anatomy=("rca", "lca")[index % 2], seed=config.seed)
+            atlas = AtlasConfig(vessel=("rca", "lca")[index % 2], seed=config.seed)
             anatomy = read_anatomy(config.given[index]) if config.given else make_patient(atlas, index)
             imager = XrayImager(anatomy, device, ct=surroundings(anatomy), config=image)
             angles = config.view_angles_deg[index // 2 % len(config.view_angles_deg)]
