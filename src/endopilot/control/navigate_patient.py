@@ -20,13 +20,13 @@ from endopilot.control.agent import OraclePolicy
 from endopilot.control.set_up import TILT_DEG, TipChoice, choose_tip
 from endopilot.devices.catheter import Catheter, read_catheter
 from endopilot.devices.device import Wire, read_device
+from endopilot.devices.robot import ASSUMED, RobotConfig, read_robot
 from endopilot.errors import InputError
 from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, XrayKind
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import Believer, Led, Observation, Policy
 from endopilot.navigation.record import NavigationRecord
 from endopilot.progress import progress
-from endopilot.robot.config import ASSUMED, RobotConfig, read_robot
 from endopilot.settings import Finite, Positive, Seconds, Seed, ShareBelowOne, Text, Within, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.mismatch import ModelMismatch, drawn_sides, mismatch_by

@@ -15,12 +15,12 @@ from jaxtyping import Bool, Float
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.belief.adviser import AdviserConfig, count_events, near_exposures
 from endopilot.control.agent import AgentPolicy
+from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
 from endopilot.navigation.navigate import NavigateConfig, navigate
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import Decision, Observation, Policy
 from endopilot.navigation.record import NavigationRecord
-from endopilot.robot.config import RobotConfig
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import CORE, Task

@@ -18,6 +18,7 @@ from typing import Any, Literal
 from endopilot import __version__, _core
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_device
+from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, write_json
 from endopilot.ladder.attempt import Recording, driven, navigation_seed, repeat
@@ -25,7 +26,6 @@ from endopilot.ladder.scores import score
 from endopilot.navigation.policies import POLICIES
 from endopilot.navigation.record import NavigationRecord
 from endopilot.parallel import each
-from endopilot.robot.config import RobotConfig
 from endopilot.settings import CountOrZero, Seed, from_record, read_settings, settings
 from endopilot.tasks.task import LadderVersion, Task, find_task, ladder_tasks
 

@@ -12,12 +12,12 @@ import numpy as np
 from pydantic import model_validator
 
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import BelievedTip, Believer, Decision, Led, Observation, Policy
 from endopilot.navigation.record import NavigationRecord, Track
-from endopilot.robot.config import RobotConfig
 from endopilot.robot.robot import CYCLE_S, SimulatedRobot, in_grip
 from endopilot.settings import Within, settings
 from endopilot.simulation.config import SimulatorConfig

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.devices.drive_limits import DriveLimits
-from endopilot.robot.config import RobotConfig
+from endopilot.devices.robot import RobotConfig
 
 _ROUNDING_S = 1e-12
 
