@@ -170,6 +170,8 @@ def test_what_is_no_trajectory_of_the_vessel_is_refused_in_one_line(vessel, wire
         arrays = dict(stored)
     newer = json.loads(str(arrays["about"])) | {"version": 99}
     np.savez(tmp_path / "newer.npz", **(arrays | {"about": np.array(json.dumps(newer))}))  # pyright: ignore[reportArgumentType]
+    older = {name: each for name, each in arrays.items() if name != "tip_twist"}
+    np.savez(tmp_path / "older.npz", **older)  # pyright: ignore[reportArgumentType]
     np.savez(tmp_path / "other.npz", values=np.zeros(3))
     (tmp_path / "text.npz").write_text("nothing")
     np.save(tmp_path / "array.npy", np.zeros(3))
@@ -177,6 +179,7 @@ def test_what_is_no_trajectory_of_the_vessel_is_refused_in_one_line(vessel, wire
     for name in ("none.npz", "other.npz", "text.npz", "array.npy", "list.npz"):
         _refused(tmp_path / name, vessel, "no trajectory")
     _refused(tmp_path / "newer.npz", vessel, "format version 99, not 1; simulate it again")
+    _refused(tmp_path / "older.npz", vessel, "lacks tip_twist, which this version records; simulate it again")
     _refused(path, make_patient(AtlasConfig(count=2), 1), f"world 0 is of another vessel, '{vessel.name}'")
     _refused(path, [vessel], f"world 1 is of another vessel, '{vessel.name}'")
     with pytest.raises(InputError, match=r"written as \.parquet, \.csv or \.npz"):

@@ -41,7 +41,7 @@ def simulate_again(
     anatomy: Anatomy,
     control: Float[np.ndarray, "episodes samples *devices 2"],
     *,
-    friction: Float[np.ndarray, "episodes"] | None = None,
+    friction: Float[np.ndarray, "episodes devices"] | None = None,
     record_shape: bool = False,
 ) -> Iterator[tuple[Int[np.ndarray, "chosen"], Trajectory]]:
     """Simulate the episodes of one anatomy again.
@@ -52,7 +52,7 @@ def simulate_again(
         data: episodes of the anatomy alone, in any order; one may stand there several times.
         anatomy: of theirs.
         control: of the drives of each episode, mm/s and rad/s.
-        friction: the wire's friction coefficient in each; as recorded if not given.
+        friction: Coulomb coefficients of the devices on the wall; as recorded if not given.
         record_shape: record the positions of all nodes too.
 
     Yields:
@@ -73,7 +73,7 @@ def simulate_again(
                 initial=data.initial[chosen],
                 config=config,
                 record_shape=record_shape,
-                friction=stack.frictions(friction[chosen]),
+                friction=friction[chosen],
                 motion=data.motion(anatomy.name),
             ),
         )
