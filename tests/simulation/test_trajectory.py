@@ -202,12 +202,25 @@ def test_a_recorder_gives_what_a_run_gives_to_the_bit(vessel, devices) -> None:
         simulator.reset(inserted_length=start[..., 0], rotation=start[..., 1])
         return simulator
 
-    recorder = Recorder(begun(), 0.5)
+    recorder = Recorder(begun(), 0.5, record_shape=True)
     for sample in range(SAMPLES):
         recorder.step(control[:, sample])
     gathered = recorder.trajectory()
-    assert_same(gathered, begun().run(control))
+    assert_same(gathered, begun().run(control, record_shape=True))
     assert_same(gathered.replay(), gathered)
+
+
+def test_shapes_in_a_longer_and_a_shorter_vessel_are_recorded_alike(vessel) -> None:
+    """Nodes that neither needs are left out, and those that the shorter one lacks are NaN."""
+    vessels, control = [vessel, make_patient(AtlasConfig(count=2), 1)], np.zeros((2, 2, 1, 2))
+    control[0, :, 0, 0] = 10.0
+    first, second = (endopilot.Simulator(vessels, [WIRE, WIRE]) for _ in range(2))
+    recorder = Recorder(first, 0.5, record_shape=True)
+    for sample in range(2):
+        recorder.step(control[:, sample])
+    gathered = recorder.trajectory()
+    assert gathered.shape is not None and np.isnan(gathered.shape).any() and gathered.shape.shape[2] < first.nodes
+    assert_same(gathered, second.run(control, record_shape=True))
 
 
 def test_a_wire_alone_needs_no_axis_of_devices(vessel, wire_alone) -> None:

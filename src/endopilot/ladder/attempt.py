@@ -16,7 +16,7 @@ from endopilot.anatomy.projection import safety_ratio
 from endopilot.belief.adviser import AdviserConfig, count_events, near_exposures
 from endopilot.control.agent import AgentPolicy
 from endopilot.errors import InputError
-from endopilot.navigation.navigate import NavigateConfig, navigate
+from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, navigate
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import Decision, Observation, Policy
 from endopilot.navigation.record import NavigationRecord
@@ -140,9 +140,16 @@ def driven(recording: Recording, navigation: Navigation, *, seed: int) -> Naviga
     return _drive(navigation, Repeated(recording), seed, None)
 
 
+def begun(recording: Recording, navigation: Navigation, *, seed: int) -> NavigationLoop:
+    """Return the loop that drives a navigation as it was recorded, at its start."""
+    return NavigationLoop(navigation, Repeated(recording), config=_CONFIG, seed=seed)
+
+
+_CONFIG = NavigateConfig(simulator=replace(CORE, threads=1))
+
+
 def _drive(navigation: Navigation, policy: Policy, seed: int, mismatch: ModelMismatch | None) -> NavigationRecord:
-    config = NavigateConfig(simulator=replace(CORE, threads=1))
-    return navigate(navigation, policy, config=config, seed=seed, truth=mismatch)
+    return navigate(navigation, policy, config=_CONFIG, seed=seed, truth=mismatch)
 
 
 class Repeated:

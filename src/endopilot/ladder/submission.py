@@ -20,10 +20,9 @@ from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_device
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, write_json
-from endopilot.ladder.attempt import Recording, driven, navigation_seed, repeat
+from endopilot.ladder.attempt import Recording, navigation_seed, repeat
 from endopilot.ladder.scores import score
 from endopilot.navigation.policies import POLICIES
-from endopilot.navigation.record import NavigationRecord
 from endopilot.parallel import each
 from endopilot.settings import CountOrZero, Seed, read_settings, settings
 from endopilot.tasks.task import LadderVersion, Task, find_task, ladder_tasks
@@ -236,8 +235,8 @@ def _first_difference(submission: Submission, folder: Path) -> str | None:
     return None
 
 
-def read_navigation(path: Path, name: str | None, place: int) -> tuple[Task, int, NavigationRecord]:
-    """Return one navigation of a submission, or of a result file of a ladder's folder, driven again by its recording.
+def recorded_navigation(path: Path, name: str | None, place: int) -> tuple[Task, int, Recording]:
+    """Return what was recorded of one navigation, from a submission or from a result file of a ladder's folder.
 
     Args:
         path: a submission.json or TASK/NUMBER.json.
@@ -245,7 +244,7 @@ def read_navigation(path: Path, name: str | None, place: int) -> tuple[Task, int
         place: of the patient in the task's list, likewise.
 
     Returns:
-        The task, the patient's place in its list, and the navigation.
+        The task, the patient's place in its list, and the recording.
 
     Raises:
         InputError: the file is none of the ladder, or has no such navigation.
@@ -263,9 +262,7 @@ def read_navigation(path: Path, name: str | None, place: int) -> tuple[Task, int
     else:
         raise InputError(f"{path}: is no file of the ladder; give a submission.json or TASK/NUMBER.json")
     task = find_task(name, content.get("ladder") or 1)
-    navigation = task.ladder_navigation(place)
-    recording = Recording.unpacked(entry["recording"], len(navigation.devices))
-    return task, place, driven(recording, navigation, seed=navigation_seed(task, place))
+    return task, place, Recording.unpacked(entry["recording"], 2 if task.catheter else 1)
 
 
 def _repeat(path: Path, *, version: LadderVersion) -> None:

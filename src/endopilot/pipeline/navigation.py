@@ -23,8 +23,6 @@ from endopilot.control.navigate_patient import (
 )
 from endopilot.control.outcome import name_target, slipped_s, tell_outcome, worst_ratio
 from endopilot.control.set_up import tip_name
-from endopilot.devices.catheter import write_catheter
-from endopilot.devices.device import write_device
 from endopilot.extras import require_extras
 from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.navigation.policies import POLICIES
@@ -35,8 +33,7 @@ from endopilot.tasks.targets import section_at
 from endopilot.types import TipProjection
 
 PAGE_FILE, PICTURE_FILE, TABLE_FILE = "navigation.html", "navigation.png", "navigation.csv"
-WIRE_FILE, EPISODE_FOLDER, ANATOMY_FOLDER = "wire.yaml", "episode", "anatomy"
-CATHETER_FILE, MANIFEST_FILE = "catheter-{}.yaml", "manifest.json"
+EPISODE_FOLDER, ANATOMY_FOLDER, MANIFEST_FILE = "episode", "anatomy", "manifest.json"
 
 
 def navigate_into(
@@ -97,9 +94,6 @@ def _write(found: PatientNavigation, folder: Path, target: str, output: Path) ->
     assert cycles is not None  # a navigation has a period at least
     about = {"policy": set_up.config.policy, "seed": set_up.config.seed, "truth": asdict(set_up.truth)}
     replace(cycles, about=cycles.about | about).write(output / TRAJECTORY)
-    write_device(set_up.true_wire, output / WIRE_FILE)
-    for number, catheter in enumerate(set_up.true_catheters, start=1):
-        write_catheter(catheter, output / CATHETER_FILE.format(number))
     _write_episode(found, driven_in, output / EPISODE_FOLDER)
     picture = png(navigation_figure(found))
     with writing(output / PICTURE_FILE) as partial:
