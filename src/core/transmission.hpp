@@ -28,8 +28,8 @@ struct TransmissionArrays {
 
     // The twist by a torque of the first `at` mm of device k. Beyond the last point it goes on as before.
     ENDOPILOT_DEVICE double twist(int k, double at) const {
-        const double place = std::max(at, 0.0) / spacing;
-        const int i = std::min(int(place), points - 2);
+        const double place = std::max(0.0, at) / spacing;   // 0 for NaN
+        const int i = int(std::min(place, points - 2.0));
         const double before = compliance[k * points + i];
         return before + (place - i) * (compliance[k * points + i + 1] - before);
     }

@@ -37,6 +37,7 @@ from .devices.device import read_device as read_device
 from .devices.device_files import device_yaml as device_yaml
 from .devices.device_files import list_devices as list_devices
 from .devices.stack import Stack as Stack
+from .devices.transmission import Transmission as Transmission
 from .env.single import NavigateEnv as NavigateEnv
 from .env.vector import NavigateVectorEnv as NavigateVectorEnv
 from .env.vector import NavigationState as NavigationState
