@@ -34,7 +34,11 @@ from .devices.device import TipShaping as TipShaping
 from .devices.device import Wire as Wire
 from .devices.device import read_wire as read_wire
 from .devices.device_files import list_wires as list_wires
+from .devices.robot import DriveConfig as DriveConfig
+from .devices.robot import RobotConfig as RobotConfig
+from .devices.robot import read_robot as read_robot
 from .devices.stack import Stack as Stack
+from .devices.transmission import Transmission as Transmission
 from .devices.write import write_device as write_device
 from .env.single import NavigateEnv as NavigateEnv
 from .env.vector import NavigateVectorEnv as NavigateVectorEnv
@@ -73,7 +77,6 @@ from .phantom.phantom import PhantomConfig as PhantomConfig
 from .phantom.phantom import make_phantom as make_phantom
 from .pipeline.navigation import write_navigation as write_navigation
 from .progress import Advance as Advance
-from .robot.robot import RobotConfig as RobotConfig
 from .simulation.config import SimulatorConfig as SimulatorConfig
 from .simulation.controls import ControlConfig as ControlConfig
 from .simulation.mismatch import ModelMismatch as ModelMismatch
