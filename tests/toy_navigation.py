@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -100,9 +101,9 @@ def toy_simulate(
     )
 
 
-def toy_outputs(each: tuple[int, ...], devices: int, **known: np.ndarray) -> dict[str, np.ndarray]:
+def toy_outputs(each: tuple[int, ...], devices: int, **known: np.ndarray) -> dict[str, Any]:
     """Return all that the core records of worlds: 0, and valid, but for what is known."""
-    outputs = {
+    outputs: dict[str, Any] = {
         name: np.zeros((*each, *([devices] if of == "device" else []), *([numbers] if numbers > 1 else [])))
         for name, of, numbers, *_ in _core.OUTPUTS
         if of in ("device", "sample")

@@ -26,7 +26,7 @@ def dataset(toy_dataset):
 def test_a_dataset_gives_its_navigations_to_the_bit(dataset):
     slip = np.random.default_rng(1).uniform(0, 1, dataset.slip.shape).astype(np.float32)
     asked = dataset.control + np.stack([slip, np.zeros_like(slip)], axis=-1) / dataset.sample_period_s
-    slipped = replace(dataset, slip=slip, command=asked.astype(np.float32).astype(float))
+    slipped = replace(dataset, slip=slip, command=asked.astype(float) + 1e-9)  # with digits that float32 lacks
     episodes = Episodes.of_dataset(slipped)
     assert len(episodes) == len(dataset) and episodes.samples == 120
     np.testing.assert_array_equal(episodes.proximal[..., 0], dataset.inserted_length[:, :, 0])
