@@ -33,11 +33,11 @@ _WORK_PATH = "meta/work.json"
 
 
 def generate_dataset(
-    anatomy_folders: Sequence[str | Path],
-    output: str | Path,
-    device: Wire | Stack,
-    config: DatasetConfig | None = None,
+    anatomies: Sequence[str | Path],
     *,
+    device: Wire | Stack | str | Path,
+    output: str | Path,
+    config: DatasetConfig | None = None,
     robot: RobotConfig | None = None,
     scheduler: str | None = None,
 ) -> None:
@@ -47,9 +47,9 @@ def generate_dataset(
     one returns at once.
 
     Args:
-        anatomy_folders: anatomies on disk, with different names.
+        anatomies: folders of anatomies with different names.
+        device: the wire or its name, or the wire and its catheters; each is driven at random and independently.
         output: folder of the dataset.
-        device: the wire, or the wire and its catheters; each is driven at random and independently.
         config: number, length, distribution and split of the navigations; the defaults if not given.
         robot: what makes the motions and measures them; if not given, they are made as drawn.
         scheduler: address of a Dask scheduler whose workers simulate; the cores of this machine if not given.
@@ -60,7 +60,7 @@ def generate_dataset(
             force, or a robot that is, a scheduler that cannot be reached, or a full disk.
     """
     config = config or DatasetConfig()
-    folders, stack = [Path(folder) for folder in anatomy_folders], Stack.of(device)
+    folders, stack = [Path(folder) for folder in anatomies], Stack.of(device)
     if robot is not None:
         stack, core = in_grip(stack, robot, config.simulator)
         config = replace(config, simulator=core)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.devices.catheter import Catheter, check_nested
-from endopilot.devices.device import Device, Wire, check_fits
+from endopilot.devices.catheter import Catheter, check_nested, read_catheter
+from endopilot.devices.device import Device, Wire, check_fits, read_wire
+from endopilot.devices.transmission import Transmission
+from endopilot.errors import InputError
 from endopilot.types import Anatomy
 
 SHOWN_BEHIND_MM = 20.0
@@ -22,15 +25,42 @@ Proximals = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class Stack:
-    """A wire, and the catheters around it from the inside out; a wire alone is a stack of one."""
+    """A wire, and the catheters around it from the inside out; a wire alone is a stack of one.
+
+    Attributes:
+        wire: the wire.
+        catheters: around it.
+        transmissions: what lies between drive and ostium, of each device; drives act at the ostium if not given.
+    """
 
     wire: Wire
     catheters: tuple[Catheter, ...] = ()
+    transmissions: tuple[Transmission, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check that there are as many transmissions as devices, and give drives at the ostium that of no length."""
+        given = len(self.transmissions)
+        if given not in (0, len(self)):
+            raise InputError(f"transmissions: {given} for {len(self)} devices; give one for each device, or none")
+        if not given:
+            object.__setattr__(self, "transmissions", (Transmission(),) * len(self))
 
     @staticmethod
-    def of(device: Wire | Stack) -> Stack:
-        """Return a stack as it is, and a wire as a stack of one."""
-        return device if isinstance(device, Stack) else Stack(device)
+    def of(device: Wire | Stack | str | Path, *catheters: Catheter | str | Path) -> Stack:
+        """Return the stack of a wire and catheters, each given itself, by its name or by its YAML file.
+
+        Args:
+            device: the wire, or a stack that the catheters are put around.
+            catheters: from the inside out.
+
+        Raises:
+            InputError: no such wire or catheter.
+        """
+        stack = (
+            device if isinstance(device, Stack) else Stack(device if isinstance(device, Wire) else read_wire(device))
+        )
+        around = tuple(each if isinstance(each, Catheter) else read_catheter(each) for each in catheters)
+        return replace(stack, catheters=stack.catheters + around) if around else stack
 
     def __len__(self) -> int:
         """Return the number of devices."""
@@ -69,7 +99,8 @@ class Stack:
     @property
     def constants(self) -> tuple[Any, ...]:
         """All numbers of the devices: stacks with the same constants behave the same."""
-        return self.wire.constants + tuple(each.constants for each in self.catheters)
+        behind = tuple((each.length_mm, each.twist_friction_n_mm_mm) for each in self.transmissions)
+        return self.wire.constants + tuple(each.constants for each in self.catheters) + behind
 
     def check(self, anatomy: Anatomy) -> None:
         """Check that the devices fit into each other, and into an anatomy.
@@ -88,15 +119,15 @@ def column_prefixes(devices: int) -> tuple[str, ...]:
 
 
 def lines_from_tips(
-    nodes: Float[np.ndarray, "n 3"], inserted_mm: Float[np.ndarray, "devices"]
+    nodes: Float[np.ndarray, "n 3"], inserted_length_mm: Float[np.ndarray, "devices"]
 ) -> list[Float[np.ndarray, "_ 3"]]:
     """Return the line that telescoping devices share, as each of them has it: from its own tip on.
 
     Args:
         nodes: of the line, from the foremost tip on, LPS mm.
-        inserted_mm: inserted length of each device; the foremost tip is that of the largest.
+        inserted_length_mm: inserted length of each device; the foremost tip is that of the largest.
     """
-    behind = inserted_mm.max() - inserted_mm
+    behind = inserted_length_mm.max() - inserted_length_mm
     along = _along(nodes)
     return [
         nodes if at == 0 else np.vstack([_at(nodes, along, at), nodes[along > at + _APART_MM]])
