@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from endopilot.types import TipProjection
 
 Controls = Float[np.ndarray, "periods devices 2"]
+"""Translation (mm/s) and rotation (rad/s) of each device in each decision period."""
 
 
 @dataclass(frozen=True, eq=False)

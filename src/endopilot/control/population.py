@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.control.push import Motion
+from endopilot.control.course import Controls
 from endopilot.control.search_config import SearchConfig
 from endopilot.control.trials import WIRE, Control, Move, Trials
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
@@ -51,7 +51,7 @@ class Population:
         self._config, self._random = config, random
         self._wire_radius = navigation.device.tip_radius_mm
 
-    def find(self, one: Trials, waypoint: float, *, rounds: int, spare_share: float) -> tuple[Motion, bool]:
+    def find(self, one: Trials, waypoint: float, *, rounds: int, spare_share: float) -> tuple[Controls, bool]:
         """Find controls that bring most wires past a place; return the best, and whether they do.
 
         Every attempt begins from the same state, so that what is found holds no motion of a failed one.
@@ -74,7 +74,7 @@ class Population:
 
     def attempt(
         self, one: Trials, waypoint: float, rounds: int, attempt: int, force_share: float
-    ) -> tuple[float, Motion, bool]:
+    ) -> tuple[float, Controls, bool]:
         """Search once; return the least cost so far and to go, its controls, and whether they pass the place."""
         trials, count = self._trials.copy_of(one), self._trials.count
         history, spent, peak = np.zeros((0, count, 1, 2)), np.zeros(count), np.zeros(trials.simulator.worlds)

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from endopilot.control.course import Controls
 from endopilot.control.search_config import SearchConfig
 from endopilot.control.trials import CATHETER, STALL_PERIODS, WIRE, Control, Move, Period, Trials
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
@@ -21,8 +22,6 @@ from endopilot.tasks.route import Route
 Halt = Literal["off", "stalled", "slipped", "pressed", "late"]
 """A wire leaves the route, does not come forward though it is pushed, cannot be pushed without the drive's slipping,
 presses on the wall too hard, or the time is over."""
-Motion = Float[np.ndarray, "periods devices 2"]
-"""(mm/s, rad/s) of each device in each decision period."""
 Each = Float[np.ndarray, "trials"]
 TURN_PERIODS = 2
 """Decision periods in which devices are turned, half a turn at most."""
@@ -70,7 +69,7 @@ class Pushed:
         """Return which pass without pressing on the wall with more than some force, N."""
         return self.passed & (self.force <= force_n)
 
-    def controls(self, trial: int) -> Motion:
+    def controls(self, trial: int) -> Controls:
         """Return the controls of one trial."""
         return np.array([row.control[trial] for row in self.rows[: self.periods[trial]]])
 
