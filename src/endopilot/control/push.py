@@ -163,7 +163,7 @@ class Push:
         if self.strict:
             stop(self._off(trials, off_mm), "off")
         for _ in range(min(periods, longest)):
-            going, before = ~trials.still, trials.simulator.inserted_length[:, WIRE]
+            going, before = ~trials.still, trials.lengths[:, WIRE]
             control = self._straight(trials, progress) if alone else follower.control(progress)
             if not control[going].any():
                 break
@@ -291,12 +291,12 @@ class _Follower:
 def _slips(trials: Trials, before: Float[np.ndarray, "worlds"]) -> Bool[np.ndarray, "trials"]:
     """Return which drives have slipped in the last period, given the wires' inserted lengths before, mm."""
     commanded = np.tile(trials.rows[-1].control[:, WIRE, 0], trials.wires) * DECISION_PERIOD_S
-    return ~trials.all(trials.simulator.inserted_length[:, WIRE] - before >= _SLIP_SHARE * commanded)
+    return ~trials.all(trials.lengths[:, WIRE] - before >= _SLIP_SHARE * commanded)
 
 
 def _deepest(trials: Trials) -> Each:
     """Return the inserted length of each trial's foremost device, mm."""
-    return trials.mean(trials.simulator.inserted_length.max(axis=1))
+    return trials.mean(trials.lengths.max(axis=1))
 
 
 def _largest_force(trials: Trials, periods: Int[np.ndarray, "trials"]) -> Each:

@@ -267,7 +267,7 @@ class Search:
         for _ in range(self._left):
             here, on_route = self._here(), course.all(route.off_route(course.foremost) == 0)[0]
             rests = len(course.rows) >= STALL_PERIODS and course.stalled(lambda tip: tip.abscissa, STALL_PERIODS - 1)
-            if not on_route and course.simulator.inserted_length[:, WIRE].min() > 1.0:
+            if not on_route and course.lengths[:, WIRE].min() > 1.0:
                 course.move(course.control(Move(WIRE, -speed)))
             elif here < begin - 1.0 and not rests:
                 course.move(course.control(Move(WIRE, min(speed, (begin - here) / DECISION_PERIOD_S))))

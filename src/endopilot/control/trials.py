@@ -100,7 +100,7 @@ class Trials:
         self.simulator, self.wires = simulator, wires
         self.count, self.devices = simulator.worlds // wires, simulator.devices
         self._limits, self.fastest = list(limits), limits[0].fastest
-        self._tips: TipProjection | None = None
+        self._seen: tuple[np.ndarray, TipProjection] | None = None
         self._forget(np.full(wires, 1 / wires))
 
     @staticmethod
@@ -141,10 +141,10 @@ class Trials:
     def copy_trials(self, chosen: Int[np.ndarray, "trials"]) -> None:
         """Put each trial where another one is."""
         self.simulator.copy_worlds((np.arange(self.wires)[:, None] * self.count + chosen).ravel())
-        self._tips = None
+        self._seen = None
 
     def _forget(self, weight: Float[np.ndarray, "wires"]) -> None:
-        self.weight, self._tips = weight, None
+        self.weight, self._seen = weight, None
         self.rows: list[Period] = []
         self.still = np.zeros(self.count, dtype=bool)
 
@@ -153,21 +153,30 @@ class Trials:
         """Which wires count."""
         return self.weight > 0
 
+    def _see(self) -> tuple[Float[np.ndarray, "worlds devices 2"], TipProjection]:
+        """Return where proximal ends and tips are, which is asked of the simulator once."""
+        if self._seen is None:
+            self._seen = self.simulator.proximal, self.simulator.project()
+        return self._seen
+
     @property
     def tips(self) -> TipProjection:
         """Tips of each world's devices."""
-        if self._tips is None:
-            self._tips = self.simulator.project()
-        return self._tips
+        return self._see()[1]
+
+    @property
+    def lengths(self) -> Float[np.ndarray, "worlds devices"]:
+        """Inserted lengths of each world's devices, mm."""
+        return self._see()[0][..., 0]
 
     @property
     def foremost(self) -> TipProjection:
         """Each world's foremost tip, that of the device which is inserted farthest."""
-        return self.tips[np.arange(self.simulator.worlds), self.simulator.inserted_length.argmax(axis=1)]
+        return self.tips[np.arange(self.simulator.worlds), self.lengths.argmax(axis=1)]
 
     def inserted(self, device: int) -> Float[np.ndarray, "trials"]:
         """Return the inserted lengths of a device, mm."""
-        return self.mean(self.simulator.inserted_length[:, device])
+        return self.mean(self.lengths[:, device])
 
     def mean(self, values: Float[np.ndarray, "worlds"] | Bool[np.ndarray, "worlds"]) -> Float[np.ndarray, "trials"]:
         """Return the mean over the wires, by weight."""
@@ -193,7 +202,7 @@ class Trials:
         """
         made = np.array(control)
         for device, limits in enumerate(self._limits):
-            inserted = self.simulator.inserted_length[:, device].reshape(self.wires, -1)
+            inserted = self.lengths[:, device].reshape(self.wires, -1)
             for length in (inserted.min(axis=None if alike else 0), inserted.max(axis=None if alike else 0)):
                 made[:, device] = limits.clip(made[:, device], length, DECISION_PERIOD_S)
         return made
@@ -211,8 +220,9 @@ class Trials:
     def drive(self, control: Control) -> Step:
         """Drive for a decision period; return the worlds at its end, with the largest force within it."""
         step = drive_period(self.simulator, np.tile(control, (self.wires, 1, 1)))
-        self._tips = None
-        self.rows.append(Period(control, self.simulator.proximal, self.tips[:, 0], step.contact_force_max))
+        self._seen = None
+        proximal, tips = self._see()
+        self.rows.append(Period(control, proximal, tips[:, WIRE], step.contact_force_max))
         return step
 
     def stalled(self, along: Callable[[TipProjection], np.ndarray], gains: int) -> Bool[np.ndarray, "trials"]:
@@ -234,7 +244,7 @@ class Trials:
     def restore(self, kept: Kept) -> None:
         """Put them back to where they were, and forget what they have done since."""
         self.simulator.set_state(kept.state)
-        self.still[:], self._tips = False, None
+        self.still[:], self._seen = False, None
         del self.rows[kept.periods :]
 
     def as_course(self, *, reached: float, ostium_mm: float, settled: Sequence[int] | None) -> Course:
