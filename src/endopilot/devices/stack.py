@@ -72,6 +72,11 @@ class Stack:
         return (self.wire, *self.catheters)
 
     @property
+    def name(self) -> str:
+        """The names of its devices, such as "workhorse-014 in microcatheter-1.7f"."""
+        return " in ".join(device.name for device in self.devices)
+
+    @property
     def outer_radius_mm(self) -> float:
         """Radius of the widest device, mm."""
         return max(device.tip_radius_mm for device in self.devices)
