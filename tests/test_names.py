@@ -153,7 +153,11 @@ def test_a_public_function_is_a_verb_with_subjects_and_keywords(name: str) -> No
 def test_a_file_is_read_and_a_trained_model_loaded() -> None:
     assert [name for name in CALLS if name.startswith("load_")] == ["load_model"]
     for name in endopilot.__all__:
-        methods = {field for field, member in vars(getattr(endopilot, name)).items() if callable(getattr(member, "__func__", member))}
+        methods = {
+            field
+            for field, member in vars(getattr(endopilot, name)).items()
+            if callable(getattr(member, "__func__", member))
+        }
         assert not methods & {"load", "save"}, name
 
 
