@@ -51,16 +51,16 @@ class Stack:
 
         Args:
             device: the wire, or a stack that the catheters are put around.
-            catheters: from the inside out.
+            catheters: from the inside out; their drives act at the ostium.
 
         Raises:
             InputError: no such wire or catheter.
         """
-        stack = (
-            device if isinstance(device, Stack) else Stack(device if isinstance(device, Wire) else read_wire(device))
-        )
         around = tuple(each if isinstance(each, Catheter) else read_catheter(each) for each in catheters)
-        return replace(stack, catheters=stack.catheters + around) if around else stack
+        if not isinstance(device, Stack):
+            return Stack(device if isinstance(device, Wire) else read_wire(device), around)
+        further = tuple(Transmission() for _ in around)
+        return replace(device, catheters=device.catheters + around, transmissions=device.transmissions + further)
 
     def __len__(self) -> int:
         """Return the number of devices."""
