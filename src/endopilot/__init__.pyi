@@ -75,6 +75,8 @@ from .phantom.phantom import PhantomConfig as PhantomConfig
 from .phantom.phantom import make_phantom as make_phantom
 from .pipeline.navigation import navigate_into as navigate_into
 from .progress import Advance as Advance
+from .robot.log import RobotLog as RobotLog
+from .robot.log import read_log as read_log
 from .robot.robot import RobotConfig as RobotConfig
 from .simulation.config import SimulatorConfig as SimulatorConfig
 from .simulation.controls import ControlConfig as ControlConfig
@@ -105,6 +107,8 @@ from .types import LumenMask as LumenMask
 from .types import TipProjection as TipProjection
 from .types import VesselTree as VesselTree
 from .types import Volume as Volume
+from .xray.camera import CArmCamera as CArmCamera
+from .xray.camera import PlanarCamera as PlanarCamera
 from .xray.carm import CArmGeometry as CArmGeometry
 from .xray.carm import Pose as Pose
 from .xray.carm import View as View
