@@ -1,0 +1,91 @@
+"""What a drive makes of the commands of a log: where the device's proximal end is at any time, with lag, gain and play.
+
+A command moves the drive from where it is to the commanded position by the time of the next one, and it begins
+`latency` later. The device follows by `gain`, through the play, which is a play operator (backlash): with the drive
+at x, it lies within [x - play/2, x + play/2], and moves only where it would leave that. Whole sets of candidates are
+computed side by side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from endopilot.robot.log import RobotLog
+
+
+@dataclass(frozen=True, eq=False)
+class Courses:
+    """The commands of episodes, and the times at which the tip was seen, padded to one length.
+
+    Attributes:
+        knot_s: times from the start of each episode at which the drive reaches what was commanded, s.
+        command: what it reaches then, mm and rad from the first command; device 0.
+        seen_s: times at which the tip was seen, s; the last one again as padding.
+        seen: which of them are no padding.
+    """
+
+    knot_s: Float[np.ndarray, "episodes knots"]
+    command: Float[np.ndarray, "episodes knots 2"]
+    seen_s: Float[np.ndarray, "episodes tips"]
+    seen: Bool[np.ndarray, "episodes tips"]
+
+    @staticmethod
+    def of(episodes: Sequence[RobotLog]) -> Courses:
+        """Take them from logs of one episode each, with a command and a tip at least."""
+        knots = max(int(log.commanded.sum()) for log in episodes) + 1
+        tips = max(int(log.seen.sum()) for log in episodes)
+        knot_s, command = np.zeros((len(episodes), knots)), np.zeros((len(episodes), knots, 2))
+        seen_s, seen = np.zeros((len(episodes), tips)), np.zeros((len(episodes), tips), dtype=bool)
+        for k, log in enumerate(episodes):
+            asked, at = log.command[log.commanded, 0], log.time_s[log.commanded] - log.time_s[0]
+            period = float(np.median(np.diff(at))) if len(at) > 1 else 0.1
+            count, looks = len(at), log.time_s[log.seen] - log.time_s[0]
+            knot_s[k, 0], knot_s[k, 1 : count + 1] = at[0], [*at[1:], at[-1] + period]
+            knot_s[k, count + 1 :] = knot_s[k, count] + 1e-3 * np.arange(1, knots - count)
+            command[k, 1 : count + 1] = asked - asked[0]
+            command[k, count + 1 :] = asked[-1] - asked[0]
+            seen_s[k, : len(looks)], seen_s[k, len(looks) :] = looks, looks[-1]
+            seen[k, : len(looks)] = True
+        return Courses(knot_s, command, seen_s, seen)
+
+    def followed(
+        self,
+        axis: int,
+        *,
+        at_s: Float[np.ndarray, "episodes times"],
+        latency_s: Float[np.ndarray, "candidates"],
+        gain: Float[np.ndarray, "candidates"],
+        play: Float[np.ndarray, "candidates"],
+        start: float = 0.0,
+    ) -> Float[np.ndarray, "candidates episodes times"]:
+        """Return where the device's proximal end is, from where it was at the first command, mm or rad.
+
+        Args:
+            axis: 0 for the translation, 1 for the rotation.
+            at_s: times of each episode, s.
+            latency_s: from a command to the motion, s.
+            gain: motion of the device per motion of the drive.
+            play: motion that is lost where the drive reverses, mm or rad.
+            start: where in the play the device begins: -1 it was pushed last, 0 the middle, 1 it was pulled last.
+        """
+        drive = gain[:, None, None] * self.command[None, :, :, axis]
+        half = play[:, None] / 2
+        device = np.empty_like(drive)
+        device[:, :, 0] = start * half
+        for k in range(1, drive.shape[2]):
+            device[:, :, k] = np.clip(device[:, :, k - 1], drive[:, :, k] - half, drive[:, :, k] + half)
+        result = np.empty((len(gain), *at_s.shape))
+        for c, e in np.ndindex(len(gain), len(at_s)):
+            since = at_s[e] - latency_s[c]
+            before = _knot_before(self.knot_s[e], since)
+            now = np.interp(since, self.knot_s[e], drive[c, e])
+            result[c, e] = np.clip(device[c, e, before], now - half[c], now + half[c])
+        return result
+
+
+def _knot_before(knot_s: Float[np.ndarray, "knots"], at_s: Float[np.ndarray, "times"]) -> Int[np.ndarray, "times"]:
+    return np.clip(np.searchsorted(knot_s, at_s, side="right") - 1, 0, len(knot_s) - 1)
