@@ -22,6 +22,8 @@ Costs = Callable[[Float[np.ndarray, "candidates parameters"]], Float[np.ndarray,
 _STANDARD_ERRORS = 0.98
 _WIDER = 0.5
 """What is drawn from reaches beyond the candidates that are not worse by this share of their range."""
+_LEAST_SPARE = 0.03
+"""And by this share of all that was searched in, at least."""
 UNKNOWN_SHARE = 0.6
 """A parameter whose interval takes this share of what it was searched in is not identified."""
 LEAST_EPISODES = 5
@@ -75,7 +77,7 @@ class Candidates:
     @property
     def best(self) -> int:
         """The candidate that costs least."""
-        return int(np.argmin(self.costs.mean(axis=1)))
+        return int(np.argmin(self.costs.sum(axis=1)))
 
     @property
     def not_worse(self) -> Bool[np.ndarray, "candidates"]:
@@ -91,6 +93,7 @@ def search(
     generations: int,
     rounds: int,
     draws: int,
+    first: int = 0,
     seed: int = 0,
 ) -> Candidates:
     """Find parameters, and all that are as good.
@@ -101,7 +104,8 @@ def search(
         generations: of differential evolution, of about eight candidates a parameter.
         rounds: in which candidates are drawn around those that are not worse.
         draws: number of them in each round, a power of two.
-        seed: of both.
+        first: number that is drawn from everywhere in place of differential evolution, where each takes long.
+        seed: of all.
     """
     low, high = np.array(list(ranges.values()), dtype=float).T
     tried: list[np.ndarray] = []
@@ -110,12 +114,30 @@ def search(
     def total(columns: Float[np.ndarray, "parameters candidates"]) -> Float[np.ndarray, "candidates"]:
         tried.append(columns.T.copy())
         cost.append(costs(tried[-1]))
-        return cost[-1].mean(axis=1)
+        return cost[-1].sum(axis=1)
 
+    def draw(number: int, bottom: np.ndarray, top: np.ndarray, seed: int) -> None:
+        total((bottom + qmc.Sobol(len(low), seed=seed).random(number) * (top - bottom)).T)
+
+    if first:
+        draw(first, low, high, seed)
+    else:
+        _evolve(total, list(zip(low, high, strict=True)), generations, seed)
+    for number in range(rounds):
+        found = Candidates(tuple(ranges), np.concatenate(tried), np.concatenate(cost))
+        as_good = found.values[found.not_worse]
+        spare = np.maximum(_WIDER * np.ptp(as_good, axis=0), _LEAST_SPARE * (high - low))
+        bottom, top = np.clip([as_good.min(axis=0) - spare, as_good.max(axis=0) + spare], low, high)
+        draw(draws, bottom, top, seed + number + 1)
+    return Candidates(tuple(ranges), np.concatenate(tried), np.concatenate(cost))
+
+
+def _evolve(total: Callable[[np.ndarray], np.ndarray], ranges: list[tuple[float, float]], most: int, seed: int) -> None:
+    """Let differential evolution look for the least total, for a number of generations."""
     differential_evolution(
         total,
-        list(zip(low, high, strict=True)),
-        maxiter=generations,
+        ranges,
+        maxiter=most,
         popsize=8,
         init="sobol",
         polish=False,
@@ -124,14 +146,6 @@ def search(
         tol=0.0,
         seed=seed,
     )
-    for number in range(rounds):
-        found = Candidates(tuple(ranges), np.concatenate(tried), np.concatenate(cost))
-        as_good = found.values[found.not_worse]
-        spare = np.maximum(_WIDER * np.ptp(as_good, axis=0), 1e-3 * (high - low))
-        box = np.clip([as_good.min(axis=0) - spare, as_good.max(axis=0) + spare], low, high)
-        drawn = qmc.Sobol(len(low), seed=seed + number + 1).random(draws)
-        total((box[0] + drawn * (box[1] - box[0])).T)
-    return Candidates(tuple(ranges), np.concatenate(tried), np.concatenate(cost))
 
 
 def estimates(

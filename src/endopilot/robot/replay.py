@@ -33,7 +33,7 @@ _LEAD_S = 2.0
 """A simulation begins so long before the first tip was seen, or with the first command, s."""
 _TOGETHER = 8
 """Episodes that are simulated side by side, for as long as the longest of them takes."""
-_FAR_MM = 2.0
+FAR_MM = 2.0
 """No tip counts as farther from the real one than this, mm, when a world is chosen: one in a wrong branch is wrong."""
 
 
@@ -93,7 +93,7 @@ class EpisodeReplay:
 
 
 @dataclass(frozen=True, eq=False)
-class _Prepared:
+class Prepared:
     """Episodes and what was seen in them, with the vessel."""
 
     logs: list[RobotLog]
@@ -146,7 +146,7 @@ def replay_log(
     return replay_prepared(prepared, device, robot, config, simulator=simulator)
 
 
-def prepare(logs: list[RobotLog], anatomy: Anatomy, given: float) -> _Prepared:
+def prepare(logs: list[RobotLog], anatomy: Anatomy, given: float) -> Prepared:
     """Project what was seen in episodes onto a vessel, once for many replays."""
     courses, project = Courses.of(logs), TipProjector(anatomy.tree, anatomy.insertion)
     abscissa, branch = np.full(courses.seen.shape, np.nan), np.full(courses.seen.shape, -1.0)
@@ -155,11 +155,11 @@ def prepare(logs: list[RobotLog], anatomy: Anatomy, given: float) -> _Prepared:
         count, tip = int(log.seen.sum()), project(log.tip[log.seen])
         abscissa[k, :count], branch[k, :count] = tip.abscissa, tip.branch
         share[k, : max(1, round(given * count))] = True
-    return _Prepared(logs, courses, anatomy, project, abscissa, branch, share & courses.seen)
+    return Prepared(logs, courses, anatomy, project, abscissa, branch, share & courses.seen)
 
 
 def replay_prepared(
-    of: _Prepared,
+    of: Prepared,
     device: Stack,
     robot: RobotConfig,
     config: ReplayConfig,
@@ -186,7 +186,7 @@ def replay_prepared(
     ]
 
 
-def _proximal(of: _Prepared, robot: RobotConfig) -> tuple[Float[np.ndarray, "episodes times"], np.ndarray]:
+def _proximal(of: Prepared, robot: RobotConfig) -> tuple[Float[np.ndarray, "episodes times"], np.ndarray]:
     """Return equal times of each episode, and where the drive then has the wire, mm and rad, from its first place."""
     drive, courses = robot.wire, of.courses
     begin = np.maximum(courses.seen_s[:, 0] - _LEAD_S, 0.0)
@@ -212,7 +212,7 @@ class _Tried:
 
 
 def _simulated(
-    of: _Prepared,
+    of: Prepared,
     device: Stack,
     times: Float[np.ndarray, "episodes times"],
     course: Float[np.ndarray, "episodes times 2"],
@@ -250,13 +250,13 @@ def _simulated(
     return _Tried(tip, abscissa, branch, _costs(of, tip, of.given))
 
 
-def _costs(of: _Prepared, tip: np.ndarray, used: Bool[np.ndarray, "episodes tips"]) -> np.ndarray:
-    """Return how far tips are from the real ones on average, at most `_FAR_MM`, as the camera sees them, mm."""
+def _costs(of: Prepared, tip: np.ndarray, used: Bool[np.ndarray, "episodes tips"]) -> np.ndarray:
+    """Return how far tips are from the real ones on average, at most `FAR_MM`, as the camera sees them, mm."""
     cost = np.zeros(tip.shape[:2])
     for k, log in enumerate(of.logs):
         count = int(log.seen.sum())
         far = np.linalg.norm(_in_view(log, tip[k, :, :count]), axis=-1)
-        cost[k] = np.minimum(far, _FAR_MM)[:, used[k, :count]].mean(axis=1)
+        cost[k] = np.minimum(far, FAR_MM)[:, used[k, :count]].mean(axis=1)
     return cost
 
 
@@ -278,7 +278,7 @@ def _at(
 
 
 def _episode(
-    of: _Prepared, k: int, tried: _Tried, world: int, driven: Float[np.ndarray, "tips"], rotation: float
+    of: Prepared, k: int, tried: _Tried, world: int, driven: Float[np.ndarray, "tips"], rotation: float
 ) -> EpisodeReplay:
     log, count = of.logs[k], int(of.courses.seen[k].sum())
     line = of.anatomy.tree.path(int(of.branch[k, count - 1]))
@@ -304,11 +304,9 @@ def summary(found: Sequence[EpisodeReplay]) -> dict[str, float | int | None]:
     figures: dict[str, float | int | None] = {"episodes": len(found)}
     for name in ("along", "across", "in_view"):
         figures[f"error_{name}_mm"] = round(float(np.median([each[name] for each in errors])), 3)
-    drive_alone = [
-        np.median(np.abs(each.abscissa[:, 0] - each.driven)[~each.given]) for each in found
-    ]
+    drive_alone = [np.median(np.abs(each.abscissa[:, 0] - each.driven)[~each.given]) for each in found]
     figures["error_along_of_the_drive_alone_mm"] = round(float(np.median(drive_alone)), 3)
-    figures["real_branch_share"] = round(float(np.mean([each.branch[-1, 0] == each.branch[-1, 1] for each in found])), 3)
+    figures["real_branch_share"] = round(
+        float(np.mean([each.branch[-1, 0] == each.branch[-1, 1] for each in found])), 3
+    )
     return figures
-
-
