@@ -36,6 +36,9 @@ from .devices.device import Wire as Wire
 from .devices.device import read_device as read_device
 from .devices.device_files import device_yaml as device_yaml
 from .devices.device_files import list_devices as list_devices
+from .devices.robot import DriveConfig as DriveConfig
+from .devices.robot import RobotConfig as RobotConfig
+from .devices.robot import read_robot as read_robot
 from .devices.stack import Stack as Stack
 from .env.single import NavigateEnv as NavigateEnv
 from .env.vector import NavigateVectorEnv as NavigateVectorEnv
@@ -77,7 +80,6 @@ from .pipeline.navigation import navigate_into as navigate_into
 from .progress import Advance as Advance
 from .robot.log import RobotLog as RobotLog
 from .robot.log import read_log as read_log
-from .robot.robot import RobotConfig as RobotConfig
 from .simulation.config import SimulatorConfig as SimulatorConfig
 from .simulation.controls import ControlConfig as ControlConfig
 from .simulation.mismatch import ModelMismatch as ModelMismatch

@@ -14,7 +14,7 @@ from endopilot.devices.device import read_device
 from endopilot.devices.stack import Stack
 from endopilot.files import input_hash, manifest, write_json, writing
 from endopilot.plotting import png
-from endopilot.robot.config import read_robot
+from endopilot.devices.robot import read_robot
 from endopilot.robot.log import read_log
 from endopilot.robot.replay import EpisodeReplay, ReplayConfig, replay_log, summary
 

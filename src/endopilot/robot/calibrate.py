@@ -22,7 +22,7 @@ from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.progress import Advance, progress
 from endopilot.robot.candidates import LEAST_EPISODES, Candidates, Estimate, estimates, search
-from endopilot.robot.config import RobotConfig
+from endopilot.devices.robot import RobotConfig
 from endopilot.robot.log import RobotLog
 from endopilot.robot.replay import (
     FAR_MM,

@@ -18,7 +18,7 @@ from endopilot.anatomy.projection import TipProjector
 from endopilot.anatomy.tree import tangents
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
-from endopilot.robot.config import RobotConfig
+from endopilot.devices.robot import RobotConfig
 from endopilot.robot.course import Courses
 from endopilot.robot.log import RobotLog
 from endopilot.settings import OpenShare, Within, settings
