@@ -11,10 +11,10 @@ from tyro.conf import Positional
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cli.arguments import Existing, Figures, OutputFolder
 from endopilot.devices.device import read_device
+from endopilot.devices.robot import read_robot
 from endopilot.devices.stack import Stack
 from endopilot.files import input_hash, manifest, write_json, writing
 from endopilot.plotting import png
-from endopilot.devices.robot import read_robot
 from endopilot.robot.log import read_log
 from endopilot.robot.replay import EpisodeReplay, ReplayConfig, replay_log, summary
 

@@ -2,8 +2,8 @@
 
 Two fits, one after the other, with the same search (`candidates`). The drive: lag, gain and play of the translation,
 from Δtip of the real tip, which follows the proximal end but for a constant in each episode. The wire: its bent tip,
-friction, stiffness and the play of the rotation, from where the real tip lies in the vessel beside that of the rod core,
-one world for each candidate, episode and rotation at the start.
+friction, stiffness and the play of the rotation, from where the real tip lies beside that of the rod core and from the
+drive's force where the log has it, with a world for each candidate, episode and rotation at the start.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from endopilot.devices.device import Wire
+from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.progress import Advance, progress
 from endopilot.robot.candidates import LEAST_EPISODES, Candidates, Estimate, estimates, search
-from endopilot.devices.robot import RobotConfig
+from endopilot.robot.course import STARTS, Courses
 from endopilot.robot.log import RobotLog
 from endopilot.robot.replay import (
-    FAR_MM,
     EpisodeReplay,
     Prepared,
     ReplayConfig,
@@ -51,8 +51,13 @@ WIRE = MappingProxyType(
 UNITS = MappingProxyType(
     {"play_mm": "mm", "latency_s": "s", "tip_bend_deg": "°", "tip_bend_length_mm": "mm", "play_rad": "rad"}
 )
+RESOLUTION = MappingProxyType({"gain_translation": 0.005, "play_mm": 0.1, "latency_s": 0.01})
+"""Least half-widths of intervals. A command lasts for 0.05 to 0.2 s and moves the wire by some 0.3 mm; what it does
+within that, and how the wire lies in a vessel that is known to 0.1 mm, no log tells."""
 _TYPICAL_MM = 0.3
 """Errors of Δtip up to this count by their squares, larger ones by their size: a tip that snaps, mm."""
+_TIMES = 2
+"""Fits of the drive with the slack that the rod core has by the fit before."""
 _LEVEL = 0.9
 """Share of episodes in which the band is to hold."""
 
@@ -63,10 +68,12 @@ class CalibrateConfig:
 
     given: OpenShare = 0.5
     """Share of each episode's tips that say where the wire lies; the rest is predicted."""
+    episodes: Annotated[int, Within(LEAST_EPISODES, 10000)] = 64
+    """Episodes that the drive is fitted to at most, evenly chosen from all."""
     wire_episodes: Annotated[int, Within(LEAST_EPISODES, 1000)] = 16
-    """Episodes that the wire is fitted to, evenly chosen from all."""
-    wire_rounds: Annotated[int, Within(0, 20)] = 2
-    """Rounds of 32 wires each that are drawn after the first 64; with 0 the wire is not fitted."""
+    """Episodes that the wire is fitted to at most, likewise."""
+    wires: Annotated[int, Within(0, 10000)] = 128
+    """Wires that are tried: half of them from all that may be, the others around the best; with 0 it is not fitted."""
     seed: Seed = 0
     """Seed of both searches."""
 
@@ -80,7 +87,7 @@ class RobotCalibration:
         wire: with the tip, friction and stiffness that were found where they are identified.
         estimates: each constant with its interval.
         band_mm: half-width within which Δtip was predicted throughout 90 % of the episodes, mm; None with too few.
-        replays: of the episodes that the wire was fitted to.
+        replays: of the episodes that the drive was fitted to.
     """
 
     robot: RobotConfig
@@ -116,61 +123,102 @@ def calibrate(
             f"{logs[0].name}: {len(episodes)} episodes that show the tip often enough; intervals need "
             f"{LEAST_EPISODES}: log more, or number them anew (`episode`) wherever the device was reset"
         )
-    of = prepare(episodes, anatomy, config.given)
-    found = fit_drive(of, seed=config.seed)
-    told = estimates(found, DRIVE, [UNITS.get(name, "") for name in DRIVE])
-    drive = replace(robot.wire, gain_translation=told["gain_translation"].value, play_mm=told["play_mm"].value)
-    robot = replace(robot, latency_s=told["latency_s"].value, wire=drive)
-    encoders = where_encoders_sit(logs)
-    robot = replace(robot, encoders_at=encoders or robot.encoders_at)
-    some = np.unique(np.linspace(0, len(episodes) - 1, min(config.wire_episodes, len(episodes))).round().astype(int))
-    of = prepare([episodes[k] for k in some], anatomy, config.given)
-    if config.wire_rounds:
-        wires = fit_wire(of, device, robot, config)
-        told |= estimates(wires, WIRE, [UNITS.get(name, "") for name in WIRE])
+    replays = ReplayConfig(given=config.given)
+    of = prepare(_evenly(episodes, config.episodes), anatomy, config.given)
+    drives, told = fit_drive(of, robot, seed=config.seed), {}
+    robot = _driven(robot, drives)
+    robot = replace(robot, encoders_at=where_encoders_sit(of.logs, robot) or robot.encoders_at)
+    if config.wires:
+        some = prepare(_evenly(episodes, config.wire_episodes), anatomy, config.given)
+        wires = fit_wire(some, device, robot, config)
+        told = estimates(wires, WIRE, UNITS, RESOLUTION)
         known = {name: told[name].value for name in WIRE if told[name].identified}
         device, robot = with_found(device, robot, known)
-    replays = replay_prepared(of, Stack(device), robot, ReplayConfig(given=config.given))
-    return RobotCalibration(robot, device, told, band(replays), replays)
+    for _ in range(_TIMES):
+        slack = _slack(of, replay_prepared(of, Stack(device), robot, replays))
+        drives = fit_drive(of, robot, slack, seed=config.seed)
+        robot = _driven(robot, drives)
+    told = estimates(drives, DRIVE, UNITS, RESOLUTION) | told
+    found = replay_prepared(of, Stack(device), robot, replays)
+    return RobotCalibration(robot, device, told, band(found), found)
 
 
-def fit_drive(of: Prepared, *, seed: int = 0) -> Candidates:
-    """Return candidates of `DRIVE`, by how far Δtip of the real tip is from what the drive made of the commands."""
-    unit = _units(of)
+def _evenly(episodes: list[RobotLog], most: int) -> list[RobotLog]:
+    """Return so many of some episodes at most, evenly chosen."""
+    return [episodes[k] for k in np.unique(np.linspace(0, len(episodes) - 1, most).round().astype(int))]
+
+
+def _driven(robot: RobotConfig, found: Candidates) -> RobotConfig:
+    """Return a robot with the best candidate of `DRIVE`."""
+    gain, play, latency = found.values[found.best].tolist()
+    return replace(robot, latency_s=latency, wire=replace(robot.wire, gain_translation=gain, play_mm=play))
+
+
+def _slack(of: Prepared, found: Sequence[EpisodeReplay]) -> Float[np.ndarray, "episodes tips"]:
+    """Return how much farther than its proximal end each tip went in the rod core, mm; NaN in another branch."""
+    slack = np.full(of.abscissa.shape, np.nan)
+    for row, each in zip(slack, found, strict=True):
+        same = each.branch[:, 0] == each.branch[:, 1]
+        row[: len(same)] = np.where(same, each.abscissa[:, 1] - each.driven, np.nan)
+    return slack
+
+
+def fit_drive(
+    of: Prepared, robot: RobotConfig, slack: Float[np.ndarray, "episodes tips"] | float = 0.0, *, seed: int = 0
+) -> Candidates:
+    """Return candidates of `DRIVE`, by how far Δtip of the real tip is from what the drive made of the commands.
+
+    Args:
+        of: episodes.
+        robot: what is known of it: how fast it ramps.
+        slack: how much farther than its proximal end the tip went in the rod core, mm; NaN where that is not known.
+        seed: of the search.
+    """
+    unit, abscissa = _units(of), of.abscissa - slack
+    ramp = of.courses.ramp_s(robot.wire.max_acceleration_mm_s2)
 
     def costs(values: Float[np.ndarray, "candidates 3"]) -> Float[np.ndarray, "candidates units"]:
         gain, play, latency = values.T
         least = np.full((len(values), len(of.logs)), np.inf)
-        for start in (1.0, -1.0):  # nobody knows which way the drive went last before the log begins
+        for start in STARTS:
             motion = of.courses.followed(
-                0, at_s=of.courses.seen_s, latency_s=latency, gain=gain, play=play, start=start
+                0, at_s=of.courses.seen_s, latency_s=latency + ramp, gain=gain, play=play, start=start
             )
-            error = of.abscissa - motion
+            error = abscissa - motion
             error -= np.nanmedian(error, axis=2, keepdims=True)
             size = 2 * (np.sqrt(1 + (error / _TYPICAL_MM) ** 2) - 1)
             least = np.minimum(least, np.nansum(size, axis=2))
         return _summed(least, unit)
 
-    return search(costs, DRIVE, generations=15, rounds=3, draws=128, seed=seed)
+    return search(costs, DRIVE, generations=12, rounds=3, draws=256, seed=seed)
 
 
 def fit_wire(of: Prepared, device: Wire, robot: RobotConfig, config: CalibrateConfig) -> Candidates:
     """Return candidates of `WIRE`, by how far the simulated tip is from the real one, as the camera sees it."""
     replays, unit = ReplayConfig(given=config.given), _units(of)
-    draws, first = 32, 64
+    first, draws = config.wires // 2, config.wires // 4
 
     def costs(values: Float[np.ndarray, "candidates parameters"]) -> Float[np.ndarray, "candidates units"]:
         rows = []
         for row in values:
             wire, driven = with_found(device, robot, dict(zip(WIRE, row.tolist(), strict=True)))
             found = replay_prepared(of, Stack(wire), driven, replays)
-            rows.append([np.minimum(np.linalg.norm(each.in_view, axis=1), FAR_MM).mean() for each in found])
+            rows.append([_cost(each, robot) for each in found])
             advance(1)
         return _summed(np.array(rows), unit)
 
     advance: Advance
-    with progress("Fitting the wire", total=first + draws * config.wire_rounds) as advance:
-        return search(costs, WIRE, generations=0, rounds=config.wire_rounds, draws=draws, first=first, seed=config.seed)
+    with progress("Fitting the wire", total=first + 2 * draws) as advance:
+        return search(costs, WIRE, generations=0, rounds=2, draws=draws, first=first, seed=config.seed)
+
+
+def _cost(episode: EpisodeReplay, robot: RobotConfig) -> float:
+    """Return what a wire costs in an episode: errors of the tip, and of the drive's force where it was measured."""
+    tip = float(np.minimum(np.linalg.norm(episode.in_view, axis=1), FAR_MM).mean()) / _TYPICAL_MM
+    if not len(episode.force):
+        return tip
+    error = np.diff(episode.force, axis=1) / max(3 * robot.wire.load_sd_n, 1e-3)
+    return tip + float((2 * (np.sqrt(1 + error**2) - 1)).mean())
 
 
 def with_found(device: Wire, robot: RobotConfig, found: Mapping[str, float]) -> tuple[Wire, RobotConfig]:
@@ -183,24 +231,29 @@ def with_found(device: Wire, robot: RobotConfig, found: Mapping[str, float]) -> 
     return wire, replace(robot, wire=drive)
 
 
-def where_encoders_sit(logs: Sequence[RobotLog]) -> str | None:
-    """Return where the wire's encoders sit: at the motor if they follow its commands back and forth; None without any.
+def where_encoders_sit(episodes: Sequence[RobotLog], robot: RobotConfig) -> str | None:
+    """Return where the wire's encoders sit: "motor" if they follow its commands, "wire" if they follow gain and play.
 
-    Behind a play they would rest after a reversal: their distance from the commands would spread as widely as it.
+    Args:
+        episodes: logs of one episode each.
+        robot: with lag, gain and play as they were found.
+
+    Returns:
+        None where no log has readings.
     """
-    apart = []
-    for log in (episode for each in logs for episode in each.episodes()):
-        read, asked = np.isfinite(log.encoders[:, 0, 0]), log.commanded
-        if read.sum() > 1 and asked.sum() > 1:
-            last = np.searchsorted(np.flatnonzero(asked), np.flatnonzero(read)) - 1
-            before = log.command[asked, 0, 0][np.maximum(last, 0)]
-            apart.append(np.ptp(np.quantile(log.encoders[read, 0, 0] - before, [0.05, 0.95])))
-    if not apart:
+    far = {"motor": [], "wire": []}
+    for log in episodes:
+        read = np.isfinite(log.encoders[:, 0, 0])
+        if read.sum() < 2:
+            continue
+        courses, at_s = Courses.of([log]), (log.time_s[read] - log.time_s[0])[None]
+        late = np.array([robot.latency_s + courses.ramp_s(robot.wire.max_acceleration_mm_s2)])
+        for place, gain, play in (("motor", 1.0, 0.0), ("wire", robot.wire.gain_translation, robot.wire.play_mm)):
+            motion = courses.followed(0, at_s=at_s, latency_s=late, gain=np.array([gain]), play=np.array([play]))
+            far[place].append(float(np.std(log.encoders[read, 0, 0] - motion[0, 0])))
+    if not far["motor"]:
         return None
-    return "motor" if float(np.median(apart)) < _SPREAD_MM else "wire"
-
-
-_SPREAD_MM = 1.0
+    return min(far, key=lambda place: np.median(far[place]))
 
 
 def band(replays: Sequence[EpisodeReplay], level: float = _LEVEL) -> float | None:

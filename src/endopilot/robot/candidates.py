@@ -1,25 +1,25 @@
 """A search for the parameters of a model by what they cost in each of many episodes, with intervals.
 
 Differential evolution (scipy) finds the parameters that cost least over all episodes; then candidates are drawn where
-others might be as good. A candidate is worse than the best if it costs more by 0.98 standard errors of the sum over
-episodes of the difference; all that are not worse make the interval. Near the best the cost is c + a δ² - 2 b δ, with
-the sum of b over episodes 0: the rule excludes δ beyond 1.96 times the standard error that the spread of b between
-episodes gives it (the sandwich estimator), so intervals are of 95 %, and hold where the noise within an episode is of
-any kind. A parameter on which the cost does not depend keeps its whole range: the log does not identify it.
+others might be as good. A candidate is worse than the best if it costs more by t/2 standard errors of the sum over
+episodes of the difference, t Student's 97.5 % quantile; all that are not worse make the interval. Near the best the
+cost is c + a δ² - 2 b δ, with the sum of b over episodes 0: the rule excludes δ beyond t times the standard error that
+the spread of b between episodes gives it (the sandwich estimator). So intervals are of 95 %, and hold where the noise
+within an episode is of any kind. A parameter on which the cost does not depend keeps its whole range: the log does not
+identify it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import differential_evolution
-from scipy.stats import qmc
+from scipy.stats import qmc, t
 
 Costs = Callable[[Float[np.ndarray, "candidates parameters"]], Float[np.ndarray, "candidates episodes"]]
-_STANDARD_ERRORS = 0.98
 _WIDER = 0.5
 """What is drawn from reaches beyond the candidates that are not worse by this share of their range."""
 _LEAST_SPARE = 0.03
@@ -83,7 +83,9 @@ class Candidates:
     def not_worse(self) -> Bool[np.ndarray, "candidates"]:
         """Which are not worse than the best."""
         more = self.costs - self.costs[self.best]
-        return more.sum(axis=1) <= _STANDARD_ERRORS * np.sqrt(more.shape[1]) * more.std(axis=1, ddof=1)
+        count = more.shape[1]
+        standard_error = np.sqrt(count) * more.std(axis=1, ddof=1)
+        return more.sum(axis=1) <= t.ppf(0.975, count - 1) / 2 * standard_error
 
 
 def search(
@@ -149,11 +151,24 @@ def _evolve(total: Callable[[np.ndarray], np.ndarray], ranges: list[tuple[float,
 
 
 def estimates(
-    found: Candidates, ranges: Mapping[str, tuple[float, float]], units: Sequence[str]
+    found: Candidates,
+    ranges: Mapping[str, tuple[float, float]],
+    units: Mapping[str, str],
+    resolution: Mapping[str, float],
 ) -> dict[str, Estimate]:
-    """Return each parameter with its interval."""
+    """Return each parameter with its interval.
+
+    Args:
+        found: what was tried.
+        ranges: what was searched.
+        units: of the parameters.
+        resolution: least half-widths of intervals: what the model itself does not resolve, however long the log.
+    """
     as_good, best = found.values[found.not_worse], found.values[found.best]
-    return {
-        name: Estimate(float(best[i]), float(as_good[:, i].min()), float(as_good[:, i].max()), ranges[name], units[i])
-        for i, name in enumerate(found.names)
-    }
+    told = {}
+    for i, name in enumerate(found.names):
+        spare, value = resolution.get(name, 0.0), float(best[i])
+        low, high = min(float(as_good[:, i].min()), value - spare), max(float(as_good[:, i].max()), value + spare)
+        least, largest = ranges[name]
+        told[name] = Estimate(value, max(low, least), min(high, largest), ranges[name], units.get(name, ""))
+    return told

@@ -12,9 +12,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from endopilot.robot.log import RobotLog
+
+
+STARTS = (-1.0, -0.5, 0.0, 0.5, 1.0)
+"""Where in the play a device may begin: nobody logs which way it was driven last."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +64,7 @@ class Courses:
         latency_s: Float[np.ndarray, "candidates"],
         gain: Float[np.ndarray, "candidates"],
         play: Float[np.ndarray, "candidates"],
-        start: float = 0.0,
+        start: float | Float[np.ndarray, "episodes"] = 0.0,
     ) -> Float[np.ndarray, "candidates episodes times"]:
         """Return where the device's proximal end is, from where it was at the first command, mm or rad.
 
@@ -70,22 +74,29 @@ class Courses:
             latency_s: from a command to the motion, s.
             gain: motion of the device per motion of the drive.
             play: motion that is lost where the drive reverses, mm or rad.
-            start: where in the play the device begins: -1 it was pushed last, 0 the middle, 1 it was pulled last.
+            start: where in the play the device of each episode begins: -1 it was pushed last, 1 it was pulled last.
         """
         drive = gain[:, None, None] * self.command[None, :, :, axis]
         half = play[:, None] / 2
         device = np.empty_like(drive)
-        device[:, :, 0] = start * half
+        device[:, :, 0] = np.clip(start, -1.0, 1.0) * half
         for k in range(1, drive.shape[2]):
             device[:, :, k] = np.clip(device[:, :, k - 1], drive[:, :, k] - half, drive[:, :, k] + half)
         result = np.empty((len(gain), *at_s.shape))
-        for c, e in np.ndindex(len(gain), len(at_s)):
-            since = at_s[e] - latency_s[c]
-            before = _knot_before(self.knot_s[e], since)
-            now = np.interp(since, self.knot_s[e], drive[c, e])
-            result[c, e] = np.clip(device[c, e, before], now - half[c], now + half[c])
+        for e, knots in enumerate(self.knot_s):
+            since = np.clip(at_s[e] - latency_s[:, None], knots[0], knots[-1])
+            before = np.minimum(np.searchsorted(knots, since, side="right") - 1, len(knots) - 2)
+            share = (since - knots[before]) / (knots[before + 1] - knots[before])
+            left, right = (np.take_along_axis(drive[:, e], before + k, axis=1) for k in (0, 1))
+            now = left + share * (right - left)
+            result[:, e] = np.clip(np.take_along_axis(device[:, e], before, axis=1), now - half, now + half)
         return result
 
+    def ramp_s(self, acceleration: float, axis: int = 0) -> float:
+        """Return by how much a drive of some acceleration, mm/s² or rad/s², comes later than one that needs no ramp, s.
 
-def _knot_before(knot_s: Float[np.ndarray, "knots"], at_s: Float[np.ndarray, "times"]) -> Int[np.ndarray, "times"]:
-    return np.clip(np.searchsorted(knot_s, at_s, side="right") - 1, 0, len(knot_s) - 1)
+        A change of the velocity by v takes v/a, and leaves what a delay of v/2a would; changes count by their squares.
+        """
+        velocity = np.diff(self.command[..., axis], axis=1) / np.diff(self.knot_s, axis=1)
+        change = np.abs(np.diff(velocity, axis=1))
+        return float((change**3).sum() / (2 * acceleration * max(float((change**2).sum()), 1e-12)))

@@ -8,8 +8,8 @@ positive. Columns of catheters begin with `catheter_1_` and `catheter_2_`.
 columns                                            meaning
 =================================================  =====================================================================
 `time_s`                                           by one clock, never going back
-`translation_mm`, `rotation_rad`                   where the drive is sent, a position of its own count; it gets there by
-                                                   the next command
+`translation_mm`, `rotation_rad`                   where the drive is sent, by its own count; it gets there by the next
+                                                   command
 `translation_mm_s`, `rotation_rad_s`               or with what velocity it is sent, until the next command
 `encoder_mm`, `encoder_rad`                        what the encoders read
 `force_n`, `torque_nmm`                            load of the drive: positive where it pushes, and turns clockwise

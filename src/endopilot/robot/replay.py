@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float
 
 from endopilot.anatomy.projection import TipProjector
 from endopilot.anatomy.tree import tangents
+from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
-from endopilot.devices.robot import RobotConfig
-from endopilot.robot.course import Courses
+from endopilot.robot.course import STARTS, Courses
 from endopilot.robot.log import RobotLog
 from endopilot.settings import OpenShare, Within, settings
 from endopilot.simulation.config import PRESETS, SimulatorConfig
@@ -62,6 +62,7 @@ class EpisodeReplay:
         in_view: the difference of both tips, as the camera sees it, mm.
         along: unit vector along the vessel at the real tip.
         branch: of both tips.
+        force: of the drive, N, as the log has it and simulated, at each of its readings after the first tip.
         rotation_rad: φ that the simulated wire began with.
     """
 
@@ -75,6 +76,7 @@ class EpisodeReplay:
     in_view: Float[np.ndarray, "tips 3"]
     along: Float[np.ndarray, "tips 3"]
     branch: Float[np.ndarray, "tips 2"]
+    force: Float[np.ndarray, "readings 2"]
     rotation_rad: float
 
     @property
@@ -182,7 +184,8 @@ def replay_prepared(
     tried = _simulated(of, device, times, course, depth, near, simulator)
     best = np.argmin(tried.cost, axis=1)
     return [
-        _episode(of, k, tried, int(best[k]), at_tips[k] + depth[k], float(near[k, best[k]])) for k in range(len(best))
+        _episode(of, k, tried, int(best[k]), at_tips[k] + depth[k], float(near[k, best[k]]), times[k, 1:])
+        for k in range(len(best))
     ]
 
 
@@ -192,22 +195,33 @@ def _proximal(of: Prepared, robot: RobotConfig) -> tuple[Float[np.ndarray, "epis
     begin = np.maximum(courses.seen_s[:, 0] - _LEAD_S, 0.0)
     count = int(np.ceil((courses.seen_s.max(axis=1) - begin).max() / _PERIOD_S)) + 1
     times = begin[:, None] + _PERIOD_S * np.arange(count + 1)
-    latency = np.array([robot.latency_s])
-    pairs = ((drive.gain_translation, drive.play_mm), (drive.gain_rotation, drive.play_rad))
-    motion = [
-        courses.followed(axis, at_s=times, latency_s=latency, gain=np.array([gain]), play=np.array([play]))[0]
-        for axis, (gain, play) in enumerate(pairs)
-    ]
-    return times, np.stack(motion, axis=-1)
+    along, around = ((drive.gain_translation, drive.play_mm), (drive.gain_rotation, drive.play_rad))
+
+    def followed(axis: int, at_s: np.ndarray, start: float | np.ndarray) -> np.ndarray:
+        gain, play = (np.array([value]) for value in (along, around)[axis])
+        ramp = courses.ramp_s((drive.max_acceleration_mm_s2, drive.max_acceleration_rad_s2)[axis], axis)
+        late = np.array([robot.latency_s + ramp])
+        return courses.followed(axis, at_s=at_s, latency_s=late, gain=gain, play=play, start=start)[0]
+
+    missed = []
+    for start in STARTS:
+        error = np.where(of.given, of.abscissa - followed(0, courses.seen_s, start), np.nan)
+        missed.append(np.nanmean(np.abs(error - np.nanmedian(error, axis=1, keepdims=True)), axis=1))
+    begun = np.array(STARTS)[np.argmin(missed, axis=0)]
+    return times, np.stack([followed(0, times, begun), followed(1, times, 0.0)], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
 class _Tried:
-    """Worlds of each episode: their tips where the real one was seen, and how far they were from it while given."""
+    """Worlds of each episode: their tips where the real one was seen, and how far they were from it while given.
+
+    Forces are those of the drive at the ends of periods, N; NaN beyond an episode's end.
+    """
 
     tip: Float[np.ndarray, "episodes worlds tips 3"]
     abscissa: Float[np.ndarray, "episodes worlds tips"]
     branch: Float[np.ndarray, "episodes worlds tips"]
+    force: Float[np.ndarray, "episodes worlds periods"]
     cost: Float[np.ndarray, "episodes worlds"]
 
 
@@ -229,6 +243,7 @@ def _simulated(
     samples = np.ceil((seen_s.max(axis=1) - times[:, 0]) / _PERIOD_S - 1e-9).astype(int)
     tip = np.empty((*angles.shape, seen_s.shape[1], 3))
     abscissa, branch = np.empty(tip.shape[:-1]), np.empty(tip.shape[:-1])
+    force = np.full((*angles.shape, control.shape[1]), np.nan)
     made: Simulator | None = None
     for some in np.array_split(np.argsort(samples), max(1, len(samples) // _TOGETHER)):
         last, worlds = int(samples[some].max()), angles[some].size
@@ -246,8 +261,8 @@ def _simulated(
             at_tips = np.column_stack([np.interp(seen_s[k], ends, column) for column in places.T])
             tip[k, j], abscissa[k, j] = at_tips[:, :3], at_tips[:, 3]
             nearest = np.clip(np.searchsorted(ends, seen_s[k]), 0, last - 1)
-            branch[k, j] = moved.tip.branch[row, nearest, 0]
-    return _Tried(tip, abscissa, branch, _costs(of, tip, of.given))
+            branch[k, j], force[k, j, :last] = moved.tip.branch[row, nearest, 0], moved.drive_force[row, :, 0]
+    return _Tried(tip, abscissa, branch, force, _costs(of, tip, of.given))
 
 
 def _costs(of: Prepared, tip: np.ndarray, used: Bool[np.ndarray, "episodes tips"]) -> np.ndarray:
@@ -278,11 +293,22 @@ def _at(
 
 
 def _episode(
-    of: Prepared, k: int, tried: _Tried, world: int, driven: Float[np.ndarray, "tips"], rotation: float
+    of: Prepared,
+    k: int,
+    tried: _Tried,
+    world: int,
+    driven: Float[np.ndarray, "tips"],
+    rotation: float,
+    ends: Float[np.ndarray, "periods"],
 ) -> EpisodeReplay:
     log, count = of.logs[k], int(of.courses.seen[k].sum())
     line = of.anatomy.tree.path(int(of.branch[k, count - 1]))
     nearest = np.clip(np.searchsorted(line.abscissa, of.abscissa[k, :count]), 0, len(line.points) - 1)
+    simulated = tried.force[k, world]
+    measured = np.isfinite(log.load[:, 0, 0]) & (log.time_s >= log.time_s[log.seen][0])
+    pushed = np.interp(
+        log.time_s[measured] - log.time_s[0], ends[np.isfinite(simulated)], simulated[np.isfinite(simulated)]
+    )
     return EpisodeReplay(
         number=int(log.episode[0]),
         time_s=log.time_s[log.seen],
@@ -294,6 +320,7 @@ def _episode(
         in_view=_in_view(log, tried.tip[k, world, :count]),
         along=tangents(line.points)[nearest],
         branch=np.column_stack([of.branch[k, :count], tried.branch[k, world, :count]]),
+        force=np.column_stack([log.load[measured, 0, 0], pushed]),
         rotation_rad=rotation,
     )
 
