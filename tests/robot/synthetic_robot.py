@@ -16,9 +16,12 @@ from endopilot.simulation.simulator import Simulator
 PERIOD_S = 0.1
 
 
-def logged(anatomy, wire, robot: RobotConfig, *, episodes=6, seconds=12.0, seed=0, tip_sd_mm=0.05) -> RobotLog:
-    """Drive a wire to and fro at random, and log commands, loads and tips; each episode begins anew."""
-    random, rows = np.random.default_rng(seed), []
+def logged(anatomy, wire, robot: RobotConfig, *, episodes=6, seconds=12.0, seed=0, tip_sd_mm=0.05, with_truth=False):
+    """Drive a wire to and fro at random, and log commands, loads and tips; each episode begins anew.
+
+    With `with_truth`, also return where the wire's proximal end truly was at the end of each period, mm and rad.
+    """
+    random, rows, truth = np.random.default_rng(seed), [], []
     far = float(anatomy.tree.longest_path().abscissa[-1])
     for episode in range(episodes):
         simulator = Simulator(anatomy, wire, config=PRESETS["fast"])
@@ -36,9 +39,10 @@ def logged(anatomy, wire, robot: RobotConfig, *, episodes=6, seconds=12.0, seed=
             drive.command(((velocity[0], velocity[1]),))
             drive.run(PERIOD_S)
             tip = simulator.tip_position[0, 0] + tip_sd_mm * random.standard_normal(3)
+            truth.append(drive.proximal[0].copy())
             state = drive.proximal_state()
             rows.append((episode, k * PERIOD_S, velocity.copy(), tip, state.devices[0], state.load[0]))
-    return _log(rows)
+    return (_log(rows), np.array(truth)) if with_truth else _log(rows)
 
 
 def _log(rows) -> RobotLog:
@@ -55,6 +59,7 @@ def _log(rows) -> RobotLog:
         tip=np.full((count, 3), np.nan),
         pixel=np.full((count, 2), np.nan),
         used=np.ones(count, dtype=bool),
+        by_velocity=True,
     )
     place = np.zeros(2)
     for k, (episode, time_s, velocity, tip, encoders, load) in enumerate(rows):

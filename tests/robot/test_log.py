@@ -56,6 +56,10 @@ def test_velocities_are_summed_up_to_where_a_command_ends(tmp_path) -> None:
     )
     log = read_log(written(tmp_path, text, camera=False))
     np.testing.assert_allclose(log.command[:, 0], [[1, 0.5], [-1, 0.5], [-1, 0.5], [1, 0], [1, 0]])
+    log.write(tmp_path / "again.csv")
+    again = read_log(tmp_path / "again.csv")
+    np.testing.assert_allclose(again.command, log.command)
+    assert again.by_velocity
     assert log.camera is None and log.seen.tolist() == [False, True, False, False, False]
 
 

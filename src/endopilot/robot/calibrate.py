@@ -26,6 +26,7 @@ from endopilot.robot.candidates import LEAST_EPISODES, Candidates, Estimate, est
 from endopilot.robot.course import STARTS, Courses
 from endopilot.robot.log import RobotLog
 from endopilot.robot.replay import (
+    FAR_MM,
     EpisodeReplay,
     Prepared,
     ReplayConfig,
@@ -124,19 +125,19 @@ def calibrate(
             f"{LEAST_EPISODES}: log more, or number them anew (`episode`) wherever the device was reset"
         )
     replays = ReplayConfig(given=config.given)
-    of = prepare(_evenly(episodes, config.episodes), anatomy, config.given)
-    drives, told = fit_drive(of, robot, seed=config.seed), {}
+    of = prepare(_evenly(episodes, config.episodes), anatomy, config.given, robot)
+    drives, told = fit_drive(of, seed=config.seed), {}
     robot = _driven(robot, drives)
     robot = replace(robot, encoders_at=where_encoders_sit(of.logs, robot) or robot.encoders_at)
     if config.wires:
-        some = prepare(_evenly(episodes, config.wire_episodes), anatomy, config.given)
+        some = prepare(_evenly(episodes, config.wire_episodes), anatomy, config.given, robot)
         wires = fit_wire(some, device, robot, config)
         told = estimates(wires, WIRE, UNITS, RESOLUTION)
         known = {name: told[name].value for name in WIRE if told[name].identified}
         device, robot = with_found(device, robot, known)
     for _ in range(_TIMES):
         slack = _slack(of, replay_prepared(of, Stack(device), robot, replays))
-        drives = fit_drive(of, robot, slack, seed=config.seed)
+        drives = fit_drive(of, slack, seed=config.seed)
         robot = _driven(robot, drives)
     told = estimates(drives, DRIVE, UNITS, RESOLUTION) | told
     found = replay_prepared(of, Stack(device), robot, replays)
@@ -163,26 +164,22 @@ def _slack(of: Prepared, found: Sequence[EpisodeReplay]) -> Float[np.ndarray, "e
     return slack
 
 
-def fit_drive(
-    of: Prepared, robot: RobotConfig, slack: Float[np.ndarray, "episodes tips"] | float = 0.0, *, seed: int = 0
-) -> Candidates:
+def fit_drive(of: Prepared, slack: Float[np.ndarray, "episodes tips"] | float = 0.0, *, seed: int = 0) -> Candidates:
     """Return candidates of `DRIVE`, by how far Δtip of the real tip is from what the drive made of the commands.
 
     Args:
         of: episodes.
-        robot: what is known of it: how fast it ramps.
         slack: how much farther than its proximal end the tip went in the rod core, mm; NaN where that is not known.
         seed: of the search.
     """
     unit, abscissa = _units(of), of.abscissa - slack
-    ramp = of.courses.ramp_s(robot.wire.max_acceleration_mm_s2)
 
     def costs(values: Float[np.ndarray, "candidates 3"]) -> Float[np.ndarray, "candidates units"]:
         gain, play, latency = values.T
         least = np.full((len(values), len(of.logs)), np.inf)
         for start in STARTS:
             motion = of.courses.followed(
-                0, at_s=of.courses.seen_s, latency_s=latency + ramp, gain=gain, play=play, start=start
+                0, at_s=of.courses.seen_s, latency_s=latency, gain=gain, play=play, start=start
             )
             error = abscissa - motion
             error -= np.nanmedian(error, axis=2, keepdims=True)
@@ -246,8 +243,8 @@ def where_encoders_sit(episodes: Sequence[RobotLog], robot: RobotConfig) -> str 
         read = np.isfinite(log.encoders[:, 0, 0])
         if read.sum() < 2:
             continue
-        courses, at_s = Courses.of([log]), (log.time_s[read] - log.time_s[0])[None]
-        late = np.array([robot.latency_s + courses.ramp_s(robot.wire.max_acceleration_mm_s2)])
+        courses, at_s = Courses.of([log], robot.wire), (log.time_s[read] - log.time_s[0])[None]
+        late = np.array([robot.latency_s])
         for place, gain, play in (("motor", 1.0, 0.0), ("wire", robot.wire.gain_translation, robot.wire.play_mm)):
             motion = courses.followed(0, at_s=at_s, latency_s=late, gain=np.array([gain]), play=np.array([play]))
             far[place].append(float(np.std(log.encoders[read, 0, 0] - motion[0, 0])))

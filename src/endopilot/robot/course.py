@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from endopilot.devices.robot import DriveConfig
 from endopilot.robot.log import RobotLog
-
 
 STARTS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 """Where in the play a device may begin: nobody logs which way it was driven last."""
@@ -38,8 +38,13 @@ class Courses:
     seen: Bool[np.ndarray, "episodes tips"]
 
     @staticmethod
-    def of(episodes: Sequence[RobotLog]) -> Courses:
-        """Take them from logs of one episode each, with a command and a tip at least."""
+    def of(episodes: Sequence[RobotLog], drive: DriveConfig) -> Courses:
+        """Take them from logs of one episode each, with a command and a tip at least.
+
+        A drive that is sent along by velocity ramps from one to the next, and is behind by what a ramp costs for ever
+        after; one that is sent to a position gets there.
+        """
+        acceleration = np.array([drive.max_acceleration_mm_s2, drive.max_acceleration_rad_s2])
         knots = max(int(log.commanded.sum()) for log in episodes) + 1
         tips = max(int(log.seen.sum()) for log in episodes)
         knot_s, command = np.zeros((len(episodes), knots)), np.zeros((len(episodes), knots, 2))
@@ -50,8 +55,13 @@ class Courses:
             count, looks = len(at), log.time_s[log.seen] - log.time_s[0]
             knot_s[k, 0], knot_s[k, 1 : count + 1] = at[0], [*at[1:], at[-1] + period]
             knot_s[k, count + 1 :] = knot_s[k, count] + 1e-3 * np.arange(1, knots - count)
-            command[k, 1 : count + 1] = asked - asked[0]
-            command[k, count + 1 :] = asked[-1] - asked[0]
+            place = np.concatenate([asked[:1], asked])
+            if log.by_velocity:
+                place[0] = 0.0
+                velocity = np.diff(place, axis=0) / np.diff(knot_s[k, : count + 1])[:, None]
+                change = np.diff(velocity, axis=0, prepend=0.0)
+                place[1:] -= np.cumsum(change * np.abs(change) / (2 * acceleration), axis=0)
+            command[k, : count + 1], command[k, count + 1 :] = place - place[0], place[-1] - place[0]
             seen_s[k, : len(looks)], seen_s[k, len(looks) :] = looks, looks[-1]
             seen[k, : len(looks)] = True
         return Courses(knot_s, command, seen_s, seen)
@@ -91,12 +101,3 @@ class Courses:
             now = left + share * (right - left)
             result[:, e] = np.clip(np.take_along_axis(device[:, e], before, axis=1), now - half, now + half)
         return result
-
-    def ramp_s(self, acceleration: float, axis: int = 0) -> float:
-        """Return by how much a drive of some acceleration, mm/s² or rad/s², comes later than one that needs no ramp, s.
-
-        A change of the velocity by v takes v/a, and leaves what a delay of v/2a would; changes count by their squares.
-        """
-        velocity = np.diff(self.command[..., axis], axis=1) / np.diff(self.knot_s, axis=1)
-        change = np.abs(np.diff(velocity, axis=1))
-        return float((change**3).sum() / (2 * acceleration * max(float((change**2).sum()), 1e-12)))

@@ -61,6 +61,7 @@ class RobotLog:
         pixel: column and row that showed it.
         used: whether what was seen is to be used.
         camera: what pixels belong to; None where tips were seen in space.
+        by_velocity: whether the drives were sent along by velocity, and `command` is what these sum up to.
     """
 
     name: str
@@ -73,6 +74,7 @@ class RobotLog:
     pixel: Float[np.ndarray, "rows 2"]
     used: Bool[np.ndarray, "rows"]
     camera: Camera | None = None
+    by_velocity: bool = False
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -104,13 +106,27 @@ class RobotLog:
         arrays = {name: value[chosen] for name, value in vars(self).items() if isinstance(value, np.ndarray)}
         return replace(self, **arrays)
 
+    def _velocities(self) -> Float[np.ndarray, "rows devices 2"]:
+        """Return the velocities that `command` is the sum of; the last one of an episode moves nothing."""
+        velocity = np.full_like(self.command, np.nan)
+        for number in np.unique(self.episode):
+            rows = np.flatnonzero((self.episode == number) & self.commanded)
+            holds = np.diff(self.time_s[rows], append=np.inf)[:, None, None]
+            velocity[rows] = np.diff(self.command[rows], axis=0, prepend=0.0) / holds
+        return velocity
+
     def write(self, path: Path) -> None:
         """Write it as `read_log` reads it, whole or not at all; the camera's file is not written."""
         import pandas as pd
 
         columns: dict[str, np.ndarray] = {"time_s": self.time_s, "episode": self.episode}
+        command = self._velocities() if self.by_velocity else self.command
         for k, prefix in enumerate(column_prefixes(self.command.shape[1])):
-            for names, values in ((_POSITION, self.command), (_ENCODER, self.encoders), (_LOAD, self.load)):
+            for names, values in (
+                (_VELOCITY if self.by_velocity else _POSITION, command),
+                (_ENCODER, self.encoders),
+                (_LOAD, self.load),
+            ):
                 columns |= {prefix + name: values[:, k, i] for i, name in enumerate(names)}
         seen = (_TIP, self.tip) if self.camera is None else (_PIXEL, self.pixel)
         columns |= {name: seen[1][:, i] for i, name in enumerate(seen[0])}
@@ -158,6 +174,7 @@ def read_log(path: Path | str, *, camera: Camera | None = None) -> RobotLog:
         pixel=pixel,
         used=_whole(table, "flag", len(time_s)) == 0,
         camera=camera if np.isfinite(pixel).any() else None,
+        by_velocity=_VELOCITY[0] in table.values,
     )
 
 

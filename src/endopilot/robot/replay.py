@@ -144,13 +144,13 @@ def replay_log(
         InputError: no episode shows the tip often enough.
     """
     config = config or ReplayConfig()
-    prepared = prepare(usable_episodes(logs, anatomy), anatomy, config.given)
+    prepared = prepare(usable_episodes(logs, anatomy), anatomy, config.given, robot)
     return replay_prepared(prepared, device, robot, config, simulator=simulator)
 
 
-def prepare(logs: list[RobotLog], anatomy: Anatomy, given: float) -> Prepared:
+def prepare(logs: list[RobotLog], anatomy: Anatomy, given: float, robot: RobotConfig) -> Prepared:
     """Project what was seen in episodes onto a vessel, once for many replays."""
-    courses, project = Courses.of(logs), TipProjector(anatomy.tree, anatomy.insertion)
+    courses, project = Courses.of(logs, robot.wire), TipProjector(anatomy.tree, anatomy.insertion)
     abscissa, branch = np.full(courses.seen.shape, np.nan), np.full(courses.seen.shape, -1.0)
     share = np.zeros(courses.seen.shape, dtype=bool)
     for k, log in enumerate(logs):
@@ -199,8 +199,7 @@ def _proximal(of: Prepared, robot: RobotConfig) -> tuple[Float[np.ndarray, "epis
 
     def followed(axis: int, at_s: np.ndarray, start: float | np.ndarray) -> np.ndarray:
         gain, play = (np.array([value]) for value in (along, around)[axis])
-        ramp = courses.ramp_s((drive.max_acceleration_mm_s2, drive.max_acceleration_rad_s2)[axis], axis)
-        late = np.array([robot.latency_s + ramp])
+        late = np.array([robot.latency_s])
         return courses.followed(axis, at_s=at_s, latency_s=late, gain=gain, play=play, start=start)[0]
 
     missed = []
