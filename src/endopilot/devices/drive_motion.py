@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -53,8 +54,9 @@ class DriveMotion:
         self._fastest = np.array([[each.fastest for each in of_robot] for of_robot in limits])
         self._travel = np.moveaxis(np.array([[each.travel_mm for each in of_robot] for of_robot in limits]), -1, 0)
         self._latency_s, self._jitter_s = config.latency_s, config.jitter_s
+        self._draw_gains = partial(config.gains, devices)
         self._random = [np.random.default_rng(seed) for seed in seeds]
-        self._gain = np.stack([config.gains(devices, random) for random in self._random])
+        self._gain = np.stack([self._draw_gains(random) for random in self._random])
         self._top = self._fastest / np.maximum(self._gain, 1.0)  # of the motors: no device goes faster than its limit
         self._wanted, self._ahead = np.zeros(position.shape), np.zeros(position.shape)
         self._ramp = np.broadcast_to(self._acceleration, position.shape).copy()
@@ -82,9 +84,15 @@ class DriveMotion:
         self._wanted = np.zeros_like(self._wanted)
         self._ramp = np.maximum(self._acceleration, self._fastest / within_s)
 
-    def reset(self, robots: Sequence[int], position: Float[np.ndarray, "chosen devices 2"]) -> None:
-        """Let some robots begin again at rest at a position, in the middle of the play; their gains stay."""
+    def reset(
+        self, robots: Sequence[int], position: Float[np.ndarray, "chosen devices 2"], seeds: Sequence[Sequence[int]]
+    ) -> None:
+        """Put other robots, drawn by their seeds, in the place of some, at rest in the middle of the play."""
         chosen = np.asarray(robots, dtype=int)
+        for robot, seed in zip(robots, seeds, strict=True):
+            self._random[robot] = np.random.default_rng(seed)
+            self._gain[robot] = self._draw_gains(self._random[robot])
+        self._top = self._fastest / np.maximum(self._gain, 1.0)
         for due, velocity in self._orders:
             due[chosen], velocity[chosen] = -np.inf, 0.0
         for array in (self._wanted, self._ahead, self.velocity):
