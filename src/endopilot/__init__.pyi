@@ -79,8 +79,15 @@ from .phantom.phantom import PhantomConfig as PhantomConfig
 from .phantom.phantom import make_phantom as make_phantom
 from .pipeline.navigation import navigate_into as navigate_into
 from .progress import Advance as Advance
+from .robot.calibrate import CalibrateConfig as CalibrateConfig
+from .robot.calibrate import RobotCalibration as RobotCalibration
+from .robot.calibrate import calibrate as calibrate
+from .robot.candidates import Estimate as Estimate
 from .robot.log import RobotLog as RobotLog
 from .robot.log import read_log as read_log
+from .robot.replay import EpisodeReplay as EpisodeReplay
+from .robot.replay import ReplayConfig as ReplayConfig
+from .robot.replay import replay_log as replay_log
 from .simulation.config import SimulatorConfig as SimulatorConfig
 from .simulation.controls import ControlConfig as ControlConfig
 from .simulation.mismatch import ModelMismatch as ModelMismatch

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
+import numpy as np
 import pytest
 from synthetic_robot import drawn, logged
 
+import endopilot
+from endopilot.errors import InputError
 from endopilot.robot.calibrate import CalibrateConfig, calibrate
+
+sys.path.append(str(Path(__file__).parents[2] / "examples"))
 
 NO_WIRE = CalibrateConfig(wires=0)
 
@@ -24,3 +32,26 @@ def test_intervals_of_the_drive_hold_the_truth(fork, wire, seed) -> None:
         assert told.identified and told.low <= value <= told.high, f"{name}: {value} not in {told}"
     assert abs(found.robot.wire.gain_translation / robot.wire.gain_translation - 1) < 0.03
     assert found.robot.encoders_at == "motor"
+
+
+def test_too_few_episodes_are_refused(fork, wire) -> None:
+    log = logged(fork, wire, drawn(1), episodes=2, seconds=5.0)
+    with pytest.raises(InputError, match=r"synthetic: 2 episodes .*; intervals need 5: log more"):
+        calibrate([log], fork, wire, config=NO_WIRE)
+
+
+def test_the_public_logs_have_the_play_that_was_measured_on_them(tmp_path) -> None:
+    """Measured on the logs by others: advance per drive 1.01 (quartiles 0.97 and 1.05), play 2.4 to 2.6 mm."""
+    folder = Path(__file__).parents[3] / "shared" / "data" / "robot_phantom"
+    if not folder.is_dir():
+        pytest.skip("the public logs are not here")
+    from robot_phantom_logs import convert
+
+    phantom = endopilot.extract_anatomy(next(folder.glob("phantom2d*.vtp")))
+    logs = [convert(path, tmp_path) for path in sorted(folder.glob("2D_phantom_Mid_M1*.csv"))]
+    found = calibrate(
+        logs, phantom, endopilot.read_device("workhorse-014"), config=CalibrateConfig(wires=0, episodes=12)
+    )
+    assert abs(found.robot.wire.gain_translation - 1.01) < 0.03
+    assert abs(found.robot.wire.play_mm - 2.6) < 0.3
+    assert np.median([each.errors["along"] for each in found.replays]) < 0.35
