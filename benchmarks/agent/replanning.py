@@ -16,6 +16,7 @@ from tyro.conf import Positional
 from endopilot.control.agent import AgentPolicy
 from endopilot.ladder.mismatch import CASES, mismatch_of
 from endopilot.navigation.navigate import NavigateConfig, navigate
+from endopilot.robot.config import RobotConfig
 from endopilot.settings import Count
 from endopilot.tasks.task import CORE, find_task
 from endopilot.xray.fluoroscope import TipMeasurement
@@ -40,8 +41,8 @@ def drive(name: str, place: int, case: str, rule: type[AgentPolicy]) -> list[flo
     """Return the figures of one navigation, as `COLUMNS` names them."""
     task, policy = find_task(name), rule()
     navigation = task.ladder_navigation(place)
-    mismatch = mismatch_of(case, MISMATCH, navigation, task, place)
-    config, began = NavigateConfig(simulator=replace(CORE, threads=1)), time.process_time()
+    mismatch, robot = mismatch_of(case, MISMATCH, navigation, task, place, RobotConfig())
+    config, began = NavigateConfig(robot=robot, simulator=replace(CORE, threads=1)), time.process_time()
     record = navigate(navigation, policy, config=config, seed=100 * task.level + place, truth=mismatch)
     spent = time.process_time() - began
     return [record.success and record.safe, record.exposures, record.seconds, policy.plans, spent]

@@ -75,7 +75,9 @@ from .phantom.phantom import PhantomConfig as PhantomConfig
 from .phantom.phantom import make_phantom as make_phantom
 from .pipeline.navigation import navigate_into as navigate_into
 from .progress import Advance as Advance
-from .robot.robot import RobotConfig as RobotConfig
+from .robot.config import DriveConfig as DriveConfig
+from .robot.config import RobotConfig as RobotConfig
+from .robot.config import read_robot as read_robot
 from .simulation.config import SimulatorConfig as SimulatorConfig
 from .simulation.controls import ControlConfig as ControlConfig
 from .simulation.mismatch import ModelMismatch as ModelMismatch

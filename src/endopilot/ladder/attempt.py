@@ -20,6 +20,7 @@ from endopilot.navigation.navigate import NavigateConfig, navigate
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import Decision, Observation, Policy
 from endopilot.navigation.record import NavigationRecord
+from endopilot.robot.config import RobotConfig
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import CORE, Task
@@ -85,7 +86,14 @@ def navigation_seed(task: Task, place: int) -> int:
     return 100 * task.level + place
 
 
-def attempt(policy: str, navigation: Navigation, *, seed: int, mismatch: ModelMismatch | None = None) -> dict[str, Any]:
+def attempt(
+    policy: str,
+    navigation: Navigation,
+    *,
+    seed: int,
+    mismatch: ModelMismatch | None = None,
+    robot: RobotConfig | None = None,
+) -> dict[str, Any]:
     """Let a policy drive a navigation, and return its figures, its course and its recording.
 
     Args:
@@ -93,12 +101,13 @@ def attempt(policy: str, navigation: Navigation, *, seed: int, mismatch: ModelMi
         navigation: what is to be done, as the policy is given it.
         seed: of encoder noise, detection errors and the policy.
         mismatch: how the simulated reality differs from the navigation; not at all if not given.
+        robot: what drives; the default one if not given.
 
     Raises:
         InputError: there is no such policy, or the wire does not fit the vessel.
     """
     driver = make_policy(policy)
-    record = _drive(navigation, driver, seed, mismatch)
+    record = _drive(navigation, driver, seed, mismatch, robot)
     return {"seed": seed} | scored(navigation, record, tells=isinstance(driver, AgentPolicy))
 
 
@@ -115,7 +124,9 @@ def scored(navigation: Navigation, record: NavigationRecord, *, tells: bool = Fa
     return _figures(navigation, record, recording) | {"course": _course(record), "recording": recording.packed()}
 
 
-def repeat(recording: Recording, navigation: Navigation, *, seed: int) -> dict[str, Any]:
+def repeat(
+    recording: Recording, navigation: Navigation, *, seed: int, robot: RobotConfig | None = None
+) -> dict[str, Any]:
     """Drive the recorded velocities through the same robot and simulator, without the policy.
 
     Returns:
@@ -124,24 +135,28 @@ def repeat(recording: Recording, navigation: Navigation, *, seed: int) -> dict[s
     Raises:
         InputError: the recording is longer or shorter than the navigation.
     """
-    record = driven(recording, navigation, seed=seed)
+    record = driven(recording, navigation, seed=seed, robot=robot)
     given, needed = len(recording.control), len(record.control) - 1
     if given != needed:
         raise InputError(f"control: holds {given} decisions, and the navigation ends after {needed}")
     return _figures(navigation, record, recording)
 
 
-def driven(recording: Recording, navigation: Navigation, *, seed: int) -> NavigationRecord:
+def driven(
+    recording: Recording, navigation: Navigation, *, seed: int, robot: RobotConfig | None = None
+) -> NavigationRecord:
     """Return how a navigation goes under what was recorded: its trajectory is the recorded one to the bit.
 
     Raises:
         InputError: the recording is shorter than the navigation.
     """
-    return _drive(navigation, Repeated(recording), seed, None)
+    return _drive(navigation, Repeated(recording), seed, None, robot)
 
 
-def _drive(navigation: Navigation, policy: Policy, seed: int, mismatch: ModelMismatch | None) -> NavigationRecord:
-    config = NavigateConfig(simulator=replace(CORE, threads=1))
+def _drive(
+    navigation: Navigation, policy: Policy, seed: int, mismatch: ModelMismatch | None, robot: RobotConfig | None
+) -> NavigationRecord:
+    config = NavigateConfig(robot=robot or RobotConfig(), simulator=replace(CORE, threads=1))
     return navigate(navigation, policy, config=config, seed=seed, truth=mismatch)
 
 

@@ -69,6 +69,7 @@ def navigate_into(
         config=config,
         device=set_up.navigation.device,
         catheters=set_up.navigation.catheters,
+        robot=set_up.robot,
         policy=POLICIES.origin(config.policy),
         version=__version__,
     )
@@ -95,6 +96,7 @@ def _write(found: PatientNavigation, folder: Path, target: str, output: Path) ->
     cycles = found.record.cycles
     assert cycles is not None  # a navigation has a period at least
     about = {"policy": set_up.config.policy, "seed": set_up.config.seed, "truth": asdict(set_up.truth)}
+    about["robot"] = asdict(set_up.robot)
     replace(cycles, about=cycles.about | about).write(output / TRAJECTORY)
     write_device(set_up.true_wire, output / WIRE_FILE)
     for number, catheter in enumerate(set_up.true_catheters, start=1):
@@ -162,6 +164,7 @@ def _write_episode(found: PatientNavigation, anatomy_folder: Path, output: Path)
             "target": asdict(set_up.navigation.target),
             "navigation": asdict(set_up.config),
             "truth": asdict(truth),
+            "robot": asdict(set_up.robot),
         },
     )
 
@@ -202,6 +205,7 @@ def _manifest(found: PatientNavigation, target: str, output: Path) -> dict[str, 
         catheter_axis=None if navigation.anatomy is set_up.anatomy else navigation.anatomy.insertion.direction.tolist(),
         target={"asked": target, **asdict(navigation.target)},
         truth=asdict(set_up.truth),
+        robot=asdict(set_up.robot),
         simulator=asdict(set_up.simulator),
         figures=figures,
     )
