@@ -185,7 +185,7 @@ class Belief(Ensemble):
         shift = np.einsum("si,si->s", error, along)
         across = np.linalg.norm(error - shift[:, None] * along, axis=1)
         scaled = np.column_stack([shift, across]) / np.maximum(self._accuracy_mm, measured.sd_mm)
-        drives.weigh(0, -np.log1p((scaled**2).sum(axis=1)))
+        drives.weigh(0, -np.log1p(scaled**2).sum(axis=1))
         moved = (drives.proximal[0] - before)[:, None]
         return (self._turned(best, moved[1], fan)[0] - self._end(self.simulator)[best] + self._shifted(best, moved[0]))[0]
 

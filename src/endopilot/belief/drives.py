@@ -32,7 +32,7 @@ _STRAY_SHARE, _STRAYS = 0.03, np.array([0.7, 1.0])
 """Share of the samples that may be where none of the others is, and how far from these, mm and rad."""
 _TAKEN_UP = np.array([0.05, 0.03])
 """What is left of a play that counts as taken up, mm and rad."""
-_WORTH_IT = np.array([0.25, 0.15])
+_WORTH_IT = np.array([0.3, 0.3])
 """A device this near to where it should be stays where a play would have to be taken up first, mm and rad."""
 
 
@@ -55,6 +55,7 @@ class Drives:
         lose: whether there is play between the encoders and the devices.
         proximal: Δ, mm, and φ, rad, of each device where it most likely is.
         sd: standard deviations of these.
+        at_rest: where the devices are once the motors have done what they were told before.
     """
 
     def __init__(
@@ -74,7 +75,8 @@ class Drives:
         self._known, self._fastest, self._random = tuple(known), fastest, np.random.default_rng(0)
         self._encoder, self._run_out = np.array(start, dtype=float), np.zeros(start.shape)
         self._sent = np.zeros(start.shape)
-        self.proximal, self.sd = self._encoder, np.zeros(start.shape)
+        self.proximal = self.at_rest = self._encoder
+        self.sd = np.zeros(start.shape)
         if self.lose:
             shape = (_SAMPLES, *start.shape)
             gap = np.array([drive.gap for drive in known])
@@ -83,12 +85,13 @@ class Drives:
             self._gap = gap * np.maximum(1 + spread * self._random.standard_normal(shape), _LEAST_SHARE)
             self._ahead = self._gap * (self._random.random(shape) - 0.5)
             self._position = np.tile(self._encoder, (_SAMPLES, 1, 1))
+            self._estimate()
 
     def follow(self, encoders: Proximals) -> None:
         """Take a reading of the encoders, a period after the last."""
         read = np.array(encoders, dtype=float)
         if not self.lose:
-            self.proximal = self._encoder = read
+            self.proximal = self.at_rest = self._encoder = read
             return
         for place in (self._encoder + self._run_out, read):
             self._ahead, moved = through_play(self._ahead, (place - self._encoder) * self._gain, self._gap / 2)
@@ -105,46 +108,40 @@ class Drives:
             self._run_out = self._on_the_way()
             self._sent = np.clip(told, -self._fastest, self._fastest)
 
-    def towards(
-        self, wanted: Float[np.ndarray, "devices 2"], slower: Float[np.ndarray, "2"] | None = None
-    ) -> Motion:
+    def towards(self, wanted: Float[np.ndarray, "devices 2"], slower: Float[np.ndarray, "2"]) -> Motion:
         """Return how to bring the devices to where they are wanted, mm and rad, in a period.
 
         Where one has to turn back, its play is taken up first, and all devices rest.
 
         Args:
             wanted: Δ, mm, and φ, rad, of each device.
-            slower: no device is to go faster than this, mm/s and rad/s.
+            slower: no device is to go faster than this behind a play that is taken up, mm/s and rad/s.
         """
         if not self.lose:
             return Motion((wanted - self._encoder) / DECISION_PERIOD_S, True)
-        run_out = self._on_the_way()
-        ahead, moved = through_play(self._ahead, np.tile(run_out * self._gain, (_SAMPLES, 1, 1)), self._gap / 2)
-        place, near = _estimated(self._position + moved)
-        left = wanted - place
-        slack = self._slack(ahead, np.sign(left), near)
+        left = wanted - self.at_rest
+        slack = self._slack(np.sign(left))
         turns = slack > _TAKEN_UP
         takes = turns & (np.abs(left) > _WORTH_IT)
         motor = np.where(takes, np.sign(left) * slack, 0.0)
         if not takes.any():
             motor = np.where(turns, 0.0, left + np.sign(left) * slack)
-        velocity = (run_out + motor / self._gain) / DECISION_PERIOD_S
-        allowed = self._fastest if slower is None or takes.any() else np.minimum(self._fastest, slower)
+        velocity = motor / self._gain / DECISION_PERIOD_S
+        allowed = self._fastest if takes.any() else np.minimum(self._fastest, slower)
         made = np.clip(velocity, -allowed, allowed)
-        return Motion(made, not takes.any() and (slower is None or np.allclose(made, velocity)))
+        return Motion(made, not takes.any() and np.array_equal(made, velocity))
 
     def nearest_turn(self, wanted: Float[np.ndarray, "devices"]) -> Float[np.ndarray, "devices"]:
         """Return rotations that are whole turns from wanted ones, rad, to which the motors go the shortest way."""
         if not self.lose:
             return wanted
-        _, near = _estimated(self._position)
         whole = wanted + 2 * np.pi * np.arange(-1, 2)[:, None]
-        left = whole - self.proximal[:, 1]
+        left = whole - self.at_rest[:, 1]
         cost = []
         for each in left:
             sign = np.sign(np.column_stack([np.zeros_like(each), each]))
-            slack = self._slack(self._ahead, sign, near)[:, 1]
-            unsure = (self._gap / 2 - sign * self._ahead)[..., 1].std(axis=0) * (slack > _TAKEN_UP[1])
+            slack = self._slack(sign)[:, 1]
+            unsure = (self._gap / 2 - sign * self._ahead_at_rest)[..., 1].std(axis=0) * (slack > _TAKEN_UP[1])
             cost.append(np.abs(each) + slack + unsure)
         return np.take_along_axis(whole, np.argmin(cost, axis=0)[None], axis=0)[0]
 
@@ -175,16 +172,14 @@ class Drives:
         self.proximal, _ = _estimated(self._position)
         low, high = np.quantile(self._position, (0.159, 0.841), axis=0)
         self.sd = (high - low) / 2
+        driven = np.tile(self._on_the_way() * self._gain, (_SAMPLES, 1, 1))
+        self._ahead_at_rest, moved = through_play(self._ahead, driven, self._gap / 2)
+        self.at_rest, self._near = _estimated(self._position + moved)
 
-    def _slack(
-        self,
-        ahead: Float[np.ndarray, "samples devices 2"],
-        sign: Float[np.ndarray, "devices 2"],
-        near: Bool[np.ndarray, "samples devices 2"],
-    ) -> Float[np.ndarray, "devices 2"]:
+    def _slack(self, sign: Float[np.ndarray, "devices 2"]) -> Float[np.ndarray, "devices 2"]:
         """Return how far the motors go to a side before their devices follow, mm and rad."""
-        left = self._gap / 2 - sign * ahead
-        return np.nanmedian(np.where(near, left, np.nan), axis=0)
+        left = self._gap / 2 - sign * self._ahead_at_rest
+        return np.nanmedian(np.where(self._near, left, np.nan), axis=0)
 
 
 def _estimated(

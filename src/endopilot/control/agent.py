@@ -143,6 +143,7 @@ class _PlanningPolicy:
             if navigation.catheters
             else WireSearch(navigation, self.route, self.belief, config=search, seed=seed)
         )
+        self._fastest = np.array([np.inf, search.turn_rad_s])
         self._lost = self._began = self._led = self._arrived = self._shows = False
         self._at, self._crept, self.plans, self._failed, self.planning_s = 0, 0, 0, 0, 0.0
         self._begin_course(None)
@@ -216,9 +217,9 @@ class _PlanningPolicy:
         drives = self.belief.drives
         if not drives.lose:
             return tuple((speed, 0.0) for speed in speed_mm_s)
-        wanted = drives.proximal.copy()
+        wanted = drives.at_rest.copy()
         wanted[: len(speed_mm_s), 0] += DECISION_PERIOD_S * np.array(speed_mm_s)
-        return _pairs(drives.towards(wanted).velocity)
+        return _pairs(drives.towards(wanted, self._fastest).velocity)
 
     def _go_on(self, observation: Observation) -> Proximals:
         """Return the velocities that lead to the next place of the course."""
@@ -246,7 +247,7 @@ class _PlanningPolicy:
                 return held
             at = self._turn_ends(course)
             wanted = course.proximal[at] + self._whole_turns
-        motion = drives.towards(wanted)
+        motion = drives.towards(wanted, self._fastest)
         if motion.done:
             self._shows, self._at = bool(course.exposed[at]), at + 1
             self._looked = self._settled = 0
@@ -273,15 +274,15 @@ class _PlanningPolicy:
             self._looked, self._shows = self._looked + 1, True
             return ((0.0, 0.0),)
         turn = course.proximal[at, 0, 1] - DECISION_PERIOD_S * course.control[at, 0, 1] + self._whole_turns[0, 1]
-        if abs(turn - drives.proximal[0, 1]) <= _OFF_RAD or self._settled >= _SETTLES:
+        if abs(turn - drives.at_rest[0, 1]) <= _OFF_RAD or self._settled >= _SETTLES:
             return None
-        wanted = drives.proximal.copy()
+        wanted = drives.at_rest.copy()
         wanted[0, 1] = turn
         nearest = drives.nearest_turn(wanted[:, 1])
         self._whole_turns[:, 1] += nearest - wanted[:, 1]
         wanted[:, 1] = nearest
         self._settled += 1
-        return _pairs(drives.towards(wanted).velocity)
+        return _pairs(drives.towards(wanted, self._fastest).velocity)
 
     def _creep(self) -> Proximals:
         """Return the velocity of a catheter that should have arrived: a little ahead and back; then search again."""

@@ -33,7 +33,7 @@ class NavigateConfig:
     """Robot and C-arm of the policy, and the settings of the simulated reality."""
 
     robot: RobotConfig = field(default_factory=RobotConfig)
-    """The robot as it truly is; a policy is not told."""
+    """The robot; a policy is given what a robot is made to (`RobotConfig.known`), not what a seed draws of it."""
     fluoroscope: FluoroscopeConfig = field(default_factory=FluoroscopeConfig)
     """The C-arm."""
     xray: XrayKind = "assumed"
@@ -110,7 +110,8 @@ class NavigationLoop:
         """
         self.config = config = config or NavigateConfig()
         truth = truth or ModelMismatch()
-        self.navigation = navigation = replace(navigation, xray=config.xray)
+        drives = navigation.drives or config.robot.known(len(navigation.devices))
+        self.navigation = navigation = replace(navigation, xray=config.xray, drives=drives)
         self.policy = make_policy(policy) if isinstance(policy, str) else policy
         self.simulator = start_world(navigation, truth, config.simulator, robot=config.robot, motion=config.motion)
         limits = [DriveLimits.of(device, navigation.anatomy) for device in navigation.devices]

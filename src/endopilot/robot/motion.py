@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.play import through_play
 from endopilot.robot.config import RobotConfig
 
 _ROUNDING_S = 1e-12
@@ -39,7 +40,7 @@ class DriveMotion:
         *,
         seeds: Sequence[int | Sequence[int]] = (0,),
     ) -> None:
-        """Begin at rest, in the middle of the play.
+        """Begin at rest, in the middle of the play, or somewhere in it if the encoders do not see it.
 
         Args:
             config: latency, jitter, accelerations, gains and plays.
@@ -49,14 +50,18 @@ class DriveMotion:
         """
         robots, devices, _ = position.shape
         self._acceleration = config.of_drives(devices, "max_acceleration_mm_s2", "max_acceleration_rad_s2")[None]
-        self._half_play = config.of_drives(devices, "play_mm", "play_rad")[None] / 2
         self._fastest = np.array([[each.fastest for each in of_robot] for of_robot in limits])
         self._travel = np.moveaxis(np.array([[each.travel_mm for each in of_robot] for of_robot in limits]), -1, 0)
         self._latency_s, self._jitter_s = config.latency_s, config.jitter_s
         self._random = [np.random.default_rng(seed) for seed in seeds]
         self._gain = np.stack([config.gains(devices, random) for random in self._random])
+        apart = [np.random.default_rng([*np.atleast_1d(seed), 1]) for seed in seeds]  # keeps what was drawn before
+        self._half_play = np.stack([config.plays(devices, random) for random in apart]) / 2
+        # Encoders at the motors do not say where in its play a device lies.
+        self._begins = [random.uniform(-1.0, 1.0, (devices, 2)) for random in apart]
+        self._begins = np.stack(self._begins) * self._half_play * (config.encoders_at == "motor")
         self._top = self._fastest / np.maximum(self._gain, 1.0)  # of the motors: no device goes faster than its limit
-        self._wanted, self._ahead = np.zeros(position.shape), np.zeros(position.shape)
+        self._wanted, self._ahead = np.zeros(position.shape), self._begins.copy()
         self._ramp = np.broadcast_to(self._acceleration, position.shape).copy()
         self._orders: deque[tuple[Float[np.ndarray, "robots"], Float[np.ndarray, "robots devices 2"]]] = deque()
         self._clock = np.zeros(robots)
@@ -83,12 +88,13 @@ class DriveMotion:
         self._ramp = np.maximum(self._acceleration, self._fastest / within_s)
 
     def reset(self, robots: Sequence[int], position: Float[np.ndarray, "chosen devices 2"]) -> None:
-        """Let some robots begin again at rest at a position, in the middle of the play; their gains stay."""
+        """Let some robots begin again at rest at a position, where they first lay in the play; their gains stay."""
         chosen = np.asarray(robots, dtype=int)
         for due, velocity in self._orders:
             due[chosen], velocity[chosen] = -np.inf, 0.0
-        for array in (self._wanted, self._ahead, self.velocity):
+        for array in (self._wanted, self.velocity):
             array[chosen] = 0.0
+        self._ahead[chosen] = self._begins[chosen]
         self._ramp[chosen] = self._acceleration
         self.motor[chosen], self.position[chosen] = position, position
 
@@ -123,8 +129,6 @@ class DriveMotion:
         motor = (self.velocity + reached) / 2 * ramp + reached * (duration - ramp)
         self.velocity, self.motor = reached, self.motor + motor
         driven = self._gain * motor
-        ahead = np.clip(self._ahead + driven, -self._half_play, self._half_play)
-        moved = driven - (ahead - self._ahead)
-        self._ahead = ahead
+        self._ahead, moved = through_play(self._ahead, driven, self._half_play)
         self.position = self.position + moved
         self.position[..., 0] = np.clip(self.position[..., 0], *self._travel)
