@@ -28,10 +28,11 @@ from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.types import TipProjection
 from endopilot.xray.fluoroscope import TipMeasurement
 
-
 _SIDES = 16
 """Angles that a wire is turned to where its rotation is looked for."""
-_SURE_RAD = 0.12
+_PLACED_MM = 0.5, 0.15
+"""Scales of the errors, along and across the wire, of a tip whose proximal end is where it is believed, mm."""
+_SURE_RAD = 0.08
 """A rotation that is known as well is not looked for, rad."""
 
 
@@ -94,9 +95,7 @@ class Belief(Ensemble):
         )
         self._accuracy_mm = config.along_sd_mm, config.across_sd_mm
         self._limits = [DriveLimits.of(each, navigation.anatomy) for each in navigation.devices]
-        self.drives = Drives(
-            navigation.drives, navigation.start, np.array([limits.fastest for limits in self._limits])
-        )
+        self.drives = Drives(navigation.drives, navigation.start, np.array([limits.fastest for limits in self._limits]))
         self._navigation, self._fans = navigation, dict[float, Simulator]()
         self.error = np.zeros((len(parameters), 2))
         self._score, self._coaxial = np.zeros(len(parameters)), bool(navigation.catheters)
@@ -184,10 +183,12 @@ class Belief(Ensemble):
         error = measured.position - tip - self._shifted(best, left[:, 0])
         shift = np.einsum("si,si->s", error, along)
         across = np.linalg.norm(error - shift[:, None] * along, axis=1)
-        scaled = np.column_stack([shift, across]) / np.maximum(self._accuracy_mm, measured.sd_mm)
+        scaled = np.column_stack([shift, across]) / np.maximum(_PLACED_MM, measured.sd_mm)
         drives.weigh(0, -np.log1p(scaled**2).sum(axis=1))
         moved = (drives.proximal[0] - before)[:, None]
-        return (self._turned(best, moved[1], fan)[0] - self._end(self.simulator)[best] + self._shifted(best, moved[0]))[0]
+        return (self._turned(best, moved[1], fan)[0] - self._end(self.simulator)[best] + self._shifted(best, moved[0]))[
+            0
+        ]
 
     def _turned(
         self, best: int, turn: Float[np.ndarray, "n"], fan: Simulator | None
@@ -238,7 +239,8 @@ class Belief(Ensemble):
         abscissa = np.concatenate([behind, line.abscissa])
         points = np.concatenate([insertion.position + behind[:, None] * insertion.direction, line.points])
         there, here = (
-            np.column_stack([np.interp(x, abscissa, axis) for axis in points.T]) for x in (at + along_mm, np.array([at]))
+            np.column_stack([np.interp(x, abscissa, axis) for axis in points.T])
+            for x in (at + along_mm, np.array([at]))
         )
         return there - here
 

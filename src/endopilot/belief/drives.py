@@ -32,7 +32,7 @@ _STRAY_SHARE, _STRAYS = 0.03, np.array([0.7, 1.0])
 """Share of the samples that may be where none of the others is, and how far from these, mm and rad."""
 _TAKEN_UP = np.array([0.05, 0.03])
 """What is left of a play that counts as taken up, mm and rad."""
-_WORTH_IT = np.array([0.3, 0.3])
+_WORTH_IT = np.array([0.3, 0.1])
 """A device this near to where it should be stays where a play would have to be taken up first, mm and rad."""
 
 

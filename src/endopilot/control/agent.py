@@ -91,12 +91,14 @@ _SURE_SDS = 3.0
 """A measured tip is taken for another than the simulated ones beyond this many of its own standard deviations."""
 _WIRE_CREEP_MM_S = 2.0
 """Fastest translation of a wire that should have arrived, and that X-ray shows beside its target, mm/s."""
-_UNSURE_RAD = 0.5
+_UNSURE_RAD = 0.3
 """A rotation that is known no better is looked at before a wire is pushed or pulled, rad."""
-_OFF_RAD = 0.4
+_OFF_RAD = 0.25
 """A wire that is turned otherwise than its course by more than this is turned before it goes on, rad."""
 _LOOKS, _SETTLES = 2, 6
 """Times that a wire is looked at, and periods that it is turned for, at one place of a course."""
+_CLEAR_MM = 4.0
+"""A wire that is lost is pulled back by this much at least before it is looked at again, mm."""
 _CREEP_MM_S, _CREEP_PERIODS = 1.0, 6
 """A catheter, which X-ray does not show, is moved ahead and back by this where it should have arrived, for as many
 periods and twice."""
@@ -144,6 +146,7 @@ class _PlanningPolicy:
             else WireSearch(navigation, self.route, self.belief, config=search, seed=seed)
         )
         self._fastest = np.array([np.inf, search.turn_rad_s])
+        self._back_mm = np.inf
         self._lost = self._began = self._led = self._arrived = self._shows = False
         self._at, self._crept, self.plans, self._failed, self.planning_s = 0, 0, 0, 0, 0.0
         self._begin_course(None)
@@ -157,7 +160,8 @@ class _PlanningPolicy:
         wanted = self._pull_back() if self._lost else self._go_on(observation)
         self.belief.drives.sent(wanted)
         ends = self._failed >= self.config.tries and self._course is None and not self._lost
-        return Decision(wanted, expose=self._lost or self.wants_xray(), gives_up=self._search.halt if ends else "")
+        expose = self._back_far_enough() if self._lost else self.wants_xray()
+        return Decision(wanted, expose=expose, gives_up=self._search.halt if ends else "")
 
     def watch(self, observation: Observation) -> None:
         """Follow what somebody else does; a new course is searched at the next decision."""
@@ -206,6 +210,26 @@ class _PlanningPolicy:
         if lost or self._lost:
             self._begin_course(None)
         self._lost = lost
+        self._back_mm = self.belief.drives.proximal[0, 0] - self._way_back(measured)
+
+    def _way_back(self, measured: TipMeasurement) -> float:
+        """Return how far a wire that is lost is pulled back before it is looked at again, mm.
+
+        That is out of the branch that its tip is in and none of the likeliest wire is, a little at least. Without play
+        it is looked at all the time.
+        """
+        tree, tip = self.navigation.anatomy.tree, self.belief.likeliest_tip()
+        if not self.belief.drives.lose:
+            return -np.inf
+        leaves = min(
+            tree.departures(int(tip.branch[0]))[measured.branch], tree.departures(measured.branch)[tip.branch[0]]
+        )
+        return max(measured.abscissa - leaves + _CLEAR_MM, _CLEAR_MM)
+
+    def _back_far_enough(self) -> bool:
+        """Return whether a wire that is lost is to be looked at when it is pulled back for another period."""
+        drives = self.belief.drives
+        return bool(drives.proximal[0, 0] - self.config.search.speed_mm_s * DECISION_PERIOD_S <= self._back_mm)
 
     def _pull_back(self) -> Proximals:
         """Return the velocities that pull the wire back, and each catheter that the wire's tip is in."""
@@ -247,6 +271,8 @@ class _PlanningPolicy:
                 return held
             at = self._turn_ends(course)
             wanted = course.proximal[at] + self._whole_turns
+            still = np.abs(course.control[at, :, 1]) < 1e-3  # what is off by less than `_OFF_RAD` is left as it is
+            wanted[:, 1] = np.where(still & (at == self._at), drives.at_rest[:, 1], wanted[:, 1])
         motion = drives.towards(wanted, self._fastest)
         if motion.done:
             self._shows, self._at = bool(course.exposed[at]), at + 1
@@ -254,8 +280,7 @@ class _PlanningPolicy:
         return _pairs(motion.velocity)
 
     def _turn_ends(self, course: Course) -> int:
-        """Return the last of the next periods in which devices only turn, and turn them the shorter way; or the next.
-        """
+        """Return the last of the periods in which devices only turn, which they do the shorter way, or the next."""
         at, drives = self._at, self.belief.drives
         still = np.abs(course.control[at:, :, 0]).max(axis=1) < 1e-3
         if not still[0]:
