@@ -96,7 +96,9 @@ _UNSURE_RAD = 0.3
 _OFF_RAD = 0.25
 """A wire that is turned otherwise than its course by more than this is turned before it goes on, rad."""
 _LOOKS, _SETTLES = 2, 6
-"""Times that a wire is looked at, and periods that it is turned for, at one place of a course."""
+"""Times that a wire is looked at after it was turned, and periods that it is turned for at one place of a course."""
+_TURNED_RAD_S = 0.1
+"""A wire whose drive turned no faster was not turned, rad/s."""
 _CLEAR_MM = 4.0
 """A wire that is lost is pulled back by this much at least before it is looked at again, mm."""
 _CREEP_MM_S, _CREEP_PERIODS = 1.0, 6
@@ -146,7 +148,7 @@ class _PlanningPolicy:
             else WireSearch(navigation, self.route, self.belief, config=search, seed=seed)
         )
         self._fastest = np.array([np.inf, search.turn_rad_s])
-        self._back_mm = np.inf
+        self._back_mm, self._looked = np.inf, 0
         self._lost = self._began = self._led = self._arrived = self._shows = False
         self._at, self._crept, self.plans, self._failed, self.planning_s = 0, 0, 0, 0, 0.0
         self._begin_course(None)
@@ -275,8 +277,9 @@ class _PlanningPolicy:
             wanted[:, 1] = np.where(still & (at == self._at), drives.at_rest[:, 1], wanted[:, 1])
         motion = drives.towards(wanted, self._fastest)
         if motion.done:
-            self._shows, self._at = bool(course.exposed[at]), at + 1
-            self._looked = self._settled = 0
+            self._shows, self._at, self._settled = bool(course.exposed[at]), at + 1, 0
+            if np.abs(motion.velocity[0, 1]) > _TURNED_RAD_S:
+                self._looked = 0
         return _pairs(motion.velocity)
 
     def _turn_ends(self, course: Course) -> int:
@@ -306,7 +309,7 @@ class _PlanningPolicy:
         nearest = drives.nearest_turn(wanted[:, 1])
         self._whole_turns[:, 1] += nearest - wanted[:, 1]
         wanted[:, 1] = nearest
-        self._settled += 1
+        self._settled, self._looked = self._settled + 1, 0
         return _pairs(drives.towards(wanted, self._fastest).velocity)
 
     def _creep(self) -> Proximals:
@@ -319,7 +322,7 @@ class _PlanningPolicy:
 
     def _begin_course(self, course: Course | None) -> None:
         """Follow a course from its begin on, or none."""
-        self._course, self._looked, self._settled = course, 0, 0
+        self._course, self._settled = course, 0
         self._whole_turns = np.zeros((len(self.navigation.devices), 2))
 
     @property
