@@ -14,9 +14,9 @@ import numpy as np
 from tyro.conf import Positional
 
 from endopilot.control.agent import AgentPolicy
+from endopilot.devices.robot import RobotConfig
 from endopilot.ladder.mismatch import CASES, mismatch_of
 from endopilot.navigation.navigate import NavigateConfig, navigate
-from endopilot.robot.config import RobotConfig
 from endopilot.settings import Count
 from endopilot.tasks.task import CORE, find_task
 from endopilot.xray.fluoroscope import TipMeasurement

@@ -17,12 +17,12 @@ from tyro.conf import Positional
 
 from benchmarks.figures import DOCS, fill
 from endopilot.control.agent import AgentPolicy
+from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import navigation_events, navigation_seed
 from endopilot.ladder.ladder import identity
 from endopilot.navigation.navigate import NavigateConfig, XrayKind, navigate
-from endopilot.robot.config import RobotConfig
 from endopilot.runs import claim, make_missing
 from endopilot.settings import Count
 from endopilot.simulation.mismatch import drawn_sides, mismatch_by

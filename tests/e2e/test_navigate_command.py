@@ -24,7 +24,7 @@ from endopilot.simulation.trajectory_file import read_trajectory
 
 SHORT = ("--tip", "own", "--seconds", "20")
 FILES = ["episode", "manifest.json", "navigation.csv", "navigation.html", "navigation.png", "run.json",
-         "trajectory.npz", "wire.yaml"]  # fmt: skip
+         "trajectory.npz"]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -155,16 +155,17 @@ def test_a_catheter_follows_its_wire_and_both_are_written(patient, capsys, tmp_p
     command = ("navigate", patient, "--target", "1", "--policy", "in-turn", "--arrives", "catheter", *SHORT)
     figures = run(capsys, *command, "--true-friction", "1.1", "--catheter", "microcatheter-1.7f", "-o", folder)
     assert figures["reached"]
-    assert sorted(path.name for path in folder.iterdir()) == sorted({*FILES, "catheter-1.yaml"})
+    assert sorted(path.name for path in folder.iterdir()) == FILES
     table = pd.read_csv(folder / "navigation.csv")
     assert table["catheter_1_inserted_length_mm"].iloc[-1] > 0.8 * figures["target_mm"]
     assert abs(table["catheter_1_tip_abscissa_mm"].iloc[-1] - figures["target_mm"]) <= 2.0
-    given, true = read_catheter("microcatheter-1.7f"), read_catheter(folder / "catheter-1.yaml")
-    episode = load_dataset(folder / "episode")
+    given, episode = read_catheter("microcatheter-1.7f"), load_dataset(folder / "episode")
     lengths = episode.inserted_length[0, : len(table) - 1, 1]
     np.testing.assert_allclose(lengths, table["catheter_1_inserted_length_mm"][1:], atol=1e-4)
-    assert true.friction == 1.1 * given.friction
-    assert true == replace(given, friction=true.friction)
+    true = read_trajectory(folder / "trajectory.npz").set_up
+    assert true.stacks[0].catheters == (replace(given, friction=1.1 * given.friction),)
+    np.testing.assert_array_equal(episode.friction, true.friction)
+    assert true.friction[0].tolist() == [1.1 * true.stacks[0].wire.friction, 1.1 * given.friction]
     assert episode.stack.catheters == (given,) and episode.initial[0, 1].tolist() == [0.0, 0.0]
     again = run(capsys, "simulate", patient, "--controls", folder / "trajectory.npz", "-o", tmp_path / "again.csv")
     assert again["valid_worlds"] == 1

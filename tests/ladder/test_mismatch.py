@@ -7,11 +7,11 @@ import json
 import pytest
 
 from endopilot import runs
+from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
 from endopilot.ladder import mismatch as mismatches
 from endopilot.ladder.ladder import LadderConfig
 from endopilot.ladder.mismatch import CASES, measure_mismatch, mismatch_of, title_of
-from endopilot.robot.config import RobotConfig
 from endopilot.tasks.task import find_task
 
 ONE = LadderConfig(policy="forward", tasks=("straight",), patients=1)

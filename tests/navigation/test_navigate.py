@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from endopilot.control.navigate_patient import NavigatePatientConfig, set_up_navigation
+from endopilot.devices.robot import read_robot
 from endopilot.errors import InputError
 from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, navigate
 from endopilot.navigation.policy import Decision, Hand, Observation, Policy
-from endopilot.robot.config import read_robot
 from endopilot.robot.robot import CYCLE_S
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import Motion, motion_named

@@ -9,12 +9,12 @@ import pytest
 
 from endopilot.devices.catheter import Catheter, read_catheter
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.errors import InputError
 from endopilot.ladder.attempt import Recording, Repeated, attempt, repeat
 from endopilot.navigation.baseline_policies import BEHIND_MM, LEAD_MM, CatheterAlone, InTurn
 from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, navigate, start_world
 from endopilot.navigation.policy import Decision, Hand, Observation
-from endopilot.robot.config import DriveConfig, RobotConfig
 from endopilot.robot.robot import SimulatedRobot
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.mismatch import ModelMismatch

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as some
 
 from endopilot.devices.drive_limits import DriveLimits
-from endopilot.robot.config import DriveConfig, RobotConfig
+from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.robot.drive import Drive
 from endopilot.robot.drive_protocol import LONGEST_LINE, SILENCE_S, number
 

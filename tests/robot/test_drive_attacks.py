@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from test_drive_process import CLIENT, HOST, running
 
-from endopilot.robot.config import RobotConfig
+from endopilot.devices.robot import RobotConfig
 from endopilot.robot.drive import LASTS_S
 from endopilot.robot.drive_protocol import BRAKING_S, LONGEST_LINE, tls_context
 from endopilot.robot.remote import RemoteRobot

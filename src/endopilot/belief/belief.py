@@ -95,7 +95,8 @@ class Belief(Ensemble):
         )
         self._accuracy_mm = config.along_sd_mm, config.across_sd_mm
         self._limits = [DriveLimits.of(each, navigation.anatomy) for each in navigation.devices]
-        self.drives = Drives(navigation.drives, navigation.start, np.array([limits.fastest for limits in self._limits]))
+        fastest = np.array([limits.fastest for limits in self._limits])
+        self.drives = Drives(navigation.robot, navigation.start, fastest)
         self._navigation, self._fans = navigation, dict[float, Simulator]()
         self.error = np.zeros((len(parameters), 2))
         self._score, self._coaxial = np.zeros(len(parameters)), bool(navigation.catheters)

@@ -7,17 +7,19 @@ tip weights them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from endopilot.devices.play import KnownDrive, through_play
+from endopilot.devices.play import through_play
+from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Proximals
 from endopilot.tasks.navigation import DECISION_PERIOD_S
 
 _SAMPLES = 2000
+_LEAST_SD = 0.15
+"""Standard deviation of a play, as a share of what it is known as, at least."""
 _LEAST_SHARE = 0.2
 """No play is less than this share of what it is known as."""
 _CREEP_SHARE = 0.01
@@ -52,7 +54,7 @@ class Drives:
     """The drives of a navigation, as they are believed to be.
 
     Attributes:
-        lose: whether there is play between the encoders and the devices.
+        lose: whether encoders sit in front of the play, at the motors.
         proximal: Δ, mm, and φ, rad, of each device where it most likely is.
         sd: standard deviations of these.
         at_rest: where the devices are once the motors have done what they were told before.
@@ -60,29 +62,31 @@ class Drives:
 
     def __init__(
         self,
-        known: Sequence[KnownDrive],
+        robot: RobotConfig | None,
         start: Float[np.ndarray, "devices 2"],
         fastest: Float[np.ndarray, "devices 2"],
     ) -> None:
         """Begin at rest, at a place in the play that is not known.
 
         Args:
-            known: of each drive; none if the encoders sit at the devices.
+            robot: as it is known; one whose encoders sit at the devices if not given.
             start: where the devices are, and what the encoders read there, mm and rad.
             fastest: translation and rotation of each drive, mm/s and rad/s.
         """
-        self.lose = bool(known) and any(drive.gap.any() for drive in known)
-        self._known, self._fastest, self._random = tuple(known), fastest, np.random.default_rng(0)
+        self._fastest, self._random = fastest, np.random.default_rng(0)
         self._encoder, self._run_out = np.array(start, dtype=float), np.zeros(start.shape)
         self._sent = np.zeros(start.shape)
         self.proximal = self.at_rest = self._encoder
         self.sd = np.zeros(start.shape)
-        if self.lose:
-            shape = (_SAMPLES, *start.shape)
-            gap = np.array([drive.gap for drive in known])
-            spread = np.array([drive.play_sd for drive in known])[:, None]
-            self._gain = np.array([drive.gain for drive in known])
-            self._gap = gap * np.maximum(1 + spread * self._random.standard_normal(shape), _LEAST_SHARE)
+        self.lose = robot is not None and robot.encoders_at == "motor"
+        if robot is not None and self.lose:
+            shape, count = (_SAMPLES, *start.shape), len(start)
+            self._robot, self._play = robot, robot.of_drives(count, "play_mm", "play_rad")
+            gain = robot.of_drives(count, "gain_translation", "gain_rotation")
+            spread = robot.of_drives(count, "gain_sd_translation", "gain_sd_rotation")
+            self._gain = gain * (1 + spread * self._random.standard_normal(shape))
+            spread = np.maximum(robot.of_drives(count, "play_sd"), _LEAST_SD)
+            self._gap = self._play * np.maximum(1 + spread * self._random.standard_normal(shape), _LEAST_SHARE)
             self._ahead = self._gap * (self._random.random(shape) - 0.5)
             self._position = np.tile(self._encoder, (_SAMPLES, 1, 1))
             self._estimate()
@@ -105,7 +109,7 @@ class Drives:
         if self.lose:
             told = np.zeros(self._sent.shape)
             told[: len(velocity)] = velocity
-            self._run_out = self._on_the_way()
+            self._run_out = self._robot.run_out(self._sent)
             self._sent = np.clip(told, -self._fastest, self._fastest)
 
     def towards(self, wanted: Float[np.ndarray, "devices 2"], slower: Float[np.ndarray, "2"]) -> Motion:
@@ -126,7 +130,7 @@ class Drives:
         motor = np.where(takes, np.sign(left) * slack, 0.0)
         if not takes.any():
             motor = np.where(turns, 0.0, left + np.sign(left) * slack)
-        velocity = motor / self._gain / DECISION_PERIOD_S
+        velocity = motor / self._gain.mean(axis=0) / DECISION_PERIOD_S
         allowed = self._fastest if takes.any() else np.minimum(self._fastest, slower)
         made = np.clip(velocity, -allowed, allowed)
         return Motion(made, not takes.any() and np.array_equal(made, velocity))
@@ -154,25 +158,21 @@ class Drives:
         weight, random = np.exp(score - score.max()), self._random
         at = (np.arange(_SAMPLES) + random.random()) / _SAMPLES
         chosen = np.searchsorted(np.cumsum(weight) / weight.sum(), at).clip(0, _SAMPLES - 1)
-        moving = np.array([drive.gap for drive in self._known])[device] > 0
+        moving = self._play[device] > 0
         gap, ahead, position = (each[chosen, device] for each in (self._gap, self._ahead, self._position))
         wider = 1 + _GAP_JITTER * random.standard_normal(gap.shape)
         position = position + moving * _JITTER * random.standard_normal(position.shape)
         stray = random.random(_SAMPLES) < _STRAY_SHARE
         position[stray] += moving * _STRAYS * random.standard_normal((int(stray.sum()), 2))
         self._gap[:, device], self._ahead[:, device] = gap * wider, ahead * wider
-        self._position[:, device] = position
+        self._gain[:, device], self._position[:, device] = self._gain[chosen, device], position
         self._estimate()
-
-    def _on_the_way(self) -> Float[np.ndarray, "devices 2"]:
-        """Return how far the motors go on before they do what they are told next, mm and rad."""
-        return np.array([drive.run_out(sent) for drive, sent in zip(self._known, self._sent, strict=True)])
 
     def _estimate(self) -> None:
         self.proximal, _ = _estimated(self._position)
         low, high = np.quantile(self._position, (0.159, 0.841), axis=0)
         self.sd = (high - low) / 2
-        driven = np.tile(self._on_the_way() * self._gain, (_SAMPLES, 1, 1))
+        driven = self._robot.run_out(self._sent) * self._gain
         self._ahead_at_rest, moved = through_play(self._ahead, driven, self._gap / 2)
         self.at_rest, self._near = _estimated(self._position + moved)
 

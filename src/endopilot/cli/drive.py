@@ -11,7 +11,7 @@ from pathlib import Path
 from endopilot.cli.arguments import ListenConfig
 from endopilot.devices.device import read_device
 from endopilot.devices.drive_limits import DriveLimits
-from endopilot.robot.config import ASSUMED, read_robot
+from endopilot.devices.robot import ASSUMED, read_robot
 from endopilot.robot.drive import Drive
 from endopilot.robot.drive_protocol import tls_context
 from endopilot.robot.drive_server import serve

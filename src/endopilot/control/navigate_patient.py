@@ -18,15 +18,15 @@ from endopilot.anatomy.catheter_axis import lean_between, with_axis
 from endopilot.anatomy.io import read_anatomy
 from endopilot.control.agent import OraclePolicy
 from endopilot.control.set_up import TILT_DEG, TipChoice, choose_tip
-from endopilot.devices.catheter import Catheter, read_catheter
+from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import Wire, read_device
+from endopilot.devices.robot import ASSUMED, RobotConfig, read_robot
 from endopilot.errors import InputError
 from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, XrayKind
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import Believer, Led, Observation, Policy
 from endopilot.navigation.record import NavigationRecord
 from endopilot.progress import progress
-from endopilot.robot.config import ASSUMED, RobotConfig, read_robot
 from endopilot.settings import Finite, Positive, Seconds, Seed, ShareBelowOne, Text, Within, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.mismatch import ModelMismatch, drawn_sides, mismatch_by
@@ -129,18 +129,6 @@ class SetUp:
     def true_anatomy(self) -> Anatomy:
         """The vessel with its guiding catheter as it truly lies."""
         return self.truth.anatomy(self.navigation.anatomy)
-
-    @property
-    def true_wire(self) -> Wire:
-        """The wire as it truly is."""
-        device = self.navigation.device
-        wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=self.truth.stiffness_factor)
-        return replace(wire, friction=device.friction * self.truth.friction_factor)
-
-    @property
-    def true_catheters(self) -> tuple[Catheter, ...]:
-        """The catheters as they truly are."""
-        return self.truth.catheters(self.navigation.catheters)
 
     @property
     def motion(self) -> Motion | None:

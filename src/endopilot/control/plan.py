@@ -19,12 +19,12 @@ from endopilot.control.set_up import TipChoice, choose_tip
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire, read_device
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.robot import IDEAL, read_robot
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.models.config import read_run
 from endopilot.navigation.navigate import NavigateConfig, navigate
 from endopilot.progress import progress
-from endopilot.robot.config import IDEAL, read_robot
 from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate

@@ -1,13 +1,9 @@
-"""Play between the motor of a drive and the device that it holds, and what is known of it."""
+"""Play between the motor of a drive and the device that it holds: `through_play`."""
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import numpy as np
 from jaxtyping import Float
-
-from endopilot.settings import NonNegative, Share, Within, settings
 
 
 def through_play(
@@ -25,44 +21,3 @@ def through_play(
     """
     after = np.clip(ahead + driven, -half_gap, half_gap)
     return after, driven - (after - ahead)
-
-
-@settings
-class KnownDrive:
-    """What is known of a drive whose encoders sit at the motor: what lies between them and the device."""
-
-    play_mm: NonNegative = 0.0
-    """Motion that is lost where the translation reverses, mm."""
-    play_rad: NonNegative = 0.0
-    """Motion that is lost where the rotation reverses, rad."""
-    play_sd: Share = 0.15
-    """Standard deviation of both plays, as a share of them."""
-    gain_translation: Annotated[float, Within(0.1, 10)] = 1.0
-    """Translation of the device by that of the encoder, while it moves."""
-    gain_rotation: Annotated[float, Within(0.1, 10)] = 1.0
-    """The same of the rotation."""
-    latency_s: NonNegative = 0.0
-    """Time in which the motor goes on as it was commanded before, s."""
-    max_acceleration_mm_s2: Annotated[float, Within(1e-3, 1e9)] = 1e6
-    """Largest change of the translation's speed, mm/s²."""
-    max_acceleration_rad_s2: Annotated[float, Within(1e-3, 1e9)] = 1e6
-    """Largest change of the rotation's speed, rad/s²."""
-
-    @property
-    def gap(self) -> Float[np.ndarray, "2"]:
-        """Motion lost at a reversal, mm and rad."""
-        return np.array([self.play_mm, self.play_rad])
-
-    @property
-    def gain(self) -> Float[np.ndarray, "2"]:
-        """Motion of the device by that of the encoder, of translation and rotation."""
-        return np.array([self.gain_translation, self.gain_rotation])
-
-    def run_out(self, velocity: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-        """Return how far the motor goes on before it turns back, mm and rad.
-
-        Args:
-            velocity: that it has, mm/s and rad/s.
-        """
-        braking = np.array([self.max_acceleration_mm_s2, self.max_acceleration_rad_s2])
-        return velocity * self.latency_s + velocity * np.abs(velocity) / (2 * braking)

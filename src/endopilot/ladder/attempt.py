@@ -6,7 +6,7 @@ import base64
 import binascii
 import hashlib
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,12 +15,12 @@ from jaxtyping import Bool, Float
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.belief.adviser import AdviserConfig, count_events, near_exposures
 from endopilot.control.agent import AgentPolicy
+from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
-from endopilot.navigation.navigate import NavigateConfig, navigate
+from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, navigate
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import Decision, Observation, Policy
 from endopilot.navigation.record import NavigationRecord
-from endopilot.robot.config import RobotConfig
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import CORE, Task
@@ -39,12 +39,14 @@ class Recording:
         exposed: whether X-ray was on at each decision.
         believed_mm: where the agent believed the tip to be (Δtip) at each decision, mm; None for other policies.
         gave_up: whether the policy ended the navigation with its last decision.
+        robot: what drove; not part of the text.
     """
 
     control: Float[np.ndarray, "decisions devices 2"]
     exposed: Bool[np.ndarray, "decisions"]
     believed_mm: Float[np.ndarray, "decisions"] | None
     gave_up: bool = False
+    robot: RobotConfig = field(default_factory=RobotConfig)
 
     def packed(self) -> dict[str, Any]:
         """Return the recording as text: little-endian arrays, compressed by zlib, in base64."""
@@ -57,12 +59,13 @@ class Recording:
         }
 
     @staticmethod
-    def unpacked(text: dict[str, Any], devices: int = 1) -> Recording:
+    def unpacked(text: dict[str, Any], devices: int = 1, robot: RobotConfig | None = None) -> Recording:
         """Return the recording that `packed` made a text of.
 
         Args:
             text: the arrays.
             devices: number of wire and catheters.
+            robot: what drove; the default one if not given.
 
         Raises:
             InputError: an array cannot be read, is not finite, or has another length than the others.
@@ -78,7 +81,8 @@ class Recording:
                 raise InputError(f"{name}: {size:g} decisions, exposed: {count}; each must have one value a decision")
         if not exposed[0]:
             raise InputError("exposed: X-ray is off at the first decision, where it is always on")
-        return Recording(control.reshape(count, devices, 2), exposed, believed, bool(text.get("gave_up", False)))
+        decided, gave_up = control.reshape(count, devices, 2), bool(text.get("gave_up", False))
+        return Recording(decided, exposed, believed, gave_up, robot or RobotConfig())
 
 
 def navigation_seed(task: Task, place: int) -> int:
@@ -107,7 +111,7 @@ def attempt(
         InputError: there is no such policy, or the wire does not fit the vessel.
     """
     driver = make_policy(policy)
-    record = _drive(navigation, driver, seed, mismatch, robot)
+    record = _drive(navigation, driver, seed, mismatch, robot or RobotConfig())
     return {"seed": seed} | scored(navigation, record, tells=isinstance(driver, AgentPolicy))
 
 
@@ -124,9 +128,7 @@ def scored(navigation: Navigation, record: NavigationRecord, *, tells: bool = Fa
     return _figures(navigation, record, recording) | {"course": _course(record), "recording": recording.packed()}
 
 
-def repeat(
-    recording: Recording, navigation: Navigation, *, seed: int, robot: RobotConfig | None = None
-) -> dict[str, Any]:
+def repeat(recording: Recording, navigation: Navigation, *, seed: int) -> dict[str, Any]:
     """Drive the recorded velocities through the same robot and simulator, without the policy.
 
     Returns:
@@ -135,29 +137,35 @@ def repeat(
     Raises:
         InputError: the recording is longer or shorter than the navigation.
     """
-    record = driven(recording, navigation, seed=seed, robot=robot)
+    record = driven(recording, navigation, seed=seed)
     given, needed = len(recording.control), len(record.control) - 1
     if given != needed:
         raise InputError(f"control: holds {given} decisions, and the navigation ends after {needed}")
     return _figures(navigation, record, recording)
 
 
-def driven(
-    recording: Recording, navigation: Navigation, *, seed: int, robot: RobotConfig | None = None
-) -> NavigationRecord:
+def driven(recording: Recording, navigation: Navigation, *, seed: int) -> NavigationRecord:
     """Return how a navigation goes under what was recorded: its trajectory is the recorded one to the bit.
 
     Raises:
         InputError: the recording is shorter than the navigation.
     """
-    return _drive(navigation, Repeated(recording), seed, None, robot)
+    return _drive(navigation, Repeated(recording), seed, None, recording.robot)
+
+
+def begun(recording: Recording, navigation: Navigation, *, seed: int) -> NavigationLoop:
+    """Return the loop that drives a navigation as it was recorded, at its start."""
+    return NavigationLoop(navigation, Repeated(recording), config=_config(recording.robot), seed=seed)
+
+
+def _config(robot: RobotConfig) -> NavigateConfig:
+    return NavigateConfig(robot=robot, simulator=replace(CORE, threads=1))
 
 
 def _drive(
-    navigation: Navigation, policy: Policy, seed: int, mismatch: ModelMismatch | None, robot: RobotConfig | None
+    navigation: Navigation, policy: Policy, seed: int, mismatch: ModelMismatch | None, robot: RobotConfig
 ) -> NavigationRecord:
-    config = NavigateConfig(robot=robot or RobotConfig(), simulator=replace(CORE, threads=1))
-    return navigate(navigation, policy, config=config, seed=seed, truth=mismatch)
+    return navigate(navigation, policy, config=_config(robot), seed=seed, truth=mismatch)
 
 
 class Repeated:

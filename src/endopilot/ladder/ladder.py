@@ -9,12 +9,12 @@ from typing import Annotated, Any
 from pydantic import model_validator
 
 from endopilot import __version__
+from endopilot.devices.robot import ASSUMED, RobotConfig, read_robot
 from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import attempt, navigation_seed
 from endopilot.ladder.scores import score
 from endopilot.ladder.submission import MOST_PATIENTS, SUBMISSION_FILE, task_digest, write_submission
 from endopilot.navigation.policies import POLICIES, make_policy
-from endopilot.robot.config import ASSUMED, RobotConfig, read_robot
 from endopilot.runs import claim, make_missing
 from endopilot.settings import Within, settings
 from endopilot.tasks.task import NEWEST, LadderVersion, Task, find_task, ladder_tasks

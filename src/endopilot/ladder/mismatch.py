@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from endopilot.devices.robot import RobotConfig, read_robot
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json, writing
 from endopilot.ladder.attempt import attempt, navigation_seed
 from endopilot.ladder.ladder import LadderConfig, identity
 from endopilot.ladder.scores import score_navigations
 from endopilot.navigation.policies import make_policy
-from endopilot.robot.config import RobotConfig, read_robot
 from endopilot.runs import claim, make_missing
 from endopilot.simulation.mismatch import QUANTITIES, ModelMismatch, drawn_sides, mismatch_by
 from endopilot.tasks.navigation import Navigation

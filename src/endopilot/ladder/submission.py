@@ -18,14 +18,13 @@ from typing import Any, Literal
 from endopilot import __version__, _core
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_device
+from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, write_json
-from endopilot.ladder.attempt import Recording, driven, navigation_seed, repeat
+from endopilot.ladder.attempt import Recording, navigation_seed, repeat
 from endopilot.ladder.scores import score
 from endopilot.navigation.policies import POLICIES
-from endopilot.navigation.record import NavigationRecord
 from endopilot.parallel import each
-from endopilot.robot.config import RobotConfig
 from endopilot.settings import CountOrZero, Seed, from_record, read_settings, settings
 from endopilot.tasks.task import LadderVersion, Task, find_task, ladder_tasks
 
@@ -243,8 +242,8 @@ def _first_difference(submission: Submission, folder: Path) -> str | None:
     return None
 
 
-def read_navigation(path: Path, name: str | None, place: int) -> tuple[Task, int, NavigationRecord]:
-    """Return one navigation of a submission, or of a result file of a ladder's folder, driven again by its recording.
+def recorded_navigation(path: Path, name: str | None, place: int) -> tuple[Task, int, Recording]:
+    """Return what was recorded of one navigation, from a submission or from a result file of a ladder's folder.
 
     Args:
         path: a submission.json or TASK/NUMBER.json.
@@ -252,7 +251,7 @@ def read_navigation(path: Path, name: str | None, place: int) -> tuple[Task, int
         place: of the patient in the task's list, likewise.
 
     Returns:
-        The task, the patient's place in its list, and the navigation.
+        The task, the patient's place in its list, and the recording.
 
     Raises:
         InputError: the file is none of the ladder, or has no such navigation.
@@ -270,18 +269,16 @@ def read_navigation(path: Path, name: str | None, place: int) -> tuple[Task, int
     else:
         raise InputError(f"{path}: is no file of the ladder; give a submission.json or TASK/NUMBER.json")
     task = find_task(name, content.get("ladder") or 1)
-    navigation = task.ladder_navigation(place)
-    recording = Recording.unpacked(entry["recording"], len(navigation.devices))
     robot = from_record(RobotConfig, content["robot"]) if "robot" in content else None
-    return task, place, driven(recording, navigation, seed=navigation_seed(task, place), robot=robot)
+    return task, place, Recording.unpacked(entry["recording"], 2 if task.catheter else 1, robot)
 
 
 def _repeat(path: Path, *, version: LadderVersion, robot: RobotConfig) -> None:
     """Drive the recording in a file again, and put the figures in its place."""
     task, place = find_task(path.parent.name, version), int(path.stem)
     navigation = task.ladder_navigation(place)
-    recording = Recording.unpacked(read_json(path), len(navigation.devices))
-    figures = repeat(recording, navigation, seed=navigation_seed(task, place), robot=robot)
+    recording = Recording.unpacked(read_json(path), len(navigation.devices), robot)
+    figures = repeat(recording, navigation, seed=navigation_seed(task, place))
     write_json(path, {"patient": navigation.anatomy.name} | figures)
 
 

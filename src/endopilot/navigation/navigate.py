@@ -12,12 +12,12 @@ import numpy as np
 from pydantic import model_validator
 
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import BelievedTip, Believer, Decision, Led, Observation, Policy
 from endopilot.navigation.record import NavigationRecord, Track
-from endopilot.robot.config import RobotConfig
 from endopilot.robot.robot import CYCLE_S, SimulatedRobot, in_grip
 from endopilot.settings import Within, settings
 from endopilot.simulation.config import SimulatorConfig
@@ -33,7 +33,8 @@ class NavigateConfig:
     """Robot and C-arm of the policy, and the settings of the simulated reality."""
 
     robot: RobotConfig = field(default_factory=RobotConfig)
-    """The robot; a policy is given what a robot is made to (`RobotConfig.known`), not what a seed draws of it."""
+    """The robot as it truly is; a seed draws gains and plays if their spreads are given. `Navigation.robot` is what is
+    known of it."""
     fluoroscope: FluoroscopeConfig = field(default_factory=FluoroscopeConfig)
     """The C-arm."""
     xray: XrayKind = "assumed"
@@ -110,8 +111,8 @@ class NavigationLoop:
         """
         self.config = config = config or NavigateConfig()
         truth = truth or ModelMismatch()
-        drives = navigation.drives or config.robot.known(len(navigation.devices))
-        self.navigation = navigation = replace(navigation, xray=config.xray, drives=drives)
+        known = navigation.robot or config.robot
+        self.navigation = navigation = replace(navigation, xray=config.xray, robot=known)
         self.policy = make_policy(policy) if isinstance(policy, str) else policy
         self.simulator = start_world(navigation, truth, config.simulator, robot=config.robot, motion=config.motion)
         limits = [DriveLimits.of(device, navigation.anatomy) for device in navigation.devices]

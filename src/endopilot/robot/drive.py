@@ -18,9 +18,9 @@ from collections import OrderedDict, deque
 import numpy as np
 
 from endopilot.devices.drive_limits import DriveLimits
-from endopilot.robot.config import RobotConfig
+from endopilot.devices.drive_motion import DriveMotion
+from endopilot.devices.robot import RobotConfig
 from endopilot.robot.drive_protocol import BRAKING_S, LONGEST_LINE, PROTOCOL, SILENCE_S, number
-from endopilot.robot.motion import DriveMotion
 
 LASTS_S = SILENCE_S - BRAKING_S
 """Age at which a ticket is void, s."""

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.drive_motion import DriveMotion
+from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Proximals, Stack
-from endopilot.robot.config import RobotConfig
-from endopilot.robot.motion import DriveMotion
 from endopilot.simulation.config import SimulatorConfig, wall_stiffness
 from endopilot.simulation.recorder import Recorder
 from endopilot.simulation.simulator import Simulator

@@ -11,7 +11,7 @@ from pydantic import InstanceOf, model_validator
 from endopilot.devices.catheter import Catheter, check_nested
 from endopilot.devices.device import Device, Wire
 from endopilot.devices.drive_limits import Numbers
-from endopilot.devices.play import KnownDrive
+from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.settings import CountOrZero, Finite, NonNegative, Positive, Seconds, Within, settings
 from endopilot.simulation.motion import Motion
@@ -81,8 +81,8 @@ class Navigation:
         known_motion: how heart and breath are known to move the vessel, which the C-arm takes off what it measures and
             policies simulate; it is taken to lie still if not given.
         xray: how an exposure finds the tip; `NavigationLoop` says what its C-arm does.
-        drives: what is known of the drives whose encoders sit at their motors, that of the wire and of each catheter;
-            none where the encoders sit at the devices. `NavigationLoop` takes it from its robot if not given.
+        robot: as it is known, not what a seed draws of it. `NavigationLoop` takes its own if not given; elsewhere encoders
+            then sit at the devices.
     """
 
     anatomy: InstanceOf[Anatomy]
@@ -97,7 +97,7 @@ class Navigation:
     force_limit_n: Positive = 0.5
     known_motion: Motion | None = None
     xray: XrayKind = "assumed"
-    drives: tuple[KnownDrive, ...] = ()
+    robot: RobotConfig | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Navigation:
@@ -105,8 +105,6 @@ class Navigation:
         if len(self.catheters) < self.arriving:
             raise ValueError("arrives: catheter; there is none; give catheters, or arrives: wire")
         check_nested(self.device, self.catheters)
-        if len(self.drives) not in (0, len(self.devices)):
-            raise ValueError(f"drives: {len(self.drives)} for {len(self.devices)} devices; give one for each, or none")
         return self
 
     @property

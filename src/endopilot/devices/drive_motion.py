@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.play import through_play
-from endopilot.robot.config import RobotConfig
+from endopilot.devices.robot import RobotConfig
 
 _ROUNDING_S = 1e-12
 

@@ -18,7 +18,6 @@ from pydantic import model_validator
 
 from endopilot.devices.device import Device
 from endopilot.devices.device_files import there
-from endopilot.devices.play import KnownDrive
 from endopilot.errors import InputError
 from endopilot.files import writing
 from endopilot.settings import NonNegative, Positive, Within, read_settings, settings
@@ -122,23 +121,14 @@ class RobotConfig:
         spread = self.of_drives(count, "play_sd")
         return self.of_drives(count, "play_mm", "play_rad") * np.maximum(1 + spread * drawn, 0.0)
 
-    def known(self, count: int) -> tuple[KnownDrive, ...]:
-        """Return what is known of the drives in front of whose play encoders sit; nothing if they sit behind it."""
-        if self.encoders_at == "wire":
-            return ()
-        return tuple(
-            KnownDrive(
-                play_mm=drive.play_mm,
-                play_rad=drive.play_rad,
-                play_sd=max(drive.play_sd, KnownDrive().play_sd),
-                gain_translation=drive.gain_translation,
-                gain_rotation=drive.gain_rotation,
-                latency_s=self.latency_s,
-                max_acceleration_mm_s2=drive.max_acceleration_mm_s2,
-                max_acceleration_rad_s2=drive.max_acceleration_rad_s2,
-            )
-            for drive in self.drives(count)
-        )
+    def run_out(self, velocity: Float[np.ndarray, "devices 2"]) -> Float[np.ndarray, "devices 2"]:
+        """Return how far motors go on before they obey a command to stop, mm and rad.
+
+        Args:
+            velocity: that they have, mm/s and rad/s.
+        """
+        braking = self.of_drives(len(velocity), "max_acceleration_mm_s2", "max_acceleration_rad_s2")
+        return velocity * self.latency_s + velocity * np.abs(velocity) / (2 * braking)
 
     def delayed(self, factor: float) -> RobotConfig:
         """Return a robot whose latency is some times this one's."""

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from endopilot.devices.device import read_device
+from endopilot.devices.robot import DriveConfig, RobotConfig, list_robots, read_robot
 from endopilot.errors import InputError
-from endopilot.robot.config import DriveConfig, RobotConfig, list_robots, read_robot
 
 
 def test_a_robot_is_written_and_read_back(tmp_path) -> None:

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as some
 
 from endopilot.devices.drive_limits import DriveLimits
-from endopilot.robot.config import DriveConfig, RobotConfig, read_robot
-from endopilot.robot.motion import DriveMotion
+from endopilot.devices.drive_motion import DriveMotion
+from endopilot.devices.robot import DriveConfig, RobotConfig, read_robot
 
 LIMITS = DriveLimits(max_velocity_mm_s=40.0, max_rotation_rad_s=12.0, travel_mm=(0.0, 100.0))
 IDEAL = read_robot("ideal")
