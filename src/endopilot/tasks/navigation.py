@@ -81,8 +81,8 @@ class Navigation:
         known_motion: how heart and breath are known to move the vessel, which the C-arm takes off what it measures and
             policies simulate; it is taken to lie still if not given.
         xray: how an exposure finds the tip; `NavigationLoop` says what its C-arm does.
-        robot: as it is known, not what a seed draws of it. `NavigationLoop` takes its own if not given; elsewhere encoders
-            then sit at the devices.
+        robot: as it is known, not what a seed draws of it. `NavigationLoop` takes its own if not given; else encoders
+            sit at the devices.
     """
 
     anatomy: InstanceOf[Anatomy]
