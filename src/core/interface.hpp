@@ -11,6 +11,7 @@
 #include "lumen.hpp"
 #include "motion.hpp"
 #include "rod.hpp"
+#include "transmission.hpp"
 #include "tubes.hpp"
 
 namespace endopilot {
@@ -37,8 +38,6 @@ struct Options {
     ENDOPILOT_OPTIONS(OPTION)
 #undef OPTION
 };
-
-constexpr int kMostDevices = 3;   // a wire and two catheters around it
 
 // The devices, from the inside out, and where their drives slip rather than push, pull (N) or turn (N mm) harder.
 struct Drives {
@@ -122,6 +121,7 @@ struct Scene {
     Drives drives;
     Tubes tubes{};
     Motion motion{};
+    Transmission transmission{};
 };
 
 struct OwnedScene {
@@ -133,6 +133,7 @@ struct OwnedScene {
     Drives drives;
     std::shared_ptr<const OwnedTubes> tubes{};   // null for a wire alone; else the rod is the mesh that they share
     std::shared_ptr<const OwnedMotion> motion{};  // null for a vessel that lies still
+    std::shared_ptr<const OwnedTransmission> transmission{};   // null where drives act at the ostium
 };
 
 template <class Place>
@@ -144,7 +145,8 @@ Scene view(const OwnedScene& scene, const Place& place) {
             .options = scene.options,
             .drives = scene.drives,
             .tubes = scene.tubes ? view(*scene.tubes, place) : Tubes{},
-            .motion = scene.motion ? view(*scene.motion, place) : Motion{}};
+            .motion = scene.motion ? view(*scene.motion, place) : Motion{},
+            .transmission = scene.transmission ? view(*scene.transmission, place) : Transmission{}};
 }
 
 constexpr int kTicks = 64;   // of a time step, which may be halved down to one
@@ -173,7 +175,7 @@ enum class Of { sample, device, node, element, start };
 // (`simulation/signals.py`). Devices count from the inside out. The 2 mm of wall_force are kResultantLength.
 #define ENDOPILOT_OUTPUTS(OUTPUT)                                                                                                   \
     OUTPUT(double, inserted_length, device, 1, "mm", "Δ, how far the device is inserted")                                           \
-    OUTPUT(double, rotation, device, 1, "rad", "φ, by which its drive has turned it")                                               \
+    OUTPUT(double, rotation, device, 1, "rad", "φ, by which it is turned where it enters")                                       \
     OUTPUT(double, tip_position, device, 3, "mm", "of its tip, LPS, in the vessel as CT shows it")                                  \
     OUTPUT(double, tip_direction, device, 3, "", "unit vector along the device at its tip")                                         \
     OUTPUT(double, tip_twist, device, 1, "rad", "of its frame at its tip against that of the innermost device there")               \

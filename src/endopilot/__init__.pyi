@@ -40,6 +40,7 @@ from .devices.robot import DriveConfig as DriveConfig
 from .devices.robot import RobotConfig as RobotConfig
 from .devices.robot import read_robot as read_robot
 from .devices.stack import Stack as Stack
+from .devices.transmission import Transmission as Transmission
 from .env.single import NavigateEnv as NavigateEnv
 from .env.vector import NavigateVectorEnv as NavigateVectorEnv
 from .env.vector import NavigationState as NavigationState

@@ -118,9 +118,9 @@ def test_robots_side_by_side_move_as_alone_to_the_bit() -> None:
     alone = [DriveMotion(config, [[LIMITS]], start[k : k + 1], seeds=[k]) for k in range(5)]
     for place, each in enumerate(control):
         if place == 6:
-            many.reset([1, 3], start[[1, 3]])
+            many.reset([1, 3], start[[1, 3]], [[11], [13]])
             for k in (1, 3):
-                alone[k].reset([0], start[k : k + 1])
+                alone[k].reset([0], start[k : k + 1], [[10 + k]])
         many.command(each)
         moved = many.advance(0.1)
         for k, one in enumerate(alone):

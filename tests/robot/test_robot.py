@@ -154,9 +154,9 @@ def test_the_load_is_the_drives_with_noise_and_the_valve_resists_either_way(fork
         assert robot.last_step is not None
         valve = core.introducer_friction_n + 5.0 * core.introducer_drag_n_s_mm
         expected = float(robot.last_step.base_force[0, 0]) + np.sign(speed) * valve
-        assert robot.load[0, 0] == pytest.approx(expected, abs=1e-4)
+        assert simulator.drive_load[0, 0, 0] == pytest.approx(expected, abs=1e-4)
         read = np.array([robot.proximal_state().load[0] for _ in range(500)])
-        assert read.mean(axis=0) == pytest.approx(robot.load[0], abs=3e-3)
+        assert read.mean(axis=0) == pytest.approx(simulator.drive_load[0, 0], abs=3e-3)
         assert read.std(axis=0) == pytest.approx([0.02, 0.005], rel=0.15)
 
 

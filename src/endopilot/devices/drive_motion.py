@@ -53,15 +53,12 @@ class DriveMotion:
         self._fastest = np.array([[each.fastest for each in of_robot] for of_robot in limits])
         self._travel = np.moveaxis(np.array([[each.travel_mm for each in of_robot] for of_robot in limits]), -1, 0)
         self._latency_s, self._jitter_s = config.latency_s, config.jitter_s
+        self._config, self._devices = config, devices
         self._random = [np.random.default_rng(seed) for seed in seeds]
-        self._gain = np.stack([config.gains(devices, random) for random in self._random])
-        apart = [np.random.default_rng([*np.atleast_1d(seed), 1]) for seed in seeds]  # keeps what was drawn before
-        self._half_play = np.stack([config.plays(devices, random) for random in apart]) / 2
-        # Encoders at the motors do not say where in its play a device lies.
-        self._begins = [random.uniform(-1.0, 1.0, (devices, 2)) for random in apart]
-        self._begins = np.stack(self._begins) * self._half_play * (config.encoders_at == "motor")
+        drawn = [self._drawn(random) for random in self._random]
+        self._gain, self._half_play, ahead = (np.stack(each) for each in zip(*drawn, strict=True))
         self._top = self._fastest / np.maximum(self._gain, 1.0)  # of the motors: no device goes faster than its limit
-        self._wanted, self._ahead = np.zeros(position.shape), self._begins.copy()
+        self._wanted, self._ahead = np.zeros(position.shape), ahead
         self._ramp = np.broadcast_to(self._acceleration, position.shape).copy()
         self._orders: deque[tuple[Float[np.ndarray, "robots"], Float[np.ndarray, "robots devices 2"]]] = deque()
         self._clock = np.zeros(robots)
@@ -87,14 +84,19 @@ class DriveMotion:
         self._wanted = np.zeros_like(self._wanted)
         self._ramp = np.maximum(self._acceleration, self._fastest / within_s)
 
-    def reset(self, robots: Sequence[int], position: Float[np.ndarray, "chosen devices 2"]) -> None:
-        """Let some robots begin again at rest at a position, where they first lay in the play; their gains stay."""
+    def reset(
+        self, robots: Sequence[int], position: Float[np.ndarray, "chosen devices 2"], seeds: Sequence[Sequence[int]]
+    ) -> None:
+        """Put other robots, drawn by their seeds, in the place of some, at rest where they are."""
         chosen = np.asarray(robots, dtype=int)
+        for robot, seed in zip(robots, seeds, strict=True):
+            self._random[robot] = np.random.default_rng(seed)
+            self._gain[robot], self._half_play[robot], self._ahead[robot] = self._drawn(self._random[robot])
+        self._top = self._fastest / np.maximum(self._gain, 1.0)
         for due, velocity in self._orders:
             due[chosen], velocity[chosen] = -np.inf, 0.0
         for array in (self._wanted, self.velocity):
             array[chosen] = 0.0
-        self._ahead[chosen] = self._begins[chosen]
         self._ramp[chosen] = self._acceleration
         self.motor[chosen], self.position[chosen] = position, position
 
@@ -107,6 +109,18 @@ class DriveMotion:
             self._move((until - self._clock)[:, None, None])
             self._clock = until
         return self.position - before
+
+    def _drawn(self, random: np.random.Generator) -> tuple[Float[np.ndarray, "devices 2"], ...]:
+        """Draw a robot: its gains, half its plays, and how far the motors are ahead of the devices at the start.
+
+        That is nothing, in the middle of the play, or anywhere in it where encoders at the motors do not see it.
+        """
+        config, devices = self._config, self._devices
+        gain = config.gains(devices, random)
+        apart = random.spawn(1)[0]  # what is drawn from the stream stays the same
+        half_play = config.plays(devices, apart) / 2
+        ahead = apart.uniform(-1.0, 1.0, half_play.shape) * half_play
+        return gain, half_play, ahead * (config.encoders_at == "motor")
 
     def _obey(self) -> None:
         """Take what is due of each robot, and forget what all have taken."""

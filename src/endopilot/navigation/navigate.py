@@ -18,11 +18,12 @@ from endopilot.errors import InputError
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import BelievedTip, Believer, Decision, Led, Observation, Policy
 from endopilot.navigation.record import NavigationRecord, Track
-from endopilot.robot.robot import CYCLE_S, SimulatedRobot, in_grip
+from endopilot.robot.robot import CYCLE_S, SimulatedRobot
 from endopilot.settings import Within, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import Motion
+from endopilot.simulation.robots import in_grip
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM, Navigation, Target, XrayKind
 from endopilot.xray.fluoroscope import FluoroscopeConfig, make_c_arm

@@ -104,6 +104,8 @@ class Simulator(Readout):
         self._devices = counts.pop()
         if self._devices > 1 and actuation == "force":
             raise InputError("actuation: 'force' with catheters; give 'velocity'")
+        if actuation == "force" and any(one.length_mm > 0 for stack in stacks for one in stack.transmissions):
+            raise InputError("actuation: 'force' with a length between drive and ostium; give 'velocity'")
         with gpu_errors(config.processor):
             self._groups = make_groups(
                 anatomies, stacks, motion, config, sharing._groups if sharing else (), reach_mm=reach_mm

@@ -24,6 +24,7 @@ import numpy as np
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
+from endopilot.devices.transmission import Transmission
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.files import json_text, writing
@@ -182,7 +183,9 @@ def _about(trajectory: Trajectory, arrays: Mapping[str, np.ndarray]) -> str:
 
 
 def _stack(described: Mapping[str, Any]) -> Stack:
-    return Stack(Wire(**described["wire"]), tuple(Catheter(**each) for each in described["catheters"]))
+    catheters = tuple(Catheter(**each) for each in described["catheters"])
+    behind = tuple(Transmission(**each) for each in described.get("transmissions", ()))
+    return Stack(Wire(**described["wire"]), catheters, behind)
 
 
 def _vessels(path: Path | str, about: Mapping[str, Any], anatomy: Anatomy | Sequence[Anatomy] | None) -> list[Anatomy]:
