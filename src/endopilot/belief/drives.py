@@ -101,6 +101,7 @@ class Drives:
             self._ahead, moved = through_play(self._ahead, (place - self._encoder) * self._gain, self._gap / 2)
             self._position = self._position + moved
             self._position += _CREEP_SHARE * np.abs(moved) * self._random.standard_normal(moved.shape)
+            self._position[..., 0] = np.maximum(self._position[..., 0], 0.0)  # no drive goes farther back
             self._encoder = place
         self._estimate()
 
@@ -109,6 +110,7 @@ class Drives:
         if self.lose:
             told = np.zeros(self._sent.shape)
             told[: len(velocity)] = velocity
+            told[~np.isfinite(told).all(axis=1)] = 0.0  # a drive stops then
             self._run_out = self._robot.run_out(self._sent)
             self._sent = np.clip(told, -self._fastest, self._fastest)
 
