@@ -49,6 +49,7 @@ cta: $(INSTALLED)
 readme: $(INSTALLED)
 	$(BIN)/python docs/readme.py
 	$(BIN)/python docs/commands.py
+	$(BIN)/python docs/signals.py
 
 # docs/learning.md's figures: two cores and an evening. What is there already is not made again.
 LEARNING := runs/causal

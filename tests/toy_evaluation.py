@@ -19,6 +19,7 @@ from endopilot.types import (
     TipProjection,
     VesselTree,
 )
+from toy_navigation import toy_outputs
 
 SPACING_MM = 0.5
 LENGTH_MM = 40.0
@@ -51,7 +52,7 @@ def make_trajectory(samples: int = 6) -> Trajectory:
     shape = np.zeros((1, samples, 30, 3))
     shape[0, :, :, 2] = -depth[:, None] + 2.0 * nodes
     start = np.array([[[4.0, 0.0]]])
-    flat, of_wire = np.zeros((1, samples)), np.zeros((1, samples, 1))
+    of_wire = np.zeros((1, samples, 1))
     inserted = depth[None, :, None]
     stack, friction = Stack(read_device("workhorse-014")), np.full((1, 1), 0.1)
     return Trajectory(
@@ -59,23 +60,14 @@ def make_trajectory(samples: int = 6) -> Trajectory:
         period_s=0.5,
         start=start,
         command=np.tile([8.0, 0.0], (1, samples, 1, 1)),
-        inserted_length=inserted,
-        rotation=of_wire,
-        tip_position=shape[:, :, :1],
-        tip_direction=np.tile([0.0, 0.0, -1.0], (1, samples, 1, 1)),
         tip=TipProjection(inserted, of_wire, np.zeros((1, samples, 1), dtype=int), of_wire + RADIUS_MM),
-        contact_force_max=flat,
-        contact_force_sum=flat,
-        wall_force=flat,
-        base_force=of_wire,
-        base_torque=of_wire,
-        drive_force=of_wire,
-        drive_torque=of_wire,
-        slip=of_wire,
-        rotation_slip=of_wire,
-        iterations=flat,
-        node_iterations=flat,
-        valid=np.ones((1, samples), dtype=bool),
+        **toy_outputs(
+            (1, samples),
+            1,
+            inserted_length=inserted,
+            tip_position=shape[:, :, :1],
+            tip_direction=np.tile([0.0, 0.0, -1.0], (1, samples, 1, 1)),
+        ),
         reason=np.zeros(1, dtype=int),
         shape=shape,
     )

@@ -13,6 +13,7 @@ from unittest.mock import patch
 
 import numpy as np
 
+from endopilot import _core
 from endopilot.anatomy.io import write_anatomy
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
@@ -76,26 +77,37 @@ def toy_simulate(
         period_s=SAMPLE_PERIOD_S,
         start=initial,
         command=control,
-        inserted_length=inserted,
-        rotation=rotation,
-        tip_position=np.stack([abscissa, offset, still], axis=-1),
-        tip_direction=np.tile([1.0, 0.0, 0.0], (worlds, samples, 1, 1)),
         tip=TipProjection(abscissa=abscissa, offset=offset, branch=branch, radius=still + 1.5),
-        contact_force_max=force[..., 0],
-        contact_force_sum=2 * force[..., 0],
-        wall_force=force[..., 0],
-        base_force=force.copy(),
-        base_torque=0.1 * force,
-        drive_force=force + 0.05,
-        drive_torque=0.1 * force + 0.01,
-        slip=still,
-        rotation_slip=still,
-        iterations=np.ones((worlds, samples)),
-        node_iterations=np.ones((worlds, samples)),
-        valid=np.ones((worlds, samples), dtype=bool),
+        **toy_outputs(
+            (worlds, samples),
+            1,
+            inserted_length=inserted,
+            rotation=rotation,
+            tip_position=np.stack([abscissa, offset, still], axis=-1),
+            tip_direction=np.tile([1.0, 0.0, 0.0], (worlds, samples, 1, 1)),
+            contact_force_max=force[..., 0],
+            contact_force_sum=2 * force[..., 0],
+            wall_force=force[..., 0],
+            base_force=force.copy(),
+            base_torque=0.1 * force,
+            drive_force=force + 0.05,
+            drive_torque=0.1 * force + 0.01,
+            iterations=np.ones((worlds, samples)),
+            node_iterations=np.ones((worlds, samples)),
+        ),
         reason=np.zeros(worlds, dtype=int),
         shape=_straight(abscissa[..., 0], offset[..., 0]) if record_shape else None,
     )
+
+
+def toy_outputs(each: tuple[int, ...], devices: int, **known: np.ndarray) -> dict[str, np.ndarray]:
+    """Return all that the core records of worlds: 0, and valid, but for what is known."""
+    outputs = {
+        name: np.zeros((*each, *([devices] if of == "device" else []), *([numbers] if numbers > 1 else [])))
+        for name, of, numbers, *_ in _core.OUTPUTS
+        if of in ("device", "sample")
+    }
+    return outputs | {"valid": np.ones(each, dtype=bool)} | known
 
 
 def _straight(abscissa: np.ndarray, offset: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ import numpy as np
 from tyro.conf import Positional
 
 from endopilot.control.agent import AgentPolicy
+from endopilot.devices.robot import RobotConfig
 from endopilot.ladder.mismatch import CASES, mismatch_of
 from endopilot.navigation.navigate import NavigateConfig, navigate
 from endopilot.settings import Count
@@ -40,8 +41,8 @@ def drive(name: str, place: int, case: str, rule: type[AgentPolicy]) -> list[flo
     """Return the figures of one navigation, as `COLUMNS` names them."""
     task, policy = find_task(name), rule()
     navigation = task.ladder_navigation(place)
-    mismatch = mismatch_of(case, MISMATCH, navigation, task, place)
-    config, began = NavigateConfig(simulator=replace(CORE, threads=1)), time.process_time()
+    mismatch, robot = mismatch_of(case, MISMATCH, navigation, task, place, RobotConfig())
+    config, began = NavigateConfig(robot=robot, simulator=replace(CORE, threads=1)), time.process_time()
     record = navigate(navigation, policy, config=config, seed=100 * task.level + place, truth=mismatch)
     spent = time.process_time() - began
     return [record.success and record.safe, record.exposures, record.seconds, policy.plans, spent]

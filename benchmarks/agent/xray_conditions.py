@@ -17,6 +17,7 @@ from tyro.conf import Positional
 
 from benchmarks.figures import DOCS, fill
 from endopilot.control.agent import AgentPolicy
+from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import navigation_events, navigation_seed
@@ -48,13 +49,15 @@ def measure(path: Path) -> None:
     place, task = int(path.stem), find_task(path.parent.name)
     _, xray, moves, measured = CONDITIONS[path.parent.parent.name]
     navigation, seed = task.ladder_navigation(place), navigation_seed(task, place)
+    change = drawn_sides(MISMATCH, np.random.default_rng([seed, 3]))
     config = NavigateConfig(
+        robot=RobotConfig().delayed(1 + change["latency"]),
         simulator=replace(CORE, threads=1),
         xray=xray,
         motion=motion_named("both", seed) if moves else None,
         measure_motion=measured,
     )
-    truth = mismatch_by(drawn_sides(MISMATCH, np.random.default_rng([seed, 3])), navigation.anatomy)
+    truth = mismatch_by(change, navigation.anatomy)
     navigation = replace(navigation, known_motion=Motion() if moves else None)
     try:
         record = navigate(navigation, AgentPolicy(), config=config, seed=seed, truth=truth)

@@ -183,6 +183,19 @@ Drives make_drives(const Array<2>& limits) {
     return drives;
 }
 
+// A row a device: the length between drive and ostium (mm), the friction torque a length (N mm/mm), and the integrals of 1/GJ (1/(N mm)).
+OwnedTransmission make_transmission(double spacing, const Array<1>& length, const Array<1>& friction, const Array<2>& compliance) {
+    const std::size_t n = length.size();
+    require(n >= 1 && n <= kMostDevices && friction.size() == n && compliance.shape(0) == n, "a transmission needs a row for each of up to three devices");
+    require(spacing > 0 && compliance.shape(1) >= 2, "a transmission needs two points at least");
+    OwnedTransmission made{.points = int(compliance.shape(1)),
+                           .spacing = spacing,
+                           .compliance = std::vector<double>(compliance.data(), compliance.data() + compliance.size())};
+    std::copy_n(length.data(), n, made.length);
+    std::copy_n(friction.data(), n, made.friction);
+    return made;
+}
+
 // `coefficients`: cycles × knots × numbers.
 OwnedMotion make_motion(const Array<1>& ostium, const Array<1>& period, const Array<3>& coefficients) {
     const std::size_t cycles = period.size();
@@ -277,12 +290,12 @@ nb::list options() {
 
 OwnedScene make_scene(Rod rod, std::shared_ptr<LumenMap> lumen, std::shared_ptr<OwnedLoads> loads, const Array<1>& origin,
                       const Array<1>& orientation, const Options& options, const Drives& drives, std::shared_ptr<OwnedTubes> tubes,
-                      std::shared_ptr<OwnedMotion> motion) {
+                      std::shared_ptr<OwnedMotion> motion, std::shared_ptr<OwnedTransmission> transmission) {
     require(origin.size() == 3 && orientation.size() == 4, "the base needs a position and a quaternion");
     require(!loads || int(loads->force.size()) == rod.nodes, "loads need one entry a node of the rod");
     require(drives.count == (tubes ? tubes->tubes : 1), "every device needs the limits of its drive");
     const Base base{.origin = vec3(origin.data()), .orientation = quaternion(orientation.data())};
-    return {std::move(rod), std::move(lumen), std::move(loads), base, options, drives, std::move(tubes), std::move(motion)};
+    return {std::move(rod), std::move(lumen), std::move(loads), base, options, drives, std::move(tubes), std::move(motion), std::move(transmission)};
 }
 
 // Puts worlds at the ostium, ready to be pushed to their first inserted length by the next run. `initial` and `friction` have a row a
@@ -424,6 +437,8 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
     module.def("make_drives", &make_drives, nb::arg("limits"));
     nb::class_<OwnedMotion>(module, "Motion").def("placements", &placements, nb::arg("times"));
     module.def("make_motion", &make_motion, nb::kw_only(), nb::arg("ostium"), nb::arg("period"), nb::arg("coefficients"));
+    nb::class_<OwnedTransmission>(module, "Transmission");
+    module.def("make_transmission", &make_transmission, nb::kw_only(), nb::arg("spacing"), nb::arg("length"), nb::arg("friction"), nb::arg("compliance"));
     nb::class_<Options>(module, "Options")
         .def(nb::init<>())
 #define OPTION(Type, name, unit, meaning) .def_rw(#name, &Options::name, meaning)
@@ -433,12 +448,13 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
     simulation
         .def("__init__", [](Simulations* self, Rod rod, std::shared_ptr<LumenMap> lumen, std::shared_ptr<OwnedLoads> loads, const Array<1>& origin,
                             const Array<1>& orientation, const Options& options, const Drives& drives, std::shared_ptr<OwnedTubes> tubes,
-                            std::shared_ptr<OwnedMotion> motion, int worlds) {
+                            std::shared_ptr<OwnedMotion> motion, std::shared_ptr<OwnedTransmission> transmission, int worlds) {
                  require(worlds >= 1, "a simulation needs at least one world");
-                 new (self) Simulations(make_scene(std::move(rod), lumen, loads, origin, orientation, options, drives, tubes, motion), std::size_t(worlds));
+                 new (self) Simulations(make_scene(std::move(rod), lumen, loads, origin, orientation, options, drives, tubes, motion, transmission), std::size_t(worlds));
              },
              nb::kw_only(), nb::arg("rod"), nb::arg("lumen").none(), nb::arg("loads").none(), nb::arg("origin"), nb::arg("orientation"), nb::arg("options"),
-             nb::arg("drives"), nb::arg("tubes").none() = nb::none(), nb::arg("motion").none() = nb::none(), nb::arg("worlds"))
+             nb::arg("drives"), nb::arg("tubes").none() = nb::none(), nb::arg("motion").none() = nb::none(),
+             nb::arg("transmission").none() = nb::none(), nb::arg("worlds"))
         .def("reset", &reset, nb::kw_only(), nb::arg("index"), nb::arg("initial"), nb::arg("friction"), nb::arg("sample_period"))
         .def("run", &run, nb::kw_only(), nb::arg("control"), nb::arg("force_driven"), nb::arg("time_step"), nb::arg("steps_per_sample"),
              nb::arg("record_shape"), nb::arg("record_attitude"), nb::arg("threads"), nb::arg("lanes"), nb::arg("progress").none())
@@ -454,5 +470,6 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
         simulation.def(name, [which](Simulations& s) { return of_world(s, which); });
 #define NUMBER(name, quantity) simulation.def(#name, [](Simulations& s) { return of_devices(s, World::quantity); });
     ENDOPILOT_DEVICE_NUMBERS(NUMBER)
+    NUMBER(drive_rotation, kDriveRotation)
 #undef NUMBER
 }

@@ -14,10 +14,10 @@ constexpr double kMobilizingLength = 0.02;   // mm of sliding that turn friction
 constexpr double kFaster = 1.25, kLeastFeed = 1.0 / 64;   // of the share of its motion that a drive makes after it was at its limit
 constexpr double kBackdrive = 20, kMostBackdrive = 40;   // mm/s by which a drive at twice its limit gives way faster with each step, and at most
 
-// The energy of the drives' loads, with its gradient, and its Hessian for the first two coordinates.
+// The energy of the drives' loads, with its gradient, and its Hessian for the first two coordinates and of chains.
 template <int T>
 struct DriveLoad {
-    double energy = 0, gradient[2 + T]{}, aa = 0, ar = 0, rr = 0;
+    double energy = 0, gradient[2 + T]{}, aa = 0, ar = 0, rr = 0, chain[T + 1]{};
 };
 
 // Radius of a device where it passes the introducer, mm.
@@ -35,8 +35,9 @@ ENDOPILOT_DEVICE inline double beyond_limit(const Drives& drives, int k, double 
 // Where the devices are at the start of the step and are to be at its end; `weight` extrapolates the last step. The mesh follows the
 // device whose tip is foremost.
 template <class V, int T>
-ENDOPILOT_DEVICE void command_drives(const Inputs& in, Lanes<V, T>& lanes, int l, double weight) {
+ENDOPILOT_DEVICE void command_drives(const Run& run, Lanes<V, T>& lanes, int l, double weight) {
     Lane<T>& lane = lanes.lane[l];
+    const Inputs& in = run.in;
     if (lane.by_force) {   // of a wire alone
         for (int r = 0; r < 2 + T; ++r) {
             Coordinate& free = lane.coordinate(r);
@@ -51,7 +52,7 @@ ENDOPILOT_DEVICE void command_drives(const Inputs& in, Lanes<V, T>& lanes, int l
     const double began = in.seconds(lane.tick), ends = in.seconds(lane.tick + lane.stride);
     const auto reach = [weight](Coordinate& c) {   // where a drive that slips would come to, and no farther than commanded
         const double offset = c.start + weight * c.last - c.commanded;
-        c.offset = c.accepted = c.slipping * offset < 0 ? offset : 0.0;
+        c.offset = c.accepted = c.chained || c.slipping * offset < 0 ? offset : 0.0;
         c.end = c.commanded + c.offset;
     };
     int lead = 0;
@@ -63,6 +64,7 @@ ENDOPILOT_DEVICE void command_drives(const Inputs& in, Lanes<V, T>& lanes, int l
         device.commanded = inserted + device.control[0] * ends;
         device.turn.start = rotation + device.control[1] * began;
         device.turn.commanded = rotation + device.control[1] * ends;
+        device.turn.chained = run.scene.transmission.length[k] > 0;
         reach(device.turn);
         if (k == 0 || device.start > foremost) foremost = device.start;
         if (device.commanded > lane.device[lead].commanded) lead = k;
@@ -82,6 +84,10 @@ ENDOPILOT_DEVICE void command_drives(const Inputs& in, Lanes<V, T>& lanes, int l
         device.end = k == lead ? end : std::min(made, end);
         set(lanes.step.slide[k], l, (device.end - device.start) - (end - foremost));
         if (k > 0) set(lanes.step.mobilized[k - 1], l, lane.device[k - 1].mobilized);
+        if (device.turn.chained)
+            lanes.chain[l][k].begin(run.scene.transmission, k, device.start + run.scene.options.free_behind, device.control[1] * (ends - began),
+                                    run.scene.drives.torque[k], device.turn.start, std::abs(device.commanded - device.start),
+                                    device_radius(run.scene, lane, k));
     }
     lane.friction_share = 0;
 }
@@ -146,6 +152,12 @@ ENDOPILOT_DEVICE DriveLoad<T> drive_load(const Scene& scene, const Lanes<V, T>& 
     }
     for (int k = 0; k <= T; ++k) {
         const Coordinate& turn = lane.device[k].turn;
+        if (turn.chained) {
+            const ChainLoad chain = lanes.chain[l][k].load(turn.end);
+            t.energy += chain.energy;
+            t.gradient[1 + k] = chain.torque;
+            t.chain[k] = chain.stiffness;
+        }
         if (turn.slipping == 0) continue;   // a limit may be infinite
         t.gradient[1 + k] = -(turn.slipping * drives.torque[k]);
         t.energy += t.gradient[1 + k] * turn.offset;
@@ -167,7 +179,7 @@ ENDOPILOT_LARGE bool solve_drives(const Scene& scene, Lanes<V, T>& lanes, int l)
     int side[N];
     for (int r = 0; r < N; ++r) {
         const Coordinate& coordinate = lane.coordinate(r);
-        side[r] = lane.by_force ? kUnbounded : coordinate.slipping;
+        side[r] = lane.by_force || coordinate.chained ? kUnbounded : coordinate.slipping;
         offset[r] = coordinate.offset;
         g[r] = get(drive.gradient[r], l) + load.gradient[r];
         for (int c = 0; c <= r; ++c) h[r][c] = get(drive.h(r, c), l);
@@ -175,6 +187,7 @@ ENDOPILOT_LARGE bool solve_drives(const Scene& scene, Lanes<V, T>& lanes, int l)
     h[0][0] += load.aa;
     h[1][0] += load.ar;
     h[1][1] += load.rr;
+    for (int k = 0; k <= T; ++k) h[1 + k][1 + k] += load.chain[k];
     for (int r = 0; r < N; ++r) {
         h[r][r] += damping;
         for (int c = 0; c < r; ++c) h[c][r] = h[r][c];
@@ -198,7 +211,7 @@ ENDOPILOT_DEVICE bool release_drives(const Drives& drives, Lanes<V, T>& lanes, i
     if (lane.by_force || lane.releases == kMaxReleases) return false;
     bool released = false;
     const auto release = [&released](Coordinate& coordinate, double load, double forwards, double backwards) {
-        if (coordinate.offset != 0 || !(load > forwards || load < -backwards)) return;
+        if (coordinate.chained || coordinate.offset != 0 || !(load > forwards || load < -backwards)) return;
         const int side = load > 0 ? 1 : -1;
         released = released || coordinate.slipping != side;
         coordinate.slipping = side;

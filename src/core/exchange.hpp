@@ -135,6 +135,9 @@ ENDOPILOT_LARGE double load(const Run& run, Lanes<V, T>& lanes, int l) {
         device.torque = from[World::kBaseTorque];
         pushed += device.force;
         if (from[World::kForemost] != 0) lane.foremost = k;
+        Chain& chain = lanes.chain[l][k];
+        chain.drive = from[World::kDriveRotation];
+        for (int i = 0; i < kSections; ++i) chain.node[i] = from[World::kChain + i];
         set(lanes.step.friction[k], l, from[World::kFriction]);
     }
     lane.others_force = pushed - lane.device[lane.foremost].force;
@@ -203,6 +206,9 @@ ENDOPILOT_LARGE void store(const Run& run, const Lanes<V, T>& lanes, int l) {
         to[World::kBackdrive] = device.backdrive;
         to[World::kMobilized] = device.mobilized;
         to[World::kForemost] = k == lane.foremost;
+        const Chain& chain = lanes.chain[l][k];
+        to[World::kDriveRotation] = run.scene.transmission.length[k] > 0 ? chain.drive : device.rotation;
+        for (int i = 0; i < kSections; ++i) to[World::kChain + i] = chain.node[i];
         to[World::kBaseForce] = device.force;
         to[World::kBaseTorque] = device.torque;
     }

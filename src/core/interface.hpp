@@ -11,6 +11,7 @@
 #include "lumen.hpp"
 #include "motion.hpp"
 #include "rod.hpp"
+#include "transmission.hpp"
 #include "tubes.hpp"
 
 namespace endopilot {
@@ -37,8 +38,6 @@ struct Options {
     ENDOPILOT_OPTIONS(OPTION)
 #undef OPTION
 };
-
-constexpr int kMostDevices = 3;   // a wire and two catheters around it
 
 // The devices, from the inside out, and where their drives slip rather than push, pull (N) or turn (N mm) harder.
 struct Drives {
@@ -122,6 +121,7 @@ struct Scene {
     Drives drives;
     Tubes tubes{};
     Motion motion{};
+    Transmission transmission{};
 };
 
 struct OwnedScene {
@@ -133,6 +133,7 @@ struct OwnedScene {
     Drives drives;
     std::shared_ptr<const OwnedTubes> tubes{};   // null for a wire alone; else the rod is the mesh that they share
     std::shared_ptr<const OwnedMotion> motion{};  // null for a vessel that lies still
+    std::shared_ptr<const OwnedTransmission> transmission{};   // null where drives act at the ostium
 };
 
 template <class Place>
@@ -144,7 +145,8 @@ Scene view(const OwnedScene& scene, const Place& place) {
             .options = scene.options,
             .drives = scene.drives,
             .tubes = scene.tubes ? view(*scene.tubes, place) : Tubes{},
-            .motion = scene.motion ? view(*scene.motion, place) : Motion{}};
+            .motion = scene.motion ? view(*scene.motion, place) : Motion{},
+            .transmission = scene.transmission ? view(*scene.transmission, place) : Transmission{}};
 }
 
 constexpr int kTicks = 64;   // of a time step, which may be halved down to one
@@ -169,27 +171,28 @@ enum Reason : std::uint8_t { kFine = 0, kNotFinite = 1, kNotConverged = 2, kThro
 enum class Of { sample, device, node, element, start };
 
 // Every output of a run, once: its type and name, what it has entries of and the numbers of one, its unit, and what it is. The arrays of
-// `Outputs`, their allocation here and on a GPU, and `OUTPUTS` in Python are made of this table. Devices count from the inside out.
-#define ENDOPILOT_OUTPUTS(OUTPUT)                                                                                                 \
-    OUTPUT(double, inserted_length, device, 1, "mm", "how far the device is inserted")                                            \
-    OUTPUT(double, rotation, device, 1, "rad", "by which its drive has turned it")                                                \
-    OUTPUT(double, tip_position, device, 3, "mm", "of its tip, in the vessel as CT shows it")                                     \
-    OUTPUT(double, tip_direction, device, 3, "", "unit vector along it at its tip")                                               \
-    OUTPUT(double, tip_twist, device, 1, "rad", "of its frame at its tip against that of the innermost device there")             \
-    OUTPUT(double, base_force, device, 1, "N", "axial force that holds it where it enters, positive when it pushes")              \
-    OUTPUT(double, base_torque, device, 1, "N mm", "torque that holds it there")                                                  \
-    OUTPUT(double, drive_force, device, 1, "N", "of its drive: that of the base and the introducer's resistance")                 \
-    OUTPUT(double, drive_torque, device, 1, "N mm", "of its drive, likewise")                                                     \
-    OUTPUT(double, slip, device, 1, "mm", "advance that was commanded in the sample and not made")                                \
-    OUTPUT(double, rotation_slip, device, 1, "rad", "rotation that was commanded in the sample and not made")                     \
-    OUTPUT(double, contact_force_max, sample, 1, "N", "largest force of the wall at a node")                                      \
-    OUTPUT(double, contact_force_sum, sample, 1, "N", "sum of the magnitudes of the wall's forces")                               \
-    OUTPUT(double, wall_force, sample, 1, "N", "largest resultant of the wall's forces on any kResultantLength of the wire")      \
-    OUTPUT(double, iterations, sample, 1, "", "Newton's, mean over the steps of the sample")                                      \
-    OUTPUT(double, node_iterations, sample, 1, "", "evaluations of active nodes, those of attempts that were given up too")       \
-    OUTPUT(bool, valid, sample, 1, "", "false from the sample on in which the world failed")                                      \
-    OUTPUT(double, approach_slip, start, 2, "mm, rad", "advance and rotation that the approach did not make")                     \
-    OUTPUT(double, shape, node, 3, "mm", "where the nodes are, if that is recorded")                                              \
+// `Outputs`, their allocation here and on a GPU, and `OUTPUTS` in Python are made of this table; of that, the columns of files and tables
+// (`simulation/signals.py`). Devices count from the inside out. The 2 mm of wall_force are kResultantLength.
+#define ENDOPILOT_OUTPUTS(OUTPUT)                                                                                                   \
+    OUTPUT(double, inserted_length, device, 1, "mm", "Δ, how far the device is inserted")                                           \
+    OUTPUT(double, rotation, device, 1, "rad", "φ, by which it is turned where it enters")                                       \
+    OUTPUT(double, tip_position, device, 3, "mm", "of its tip, LPS, in the vessel as CT shows it")                                  \
+    OUTPUT(double, tip_direction, device, 3, "", "unit vector along the device at its tip")                                         \
+    OUTPUT(double, tip_twist, device, 1, "rad", "of its frame at its tip against that of the innermost device there")               \
+    OUTPUT(double, base_force, device, 1, "N", "axial force that holds it where it enters, positive when it pushes")                \
+    OUTPUT(double, base_torque, device, 1, "N·mm", "torque that holds it there, about its axis")                                    \
+    OUTPUT(double, drive_force, device, 1, "N", "axial force of its drive: base_force and what the introducer's valve takes")       \
+    OUTPUT(double, drive_torque, device, 1, "N·mm", "torque of its drive, likewise")                                                \
+    OUTPUT(double, slip, device, 1, "mm", "advance that was commanded in the period and not made; below 0 where it pulled, or was out")\
+    OUTPUT(double, rotation_slip, device, 1, "rad", "rotation that was commanded in the period and not made")                       \
+    OUTPUT(double, contact_force_max, sample, 1, "N", "largest force of the wall on one node")                                      \
+    OUTPUT(double, contact_force_sum, sample, 1, "N", "sum of the magnitudes of the wall's forces")                                 \
+    OUTPUT(double, wall_force, sample, 1, "N", "largest resultant of the wall's forces on any 2 mm of the line that the devices share")\
+    OUTPUT(double, iterations, sample, 1, "", "Newton's, mean over the time steps of the period")                                   \
+    OUTPUT(double, node_iterations, sample, 1, "", "evaluations of active nodes in the period, those of attempts that were given up too")\
+    OUTPUT(bool, valid, sample, 1, "", "false from the sample on in which the world failed")                                        \
+    OUTPUT(double, approach_slip, start, 2, "mm, rad", "advance and rotation that the approach did not make")                       \
+    OUTPUT(double, shape, node, 3, "mm", "where the nodes are, if that is recorded")                                                \
     OUTPUT(double, attitude, element, 4, "", "of the elements, quaternions w x y z, if they are recorded")
 
 struct Outputs {

@@ -50,12 +50,13 @@ struct Node {
 };
 
 // A coordinate of the drives: how far the foremost device is inserted (mm), or by what a device is turned (rad). It is an unknown of the
-// step where its drive slips at its limit or is driven by force.
+// step where its drive slips at its limit, is driven by force, or acts through a chain.
 struct Coordinate {
     double start = 0, commanded = 0, end = 0;   // at the step's start; for its end; trial
     double offset = 0, accepted = 0, step = 0;  // end - commanded: trial, accepted; Newton step
     double last = 0;                            // last increment
     int slipping = 0;                           // 1: the drive slips where it would move forwards, -1: backwards, 0: it holds
+    bool chained = false;                       // an unknown too, held by the chain between drive and ostium
 };
 
 // A device of a lane and its drive.
@@ -110,7 +111,7 @@ struct Lane {
     // Whether any of them is an unknown.
     ENDOPILOT_DEVICE bool drives_free() const {
         bool free = by_force;
-        for (int r = 0; r < 2 + T; ++r) free = free || coordinate(r).slipping != 0;
+        for (int r = 0; r < 2 + T; ++r) free = free || coordinate(r).slipping != 0 || coordinate(r).chained;
         return free;
     }
 };
@@ -183,6 +184,7 @@ struct Lanes {
     Node<V, T>* node;
     Factor<V, T>* factor;
     Lane<T> lane[W]{};
+    Chain chain[W][T + 1]{};          // of devices between drive and ostium
     TimeStep<V, T> step{};
     HessianTerms<V> terms{};
     Mask<V> accepted{};               // lanes whose last trial was accepted

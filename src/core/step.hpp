@@ -59,7 +59,7 @@ ENDOPILOT_LARGE void begin_step(const Run& run, Lanes<V, T>& lanes, int l, doubl
     const bool moves = run.scene.motion.cycles > 0;
     const int before = lane.active;
     if (moves) carry(run, lanes, l);
-    command_drives(run.in, lanes, l, weight);
+    command_drives(run, lanes, l, weight);
     lane.active = Base::count_active(rod, lane.advance.start, options.free_behind);
     for (int i = std::min(before, lane.active); i <= std::max(before, lane.active); ++i)
         if (i >= before || i >= lane.active) place(rod, lanes, l, i);
@@ -186,9 +186,11 @@ ENDOPILOT_DEVICE void end_sample(const Run& run, Lanes<V, T>& lanes, int l, Queu
             if (lane.sample == -1) device.inserted = device.depth;  // exactly
         }
         const double radius = device_radius(run.scene, lane, k);
-        const DriveLoad<T> valve = introducer(run.scene.options, lanes, l, device.end - device.start, device.turn.last, radius);
+        const Chain& chain = lanes.chain[l][k];
+        const bool chained = device.turn.chained;
+        const DriveLoad<T> valve = introducer(run.scene.options, lanes, l, device.end - device.start, chained ? chain.turned : device.turn.last, radius);
         to[World::kDriveForce] = lane.by_force ? device.control[0] : device.force + valve.gradient[0];
-        to[World::kDriveTorque] = lane.by_force ? device.control[1] : device.torque + valve.gradient[1];
+        to[World::kDriveTorque] = lane.by_force ? device.control[1] : (chained ? chain.torque : device.torque) + valve.gradient[1];
         to[World::kSlip] = device.slipped + device.refused;
         to[World::kRotationSlip] = device.rotation_slipped;
     }
@@ -241,6 +243,8 @@ ENDOPILOT_DEVICE int end_steps(const Run& run, Lanes<V, T>& lanes, const Next (&
             lane.tick += lane.stride;
             ++lane.steps;
             settle_drives(lanes, l);
+            for (int k = 0; k <= T; ++k)
+                if (lane.device[k].turn.chained) lanes.chain[l][k].end(lane.device[k].turn.end);
             for (int r = 0; r < 2 + T; ++r) lane.coordinate(r).start = lane.coordinate(r).end;
             ended[l] = lane.tick == kTicks * run.in.steps_per_sample;
             if (lane.stride < kTicks && lane.tick % (2 * lane.stride) == 0) lane.stride *= 2;

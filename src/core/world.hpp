@@ -37,7 +37,9 @@ struct World {
         kMobilized,                    // friction along the device around it, as a share of its most
         kBackdrive,                    // mm/s by which a drive beyond its limit gives way
         kForemost,                     // 1: its tip is
-        kDeviceSize
+        kDriveRotation,                // rad; ahead of kRotation by the twist between drive and ostium
+        kChain,                        // rotations of the nodes between them, rad
+        kDeviceSize = kChain + kSections
     };
     // of a node: last increments of position and rotation; the contact points at the node and at the middle of the element behind it
     static constexpr int kX = 0, kQ = 3, kLast = 7, kLastTurn = 10, kAtNode = 13, kAtMiddle = 24, kNodeSize = 35;
@@ -189,6 +191,8 @@ inline void start_world(const Scene& scene, const World& w, const double* initia
         device[World::kRotation] = initial[2 * k + 1];
         device[World::kFriction] = friction[k];
         device[World::kFeed] = 1.0;
+        device[World::kDriveRotation] = initial[2 * k + 1];
+        for (int i = 0; i < kSections; ++i) device[World::kChain + i] = initial[2 * k + 1];
     }
     const Base base = scene.motion.cycles > 0 ? scene.base.moved(placement(scene.motion, w[World::kTime])) : scene.base;
     for (int i = 0; i < w.active(); ++i) {

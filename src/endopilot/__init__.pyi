@@ -36,7 +36,11 @@ from .devices.device import Wire as Wire
 from .devices.device import read_device as read_device
 from .devices.device_files import device_yaml as device_yaml
 from .devices.device_files import list_devices as list_devices
+from .devices.robot import DriveConfig as DriveConfig
+from .devices.robot import RobotConfig as RobotConfig
+from .devices.robot import read_robot as read_robot
 from .devices.stack import Stack as Stack
+from .devices.transmission import Transmission as Transmission
 from .env.single import NavigateEnv as NavigateEnv
 from .env.vector import NavigateVectorEnv as NavigateVectorEnv
 from .env.vector import NavigationState as NavigationState
@@ -75,7 +79,6 @@ from .phantom.phantom import PhantomConfig as PhantomConfig
 from .phantom.phantom import make_phantom as make_phantom
 from .pipeline.navigation import navigate_into as navigate_into
 from .progress import Advance as Advance
-from .robot.robot import RobotConfig as RobotConfig
 from .simulation.config import SimulatorConfig as SimulatorConfig
 from .simulation.controls import ControlConfig as ControlConfig
 from .simulation.mismatch import ModelMismatch as ModelMismatch

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 
 from endopilot.cli import main
+from endopilot.simulation.trajectory_file import read_trajectory
 
 
 @pytest.mark.parametrize(("option", "deepest_mm"), [((), 35.0), (("--no-stop-short",), 39.0)])
@@ -22,3 +24,17 @@ def test_random_navigations_stop_short_of_ends_unless_asked_otherwise(vessel, tm
         assert figures["worlds_stopped_short"] > 0 and figures["deepest_tip_mm"] <= deepest_mm + 0.5
     else:
         assert "worlds_stopped_short" not in figures and figures["deepest_tip_mm"] >= deepest_mm
+
+
+def test_a_random_navigation_is_simulated_once_with_its_shapes(vessel, tmp_path, capsys, monkeypatch):
+    def refuse(*given, **named):
+        raise AssertionError("simulated a second time")
+
+    monkeypatch.setattr("endopilot.cli.simulate.simulate", refuse)
+    options = ("--sequences", "1", "--seconds", "5", "--seed", "1", "--shape", "--json")
+    with pytest.raises(SystemExit) as leaving:
+        main(["simulate", str(vessel), "-o", str(tmp_path / "run.npz"), *options])
+    assert leaving.value.code == 0 and json.loads(capsys.readouterr().out)["worlds_stopped_short"] >= 0
+    made = read_trajectory(tmp_path / "run.npz")
+    assert made.shape is not None
+    np.testing.assert_array_equal(made.shape[:, :, 0], made.tip_position[:, :, 0])

@@ -22,7 +22,6 @@ from endopilot.control.wire_search import WireSearch
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.navigation.navigate import NavigationLoop, navigate, start_world
 from endopilot.navigation.policy import Decision, Hand, Observation, Policy
-from endopilot.robot.robot import DriveMotion, RobotConfig
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import motion_named
 from endopilot.tasks.navigation import Navigation, Target
@@ -261,7 +260,7 @@ def test_whatever_the_model_returns_a_drive_takes_what_is_finite_and_within_limi
     started._search.find, started._course, started._failed = find, None, 0
     for k in range(len(control)):
         (velocity,) = started.decide(Observation(0.5 * k, ((2.0, 0.0),), None)).devices
-        taken = DriveMotion(DriveLimits.of(shaped), RobotConfig(), (2.0, 0.0)).command(*velocity)
+        taken = DriveLimits.of(shaped).safe(*velocity)
         assert np.isfinite(taken).all()
         assert (np.abs(taken) <= [shaped.max_velocity_mm_s, shaped.max_rotation_rad_s]).all()
 

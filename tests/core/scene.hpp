@@ -79,7 +79,17 @@ inline OwnedTubes make_tubes(int devices) {
     return tubes;
 }
 
-inline OwnedScene make_scene(int devices, bool with_loads, bool moving = false) {
+// A hundred millimetres of each device between drive and ostium.
+inline OwnedTransmission make_transmission(int devices) {
+    OwnedTransmission made{.points = 3, .spacing = 80.0};
+    for (int k = 0; k < devices; ++k) {
+        made.length[k] = 100.0, made.friction[k] = 1e-3;
+        for (int i = 0; i < made.points; ++i) made.compliance.push_back(made.spacing * i / (3.0 + 2 * k));
+    }
+    return made;
+}
+
+inline OwnedScene make_scene(int devices, bool with_loads, bool moving = false, bool chained = false) {
     const double half = std::sqrt(0.5);
     OwnedScene scene{.rod = make_rod(40),
                      .lumen = std::make_shared<LumenMap>(make_lumen()),
@@ -90,7 +100,8 @@ inline OwnedScene make_scene(int devices, bool with_loads, bool moving = false) 
                                  .approach_velocity = 20.0, .introducer_friction = 0.05, .introducer_drag = 0.002},
                      .drives = {.count = devices},
                      .tubes = devices > 1 ? std::make_shared<OwnedTubes>(make_tubes(devices)) : nullptr,
-                     .motion = moving ? std::make_shared<OwnedMotion>(make_motion()) : nullptr};
+                     .motion = moving ? std::make_shared<OwnedMotion>(make_motion()) : nullptr,
+                     .transmission = chained ? std::make_shared<OwnedTransmission>(make_transmission(devices)) : nullptr};
     for (int k = 0; k < devices; ++k) scene.drives.push[k] = scene.drives.pull[k] = 0.05, scene.drives.torque[k] = 0.5;
     return scene;
 }

@@ -61,8 +61,8 @@ bool same(const std::vector<double>& a, const std::vector<double>& b) {
 }
 
 template <int T>
-void test_kernel(bool by_force, bool with_loads, bool moving = false) {
-    const OwnedScene owned = make_scene(1 + T, with_loads, moving);
+void test_kernel(bool by_force, bool with_loads, bool moving = false, bool chained = false) {
+    const OwnedScene owned = make_scene(1 + T, with_loads, moving, chained);
     const Scene scene = view(owned, InPlace{});
     std::mt19937 random(4);
     std::uniform_real_distribution<double> any(-1.0, 1.0);
@@ -130,6 +130,8 @@ int main() {
     test_kernel<0>(false, false, true);
     test_kernel<1>(false, false);
     test_kernel<2>(false, false, true);
+    test_kernel<0>(false, false, false, true);
+    test_kernel<1>(false, false, false, true);
     for (int devices = 1; devices <= kMostDevices; ++devices) test_longest(devices, kMostNodes[devices - 1]);
     std::printf(failures == 0 ? "all core tests passed\n" : "%d core checks failed\n", failures);
     return failures == 0 ? EXIT_SUCCESS : EXIT_FAILURE;

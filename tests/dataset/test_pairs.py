@@ -28,6 +28,7 @@ from endopilot.errors import InputError
 from endopilot.files import read_json
 from endopilot.models.episodes import Episodes
 from endopilot.models.provenance import check_wire
+from endopilot.simulation.signals import Outputs
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.trajectory import Trajectory
 
@@ -36,9 +37,7 @@ WEAK = replace(CATHETER, push_limit_n=0.03, pull_limit_n=0.021)
 CONFIG = DatasetConfig(sequences=3, seconds=10.0, seed=7)
 OF_EPISODES = ("folder", "manifest", "sample_period_s", "anatomy", "sequence", "split", "device", "friction")
 OF_EPISODES += ("tip_bend", "tip_stiffness_factor", "initial")
-OF_TRAJECTORY = ("command", "control", "inserted_length", "rotation", "tip_position", "tip_direction")
-OF_TRAJECTORY += ("base_force", "base_torque", "drive_force", "drive_torque", "slip", "rotation_slip")
-OF_TRAJECTORY += ("contact_force_max", "contact_force_sum", "valid")
+OF_TRAJECTORY = ("command", "control", *(each.name for each in fields(Outputs)))
 OF_TIP = {"tip_abscissa": "abscissa", "tip_offset": "offset", "branch": "branch", "lumen_radius": "radius"}
 EXACT = {"command": np.float64, "slip": np.float64, "rotation_slip": np.float64, "valid": np.bool_}
 
@@ -74,13 +73,21 @@ def test_the_commands_of_both_devices_repeat_an_episode_to_the_bit(pairs, patien
 def test_every_number_of_every_device_is_read_back(patient, tmp_path):
     drawn = draw_navigations(CONFIG, WIRE, read_anatomy(patient), range(1), devices=2)
     initial, stack = drawn.initial + np.array([[0.1, 0.2], [0.3, 0.4]]), Stack(WIRE, (WEAK,))
-    made = simulate(read_anatomy(patient), stack, drawn.control, initial=initial, config=CONFIG.simulator)
+    made = simulate(
+        read_anatomy(patient),
+        stack,
+        drawn.control,
+        initial=initial,
+        friction=np.array([[0.12, 1.2 * WEAK.friction]]),  # of wire and catheter, in reality
+        config=CONFIG.simulator,
+    )
     assert (made.command != made.command.astype(np.float32)).any() and (made.slip != 0).any()
-    told = {"task": "navigate", "seed": 7, "origin": {}, "friction": WIRE.friction, "tip_stiffness_factor": 1.0}
+    told = {"task": "navigate", "seed": 7, "origin": {}, "tip_stiffness_factor": 1.0}
     write_episode(made, patient, tmp_path / "episode", stack, **told)
     data = load_dataset(tmp_path / "episode")
     _assert_same(data, made)
     np.testing.assert_array_equal(data.initial, initial)
+    np.testing.assert_array_equal(data.friction, made.set_up.friction)
     kept = {field.name for field in fields(data)} - set(OF_EPISODES)
     assert kept == {*OF_TRAJECTORY, *OF_TIP}
     ((_, again),) = simulate_again(data, read_anatomy(patient), data.command)

@@ -172,7 +172,7 @@ def test_an_episode_names_the_motion_of_its_vessel_and_is_replayed_in_it(tmp_pat
     options = {"initial": drawn.initial, "config": simulator, "motion": motion}
     trajectory = simulate(read_anatomy(patient), DEVICE, drawn.control, **options)
     assert (drawn.control != drawn.control.astype(np.float32)).any()
-    told = {"task": "navigate", "seed": 7, "origin": {}, "friction": DEVICE.friction, "tip_stiffness_factor": 1.0}
+    told = {"task": "navigate", "seed": 7, "origin": {}, "tip_stiffness_factor": 1.0}
     write_episode(trajectory, patient, tmp_path / "episode", Stack(DEVICE), **told)
     data = load_dataset(tmp_path / "episode")
     assert data.motion(str(data.anatomy[0])) == motion

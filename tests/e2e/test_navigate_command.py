@@ -24,7 +24,7 @@ from endopilot.simulation.trajectory_file import read_trajectory
 
 SHORT = ("--tip", "own", "--seconds", "20")
 FILES = ["episode", "manifest.json", "navigation.csv", "navigation.html", "navigation.png", "run.json",
-         "trajectory.npz", "wire.yaml"]  # fmt: skip
+         "trajectory.npz"]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +41,8 @@ def patient(tmp_path_factory):
 def driven(patient, tmp_path_factory):
     """Return the folder of a navigation under model mismatch, and its figures."""
     folder = tmp_path_factory.mktemp("driven") / "navigation"
+    robot = folder.with_name("robot.yaml")
+    robot.write_text("latency_s: 0.1\njitter_s: 0.02\n", encoding="utf-8")
     config = NavigatePatientConfig(
         tip="own",
         seconds=20.0,
@@ -48,7 +50,7 @@ def driven(patient, tmp_path_factory):
         true_friction=1.2,
         true_tip_stiffness=0.8,
         true_ostium_mm=0.4,
-        true_latency_s=0.1,
+        robot=str(robot),
     )
     return folder, navigation.navigate_into(patient, "2", folder, config)
 
@@ -68,8 +70,9 @@ def test_the_folder_tells_what_happened(driven, patient):
     # every exposure but the first was asked for a decision before, with a reason; the last decision's comes too late
     asked = (table["asks_for_xray"].fillna("") != "").to_numpy()
     np.testing.assert_array_equal(asked[1:-2], (table["xray"] == 1).to_numpy()[2:-1])
-    truth = {"friction_factor": 1.2, "stiffness_factor": 0.8, "ostium_mm": 0.4, "latency_factor": 2.0}
+    truth = {"friction_factor": 1.2, "stiffness_factor": 0.8, "ostium_mm": 0.4}
     assert record["truth"] == truth | {"axis_deg": 0.0, "axis_side_deg": 0.0}
+    assert record["robot"]["latency_s"] == 0.1 and record["robot"]["encoders_at"] == "wire"
     assert record["anatomy"]["identity"] == read_anatomy(patient).identity
     # it starts deeper than the encoder says
     assert table["inserted_length_mm"].iloc[0] == pytest.approx(2.4, abs=1e-6)
@@ -152,16 +155,17 @@ def test_a_catheter_follows_its_wire_and_both_are_written(patient, capsys, tmp_p
     command = ("navigate", patient, "--target", "1", "--policy", "in-turn", "--arrives", "catheter", *SHORT)
     figures = run(capsys, *command, "--true-friction", "1.1", "--catheter", "microcatheter-1.7f", "-o", folder)
     assert figures["reached"]
-    assert sorted(path.name for path in folder.iterdir()) == sorted({*FILES, "catheter-1.yaml"})
+    assert sorted(path.name for path in folder.iterdir()) == FILES
     table = pd.read_csv(folder / "navigation.csv")
     assert table["catheter_1_inserted_length_mm"].iloc[-1] > 0.8 * figures["target_mm"]
     assert abs(table["catheter_1_tip_abscissa_mm"].iloc[-1] - figures["target_mm"]) <= 2.0
-    given, true = read_catheter("microcatheter-1.7f"), read_catheter(folder / "catheter-1.yaml")
-    episode = load_dataset(folder / "episode")
+    given, episode = read_catheter("microcatheter-1.7f"), load_dataset(folder / "episode")
     lengths = episode.inserted_length[0, : len(table) - 1, 1]
     np.testing.assert_allclose(lengths, table["catheter_1_inserted_length_mm"][1:], atol=1e-4)
-    assert true.friction == 1.1 * given.friction
-    assert true == replace(given, friction=true.friction)
+    true = read_trajectory(folder / "trajectory.npz").set_up
+    assert true.stacks[0].catheters == (replace(given, friction=1.1 * given.friction),)
+    np.testing.assert_array_equal(episode.friction, true.friction)
+    assert true.friction[0].tolist() == [1.1 * true.stacks[0].wire.friction, 1.1 * given.friction]
     assert episode.stack.catheters == (given,) and episode.initial[0, 1].tolist() == [0.0, 0.0]
     again = run(capsys, "simulate", patient, "--controls", folder / "trajectory.npz", "-o", tmp_path / "again.csv")
     assert again["valid_worlds"] == 1
@@ -249,7 +253,7 @@ def test_a_finished_folder_is_left_alone_and_another_run_is_refused(driven, pati
     folder, figures = driven
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     same = ("--seed", "3", "--true-friction", "1.2", "--true-tip-stiffness", "0.8", "--true-ostium-mm", "0.4")
-    same += ("--true-latency-s", "0.1")
+    same += ("--robot", folder.with_name("robot.yaml"))
     assert run(capsys, "navigate", patient, "--target", "2", "-o", folder, *SHORT, *same) == figures
     line = refused(capsys, "navigate", patient, "--target", "3", "-o", folder, *SHORT, *same)
     assert "was begun with target = 2, now it is 3" in line
@@ -317,14 +321,18 @@ def test_what_does_not_arrive_says_why(vessel, fork, capsys, tmp_path):
 
 
 def test_mismatch_is_drawn_with_the_seed(patient):
+    def set_up(**changed):
+        return set_up_navigation(patient, "1", NavigatePatientConfig(tip="own", mismatch=0.2, **changed))
+
     def truth(**changed):
-        return set_up_navigation(patient, "1", NavigatePatientConfig(tip="own", mismatch=0.2, **changed)).truth
+        return set_up(**changed).truth
 
     drawn = [truth(seed=seed) for seed in range(6)]
+    assert {round(set_up(seed=seed).robot.latency_s, 9) for seed in range(6)} == {0.04, 0.06}
     assert drawn[0] == truth(seed=0) and len({str(each) for each in drawn}) > 2
     diameter = 2 * float(read_anatomy(patient).tree.branches[0].centerline.radius[0])
     for each in drawn:
-        assert {round(abs(each.friction_factor - 1), 9), round(abs(each.latency_factor - 1), 9)} == {0.2}
+        assert round(abs(each.friction_factor - 1), 9) == 0.2
         assert abs(each.ostium_mm) == pytest.approx(0.2 * diameter)
     assert truth(seed=0, true_friction=1.1).friction_factor == 1.1
     assert truth(seed=0, true_friction=1.1).ostium_mm == drawn[0].ostium_mm

@@ -7,6 +7,7 @@ import json
 import pytest
 
 from endopilot import runs
+from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
 from endopilot.ladder import mismatch as mismatches
 from endopilot.ladder.ladder import LadderConfig
@@ -29,18 +30,23 @@ def test_one_quantity_differs_at_a_time_then_all():
     task = find_task("straight")
     navigation = task.ladder_navigation(0)
     assert len(CASES) == 10
-    matched = vars(mismatch_of("matched", 0.2, navigation, task, 0))
-    factors = {"friction_factor": 1.0, "stiffness_factor": 1.0, "latency_factor": 1.0}
+
+    def reality(case, share=0.2, place=0):
+        mismatch, robot = mismatch_of(case, share, navigation, task, place, RobotConfig(latency_s=0.1))
+        return vars(mismatch) | {"latency_s": robot.latency_s}
+
+    matched = reality("matched")
+    factors = {"friction_factor": 1.0, "stiffness_factor": 1.0, "latency_s": 0.1}
     assert matched == factors | {"ostium_mm": 0.0, "axis_deg": 0.0, "axis_side_deg": 0.0}
     for case in CASES[1:-1]:
-        now = vars(mismatch_of(case, 0.2, navigation, task, 0))
+        now = reality(case)
         assert sum(now[name] != matched[name] for name in matched) == 1
     wide = 2 * navigation.anatomy.tree.branches[0].centerline.radius[0]
-    assert mismatch_of("ostium-less", 0.2, navigation, task, 0).ostium_mm == pytest.approx(-0.2 * wide)
-    assert mismatch_of("stiffness-more", 0.2, navigation, task, 0).stiffness_factor == 1.2
-    every = [vars(mismatch_of("all", 0.1, navigation, task, place)) for place in range(6)]
+    assert reality("ostium-less")["ostium_mm"] == pytest.approx(-0.2 * wide)
+    assert reality("stiffness-more")["stiffness_factor"] == 1.2
+    every = [reality("all", 0.1, place) for place in range(6)]
     assert {round(abs(one["friction_factor"] - 1), 9) for one in every} == {0.1}
-    assert {one["latency_factor"] for one in every} == {0.9, 1.1}
+    assert {round(one["latency_s"], 9) for one in every} == {0.09, 0.11}
 
 
 def test_a_row_a_case_and_a_deeper_wire_arrives_sooner(measured):

@@ -66,7 +66,7 @@ def everyone(dataset) -> Episodes:
 @pytest.fixture(scope="module")
 def brief(everyone) -> Episodes:
     """Return them cut off after 22.5 s, where what counts is that nothing later is read."""
-    signals = ("control", "slip", "proximal", "tip", "branch", "tip_sd")
+    signals = ("control", "command", "proximal", "tip", "branch", "tip_sd")
     return replace(everyone, **{name: getattr(everyone, name)[:, :45] for name in signals})
 
 

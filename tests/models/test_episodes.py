@@ -52,7 +52,7 @@ def test_episodes_from_a_sample_on_begin_at_the_state_before_it(dataset):
     episodes = Episodes.of_dataset(dataset)
     later = episodes.from_sample(40)
     np.testing.assert_array_equal(later.initial, episodes.proximal[:, 39])
-    for name in ("control", "slip", "proximal", "tip", "branch", "tip_sd"):
+    for name in ("control", "command", "proximal", "tip", "branch", "tip_sd"):
         np.testing.assert_array_equal(getattr(later, name), getattr(episodes, name)[:, 40:])
     assert episodes.from_sample(0) is episodes
 

@@ -91,7 +91,7 @@ def test_a_wire_that_is_held_while_it_is_pulled_starts_where_it_lies(folder, epi
             starts.append(self.set_up.initial[:, 0, 0])
 
     monkeypatch.setattr(twin_module, "Ensemble", Kept)
-    held = replace(episodes, slip=episodes.slip - np.array([5.0, 0.0], dtype=episodes.slip.dtype))
+    held = replace(episodes, command=episodes.command - np.array([10.0, 0.0]))
     twin = load_model(folder / "run")
     twin.predict(held.select(np.array([0])), GIVEN)
     assert np.abs(np.concatenate(starts) - held.initial[0, 0]).max() <= twin.config.ostium_spread_mm + 1e-6

@@ -8,24 +8,18 @@ import numpy as np
 import pytest
 
 from endopilot.control.navigate_patient import NavigatePatientConfig, set_up_navigation
+from endopilot.devices.robot import read_robot
 from endopilot.errors import InputError
 from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, navigate
 from endopilot.navigation.policy import Decision, Hand, Observation, Policy
-from endopilot.robot.robot import CYCLE_S, RobotConfig
+from endopilot.robot.robot import CYCLE_S
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import Motion, motion_named
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.xray.fluoroscope import FluoroscopeConfig
 
-PERFECT = RobotConfig(
-    latency_s=0.0,
-    max_acceleration_mm_s2=1e9,
-    max_acceleration_rad_s2=1e9,
-    backlash_mm=0.0,
-    backlash_rad=0.0,
-    encoder_sd_mm=0.0,
-    encoder_sd_rad=0.0,
-)
+IDEAL = read_robot("ideal")
+PERFECT = replace(IDEAL, wire=replace(IDEAL.wire, max_acceleration_mm_s2=1e9, max_acceleration_rad_s2=1e9))
 
 
 class Forward:

@@ -9,12 +9,13 @@ import pytest
 
 from endopilot.devices.catheter import Catheter, read_catheter
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.errors import InputError
 from endopilot.ladder.attempt import Recording, Repeated, attempt, repeat
 from endopilot.navigation.baseline_policies import BEHIND_MM, LEAD_MM, CatheterAlone, InTurn
 from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, navigate, start_world
 from endopilot.navigation.policy import Decision, Hand, Observation
-from endopilot.robot.robot import RobotConfig, SimulatedRobot
+from endopilot.robot.robot import SimulatedRobot
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.tasks.navigation import Navigation, Target
@@ -43,7 +44,8 @@ def over_the_wire(fork, wire, catheter) -> Navigation:
 def test_wire_and_catheter_are_driven_by_drives_of_their_own(over_the_wire) -> None:
     simulator = start_world(over_the_wire, ModelMismatch(), COARSE.simulator)
     limits = [DriveLimits.of(device, over_the_wire.anatomy) for device in over_the_wire.devices]
-    noiseless = RobotConfig(encoder_sd_mm=0.0, encoder_sd_rad=0.0, backlash_mm=0.0, backlash_rad=0.0)
+    drive = DriveConfig(encoder_sd_mm=0.0, encoder_sd_rad=0.0, play_mm=0.0, play_rad=0.0)
+    noiseless = RobotConfig(wire=drive, catheters=(drive,))
     robot = SimulatedRobot(simulator, limits, noiseless)
     robot.command(((4.0, 0.0), (2.0, 0.5)))
     robot.run(2.0)

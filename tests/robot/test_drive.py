@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as some
 
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.robot.drive import Drive
 from endopilot.robot.drive_protocol import LONGEST_LINE, SILENCE_S, number
-from endopilot.robot.robot import RobotConfig
 
 LIMITS = DriveLimits(max_velocity_mm_s=40.0, max_rotation_rad_s=12.0, travel_mm=(0.0, 100.0))
-QUIET = RobotConfig(latency_s=0.0, encoder_sd_mm=0.0, encoder_sd_rad=0.0)
+QUIET = RobotConfig(latency_s=0.0, wire=DriveConfig(encoder_sd_mm=0.0, encoder_sd_rad=0.0))
 
 
 class State(NamedTuple):
@@ -24,6 +24,8 @@ class State(NamedTuple):
     clock: str
     inserted: str
     rotation: str
+    force: str
+    torque: str
     status: str
     ticket: str
 
@@ -76,7 +78,7 @@ def rest(drive: Drive, now: float) -> float:
 
 def test_it_moves_as_commanded_while_commands_come() -> None:
     drive, client = moving()
-    assert drive.greeting == "endopilot-drive 2 40.0 12.0 0.0 100.0\n"
+    assert drive.greeting == "endopilot-drive 3 40.0 12.0 0.0 100.0\n"
     state = client.say("STATE", now=1.0)
     assert float(state.clock) == 1.0 and state.status == "armed"
     assert float(state.inserted) == pytest.approx(drive.position[0], abs=1e-4)

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from test_drive_process import CLIENT, HOST, running
 
+from endopilot.devices.robot import RobotConfig
 from endopilot.robot.drive import LASTS_S
 from endopilot.robot.drive_protocol import BRAKING_S, LONGEST_LINE, tls_context
 from endopilot.robot.remote import RemoteRobot
-from endopilot.robot.robot import RobotConfig
 
 SPEED = 20.0
 """Of the wire when the attack begins, mm/s."""
-NOISE_MM = 6 * RobotConfig().encoder_sd_mm * 2**0.5
+NOISE_MM = 6 * RobotConfig().wire.encoder_sd_mm * 2**0.5
 MOST_MM = SPEED * (LASTS_S + BRAKING_S / 2) + NOISE_MM
 """Way at full speed until the watchdog stops the drive, and, from the highest speed, the way of the braking."""
 
@@ -46,7 +46,7 @@ class Attacker:
     def ask(self, line: str) -> str:
         """Send a line, and return the status that the answer gives."""
         self.socket.sendall(f"{line}\n".encode())
-        _, clock, place, _, status, self.ticket = self.lines.readline().decode().split()
+        _, clock, place, *_, status, self.ticket = self.lines.readline().decode().split()
         self.clock, self.place = float(clock), float(place)
         return status
 

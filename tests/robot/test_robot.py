@@ -1,4 +1,4 @@
-"""The drive's motion and the robot in the simulator: limits hold whatever is asked, and every imperfection is there."""
+"""The robot in the simulator: limits hold whatever is asked, encoders see what lies before them, loads are measured."""
 
 from __future__ import annotations
 
@@ -7,18 +7,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as some
 
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.robot import RobotConfig, read_robot
 from endopilot.errors import InputError
+from endopilot.navigation.navigate import start_world
 from endopilot.robot.remote import RemoteRobot
-from endopilot.robot.robot import CYCLE_S, DriveMotion, Robot, RobotConfig, SimulatedRobot
+from endopilot.robot.robot import CYCLE_S, Robot, SimulatedRobot
 from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.simulator import Simulator
+from endopilot.tasks.navigation import Navigation, Target
 
 LIMITS = DriveLimits(max_velocity_mm_s=40.0, max_rotation_rad_s=12.0, travel_mm=(0.0, 100.0))
-IDEAL = {"latency_s": 0.0, "backlash_mm": 0.0, "backlash_rad": 0.0, "encoder_sd_mm": 0.0, "encoder_sd_rad": 0.0}
+IDEAL = read_robot("ideal")
 ANYTHING = some.one_of(
     some.floats(), some.integers(), some.none(), some.text(max_size=3), some.booleans(), some.just(np.float32("nan"))
 )
@@ -47,49 +51,10 @@ def test_what_is_sent_to_a_drive_is_finite_and_within_its_limits(orders) -> None
     assert np.isfinite(numbers).all() and (np.abs(numbers) <= [40.0, 12.0]).all()
 
 
-@settings(deadline=None, max_examples=30)
-@given(some.lists(some.tuples(some.floats(), some.floats(), some.floats(0.0, 0.4)), max_size=8))
-def test_the_motor_keeps_speed_acceleration_and_travel(orders) -> None:
-    config = RobotConfig()
-    drive = DriveMotion(LIMITS, config, (50.0, 0.0))
-    for translation, rotation, wait in orders:
-        drive.command(translation, rotation)
-        for _ in range(int(wait / 0.01)):
-            speed, place = drive.velocity, drive.position
-            moved = drive.advance(0.01)
-            assert (np.abs(drive.velocity) <= [40.0, 12.0]).all()
-            most = 0.01 * np.array([config.max_acceleration_mm_s2, config.max_acceleration_rad_s2])
-            assert (np.abs(drive.velocity - speed) <= most + 1e-9).all()
-            assert 0.0 <= drive.position[0] <= 100.0
-            np.testing.assert_allclose(drive.position - place, moved)
-
-
-def test_a_command_acts_after_the_latency_and_the_ramp() -> None:
-    drive = DriveMotion(LIMITS, RobotConfig(**IDEAL | {"latency_s": 0.1, "max_acceleration_mm_s2": 100.0}), (10.0, 0.0))
-    drive.command(20.0, 0.0)
-    assert not drive.advance(0.1).any()
-    # v²/2a on the ramp of v/a = 0.2 s, then v·t
-    assert drive.advance(0.2)[0] == pytest.approx(2.0)
-    assert drive.advance(0.3)[0] == pytest.approx(6.0)
-    drive.command(0.0, 0.0)
-    drive.stop()
-    assert drive.advance(1.0)[0] == pytest.approx(2.0)
-
-
-def test_motion_is_lost_where_it_reverses() -> None:
-    drive = DriveMotion(LIMITS, RobotConfig(**IDEAL | {"backlash_mm": 0.4, "max_acceleration_mm_s2": 1e9}), (10.0, 0.0))
-    moved = []
-    for speed in (2.0, 2.0, -2.0, -2.0, 2.0):
-        drive.command(speed, 0.0)
-        moved.append(drive.advance(1.0)[0])
-    # half the gap at first, which starts in its middle; all of it at every reversal
-    np.testing.assert_allclose(moved, [1.8, 2.0, -1.6, -2.0, 1.6], atol=1e-6)
-
-
 def test_the_encoders_read_the_wire_with_noise(fork, wire) -> None:
     simulator = Simulator(fork, wire, config=SimulatorConfig(element_mm=1.5, threads=1))
     simulator.reset(inserted_length=[10.0], rotation=[0.3])
-    robot = SimulatedRobot(simulator, [DriveLimits.of(wire, fork)], RobotConfig(encoder_sd_mm=0.05), seed=3)
+    robot = SimulatedRobot(simulator, [DriveLimits.of(wire, fork)], with_wire(encoder_sd_mm=0.05), seed=3)
     assert isinstance(robot, Robot)
     assert robot.command(((8.0, 0.0),)) == ((8.0, 0.0),)
     robot.run(10 * CYCLE_S)
@@ -110,7 +75,7 @@ def test_a_wire_is_not_driven_beyond_its_end_wherever_the_ostium_truly_is(fork, 
     limits = replace(DriveLimits.of(wire, fork), travel_mm=(0.0, 15.0))
     simulator = Simulator(fork, wire, config=SimulatorConfig(element_mm=1.5, threads=1))
     simulator.reset(inserted_length=[10.0], rotation=[0.0])
-    robot = SimulatedRobot(simulator, [limits], RobotConfig(**IDEAL), ostium_mm=ostium_mm)
+    robot = SimulatedRobot(simulator, [limits], IDEAL, ostium_mm=ostium_mm)
     robot.command(((20.0, 0.0),))
     robot.run(1.0)
     # by the encoder it goes no farther than the travel, and in truth no farther than the wire is laid out for
@@ -121,8 +86,96 @@ def test_refuses_bad_settings() -> None:
     for make, message in (
         (lambda: DriveLimits(max_velocity_mm_s=np.nan, max_rotation_rad_s=1.0), "max_velocity_mm_s: nan"),
         (lambda: DriveLimits(max_velocity_mm_s=1.0, max_rotation_rad_s=1.0, travel_mm=(3.0, 1.0)), "travel_mm"),
-        (lambda: RobotConfig(latency_s=-1.0), "latency_s: -1.0"),
-        (lambda: RobotConfig(max_acceleration_mm_s2=0.0), "max_acceleration_mm_s2: 0.0"),
     ):
         with pytest.raises(InputError, match=message):
             make()
+
+
+def with_wire(**changed) -> RobotConfig:
+    """Return the assumed robot with another drive of the wire."""
+    return replace(RobotConfig(), wire=replace(RobotConfig().wire, **changed))
+
+
+def ideal(fork, wire, config: RobotConfig, **given) -> tuple[SimulatedRobot, Simulator]:
+    """Return a robot that holds a wire at 10 mm in a fork."""
+    simulator = Simulator(fork, wire, config=SimulatorConfig(element_mm=1.5, threads=1))
+    simulator.reset(inserted_length=[10.0], rotation=[0.3])
+    return SimulatedRobot(simulator, [DriveLimits.of(wire, fork)], config, **given), simulator
+
+
+@pytest.mark.parametrize("at", ["motor", "wire"])
+def test_encoders_in_front_of_play_and_gain_do_not_see_them(fork, wire, at) -> None:
+    drive = replace(IDEAL.wire, play_mm=2.4, play_rad=1.0, gain_translation=0.9)
+    robot, simulator = ideal(fork, wire, replace(IDEAL, encoders_at=at, wire=drive), ostium_mm=0.5)
+    robot.command(((6.0, 2.0),))
+    robot.run(1.0)
+    motor, true = (9.5 + 6.0, 0.3 + 2.0), (10.0 + 0.9 * 6.0 - 1.2, 0.3 + 2.0 - 0.5)
+    assert robot.proximal[0] == pytest.approx(true, abs=1e-3)
+    read = motor if at == "motor" else (true[0] - 0.5, true[1])
+    assert robot.proximal_state().devices[0] == pytest.approx(read, abs=1e-3)
+    assert simulator.inserted_length[0, 0] == robot.proximal[0, 0]
+    robot.command(((-2.0, -0.5),))
+    robot.run(1.0)  # not through the play: the wire rests
+    assert robot.proximal[0] == pytest.approx(true, abs=1e-3)
+    lag = 2.0 if at == "motor" else 0.0
+    assert robot.proximal_state().devices[0][0] == pytest.approx(read[0] - lag, abs=1e-3)
+
+
+def test_a_wire_slips_in_the_grip_at_its_force_and_only_an_encoder_on_the_wire_sees_it(fork, wire) -> None:
+    """Against a wall the drive bears the grip's force, and what is commanded beyond is lost."""
+    navigation = Navigation(anatomy=fork, device=wire, target=Target(branch=1, abscissa=30.0))
+    read = {}
+    for at in ("motor", "wire"):
+        config = replace(IDEAL, encoders_at=at, wire=replace(IDEAL.wire, grip_n=0.1))
+        simulator = start_world(navigation, ModelMismatch(), SimulatorConfig(element_mm=1.5, threads=1), robot=config)
+        limits = [DriveLimits.of(navigation.device, navigation.anatomy)]
+        robot = SimulatedRobot(simulator, limits, config)
+        robot.command(((10.0, 0.0),))
+        robot.run(5.0)
+        made = robot.recorder.trajectory()
+        lost = made.slip[0, :, 0].sum()
+        assert lost > 5.0
+        assert made.base_force[0, :, 0].max() == pytest.approx(0.1, rel=1e-2)
+        asked = CYCLE_S * made.command[0, :, 0, 0].sum()
+        assert asked == pytest.approx(50.0, abs=1e-3)
+        assert robot.proximal[0, 0] == pytest.approx(navigation.start[0, 0] + asked - lost, abs=1e-6)
+        read[at] = robot.proximal_state().devices[0][0]
+        if at == "wire":
+            assert read[at] == pytest.approx(robot.proximal[0, 0], abs=1e-9)
+    assert read["motor"] == pytest.approx(navigation.start[0, 0] + 50.0, abs=1e-3)
+
+
+def test_the_load_is_the_drives_with_noise_and_the_valve_resists_either_way(fork, wire) -> None:
+    robot, simulator = ideal(fork, wire, replace(IDEAL, wire=replace(IDEAL.wire, load_sd_n=0.02, load_sd_n_mm=0.005)))
+    core = simulator.config
+    for speed in (5.0, -5.0):
+        robot.command(((speed, 0.0),))
+        robot.run(1.0)
+        assert robot.last_step is not None
+        valve = core.introducer_friction_n + 5.0 * core.introducer_drag_n_s_mm
+        expected = float(robot.last_step.base_force[0, 0]) + np.sign(speed) * valve
+        assert simulator.drive_load[0, 0, 0] == pytest.approx(expected, abs=1e-4)
+        read = np.array([robot.proximal_state().load[0] for _ in range(500)])
+        assert read.mean(axis=0) == pytest.approx(simulator.drive_load[0, 0], abs=3e-3)
+        assert read.std(axis=0) == pytest.approx([0.02, 0.005], rel=0.15)
+
+
+def test_what_was_measured_is_kept_beside_what_was_true_and_the_same_seed_repeats_it(fork, wire) -> None:
+    kept = []
+    for _ in range(2):
+        robot, _ = ideal(fork, wire, replace(with_wire(play_mm=1.0), encoders_at="motor", jitter_s=0.02), seed=4)
+        told = []
+        for speed in (4.0, -4.0, 4.0):
+            robot.command(((speed, 0.5),))
+            robot.run(0.5)
+            told.append(robot.proximal_state())
+        kept.append(robot.measured)
+    encoders, load = kept[0]["encoders"], kept[0]["load"]
+    assert encoders.shape == load.shape == (1, 30, 1, 2)
+    for name, values in kept[0].items():
+        np.testing.assert_array_equal(values, kept[1][name])
+    np.testing.assert_array_equal(encoders[0, 9::10, 0], [state.devices[0] for state in told])
+    np.testing.assert_array_equal(load[0, 9::10, 0], [state.load[0] for state in told])
+    true = robot.recorder.trajectory()
+    assert np.abs(encoders[0, :, 0, 0] - true.inserted_length[0, :, 0]).max() > 0.4  # half the play, and more
+    assert (load[0, :, 0, 0] - true.drive_force[0, :, 0]).std() == pytest.approx(0.02, rel=0.4)

@@ -171,6 +171,8 @@ def test_what_is_no_trajectory_of_the_vessel_is_refused_in_one_line(vessel, wire
         arrays = dict(stored)
     newer = json.loads(str(arrays["about"])) | {"version": 99}
     np.savez(tmp_path / "newer.npz", **(arrays | {"about": np.array(json.dumps(newer))}))  # pyright: ignore[reportArgumentType]
+    older = {name: each for name, each in arrays.items() if name != "tip_twist"}
+    np.savez(tmp_path / "older.npz", **older)  # pyright: ignore[reportArgumentType]
     np.savez(tmp_path / "other.npz", values=np.zeros(3))
     (tmp_path / "text.npz").write_text("nothing")
     np.save(tmp_path / "array.npy", np.zeros(3))
@@ -178,6 +180,7 @@ def test_what_is_no_trajectory_of_the_vessel_is_refused_in_one_line(vessel, wire
     for name in ("none.npz", "other.npz", "text.npz", "array.npy", "list.npz"):
         _refused(tmp_path / name, vessel, "no trajectory")
     _refused(tmp_path / "newer.npz", vessel, "format version 99, not 1; simulate it again")
+    _refused(tmp_path / "older.npz", vessel, "lacks tip_twist, which this version records; simulate it again")
     _refused(path, make_patient(AtlasConfig(count=2), 1), f"world 0 is of another vessel, '{vessel.name}'")
     _refused(path, [vessel], f"world 1 is of another vessel, '{vessel.name}'")
     with pytest.raises(InputError, match=r"written as \.parquet, \.csv or \.npz"):
@@ -200,12 +203,25 @@ def test_a_recorder_gives_what_a_run_gives_to_the_bit(vessel, devices) -> None:
         simulator.reset(inserted_length=start[..., 0], rotation=start[..., 1])
         return simulator
 
-    recorder = Recorder(begun(), 0.5)
+    recorder = Recorder(begun(), 0.5, record_shape=True)
     for sample in range(SAMPLES):
         recorder.step(control[:, sample])
     gathered = recorder.trajectory()
-    assert_same(gathered, begun().run(control))
+    assert_same(gathered, begun().run(control, record_shape=True))
     assert_same(gathered.replay(), gathered)
+
+
+def test_shapes_in_a_longer_and_a_shorter_vessel_are_recorded_alike(vessel) -> None:
+    """Nodes that neither needs are left out, and those that the shorter one lacks are NaN."""
+    vessels, control = [vessel, make_patient(AtlasConfig(count=2), 1)], np.zeros((2, 2, 1, 2))
+    control[0, :, 0, 0] = 10.0
+    first, second = (endopilot.Simulator(vessels, [WIRE, WIRE]) for _ in range(2))
+    recorder = Recorder(first, 0.5, record_shape=True)
+    for sample in range(2):
+        recorder.step(control[:, sample])
+    gathered = recorder.trajectory()
+    assert gathered.shape is not None and np.isnan(gathered.shape).any() and gathered.shape.shape[2] < first.nodes
+    assert_same(gathered, second.run(control, record_shape=True))
 
 
 def test_a_wire_alone_needs_no_axis_of_devices(vessel, wire_alone) -> None:

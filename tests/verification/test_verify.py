@@ -10,7 +10,7 @@ import pytest
 from benchmarks.__main__ import main as benchmarks
 from benchmarks.verification import contact, engine, motion, order, stability, tube, tubes
 from endopilot.cli import main
-from endopilot.verification import free_rod
+from endopilot.verification import free_rod, transmission
 from endopilot.verification.case import Case, compare
 
 KEYS = ["case", "reference", "value", "error", "bar", "passed"]
@@ -20,7 +20,7 @@ KEYS = ["case", "reference", "value", "error", "bar", "passed"]
 def cases(monkeypatch: pytest.MonkeyPatch) -> list[Case]:
     """The cases that are run, in place of all."""
     found = free_rod.timoshenko()
-    for module in (contact, engine, motion, order, stability, tube, tubes):
+    for module in (contact, engine, motion, order, stability, transmission, tube, tubes):
         monkeypatch.setattr(module, "CASES", ())
     monkeypatch.setattr(free_rod, "CASES", (lambda: found,))
     return found

@@ -11,10 +11,10 @@ from pathlib import Path
 from endopilot.cli.arguments import ListenConfig
 from endopilot.devices.device import read_device
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.robot import ASSUMED, read_robot
 from endopilot.robot.drive import Drive
 from endopilot.robot.drive_protocol import tls_context
 from endopilot.robot.drive_server import serve
-from endopilot.robot.robot import RobotConfig
 from endopilot.settings import Finite
 
 
@@ -24,7 +24,7 @@ def command(
     device: str = "workhorse-014",
     travel_mm: tuple[Finite, Finite] = (0.0, 300.0),
     listen: ListenConfig = ListenConfig(port=7345),
-    config: RobotConfig = RobotConfig(),
+    robot: str = ASSUMED,
 ) -> None:
     """Run a simulated robotic drive until Ctrl-C; one client commands it over TLS (docs/robot.md). No medical device.
 
@@ -33,7 +33,7 @@ def command(
         device: name of a device (`endopilot devices`) or a YAML file; it sets the speed limits.
         travel_mm: least and largest inserted length, mm.
         listen: the drive's address.
-        config: latency, accelerations, backlash and encoder noise.
+        robot: name of a robot (docs/robot.md) or a YAML file: latency, accelerations and noise.
     """
     wire = read_device(device)
     limits = DriveLimits(
@@ -43,7 +43,7 @@ def command(
     )
     context = tls_context(certificates, of_drive=True)
     low, high = travel_mm
-    drive = Drive(limits, now=time.monotonic(), config=config, inserted_length=min(max(low, 0.0), high))
+    drive = Drive(limits, now=time.monotonic(), config=read_robot(robot), inserted_length=min(max(low, 0.0), high))
     asyncio.run(serve(drive, context, listen.host, listen.port, lambda line: print(line, flush=True)))
     print("endopilot drive: terminated", file=sys.stderr)
     sys.exit(128 + signal.SIGTERM)

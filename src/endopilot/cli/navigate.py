@@ -20,7 +20,7 @@ def command(
     """Let a policy drive a wire to a place of a patient's vessel: simulated robot, X-ray only when the policy asks.
 
     The folder gets navigation.html (replay and course), navigation.csv, navigation.png, trajectory.npz for `endopilot
-    simulate`, wire.yaml, episode for `endopilot train`, and manifest.json. Whether the target was reached, or why not,
+    simulate`, episode for `endopilot train`, and manifest.json. Whether the target was reached, or why not,
     is the first line that is printed; the exit code is 0 either way.
 
     Args:

@@ -100,13 +100,12 @@ def command(
         )
     trajectory, stopped, record_shape = None, None, shape or picture is not None
     if controls is None and random.stop_short:
-        trajectory, stopped = _stopped_short(patient, stack, initial, control, moves, config)
-        initial, control = trajectory.set_up.initial, trajectory.command  # they give the same navigations again
+        trajectory, stopped = _stopped_short(patient, stack, initial, control, moves, config, record_shape)
     if recorded is not None:
         others = {"motion": moves, "config": None if config == SimulatorConfig() else config}
         others = {name: value for name, value in others.items() if value is not None}
         trajectory = recorded.replay(record_shape=record_shape, **others)
-    elif trajectory is None or record_shape:
+    elif trajectory is None:
         trajectory = simulate(
             patient,
             stack,
@@ -167,6 +166,7 @@ def _stopped_short(
     control: np.ndarray,
     motion: Motion | None,
     config: SimulatorConfig,
+    record_shape: bool,
 ) -> tuple[Trajectory, np.ndarray]:
     """Return random navigations that stop short of the ends, and which were stopped."""
     worlds, samples = control.shape[:2]
@@ -179,6 +179,7 @@ def _stopped_short(
             stack.frictions(np.full(worlds, stack.wire.friction)),
             config,
             motion=motion,
+            record_shape=record_shape,
             advance=advance,
         )
 

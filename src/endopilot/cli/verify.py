@@ -5,23 +5,23 @@ from __future__ import annotations
 import sys
 
 from endopilot.cli.arguments import show_rows
-from endopilot.verification import free_rod
+from endopilot.verification import free_rod, transmission
 from endopilot.verification.case import run
 
 EXIT_FAILED = 1
 
 
 def command(*, json: bool = False) -> None:
-    """Compare the rod core with closed forms of free rods; print case, reference, value, error, bar and verdict.
+    """Compare the rod core with closed forms of free rods and of their drives; print one row a case and its verdict.
 
-    The exit code is 1 if an error exceeds its bar. In the source tree, `python -m benchmarks verification` also
-    compares walls, friction, catheters, moving vessels and an independent engine, and `python -m benchmarks --help`
-    lists what else is measured.
+    A row holds case, reference, value, error and bar. The exit code is 1 if an error exceeds its bar. In the source
+    tree, `python -m benchmarks verification` also compares walls, friction, catheters, moving vessels and an
+    independent engine, and `python -m benchmarks --help` lists what else is measured.
 
     Args:
         json: print the rows as JSON.
     """
-    rows = [case.row() for case in run(free_rod.CASES)]
+    rows = [case.row() for case in run((*free_rod.CASES, *transmission.CASES))]
     show_rows(rows, as_json=json)
     if not json:
         print("more: `python -m benchmarks verification` in the source tree (walls, friction, catheters, MuJoCo)")

@@ -34,7 +34,6 @@ def write_session_episode(session: Path, output: Path) -> None:
     navigation, truth = recording.navigation, recording.truth
     *_, (world, _events) = replayed(recording)
     cycles = world.loop.robot.recorder.trajectory().samples(slice(samples * per_sample))
-    friction = navigation.device.friction * truth.friction_factor
     folder = recording.where.patient
     if folder is None:
         folder = output.with_name(f"{output.name}-anatomy")
@@ -46,7 +45,6 @@ def write_session_episode(session: Path, output: Path) -> None:
         output,
         navigation.stack,
         task="navigation by hand",
-        friction=friction,
         tip_stiffness_factor=truth.stiffness_factor,
         seed=recording.seed,
         origin={"session": session.name, "target_branch": int(target[0]), "target_mm": float(target[1])},

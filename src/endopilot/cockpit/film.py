@@ -6,25 +6,29 @@ Each becomes a `Film`: the wire every 50 ms, driven again by its recorded comman
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cockpit.recording import SUFFIX, read_recording, replayed
-from endopilot.cockpit.world import Snapshot, take_snapshot
+from endopilot.cockpit.world import Snapshot, loop_snapshot, take_snapshot
 from endopilot.control.plan_file import read_plan
-from endopilot.dataset.again import episode_trajectory
+from endopilot.dataset.again import episode_set_up
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
 from endopilot.files import reading
-from endopilot.ladder.submission import read_navigation
+from endopilot.ladder.attempt import Recording, begun, navigation_seed
+from endopilot.ladder.submission import recorded_navigation
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
 from endopilot.simulation.trajectory_file import TRAJECTORY, read_trajectory
-from endopilot.tasks.navigation import Navigation, Target
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
+from endopilot.tasks.task import Task
 
 FRAME_S = 0.05
 """Time from one frame of a film to the next, s."""
@@ -98,12 +102,12 @@ def open_film(path: Path, patient: Path | None = None, *, world: int = 0, task: 
         return _session(path)
     if (path / "meta").is_dir():
         with reading(path, "make the data set again"):
-            return _film(episode_trajectory(load_dataset(path), world), 0, f"episode {world} of {path.name}")
+            data = load_dataset(path)
+            set_up, title = episode_set_up(data, world), f"episode {world} of {path.name}"
+            return _film(set_up, data.command[world], data.sample_period_s, {}, title)
     if path.suffix == ".json":
         with reading(path, "give a file of the ladder as it was written"):
-            of, place, record = read_navigation(path, task, world)
-            assert record.cycles is not None  # a recording has a decision at least
-            return _film(record.cycles, 0, f"{of.title}, patient {place}")
+            return _of_the_ladder(*recorded_navigation(path, task, world))
     recorded = path / TRAJECTORY if path.is_dir() else path
     if recorded.suffix != ".npz" or not recorded.exists():
         raise InputError(
@@ -114,12 +118,12 @@ def open_film(path: Path, patient: Path | None = None, *, world: int = 0, task: 
         raise InputError(f"{path}: give the patient's folder too: endopilot cockpit PATIENT --replay {path}")
     vessel = read_anatomy(patient)
     if (path / "plan.csv").exists():
-        return _film(read_plan(path, vessel).trajectory, world, f"plan {path.name}")
+        return _of_trajectory(read_plan(path, vessel).trajectory, 0, f"plan {path.name}")
     trajectory = read_trajectory(recorded, vessel)
     worlds = len(trajectory.valid)
     if not 0 <= world < worlds:
         raise InputError(f"world: {world}; {path} has worlds 0 to {worlds - 1}")
-    return _film(trajectory, world, f"{path.name}, world {world}")
+    return _of_trajectory(trajectory, world, f"{path.name}, world {world}")
 
 
 def _session(path: Path) -> Film:
@@ -141,10 +145,51 @@ def _session(path: Path) -> Film:
     return Film(navigation, recording.cycles * recording.config.cycle_s, f"session {path.name}", make)
 
 
-def _film(trajectory: Trajectory, world: int, title: str) -> Film:
-    """Return a film of a world of a trajectory, which is driven again by its commands."""
-    set_up, about, period_s = trajectory.set_up, trajectory.about, trajectory.period_s
-    anatomy, stack, start = set_up.anatomies[world], set_up.stacks[world], set_up.initial[world]
+def _of_the_ladder(task: Task, place: int, recording: Recording) -> Film:
+    """Return a film of a navigation of the ladder, of which its decisions were recorded."""
+    navigation, periods = task.ladder_navigation(place), len(recording.control)
+
+    def make() -> Iterator[Frame]:
+        loop = begun(recording, navigation, seed=navigation_seed(task, place))
+        cycle_s, cycles = loop.config.cycle_s, loop.config.cycles
+        yield Frame(loop_snapshot(loop, cycle=0, force_n=float(loop.simulator.contacts.max())), True)
+        for number in range(1, periods * cycles + 1):
+            if loop.between_periods:
+                loop.begin()
+            force_n = loop.advance(cycle_s)
+            period, within = divmod(number, cycles)
+            exposed = within == 0 and period < periods and bool(recording.exposed[period])
+            yield Frame(loop_snapshot(loop, cycle=number, force_n=force_n), exposed)
+
+    return Film(navigation, DECISION_PERIOD_S * periods, f"{task.title}, patient {place}", make)
+
+
+def _of_trajectory(trajectory: Trajectory, world: int, title: str) -> Film:
+    of_world = {name: getattr(trajectory.set_up, name)[world : world + 1] for name in _OF_WORLDS}
+    set_up = replace(trajectory.set_up, **of_world)
+    return _film(set_up, trajectory.command[world], trajectory.period_s, trajectory.about, title)
+
+
+_OF_WORLDS = ("anatomies", "stacks", "initial", "friction")
+
+
+def _film(
+    set_up: SimulationSetUp,
+    commands: Float[np.ndarray, "samples devices 2"],
+    period_s: float,
+    about: Mapping[str, Any],
+    title: str,
+) -> Film:
+    """Return a film of one world that is driven again by its commands.
+
+    Args:
+        set_up: of that world alone.
+        commands: of its drives.
+        period_s: time that each holds, s.
+        about: its `target` and `exposures_s`, if they are known.
+        title: what it is.
+    """
+    (anatomy,), (stack,), (start,) = set_up.anatomies, set_up.stacks, set_up.initial
     if np.isnan(start).any():
         raise InputError(f"{title}: was on its way when the recording began; record from its start")
     leaf = anatomy.tree.longest_leaf()
@@ -162,13 +207,11 @@ def _film(trajectory: Trajectory, world: int, title: str) -> Film:
         simulator = Simulator(
             anatomy, stack, actuation=set_up.actuation, motion=set_up.motion, config=replace(set_up.config, threads=1)
         )
-        simulator.reset(
-            inserted_length=start[None, :, 0], rotation=start[None, :, 1], friction=set_up.friction[world : world + 1]
-        )
+        simulator.reset(inserted_length=start[None, :, 0], rotation=start[None, :, 1], friction=set_up.friction)
         frame = {"cycle": 0, "time_s": 0.0, "force_n": 0.0, "velocity": (0.0,) * start.size}
         yield Frame(take_snapshot(simulator, None, **frame), 0 in exposed)
         force_n = 0.0
-        for number, command in enumerate(np.repeat(trajectory.command[world], parts, axis=0), start=1):
+        for number, command in enumerate(np.repeat(commands, parts, axis=0), start=1):
             before = simulator.proximal[0]
             step = simulator.step([command], period_s / parts)
             force_n = max(force_n, float(step.contact_force_max[0]))
@@ -182,4 +225,4 @@ def _film(trajectory: Trajectory, world: int, title: str) -> Film:
                 yield Frame(take_snapshot(simulator, step, **frame), number // every in exposed)
                 force_n = 0.0
 
-    return Film(navigation, len(trajectory.command[world]) * period_s, title, make)
+    return Film(navigation, len(commands) * period_s, title, make)

@@ -186,14 +186,7 @@ class World:
 
     def snapshot(self) -> Snapshot:
         """Return the world as it is now."""
-        return take_snapshot(
-            self.loop.simulator,
-            self.loop.robot.last_step,
-            cycle=self.cycle,
-            time_s=self.time_s,
-            force_n=self.force_n,
-            velocity=tuple(self.loop.robot.velocity.ravel().tolist()),
-        )
+        return loop_snapshot(self.loop, cycle=self.cycle, force_n=self.force_n)
 
     def digest(self) -> str:
         """Return a hash of the state of wire and catheters, to the bit."""
@@ -201,6 +194,24 @@ class World:
         inserted, turned = simulator.inserted_length, simulator.rotation
         parts = [simulator.position, inserted[:, 0], turned[:, 0], simulator.contacts, inserted[:, 1:], turned[:, 1:]]
         return hashlib.sha256(b"".join(part.astype("<f8").tobytes() for part in parts)).hexdigest()[:16]
+
+
+def loop_snapshot(loop: NavigationLoop, *, cycle: int, force_n: float) -> Snapshot:
+    """Return how the world of a navigation is now.
+
+    Args:
+        loop: the navigation.
+        cycle: how many of the drives' cycles have passed.
+        force_n: largest wall force on one node in the last one, N.
+    """
+    return take_snapshot(
+        loop.simulator,
+        loop.robot.last_step,
+        cycle=cycle,
+        time_s=cycle * loop.config.cycle_s,
+        force_n=force_n,
+        velocity=tuple(loop.robot.velocity.ravel().tolist()),
+    )
 
 
 def take_snapshot(

@@ -18,8 +18,9 @@ from endopilot.anatomy.catheter_axis import lean_between, with_axis
 from endopilot.anatomy.io import read_anatomy
 from endopilot.control.agent import OraclePolicy
 from endopilot.control.set_up import TILT_DEG, TipChoice, choose_tip
-from endopilot.devices.catheter import Catheter, read_catheter
+from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import Wire, read_device
+from endopilot.devices.robot import ASSUMED, RobotConfig, read_robot
 from endopilot.errors import InputError
 from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, XrayKind
 from endopilot.navigation.policies import make_policy
@@ -54,6 +55,9 @@ class NavigatePatientConfig:
     """Up to two catheters around it, from the inside out: names such as microcatheter-1.7f, or YAML files."""
     arrives: Arrives = "wire"
     """Whose tip is to go to the target: wire, or catheter, the one next to the wire."""
+    robot: Text = ASSUMED
+    """Name of the robot that drives them, such as assumed, ideal or kweon-2021-2d (docs/robot.md), or a YAML file. The
+    policy is not told."""
     tip: Text = "auto"
     """Shape of the wire's tip: auto (chosen for the forks of the route), own (the device's), or angle and length such
     as 75/5, 75 degrees over 5 mm."""
@@ -81,8 +85,8 @@ class NavigatePatientConfig:
     seed: Seed = 0
     """Seed of encoder noise, detection errors, the policy, and of the sides that `mismatch` draws."""
     mismatch: ShareBelowOne = 0.0
-    """Friction, tip stiffness, latency and ostium differ by this share, each up or down as drawn with the seed; the
-    ostium by this share of the lumen's diameter there. What is given below is not drawn."""
+    """Friction, tip stiffness, the robot's latency and the ostium differ by this share, each up or down as drawn with
+    the seed; the ostium by this share of the lumen's diameter there. What is given below is not drawn."""
     true_friction: _Factor | None = None
     """Factor on the friction coefficient in reality."""
     true_tip_stiffness: _Factor | None = None
@@ -92,8 +96,6 @@ class NavigatePatientConfig:
     true_axis_deg: Annotated[float, Within(0, 45)] = 0.0
     """In reality the guiding catheter leans off its given axis by this angle, degrees, to a side drawn by the seed. An
     exposure shows its axis before the wire is shaped; in X-ray images it lies as given, and is not looked for."""
-    true_latency_s: Annotated[float, Within(0, 10)] | None = None
-    """Time from a command to the motion in reality, s; 0.05 if not given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +109,7 @@ class SetUp:
         navigation: as the policy is given it.
         choice: of the tip's shape and the catheter's axis.
         truth: how reality differs from the navigation.
+        robot: what drives, as it truly is.
         snapped_mm: distance from a target that was given as a point to the centerline, mm; None for a section.
         policy: what decides.
         simulator: settings of the simulated reality.
@@ -117,6 +120,7 @@ class SetUp:
     navigation: Navigation
     choice: TipChoice
     truth: ModelMismatch
+    robot: RobotConfig
     snapped_mm: float | None
     policy: Policy
     simulator: SimulatorConfig
@@ -125,18 +129,6 @@ class SetUp:
     def true_anatomy(self) -> Anatomy:
         """The vessel with its guiding catheter as it truly lies."""
         return self.truth.anatomy(self.navigation.anatomy)
-
-    @property
-    def true_wire(self) -> Wire:
-        """The wire as it truly is."""
-        device = self.navigation.device
-        wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=self.truth.stiffness_factor)
-        return replace(wire, friction=device.friction * self.truth.friction_factor)
-
-    @property
-    def true_catheters(self) -> tuple[Catheter, ...]:
-        """The catheters as they truly are."""
-        return self.truth.catheters(self.navigation.catheters)
 
     @property
     def motion(self) -> Motion | None:
@@ -177,7 +169,7 @@ def set_up_navigation(anatomy: Anatomy | str | Path, target: str, config: Naviga
 
     Raises:
         InputError: no such section, a point outside the vessel, a target behind an occlusion; no such policy, device,
-            catheter or tip; devices that do not fit; a motion that is measured without X-ray images.
+            catheter, robot or tip; devices that do not fit; a motion that is measured without X-ray images.
     """
     config = config or NavigatePatientConfig()
     if config.motion_known == "measured" and config.xray != "images":
@@ -185,7 +177,7 @@ def set_up_navigation(anatomy: Anatomy | str | Path, target: str, config: Naviga
     vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
     device, goal = read_device(config.device), find_target(vessel.tree, target)
     catheters = tuple(read_catheter(name) for name in config.catheter)
-    truth = _truth(config, vessel)
+    truth, robot = _truth(config, vessel)
     seen, truth = _see_catheter(vessel, device, truth, config)
     policy = OraclePolicy(truth) if config.policy == "oracle" else make_policy(config.policy)
     given = Navigation(
@@ -209,6 +201,7 @@ def set_up_navigation(anatomy: Anatomy | str | Path, target: str, config: Naviga
         navigation=choice.navigation,
         choice=choice,
         truth=truth,
+        robot=robot,
         snapped_mm=float(np.linalg.norm(place - np.array(parts, dtype=float))) if len(parts) == 3 else None,
         policy=policy,
         simulator=SimulatorConfig(threads=1),
@@ -219,6 +212,7 @@ def navigate_patient(set_up: SetUp) -> PatientNavigation:
     """Let the policy drive the wire in the simulated reality, and return what happened."""
     navigation, policy = set_up.navigation, set_up.policy
     config = NavigateConfig(
+        robot=set_up.robot,
         simulator=set_up.simulator,
         xray=set_up.config.xray,
         motion=set_up.motion,
@@ -236,7 +230,7 @@ def navigate_patient(set_up: SetUp) -> PatientNavigation:
                 wires.append(policy.believed_wires())  # at the decision, which ended the period before
     if isinstance(policy, Led):
         state = loop.robot.proximal_state()
-        policy.watch(Observation(loop.time_s, state.devices, None))
+        policy.watch(Observation(loop.time_s, state.devices, None, state.load))
     if isinstance(policy, Believer):
         wires.append(policy.believed_wires())
     record = loop.record()
@@ -260,19 +254,19 @@ def _known_motion(config: NavigatePatientConfig) -> Motion | None:
     return motion_named(config.motion, config.motion_seed if config.motion_known == "exact" else None)
 
 
-def _truth(config: NavigatePatientConfig, vessel: Anatomy) -> ModelMismatch:
+def _truth(config: NavigatePatientConfig, vessel: Anatomy) -> tuple[ModelMismatch, RobotConfig]:
+    """Return how reality differs, and the robot as it truly is."""
     random = np.random.default_rng([config.seed, 3])
-    drawn = mismatch_by(drawn_sides(config.mismatch, random), vessel)
+    change = drawn_sides(config.mismatch, random)
+    drawn, robot = mismatch_by(change, vessel), read_robot(config.robot).delayed(1 + change["latency"])
     side_deg = float(random.uniform(0.0, 360.0)) if config.true_axis_deg else 0.0
-    latency_s = NavigateConfig().robot.latency_s
     given = {
         "friction_factor": config.true_friction,
         "stiffness_factor": config.true_tip_stiffness,
         "ostium_mm": config.true_ostium_mm,
-        "latency_factor": None if config.true_latency_s is None else config.true_latency_s / latency_s,
     }
     given_too = {name: value for name, value in given.items() if value is not None}
-    return replace(drawn, axis_deg=config.true_axis_deg, axis_side_deg=side_deg, **given_too)
+    return replace(drawn, axis_deg=config.true_axis_deg, axis_side_deg=side_deg, **given_too), robot
 
 
 def _see_catheter(

@@ -19,12 +19,12 @@ from endopilot.control.set_up import TipChoice, choose_tip
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire, read_device
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.robot import IDEAL, read_robot
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.models.config import read_run
 from endopilot.navigation.navigate import NavigateConfig, navigate
 from endopilot.progress import progress
-from endopilot.robot.robot import RobotConfig
 from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
@@ -33,11 +33,6 @@ from endopilot.tasks.route import Route, check_passable
 from endopilot.tasks.targets import find_target
 from endopilot.types import Anatomy
 
-_IDEAL = RobotConfig(
-    latency_s=0.0, max_acceleration_mm_s2=1e6, max_acceleration_rad_s2=1e6, backlash_mm=0.0, backlash_rad=0.0,
-    encoder_sd_mm=0.0, encoder_sd_rad=0.0,
-)  # fmt: skip
-"""A drive that makes every commanded motion exactly."""
 _TRIALS = 3
 """Searches at most: a path that does not hold in the rod core at its own settings is searched again there."""
 
@@ -269,7 +264,8 @@ def _by_policy(navigation: Navigation, config: PlanConfig) -> tuple[Steps, Steps
     """Let a policy drive the rod core with an ideal drive, and record what it did."""
     from endopilot.navigation.policies import make_policy
 
-    record = navigate(navigation, make_policy(config.method), config=NavigateConfig(robot=_IDEAL), seed=config.seed)
+    ideal = NavigateConfig(robot=read_robot(IDEAL))
+    record = navigate(navigation, make_policy(config.method), config=ideal, seed=config.seed)
     proximal, tip = np.column_stack([record.inserted_length[:, 0], record.rotation[:, 0]]), record.tip[:, 0]
     control = np.diff(proximal, axis=0) / DECISION_PERIOD_S
     return control, np.column_stack([tip.abscissa, tip.offset])[1:]

@@ -20,7 +20,7 @@ xray                                              1 where an exposure will be du
 band_tip_abscissa_mm, band_tip_offset_mm          half-widths of the adviser's bands around the prediction
 ================================================  ====================================================================
 
-The last three are there if the plan holds X-ray. A plan for wire and catheter has columns `catheter_1_...` before them:
+The last two rows are there if the plan holds X-ray. A plan for wire and catheter also has columns `catheter_1_...`:
 those from the translation to the tip in space, of the catheter.
 """
 
@@ -35,7 +35,6 @@ import numpy as np
 import pandas as pd
 
 from endopilot.anatomy.catheter_axis import with_axis
-from endopilot.control.columns import device_columns
 from endopilot.control.plan_config import Plan, PlanConfig
 from endopilot.control.plan_xray import PlannedXray
 from endopilot.control.set_up import tip_name
@@ -45,9 +44,10 @@ from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, reading, sha256, writing
 from endopilot.settings import from_record
+from endopilot.simulation.signals import table_columns
 from endopilot.simulation.trajectory_file import TRAJECTORY, read_trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
-from endopilot.types import Anatomy
+from endopilot.types import Anatomy, TipProjection
 
 _TABLE, _RECORD, PICTURE = "plan.csv", "manifest.json", "plan.png"
 
@@ -119,28 +119,24 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
 
 def _table(plan: Plan, xray: PlannedXray | None) -> pd.DataFrame:
     """Return a row for the end of each sample period."""
-    columns: dict[str, Any] = {
-        "time_s": DECISION_PERIOD_S * np.arange(1, len(plan.control) + 1),
-        **_device(plan, 0),
-        "desired_tip_abscissa_mm": plan.desired[:, 0],
-        "desired_tip_offset_mm": plan.desired[:, 1],
-        "predicted_tip_abscissa_mm": plan.predicted[:, 0],
-        "predicted_tip_offset_mm": plan.predicted[:, 1],
-        "safety_ratio": plan.ratio,
-        "contact_force_n": plan.force,
-    }
-    for device in range(1, plan.control.shape[1]):
-        columns |= _device(plan, device)
-    if xray is not None:
-        columns["xray"] = xray.exposure.astype(int)
-        columns["band_tip_abscissa_mm"], columns["band_tip_offset_mm"] = xray.half_width.T
-    return pd.DataFrame(columns)
-
-
-def _device(plan: Plan, device: int) -> dict[str, np.ndarray]:
     made = plan.trajectory
-    moved = plan.control[:, device], made.proximal[0, :, device]
-    return device_columns(device, *moved, plan.tip[:, device], made.tip_position[0, :, device])
+    signals = {
+        "control": plan.control,
+        **{name: getattr(made, name)[0] for name in ("inserted_length", "rotation", "tip_position")},
+        **{f"tip_{name}": getattr(plan.tip, name) for name in TipProjection.__dataclass_fields__},
+        "desired": plan.desired,
+        "predicted": plan.predicted,
+        **({} if xray is None else {"half_width": xray.half_width}),
+    }
+    return pd.DataFrame(
+        {
+            "time_s": DECISION_PERIOD_S * np.arange(1, len(plan.control) + 1),
+            **table_columns(signals),
+            "safety_ratio": plan.ratio,
+            "contact_force_n": plan.force,
+            **({} if xray is None else {"xray": xray.exposure.astype(int)}),
+        }
+    )
 
 
 def read_plan(folder: Path, anatomy: Anatomy, stack: Stack | None = None) -> Plan:

@@ -10,20 +10,20 @@ from jaxtyping import Float, Int
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.loader import Dataset
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
-from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
 from endopilot.types import Anatomy
 
 
-def episode_trajectory(data: Dataset, number: int, *, record_shape: bool = False) -> Trajectory:
-    """Return an episode as a trajectory: it is simulated again, which gives the recorded one to the bit.
+def episode_set_up(data: Dataset, number: int) -> SimulationSetUp:
+    """Return what an episode was simulated with; its `command` then gives the recorded one to the bit.
 
     Args:
         data: the dataset.
         number: of the episode.
-        record_shape: record the positions of all nodes too.
 
     Raises:
         InputError: there is no such episode, or its anatomy is missing or another.
@@ -32,8 +32,24 @@ def episode_trajectory(data: Dataset, number: int, *, record_shape: bool = False
         raise InputError(f"world: {number}; {data.folder} has episodes 0 to {len(data) - 1}")
     one = data.select(np.array([number]))
     anatomy = read_anatomy(data.anatomy_folder(str(one.anatomy[0])))
-    ((_, trajectory),) = simulate_again(one, anatomy, one.command, record_shape=record_shape)
-    return trajectory
+    return SimulationSetUp(
+        anatomies=[anatomy],
+        stacks=[_stack(one, float(one.tip_bend[0]), float(one.tip_stiffness_factor[0]))],
+        initial=one.initial,
+        friction=one.friction,
+        actuation=data.manifest["config"]["control"],
+        motion=one.motion(anatomy.name),
+        config=_config(one),
+    )
+
+
+def _stack(data: Dataset, bend_rad: float, stiffness_factor: float) -> Stack:
+    stack = data.stack
+    return replace(stack, wire=stack.wire.with_tip(bend_rad=bend_rad, stiffness_factor=stiffness_factor))
+
+
+def _config(data: Dataset) -> SimulatorConfig:
+    return SimulatorConfig(**data.manifest["config"]["simulator"])
 
 
 def simulate_again(
@@ -41,7 +57,7 @@ def simulate_again(
     anatomy: Anatomy,
     control: Float[np.ndarray, "episodes samples *devices 2"],
     *,
-    friction: Float[np.ndarray, "episodes"] | None = None,
+    friction: Float[np.ndarray, "episodes devices"] | None = None,
     record_shape: bool = False,
 ) -> Iterator[tuple[Int[np.ndarray, "chosen"], Trajectory]]:
     """Simulate the episodes of one anatomy again.
@@ -52,28 +68,26 @@ def simulate_again(
         data: episodes of the anatomy alone, in any order; one may stand there several times.
         anatomy: of theirs.
         control: of the drives of each episode, mm/s and rad/s.
-        friction: the wire's friction coefficient in each; as recorded if not given.
+        friction: Coulomb coefficients of the devices on the wall; as recorded if not given.
         record_shape: record the positions of all nodes too.
 
     Yields:
         Indices of the episodes whose wires have the same tip, and their simulation: a simulation has one wire.
     """
-    stack, config = data.stack, SimulatorConfig(**data.manifest["config"]["simulator"])
     friction = data.friction if friction is None else friction
     tips, tip_of = np.unique(np.stack([data.tip_bend, data.tip_stiffness_factor], axis=-1), axis=0, return_inverse=True)
     for kind, (bend, factor) in enumerate(tips.astype(float)):
         chosen = np.flatnonzero(tip_of.ravel() == kind)
-        wire = stack.wire.with_tip(bend_rad=float(bend), stiffness_factor=float(factor))
         yield (
             chosen,
             simulate(
                 anatomy,
-                replace(stack, wire=wire),
+                _stack(data, float(bend), float(factor)),
                 control[chosen],
                 initial=data.initial[chosen],
-                config=config,
+                config=_config(data),
                 record_shape=record_shape,
-                friction=stack.frictions(friction[chosen]),
+                friction=friction[chosen],
                 motion=data.motion(anatomy.name),
             ),
         )

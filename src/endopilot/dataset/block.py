@@ -61,7 +61,7 @@ def store_block(
     Args:
         context: what all blocks share.
         block: which navigations.
-        draw: their friction and tips.
+        draw: their tips.
         trajectory: their motion, one world each.
         stopped: which were stopped short of an end of the vessel.
     """
@@ -93,6 +93,7 @@ def _episodes(
 ) -> dict[str, Any]:
     """Return the columns of the episode table; the first seven and the last two are LeRobot's."""
     n, samples = trajectory.valid.shape
+    set_up, prefixes = trajectory.set_up, column_prefixes(trajectory.devices)
     whole = [bool(valid.all()) for valid in trajectory.valid]
     episode = block.first_episode + np.arange(n)
     chunk, file = divmod(block.number, schema.FILES_PER_CHUNK)
@@ -109,12 +110,12 @@ def _episodes(
         "sequence": np.array(block.sequences),
         "split": block.splits.tolist(),
         "device": [context.stack.wire.name] * n,
-        "friction": draw.friction,
         "tip_bend_rad": draw.tip_bend_rad,
         "tip_stiffness_factor": draw.tip_stiffness_factor,
+        **{f"{prefix}friction": set_up.friction[:, k] for k, prefix in enumerate(prefixes)},
         **{
-            f"{prefix}initial_{name}": trajectory.set_up.initial[:, k, axis]
-            for k, prefix in enumerate(column_prefixes(trajectory.devices))
+            f"{prefix}initial_{name}": set_up.initial[:, k, axis]
+            for k, prefix in enumerate(prefixes)
             for axis, name in enumerate(("inserted_length_mm", "rotation_rad"))
         },
         **{f"catheter_{k + 1}": [each.name] * n for k, each in enumerate(context.stack.catheters)},

@@ -26,7 +26,6 @@ def write_episode(
     stack: Stack,
     *,
     task: str,
-    friction: float,
     tip_stiffness_factor: float,
     seed: int,
     origin: Mapping[str, Any],
@@ -39,7 +38,6 @@ def write_episode(
         output: folder of the dataset.
         stack: the devices as they were given; friction and stiffness of the wire's tip may have been others.
         task: what was done, in words.
-        friction: the true friction coefficient.
         tip_stiffness_factor: the true factor on the stiffness of the distal 10 mm.
         seed: of the navigation.
         origin: what else it followed from, such as target and policy.
@@ -61,7 +59,11 @@ def write_episode(
     layout = replace(layout, motions=(set_up.motion,))  # it was not drawn with the seed
     (block,) = layout.blocks()
     claim(output, "endopilot navigate", **layout.settings)
-    one = {"friction": friction, "tip_bend_rad": stack.wire.tip_bend_rad, "tip_stiffness_factor": tip_stiffness_factor}
+    one = {
+        "friction": set_up.friction[0, 0],
+        "tip_bend_rad": stack.wire.tip_bend_rad,
+        "tip_stiffness_factor": tip_stiffness_factor,
+    }
     drawn = Draw(set_up.initial, trajectory.command, **{name: np.array([value]) for name, value in one.items()})
     store_block(layout.context, block, drawn, trajectory, np.array([False]))
     describe(layout, [block])

@@ -24,7 +24,7 @@ from endopilot.errors import InputError
 from endopilot.files import json_text, read_json
 from endopilot.simulation.motion import Motion
 
-FORMAT_VERSION = 6
+FORMAT_VERSION = 7
 """Counts changes of the columns or of their meaning."""
 
 

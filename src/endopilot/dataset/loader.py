@@ -7,17 +7,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Float, Int, Shaped
 
 from endopilot.dataset.layout import identify, version
 from endopilot.dataset.schema import (
     INFO_PATH,
     LEROBOT_VERSION,
     MANIFEST_PATH,
+    OWN_COLUMNS,
+    STATE,
     actuation_of,
     devices_of,
     paths_of_file,
-    signals,
+    signal_columns,
 )
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire
@@ -28,12 +30,14 @@ from endopilot.files import read_json, reading
 from endopilot.runs import RECORD_FILE
 from endopilot.settings import from_record
 from endopilot.simulation.motion import Motion
+from endopilot.simulation.signals import SIGNALS, Outputs, described
 
 _MEND = "make the dataset again"
 
 
-@dataclass(frozen=True, eq=False)
-class Dataset:
+@described
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Dataset(Outputs):
     """Episodes of equal length. Sample t is the state at the end of period t; `control[:, t]` is the mean over it.
 
     Device 0 is the wire; the catheters around it follow from the inside out.
@@ -46,7 +50,7 @@ class Dataset:
         sequence: index of each episode among those of its anatomy.
         split: "train", "seen_test", "calibrate" or "test".
         device: name of the wire.
-        friction: friction coefficient between wire and wall.
+        friction: Coulomb coefficient of each device on the wall.
         tip_bend: angle by which the unloaded tip is bent, rad.
         tip_stiffness_factor: factor on the stiffness of the device's distal 10 mm.
         initial: Δ (mm) and φ (rad) of each device before the first period.
@@ -54,23 +58,10 @@ class Dataset:
             Simulated again it gives the same navigation to the bit, which `control` does not: a drive that pushes at
             one speed until it slips strains the wire otherwise than one that is slower from the start.
         control: π = (dΔ/dt mm/s, dφ/dt rad/s), what was made of it.
-        inserted_length: Δ, mm.
-        rotation: φ, rad, unwrapped.
         tip_abscissa: Δtip, mm.
         tip_offset: γtip, mm.
-        tip_position: LPS mm.
-        tip_direction: unit vector along the wire at its tip.
         branch: index of the branch that the tip lies in.
         lumen_radius: lumen radius at the tip's projection, mm.
-        contact_force_max: largest wall force on one node, N.
-        contact_force_sum: sum of the wall forces' magnitudes, N.
-        base_force: axial force of the drive, N, positive when it pushes.
-        base_torque: torque of the drive, N·mm.
-        drive_force: axial force of the drive with what the introducer's valve takes, N.
-        drive_torque: torque of the drive, likewise, N·mm.
-        slip: advance that was commanded and not made over the period, mm; nearly always 0.
-        rotation_slip: rotation likewise, rad.
-        valid: false from the sample in which the simulation of that episode failed.
     """
 
     folder: Path
@@ -80,29 +71,16 @@ class Dataset:
     sequence: Int[np.ndarray, "episodes"]
     split: Shaped[np.ndarray, "episodes"]
     device: Shaped[np.ndarray, "episodes"]
-    friction: Float[np.ndarray, "episodes"]
+    friction: Float[np.ndarray, "episodes devices"]
     tip_bend: Float[np.ndarray, "episodes"]
     tip_stiffness_factor: Float[np.ndarray, "episodes"]
     initial: Float[np.ndarray, "episodes devices 2"]
     command: Float[np.ndarray, "episodes samples devices 2"]
     control: Float[np.ndarray, "episodes samples devices 2"]
-    inserted_length: Float[np.ndarray, "episodes samples devices"]
-    rotation: Float[np.ndarray, "episodes samples devices"]
     tip_abscissa: Float[np.ndarray, "episodes samples devices"]
     tip_offset: Float[np.ndarray, "episodes samples devices"]
-    tip_position: Float[np.ndarray, "episodes samples devices 3"]
-    tip_direction: Float[np.ndarray, "episodes samples devices 3"]
     branch: Int[np.ndarray, "episodes samples devices"]
     lumen_radius: Float[np.ndarray, "episodes samples devices"]
-    base_force: Float[np.ndarray, "episodes samples devices"]
-    base_torque: Float[np.ndarray, "episodes samples devices"]
-    drive_force: Float[np.ndarray, "episodes samples devices"]
-    drive_torque: Float[np.ndarray, "episodes samples devices"]
-    slip: Float[np.ndarray, "episodes samples devices"]
-    rotation_slip: Float[np.ndarray, "episodes samples devices"]
-    contact_force_max: Float[np.ndarray, "episodes samples"]
-    contact_force_sum: Float[np.ndarray, "episodes samples"]
-    valid: Bool[np.ndarray, "episodes samples"]
 
     def __len__(self) -> int:
         """Return the number of episodes."""
@@ -242,7 +220,7 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
         end = filled + table.num_rows
         if end > total:
             break
-        for name in signals(actuation, devices):
+        for name in signal_columns(actuation, devices):
             values = column_values(data, name)
             values = values.reshape(table.num_rows, samples, *values.shape[1:])
             if name not in signal:  # in place, so that a large dataset is never held twice
@@ -257,19 +235,16 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
             "run `endopilot dataset` again"
         )
     shape = (total, samples, devices)
-    vectors = ("action", "velocity", "observation.state", "tip_position_mm", "tip_direction")
-    of_devices = {name: signal[name].reshape(*shape, -1) for name in vectors if name in signal}
-    state = of_devices["observation.state"]
+    vectors = {name: signal[name].reshape(*shape, -1) for name in ("action", "velocity") if name in signal}
+    recorded = {name: _of_signal(name, signal[column], devices) for column, (name, *_) in OWN_COLUMNS.items()}
+    recorded |= {name: signal["observation.state"].reshape(*shape, -1)[..., k] for k, name in enumerate(STATE)}
     if actuation == "force":
-        control = of_devices["velocity"]
+        control = vectors["velocity"]
     else:
-        slip = np.stack([signal["slip_mm"], signal["rotation_slip_rad"]], axis=-1).reshape(*shape, 2)
-        control = (of_devices["action"] - slip * info["fps"]).astype(np.float32)
-    starts = [
-        f"{prefix}initial_{name}"
-        for prefix in column_prefixes(devices)
-        for name in ("inserted_length_mm", "rotation_rad")
-    ]
+        slip = np.stack([recorded["slip"], recorded["rotation_slip"]], axis=-1)
+        control = (vectors["action"] - slip * info["fps"]).astype(np.float32)
+    prefixes = column_prefixes(devices)
+    starts = [f"{prefix}initial_{name}" for prefix in prefixes for name in ("inserted_length_mm", "rotation_rad")]
     return Dataset(
         folder=folder,
         manifest=manifest,
@@ -278,27 +253,20 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
         sequence=episode["sequence"],
         split=episode["split"].astype(str),
         device=episode["device"].astype(str),
-        friction=episode["friction"],
+        friction=np.stack([episode[f"{prefix}friction"] for prefix in prefixes], axis=-1),
         tip_bend=episode["tip_bend_rad"],
         tip_stiffness_factor=episode["tip_stiffness_factor"],
         initial=np.stack([episode[name] for name in starts], axis=-1).reshape(total, devices, 2),
-        command=of_devices["action"],
+        command=vectors["action"],
         control=control,
-        inserted_length=state[..., 0],
-        rotation=state[..., 1],
-        tip_abscissa=state[..., 2],
-        tip_offset=state[..., 3],
-        tip_position=of_devices["tip_position_mm"],
-        tip_direction=of_devices["tip_direction"],
-        branch=signal["branch"].reshape(shape),
-        lumen_radius=signal["lumen_radius_mm"].reshape(shape),
-        base_force=signal["base_force_n"].reshape(shape),
-        base_torque=signal["base_torque_nmm"].reshape(shape),
-        drive_force=signal["drive_force_n"].reshape(shape),
-        drive_torque=signal["drive_torque_nmm"].reshape(shape),
-        slip=signal["slip_mm"].reshape(shape),
-        rotation_slip=signal["rotation_slip_rad"].reshape(shape),
-        contact_force_max=signal["contact_force_max_n"],
-        contact_force_sum=signal["contact_force_sum_n"],
-        valid=signal["valid"],
+        branch=recorded.pop("tip_branch"),
+        lumen_radius=recorded.pop("tip_radius"),
+        **recorded,
     )
+
+
+def _of_signal(name: str, values: np.ndarray, devices: int) -> np.ndarray:
+    """Return a signal (episodes, samples, ...) with axes of devices and numbers in place of that of components."""
+    if not SIGNALS[name].of_devices:
+        return values
+    return values.reshape(*values.shape[:2], devices, *([-1] if len(SIGNALS[name].columns) > 1 else []))

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 
 from endopilot.devices.drive_limits import within_travel
 from endopilot.devices.stack import Stack
+from endopilot.simulation.checks import check_shape_memory
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.recorder import Recorder
@@ -43,6 +44,7 @@ def simulate_navigations(
     *,
     actuation: Actuation = "velocity",
     motion: Motion | None = None,
+    record_shape: bool = False,
     advance: Callable[[int], None] = lambda samples: None,
 ) -> tuple[Trajectory, Bool[np.ndarray, "worlds"]]:
     """Simulate navigations, stopped short of the ends of the vessel.
@@ -56,6 +58,7 @@ def simulate_navigations(
         config: settings of the rod core.
         actuation: what the controls are.
         motion: how the vessel moves with time; it lies still if not given.
+        record_shape: record the positions of all nodes too.
         advance: called after each sample with the number of worlds.
 
     Returns:
@@ -64,7 +67,10 @@ def simulate_navigations(
     watch = _PushRoom(anatomy.tree, stacks)
     simulator = Simulator(anatomy, stacks, actuation=actuation, motion=motion, config=config)
     _begin(simulator, watch, initial, friction)
-    recorder, stopped = Recorder(simulator, SAMPLE_PERIOD_S), np.zeros(len(control), dtype=bool)
+    if record_shape:
+        check_shape_memory(*control.shape[:2], simulator.nodes)
+    recorder = Recorder(simulator, SAMPLE_PERIOD_S, record_shape=record_shape)
+    stopped = np.zeros(len(control), dtype=bool)
     inserted = simulator.inserted_length
     last, slip = np.zeros_like(inserted), np.zeros_like(inserted)
     for sample in range(control.shape[1]):

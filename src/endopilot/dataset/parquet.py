@@ -10,11 +10,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from endopilot.dataset.schema import INDEX_COLUMNS, MANOEUVRES, manoeuvres, signals
+from endopilot.dataset.schema import INDEX_COLUMNS, MANOEUVRES, OWN_COLUMNS, STATE, manoeuvres, signal_columns
 from endopilot.errors import InputError
 from endopilot.progress import Advance
 from endopilot.simulation.config import Actuation
 from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.trajectory_file import trajectory_signals
 
 _KEY = b"endopilot_key"
 _LEVEL = 5
@@ -32,7 +33,7 @@ def sample_table(trajectory: Trajectory, first_episode: int, key: str) -> pa.Tab
         key: marks the dataset that the file belongs to.
     """
     worlds, samples = trajectory.valid.shape
-    tip = trajectory.tip
+    signals = trajectory_signals(trajectory)
     columns = {
         "index": first_episode * samples + np.arange(worlds * samples),
         "episode_index": np.repeat(first_episode + np.arange(worlds), samples),
@@ -42,23 +43,11 @@ def sample_table(trajectory: Trajectory, first_episode: int, key: str) -> pa.Tab
         "timestamp": np.tile(np.arange(samples) * trajectory.period_s, worlds),
         "action": trajectory.command,
         "velocity": trajectory.control,
-        "observation.state": np.concatenate([trajectory.proximal, np.stack([tip.abscissa, tip.offset], -1)], axis=-1),
-        "tip_position_mm": trajectory.tip_position,
-        "tip_direction": trajectory.tip_direction,
-        "branch": tip.branch,
-        "lumen_radius_mm": tip.radius,
-        "contact_force_max_n": trajectory.contact_force_max,
-        "contact_force_sum_n": trajectory.contact_force_sum,
-        "base_force_n": trajectory.base_force,
-        "base_torque_nmm": trajectory.base_torque,
-        "drive_force_n": trajectory.drive_force,
-        "drive_torque_nmm": trajectory.drive_torque,
-        "slip_mm": trajectory.slip,
-        "rotation_slip_rad": trajectory.rotation_slip,
-        "valid": trajectory.valid,
+        "observation.state": np.stack([signals[name] for name in STATE], axis=-1),
+        **{column: signals[name] for column, (name, *_) in OWN_COLUMNS.items()},
     }
     kinds = dict.fromkeys(INDEX_COLUMNS, ("int64", None)) | {"timestamp": ("float32", None)}
-    kinds |= signals(trajectory.set_up.actuation, trajectory.devices)
+    kinds |= signal_columns(trajectory.set_up.actuation, trajectory.devices)
     arrays = {name: _column(columns[name], *kinds[name]) for name in columns if name in kinds}
     return pa.table(arrays).replace_schema_metadata({_KEY: key.encode()})
 
@@ -143,7 +132,7 @@ def statistics(
         count += int(valid.sum())
         velocity = column_values(table, "velocity" if actuation == "force" else "action")[valid]
         driven += np.bincount(manoeuvres(velocity), minlength=len(driven))
-        for name, (dtype, _) in signals(actuation, devices).items():
+        for name, (dtype, _) in signal_columns(actuation, devices).items():
             if dtype == "bool" or not valid.any():
                 continue
             values = column_values(table, name)[valid].astype(np.float64).reshape(int(valid.sum()), -1)

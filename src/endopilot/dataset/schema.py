@@ -7,6 +7,7 @@ episodes in one Parquet file, an episode table that says where each lies, and JS
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from endopilot.devices.stack import column_prefixes
 from endopilot.simulation.config import Actuation
+from endopilot.simulation.signals import SIGNALS, UNIT_SUFFIXES, Outputs
 from endopilot.types import SAMPLE_PERIOD_S
 
 LEROBOT_VERSION = "v3.0"
@@ -29,33 +31,34 @@ TASK = "random navigation"
 INDEX_COLUMNS = ("index", "episode_index", "frame_index", "task_index")
 """Integer columns that LeRobot requires; `timestamp` (s, float32) is the fifth."""
 
-VELOCITY = ["translation_mm_s", "rotation_rad_s"]
+VELOCITY = list(SIGNALS["control"].columns)
 LOAD = ["drive_force_n", "drive_torque_nmm"]
-_OF_DEVICES: dict[str, tuple[str, list[str] | None]] = {
-    "observation.state": ("float32", ["inserted_length_mm", "rotation_rad", "tip_abscissa_mm", "tip_offset_mm"]),
-    "tip_position_mm": ("float32", ["x", "y", "z"]),
-    "tip_direction": ("float32", ["x", "y", "z"]),
-    "branch": ("int64", None),
-    "lumen_radius_mm": ("float32", None),
-    "base_force_n": ("float32", None),
-    "base_torque_nmm": ("float32", None),
-    "drive_force_n": ("float32", None),
-    "drive_torque_nmm": ("float32", None),
-    "slip_mm": ("float64", None),
-    "rotation_slip_rad": ("float64", None),
-}
-"""Columns that hold numbers of each device, the wire's first."""
-_OF_ALL: dict[str, tuple[str, list[str] | None]] = {
-    "contact_force_max_n": ("float32", None),
-    "contact_force_sum_n": ("float32", None),
-    "valid": ("bool", None),
-}
+STATE = ("inserted_length", "rotation", "tip_abscissa", "tip_offset")
+"""Signals that `observation.state` is made of."""
+_TYPES = {"slip": "float64", "rotation_slip": "float64", "tip_branch": "int64", "valid": "bool"}
+"""Of columns that are not float32."""
+
+
+def _own_column(name: str) -> tuple[str, tuple[str, str, list[str] | None]]:
+    """Return a signal's column, the signal, the column's type, and the names of its components if it is a vector."""
+    signal, kind = SIGNALS[name], _TYPES.get(name, "float32")
+    if len(signal.columns) == 1:
+        return signal.columns[0], (name, kind, None)
+    return name + UNIT_SUFFIXES[signal.unit], (name, kind, list("xyz"))
+
+
+OWN_COLUMNS = dict(
+    _own_column(name)
+    for name in (*(each.name for each in fields(Outputs)), "tip_branch", "tip_radius")
+    if name not in STATE
+)
+"""Signals that have a column of their own: by the column, the signal, its type and the names of its components."""
 MANOEUVRES = ("insertion", "retraction", "spin", "pause")
 _MOVES_MM_S, _TURNS_RAD_S = 0.1, 0.02
 """Below these a drive rests: mm/s, rad/s."""
 
 
-def signals(actuation: Actuation, devices: int = 1) -> dict[str, tuple[str, list[str] | None]]:
+def signal_columns(actuation: Actuation, devices: int = 1) -> dict[str, tuple[str, list[str] | None]]:
     """Return the name of each simulated column, its type, and the names of its components if it is a vector.
 
     `action` is what the drives were commanded, with all its digits: simulated again it gives the same navigation to the
@@ -63,9 +66,15 @@ def signals(actuation: Actuation, devices: int = 1) -> dict[str, tuple[str, list
     `drive_torque_nmm`. With catheters, a column has components of each device, those of catheter k named
     `catheter_k_...`.
     """
-    velocity = {"velocity": ("float32", VELOCITY)} if actuation == "force" else {}
-    own = {"action": ("float64", LOAD if actuation == "force" else VELOCITY), **velocity, **_OF_DEVICES}
-    return {name: (kind, _components(names, devices)) for name, (kind, names) in own.items()} | _OF_ALL
+    vectors: dict[str, tuple[str, list[str] | None]] = {
+        "action": ("float64", LOAD if actuation == "force" else VELOCITY),
+        **({"velocity": ("float32", VELOCITY)} if actuation == "force" else {}),
+        "observation.state": ("float32", [SIGNALS[name].columns[0] for name in STATE]),
+    }
+    found = {column: (kind, _components(names, devices)) for column, (kind, names) in vectors.items()}
+    for column, (name, kind, names) in OWN_COLUMNS.items():
+        found[column] = (kind, _components(names, devices) if SIGNALS[name].of_devices else names)
+    return found
 
 
 def _components(names: list[str] | None, devices: int) -> list[str] | None:
@@ -97,7 +106,7 @@ def features(actuation: Actuation, devices: int = 1) -> dict[str, dict[str, Any]
     """Return the `features` entry of `meta/info.json`: type, shape and component names of every column."""
     described = {"timestamp": {"dtype": "float32", "shape": [1], "names": None}}
     described |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in INDEX_COLUMNS}
-    for name, (dtype, names) in signals(actuation, devices).items():
+    for name, (dtype, names) in signal_columns(actuation, devices).items():
         described[name] = {"dtype": dtype, "shape": [len(names) if names else 1], "names": names}
     return described
 

@@ -11,10 +11,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
-import yaml
 from jaxtyping import Float
 from pydantic import model_validator
 
@@ -34,7 +33,6 @@ from endopilot.devices.device_ranges import (
     check_built,
 )
 from endopilot.errors import InputError
-from endopilot.files import writing
 from endopilot.settings import NonNegative, Positive, Text, Within, read_settings, settings
 
 _SHIPPED = Path(__file__).parent / "catheters"
@@ -132,25 +130,6 @@ def read_catheter(name_or_path: str | Path) -> Catheter:
         return catheter
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-
-
-def write_catheter(catheter: Catheter, path: Path) -> None:
-    """Write a catheter as a file that `read_catheter` reads, with the same constants.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-
-    def sourced(name: str) -> dict[str, Any]:
-        value = getattr(catheter, name)
-        return {"value": list(value) if isinstance(value, tuple) else value, "source": catheter.sources[name]}
-
-    names = [field.name for field in fields(_CatheterFile) if field.name not in ("name", "shape")]
-    content: dict[str, Any] = {"name": catheter.name} | {name: sourced(name) for name in names}
-    arcs = [[length, round(math.degrees(angle), 10)] for length, angle in catheter.shape]
-    content["shape"] = {"arcs": arcs, "source": catheter.sources["shape"]}
-    with writing(path) as partial:
-        partial.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
 
 
 def check_nested(wire: Wire, catheters: Sequence[Catheter]) -> None:

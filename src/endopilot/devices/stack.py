@@ -10,6 +10,8 @@ from jaxtyping import Float
 
 from endopilot.devices.catheter import Catheter, check_nested
 from endopilot.devices.device import Device, Wire, check_fits
+from endopilot.devices.transmission import Transmission
+from endopilot.errors import InputError
 from endopilot.lines import length_along
 from endopilot.types import Anatomy
 
@@ -23,10 +25,25 @@ Proximals = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class Stack:
-    """A wire, and the catheters around it from the inside out; a wire alone is a stack of one."""
+    """A wire, and the catheters around it from the inside out; a wire alone is a stack of one.
+
+    Attributes:
+        wire: the wire.
+        catheters: around it.
+        transmissions: what lies between drive and ostium, of each device; drives act at the ostium if not given.
+    """
 
     wire: Wire
     catheters: tuple[Catheter, ...] = ()
+    transmissions: tuple[Transmission, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check that there are as many transmissions as devices, and give drives at the ostium that of no length."""
+        given = len(self.transmissions)
+        if given not in (0, len(self)):
+            raise InputError(f"transmissions: {given} for {len(self)} devices; give one for each device, or none")
+        if not given:
+            object.__setattr__(self, "transmissions", (Transmission(),) * len(self))
 
     @staticmethod
     def of(device: Wire | Stack) -> Stack:
@@ -70,7 +87,8 @@ class Stack:
     @property
     def constants(self) -> tuple[Any, ...]:
         """All numbers of the devices: stacks with the same constants behave the same."""
-        return self.wire.constants + tuple(each.constants for each in self.catheters)
+        behind = tuple((each.length_mm, each.twist_friction_n_mm_mm) for each in self.transmissions)
+        return self.wire.constants + tuple(each.constants for each in self.catheters) + behind
 
     def check(self, anatomy: Anatomy) -> None:
         """Check that the devices fit into each other, and into an anatomy.

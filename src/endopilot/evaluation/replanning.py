@@ -63,7 +63,7 @@ def _driven(
     `last`.
     """
     now = WINDOW + commanded.shape[1] - 1
-    names = ("control", "slip", "proximal", "tip", "branch")
+    names = ("control", "command", "proximal", "tip", "branch")
     made = {name: getattr(under_way, name).copy() for name in names}
     lost = np.zeros(len(under_way), dtype=bool)
     for chosen, rollout in recorded.simulated({"P4": commanded}):
@@ -71,7 +71,7 @@ def _driven(
         lost[chosen] = ~ok
         kept, moved = chosen[ok], slice(WINDOW, now + 1)
         made["control"][kept, moved] = rollout.control[ok, moved, 0]
-        made["slip"][kept, moved] = np.stack([rollout.slip, rollout.rotation_slip], axis=-1)[ok, moved, 0]
+        made["command"][kept, moved] = rollout.command[ok, moved, 0]
         made["proximal"][kept, moved] = rollout.proximal[ok, moved, 0]
         made["tip"][kept, now] = np.stack([rollout.tip.abscissa, rollout.tip.offset], axis=-1)[ok, now, 0]
         made["branch"][kept, last + 1 : now] = made["branch"][kept, last, None]  # not observed since
@@ -89,6 +89,6 @@ def _predicted(under_way: Episodes, plan: OpenLoop, begin: int) -> Episodes:
 
 def _desired(under_way: Episodes, desired: Episodes, begin: int) -> Episodes:
     """Return episodes under way with everything from a sample on as it is desired."""
-    names = ("control", "slip", "proximal", "tip", "branch")
+    names = ("control", "command", "proximal", "tip", "branch")
     parts = {name: (getattr(under_way, name)[:, :begin], getattr(desired, name)[:, begin:]) for name in names}
     return replace(under_way, **{name: np.concatenate(both, axis=1) for name, both in parts.items()})

@@ -6,7 +6,7 @@ import base64
 import binascii
 import hashlib
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,8 +15,9 @@ from jaxtyping import Bool, Float
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.belief.adviser import AdviserConfig, count_events, near_exposures
 from endopilot.control.agent import AgentPolicy
+from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
-from endopilot.navigation.navigate import NavigateConfig, navigate
+from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, navigate
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import Decision, Observation, Policy
 from endopilot.navigation.record import NavigationRecord
@@ -38,12 +39,14 @@ class Recording:
         exposed: whether X-ray was on at each decision.
         believed_mm: where the agent believed the tip to be (Δtip) at each decision, mm; None for other policies.
         gave_up: whether the policy ended the navigation with its last decision.
+        robot: what drove; not part of the text.
     """
 
     control: Float[np.ndarray, "decisions devices 2"]
     exposed: Bool[np.ndarray, "decisions"]
     believed_mm: Float[np.ndarray, "decisions"] | None
     gave_up: bool = False
+    robot: RobotConfig = field(default_factory=RobotConfig)
 
     def packed(self) -> dict[str, Any]:
         """Return the recording as text: little-endian arrays, compressed by zlib, in base64."""
@@ -56,12 +59,13 @@ class Recording:
         }
 
     @staticmethod
-    def unpacked(text: dict[str, Any], devices: int = 1) -> Recording:
+    def unpacked(text: dict[str, Any], devices: int = 1, robot: RobotConfig | None = None) -> Recording:
         """Return the recording that `packed` made a text of.
 
         Args:
             text: the arrays.
             devices: number of wire and catheters.
+            robot: what drove; the default one if not given.
 
         Raises:
             InputError: an array cannot be read, is not finite, or has another length than the others.
@@ -77,7 +81,8 @@ class Recording:
                 raise InputError(f"{name}: {size:g} decisions, exposed: {count}; each must have one value a decision")
         if not exposed[0]:
             raise InputError("exposed: X-ray is off at the first decision, where it is always on")
-        return Recording(control.reshape(count, devices, 2), exposed, believed, bool(text.get("gave_up", False)))
+        decided, gave_up = control.reshape(count, devices, 2), bool(text.get("gave_up", False))
+        return Recording(decided, exposed, believed, gave_up, robot or RobotConfig())
 
 
 def navigation_seed(task: Task, place: int) -> int:
@@ -85,7 +90,14 @@ def navigation_seed(task: Task, place: int) -> int:
     return 100 * task.level + place
 
 
-def attempt(policy: str, navigation: Navigation, *, seed: int, mismatch: ModelMismatch | None = None) -> dict[str, Any]:
+def attempt(
+    policy: str,
+    navigation: Navigation,
+    *,
+    seed: int,
+    mismatch: ModelMismatch | None = None,
+    robot: RobotConfig | None = None,
+) -> dict[str, Any]:
     """Let a policy drive a navigation, and return its figures, its course and its recording.
 
     Args:
@@ -93,12 +105,13 @@ def attempt(policy: str, navigation: Navigation, *, seed: int, mismatch: ModelMi
         navigation: what is to be done, as the policy is given it.
         seed: of encoder noise, detection errors and the policy.
         mismatch: how the simulated reality differs from the navigation; not at all if not given.
+        robot: what drives; the default one if not given.
 
     Raises:
         InputError: there is no such policy, or the wire does not fit the vessel.
     """
     driver = make_policy(policy)
-    record = _drive(navigation, driver, seed, mismatch)
+    record = _drive(navigation, driver, seed, mismatch, robot or RobotConfig())
     return {"seed": seed} | scored(navigation, record, tells=isinstance(driver, AgentPolicy))
 
 
@@ -137,12 +150,22 @@ def driven(recording: Recording, navigation: Navigation, *, seed: int) -> Naviga
     Raises:
         InputError: the recording is shorter than the navigation.
     """
-    return _drive(navigation, Repeated(recording), seed, None)
+    return _drive(navigation, Repeated(recording), seed, None, recording.robot)
 
 
-def _drive(navigation: Navigation, policy: Policy, seed: int, mismatch: ModelMismatch | None) -> NavigationRecord:
-    config = NavigateConfig(simulator=replace(CORE, threads=1))
-    return navigate(navigation, policy, config=config, seed=seed, truth=mismatch)
+def begun(recording: Recording, navigation: Navigation, *, seed: int) -> NavigationLoop:
+    """Return the loop that drives a navigation as it was recorded, at its start."""
+    return NavigationLoop(navigation, Repeated(recording), config=_config(recording.robot), seed=seed)
+
+
+def _config(robot: RobotConfig) -> NavigateConfig:
+    return NavigateConfig(robot=robot, simulator=replace(CORE, threads=1))
+
+
+def _drive(
+    navigation: Navigation, policy: Policy, seed: int, mismatch: ModelMismatch | None, robot: RobotConfig
+) -> NavigationRecord:
+    return navigate(navigation, policy, config=_config(robot), seed=seed, truth=mismatch)
 
 
 class Repeated:

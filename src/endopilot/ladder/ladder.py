@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from pydantic import model_validator
 
 from endopilot import __version__
+from endopilot.devices.robot import ASSUMED, RobotConfig, read_robot
 from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import attempt, navigation_seed
 from endopilot.ladder.scores import score
@@ -36,6 +37,8 @@ class LadderConfig:
     version: LadderVersion = NEWEST
     """Version of the ladder: 2 in patients that resemble real ones, 1 in the textbook patients of before, or coaxial,
     four tasks of wire and catheter in patients as of version 2."""
+    robot: str = ASSUMED
+    """Name of the robot that drives (docs/robot.md), or a YAML file."""
 
     @model_validator(mode="after")
     def _consistent(self) -> LadderConfig:
@@ -68,26 +71,31 @@ def climb(output: Path, config: LadderConfig) -> list[dict[str, Any]]:
     """
     make_policy(config.policy)
     tasks = config.chosen
-    claim(output, "endopilot ladder", **identity(config.policy, config.version))
+    robot = read_robot(config.robot)
+    claim(output, "endopilot ladder", **identity(config.policy, config.version, robot))
     paths = [output / task.name / f"{place:02d}.json" for task in tasks for place in range(config.patients)]
-    make_missing(f"Ladder, {config.policy}", paths, partial(_navigate, policy=config.policy, version=config.version))
+    navigate = partial(_navigate, policy=config.policy, version=config.version, robot=robot)
+    make_missing(f"Ladder, {config.policy}", paths, navigate)
     results = {task.name: [read_json(path) for path in paths if path.parent.name == task.name] for task in tasks}
     rows = score(tasks, results)
-    content = {"policy": config.policy, "ladder": config.version, "patients": config.patients, "scores": rows}
+    content = {"policy": config.policy, "ladder": config.version, "robot": config.robot, "patients": config.patients}
+    content["scores"] = rows
     write_json(output / SCORES_FILE, content)
-    write_submission(output / SUBMISSION_FILE, config.policy, config.version, results, rows)
+    write_submission(output / SUBMISSION_FILE, config.policy, config.version, results, rows, robot)
     return rows
 
 
-def identity(policy: str, version: LadderVersion) -> dict[str, Any]:
-    """Return what a policy's results follow from: its source, every task with its device, and the package's version."""
+def identity(policy: str, version: LadderVersion, robot: RobotConfig | None = None) -> dict[str, Any]:
+    """Return what a policy's results follow from: its source, its tasks, their devices, the robot, the version."""
     tasks = {task.name: task_digest(task) for task in ladder_tasks(version)}
-    return {"policy": policy, "origin": POLICIES.origin(policy), "tasks": tasks, "version": __version__}
+    origin = POLICIES.origin(policy)
+    return {"policy": policy, "origin": origin, "tasks": tasks, "robot": robot or RobotConfig(), "version": __version__}
 
 
-def _navigate(path: Path, *, policy: str, version: LadderVersion) -> None:
+def _navigate(path: Path, *, policy: str, version: LadderVersion, robot: RobotConfig) -> None:
     """Do one navigation and write what came of it."""
     task, place = find_task(path.parent.name, version), int(path.stem)
     navigation = task.ladder_navigation(place)
-    result = attempt(policy, navigation, seed=navigation_seed(task, place))
-    write_json(path, {"task": task.name, "ladder": version, "patient": navigation.anatomy.name} | result)
+    result = attempt(policy, navigation, seed=navigation_seed(task, place), robot=robot)
+    about = {"task": task.name, "ladder": version, "robot": robot, "patient": navigation.anatomy.name}
+    write_json(path, about | result)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from endopilot.devices.robot import RobotConfig, read_robot
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json, writing
 from endopilot.ladder.attempt import attempt, navigation_seed
@@ -46,13 +47,14 @@ def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[d
         raise InputError(f"mismatch: {share} is not in (0, 1); give e.g. 0.2")
     make_policy(config.policy)
     tasks = config.chosen
-    claim(output, "endopilot ladder --mismatch", **identity(config.policy, config.version), mismatch=share)
+    robot = read_robot(config.robot)
+    claim(output, "endopilot ladder --mismatch", **identity(config.policy, config.version, robot), mismatch=share)
     paths = {
         case: [output / case / task.name / f"{place:02d}.json" for task in tasks for place in range(config.patients)]
         for case in CASES
     }
     every = [path for of_case in paths.values() for path in of_case]
-    navigate = partial(_navigate, policy=config.policy, version=config.version, share=share)
+    navigate = partial(_navigate, policy=config.policy, version=config.version, share=share, robot=robot)
     make_missing(f"Model mismatch, {config.policy}", every, navigate)
     rows = [{"case": case} | _scores([read_json(path) for path in paths[case]]) for case in CASES]
     with writing(output / PICTURE_FILE) as partly:
@@ -60,6 +62,7 @@ def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[d
     content = {
         "policy": config.policy,
         "ladder": config.version,
+        "robot": config.robot,
         "mismatch": share,
         "tasks": [task.name for task in tasks],
     }
@@ -67,22 +70,25 @@ def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[d
     return rows
 
 
-def mismatch_of(case: str, share: float, navigation: Navigation, task: Task, place: int) -> ModelMismatch:
-    """Return how reality differs from the navigation in one case and one patient."""
-    if case == "matched":
-        return ModelMismatch()
+def mismatch_of(
+    case: str, share: float, navigation: Navigation, task: Task, place: int, robot: RobotConfig
+) -> tuple[ModelMismatch, RobotConfig]:
+    """Return how reality differs from the navigation in one case and one patient, and the robot as it is then."""
+    change: dict[str, float] = {}
     if case == "all":
         random = np.random.default_rng([task.ladder.seed, task.ladder.numbers[place], 1])
-        return mismatch_by(drawn_sides(share, random), navigation.anatomy)
-    name, side = case.split("-")
-    return mismatch_by({name: share if side == "more" else -share}, navigation.anatomy)
+        change = drawn_sides(share, random)
+    elif case != "matched":
+        name, side = case.split("-")
+        change = {name: share if side == "more" else -share}
+    return mismatch_by(change, navigation.anatomy), robot.delayed(1 + change.get("latency", 0.0))
 
 
-def _navigate(path: Path, *, policy: str, version: LadderVersion, share: float) -> None:
+def _navigate(path: Path, *, policy: str, version: LadderVersion, share: float, robot: RobotConfig) -> None:
     case, task, place = path.parents[1].name, find_task(path.parent.name, version), int(path.stem)
     navigation = task.ladder_navigation(place)
-    mismatch = mismatch_of(case, share, navigation, task, place)
-    result = attempt(policy, navigation, seed=navigation_seed(task, place), mismatch=mismatch)
+    mismatch, real = mismatch_of(case, share, navigation, task, place, robot)
+    result = attempt(policy, navigation, seed=navigation_seed(task, place), mismatch=mismatch, robot=real)
     write_json(path, {"task": task.name, "patient": navigation.anatomy.name} | result)
 
 

@@ -18,14 +18,14 @@ from typing import Any, Literal
 from endopilot import __version__, _core
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_device
+from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, write_json
-from endopilot.ladder.attempt import Recording, driven, navigation_seed, repeat
+from endopilot.ladder.attempt import Recording, navigation_seed, repeat
 from endopilot.ladder.scores import score
 from endopilot.navigation.policies import POLICIES
-from endopilot.navigation.record import NavigationRecord
 from endopilot.parallel import each
-from endopilot.settings import CountOrZero, Seed, read_settings, settings
+from endopilot.settings import CountOrZero, Seed, from_record, read_settings, settings
 from endopilot.tasks.task import LadderVersion, Task, find_task, ladder_tasks
 
 SUBMISSION_FILE = "submission.json"
@@ -80,6 +80,7 @@ class Submission:
         tasks: name of each task and the SHA-256 of its definition with its device.
         navigations: by the task's name, in the order of the task's patients.
         scores: what `endopilot.ladder.scores.score` makes of them.
+        robot: what drove; a file without it has the default one.
     """
 
     format: Literal[1] = 1
@@ -91,6 +92,7 @@ class Submission:
     tasks: dict[str, str]
     navigations: dict[str, tuple[NavigationEntry, ...]]
     scores: tuple[dict[str, Any], ...]
+    robot: RobotConfig = RobotConfig()
 
     @property
     def version(self) -> LadderVersion:
@@ -134,6 +136,7 @@ def write_submission(
     version: LadderVersion,
     results: Mapping[str, Sequence[Mapping[str, Any]]],
     scores: Sequence[Mapping[str, Any]],
+    robot: RobotConfig,
 ) -> None:
     """Write the submission file of a policy.
 
@@ -143,8 +146,9 @@ def write_submission(
         version: of the ladder.
         results: by the task's name, the results of its navigations (`attempt`) in the order of the task's patients.
         scores: what `score` made of them.
+        robot: what drove.
     """
-    known = {field.name for field in fields(NavigationEntry)}
+    known = {each.name for each in fields(NavigationEntry)}
     submission = Submission(
         ladder=version,
         policy=policy,
@@ -157,6 +161,7 @@ def write_submission(
             for name, done in results.items()
         },
         scores=tuple(dict(row) for row in scores),
+        robot=robot,
     )
     write_json(path, submission)
 
@@ -216,7 +221,8 @@ def _first_difference(submission: Submission, folder: Path) -> str | None:
     }
     for path, entry in entries.items():
         write_json(path, entry.recording)
-    bad = each(f"Checking {submission.policy}", list(entries), partial(_repeat, version=submission.version))
+    again = partial(_repeat, version=submission.version, robot=submission.robot)
+    bad = each(f"Checking {submission.policy}", list(entries), again)
     differing = []
     for path, entry in entries.items():
         remark = str(bad[path]) if path in bad else _difference(entry.figures(), read_json(path))
@@ -236,8 +242,8 @@ def _first_difference(submission: Submission, folder: Path) -> str | None:
     return None
 
 
-def read_navigation(path: Path, name: str | None, place: int) -> tuple[Task, int, NavigationRecord]:
-    """Return one navigation of a submission, or of a result file of a ladder's folder, driven again by its recording.
+def recorded_navigation(path: Path, name: str | None, place: int) -> tuple[Task, int, Recording]:
+    """Return what was recorded of one navigation, from a submission or from a result file of a ladder's folder.
 
     Args:
         path: a submission.json or TASK/NUMBER.json.
@@ -245,7 +251,7 @@ def read_navigation(path: Path, name: str | None, place: int) -> tuple[Task, int
         place: of the patient in the task's list, likewise.
 
     Returns:
-        The task, the patient's place in its list, and the navigation.
+        The task, the patient's place in its list, and the recording.
 
     Raises:
         InputError: the file is none of the ladder, or has no such navigation.
@@ -263,16 +269,15 @@ def read_navigation(path: Path, name: str | None, place: int) -> tuple[Task, int
     else:
         raise InputError(f"{path}: is no file of the ladder; give a submission.json or TASK/NUMBER.json")
     task = find_task(name, content.get("ladder") or 1)
-    navigation = task.ladder_navigation(place)
-    recording = Recording.unpacked(entry["recording"], len(navigation.devices))
-    return task, place, driven(recording, navigation, seed=navigation_seed(task, place))
+    robot = from_record(RobotConfig, content["robot"]) if "robot" in content else None
+    return task, place, Recording.unpacked(entry["recording"], 2 if task.catheter else 1, robot)
 
 
-def _repeat(path: Path, *, version: LadderVersion) -> None:
+def _repeat(path: Path, *, version: LadderVersion, robot: RobotConfig) -> None:
     """Drive the recording in a file again, and put the figures in its place."""
     task, place = find_task(path.parent.name, version), int(path.stem)
     navigation = task.ladder_navigation(place)
-    recording = Recording.unpacked(read_json(path), len(navigation.devices))
+    recording = Recording.unpacked(read_json(path), len(navigation.devices), robot)
     figures = repeat(recording, navigation, seed=navigation_seed(task, place))
     write_json(path, {"patient": navigation.anatomy.name} | figures)
 

@@ -107,7 +107,7 @@ class Episodes:
         anatomy: name of each episode's anatomy.
         initial: (Δ mm, φ rad) before the first period.
         control: π = (mm/s, rad/s) that the drive made, the mean over each period.
-        slip: advance (mm) and rotation (rad) that the drive was commanded and did not make over the period.
+        command: what the drive was commanded (mm/s, rad/s), see `Dataset.command`.
         proximal: x^prox = (Δ mm, φ rad).
         tip: (Δtip, γtip), mm.
         branch: index of the branch that the tip lies in.
@@ -118,7 +118,7 @@ class Episodes:
     anatomy: Shaped[np.ndarray, "episodes"]
     initial: Float[np.ndarray, "episodes 2"]
     control: Float[np.ndarray, "episodes samples 2"]
-    slip: Float[np.ndarray, "episodes samples 2"]
+    command: Float[np.ndarray, "episodes samples 2"]
     proximal: Float[np.ndarray, "episodes samples 2"]
     tip: Float[np.ndarray, "episodes samples 2"]
     branch: Int[np.ndarray, "episodes samples"]
@@ -144,7 +144,7 @@ class Episodes:
             anatomy=dataset.anatomy,
             initial=dataset.initial[:, 0],
             control=dataset.control[:, :, 0],
-            slip=np.stack([dataset.slip, dataset.rotation_slip], axis=-1)[:, :, 0],
+            command=dataset.command[:, :, 0],
             proximal=np.stack([dataset.inserted_length, dataset.rotation], axis=-1)[:, :, 0],
             tip=np.stack([dataset.tip_abscissa, dataset.tip_offset], axis=-1)[:, :, 0],
             branch=dataset.branch[:, :, 0],
@@ -174,7 +174,7 @@ class Episodes:
             anatomy=np.full(count, name),
             initial=np.tile(initial, (count, 1)),
             control=control,
-            slip=np.zeros((count, samples, 2)),
+            command=control.astype(float),
             proximal=initial + SAMPLE_PERIOD_S * np.cumsum(control, axis=1),
             tip=tip,
             branch=np.zeros((count, samples), dtype=np.int64),
@@ -190,11 +190,6 @@ class Episodes:
         """Number of samples of each episode."""
         return self.tip.shape[1]
 
-    @property
-    def command(self) -> Float[np.ndarray, "episodes samples 2"]:
-        """Control that the drive was commanded (mm/s, rad/s), see `Dataset.command`."""
-        return (self.control + self.slip / SAMPLE_PERIOD_S).astype(self.control.dtype).astype(float)
-
     def select(self, chosen: Shaped[np.ndarray, "chosen"]) -> Episodes:
         """Return the chosen episodes, given as a mask or as indices."""
         names = [each.name for each in fields(self) if each.name != "setup"]
@@ -204,7 +199,7 @@ class Episodes:
         """Return the episodes from a sample on; the state before it is their initial one."""
         if first == 0:
             return self
-        names = ("control", "slip", "proximal", "tip", "branch", "tip_sd")
+        names = ("control", "command", "proximal", "tip", "branch", "tip_sd")
         later = {name: getattr(self, name)[:, first:] for name in names}
         return replace(self, initial=self.proximal[:, first - 1], **later)
 
@@ -216,5 +211,5 @@ class Episodes:
         def then(before: np.ndarray, later: np.ndarray) -> np.ndarray:
             return np.concatenate([before[:, : -later.shape[1]], later.astype(before.dtype)], axis=1)
 
-        slip = then(self.slip, np.zeros_like(control))
-        return replace(self, control=then(self.control, control), slip=slip, proximal=then(self.proximal, proximal))
+        moved = {"control": control, "command": control, "proximal": proximal}
+        return replace(self, **{name: then(getattr(self, name), later) for name, later in moved.items()})

@@ -12,16 +12,18 @@ import numpy as np
 from pydantic import model_validator
 
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import BelievedTip, Believer, Decision, Led, Observation, Policy
 from endopilot.navigation.record import NavigationRecord, Track
-from endopilot.robot.robot import CYCLE_S, RobotConfig, SimulatedRobot
+from endopilot.robot.robot import CYCLE_S, SimulatedRobot
 from endopilot.settings import Within, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import Motion
+from endopilot.simulation.robots import in_grip
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM, Navigation, Target, XrayKind
 from endopilot.xray.fluoroscope import FluoroscopeConfig, make_c_arm
@@ -32,7 +34,7 @@ class NavigateConfig:
     """Robot and C-arm of the policy, and the settings of the simulated reality."""
 
     robot: RobotConfig = field(default_factory=RobotConfig)
-    """The drive."""
+    """The robot as it truly is; a policy is not told."""
     fluoroscope: FluoroscopeConfig = field(default_factory=FluoroscopeConfig)
     """The C-arm."""
     xray: XrayKind = "assumed"
@@ -111,11 +113,10 @@ class NavigationLoop:
         truth = truth or ModelMismatch()
         self.navigation = navigation = replace(navigation, xray=config.xray)
         self.policy = make_policy(policy) if isinstance(policy, str) else policy
-        self.simulator = start_world(navigation, truth, config.simulator, motion=config.motion)
+        self.simulator = start_world(navigation, truth, config.simulator, robot=config.robot, motion=config.motion)
         limits = [DriveLimits.of(device, navigation.anatomy) for device in navigation.devices]
-        drive = replace(config.robot, latency_s=config.robot.latency_s * truth.latency_factor)
         self.robot = SimulatedRobot(
-            self.simulator, limits, drive, seed=seed, ostium_mm=truth.ostium_mm, cycle_s=config.cycle_s
+            self.simulator, limits, config.robot, seed=seed, ostium_mm=truth.ostium_mm, cycle_s=config.cycle_s
         )
         self.c_arm = make_c_arm(navigation, config.fluoroscope, seed=seed)
         if config.measure_motion:
@@ -184,7 +185,7 @@ class NavigationLoop:
         return self.take(self.decide(self.observe()))
 
     def observe(self) -> Observation:
-        """Read the encoders, and expose where the last decision asked for it.
+        """Read encoders and loads, and expose where the last decision asked for it.
 
         Raises:
             ValueError: the navigation is over, or the last period is not.
@@ -196,7 +197,7 @@ class NavigationLoop:
             inserted, _ = state.devices[0]
             tip = self.c_arm.expose(self.simulator, inserted, self._random, time_s=self.time_s)
         self._exposed = self._expose
-        self.observation, self.believed = Observation(self.time_s, state.devices, tip), None
+        self.observation, self.believed = Observation(self.time_s, state.devices, tip, state.load), None
         return self.observation
 
     def decide(self, observation: Observation) -> Decision:
@@ -222,12 +223,13 @@ class NavigationLoop:
             The decision as the robot has taken it: within its limits, and with the velocities of all devices.
         """
         taken = self.robot.command(decision.devices)
-        tip = None if self.observation is None else self.observation.tip
+        seen = self.observation
+        tip = None if seen is None else seen.tip
         # An image in which no wire was found is taken again.
         self._expose = bool(decision.expose) or (self._exposed and tip is None)
         self.gives_up = decision.gives_up
         fault = taken[: len(decision.devices)] != decision.devices
-        self._track.decided(taken, tip, self.believed, exposed=self._exposed, fault=fault)
+        self._track.decided(taken, seen, self.believed, exposed=self._exposed, fault=fault)
         self._period, self._cycles_left, self._peak_n = self._period + 1, self.config.cycles, 0.0
         return Decision(taken, expose=self._expose, gives_up=self.gives_up)
 
@@ -263,7 +265,7 @@ class NavigationLoop:
 
     def record(self) -> NavigationRecord:
         """Return what has happened up to the end of the last whole period."""
-        return self._track.record(self.navigation, self.robot.recorder, self.reason or "stopped", self.gives_up)
+        return self._track.record(self.navigation, self.robot, self.reason or "stopped", self.gives_up)
 
     def _end_period(self) -> None:
         self._track.moved(self.simulator, self.robot.proximal, self._peak_n)
@@ -285,15 +287,15 @@ def navigate(
 ) -> NavigationRecord:
     """Let a policy drive one navigation in the simulator, and record what truly happens.
 
-    Every `DECISION_PERIOD_S` the policy is given the encoders' readings and, where its last decision asked for it, what
-    X-ray shows; at the first decision X-ray is always on. It ends when the target is reached at the end of a period,
-    when the time is over, when the policy gives up, or when the simulation fails.
+    Every `DECISION_PERIOD_S` the policy is given the readings of the encoders and the drives' loads and, where its last
+    decision asked for it, what X-ray shows; at the first decision X-ray is always on. It ends when the target is
+    reached at the end of a period, when the time is over, when the policy gives up, or when the simulation fails.
 
     Args:
         navigation: as the policy is given it.
         policy: what decides, or the name of a policy, such as "agent".
         config: robot, C-arm and rod core.
-        seed: of encoder noise, detection errors and the policy.
+        seed: of the robot, its noise, detection errors and the policy.
         truth: how reality differs; not at all if not given.
 
     Raises:
@@ -308,7 +310,12 @@ def navigate(
 
 
 def start_world(
-    navigation: Navigation, truth: ModelMismatch, config: SimulatorConfig, *, motion: Motion | None = None
+    navigation: Navigation,
+    truth: ModelMismatch,
+    config: SimulatorConfig,
+    *,
+    robot: RobotConfig | None = None,
+    motion: Motion | None = None,
 ) -> Simulator:
     """Return the world as it truly is, with the wire and its catheters at the start of the navigation.
 
@@ -316,6 +323,7 @@ def start_world(
         navigation: as a policy is given it.
         truth: how reality differs.
         config: settings of the rod core.
+        robot: in whose grip the devices slip; at their own limits if not given.
         motion: of the vessel; it lies still if not given.
 
     Raises:
@@ -324,6 +332,8 @@ def start_world(
     device = navigation.device
     wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=truth.stiffness_factor)
     stack = Stack(wire, truth.catheters(navigation.catheters))
+    if robot is not None:
+        stack, config = in_grip(stack, robot, config)
     simulator = Simulator(truth.anatomy(navigation.anatomy), stack, motion=motion, config=config)
     start = navigation.start
     simulator.reset(

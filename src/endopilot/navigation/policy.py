@@ -25,11 +25,13 @@ class Observation:
         devices: inserted length Δ (mm) and rotation φ (rad) of each device by the robot's encoders: of the wire, then
             of each catheter from the inside out.
         tip: what X-ray shows of the wire's tip now, or None where it is off.
+        load: axial force (N) and torque (N·mm) of each drive as the robot measures them; empty where it does not.
     """
 
     time_s: float
     devices: Proximals
     tip: TipMeasurement | None
+    load: Proximals = ()
 
 
 @dataclass(frozen=True)

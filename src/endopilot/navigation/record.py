@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.anatomy.projection import project_tip
-from endopilot.navigation.policy import BelievedTip, Proximals
-from endopilot.simulation.recorder import Recorder
+from endopilot.navigation.policy import BelievedTip, Observation, Proximals
+from endopilot.robot.robot import SimulatedRobot
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, is_safe
@@ -28,6 +28,9 @@ class NavigationRecord:
         time_s: s.
         inserted_length: Δ of each device, mm.
         rotation: φ of each device, rad.
+        encoders: Δ, mm, and φ, rad, of each device as the policy was given them at this moment; NaN at the end, and
+            where nobody asked.
+        load: axial force, N, and torque, N·mm, of each drive as the policy was given them, likewise.
         tip_position: LPS mm.
         tip: Δtip, γtip, branch and lumen radius, with a row a sample and a column a device.
         shape: nodes of the line that the devices share, from the foremost tip on, LPS mm.
@@ -39,10 +42,12 @@ class NavigationRecord:
             does not tell: (Δtip, γtip), mm.
         half_width: of the adviser's bands around it, mm, likewise; NaN where there is none.
         asks: why the policy asked at this moment for X-ray at the next one; empty where it did not, or does not tell.
-        cycles: what the drives asked for in each of their cycles and what the devices did, without shapes; replayed it
-            gives the same navigation to the bit. Its columns repeat over a period's cycles what was `decided`, and
-            what was `measured`, `believed` and the `half_width` at its begin, NaN where that is nothing; `about` has
-            the target, why it ended, when X-ray was on, s, and why it was asked for. None where no period is over.
+        cycles: what the drives asked for in each of their cycles and what the devices truly did, without shapes;
+            replayed it gives the same navigation to the bit. Its columns `encoders` and `load` are what the robot
+            measured at the end of each cycle (`SimulatedRobot.measured`); others repeat over a period's cycles what was
+            `decided`, and what X-ray `measured`, what was `believed` and the `half_width` at its begin, NaN where that
+            is nothing. `about` has the target, why it ended, when X-ray was on, s, and why it was asked for. None where
+            no period is over.
         success: the tip reached the target in time, at the end of a period.
         safe: the wall force never exceeded the navigation's limit.
         seconds: how long it took, s.
@@ -58,6 +63,8 @@ class NavigationRecord:
     time_s: Float[np.ndarray, "samples"]
     inserted_length: Float[np.ndarray, "samples devices"]
     rotation: Float[np.ndarray, "samples devices"]
+    encoders: Float[np.ndarray, "samples devices 2"]
+    load: Float[np.ndarray, "samples devices 2"]
     tip_position: Float[np.ndarray, "samples devices 3"]
     tip: TipProjection
     shape: Float[np.ndarray, "samples nodes 3"]
@@ -110,7 +117,7 @@ class Track:
         self._shape: list[Float[np.ndarray, "nodes 3"]] = []
         self._force: list[float] = []
         self._control: list[Proximals] = []
-        self._measured: list[TipMeasurement | None] = []
+        self._seen: list[Observation | None] = []
         self._exposures: list[int] = []
         self._believed: list[BelievedTip | None] = []
         self._faults, self._before = 0, 0
@@ -118,16 +125,16 @@ class Track:
     def decided(
         self,
         control: Proximals,
-        tip: TipMeasurement | None,
+        seen: Observation | None,
         believed: BelievedTip | None,
         *,
         exposed: bool,
         fault: bool,
     ) -> None:
-        """Take what was decided, whether X-ray was on and what it showed then, and what the policy believed."""
+        """Take what was decided, what was observed then, whether X-ray was on, and what the policy believed."""
         self._control.append(control)
         self._exposures.append(exposed + self._before)
-        self._measured.append(tip)
+        self._seen.append(seen)
         self._believed.append(believed)
         self._faults, self._before = self._faults + fault, 0
 
@@ -145,12 +152,12 @@ class Track:
         self._shape.append(simulator.position[0])
         self._force.append(peak_n)
 
-    def record(self, navigation: Navigation, recorder: Recorder, reason: str, gives_up: str) -> NavigationRecord:
+    def record(self, navigation: Navigation, robot: SimulatedRobot, reason: str, gives_up: str) -> NavigationRecord:
         """Return the record of what was gathered up to the end of the last period.
 
         Args:
             navigation: what was to be done.
-            recorder: of the drives' cycles.
+            robot: what drove.
             reason: why it ended.
             gives_up: where and why the policy gave up, in words.
         """
@@ -158,16 +165,21 @@ class Track:
         proximal, position = np.array(self._proximal), np.array(self._position)
         samples, devices, _ = proximal.shape
         periods = samples - 1  # a decision whose period is not over does not count
-        cycles = periods * round(DECISION_PERIOD_S / recorder.period_s)
+        cycles = periods * round(DECISION_PERIOD_S / robot.recorder.period_s)
         exposures = np.array([*self._exposures[:periods], 0])
         believed = [_NOTHING if tip is None else tip for tip in self._believed[:periods]] + [_NOTHING]
         tells = any(tip is not None for tip in self._believed)
         where = np.array([(tip.abscissa, tip.offset) for tip in believed])
         half_width = np.array([tip.half_width for tip in believed])
-        seen = [(np.nan, np.nan) if tip is None else (tip.abscissa, tip.offset) for tip in self._measured[:periods]]
+        tips = [None if seen is None else seen.tip for seen in self._seen[:periods]]
+        nothing = ((np.nan, np.nan),) * devices
+        encoders, load = (
+            np.array([*(nothing if seen is None else getattr(seen, name) for seen in self._seen[:periods]), nothing])
+            for name in ("devices", "load")
+        )
         decisions = {
             "decided": np.array(self._control[:periods]),
-            "measured": np.array(seen),
+            "measured": np.array([(np.nan, np.nan) if tip is None else (tip.abscissa, tip.offset) for tip in tips]),
             "believed": where[:-1],
             "half_width": half_width[:-1],
         }
@@ -182,17 +194,19 @@ class Track:
             time_s=DECISION_PERIOD_S * np.arange(samples),
             inserted_length=proximal[..., 0],
             rotation=proximal[..., 1],
+            encoders=encoders,
+            load=load,
             tip_position=position,
             tip=project_tip(anatomy.tree, anatomy.insertion, position),
             shape=np.array(self._shape),
             contact_force_max=force,
             exposed=exposures > 0,
             control=np.array([*self._control[:periods], np.zeros((devices, 2))]),
-            measured=(*self._measured[:periods], None),
+            measured=(*tips, None),
             believed=where if tells else None,
             half_width=half_width if tells else None,
             asks=tuple(tip.asks for tip in believed),
-            cycles=_made(recorder, cycles, decisions, about) if cycles else None,
+            cycles=_made(robot, cycles, decisions, about) if cycles else None,
             success=reason == "reached",
             safe=bool(is_safe(force.max(), navigation.force_limit_n)),
             seconds=DECISION_PERIOD_S * periods,
@@ -205,9 +219,10 @@ class Track:
         )
 
 
-def _made(recorder: Recorder, cycles: int, decisions: dict[str, np.ndarray], about: dict[str, Any]) -> Trajectory:
+def _made(robot: SimulatedRobot, cycles: int, decisions: dict[str, np.ndarray], about: dict[str, Any]) -> Trajectory:
     columns = {name: np.repeat(values, cycles // len(values), axis=0)[None] for name, values in decisions.items()}
-    return replace(recorder.trajectory().samples(slice(cycles)), columns=columns, about=about)
+    columns |= {name: values[:, :cycles] for name, values in robot.measured.items()}
+    return replace(robot.recorder.trajectory().samples(slice(cycles)), columns=columns, about=about)
 
 
 _NOTHING = BelievedTip(abscissa=np.nan, offset=np.nan)

@@ -14,7 +14,6 @@ import pandas as pd
 from endopilot import __version__
 from endopilot.anatomy.io import write_anatomy
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.control.columns import device_columns
 from endopilot.control.navigate_patient import (
     NavigatePatientConfig,
     PatientNavigation,
@@ -24,18 +23,17 @@ from endopilot.control.navigate_patient import (
 )
 from endopilot.control.outcome import name_target, slipped_s, tell_outcome, worst_ratio
 from endopilot.control.set_up import tip_name
-from endopilot.devices.catheter import write_catheter
-from endopilot.devices.device import write_device
 from endopilot.extras import require_extras
 from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.navigation.policies import POLICIES
 from endopilot.runs import claim
+from endopilot.simulation.signals import table_columns
 from endopilot.simulation.trajectory_file import TRAJECTORY
 from endopilot.tasks.targets import section_at
+from endopilot.types import TipProjection
 
 PAGE_FILE, PICTURE_FILE, TABLE_FILE = "navigation.html", "navigation.png", "navigation.csv"
-WIRE_FILE, EPISODE_FOLDER, ANATOMY_FOLDER = "wire.yaml", "episode", "anatomy"
-CATHETER_FILE, MANIFEST_FILE = "catheter-{}.yaml", "manifest.json"
+EPISODE_FOLDER, ANATOMY_FOLDER, MANIFEST_FILE = "episode", "anatomy", "manifest.json"
 
 
 def navigate_into(
@@ -69,6 +67,7 @@ def navigate_into(
         config=config,
         device=set_up.navigation.device,
         catheters=set_up.navigation.catheters,
+        robot=set_up.robot,
         policy=POLICIES.origin(config.policy),
         version=__version__,
     )
@@ -95,10 +94,8 @@ def _write(found: PatientNavigation, folder: Path, target: str, output: Path) ->
     cycles = found.record.cycles
     assert cycles is not None  # a navigation has a period at least
     about = {"policy": set_up.config.policy, "seed": set_up.config.seed, "truth": asdict(set_up.truth)}
+    about["robot"] = asdict(set_up.robot)
     replace(cycles, about=cycles.about | about).write(output / TRAJECTORY)
-    write_device(set_up.true_wire, output / WIRE_FILE)
-    for number, catheter in enumerate(set_up.true_catheters, start=1):
-        write_catheter(catheter, output / CATHETER_FILE.format(number))
     _write_episode(found, driven_in, output / EPISODE_FOLDER)
     picture = png(navigation_figure(found))
     with writing(output / PICTURE_FILE) as partial:
@@ -117,30 +114,23 @@ def navigation_table(found: PatientNavigation) -> pd.DataFrame:
     places = zip(tip.branch.tolist(), tip.abscissa.tolist(), strict=True)
     measured = [(np.nan, np.nan) if seen is None else (seen.abscissa, seen.offset) for seen in record.measured]
     nothing = np.full((count, 2), np.nan)
-    believed = nothing if record.believed is None else record.believed
-    band = nothing if record.half_width is None else record.half_width
-    proximal = np.stack([record.inserted_length, record.rotation], axis=-1)
-
-    def of_device(k: int) -> dict[str, Any]:
-        return device_columns(k, record.control[:, k], proximal[:, k], record.tip[:, k], record.tip_position[:, k])
-
+    signals = {
+        **{name: getattr(record, name) for name in ("control", "inserted_length", "rotation", "tip_position")},
+        **{name: getattr(record, name) for name in ("encoders", "load")},
+        **{f"tip_{name}": getattr(record.tip, name) for name in TipProjection.__dataclass_fields__},
+        "measured": np.array(measured),
+        "believed": nothing if record.believed is None else record.believed,
+        "half_width": nothing if record.half_width is None else record.half_width,
+    }
     columns: dict[str, Any] = {
         "time_s": record.time_s,
-        **of_device(0),
+        **table_columns(signals),
         "section": [section_at(tree, branch, at) for branch, at in places],
         "safety_ratio": safety_ratio(tip.offset, tip.radius, navigation.device.tip_radius_mm),
         "contact_force_n": record.contact_force_max,
         "xray": record.exposed.astype(int),
-        "measured_tip_abscissa_mm": np.array(measured)[:, 0],
-        "measured_tip_offset_mm": np.array(measured)[:, 1],
-        "believed_tip_abscissa_mm": believed[:, 0],
-        "believed_tip_offset_mm": believed[:, 1],
-        "band_tip_abscissa_mm": band[:, 0],
-        "band_tip_offset_mm": band[:, 1],
         "asks_for_xray": list(record.asks),
     }
-    for k in range(1, len(navigation.devices)):
-        columns |= of_device(k)
     return pd.DataFrame(columns)
 
 
@@ -148,20 +138,20 @@ def _write_episode(found: PatientNavigation, anatomy_folder: Path, output: Path)
     from endopilot.dataset.episode import write_episode  # an extra brings its libraries
 
     set_up = found.set_up
-    device, truth = set_up.navigation.device, set_up.truth
+    truth = set_up.truth
     write_episode(
         found.episode,
         anatomy_folder,
         output,
         set_up.navigation.stack,
         task=f"navigate to {name_target(set_up)}",
-        friction=device.friction * truth.friction_factor,
         tip_stiffness_factor=truth.stiffness_factor,
         seed=set_up.config.seed,
         origin={
             "target": asdict(set_up.navigation.target),
             "navigation": asdict(set_up.config),
             "truth": asdict(truth),
+            "robot": asdict(set_up.robot),
         },
     )
 
@@ -202,6 +192,7 @@ def _manifest(found: PatientNavigation, target: str, output: Path) -> dict[str, 
         catheter_axis=None if navigation.anatomy is set_up.anatomy else navigation.anatomy.insertion.direction.tolist(),
         target={"asked": target, **asdict(navigation.target)},
         truth=asdict(set_up.truth),
+        robot=asdict(set_up.robot),
         simulator=asdict(set_up.simulator),
         figures=figures,
     )

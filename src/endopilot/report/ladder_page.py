@@ -17,8 +17,9 @@ from matplotlib.lines import Line2D
 from plotly.offline import get_plotlyjs
 
 from endopilot.files import read_json, writing
+from endopilot.ladder.attempt import driven, navigation_seed
 from endopilot.ladder.ladder import SCORES_FILE
-from endopilot.ladder.submission import read_navigation
+from endopilot.ladder.submission import recorded_navigation
 from endopilot.plotting import BLACK, BLUE, GREEN, ORANGE, STYLE, VERMILLION, png
 from endopilot.report.report import image, template_text
 from endopilot.report.scene import mark_target, navigation_scene
@@ -93,7 +94,8 @@ def _section(output: Path, task: Task, patients: int) -> dict[str, Any]:
 def _replay_scene(task: Task, navigation: Navigation, result: dict[str, Any], path: Path) -> go.Figure:
     """Return a navigation replayed in space, with its target, what X-ray showed, and what came of it."""
     course = result["course"]
-    *_, record = read_navigation(path, task.name, 0)
+    *_, recording = recorded_navigation(path, task.name, 0)
+    record = driven(recording, navigation, seed=navigation_seed(task, 0))
     figure = navigation_scene(navigation.anatomy, record.trajectory, devices=navigation.devices)
     exposed = np.array(course["exposed"])
     observed, seconds = np.array(course["tip_position"])[exposed], np.array(course["time_s"])[exposed]

@@ -11,7 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
-from endopilot.control.navigate_patient import PatientNavigation
+from endopilot.control.navigate_patient import PatientNavigation, SetUp
 from endopilot.control.outcome import name_target, slipped_s, tell_outcome, worst_ratio
 from endopilot.files import json_text, writing
 from endopilot.report.report import image, template_text
@@ -93,7 +93,7 @@ def _facts(found: PatientNavigation) -> list[tuple[str, str]]:
         ("Friction in reality", f"{device.friction * truth.friction_factor:.3g}, given {device.friction:g}"),
         ("Tip stiffness in reality", f"{truth.stiffness_factor:g} of the given one"),
         ("Ostium in reality", f"{truth.ostium_mm:+.2f} mm along the catheter"),
-        ("Latency in reality", f"{truth.latency_factor:g} of the given one"),
+        ("Robot", _robot(set_up)),
         ("A drive slipped for" if navigation.catheters else "Drive slipped for", f"{slipped_s(found):.2f} s"),
     ]
     if set_up.config.true_axis_deg:
@@ -102,6 +102,14 @@ def _facts(found: PatientNavigation) -> list[tuple[str, str]]:
     if found.plans is not None:
         facts.append(("Courses searched", str(found.plans)))
     return [*facts, ("Seed", str(set_up.config.seed))]
+
+
+def _robot(set_up: SetUp) -> str:
+    """Return what drives, in words."""
+    robot, wire = set_up.robot, set_up.robot.wire
+    where = "motors" if robot.encoders_at == "motor" else "devices"
+    play = f"play {wire.play_mm:g} mm and {np.rad2deg(wire.play_rad):.0f}°"
+    return f"{set_up.config.robot}: {play}, latency {1e3 * robot.latency_s:.3g} ms, encoders on the {where}"
 
 
 def _scene(found: PatientNavigation) -> str:

@@ -18,8 +18,9 @@ from collections import OrderedDict, deque
 import numpy as np
 
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.drive_motion import DriveMotion
+from endopilot.devices.robot import RobotConfig
 from endopilot.robot.drive_protocol import BRAKING_S, LONGEST_LINE, PROTOCOL, SILENCE_S, number
-from endopilot.robot.robot import DriveMotion, RobotConfig
 
 LASTS_S = SILENCE_S - BRAKING_S
 """Age at which a ticket is void, s."""
@@ -45,12 +46,14 @@ class Drive:
         Args:
             limits: a command beyond them, or the end of the travel, stops the drive.
             now: time by the drive's clock, s.
-            config: latency, backlash, accelerations and encoder noise.
+            config: latency, accelerations and noise; the encoders sit at the motor, for there is no wire.
             inserted_length: Δ at the start, mm.
         """
         config = config or RobotConfig()
-        self._limits, self._motion = limits, DriveMotion(limits, config, (inserted_length, 0.0))
-        self._noise, self._random = np.array([config.encoder_sd_mm, config.encoder_sd_rad]), np.random.default_rng()
+        self._limits, start = limits, np.array([[[inserted_length, 0.0]]])
+        self._motion = DriveMotion(config, [[limits]], start)
+        self._noise = config.of_drives(1, "encoder_sd_mm", "encoder_sd_rad", "load_sd_n", "load_sd_n_mm")[0]
+        self._random = np.random.default_rng()
         self._began = self._now = self._heard = now
         self._tickets: OrderedDict[str, float] = OrderedDict()
         self._wanted: tuple[float, float] | None = None
@@ -62,8 +65,8 @@ class Drive:
 
     @property
     def position(self) -> tuple[float, float]:
-        """Δ, mm, and φ, rad, as they are."""
-        return float(self._motion.position[0]), float(self._motion.position[1])
+        """Δ, mm, and φ, rad, by the motor, as they are."""
+        return float(self._motion.motor[0, 0, 0]), float(self._motion.motor[0, 0, 1])
 
     @property
     def at_rest(self) -> bool:
@@ -118,12 +121,13 @@ class Drive:
             self._wanted, self._heard = (translation, rotation), max(heard, self._heard)
 
     def state(self) -> str:
-        """Return a STATE answer: clock, s; Δ, mm, and φ, rad, by the encoders; armed or why not; and a ticket."""
+        """Return a STATE answer: clock, s; Δ, mm, and φ, rad, by the encoders; load, N and N·mm; status; ticket."""
         if self._state is None:  # one instant has one reading
-            inserted, rotation = self._motion.position + self._noise * self._random.standard_normal(2)
+            true = np.array([*self.position, 0.0, 0.0])  # without a wire there is no load
+            inserted, rotation, force, torque = true + self._noise * self._random.standard_normal(4)
             status = "armed" if self.stopped is None else f"stopped:{self.stopped}"
-            clock = self._now - self._began
-            self._state = f"STATE {clock:.4f} {inserted:.4f} {rotation:.5f} {status} {self._ticket()}\n"
+            read = f"{self._now - self._began:.4f} {inserted:.4f} {rotation:.5f} {force:.4f} {torque:.4f}"
+            self._state = f"STATE {read} {status} {self._ticket()}\n"
         return self._state
 
     def open(self) -> Session | None:
@@ -164,12 +168,13 @@ class Drive:
 
     def _advance(self, until: float) -> None:
         if self._wanted is not None:
-            self._motion.command(*self._wanted)
+            self._motion.command(np.array([[self._wanted]]))
             self._wanted = None
         if until > self._now:
             self._motion.advance(until - self._now)
+            self._motion.motor[..., 0] = np.clip(self._motion.motor[..., 0], *self._limits.travel_mm)
             self._now, self._state = until, None
-        (low, high), at, speed = self._limits.travel_mm, self._motion.position[0], self._motion.velocity[0]
+        (low, high), at, speed = self._limits.travel_mm, self.position[0], self._motion.velocity[0, 0, 0]
         if self.stopped is None and ((at <= low and speed < 0) or (at >= high and speed > 0)):
             self.stop("travel")
 

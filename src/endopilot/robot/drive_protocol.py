@@ -15,7 +15,7 @@ from pathlib import Path
 
 from endopilot.errors import InputError
 
-PROTOCOL = "endopilot-drive 2"
+PROTOCOL = "endopilot-drive 3"
 """Name and version; the drive's greeting begins with it."""
 LONGEST_LINE = 200
 """Bytes of a line, newline included."""

@@ -30,7 +30,7 @@ ANSWER_S = 2.0
 
 
 class RemoteRobot:
-    """Commands a drive process, and reads its encoders. Any thread may call it.
+    """Commands a drive process, and reads its encoders, which sit at the motor, and its load. Any thread may call it.
 
     Attributes:
         limits: of the drive, as it reported them; no command beyond them is ever sent.
@@ -85,7 +85,7 @@ class RemoteRobot:
             return (self._wanted,)
 
     def proximal_state(self) -> ProximalState:
-        """Return what the drive's encoders say now.
+        """Return what the drive measures now.
 
         Raises:
             InputError: the connection is lost.
@@ -188,8 +188,8 @@ class RemoteRobot:
                 self._socket.settimeout(ANSWER_S)
                 self._socket.sendall(" ".join([verb, *arguments]).encode("ascii") + b"\n")
                 fields = self._line().split(" ")
-                values = [value for value in map(number, fields[1:4]) if value is not None]
-                if fields[0] != "STATE" or len(fields) != 6 or len(values) != 3:
+                values = [value for value in map(number, fields[1:6]) if value is not None]
+                if fields[0] != "STATE" or len(fields) != 8 or len(values) != 5:
                     raise ConnectionError("its answer is not of the protocol")
             except OSError as error:
                 self._lose(str(error))
@@ -197,11 +197,11 @@ class RemoteRobot:
             except BaseException:  # Ctrl-C between question and answer: the next answer would be that of this question
                 self._lose("a question was interrupted")
                 raise
-            self.status, self._ticket, self._ticket_time = fields[4], fields[5], asked
+            self.status, self._ticket, self._ticket_time = fields[6], fields[7], asked
             if self.status != "armed":
                 self._until = 0.0
-            clock, inserted, rotation = values
-            return ProximalState(clock, ((inserted, rotation),))
+            clock, inserted, rotation, force, torque = values
+            return ProximalState(clock, ((inserted, rotation),), ((force, torque),))
 
     def _lose(self, reason: str) -> None:
         self._lost = self._lost or reason

@@ -65,6 +65,16 @@ def check_memory(needed: int, what: str, mend: str) -> None:
         raise InputError(f"{what} need {needed / 2**30:.1f} GiB of {available / 2**30:.1f}; {mend}")
 
 
+def check_shape_memory(worlds: int, samples: int, nodes: int) -> None:
+    """Check that the positions of all nodes, 24 bytes each, fit into 0.8 of the machine's memory.
+
+    Raises:
+        InputError: they do not.
+    """
+    what = f"shapes of {worlds} worlds of {samples} samples"
+    check_memory(24 * worlds * samples * nodes, what, "simulate fewer at once")
+
+
 def with_device_axis(name: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return an array with its axis of devices, which may be left out where a wire is alone.
 

@@ -21,6 +21,7 @@ from endopilot.simulation.config import (
 )
 from endopilot.simulation.processor import CoreMotion, Lumen, Options, Processor, Simulation, core_for, gpu_errors
 from endopilot.simulation.rod import RodLayout
+from endopilot.simulation.transmission import TransmissionLayout
 from endopilot.simulation.tubes import TubeLayout
 from endopilot.types import SAMPLE_PERIOD_S, DistanceMap, Insertion
 
@@ -53,6 +54,7 @@ def run_core(
     torque_limit_n_mm: float = np.inf,
     tubes: TubeLayout | None = None,
     motion: CoreMotion | None = None,
+    transmission: TransmissionLayout | None = None,
 ) -> dict[str, np.ndarray]:
     """Run the C++ core on rods and walls of one's own making, as the verification does.
 
@@ -80,6 +82,7 @@ def run_core(
         torque_limit_n_mm: torque at which it slips, N·mm.
         tubes: telescoping tubes, which have limits of their own.
         motion: of the vessel and the insertion; positions and directions are returned in the vessel as it was at first.
+        transmission: how the drives act on the devices; at the ostium if not given.
 
     Returns:
         The arrays that `_core.OUTPUTS` lists, with an axis of devices where they are of devices; `reason`: 0 fine,
@@ -99,6 +102,7 @@ def run_core(
         config=config,
         tubes=tubes,
         motion=motion,
+        transmission=transmission,
         loads=loads,
         approach=approach,
         free_behind_mm=free_behind_mm,
@@ -147,6 +151,7 @@ def make_simulation(
     config: SimulatorConfig,
     tubes: TubeLayout | None = None,
     motion: CoreMotion | None = None,
+    transmission: TransmissionLayout | None = None,
     loads: _core.Loads | None = None,
     approach: bool = True,
     free_behind_mm: float = FREE_BEHIND_MM,
@@ -163,6 +168,7 @@ def make_simulation(
         config: settings.
         tubes: of a wire in catheters.
         motion: of the vessel and the insertion.
+        transmission: how the drives act on the devices; at the ostium if not given.
         loads: dead loads and springs.
         approach: bring devices to their first inserted length from the ostium; else they start there, straight.
         free_behind_mm: nodes farther behind the insertion point follow the drive, mm.
@@ -178,6 +184,7 @@ def make_simulation(
             drives=core.make_drives(limits),
             tubes=None if tubes is None else tubes.model(config.processor),
             motion=motion,
+            transmission=None if transmission is None else transmission.model(config.processor),
             worlds=worlds,
         )
 

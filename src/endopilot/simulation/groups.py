@@ -18,6 +18,7 @@ from endopilot.simulation.core import make_simulation
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.processor import CoreMotion, Lumen, Simulation, core_for
 from endopilot.simulation.rod import LONGEST_ELEMENTS, RodLayout, lay_out
+from endopilot.simulation.transmission import lay_out_transmission
 from endopilot.simulation.tubes import lay_out_tubes
 from endopilot.simulation.vessel_wall import make_wall
 from endopilot.types import Anatomy
@@ -127,6 +128,7 @@ def make_groups(
             config=config,
             tubes=lay_out_tubes(stack, length_mm=longest_mm + FREE_BEHIND_MM),
             motion=moving,
+            transmission=lay_out_transmission(stack, longest_mm=longest_mm + FREE_BEHIND_MM),
         )
         index, project = np.array(worlds), projectors[anatomy.identity]
         groups.append(

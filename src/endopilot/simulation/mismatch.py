@@ -15,12 +15,16 @@ from endopilot.types import Anatomy
 
 QUANTITIES = ("friction", "stiffness", "latency", "ostium")
 """What differs: friction coefficient, stiffness of the tip, the robot's latency, and the position of the ostium along
-the catheter's axis, the last in units of the lumen's diameter there."""
+the catheter's axis, the last in units of the lumen's diameter there. The robot holds its latency itself, and delays
+its copy with `RobotConfig.delayed`."""
 
 
 @settings
 class ModelMismatch:
-    """How reality differs from the navigation that the policy is given."""
+    """How vessel and devices differ in reality from the navigation that the policy is given.
+
+    The robot is no part of a navigation: `RobotConfig` says how it truly is.
+    """
 
     friction_factor: NonNegative = 1.0
     """Factor on the friction coefficient."""
@@ -28,8 +32,6 @@ class ModelMismatch:
     """Factor on the stiffness of the wire's distal 10 mm."""
     ostium_mm: Finite = 0.0
     """The wire is inserted this much deeper than the encoder says, mm: the ostium lies elsewhere along the catheter."""
-    latency_factor: NonNegative = 1.0
-    """Factor on the robot's latency."""
     axis_deg: Annotated[float, Within(0, 45)] = 0.0
     """The guiding catheter leans by this angle off its given axis, degrees."""
     axis_side_deg: Finite = 0.0
@@ -52,7 +54,7 @@ def drawn_sides(share: float, random: np.random.Generator) -> dict[str, float]:
 
 
 def mismatch_by(change: Mapping[str, float], anatomy: Anatomy) -> ModelMismatch:
-    """Return the mismatch in which some of `QUANTITIES` differ by a share.
+    """Return the mismatch in which some of `QUANTITIES` differ by a share; the latency is the robot's.
 
     Args:
         change: share by quantity; what is not there does not differ.
@@ -62,6 +64,5 @@ def mismatch_by(change: Mapping[str, float], anatomy: Anatomy) -> ModelMismatch:
     return ModelMismatch(
         friction_factor=1 + change.get("friction", 0.0),
         stiffness_factor=1 + change.get("stiffness", 0.0),
-        latency_factor=1 + change.get("latency", 0.0),
         ostium_mm=change.get("ostium", 0.0) * diameter_mm,
     )

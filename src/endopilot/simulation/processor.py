@@ -13,8 +13,9 @@ from endopilot.errors import InputError
 if TYPE_CHECKING:
     from endopilot._core import Lumen, Options, RodModel, Simulation, Tubes
     from endopilot._core import Motion as CoreMotion
+    from endopilot._core import Transmission as CoreTransmission
 else:  # each build of the core has classes of its own
-    CoreMotion = Lumen = Options = RodModel = Simulation = Tubes = Any
+    CoreMotion = CoreTransmission = Lumen = Options = RodModel = Simulation = Tubes = Any
 
 Processor = Literal["cpu", "cuda"]
 """Where worlds are stepped: the processor's threads, or a CUDA GPU."""

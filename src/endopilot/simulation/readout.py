@@ -76,7 +76,7 @@ class Readout:
 
     @property
     def rotation(self) -> Float[np.ndarray, "worlds devices"]:
-        """Rotations φ of the drives, rad.
+        """Rotations φ of the devices at the ostium, rad.
 
         Example:
             >>> simulator.reset(inserted_length=np.full(4, 5.0), rotation=[0.0, 0.5, 1.0, 1.5])
@@ -84,6 +84,16 @@ class Readout:
             array([0. , 0.5, 1. , 1.5])
         """
         return self._gather("rotation")
+
+    @property
+    def drive_rotation(self) -> Float[np.ndarray, "worlds devices"]:
+        """Rotations of the drives, rad: ahead of `rotation` by the twist of what lies between drive and ostium.
+
+        Example:
+            >>> np.array_equal(simulator.drive_rotation, simulator.rotation)  # where drives act at the ostium
+            True
+        """
+        return self._gather("drive_rotation")
 
     @property
     def proximal(self) -> Float[np.ndarray, "worlds devices 2"]:

@@ -12,7 +12,7 @@ from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError, Remark
 from endopilot.progress import progress
-from endopilot.simulation.checks import check_control, check_memory, with_device_axis
+from endopilot.simulation.checks import check_control, check_memory, check_shape_memory, with_device_axis
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
@@ -153,8 +153,8 @@ def run_set_up(
         config=set_up.config,
         reach_mm=reach_mm,
     )
-    shapes = 24 * worlds * samples * simulator.nodes if record_shape else 0
-    check_memory(shapes, f"shapes of {worlds} worlds of {samples} samples", "simulate fewer at once")
+    if record_shape:
+        check_shape_memory(worlds, samples, simulator.nodes)
     simulator.reset(inserted_length=start, rotation=set_up.initial[..., 1], friction=set_up.friction)
     with progress("Simulating the wire", total=worlds * samples) as advance:
         return simulator.run(command, period_s=period_s, record_shape=record_shape, advance=advance)

@@ -104,6 +104,8 @@ class Simulator(Readout):
         self._devices = counts.pop()
         if self._devices > 1 and actuation == "force":
             raise InputError("actuation: 'force' with catheters; give 'velocity'")
+        if actuation == "force" and any(one.length_mm > 0 for stack in stacks for one in stack.transmissions):
+            raise InputError("actuation: 'force' with a length between drive and ostium; give 'velocity'")
         with gpu_errors(config.processor):
             self._groups = make_groups(
                 anatomies, stacks, motion, config, sharing._groups if sharing else (), reach_mm=reach_mm
@@ -421,16 +423,34 @@ class Simulator(Readout):
         if control.size and not np.isnan(self._set_up.initial).all():
             self._go_on_their_way()
         if record_shape:  # of the wires that were needed
-            for group, result in zip(self._groups, results, strict=True):
-                needed = max(group.path_mm, float(result["inserted_length"].max())) + FREE_BEHIND_MM
-                result["shape"] = result["shape"][:, :, : np.searchsorted(group.rod.abscissa_mm, needed) + 3]
-            nodes = max(result["shape"].shape[2] for result in results)
-            for result in results:
-                missing = nodes - result["shape"].shape[2]
-                result["shape"] = np.pad(
-                    result["shape"], ((0, 0), (0, 0), (0, missing), (0, 0)), constant_values=np.nan
-                )
+            shapes, inserted = ([result[name] for result in results] for name in ("shape", "inserted_length"))
+            for result, shape in zip(results, self._needed_nodes(shapes, inserted), strict=True):
+                result["shape"] = shape
         return {name: self._merge([result[name] for result in results]) for name in results[0]}
+
+    def _shown(
+        self,
+        shape: Float[np.ndarray, "worlds samples all_nodes 3"],
+        inserted: Float[np.ndarray, "worlds samples devices"],
+    ) -> Float[np.ndarray, "worlds samples nodes 3"]:
+        """Return shapes that were read step by step as `run` records them."""
+        parts = [[values for _, values in self._of_groups(each)] for each in (shape, inserted)]
+        return self._merge(self._needed_nodes(*parts))
+
+    def _needed_nodes(
+        self,
+        shapes: Sequence[Float[np.ndarray, "_ samples nodes_of_group 3"]],
+        inserted: Sequence[Float[np.ndarray, "_ samples devices"]],
+    ) -> list[Float[np.ndarray, "_ samples nodes 3"]]:
+        """Return each group's shapes without the nodes that nothing needed, NaN beyond those of a shorter wire."""
+        kept = []
+        for group, shape, lengths in zip(self._groups, shapes, inserted, strict=True):
+            needed = max(group.path_mm, float(lengths.max())) + FREE_BEHIND_MM
+            nodes = min(int(np.searchsorted(group.rod.abscissa_mm, needed)) + 3, group.simulation.nodes)
+            kept.append(shape[:, :, :nodes])
+        most = max(shape.shape[2] for shape in kept)
+        beyond = [((0, 0), (0, 0), (0, most - shape.shape[2]), (0, 0)) for shape in kept]
+        return [np.pad(shape, width, constant_values=np.nan) for shape, width in zip(kept, beyond, strict=True)]
 
     def _run(
         self,

@@ -8,10 +8,11 @@ from typing import Any, Protocol, runtime_checkable
 from zipfile import BadZipFile
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from endopilot.errors import InputError
 from endopilot.files import writing
+from endopilot.simulation.signals import SolvedOutputs, described
 
 FORMAT_VERSION = 4
 """Of `SimulatorState`: raised when its values or its fingerprint come to mean something else."""
@@ -25,26 +26,10 @@ class SupportsDLPack(Protocol):
     def __dlpack_device__(self) -> tuple[int, int]: ...
 
 
-@dataclass(frozen=True, eq=False)
-class Step:
-    """What all worlds did in one call of `Simulator.step`: one sample of a `Trajectory`, which says what each means."""
-
-    inserted_length: Float[np.ndarray, "worlds devices"]
-    rotation: Float[np.ndarray, "worlds devices"]
-    tip_position: Float[np.ndarray, "worlds devices 3"]
-    tip_direction: Float[np.ndarray, "worlds devices 3"]
-    base_force: Float[np.ndarray, "worlds devices"]
-    base_torque: Float[np.ndarray, "worlds devices"]
-    drive_force: Float[np.ndarray, "worlds devices"]
-    drive_torque: Float[np.ndarray, "worlds devices"]
-    slip: Float[np.ndarray, "worlds devices"]
-    rotation_slip: Float[np.ndarray, "worlds devices"]
-    contact_force_max: Float[np.ndarray, "worlds"]
-    contact_force_sum: Float[np.ndarray, "worlds"]
-    wall_force: Float[np.ndarray, "worlds"]
-    iterations: Float[np.ndarray, "worlds"]
-    node_iterations: Float[np.ndarray, "worlds"]
-    valid: Bool[np.ndarray, "worlds"]
+@described
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Step(SolvedOutputs):
+    """What all worlds did in one call of `Simulator.step`: one sample of a `Trajectory`, with a row a world."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Float, Int, Shaped
 
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.motion import Motion
+from endopilot.simulation.signals import SolvedOutputs, described
 from endopilot.types import Anatomy, TipProjection
 
 if TYPE_CHECKING:
@@ -54,45 +55,28 @@ class SimulationSetUp:
         return np.full_like(fastest, np.finfo(float).max) if self.actuation == "force" else fastest
 
 
-@dataclass(frozen=True, eq=False)
-class Trajectory:
+@described
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Trajectory(SolvedOutputs):
     """The recorded motion of the devices of simulated worlds, one sample every `period_s`.
 
     Sample t is the state at the end of period t, and `command[:, t]` held over that period. Device 0 is the wire; the
     catheters around it follow from the inside out. Positions and directions are those in the vessel as CT shows it.
+    Unlike the force on one node, `wall_force` does not depend on the number of elements: neighbours share one contact.
 
     Attributes:
         set_up: what the worlds were simulated with.
         period_s: time between samples, s.
         start: Δ (mm) and φ (rad) of each device before the first period, as they truly were.
         command: what the drives were asked for: dΔ/dt (mm/s) and dφ/dt (rad/s), or force (N) and torque (N·mm).
-        inserted_length: Δ, mm.
-        rotation: φ, rad.
-        tip_position: LPS mm.
-        tip_direction: unit vector along the device at its tip.
         tip: Δtip, γtip, branch and lumen radius at each sample.
-        base_force: axial force that holds the device where it enters, N, positive when it pushes.
-        base_torque: torque that holds it there, about its axis, N·mm.
-        drive_force: axial force of the drive, N: `base_force` and what the introducer's valve takes.
-        drive_torque: torque of the drive, N·mm, likewise.
-        slip: advance that was commanded and not made in the period, mm; 0 unless the drive slipped, and negative
-            where it pulled or the device was out already.
-        rotation_slip: rotation that was commanded and not made in the period, rad.
-        contact_force_max: largest wall force on one node, N.
-        contact_force_sum: sum of the wall forces' magnitudes, N.
-        wall_force: largest resultant of the wall's forces on any 2 mm of the line that the devices share, N. It does
-            not depend on the number of elements, as the force on a node does: neighbouring nodes share one contact.
-        iterations: mean Newton iterations a time step over the period.
-        node_iterations: evaluations of active nodes in the period: for each Newton iteration, also those of attempts
-            that were given up, the nodes ahead of the guiding catheter.
-        valid: false from the sample in which a world failed to converge or left the finite numbers.
         reason: why a world became invalid: 0 it is valid, 1 it left the finite numbers, 2 it did not converge,
             3 the wire went through the wall.
         shape: positions of all nodes from the foremost tip to the base, LPS mm, if they were recorded; NaN beyond the
             nodes of a shorter wire.
         vessel_to_laboratory: where a vessel that moves lies: affine maps of its points, as CT shows them, to the
             laboratory, LPS mm; None where it lies still.
-        columns: further signals by name.
+        columns: further signals by name, such as those of a robot, a policy or a plan; `SIGNALS` describes them.
         about: what else is to be known, as plain JSON values.
     """
 
@@ -100,23 +84,7 @@ class Trajectory:
     period_s: float
     start: Float[np.ndarray, "worlds devices 2"]
     command: Float[np.ndarray, "worlds samples devices 2"]
-    inserted_length: Float[np.ndarray, "worlds samples devices"]
-    rotation: Float[np.ndarray, "worlds samples devices"]
-    tip_position: Float[np.ndarray, "worlds samples devices 3"]
-    tip_direction: Float[np.ndarray, "worlds samples devices 3"]
     tip: TipProjection
-    base_force: Float[np.ndarray, "worlds samples devices"]
-    base_torque: Float[np.ndarray, "worlds samples devices"]
-    drive_force: Float[np.ndarray, "worlds samples devices"]
-    drive_torque: Float[np.ndarray, "worlds samples devices"]
-    slip: Float[np.ndarray, "worlds samples devices"]
-    rotation_slip: Float[np.ndarray, "worlds samples devices"]
-    contact_force_max: Float[np.ndarray, "worlds samples"]
-    contact_force_sum: Float[np.ndarray, "worlds samples"]
-    wall_force: Float[np.ndarray, "worlds samples"]
-    iterations: Float[np.ndarray, "worlds samples"]
-    node_iterations: Float[np.ndarray, "worlds samples"]
-    valid: Bool[np.ndarray, "worlds samples"]
     reason: Int[np.ndarray, "worlds"]
     shape: Float[np.ndarray, "worlds samples nodes 3"] | None = None
     vessel_to_laboratory: Float[np.ndarray, "worlds samples 3 4"] | None = None

@@ -21,15 +21,16 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from endopilot import _core
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire
-from endopilot.devices.stack import Stack, column_prefixes
+from endopilot.devices.stack import Stack
+from endopilot.devices.transmission import Transmission
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.files import json_text, writing
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion, place
+from endopilot.simulation.signals import SIGNALS, SolvedOutputs, table_columns
 from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
 from endopilot.types import Anatomy, TipProjection
 
@@ -40,40 +41,19 @@ TRAJECTORY = "trajectory.npz"
 """Name of the file in a folder that holds one navigation or plan."""
 FORMAT_VERSION = 1
 """Of the .npz file: raised when an array comes to mean something else."""
-_MEANING = {
-    "command": ("worlds samples devices 2", "mm/s and rad/s, or N and N·mm", "what the drives were asked for"),
-    "start": ("worlds devices 2", "mm and rad", "inserted length and rotation before the first period"),
-    "initial": (
-        "worlds devices 2",
-        "mm and rad",
-        "what devices were brought to before; NaN where worlds were on their way",
-    ),
-    "friction": ("worlds devices", "", "Coulomb coefficient on the wall"),
-    "tip_abscissa": ("worlds samples devices", "mm", "of the tip's projection, from the ostium along the centerline"),
-    "tip_offset": ("worlds samples devices", "mm", "of the tip from the centerline"),
-    "tip_branch": ("worlds samples devices", "", "index of the branch that the tip lies in"),
-    "tip_radius": ("worlds samples devices", "mm", "of the lumen at the tip's projection"),
-    "reason": ("worlds", "", "0 valid, 1 left the finite numbers, 2 did not converge, 3 went through the wall"),
-    "shape": ("worlds samples nodes 3", "mm", "of all nodes from the foremost tip on, LPS"),
-    "vessel_to_laboratory": ("worlds samples 3 4", "", "affine map of the moving vessel's points, LPS mm"),
-}
-"""Axes, unit and meaning of the arrays that the core does not record."""
-_AXES = {"device": "worlds samples devices", "sample": "worlds samples"}
-_TABLE = (
-    ("inserted_length", "inserted_length_mm"),
-    ("rotation", "rotation_rad"),
-    ("tip.abscissa", "tip_abscissa_mm"),
-    ("tip.offset", "tip_offset_mm"),
-    ("tip.branch", "branch"),
-    ("tip.radius", "lumen_radius_mm"),
-    ("base_force", "base_force_n"),
-    ("base_torque", "base_torque_nmm"),
-    ("drive_force", "drive_force_n"),
-    ("drive_torque", "drive_torque_nmm"),
-    ("slip", "slip_mm"),
-    ("rotation_slip", "rotation_slip_rad"),
-)
-"""Signals of a device, and their columns in a table."""
+
+
+def trajectory_signals(trajectory: Trajectory) -> dict[str, np.ndarray]:
+    """Return every array of a trajectory by its name in `SIGNALS`, and further ones by their own."""
+    arrays: dict[str, np.ndarray] = {
+        each.name: value
+        for each in fields(trajectory)
+        if isinstance(value := getattr(trajectory, each.name), np.ndarray)
+    }
+    arrays |= {f"tip_{name}": getattr(trajectory.tip, name) for name in TipProjection.__dataclass_fields__}
+    set_up = trajectory.set_up
+    arrays |= {"initial": set_up.initial, "friction": set_up.friction, "control": trajectory.control}
+    return arrays | trajectory.columns
 
 
 def trajectory_table(trajectory: Trajectory) -> pd.DataFrame:
@@ -84,30 +64,18 @@ def trajectory_table(trajectory: Trajectory) -> pd.DataFrame:
     import pandas as pd
 
     worlds, samples = trajectory.valid.shape
-    columns: dict[str, np.ndarray] = {
+    rows = (worlds, samples)
+    found = {name: each for name, each in trajectory_signals(trajectory).items() if each.shape[:2] == rows}
+    shown = {name: each for name, each in found.items() if name in SIGNALS and SIGNALS[name].columns}
+    columns = {
         "world": np.repeat(np.arange(worlds), samples),
         "time_s": np.tile((np.arange(samples) + 1) * trajectory.period_s, worlds),
-    }
-    for k, prefix in enumerate(column_prefixes(trajectory.devices)):
-        columns[f"{prefix}translation_mm_s"] = trajectory.control[:, :, k, 0]
-        columns[f"{prefix}rotation_rad_s"] = trajectory.control[:, :, k, 1]
-        for signal, column in _TABLE:
-            owner, _, name = signal.rpartition(".")
-            columns[prefix + column] = getattr(trajectory.tip if owner else trajectory, name)[:, :, k]
-        for i, axis in enumerate("xyz"):
-            columns[f"{prefix}tip_{axis}_mm"] = trajectory.tip_position[:, :, k, i]
-            columns[f"{prefix}tip_direction_{axis}"] = trajectory.tip_direction[:, :, k, i]
-    columns |= {
-        "contact_force_max_n": trajectory.contact_force_max,
-        "contact_force_sum_n": trajectory.contact_force_sum,
-        "wall_force_n": trajectory.wall_force,
-        "newton_iterations": trajectory.iterations,
-        "valid": trajectory.valid,
+        **table_columns({name: each.reshape(-1, *each.shape[2:]) for name, each in shown.items()}),
     }
     if trajectory.vessel_to_laboratory is not None:
-        shown = place(trajectory.vessel_to_laboratory, trajectory.tip_position[:, :, 0])
-        columns |= {f"tip_laboratory_{axis}_mm": shown[..., i] for i, axis in enumerate("xyz")}
-    columns |= {name: values for name, values in trajectory.columns.items() if values.shape == (worlds, samples)}
+        there = place(trajectory.vessel_to_laboratory, trajectory.tip_position[:, :, 0])
+        columns |= {f"tip_laboratory_{axis}_mm": there[..., i] for i, axis in enumerate("xyz")}
+    columns |= {name: each for name, each in found.items() if name not in SIGNALS and each.shape == rows}
     return pd.DataFrame({name: np.asarray(values).reshape(-1) for name, values in columns.items()})
 
 
@@ -157,6 +125,9 @@ def read_trajectory(path: Path | str, anatomy: Anatomy | Sequence[Anatomy] | Non
         raise InputError(f"{path}: no trajectory ({error}); give a file that Trajectory.write made") from None
     if about["version"] != FORMAT_VERSION:
         raise InputError(f"{path}: format version {about['version']}, not {FORMAT_VERSION}; simulate it again")
+    missing = {each.name for each in fields(SolvedOutputs)} - arrays.keys()
+    if missing:
+        raise InputError(f"{path}: lacks {', '.join(sorted(missing))}, which this version records; simulate it again")
     vessels = _vessels(path, about, anatomy)
     made = [_stack(each) for each in about["stacks"]]
     set_up = SimulationSetUp(
@@ -179,22 +150,16 @@ _FORMAT = "endopilot trajectory"
 
 
 def _arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
-    arrays: dict[str, np.ndarray] = {
-        each.name: value
-        for each in fields(trajectory)
-        if isinstance(value := getattr(trajectory, each.name), np.ndarray)
-    }
-    arrays |= {f"tip_{name}": getattr(trajectory.tip, name) for name in TipProjection.__dataclass_fields__}
-    arrays |= {f"column.{name}": values for name, values in trajectory.columns.items()}
-    return arrays | {"initial": trajectory.set_up.initial, "friction": trajectory.set_up.friction}
+    """Return the arrays of a file: what follows from others is left out, and further signals are marked as such."""
+    found = trajectory_signals(trajectory)
+    del found["control"]
+    return {f"column.{name}" if name in trajectory.columns else name: each for name, each in found.items()}
 
 
 def _about(trajectory: Trajectory, arrays: Mapping[str, np.ndarray]) -> str:
     """Return what the arrays mean and what they were simulated with, as JSON."""
-    set_up, meaning = trajectory.set_up, dict(_MEANING)
-    for name, of, numbers, unit, words in _core.OUTPUTS:
-        if name in arrays and name not in meaning:
-            meaning[name] = (_AXES[of] + (f" {numbers}" if numbers > 1 else ""), unit.replace("N mm", "N·mm"), words)
+    set_up = trajectory.set_up
+    meaning = {name: SIGNALS.get(name.removeprefix("column.")) for name in arrays}
     stacks = list({id(stack): stack for stack in set_up.stacks}.values())
     number = {id(stack): k for k, stack in enumerate(stacks)}
     content = {
@@ -202,9 +167,9 @@ def _about(trajectory: Trajectory, arrays: Mapping[str, np.ndarray]) -> str:
         "version": FORMAT_VERSION,
         "period_s": trajectory.period_s,
         "arrays": {
-            name: dict(zip(("axes", "unit", "meaning"), meaning[name], strict=True))
-            for name in arrays
-            if name in meaning
+            name: {"axes": each.axes, "unit": each.unit, "meaning": each.meaning}
+            for name, each in meaning.items()
+            if each is not None
         },
         "actuation": set_up.actuation,
         "motion": None if set_up.motion is None else asdict(set_up.motion),
@@ -218,7 +183,9 @@ def _about(trajectory: Trajectory, arrays: Mapping[str, np.ndarray]) -> str:
 
 
 def _stack(described: Mapping[str, Any]) -> Stack:
-    return Stack(Wire(**described["wire"]), tuple(Catheter(**each) for each in described["catheters"]))
+    catheters = tuple(Catheter(**each) for each in described["catheters"])
+    behind = tuple(Transmission(**each) for each in described.get("transmissions", ()))
+    return Stack(Wire(**described["wire"]), catheters, behind)
 
 
 def _vessels(path: Path | str, about: Mapping[str, Any], anatomy: Anatomy | Sequence[Anatomy] | None) -> list[Anatomy]:

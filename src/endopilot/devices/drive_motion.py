@@ -1,0 +1,138 @@
+"""The motion of drives under velocity commands: `DriveMotion`, from a command to the proximal end of a device.
+
+Both the simulated robot and the drive process (`endopilot drive`) move by it; environments and data sets move many
+robots at once.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.robot import RobotConfig
+
+_ROUNDING_S = 1e-12
+
+
+class DriveMotion:
+    """The motion of the drives of some robots, which do not depend on each other.
+
+    A drive follows a command late, no faster and no more suddenly than its limits. Gain and play lie between motor and
+    device: after a reversal the device rests until the motor has gone through the play.
+
+    Attributes:
+        velocity: of the motors, mm/s and rad/s.
+        motor: where the devices would be if gain were 1 and there were no play: what an encoder at the motor counts, mm
+            and rad.
+        position: of the devices' proximal ends: Δ, mm, and φ, rad. Set it where a device did not follow.
+    """
+
+    def __init__(
+        self,
+        config: RobotConfig,
+        limits: Sequence[Sequence[DriveLimits]],
+        position: Float[np.ndarray, "robots devices 2"],
+        *,
+        seeds: Sequence[int | Sequence[int]] = (0,),
+    ) -> None:
+        """Begin at rest, in the middle of the play.
+
+        Args:
+            config: latency, jitter, accelerations, gains and plays.
+            limits: of the drives of each robot.
+            position: where the devices are, Δ, mm, and φ, rad.
+            seeds: of each robot's gains and jitter.
+        """
+        robots, devices, _ = position.shape
+        self._acceleration = config.of_drives(devices, "max_acceleration_mm_s2", "max_acceleration_rad_s2")[None]
+        self._half_play = config.of_drives(devices, "play_mm", "play_rad")[None] / 2
+        self._fastest = np.array([[each.fastest for each in of_robot] for of_robot in limits])
+        self._travel = np.moveaxis(np.array([[each.travel_mm for each in of_robot] for of_robot in limits]), -1, 0)
+        self._latency_s, self._jitter_s = config.latency_s, config.jitter_s
+        self._draw_gains = partial(config.gains, devices)
+        self._random = [np.random.default_rng(seed) for seed in seeds]
+        self._gain = np.stack([self._draw_gains(random) for random in self._random])
+        self._top = self._fastest / np.maximum(self._gain, 1.0)  # of the motors: no device goes faster than its limit
+        self._wanted, self._ahead = np.zeros(position.shape), np.zeros(position.shape)
+        self._ramp = np.broadcast_to(self._acceleration, position.shape).copy()
+        self._orders: deque[tuple[Float[np.ndarray, "robots"], Float[np.ndarray, "robots devices 2"]]] = deque()
+        self._clock = np.zeros(robots)
+        self.velocity = np.zeros(position.shape)
+        self.motor, self.position = np.array(position, dtype=float), np.array(position, dtype=float)
+
+    @property
+    def time_s(self) -> float:
+        """Time since the start, s."""
+        return float(self._clock[0])
+
+    def command(self, velocity: Float[np.ndarray, "robots devices 2"]) -> None:
+        """Take velocities within the limits, mm/s and rad/s, which act after latency and jitter."""
+        late = np.array([random.random() for random in self._random])
+        due = self._clock + self._latency_s + self._jitter_s * late
+        if self._orders:
+            due = np.maximum(due, self._orders[-1][0])
+        self._orders.append((due, np.array(velocity, dtype=float)))
+
+    def stop(self, *, within_s: float = np.inf) -> None:
+        """Brake at once, whatever was commanded before: within a time, s, where the motors' ramp would take longer."""
+        self._orders.clear()
+        self._wanted = np.zeros_like(self._wanted)
+        self._ramp = np.maximum(self._acceleration, self._fastest / within_s)
+
+    def reset(
+        self, robots: Sequence[int], position: Float[np.ndarray, "chosen devices 2"], seeds: Sequence[Sequence[int]]
+    ) -> None:
+        """Put other robots, drawn by their seeds, in the place of some, at rest in the middle of the play."""
+        chosen = np.asarray(robots, dtype=int)
+        for robot, seed in zip(robots, seeds, strict=True):
+            self._random[robot] = np.random.default_rng(seed)
+            self._gain[robot] = self._draw_gains(self._random[robot])
+        self._top = self._fastest / np.maximum(self._gain, 1.0)
+        for due, velocity in self._orders:
+            due[chosen], velocity[chosen] = -np.inf, 0.0
+        for array in (self._wanted, self._ahead, self.velocity):
+            array[chosen] = 0.0
+        self._ramp[chosen] = self._acceleration
+        self.motor[chosen], self.position[chosen] = position, position
+
+    def advance(self, duration: float) -> Float[np.ndarray, "robots devices 2"]:
+        """Let some time pass, s, and return how far the devices' proximal ends move in it, mm and rad."""
+        before, end = self.position.copy(), self._clock + duration
+        while (self._clock < end - _ROUNDING_S).any():
+            self._obey()
+            until = np.minimum(self._next(), end)
+            self._move((until - self._clock)[:, None, None])
+            self._clock = until
+        return self.position - before
+
+    def _obey(self) -> None:
+        """Take what is due of each robot, and forget what all have taken."""
+        for due, velocity in self._orders:
+            here = due <= self._clock + _ROUNDING_S
+            self._wanted = np.where(here[:, None, None], np.clip(velocity, -self._top, self._top), self._wanted)
+            self._ramp = np.where(here[:, None, None], self._acceleration, self._ramp)
+        while self._orders and (self._orders[0][0] <= self._clock + _ROUNDING_S).all():
+            self._orders.popleft()
+
+    def _next(self) -> Float[np.ndarray, "robots"]:
+        """Return when each robot's next order is due, s."""
+        times = [np.where(due <= self._clock + _ROUNDING_S, np.inf, due) for due, _ in self._orders]
+        return np.min(times, axis=0) if times else np.full_like(self._clock, np.inf)
+
+    def _move(self, duration: Float[np.ndarray, "robots 1 1"]) -> None:
+        """Move towards the wanted velocity for a while, s: ramp, then constant; the devices follow through the play."""
+        ramp = np.minimum(np.abs(self._wanted - self.velocity) / self._ramp, duration)
+        reached = self.velocity + np.sign(self._wanted - self.velocity) * self._ramp * ramp
+        motor = (self.velocity + reached) / 2 * ramp + reached * (duration - ramp)
+        self.velocity, self.motor = reached, self.motor + motor
+        driven = self._gain * motor
+        ahead = np.clip(self._ahead + driven, -self._half_play, self._half_play)
+        moved = driven - (ahead - self._ahead)
+        self._ahead = ahead
+        self.position = self.position + moved
+        self.position[..., 0] = np.clip(self.position[..., 0], *self._travel)

@@ -1,0 +1,149 @@
+"""What a robot does to a command before a device moves, as data: `RobotConfig`, and the YAML files that hold it.
+
+    command -> latency, jitter -> motor [encoder] -> gain -> play -> slip -> proximal end of the device [encoder]
+
+docs/robot.md describes the chain, and says where the numbers come from.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import yaml
+from jaxtyping import Float
+from pydantic import model_validator
+
+from endopilot.devices.device import Device
+from endopilot.devices.device_files import there
+from endopilot.errors import InputError
+from endopilot.files import writing
+from endopilot.settings import NonNegative, Positive, Within, read_settings, settings
+
+ASSUMED, IDEAL = "assumed", "ideal"
+"""Names of the robot whose numbers are assumptions, which is the default, and of the one that does as it is told."""
+_SHIPPED = Path(__file__).parent / "robots"
+_MOST_SPREADS = 3.0
+"""A gain that is drawn lies no farther from its mean than this many standard deviations."""
+
+
+@settings
+class DriveConfig:
+    """The drive of one device: motor, gears and grip."""
+
+    max_acceleration_mm_s2: Positive = 200.0
+    """Largest change of the translation's speed, mm/s²."""
+    max_acceleration_rad_s2: Positive = 60.0
+    """Largest change of the rotation's speed, rad/s²."""
+    gain_translation: Annotated[float, Within(0.5, 2)] = 1.0
+    """Motion of the device per motion of the motor: rollers are thicker or thinner than their drive reckons."""
+    gain_rotation: Annotated[float, Within(0.5, 2)] = 1.0
+    """The same of the rotation."""
+    gain_sd_translation: Annotated[float, Within(0, 0.2)] = 0.0
+    """Standard deviation of that gain from robot to robot, a share of it; a seed draws the robot."""
+    gain_sd_rotation: Annotated[float, Within(0, 0.2)] = 0.0
+    """The same of the rotation."""
+    play_mm: Annotated[float, Within(0, 50, unit="mm")] = 0.1
+    """Motion that is lost where the translation reverses, mm."""
+    play_rad: Annotated[float, Within(0, 50, unit="rad", mistaken=(("°", np.pi / 180),))] = 0.035
+    """Motion that is lost where the rotation reverses, rad."""
+    grip_n: Positive | None = None
+    """Axial force beyond which the device slips in the drive's grip, N; the device's own limits hold if not given."""
+    grip_n_mm: Positive | None = None
+    """Torque beyond which it slips, N·mm, likewise."""
+    encoder_sd_mm: NonNegative = 0.02
+    """Standard deviation of a reading of the inserted length, mm."""
+    encoder_sd_rad: NonNegative = 0.005
+    """Standard deviation of a reading of the rotation, rad."""
+    load_sd_n: NonNegative = 0.02
+    """Standard deviation of a reading of the axial force, N."""
+    load_sd_n_mm: NonNegative = 0.01
+    """Standard deviation of a reading of the torque, N·mm."""
+
+    def gripped(self, device: Device) -> Device:
+        """Return a device with the limits at which it slips in this drive."""
+        push, pull, torque = device.push_limit_n, device.pull_limit_n, device.torque_limit_n_mm
+        if self.grip_n is not None:
+            push, pull = min(push, self.grip_n), min(pull, self.grip_n)
+        if self.grip_n_mm is not None:
+            torque = min(torque, self.grip_n_mm)
+        if (push, pull, torque) == (device.push_limit_n, device.pull_limit_n, device.torque_limit_n_mm):
+            return device
+        return replace(device, push_limit_n=push, pull_limit_n=pull, torque_limit_n_mm=torque)
+
+
+@settings
+class RobotConfig:
+    """A robot. What a file leaves out is as here, in the robot `assumed`."""
+
+    encoders_at: Literal["motor", "wire"] = "wire"
+    """Where the encoders sit: on the motors, in front of gain, play and slip, which they do not see; or on the devices,
+    behind them."""
+    latency_s: Annotated[float, Within(0, 10, unit="s", mistaken=(("ms", 1e-3),))] = 0.05
+    """Time from a command to the motion, s."""
+    jitter_s: Annotated[float, Within(0, 10, unit="s", mistaken=(("ms", 1e-3),))] = 0.0
+    """A command comes later than that by up to this time, s, evenly drawn; none overtakes the one before."""
+    wire: DriveConfig = DriveConfig()
+    """Drive of the wire."""
+    catheters: tuple[DriveConfig, ...] = (DriveConfig(),)
+    """Drives of the catheters around it, from the inside out; the last serves all further ones."""
+    sources: tuple[str, ...] = ()
+    """Where numbers come from, a line each, such as "play_mm: 2.4 to 2.6 measured"."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> RobotConfig:
+        if not self.catheters:
+            raise ValueError("catheters: []; give at least one drive, which then serves all catheters")
+        return self
+
+    def drives(self, count: int) -> tuple[DriveConfig, ...]:
+        """Return the drives of the wire and of the catheters around it, of some devices in all."""
+        around = [self.catheters[min(k, len(self.catheters) - 1)] for k in range(count - 1)]
+        return (self.wire, *around)
+
+    def of_drives(self, count: int, *names: str) -> Float[np.ndarray, "devices numbers"]:
+        """Return some fields of each drive, of some devices in all."""
+        return np.array([[getattr(drive, name) for name in names] for drive in self.drives(count)])
+
+    def gains(self, count: int, random: np.random.Generator) -> Float[np.ndarray, "devices 2"]:
+        """Return the gains of one robot's drives, drawn; of translation and rotation of each device."""
+        spread = self.of_drives(count, "gain_sd_translation", "gain_sd_rotation")
+        drawn = np.clip(random.standard_normal(spread.shape), -_MOST_SPREADS, _MOST_SPREADS)
+        return self.of_drives(count, "gain_translation", "gain_rotation") * (1 + spread * drawn)
+
+    def delayed(self, factor: float) -> RobotConfig:
+        """Return a robot whose latency is some times this one's."""
+        return replace(self, latency_s=self.latency_s * factor)
+
+    def write(self, path: Path | str) -> None:
+        """Write the robot as a YAML file that `read_robot` reads, whole or not at all.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        content = {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+        with writing(Path(path)) as partial:
+            partial.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
+
+
+def list_robots() -> tuple[str, ...]:
+    """Return the names of the robots that the package knows."""
+    return (ASSUMED, *sorted(path.stem for path in _SHIPPED.glob("*.yaml")))
+
+
+def read_robot(name_or_path: str | Path) -> RobotConfig:
+    """Read a robot by its name (`list_robots`), or from a YAML file.
+
+    Raises:
+        InputError: no such robot, or a file that is not one; the line names file, field, value and mend.
+    """
+    if str(name_or_path) == ASSUMED:
+        return RobotConfig()
+    named = _SHIPPED / f"{name_or_path}.yaml"
+    path = named if there(named) else Path(name_or_path)
+    if not there(path):
+        names = ", ".join(list_robots())
+        raise InputError(f"robot '{name_or_path}': no such robot or file; give a path, or choose from {names}")
+    return read_settings(path, RobotConfig, onto=RobotConfig())

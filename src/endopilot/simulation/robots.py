@@ -1,0 +1,109 @@
+"""Robots in front of a simulator's devices: drives, grips, encoders and load cells; one robot a world.
+
+`endopilot.robot.robot.SimulatedRobot` is one of them behind a robot's interface; data sets and environments drive many.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.drive_motion import DriveMotion
+from endopilot.devices.robot import RobotConfig
+from endopilot.devices.stack import Stack
+from endopilot.simulation.config import SimulatorConfig, wall_stiffness
+from endopilot.simulation.simulator import Simulator
+
+Seed = Sequence[int]
+"""Seed of one robot: of its gains, its jitter and its noise."""
+
+
+def in_grip(stack: Stack, robot: RobotConfig, core: SimulatorConfig) -> tuple[Stack, SimulatorConfig]:
+    """Return devices that slip where a robot's grip yields, and settings by which the wall is as hard as before.
+
+    Args:
+        stack: the devices.
+        robot: what holds them.
+        core: settings of the rod core, whose wall is as hard as the devices' push limits say if nothing else is given.
+    """
+    wire, *around = robot.drives(len(stack))
+    catheters = tuple(drive.gripped(each) for drive, each in zip(around, stack.catheters, strict=True))
+    held = replace(stack, wire=wire.gripped(stack.wire), catheters=catheters)
+    if held == stack:
+        return stack, core
+    return held, replace(core, wall_stiffness_n_mm=wall_stiffness(core, stack.push_limit_n))
+
+
+class Robots:
+    """What moves the devices of some worlds, and what is measured of them. No world depends on another.
+
+    Encoders count from the assumed position of the ostium. On the devices they measure what play and a slipping drive
+    leave of a command; at the motors they see neither. The load holds what the introducer's valve takes: its friction,
+    with the sign of the motion.
+
+    Attributes:
+        motion: of the drives.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        config: RobotConfig,
+        limits: Sequence[Sequence[DriveLimits]],
+        *,
+        seeds: Sequence[Seed],
+        ostium_mm: float = 0.0,
+    ) -> None:
+        """Grasp the devices where they are.
+
+        Args:
+            simulator: whose devices they are.
+            config: latency, gains, plays, encoders and noise.
+            limits: of the drives of each world, by the encoders.
+            seeds: of each world's robot.
+            ostium_mm: the true inserted lengths are this much more than the encoders', mm.
+        """
+        devices = len(limits[0])
+        self._at_motor, self._ostium_mm = config.encoders_at == "motor", ostium_mm
+        self._noise = config.of_drives(devices, "encoder_sd_mm", "encoder_sd_rad")
+        self._load_noise = config.of_drives(devices, "load_sd_n", "load_sd_n_mm")
+        self._random = [np.random.default_rng([*seed, 8]) for seed in seeds]
+        self.motion = DriveMotion(config, limits, self._counted(simulator), seeds=[[*seed, 7] for seed in seeds])
+
+    def advance(self, duration: float) -> Float[np.ndarray, "worlds devices 2"]:
+        """Let some time pass, s, and return the mean velocities with which the drives move the devices in it."""
+        return self.motion.advance(duration) / duration
+
+    def follow(self, simulator: Simulator) -> None:
+        """Take from where the devices have come to that some did not follow."""
+        self.motion.position = self._counted(simulator)
+
+    def reset(self, simulator: Simulator, worlds: Sequence[int], seeds: Sequence[Seed]) -> None:
+        """Let other robots grasp the devices of some worlds, at rest."""
+        for world, seed in zip(worlds, seeds, strict=True):
+            self._random[world] = np.random.default_rng([*seed, 8])
+        self.motion.reset(worlds, self._counted(simulator)[list(worlds)], [[*seed, 7] for seed in seeds])
+
+    def read(
+        self, simulator: Simulator, *, encoder_noise: np.random.Generator | None = None
+    ) -> Float[np.ndarray, "worlds devices 4"]:
+        """Return a reading of the encoders, mm and rad, and of the drives' loads, N and N·mm.
+
+        Args:
+            simulator: whose devices are read.
+            encoder_noise: of the encoders' noise, where there is one world; the robots' own streams if not given.
+        """
+        places = self.motion.motor if self._at_motor else self._counted(simulator)
+        shape = places.shape[1:]
+        streams = [encoder_noise] if encoder_noise is not None else self._random
+        encoders = places + self._noise * np.stack([random.standard_normal(shape) for random in streams])
+        noise = self._load_noise * np.stack([random.standard_normal(shape) for random in self._random])
+        return np.concatenate([encoders, simulator.drive_load + noise], axis=-1)
+
+    def _counted(self, simulator: Simulator) -> Float[np.ndarray, "worlds devices 2"]:
+        """Return where the devices are, counted from where the ostium is assumed."""
+        return simulator.proximal - [self._ostium_mm, 0.0]

@@ -1,0 +1,146 @@
+"""Simulated devices whose drives lie a metre behind the ostium."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import bend
+import numpy as np
+import pytest
+
+from endopilot.devices.catheter import read_catheter
+from endopilot.devices.device import Wire, read_device
+from endopilot.devices.stack import Stack
+from endopilot.devices.transmission import Transmission
+from endopilot.errors import InputError
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.core import run_core
+from endopilot.simulation.rod import lay_out
+from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.trajectory_file import read_trajectory
+from endopilot.simulation.transmission import lay_out_transmission
+from endopilot.simulation.vessel_wall import make_wall
+
+CONFIG = SimulatorConfig(element_mm=1.25, time_step_s=0.025, threads=1)
+BEHIND = Transmission(length_mm=1000.0, twist_friction_n_mm_mm=2e-4)
+
+
+@pytest.fixture(scope="module")
+def wire() -> Wire:
+    return read_device("workhorse-014")
+
+
+@pytest.fixture(scope="module")
+def vessel():
+    return bend.vessel()
+
+
+def commands(worlds: int, samples: int, devices: int = 1, seed: int = 4) -> np.ndarray:
+    draw = np.random.default_rng(seed)
+    return draw.uniform(-1, 1, (worlds, samples, devices, 2)) * [8.0, 4.0]
+
+
+def simulator(vessel, stack: Stack, worlds: int = 3) -> Simulator:
+    made = Simulator(vessel, stack, worlds=worlds, config=CONFIG)
+    made.reset(inserted_length=np.full((worlds, len(stack)), 30.0), rotation=np.zeros((worlds, len(stack))))
+    return made
+
+
+def test_a_drive_without_a_length_behind_acts_at_the_ostium(vessel, wire: Wire) -> None:
+    control = commands(3, 6)
+    plain = simulator(vessel, Stack(wire)).run(control)
+    rubs = Stack(wire, (), (Transmission(length_mm=0.0, twist_friction_n_mm_mm=1e-3),))
+    near = simulator(vessel, rubs)
+    found = near.run(control)
+    assert np.array_equal(found.tip_position, plain.tip_position)
+    assert np.array_equal(found.drive_torque, plain.drive_torque)
+    assert np.array_equal(near.drive_rotation, near.rotation)
+
+
+def test_the_ostium_follows_the_drive_after_the_lag(vessel, wire: Wire) -> None:
+    stack = Stack(wire, (), (BEHIND,))
+    world = simulator(vessel, stack, 1)
+    turning = np.tile([0.0, 4.0], (1, 12, 1))
+    world.run(turning)
+    # m ∫ s/GJ ds from the ostium to the drive, and what the torque there adds
+    s = np.linspace(0.0, 1000.0, 20001)
+    gj = wire.twist_stiffness(world.inserted_length[0, 0] + 3.0 + s)
+    torque = world.base_load[0, 0, 1]
+    lag = np.trapezoid((torque + BEHIND.twist_friction_n_mm_mm * s) / gj, s)
+    assert world.drive_rotation[0, 0] == pytest.approx(24.0, abs=1e-12)
+    assert world.drive_rotation[0, 0] - world.rotation[0, 0] == pytest.approx(lag, rel=0.03)
+    assert world.rotation[0, 0] == pytest.approx(24.0 - lag, abs=0.05)
+    # while it turns back by less than twice that, the tip stays where it is
+    before = world.tip_position[0, 0]
+    world.run(np.tile([0.0, -lag / 2], (1, 3, 1)))
+    assert np.linalg.norm(world.tip_position[0, 0] - before) < 0.1
+    assert world.rotation[0, 0] == pytest.approx(24.0 - lag, abs=0.1 * lag)
+
+
+def test_a_drive_slips_at_its_own_torque(vessel, wire: Wire) -> None:
+    # friction takes 0.2 N mm of it, and no more than the limit reaches the drive
+    weak = replace(wire, torque_limit_n_mm=0.1)
+    world = simulator(vessel, Stack(weak, (), (BEHIND,)), 1)
+    trajectory = world.run(np.tile([0.0, 4.0], (1, 12, 1)))
+    held = np.abs(trajectory.drive_torque).max()
+    assert 0.1 <= held < 0.11  # with the introducer's valve
+    assert world.drive_rotation[0, 0] < 2.0  # of 24 rad that were commanded
+    assert world.rotation[0, 0] == pytest.approx(0.0, abs=0.05)
+
+
+@pytest.mark.parametrize("catheters", [(), ("microcatheter-1.7f",)])
+def test_the_same_bits_from_a_restored_state(vessel, wire: Wire, catheters: tuple[str, ...]) -> None:
+    around = tuple(read_catheter(name) for name in catheters)
+    stack = Stack(wire, around, (BEHIND,) * (1 + len(around)))
+    control = commands(3, 6, len(stack))
+    one, other = simulator(vessel, stack), simulator(vessel, stack)
+    one.run(control[:, :3])
+    kept = one.state
+    once = one.run(control[:, 3:])
+    other.set_state(kept)
+    again = other.run(control[:, 3:])
+    assert once.valid.all()
+    assert np.array_equal(once.tip_position, again.tip_position)
+    assert np.array_equal(one.drive_rotation, other.drive_rotation)
+    assert (one.drive_rotation != one.rotation).all()
+
+
+def test_the_same_bits_for_any_number_of_lanes(vessel, wire: Wire) -> None:
+    stack, worlds = Stack(wire, (), (BEHIND,)), 5
+    found = [
+        run_core(
+            lay_out(wire, element_mm=CONFIG.element_mm, length_mm=80.0),
+            make_wall(vessel, stack, CONFIG),
+            vessel.insertion,
+            config=CONFIG,
+            initial=np.tile([20.0, 0.0], (worlds, 1)),
+            control=commands(worlds, 5)[:, :, 0],
+            friction=np.full((worlds, 1), 0.1),
+            lanes=lanes,
+            push_limit_n=wire.push_limit_n,
+            torque_limit_n_mm=wire.torque_limit_n_mm,
+            transmission=lay_out_transmission(stack, longest_mm=80.0),
+        )
+        for lanes in (1, 4, 8)
+    ]
+    assert found[0]["valid"].all()
+    for name in ("tip_position", "rotation", "drive_torque", "iterations"):
+        assert np.array_equal(found[0][name], found[1][name]) and np.array_equal(found[0][name], found[2][name]), name
+
+
+def test_a_trajectory_keeps_what_lies_behind(vessel, wire: Wire, tmp_path: Path) -> None:
+    trajectory = simulator(vessel, Stack(wire, (), (BEHIND,)), 1).run(commands(1, 4))
+    trajectory.write(tmp_path / "t.npz")
+    read = read_trajectory(tmp_path / "t.npz", vessel)
+    assert read.set_up.stacks[0].transmissions == (BEHIND,)
+    assert np.array_equal(read.replay().tip_position, trajectory.tip_position)
+
+
+def test_what_cannot_be(vessel, wire: Wire) -> None:
+    with pytest.raises(InputError, match="transmissions: 2 for 1 devices; give one for each device, or none"):
+        Stack(wire, (), (BEHIND, BEHIND))
+    with pytest.raises(InputError, match="actuation: 'force' with a length between drive and ostium"):
+        Simulator(vessel, Stack(wire, (), (BEHIND,)), actuation="force")
+    with pytest.raises(InputError, match=r"length_mm: -1.*give"):
+        Transmission(length_mm=-1.0)
