@@ -80,7 +80,7 @@ def evaluated(toy_dataset, tmp_path_factory):
     make_untrained_run(toy_dataset, folder / "run")
     with patch("endopilot.dataset.again.simulate", toy_simulate):
         settings = EvaluateConfig(sequences=8)
-        metrics = evaluate(folder / "run", folder / "evaluation", settings, other_seeds=[folder / "run"])
+        metrics = evaluate(folder / "run", output=folder / "evaluation", config=settings, other_seeds=[folder / "run"])
     torch.set_num_threads(threads)
     return folder, metrics
 
@@ -96,9 +96,9 @@ def fork():
 @pytest.fixture(scope="session")
 def wire():
     """Return the workhorse wire."""
-    from endopilot.devices.device import read_device
+    from endopilot.devices.device import read_wire
 
-    return read_device("workhorse-014")
+    return read_wire("workhorse-014")
 
 
 @pytest.fixture(scope="session")
@@ -107,7 +107,7 @@ def vessel(fork, tmp_path_factory):
     from endopilot.anatomy.io import write_anatomy
 
     folder = tmp_path_factory.mktemp("vessel") / "fork"
-    write_anatomy(fork, folder)
+    write_anatomy(fork, output=folder)
     return folder
 
 
@@ -117,4 +117,4 @@ def found(vessel):
     from endopilot.control.plan import plan
     from endopilot.control.plan_config import PlanConfig
 
-    return plan(vessel, "0,0,33", PlanConfig(seconds=30.0, start_rotation=0.1, seed=4))
+    return plan(vessel, "0,0,33", config=PlanConfig(seconds=30.0, start_rotation_rad=0.1, seed=4))

@@ -27,8 +27,8 @@ from endopilot import __version__, _core
 from endopilot.anatomy.io import read_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.catheter import list_catheters, read_catheter
-from endopilot.devices.device import read_device
-from endopilot.devices.device_files import list_devices
+from endopilot.devices.device import read_wire
+from endopilot.devices.device_files import list_wires
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import read_json, sha256, write_json, writing
@@ -274,7 +274,7 @@ def _done(path: Path) -> bool:
 
 def _identity(config: RobustnessConfig) -> dict[str, Any]:
     """Return what the results of the chunks follow from."""
-    devices = [read_device(name) for name in list_devices()]
+    devices = [read_wire(name) for name in list_wires()]
     catheters = [read_catheter(name) for name in list_catheters() if config.catheters]
     return {
         "config": {name: value for name, value in asdict(config).items() if name not in ("threads", "folder", "given")},

@@ -22,7 +22,7 @@ import numpy as np
 
 import endopilot
 
-anatomy = next(endopilot.make_atlas(endopilot.AtlasConfig(anatomy="rca", seed=0, population="textbook")))
+anatomy = next(endopilot.make_atlas(config=endopilot.AtlasConfig(vessel="rca", seed=0, population="textbook")))
 
 # %%
 # Before the navigation
@@ -32,8 +32,8 @@ anatomy = next(endopilot.make_atlas(endopilot.AtlasConfig(anatomy="rca", seed=0,
 # band along the vessel is as wide as δ = 2 mm, or when the band across it reaches the wall zone, γ/(r − r_w) = τ = 0.7.
 
 config = endopilot.PlanConfig(force_limit_n=0.3)
-route = endopilot.plan(anatomy, "4", config)
-needed = endopilot.plan_xray(route, endopilot.read_calibration(config, None))
+route = endopilot.plan(anatomy, "4", config=config)
+needed = endopilot.plan_xray(route)
 print(f"{int(needed.exposure.sum())} exposures are due in {0.5 * len(route.control):.1f} s, if all goes as planned")
 
 # %%
@@ -49,7 +49,7 @@ print(f"{int(needed.exposure.sum())} exposures are due in {0.5 * len(route.contr
 navigation = replace(route.navigation, seconds=40.0)
 mismatch = endopilot.ModelMismatch(friction_factor=1.2, stiffness_factor=0.85, ostium_mm=0.4)
 records = {
-    name: endopilot.navigate(navigation, endopilot.make_policy(name), seed=3, truth=mismatch)
+    name: endopilot.NavigationLoop(navigation, endopilot.make_policy(name), seed=3, truth=mismatch).run()
     for name in ("open-loop", "agent", "retract-rotate")
 }
 for name, record in records.items():
@@ -92,7 +92,7 @@ plt.show()
 
 exposures = {"agent": [], "retract-rotate": []}
 for patient in endopilot.make_atlas(endopilot.AtlasConfig(anatomy="rca", seed=0, count=4, population="textbook")):
-    navigation = replace(endopilot.plan(patient, "4", config).navigation, seconds=40.0)
+    navigation = replace(endopilot.plan(patient, "4", config=config).navigation, seconds=40.0)
     for name, counts in exposures.items():
         record = endopilot.navigate(navigation, endopilot.make_policy(name), seed=3, truth=mismatch)
         counts.append(record.exposures)

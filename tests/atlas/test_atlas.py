@@ -122,7 +122,7 @@ def test_a_patient_depends_on_seed_and_index_alone():
 
 
 def test_anatomy_holds_lumen_and_catheter():
-    (anatomy,) = make_atlas(AtlasConfig(seed=2, stenosis_share=1.0))
+    (anatomy,) = make_atlas(config=AtlasConfig(seed=2, stenosis_share=1.0))
     path = anatomy.tree.longest_path()
     depth = sample(anatomy.distance_map, path.points)
     # Linear interpolation on the grid rounds off the ridge on the axis.

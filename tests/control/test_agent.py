@@ -20,7 +20,7 @@ from endopilot.control.halt import describe_halt
 from endopilot.control.period import drive_period
 from endopilot.control.wire_search import WireSearch
 from endopilot.devices.drive_limits import DriveLimits
-from endopilot.navigation.navigate import NavigationLoop, navigate, start_world
+from endopilot.navigation.loop import NavigationLoop, start_world
 from endopilot.navigation.policy import Decision, Hand, Observation, Policy
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import motion_named
@@ -53,11 +53,11 @@ def side_branch(fork, shaped) -> Navigation:
 
 
 def test_the_oracle_gets_into_a_side_branch_that_pushing_misses(side_branch) -> None:
-    failed = navigate(replace(side_branch, seconds=8.0), Forward(), seed=1)
+    failed = NavigationLoop(replace(side_branch, seconds=8.0), Forward(), seed=1).run()
     assert not failed.success
     policy = OraclePolicy(config=QUICK)
     assert isinstance(policy, Policy)
-    record = navigate(side_branch, policy, seed=1)
+    record = NavigationLoop(side_branch, policy, seed=1).run()
     assert record.success and record.safe and record.faults == 0
     assert record.tip.branch[-1, 0] == 2
     assert record.exposures == len(record.time_s) - 1  # X-ray is always on
@@ -80,7 +80,7 @@ def test_a_course_is_what_the_simulator_does_under_its_controls(side_branch, kno
     policy.start(side_branch, 0)
     course = policy.find_course(side_branch.seconds)
     assert course.reached == 1.0
-    moved = side_branch.start_inserted_mm + 0.5 * np.cumsum(course.control[:, 0, 0])
+    moved = side_branch.start_inserted_length_mm + 0.5 * np.cumsum(course.control[:, 0, 0])
     assert np.allclose(course.proximal[:, 0, 0], moved, atol=1e-9)
     simulator = Belief(side_branch, np.array([[1.0, 1.0, 0.0]]), QUICK.belief).simulator
     for k in range(len(course.control)):
@@ -92,7 +92,7 @@ def test_a_course_is_what_the_simulator_does_under_its_controls(side_branch, kno
 
 def test_the_agent_arrives_though_the_wire_is_another_than_believed(side_branch) -> None:
     truth = ModelMismatch(friction_factor=1.2, stiffness_factor=0.8, ostium_mm=0.3)
-    record = navigate(side_branch, AgentPolicy(QUICK), seed=2, truth=truth)
+    record = NavigationLoop(side_branch, AgentPolicy(QUICK), seed=2, truth=truth).run()
     assert record.success and record.safe and record.faults == 0
     assert 1 <= record.exposures < (len(record.time_s) - 1) / 2  # it looks seldom
     held, half = record.in_bands, record.half_width
@@ -225,7 +225,7 @@ def test_images_have_a_calibration_of_their_own(side_branch) -> None:
 
 def test_open_loop_plans_once_and_looks_no_more(side_branch) -> None:
     policy = OpenLoopPolicy(config=QUICK)
-    record = navigate(side_branch, policy, seed=1)
+    record = NavigationLoop(side_branch, policy, seed=1).run()
     assert record.success and record.exposures == 1 and policy.plans == 1
     policy.start(side_branch, 0)
     far = replace(measured(policy.belief, 0), position=np.full(3, 50.0))
@@ -329,7 +329,7 @@ def test_no_attempt_wins_without_a_wire_that_arrives(side_branch) -> None:
 def test_an_agent_gives_up_early_and_names_the_fork(side_branch) -> None:
     straight = replace(side_branch.device, tip_bend_rad=0.0, tip_bend_length_mm=0.0)
     config = replace(QUICK, search=replace(QUICK.search, attempts=1, rounds=2), tries=2)
-    record = navigate(replace(side_branch, device=straight), AgentPolicy(config), seed=2)
+    record = NavigationLoop(replace(side_branch, device=straight), AgentPolicy(config), seed=2).run()
     assert record.reason == "gave up" and not record.success
     assert record.seconds < 0.5 * side_branch.seconds
     assert "at the fork into section vessel (branch 2) at 20.0 mm" in record.gives_up
@@ -391,7 +391,7 @@ def test_a_course_may_begin_with_a_turn(side_branch) -> None:
     policy = OraclePolicy(config=QUICK)
     policy.start(side_branch, 0)
     course = policy._search.find_turned(policy.belief, np.pi, seconds=20.0)
-    assert course.proximal[1, 0, 1] - side_branch.start_rotation == pytest.approx(np.pi)
+    assert course.proximal[1, 0, 1] - side_branch.start_rotation_rad == pytest.approx(np.pi)
     assert (course.control[:2, 0, 0] == 0.0).all() and course.reached == 1.0
 
 

@@ -31,8 +31,10 @@ SIZE = ("--sequences", "5", "--seconds", "20", "--training-seconds", "0.5")
 def case(tmp_path_factory):
     """Return a folder with the CT of a patient, a wire's file, and a run on both that was killed on its way."""
     folder = tmp_path_factory.mktemp("case")
-    patient = make_patient(AtlasConfig(anatomy="rca", count=1, seed=1), 0)
-    write_volume(make_phantom(patient, PhantomConfig(in_plane_mm=0.6, slice_mm=0.7), 1), folder / "ct.nii.gz")
+    patient = make_patient(AtlasConfig(vessel="rca", count=1, seed=1), 0)
+    write_volume(
+        make_phantom(patient, config=PhantomConfig(in_plane_mm=0.6, slice_mm=0.7), seed=1), folder / "ct.nii.gz"
+    )
     shutil.copy(device_yaml("workhorse-014")[0], folder / "wire.yaml")
     line = [sys.executable, "-m", "endopilot.cli", *map(str, arguments(folder))]
     with subprocess.Popen(line, stderr=subprocess.DEVNULL) as first:

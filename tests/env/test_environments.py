@@ -170,16 +170,16 @@ def test_wire_and_catheter_are_driven_and_observed_each_by_itself(near):
     env = NavigateEnv(navigation=navigation)
     start, _ = env.reset(seed=0)
     assert start.shape == (39,) and env.action_space.shape == (4,)
-    assert start[31] == 0.0 and start[0] == pytest.approx(near.start_inserted_mm / 100)
+    assert start[31] == 0.0 and start[0] == pytest.approx(near.start_inserted_length_mm / 100)
     action = np.array([0.0, 0.0, 0.5, 0.25])
     seen, _, _, _, info = [env.step(action) for _ in range(8)][-1]
     advance, turn = 8 * CONTROL_PERIOD_S * 6.0, 8 * CONTROL_PERIOD_S * 0.25 * 3.14
-    assert info["inserted_length"] == pytest.approx(near.start_inserted_mm, abs=1e-6)
+    assert info["inserted_length"] == pytest.approx(near.start_inserted_length_mm, abs=1e-6)
     assert info["catheter_1_inserted_length"] == pytest.approx(advance, abs=1e-6)
     assert info["catheter_1_rotation"] == pytest.approx(turn, abs=1e-6)
     # the catheter is the foremost now: each tip is told by itself
     assert info["catheter_1_tip_abscissa"] == pytest.approx(advance, abs=0.5)
-    assert info["tip_abscissa"] == pytest.approx(near.start_inserted_mm, abs=0.5)
+    assert info["tip_abscissa"] == pytest.approx(near.start_inserted_length_mm, abs=0.5)
     told = [info[f"catheter_1_{name}"] for name in ("inserted_length", "tip_abscissa")]
     assert seen[[31, 34]] == pytest.approx(np.array(told) / 100, abs=1e-6)
     assert seen[32:34] == pytest.approx([np.cos(turn), np.sin(turn)], abs=1e-6)
@@ -223,7 +223,7 @@ def test_the_time_limit_truncates_and_the_next_step_begins_anew(near):
     assert infos["time_s"][0] == pytest.approx(steps * CONTROL_PERIOD_S)
     _, rewards, terminations, truncations, infos = env.step(np.ones((WORLDS, 2)))
     assert (rewards == 0).all() and not (terminations | truncations).any() and (infos["time_s"] == 0).all()
-    assert np.allclose(infos["inserted_length"], near.start_inserted_mm)
+    assert np.allclose(infos["inserted_length"], near.start_inserted_length_mm)
 
 
 def test_only_the_worlds_of_the_mask_are_reset(near):
@@ -284,7 +284,7 @@ def test_bad_actions_are_refused(near, action):
 
 
 def test_pushing_on_for_ever_stops_at_the_end_of_the_wire():
-    navigation = replace(reference_navigation(), seconds=60.0, start_inserted_mm=130.0)
+    navigation = replace(reference_navigation(), seconds=60.0, start_inserted_length_mm=130.0)
     env = NavigateEnv(navigation=navigation)
     env.reset(seed=0)
     longest = navigation.anatomy.tree.longest_path().abscissa[-1]

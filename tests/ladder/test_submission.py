@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from endopilot.cli import main
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.files import json_text
 from endopilot.ladder import submission
@@ -38,7 +38,7 @@ class Hurried:
 def written(tmp_path_factory) -> dict:
     """Return the content of the submission of `forward` in the first patient of two tasks."""
     folder = tmp_path_factory.mktemp("submission")
-    climb(folder, LadderConfig(policy="forward", tasks=("straight", "descending"), patients=1))
+    climb(output=folder, config=LadderConfig(policy="forward", tasks=("straight", "descending"), patients=1))
     return json.loads((folder / "submission.json").read_text(encoding="utf-8"))
 
 
@@ -92,7 +92,7 @@ def test_a_submission_is_confirmed_in_other_processes(written, tmp_path, in_proc
 
 
 def test_a_file_of_version_1_is_driven_again_in_the_textbook_s_patients(tmp_path):
-    climb(tmp_path, LadderConfig(policy="forward", tasks=("straight",), patients=1, version=1))
+    climb(output=tmp_path, config=LadderConfig(policy="forward", tasks=("straight",), patients=1, version=1))
     path = tmp_path / "submission.json"
     content = json.loads(path.read_text(encoding="utf-8"))
     del content["ladder"]  # as files were before there was a version 2
@@ -105,9 +105,9 @@ def test_a_file_of_version_1_is_driven_again_in_the_textbook_s_patients(tmp_path
 
 def test_a_version_1_task_has_the_hash_of_its_file_before_there_were_versions():
     since = ("version", "catheter", "arrives", "start_catheter_mm")
-    task = find_task("crux", 1)
+    task = find_task("crux", version=1)
     before = {name: value for name, value in asdict(task).items() if name not in since}
-    content = json_text(before) + json_text(read_device(task.device))
+    content = json_text(before) + json_text(read_wire(task.device))
     assert submission.task_digest(task) == hashlib.sha256(content.encode()).hexdigest()
     assert submission.task_digest(task) != submission.task_digest(replace(task, version=2))
 

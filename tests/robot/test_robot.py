@@ -13,7 +13,7 @@ from hypothesis import strategies as some
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import RobotConfig, read_robot
 from endopilot.errors import InputError
-from endopilot.navigation.navigate import start_world
+from endopilot.navigation.loop import start_world
 from endopilot.robot.remote import RemoteRobot
 from endopilot.robot.robot import CYCLE_S, Robot, SimulatedRobot
 from endopilot.simulation.config import SimulatorConfig

@@ -12,7 +12,7 @@ import pytest
 from bend import BEND, vessel
 from jaxtyping import Float
 
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import WALL_FORCE_LIMIT_N, WallForceEvent, simulate, wall_force_events
@@ -20,7 +20,7 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy, Insertion
 
 WORLDS, SAMPLES = 6, 16
-DEVICE = read_device("workhorse-014")
+DEVICE = read_wire("workhorse-014")
 
 
 @pytest.fixture(scope="module")
@@ -225,10 +225,10 @@ import numpy as np, sys
 sys.path.insert(0, sys.argv[1])
 from bend import BEND, vessel
 from endopilot.errors import InputError
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.simulation.simulate import WALL_FORCE_LIMIT_N, WallForceEvent, simulate, wall_force_events
 from endopilot.simulation.simulator import Simulator
-anatomy, device, good = vessel(), read_device("workhorse-014"), np.zeros((2, 4, 2))
+anatomy, device, good = vessel(), read_wire("workhorse-014"), np.zeros((2, 4, 2))
 for control, others in (
     (np.zeros((2, 4, 3)), {}),
     (np.zeros((4, 2)), {}),

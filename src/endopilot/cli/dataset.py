@@ -6,7 +6,6 @@ from tyro.conf import Positional
 
 from endopilot.cli.arguments import Existing, Figures, OutputFolder
 from endopilot.dataset.config import DatasetConfig
-from endopilot.devices.device import read_device
 from endopilot.devices.stack import Stack
 from endopilot.files import read_json
 
@@ -39,9 +38,9 @@ def command(
 
     generate_dataset(
         anatomies,
-        output,
-        Stack(read_device(device), tuple(read_catheter(name) for name in catheter)),
-        config,
+        output=output,
+        device=Stack.of(device, *catheter),
+        config=config,
         scheduler=scheduler,
     )
     info = read_json(output / "meta" / "info.json")

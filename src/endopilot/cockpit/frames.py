@@ -74,7 +74,7 @@ def motion_values(snapshot: Snapshot, ostium_mm: float = 0.0) -> dict[str, Any]:
 
     def place(device: Snapshot | ShownCatheter) -> dict[str, float]:
         return {
-            "inserted_mm": round(device.inserted_mm - ostium_mm, 3),
+            "inserted_length_mm": round(device.inserted_length_mm - ostium_mm, 3),
             "rotation_deg": round(float(np.rad2deg(device.rotation)), 2),
         }
 

@@ -140,7 +140,7 @@ class _PlanningPolicy:
     def decide(self, observation: Observation) -> Decision:
         """Follow the course, search another one, or pull back, as the module describes."""
         self._observe(observation)
-        if observation.tip is None and observation.devices[0][0] <= self.navigation.start_inserted_mm:
+        if observation.tip is None and observation.devices[0][0] <= self.navigation.start_inserted_length_mm:
             self._lost = False  # back where it began, the wire lies as it did, unseen in its catheter
         self._shows = False
         wanted = self._pull_back(observation) if self._lost else self._go_on(observation)

@@ -58,9 +58,9 @@ class PlanConfig:
     """How far the guiding catheter may be turned at the ostium where a fork cannot be entered otherwise, degrees."""
     arrives: Arrives = "wire"
     """Whose tip is to go to the target: wire, or catheter, the one around the wire."""
-    start_inserted_mm: Annotated[float, Within(0, 5000)] = 2.0
+    start_inserted_length_mm: Annotated[float, Within(0, 5000)] = 2.0
     """Inserted length at the start, mm."""
-    start_rotation: Finite = 0.0
+    start_rotation_rad: Finite = 0.0
     """Rotation at the start, rad."""
     force_limit_n: Positive = 0.5
     """Largest force of the wall on one node that is safe, N."""

@@ -91,8 +91,8 @@ def rotations_that_enter(navigation: Navigation, device: Wire) -> Int[np.ndarray
     route = Route.to(navigation.anatomy, replace(navigation.target, abscissa=end))  # a fork may lie next to the target
     simulator = Simulator(navigation.anatomy, device, worlds=ROTATIONS, config=PRESETS["fast"])
     simulator.reset(
-        inserted_length=np.full(ROTATIONS, navigation.start_inserted_mm),
-        rotation=np.full(ROTATIONS, navigation.start_rotation),
+        inserted_length=np.full(ROTATIONS, navigation.start_inserted_length_mm),
+        rotation=np.full(ROTATIONS, navigation.start_rotation_rad),
     )
     travel = DriveLimits.of(device, navigation.anatomy)
 

@@ -31,11 +31,11 @@ _WORK_PATH = "meta/work.json"
 
 
 def generate_dataset(
-    anatomy_folders: Sequence[str | Path],
-    output: str | Path,
-    device: Wire | Stack,
-    config: DatasetConfig | None = None,
+    anatomies: Sequence[str | Path],
     *,
+    device: Wire | Stack | str | Path,
+    output: str | Path,
+    config: DatasetConfig | None = None,
     scheduler: str | None = None,
 ) -> None:
     """Simulate random navigations of every anatomy and store them in the LeRobot v3 layout.
@@ -44,9 +44,9 @@ def generate_dataset(
     one returns at once.
 
     Args:
-        anatomy_folders: anatomies on disk, with different names.
+        anatomies: folders of anatomies with different names.
+        device: the wire or its name, or the wire and its catheters; each is driven at random and independently.
         output: folder of the dataset.
-        device: the wire, or the wire and its catheters; each is driven at random and independently.
         config: number, length, distribution and split of the navigations; the defaults if not given.
         scheduler: address of a Dask scheduler whose workers simulate; the cores of this machine if not given.
 
@@ -56,7 +56,7 @@ def generate_dataset(
             force, a scheduler that cannot be reached, or a full disk.
     """
     config = config or DatasetConfig()
-    folders = [Path(folder) for folder in anatomy_folders]
+    folders = [Path(folder) for folder in anatomies]
     layout = make_layout(folders, Path(output), Stack.of(device), config)
     blocks = layout.blocks()
     claim(layout.context.output, "endopilot dataset", **layout.settings)

@@ -183,7 +183,7 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     return manifest, info
 
 
-def load_dataset(folder: Path) -> Dataset:
+def read_dataset(folder: str | Path) -> Dataset:
     """Read a whole dataset made by `endopilot dataset`.
 
     Raises:

@@ -231,7 +231,7 @@ class _Shaping(TipShaping):
 
 
 @settings
-class _DeviceFile:
+class WireFile:
     """What a device's file holds; `Wire` says what each constant means."""
 
     name: Text
@@ -250,14 +250,14 @@ class _DeviceFile:
     tip_shaping: _Shaping | None = None
 
 
-def read_device(name_or_path: str | Path) -> Wire:
+def read_wire(name_or_path: str | Path) -> Wire:
     """Read a device by its name (`endopilot.devices.device_files`), or from a YAML file.
 
     Raises:
         InputError: no such device, or a file that is not a device; the line names file, field, value and mend.
     """
     path = device_file(name_or_path)
-    content = read_settings(path, _DeviceFile)
+    content = read_settings(path, WireFile)
     entries = {field.name: getattr(content, field.name) for field in fields(content) if field.name != "name"}
     entries = {name: entry for name, entry in entries.items() if entry is not None}
     shaping = content.tip_shaping

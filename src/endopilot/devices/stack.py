@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.devices.catheter import Catheter, check_nested
-from endopilot.devices.device import Device, Wire, check_fits
+from endopilot.devices.catheter import Catheter, check_nested, read_catheter
+from endopilot.devices.device import Device, Wire, check_fits, read_wire
 from endopilot.devices.transmission import Transmission
 from endopilot.errors import InputError
 from endopilot.lines import length_along
@@ -46,9 +47,21 @@ class Stack:
             object.__setattr__(self, "transmissions", (Transmission(),) * len(self))
 
     @staticmethod
-    def of(device: Wire | Stack) -> Stack:
-        """Return a stack as it is, and a wire as a stack of one."""
-        return device if isinstance(device, Stack) else Stack(device)
+    def of(device: Wire | Stack | str | Path, *catheters: Catheter | str | Path) -> Stack:
+        """Return the stack of a wire and catheters, each given itself, by its name or by its YAML file.
+
+        Args:
+            device: the wire, or a stack that the catheters are put around.
+            catheters: from the inside out.
+
+        Raises:
+            InputError: no such wire or catheter.
+        """
+        stack = (
+            device if isinstance(device, Stack) else Stack(device if isinstance(device, Wire) else read_wire(device))
+        )
+        around = tuple(each if isinstance(each, Catheter) else read_catheter(each) for each in catheters)
+        return replace(stack, catheters=stack.catheters + around) if around else stack
 
     def __len__(self) -> int:
         """Return the number of devices."""
@@ -107,15 +120,15 @@ def column_prefixes(devices: int) -> tuple[str, ...]:
 
 
 def lines_from_tips(
-    nodes: Float[np.ndarray, "n 3"], inserted_mm: Float[np.ndarray, "devices"]
+    nodes: Float[np.ndarray, "n 3"], inserted_length_mm: Float[np.ndarray, "devices"]
 ) -> list[Float[np.ndarray, "_ 3"]]:
     """Return the line that telescoping devices share, as each of them has it: from its own tip on.
 
     Args:
         nodes: of the line, from the foremost tip on, LPS mm.
-        inserted_mm: inserted length of each device; the foremost tip is that of the largest.
+        inserted_length_mm: inserted length of each device; the foremost tip is that of the largest.
     """
-    behind = inserted_mm.max() - inserted_mm
+    behind = inserted_length_mm.max() - inserted_length_mm
     along = length_along(nodes)
     return [
         nodes if at == 0 else np.vstack([_at(nodes, along, at), nodes[along > at + _APART_MM]])

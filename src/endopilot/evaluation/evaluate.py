@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from endopilot.dataset.loader import Dataset, load_dataset
+from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.errors import InputError
 from endopilot.evaluation.metrics import PAPER_ERRORS
 from endopilot.evaluation.results import (
@@ -41,10 +41,11 @@ class EvaluateConfig:
 
 
 def evaluate(
-    run_folder: str | Path,
+    run: str | Path,
+    *,
     output: str | Path,
-    config: EvaluateConfig = EvaluateConfig(),
-    dataset_folder: str | Path | None = None,
+    config: EvaluateConfig | None = None,
+    dataset: str | Path | None = None,
     other_seeds: Sequence[str | Path] = (),
 ) -> dict[str, Any]:
     """Evaluate a run on navigations and on patients that it was not trained on.
@@ -58,10 +59,10 @@ def evaluate(
     at all. `report.report_evaluation` makes figures and a page of them.
 
     Args:
-        run_folder: made by `endopilot train`, or "pretrained", the model of the package.
+        run: made by `endopilot train`, or "pretrained", the model of the package.
         output: where the result goes.
         config: how much is evaluated.
-        dataset_folder: dataset to evaluate on; the one that the run was trained on if not given.
+        dataset: folder of the dataset to evaluate on; the one that the run was trained on if not given.
         other_seeds: runs of the same training with other seeds, whose errors in P1 shall stand beside the run's.
 
     Returns:
@@ -76,18 +77,19 @@ def evaluate(
         from endopilot.models.episodes import Episodes
         from endopilot.models.rollout import load_model
 
-    start, run_folder, output = time.perf_counter(), Path(run_folder), Path(output)
+    config = config or EvaluateConfig()
+    start, run_folder, output = time.perf_counter(), Path(run), Path(output)
     other_seeds = [Path(run) for run in other_seeds]
-    dataset = load_dataset(Path(dataset_folder or _own_dataset(run_folder, read_run(run_folder))).resolve())
-    known = trained_patients(run_folder, read_run(run_folder), dataset)
+    whole = read_dataset(Path(dataset or _own_dataset(run_folder, read_run(run_folder))).resolve())
+    known = trained_patients(run_folder, read_run(run_folder), whole)
     for other in other_seeds:
-        if trained_patients(other, read_run(other), dataset) != known:
+        if trained_patients(other, read_run(other), whole) != known:
             raise InputError(f"{other}: was trained on other patients than {run_folder}; give runs of one training")
     predictor, others = load_model(run_folder), [load_model(other) for other in other_seeds]
-    held_out, training = _parted(dataset, known)
+    held_out, training = _parted(whole, known)
     if not held_out:
         raise InputError(
-            f"{dataset.folder}: {run_folder} was trained on all its navigations; "
+            f"{whole.folder}: {run_folder} was trained on all its navigations; "
             "make it with seen_test_share above 0 or with more patients"
         )
     chosen = {split: _chosen(data, config.sequences) for split, data in held_out.items()}
@@ -98,7 +100,7 @@ def evaluate(
             results[split] = run_protocols(predictor, data, training, advance)
     metrics = _metrics(results, known, config.seed) | {
         "run": str(run_folder),
-        "dataset": str(dataset.folder),
+        "dataset": str(whole.folder),
         "training_mean": None
         if training is None
         else {"navigations": len(training), "patients": len(set(training.anatomy.tolist()))},
@@ -106,7 +108,7 @@ def evaluate(
             config=config,
             seed=config.seed,
             inputs={path.name: sha256(path) for path in sorted(run_path(run_folder).glob("*.safetensors"))}
-            | {"dataset": dataset.manifest["key"]},
+            | {"dataset": whole.manifest["key"]},
             wall_seconds=time.perf_counter() - start,
         ),
     }

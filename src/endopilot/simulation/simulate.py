@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -48,7 +49,7 @@ class WallForceEvent:
 
 def simulate(
     anatomy: Anatomy,
-    device: Wire | Stack,
+    device: Wire | Stack | str | Path,
     control: Float[np.ndarray, "worlds samples *devices 2"],
     *,
     actuation: Actuation = "velocity",
@@ -68,7 +69,7 @@ def simulate(
 
     Args:
         anatomy: the vessel.
-        device: the wire, or the wire and its catheters; a wire alone needs no axis of devices in what follows.
+        device: the wire or its name, or the wire and its catheters; a wire alone needs no axis of devices below.
         control: proximal velocities (mm/s, rad/s), or force and torque (N, N·mm) of the drive, constant over each
             period, of each device.
         actuation: which of the two: "velocity" or "force"; catheters are driven by velocity.

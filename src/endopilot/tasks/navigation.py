@@ -72,8 +72,8 @@ class Navigation:
         arrives: whose tip is to go to the target: "wire", or "catheter", the one next to the wire. The wire's tip may
             then not be pulled back into the catheter.
         target: where the tip is to go.
-        start_inserted_mm: inserted length Δ at the start, mm.
-        start_rotation: rotation φ at the start, rad.
+        start_inserted_length_mm: inserted length Δ at the start, mm.
+        start_rotation_rad: rotation φ at the start, rad.
         start_catheter_mm: inserted length of the catheters at the start, mm; their rotations are 0.
         seconds: time in which the target is to be reached, s.
         force_limit_n: largest force of the wall on one node that is safe, N.
@@ -87,8 +87,8 @@ class Navigation:
     target: Target
     catheters: tuple[Catheter, ...] = ()
     arrives: Arrives = "wire"
-    start_inserted_mm: Annotated[float, Within(0, 5000)] = 2.0
-    start_rotation: Finite = 0.0
+    start_inserted_length_mm: Annotated[float, Within(0, 5000)] = 2.0
+    start_rotation_rad: Finite = 0.0
     start_catheter_mm: Annotated[float, Within(0, 5000)] = 0.0
     seconds: Seconds = 60.0
     force_limit_n: Positive = 0.5
@@ -122,7 +122,7 @@ class Navigation:
     def start(self) -> Float[np.ndarray, "devices 2"]:
         """(Δ mm, φ rad) of each device at the start."""
         catheters = [(self.start_catheter_mm, 0.0)] * len(self.catheters)
-        return np.array([(self.start_inserted_mm, self.start_rotation), *catheters])
+        return np.array([(self.start_inserted_length_mm, self.start_rotation_rad), *catheters])
 
     def periods(self, period_s: float) -> int:
         """Return after how many periods of some length, s, the time is over."""

@@ -45,7 +45,7 @@ def is_coronary(anatomy: Anatomy) -> bool:
 
 def surroundings(anatomy: Anatomy) -> Volume | None:
     """Return the CT of a synthetic chest around a coronary artery, HU; None for any other vessel."""
-    return make_phantom(anatomy, _SURROUNDINGS, seed=0) if is_coronary(anatomy) else None
+    return make_phantom(anatomy, config=_SURROUNDINGS, seed=0) if is_coronary(anatomy) else None
 
 
 def without_contrast(ct: Volume, anatomy: Anatomy) -> Volume:
