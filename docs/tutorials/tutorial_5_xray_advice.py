@@ -91,10 +91,10 @@ plt.show()
 # patient, and less than a tenth of them in several.
 
 exposures = {"agent": [], "retract-rotate": []}
-for patient in endopilot.make_atlas(endopilot.AtlasConfig(anatomy="rca", seed=0, count=4, population="textbook")):
+for patient in endopilot.make_atlas(config=endopilot.AtlasConfig(vessel="rca", seed=0, count=4, population="textbook")):
     navigation = replace(endopilot.plan(patient, "4", config=config).navigation, seconds=40.0)
     for name, counts in exposures.items():
-        record = endopilot.navigate(navigation, endopilot.make_policy(name), seed=3, truth=mismatch)
+        record = endopilot.NavigationLoop(navigation, endopilot.make_policy(name), seed=3, truth=mismatch).run()
         counts.append(record.exposures)
         assert record.safe and (record.success or name == "retract-rotate")
 for name, counts in exposures.items():
