@@ -130,20 +130,6 @@ def make_groups(
             motion=moving,
             transmission=lay_out_transmission(stack, longest_mm=longest_mm + FREE_BEHIND_MM),
         )
-        index, project = np.array(worlds), projectors[anatomy.identity]
-        groups.append(
-            Group(
-                anatomy,
-                stack,
-                rod,
-                lumens[key],
-                config.wall_reach_mm,
-                moving,
-                simulation,
-                index,
-                path_mm,
-                longest_mm,
-                project,
-            )
-        )
+        where = (np.array(worlds), path_mm, longest_mm, projectors[anatomy.identity])
+        groups.append(Group(anatomy, stack, rod, lumens[key], config.wall_reach_mm, moving, simulation, *where))
     return groups
