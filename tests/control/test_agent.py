@@ -109,7 +109,7 @@ def test_the_agent_arrives_though_the_wire_is_another_than_believed(side_branch)
 @pytest.fixture(scope="module")
 def with_play() -> RobotConfig:
     """Return a robot whose encoders do not see a play of 2.6 mm and 0.9 turn; a seed draws both, ± 15 %."""
-    wire = DriveConfig(play_mm=2.6, play_rad=2 * np.pi * 0.9, play_sd=0.15)
+    wire = DriveConfig(play_mm=2.6, play_rad=2 * np.pi * 0.9, play_sd_share=0.15)
     return RobotConfig(encoders_at="motor", wire=wire)
 
 

@@ -85,7 +85,7 @@ class Drives:
             gain = robot.of_drives(count, "gain_translation", "gain_rotation")
             spread = robot.of_drives(count, "gain_sd_translation", "gain_sd_rotation")
             self._gain = gain * (1 + spread * self._random.standard_normal(shape))
-            spread = np.maximum(robot.of_drives(count, "play_sd"), _LEAST_SD)
+            spread = np.maximum(robot.of_drives(count, "play_sd_share"), _LEAST_SD)
             self._gap = self._play * np.maximum(1 + spread * self._random.standard_normal(shape), _LEAST_SHARE)
             self._ahead = self._gap * (self._random.random(shape) - 0.5)
             self._position = np.tile(self._encoder, (_SAMPLES, 1, 1))
