@@ -131,7 +131,7 @@ def write_toy_anatomies(folder: Path, patients: int) -> list[Path]:
 def toy_navigate(simulate=toy_simulate):
     """Return a stand-in for `simulate_navigations`: the drawn controls, driven as they are through the toy."""
 
-    def simulate_navigations(anatomy, stacks, initial, control, friction, config, *, actuation, motion, advance):
+    def simulate_navigations(anatomy, stacks, initial, control, friction, config, *, advance, **_):
         control = control.astype(np.float32).astype(float)
         trajectory = simulate(anatomy, stacks[0], control, initial=initial, config=config, friction=friction)
         advance(control.shape[0] * control.shape[1])

@@ -17,9 +17,12 @@ from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.loader import read_dataset
 from endopilot.dataset.navigations import PULL_BACK_MM, STOP_SHORT_MM, simulate_navigations
 from endopilot.devices.device import read_wire
+from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.devices.stack import Stack
+from endopilot.errors import InputError
 from endopilot.evaluation.replay import Recorded
 from endopilot.models.config import WINDOW
+from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import motion_named
 from endopilot.simulation.simulate import simulate
 
@@ -78,6 +81,46 @@ def test_where_the_drive_slipped_its_commands_repeat_the_navigation(tmp_path, pa
     np.testing.assert_array_equal(again.rotation_slip, data.rotation_slip)
     # what was made of it, driven evenly, does not
     assert np.abs(retraced(data.control.astype(float)).tip.abscissa - data.tip_abscissa)[slips].max() > 0.01
+
+
+def test_a_robot_makes_the_motions_and_what_it_was_told_and_measured_stands_beside_what_was_true(tmp_path, patient):
+    play = DriveConfig(play_mm=2.4, play_rad=1.0, gain_sd_translation=0.05, grip_n=0.3)
+    robot = RobotConfig(encoders_at="motor", jitter_s=0.05, wire=play)
+    config = DatasetConfig(sequences=5, seconds=20.0, seed=2, sequences_per_file=3, friction=(0.05, 0.2))
+    generate_dataset([patient], device=DEVICE, output=tmp_path / "all", config=config, robot=robot)
+    data = read_dataset(tmp_path / "all")
+    assert data.robot == robot and data.stack.wire.push_limit_n == 0.3
+    assert data.decided is not None and data.encoders is not None and data.load is not None
+    # encoders at the motors follow what the robot was told, late; the devices lie off them by gain and play
+    motor = data.encoders[..., 0, 0] - data.initial[:, None, 0, 0]
+    told = 0.5 * np.cumsum(data.decided[..., 0, 0].astype(float), axis=1)
+    assert np.abs(motor - told).max() < 12.0 * (0.05 + 0.05 + 0.1)
+    true = data.inserted_length[..., 0] - data.initial[:, None, 0, 0]
+    assert np.abs(true - motor).max() > 1.2
+    reversals = np.abs(np.diff(np.sign(data.decided[..., 0, 0]), axis=1)) == 2
+    assert reversals.any()
+    noise = data.load[..., 0, 0] - data.drive_force[..., 0]
+    assert noise.std() == pytest.approx(play.load_sd_n, rel=0.2)
+    # what the drives made of it repeats the navigation
+    again = simulate(
+        read_anatomy(patient),
+        data.stack,
+        data.command,
+        initial=data.initial,
+        config=SimulatorConfig(**data.manifest["config"]["simulator"]),
+        friction=data.friction,
+    )
+    np.testing.assert_array_equal(again.tip.abscissa.astype(np.float32), data.tip_abscissa)
+    np.testing.assert_array_equal(again.inserted_length.astype(np.float32), data.inserted_length)
+    # a navigation's robot does not depend on the others
+    fewer = replace(config, sequences=2)
+    generate_dataset([patient], device=DEVICE, output=tmp_path / "few", config=fewer, robot=robot)
+    few = read_dataset(tmp_path / "few")
+    for name in ("decided", "encoders", "load", "inserted_length"):
+        np.testing.assert_array_equal(getattr(few, name), getattr(data, name)[:2])
+    forced = replace(config, control="force")
+    with pytest.raises(InputError, match="control: 'force' with a robot, which takes velocities; give 'velocity'"):
+        generate_dataset([patient], device=DEVICE, output=tmp_path / "no", config=forced, robot=robot)
 
 
 def test_wires_stay_inside_the_imaged_vessel_and_repeat_from_the_recorded_controls(patient):

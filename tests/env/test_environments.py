@@ -14,6 +14,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
+from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.env.single import NavigateEnv
 from endopilot.env.vector import (
     CONTROL_PERIOD_S,
@@ -327,3 +328,40 @@ def test_vessels_move_where_a_motion_is_given_and_go_on_from_a_pickle(near):
         assert np.array_equal(one.step(row[1])[0], moved[0][step, 1])
     copy = pickle.loads(pickle.dumps(env))
     assert _same(_rollout(copy, actions), _rollout(env, actions))
+
+
+PLAY = RobotConfig(
+    encoders_at="motor", jitter_s=0.05, wire=DriveConfig(play_mm=2.4, play_rad=1.0, gain_sd_translation=0.05)
+)
+
+
+def test_a_robot_drives_and_its_encoders_are_observed(near):
+    env = NavigateVectorEnv(WORLDS, navigations=near, robot=PLAY)
+    begun = env.reset(seed=2)[0]
+    for push in (1.0, 1.0, 1.0, -1.0):
+        observation, *_, infos = env.step(np.tile([[push, 0.0]], (WORLDS, 1)))
+    moved = 2 / 15 * 12.0 * (3 - 1)
+    motor = infos["encoder_inserted_length"] - near.start_inserted_mm
+    assert (np.abs(motor - moved) < 12.0 * 0.1 * 2 + 0.2).all()  # latency, jitter and ramps
+    assert (np.abs(infos["inserted_length"] - infos["encoder_inserted_length"]) > 0.2).all()  # play and gain
+    np.testing.assert_allclose(observation[:, 0], infos["encoder_inserted_length"] / 100.0, rtol=1e-5)
+    np.testing.assert_allclose(observation[:, 1], np.cos(infos["encoder_rotation"]), rtol=1e-4, atol=1e-6)
+    assert np.ptp(infos["load_n"]) > 0 and np.ptp(begun[:, 0]) > 0  # noise of their own
+    named = NavigateVectorEnv(1, navigations=near, robot="kweon-2021-2d")
+    assert "load_nmm" in named.reset(seed=0)[1]
+    with pytest.raises(InputError, match="robot 'none': no such robot or file"):
+        NavigateEnv(navigation=near, robot="none")
+
+
+def test_worlds_with_robots_do_not_depend_on_each_other_and_go_on_from_a_state(near):
+    env = NavigateVectorEnv(WORLDS, navigations=near, robot=PLAY)
+    start, actions = env.reset(seed=5)[0], _actions(near, steps=40)  # past the time limit
+    kept, stored = env.state, pickle.dumps(env)
+    went = _rollout(env, actions)
+    assert went[3].any()
+    env.set_state(pickle.loads(pickle.dumps(kept)))
+    assert _same(_rollout(env, actions), went)
+    assert _same(_rollout(pickle.loads(stored), actions), went)
+    alone = NavigateVectorEnv(1, navigations=near, robot=PLAY)
+    assert np.array_equal(alone.reset(seed=6)[0][0], start[1])
+    assert _same([values[:, 0] for values in _rollout(alone, actions[:, 1:2])], [values[:, 1] for values in went])

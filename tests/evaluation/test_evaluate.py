@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
@@ -11,9 +12,11 @@ import pytest
 from endopilot.cli import main
 from endopilot.dataset.loader import read_dataset
 from endopilot.devices.drive_limits import SPARE_MM
+from endopilot.devices.robot import read_robot
 from endopilot.errors import InputError
 from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
 from endopilot.evaluation.protocols import count_steps, run_protocols
+from endopilot.evaluation.replay import Recorded
 from endopilot.evaluation.results import read_results
 from endopilot.files import read_json, write_json
 from endopilot.models.config import WINDOW
@@ -249,6 +252,26 @@ def test_replayed_controls_are_simulated_from_the_start_of_the_episode(evaluated
     curliness = 0.02 + 0.005 * (len(name) % 3)
     assert (slack >= curliness * inserted - 1e-3).all()
     assert (slack <= curliness * inserted + 1.5 + 1e-3).all()
+
+
+def test_controls_pass_the_drives_of_a_robot(toy_dataset):
+    data = read_dataset(toy_dataset)
+    data = data.select((data.inserted_length[:, WINDOW - 1, 0] > 10) & (data.inserted_length[:, WINDOW - 1, 0] < 30))
+    data = data.select(np.arange(3))
+    control = np.tile([2.0, 0.5], (3, 12, 1))
+    control[:, 6:, 0] = -2.0
+    control[1, 9:] = np.nan
+    ideal = read_robot("ideal")
+    robot = replace(ideal, latency_s=0.1, wire=replace(ideal.wire, play_mm=3.0, play_rad=0.4))
+    made = Recorded.of(data, robot).drivable(control)
+    assert np.isnan(made[1, 9:]).all() and np.isfinite(made[[0, 2]]).all()
+    # v t less half the play on the way in, and v (t - latency) less all of it on the way back; it comes late by 0.1 s
+    np.testing.assert_allclose(
+        0.5 * made[0].sum(axis=0), [2 * 2.9 - 1.5 + 0.2 - (2 * 2.9 - 3.0), 0.5 * 5.9 - 0.2], atol=1e-3
+    )
+    np.testing.assert_array_equal(made[1, :9], Recorded.of(data, robot).drivable(control)[1, :9])
+    exact = Recorded.of(data, ideal).drivable(control)[[0, 2]]
+    np.testing.assert_allclose(exact, Recorded.of(data).drivable(control)[[0, 2]], atol=1e-4)
 
 
 def test_a_run_without_its_dataset_is_refused(evaluated, tmp_path):

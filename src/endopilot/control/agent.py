@@ -24,9 +24,8 @@ from endopilot.belief.adviser import AdviserConfig, XrayAdviser
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.course import Course
-from endopilot.control.search import Search, SearchConfig
-from endopilot.control.stack_search import StackSearch
-from endopilot.control.wire_search import WireSearch
+from endopilot.control.search import Search
+from endopilot.control.search_config import SearchConfig
 from endopilot.devices.stack import Proximals
 from endopilot.errors import InputError
 from endopilot.models.ensemble import NOMINAL
@@ -141,13 +140,8 @@ class _PlanningPolicy:
         for device in navigation.devices:
             check_passable(self.route, device)
         self.belief = Belief(navigation, self._parameters(), self.config.belief)
-        search = self.config.search
-        self._search: Search = (
-            StackSearch(navigation, self.route, self.belief, config=search)
-            if navigation.catheters
-            else WireSearch(navigation, self.route, self.belief, config=search, seed=seed)
-        )
-        self._fastest = np.array([np.inf, search.turn_rad_s])
+        self._search = Search(navigation, self.route, self.belief, config=self.config.search, seed=seed)
+        self._fastest = np.array([np.inf, self.config.search.turn_rad_s])
         self._back_mm, self._looked = np.inf, 0
         self._lost = self._began = self._led = self._arrived = self._shows = False
         self._at, self._crept, self.plans, self._failed, self.planning_s = 0, 0, 0, 0, 0.0

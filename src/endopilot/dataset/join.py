@@ -55,7 +55,12 @@ def _joined(first: Dataset, other: Dataset) -> Dataset:
         "anatomies": list(records.values()),
     }
     names = [field.name for field in fields(Dataset) if field.name not in ("folder", "manifest", "sample_period_s")]
-    arrays = {name: np.concatenate([getattr(first, name), getattr(other, name)]) for name in names}
+    pairs = {name: (getattr(first, name), getattr(other, name)) for name in names}
+    # where one of them has no robot, neither has what it measured
+    arrays = {
+        name: np.concatenate(pair) if all(isinstance(part, np.ndarray) for part in pair) else None
+        for name, pair in pairs.items()
+    }
     return replace(first, manifest=manifest, **arrays)
 
 

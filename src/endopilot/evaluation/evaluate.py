@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from endopilot.dataset.loader import Dataset, read_dataset
+from endopilot.devices.robot import read_robot
 from endopilot.errors import InputError
 from endopilot.evaluation.metrics import PAPER_ERRORS
 from endopilot.evaluation.results import (
@@ -38,6 +40,9 @@ class EvaluateConfig:
     """Navigations of each split that are evaluated, spread evenly over its patients; all if not given."""
     seed: Seed = 0
     """Seed of the bootstrap that gives the intervals over patients."""
+    robot: str | None = None
+    """Name of a robot (docs/robot.md) or a YAML file: the controls of P4 pass its drives before they move the wire. If
+    not given, they move it as they are."""
 
 
 def evaluate(
@@ -70,7 +75,7 @@ def evaluate(
 
     Raises:
         InputError: the run, its dataset or one of its anatomies is missing or damaged, nothing was held out, the
-            dataset was made with another wire, or another seed was trained on other patients.
+            dataset was made with another wire, another seed was trained on other patients, or there is no such robot.
     """
     with extra_named("evaluate"):
         from endopilot.evaluation.protocols import count_steps, run_protocols  # brings torch, slow to import
@@ -78,6 +83,7 @@ def evaluate(
         from endopilot.models.rollout import load_model
 
     config = config or EvaluateConfig()
+    robot = None if config.robot is None else read_robot(config.robot)
     start, run_folder, output = time.perf_counter(), Path(run), Path(output)
     other_seeds = [Path(run) for run in other_seeds]
     whole = read_dataset(Path(dataset or _own_dataset(run_folder, read_run(run_folder))).resolve())
@@ -97,10 +103,11 @@ def evaluate(
     steps = sum(count_steps(data) for data in chosen.values())
     with progress("Evaluating", total=steps) as advance:
         for split, data in chosen.items():
-            results[split] = run_protocols(predictor, data, training, advance)
+            results[split] = run_protocols(predictor, data, training, advance, robot)
     metrics = _metrics(results, known, config.seed) | {
         "run": str(run_folder),
         "dataset": str(whole.folder),
+        "robot": None if robot is None else asdict(robot),
         "training_mean": None
         if training is None
         else {"navigations": len(training), "patients": len(set(training.anatomy.tolist()))},

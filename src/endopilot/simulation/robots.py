@@ -89,20 +89,27 @@ class Robots:
         self.motion.reset(worlds, self._counted(simulator)[list(worlds)], [[*seed, 7] for seed in seeds])
 
     def read(
-        self, simulator: Simulator, *, encoder_noise: np.random.Generator | None = None
-    ) -> Float[np.ndarray, "worlds devices 4"]:
+        self,
+        simulator: Simulator,
+        *,
+        worlds: Sequence[int] | None = None,
+        encoder_noise: np.random.Generator | None = None,
+    ) -> Float[np.ndarray, "chosen devices 4"]:
         """Return a reading of the encoders, mm and rad, and of the drives' loads, N and N·mm.
 
         Args:
             simulator: whose devices are read.
+            worlds: those that are read; all if not given.
             encoder_noise: of the encoders' noise, where there is one world; the robots' own streams if not given.
         """
-        places = self.motion.motor if self._at_motor else self._counted(simulator)
-        shape = places.shape[1:]
-        streams = [encoder_noise] if encoder_noise is not None else self._random
+        chosen = list(range(len(self._random)) if worlds is None else worlds)
+        places = (self.motion.motor if self._at_motor else self._counted(simulator))[chosen]
+        own, shape = [self._random[world] for world in chosen], places.shape[1:]
+        streams = own if encoder_noise is None else [encoder_noise]
         encoders = places + self._noise * np.stack([random.standard_normal(shape) for random in streams])
-        noise = self._load_noise * np.stack([random.standard_normal(shape) for random in self._random])
-        return np.concatenate([encoders, simulator.drive_load + noise], axis=-1)
+        load = simulator.drive_load[chosen]
+        load = load + self._load_noise * np.stack([random.standard_normal(shape) for random in own])
+        return np.concatenate([encoders, load], axis=-1)
 
     def _counted(self, simulator: Simulator) -> Float[np.ndarray, "worlds devices 2"]:
         """Return where the devices are, counted from where the ostium is assumed."""
