@@ -132,6 +132,14 @@ def test_without_play_what_is_known_of_the_robot_changes_nothing(side_branch) ->
     assert np.array_equal(told.tip_position, untold.tip_position) and np.array_equal(told.control, untold.control)
 
 
+def test_the_first_decision_goes_by_the_first_reading(side_branch) -> None:
+    policy = AgentPolicy(QUICK)
+    policy.start(side_branch, 0)
+    (velocity,) = policy.decide(Observation(0.0, ((2.3, 0.1),), None)).devices
+    assert policy._course is not None
+    assert velocity == tuple(((policy._course.proximal[0, 0] - [2.3, 0.1]) / 0.5).tolist())
+
+
 def test_an_exposure_says_how_a_wire_is_turned_that_its_encoder_does_not(side_branch, with_play) -> None:
     """The real drive had all of its play before it, of which the belief knows nothing."""
     belief = Belief(replace(side_branch, robot=with_play), np.array([[1.0, 1.0, 0.0]]), QUICK.belief)

@@ -91,6 +91,11 @@ class Drives:
             self._position = np.tile(self._encoder, (_SAMPLES, 1, 1))
             self._estimate()
 
+    def begin(self, encoders: Proximals) -> None:
+        """Take the first reading of the encoders, before anything has moved."""
+        if not self.lose:
+            self.proximal = self.at_rest = self._encoder = np.array(encoders, dtype=float)
+
     def follow(self, encoders: Proximals) -> None:
         """Take a reading of the encoders, a period after the last."""
         read = np.array(encoders, dtype=float)
