@@ -20,7 +20,8 @@ from endopilot.control.halt import describe_halt
 from endopilot.control.search import Search
 from endopilot.control.trials import Period, drive_period
 from endopilot.devices.drive_limits import DriveLimits
-from endopilot.navigation.loop import NavigationLoop, start_world
+from endopilot.devices.robot import DriveConfig, RobotConfig
+from endopilot.navigation.loop import LoopConfig, NavigationLoop, start_world
 from endopilot.navigation.policy import Decision, Hand, Observation, Policy
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import motion_named
@@ -103,6 +104,50 @@ def test_the_agent_arrives_though_the_wire_is_another_than_believed(side_branch)
         and not replace(record, half_width=0 * half).in_bands.any()
     )
     assert len(replace(record, half_width=None).in_bands) == 0
+
+
+@pytest.fixture(scope="module")
+def with_play() -> RobotConfig:
+    """Return a robot whose encoders do not see a play of 2.6 mm and 0.9 turn; a seed draws both, ± 15 %."""
+    wire = DriveConfig(play_mm=2.6, play_rad=2 * np.pi * 0.9, play_sd=0.15)
+    return RobotConfig(encoders_at="motor", wire=wire)
+
+
+def test_the_agent_arrives_though_encoders_sit_in_front_of_a_wide_play(side_branch, with_play) -> None:
+    config = LoopConfig(robot=with_play)
+    for seed in (1, 2):
+        record = NavigationLoop(side_branch, AgentPolicy(QUICK), config=config, seed=seed).run()
+        assert record.success and record.safe and record.faults == 0
+        assert record.exposures <= 12
+    unaware = replace(side_branch, robot=RobotConfig())  # what it is given of the robot
+    blind = NavigationLoop(unaware, AgentPolicy(QUICK), config=config, seed=2).run()
+    assert not blind.success or blind.exposures > 2 * record.exposures
+
+
+def test_without_play_what_is_known_of_the_robot_changes_nothing(side_branch) -> None:
+    told, untold = (
+        NavigationLoop(replace(side_branch, robot=known), AgentPolicy(QUICK), seed=2).run()
+        for known in (RobotConfig(), None)
+    )
+    assert np.array_equal(told.tip_position, untold.tip_position) and np.array_equal(told.control, untold.control)
+
+
+def test_an_exposure_says_how_a_wire_is_turned_that_its_encoder_does_not(side_branch, with_play) -> None:
+    """The real drive had all of its play before it, of which the belief knows nothing."""
+    belief = Belief(replace(side_branch, robot=with_play), np.array([[1.0, 1.0, 0.0]]), QUICK.belief)
+    true = Belief(side_branch, np.array([[1.0, 1.0, 0.0]]), QUICK.belief)
+    belief.follow(((12.6, 0.0),))
+    true.follow(((10.0, 0.0),))  # the play was ahead
+    belief.weigh(measured(true, 0))
+    belief.follow(((12.6, 5.0),))
+    true.follow(((10.0, 1.5),))
+    unsure = belief.drives.sd[0].copy()
+    for _ in range(3):
+        belief.weigh(measured(true, 0))
+    assert unsure[1] > 1.0 and belief.drives.sd[0, 1] < 0.4
+    np.testing.assert_allclose(belief.drives.proximal[0], [10.0, 1.5], atol=0.35)
+    np.testing.assert_allclose(belief.simulator.proximal[0, 0], [10.0, 1.5], atol=0.35)  # and there its wires are
+    assert belief.play_spread()[0] == belief.drives.sd[0, 0]
 
 
 def measured(belief: Belief, member: int) -> TipMeasurement:
