@@ -23,18 +23,25 @@ Seed = Sequence[int]
 
 
 def in_grip(stack: Stack, robot: RobotConfig, core: SimulatorConfig) -> tuple[Stack, SimulatorConfig]:
-    """Return devices that slip where a robot's grip yields, and settings by which the wall is as hard as before.
+    """Return devices as a robot holds them, and settings by which the wall is as hard as before.
+
+    They slip where its grip yields, and lie behind the ostium as its drives say, or else as the stack says.
 
     Args:
         stack: the devices.
         robot: what holds them.
         core: settings of the rod core, whose wall is as hard as the devices' push limits say if nothing else is given.
     """
-    wire, *around = robot.drives(len(stack))
+    drives = robot.drives(len(stack))
+    wire, *around = drives
     catheters = tuple(drive.gripped(each) for drive, each in zip(around, stack.catheters, strict=True))
-    held = replace(stack, wire=wire.gripped(stack.wire), catheters=catheters)
+    behind = zip(drives, stack.transmissions, strict=True)
+    transmissions = tuple(drive.transmission if drive.transmission.length_mm else given for drive, given in behind)
+    held = replace(stack, wire=wire.gripped(stack.wire), catheters=catheters, transmissions=transmissions)
     if held == stack:
         return stack, core
+    if held.push_limit_n == stack.push_limit_n:
+        return held, core
     return held, replace(core, wall_stiffness_n_mm=wall_stiffness(core, stack.push_limit_n))
 
 
