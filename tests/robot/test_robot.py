@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
+from endopilot.devices.catheter import read_catheter
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import RobotConfig, read_robot
 from endopilot.devices.stack import Stack
@@ -184,7 +185,8 @@ def test_what_was_measured_is_kept_beside_what_was_true_and_the_same_seed_repeat
     assert (load[0, :, 0, 0] - true.drive_force[0, :, 0]).std() == pytest.approx(0.02, rel=0.4)
 
 
-def test_a_robot_brings_what_lies_between_its_drives_and_the_ostium(fork, wire, catheter) -> None:
+def test_a_robot_brings_what_lies_between_its_drives_and_the_ostium(wire) -> None:
+    catheter = read_catheter("microcatheter-1.7f")
     behind = Transmission(length_mm=900.0, twist_friction_n_mm_mm=1e-4)
     robot = replace(IDEAL, wire=replace(IDEAL.wire, transmission=behind))
     held, core = in_grip(Stack(wire, (catheter,)), robot, SimulatorConfig())

@@ -110,7 +110,7 @@ class Robots:
             encoder_noise: of the encoders' noise, where there is one world; the robots' own streams if not given.
         """
         chosen = list(range(len(self._random)) if worlds is None else worlds)
-        places = (self.motion.motor if self._at_motor else self._counted(simulator))[chosen]
+        places = self.counted(simulator)[chosen]
         own, shape = [self._random[world] for world in chosen], places.shape[1:]
         streams = own if encoder_noise is None else [encoder_noise]
         encoders = places + self._noise * np.stack([random.standard_normal(shape) for random in streams])
@@ -118,6 +118,10 @@ class Robots:
         load = load + self._load_noise * np.stack([random.standard_normal(shape) for random in own])
         return np.concatenate([encoders, load], axis=-1)
 
+    def counted(self, simulator: Simulator) -> Float[np.ndarray, "worlds devices 2"]:
+        """Return what the encoders count, without noise, mm and rad."""
+        return self.motion.motor if self._at_motor else self._counted(simulator)
+
     def _counted(self, simulator: Simulator) -> Float[np.ndarray, "worlds devices 2"]:
-        """Return where the devices are, counted from where the ostium is assumed."""
-        return simulator.proximal - [self._ostium_mm, 0.0]
+        """Return where the devices are at their drives, counted from where the ostium is assumed."""
+        return np.stack([simulator.inserted_length - self._ostium_mm, simulator.drive_rotation], axis=-1)
