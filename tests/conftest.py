@@ -11,6 +11,27 @@ from shape_checks import check_quickly
 check_quickly()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def here():
+    """Let work on several items be done in this process, and make each of the tasks' patients once: both save time."""
+    from functools import lru_cache
+
+    from endopilot import parallel
+    from endopilot.tasks import task
+
+    make_patient = lru_cache(maxsize=12)(task.make_patient)
+    with patch.object(parallel, "MOST_PROCESSES", 1), patch.object(task, "make_patient", make_patient):
+        yield
+
+
+@pytest.fixture
+def in_processes(monkeypatch):
+    """Let work on several items be done in processes of their own, as for users."""
+    from endopilot import parallel
+
+    monkeypatch.setattr(parallel, "MOST_PROCESSES", 2)
+
+
 @pytest.fixture(scope="session")
 def toy_dataset(tmp_path_factory):
     """Return the folder of a dataset of six toy patients with 24 navigations each; do not write into it."""

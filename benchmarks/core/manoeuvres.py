@@ -51,11 +51,6 @@ def stacks_of(index: int, *, seed: int, catheters: bool) -> list[Stack]:
     return [pairs[pair] for pair in drawn]
 
 
-def name_of(stack: Stack) -> str:
-    """Return the names of a wire and of the catheters around it."""
-    return " in ".join(device.name for device in stack.devices)
-
-
 def seed_of(index: int, *, seed: int) -> int:
     """Return the key of the controls in an anatomy.
 

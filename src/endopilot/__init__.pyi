@@ -77,6 +77,15 @@ from .phantom.phantom import PhantomConfig as PhantomConfig
 from .phantom.phantom import make_phantom as make_phantom
 from .pipeline.navigation import write_navigation as write_navigation
 from .progress import Advance as Advance
+from .robot.calibrate import CalibrateConfig as CalibrateConfig
+from .robot.calibrate import RobotCalibration as RobotCalibration
+from .robot.calibrate import calibrate as calibrate
+from .robot.candidates import Estimate as Estimate
+from .robot.log import RobotLog as RobotLog
+from .robot.log import read_log as read_log
+from .robot.replay import EpisodeReplay as EpisodeReplay
+from .robot.replay import ReplayConfig as ReplayConfig
+from .robot.replay import replay_log as replay_log
 from .simulation.config import SimulatorConfig as SimulatorConfig
 from .simulation.controls import ControlConfig as ControlConfig
 from .simulation.mismatch import ModelMismatch as ModelMismatch
@@ -106,6 +115,8 @@ from .types import LumenMask as LumenMask
 from .types import TipProjection as TipProjection
 from .types import VesselTree as VesselTree
 from .types import Volume as Volume
+from .xray.camera import CArmCamera as CArmCamera
+from .xray.camera import PlanarCamera as PlanarCamera
 from .xray.carm import CArmGeometry as CArmGeometry
 from .xray.carm import Pose as Pose
 from .xray.carm import View as View

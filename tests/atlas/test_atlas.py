@@ -10,6 +10,7 @@ from endopilot.atlas import curves as shape
 from endopilot.atlas.atlas import AtlasConfig, make_atlas, make_patient, make_patient_tree
 from endopilot.atlas.branching import Vessel, lumens_collide
 from endopilot.errors import InputError
+from endopilot.lines import length_along
 
 COUNT = 60
 
@@ -27,7 +28,7 @@ def assert_mean(values, mean, sd):
 
 def test_course_statistics_match_the_published_ones(patients):
     paths = [tree.longest_path().points for tree, _ in patients]
-    lengths = np.array([shape.abscissa(points)[-1] for points in paths])
+    lengths = np.array([length_along(points)[-1] for points in paths])
     assert_mean(lengths, 164, 30)
     assert lengths.min() > 111 and lengths.max() < 224
     assert_mean([shape.tortuosity(points) for points in paths], 2.07, 0.23)

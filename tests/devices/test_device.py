@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 import endopilot
+from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import Wire, read_wire
 from endopilot.devices.device_files import list_wires
+from endopilot.devices.stack import Stack
 from endopilot.devices.write import write_device
 from endopilot.errors import InputError
 
@@ -120,3 +122,9 @@ def test_a_written_device_is_read_with_the_same_constants(tmp_path: Path, name: 
         back = read_wire(tmp_path / "wire.yaml")
         assert back.constants == each.constants and back.tip_shaping == each.tip_shaping
         assert back.sources == each.sources
+
+
+def test_a_stack_is_made_of_names() -> None:
+    named, around = Stack.of("workhorse-014", "microcatheter-1.7f"), read_catheter("microcatheter-1.7f")
+    assert named == Stack(read_wire("workhorse-014"), (around,)) == Stack.of(Stack.of("workhorse-014"), around)
+    assert Stack.of(named) == named

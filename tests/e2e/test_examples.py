@@ -22,4 +22,4 @@ def test_an_example_runs_and_its_assertion_holds(name, tmp_path):
 
 
 def test_there_are_examples():
-    assert {"my_policy.py", "my_segmentation.py"} <= set(EXAMPLES)
+    assert {"my_policy.py", "my_segmentation.py", "robot_phantom_logs.py"} <= set(EXAMPLES)

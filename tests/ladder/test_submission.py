@@ -34,17 +34,6 @@ class Hurried:
 """
 
 
-def here(title, items, work):
-    """Do the work in this process; as `each`, collect bad input."""
-    bad = {}
-    for item in items:
-        try:
-            work(item)
-        except InputError as error:
-            bad[item] = error
-    return bad
-
-
 @pytest.fixture(scope="module")
 def written(tmp_path_factory) -> dict:
     """Return the content of the submission of `forward` in the first patient of two tasks."""
@@ -54,9 +43,8 @@ def written(tmp_path_factory) -> dict:
 
 
 @pytest.fixture
-def changed(written, tmp_path, monkeypatch):
+def changed(written, tmp_path):
     """Return a function that writes a changed copy of the submission and checks it."""
-    monkeypatch.setattr(submission, "each", here)
 
     def check(change) -> submission.SubmissionCheck:
         content = json.loads(json.dumps(written))
@@ -94,7 +82,7 @@ def _swap_exposures(control, exposed):
     return control, exposed
 
 
-def test_a_submission_is_confirmed_in_other_processes(written, tmp_path):
+def test_a_submission_is_confirmed_in_other_processes(written, tmp_path, in_processes):
     path = tmp_path / "submission.json"
     path.write_text(json.dumps(written), encoding="utf-8")
     found = check_submission(path)
@@ -103,8 +91,7 @@ def test_a_submission_is_confirmed_in_other_processes(written, tmp_path):
     assert {row["task"] for row in written["scores"]} == {"straight", "descending"}
 
 
-def test_a_file_of_version_1_is_driven_again_in_the_textbook_s_patients(tmp_path, monkeypatch):
-    monkeypatch.setattr(submission, "each", here)
+def test_a_file_of_version_1_is_driven_again_in_the_textbook_s_patients(tmp_path):
     climb(output=tmp_path, config=LadderConfig(policy="forward", tasks=("straight",), patients=1, version=1))
     path = tmp_path / "submission.json"
     content = json.loads(path.read_text(encoding="utf-8"))

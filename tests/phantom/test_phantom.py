@@ -10,9 +10,10 @@ from scipy.ndimage import map_coordinates, maximum_filter
 
 from endopilot.anatomy.tree import tangents
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.atlas.curves import abscissa, curve_through
+from endopilot.atlas.curves import curve_through
 from endopilot.atlas.heart_reference import TO_CRUX, aorta, fit_heart
 from endopilot.errors import InputError
+from endopilot.lines import length_along
 from endopilot.phantom import phantom
 from endopilot.phantom.painter import Grid, Painter
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
@@ -222,7 +223,7 @@ def test_fit_recovers_a_moved_heart():
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     course = curve_through(TO_CRUX)
     moved = np.array([10.0, -20, 30]) + 1.2 * course @ turn.T
-    heart = fit_heart(moved, float(abscissa(moved)[-1]), "3")
+    heart = fit_heart(moved, float(length_along(moved)[-1]), "3")
     np.testing.assert_allclose(heart.to_reference(moved), course, atol=0.2)
     np.testing.assert_allclose(heart.from_reference(course), moved, atol=0.3)
     assert heart.scale == pytest.approx(1.2, rel=1e-2)

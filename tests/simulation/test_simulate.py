@@ -185,6 +185,7 @@ def test_a_wall_force_that_no_vessel_should_bear_is_told(anatomy: Anatomy) -> No
         (lambda c, i: (c, i - [50, 0]), "world 0: .* give 0 to"),
         (lambda c, i: (c[:0], i[:0]), "at least one"),
         (lambda c, i: (c, i * np.inf), "finite"),
+        (lambda c, i: (c, i + np.array([1e6, 0.0])), "initial: world 1: 1.*e.06 mm inserted; give at most 5000"),
     ],
 )
 def test_refuses_bad_controls(anatomy: Anatomy, change, message: str) -> None:
@@ -192,6 +193,11 @@ def test_refuses_bad_controls(anatomy: Anatomy, change, message: str) -> None:
     control, initial = change(control, initial)
     with pytest.raises(InputError, match=message):
         simulate(anatomy, DEVICE, control, initial=initial)
+
+
+def test_refuses_wires_that_the_memory_does_not_hold_before_they_are_laid_out(anatomy: Anatomy) -> None:
+    with pytest.raises(InputError, match=r"^reach_mm: wires of 1e\+12 mm need .* GiB of .*; push less far$"):
+        Simulator(anatomy, DEVICE, reach_mm=1e12)
 
 
 def test_refuses_bad_anatomies(anatomy: Anatomy) -> None:

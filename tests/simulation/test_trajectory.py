@@ -113,6 +113,7 @@ def test_every_third_sample_has_the_means_and_sums_of_its_period(vessel) -> None
     assert coarse.period_s == 1.5 and coarse.valid.shape == (2, 2)
     for name in ("inserted_length", "rotation", "tip_position", "base_force", "wall_force", "shape"):
         np.testing.assert_array_equal(getattr(coarse, name), getattr(fine, name)[:, [2, 5]])
+    assert fine.vessel_to_laboratory is not None
     np.testing.assert_array_equal(coarse.vessel_to_laboratory, fine.vessel_to_laboratory[:, [2, 5]])
     np.testing.assert_array_equal(coarse.tip.abscissa, fine.tip.abscissa[:, [2, 5]])
     for name, take in (("command", np.mean), ("control", np.mean), ("iterations", np.mean)):

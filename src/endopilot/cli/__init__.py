@@ -35,6 +35,8 @@ COMMANDS = {
     "xray": "anatomy -> X-ray image of a wire in it: fluoroscopy, contrast, DSA or roadmap",
     "advise": "trained run -> calibrated X-ray adviser: exposures against missed events",
     "drive": "a simulated robotic drive that takes commands over TCP, with a watchdog",
+    "replay": "a robot's log -> its commands in the simulator, and both tips side by side",
+    "calibrate": "robot's logs -> gain, lag, plays, tip shape and friction, each with an interval",
     "cockpit": "a wire in the browser: watched, driven by hand, or left to a policy",
     "ladder": "a policy on twelve tasks in unseen patients -> scores, a page and a submission",
     "verify": "the rod core compared with closed forms",

@@ -152,8 +152,10 @@ def _recorded(path: Path, patient: Anatomy, asked: Stack | None) -> Trajectory:
         return read_plan(path, patient, asked).trajectory
     recorded = read_trajectory(path, anatomy=patient)
     if asked is not None and any(stack.constants != asked.constants for stack in recorded.set_up.stacks):
-        names = [" in ".join(each.name for each in stack.devices) for stack in (recorded.set_up.stacks[0], asked)]
-        raise InputError(f"device: {path} was made with another ({names[0]}), not with this {names[1]}; leave it out")
+        made_with = recorded.set_up.stacks[0].name
+        raise InputError(
+            f"device: {path} was made with another ({made_with}), not with this {asked.name}; leave it out"
+        )
     return recorded
 
 

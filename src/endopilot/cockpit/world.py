@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from endopilot.devices.stack import Proximals, lines_from_tips, shown_part
 from endopilot.errors import InputError
+from endopilot.lines import length_along
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Hand, Observation
 from endopilot.simulation.mismatch import ModelMismatch
@@ -269,7 +270,7 @@ def _lines(
     for device, line in reversed(list(enumerate(lines_from_tips(nodes, inserted_length_mm)))):
         own = force[len(nodes) - len(line) : len(nodes)]
         if len(inserted_length_mm) > 1:
-            along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+            along = length_along(line)
             line[0] = simulator.tip_position[0, device]
             own = np.where(inserted_length_mm[device] - along > covered, own, 0.0)
             covered = max(covered, float(inserted_length_mm[device]))

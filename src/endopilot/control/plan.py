@@ -203,19 +203,18 @@ def _search(navigation: Navigation, config: PlanConfig, trial: int) -> tuple[Con
     policy.start(navigation, config.seed + trial)
     with progress("plan: searching in the rod core", total=navigation.target.abscissa) as advance:
         course = policy.find_course(navigation.seconds, advance)
-    names = " in ".join(device.name for device in navigation.devices)
+    to = f"branch {navigation.target.branch} of {navigation.anatomy.name}"
     if course.reached < 0.5:
         came = float(course.tip.abscissa[-1, 0]) if len(course.control) else navigation.start_inserted_length_mm
         raise InputError(
-            f"target: no path found to branch {navigation.target.branch} of {navigation.anatomy.name} in "
-            f"{navigation.seconds:g} s under {navigation.force_limit_n:g} N with {names}; the tip came to "
-            f"{came:.0f} of {navigation.target.abscissa:.0f} mm; {policy.halt}"
+            f"target: no path found to {to} in {navigation.seconds:g} s under {navigation.force_limit_n:g} N with "
+            f"{navigation.stack.name}; the tip came to {came:.0f} of {navigation.target.abscissa:.0f} mm; {policy.halt}"
         )
     needed_s = DECISION_PERIOD_S * len(course.control)
     if needed_s > navigation.seconds:
         raise InputError(
-            f"seconds: {navigation.seconds:g} s are too few for the course found to branch "
-            f"{navigation.target.branch} of {navigation.anatomy.name} with {names}; give {needed_s:g} s or more"
+            f"seconds: {navigation.seconds:g} s are too few for the course found to {to} with {navigation.stack.name}; "
+            f"give {needed_s:g} s or more"
         )
     return course.control, np.column_stack([course.tip.abscissa[:, 0], course.tip.offset[:, 0]])
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.cost import Cost
+from endopilot.control.course import Controls
 from endopilot.control.set_up import TILT_DEG
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.settings import Finite, Positive, Seconds, Seed, Text, Within, settings
@@ -21,7 +22,6 @@ Method = Literal["search", "inverse", "mppi", "forward", "spin", "retract-rotate
 NETWORK_METHODS = ("inverse", "mppi")
 """Methods that ask a trained network."""
 Steps = Float[np.ndarray, "samples 2"]
-Controls = Float[np.ndarray, "samples devices 2"]
 
 
 @settings

@@ -181,9 +181,9 @@ def _plan_in(folder: Path, anatomy: Anatomy, stack: Stack | None) -> Plan:
     made_for = Stack(planned, around)
     given = made_for if stack is None else replace(stack, wire=replace(stack.wire, **tip))
     if made_for.constants != given.constants:
-        names = [" in ".join(device.name for device in each.devices) for each in (made_for, given)]
         raise InputError(
-            f"{folder}: the plan is for another device ({names[0]}), not for {names[1]}; plan anew, or give the plan's"
+            f"{folder}: the plan is for another device ({made_for.name}), not for {given.name}; plan anew, or give "
+            "the plan's"
         )
     path = folder / TRAJECTORY
     if not path.exists() or sha256(path) != record["trajectory_sha256"]:

@@ -51,6 +51,8 @@ class DriveConfig:
     """Motion that is lost where the translation reverses, mm."""
     play_rad: Annotated[float, Within(0, 50, unit="rad", mistaken=(("°", np.pi / 180),))] = 0.035
     """Motion that is lost where the rotation reverses, rad."""
+    play_sd: Annotated[float, Within(0, 0.5)] = 0.0
+    """Standard deviation of both plays from robot to robot, a share of them; a seed draws the robot."""
     grip_n: Positive | None = None
     """Axial force beyond which the device slips in the drive's grip, N; the device's own limits hold if not given."""
     grip_n_mm: Positive | None = None
@@ -116,6 +118,21 @@ class RobotConfig:
         spread = self.of_drives(count, "gain_sd_translation", "gain_sd_rotation")
         drawn = np.clip(random.standard_normal(spread.shape), -_MOST_SPREADS, _MOST_SPREADS)
         return self.of_drives(count, "gain_translation", "gain_rotation") * (1 + spread * drawn)
+
+    def plays(self, count: int, random: np.random.Generator) -> Float[np.ndarray, "devices 2"]:
+        """Return the plays of one robot's drives, drawn, mm and rad."""
+        drawn = np.clip(random.standard_normal((count, 2)), -_MOST_SPREADS, _MOST_SPREADS)
+        spread = self.of_drives(count, "play_sd")
+        return self.of_drives(count, "play_mm", "play_rad") * np.maximum(1 + spread * drawn, 0.0)
+
+    def run_out(self, velocity: Float[np.ndarray, "devices 2"]) -> Float[np.ndarray, "devices 2"]:
+        """Return how far motors go on before they obey a command to stop, mm and rad.
+
+        Args:
+            velocity: that they have, mm/s and rad/s.
+        """
+        braking = self.of_drives(len(velocity), "max_acceleration_mm_s2", "max_acceleration_rad_s2")
+        return velocity * self.latency_s + velocity * np.abs(velocity) / (2 * braking)
 
     def delayed(self, factor: float) -> RobotConfig:
         """Return a robot whose latency is some times this one's."""

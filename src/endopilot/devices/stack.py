@@ -13,6 +13,7 @@ from endopilot.devices.catheter import Catheter, check_nested, read_catheter
 from endopilot.devices.device import Device, Wire, check_fits, read_wire
 from endopilot.devices.transmission import Transmission
 from endopilot.errors import InputError
+from endopilot.lines import length_along
 from endopilot.types import Anatomy
 
 SHOWN_BEHIND_MM = 20.0
@@ -51,16 +52,16 @@ class Stack:
 
         Args:
             device: the wire, or a stack that the catheters are put around.
-            catheters: from the inside out.
+            catheters: from the inside out; their drives act at the ostium.
 
         Raises:
             InputError: no such wire or catheter.
         """
-        stack = (
-            device if isinstance(device, Stack) else Stack(device if isinstance(device, Wire) else read_wire(device))
-        )
         around = tuple(each if isinstance(each, Catheter) else read_catheter(each) for each in catheters)
-        return replace(stack, catheters=stack.catheters + around) if around else stack
+        if not isinstance(device, Stack):
+            return Stack(device if isinstance(device, Wire) else read_wire(device), around)
+        further = tuple(Transmission() for _ in around)
+        return replace(device, catheters=device.catheters + around, transmissions=device.transmissions + further)
 
     def __len__(self) -> int:
         """Return the number of devices."""
@@ -70,6 +71,11 @@ class Stack:
     def devices(self) -> tuple[Device, ...]:
         """The wire, then the catheters around it."""
         return (self.wire, *self.catheters)
+
+    @property
+    def name(self) -> str:
+        """The names of its devices, such as "workhorse-014 in microcatheter-1.7f"."""
+        return " in ".join(device.name for device in self.devices)
 
     @property
     def outer_radius_mm(self) -> float:
@@ -128,7 +134,7 @@ def lines_from_tips(
         inserted_length_mm: inserted length of each device; the foremost tip is that of the largest.
     """
     behind = inserted_length_mm.max() - inserted_length_mm
-    along = _along(nodes)
+    along = length_along(nodes)
     return [
         nodes if at == 0 else np.vstack([_at(nodes, along, at), nodes[along > at + _APART_MM]])
         for at in behind.tolist()
@@ -143,12 +149,7 @@ def shown_part(nodes: Float[np.ndarray, "n 3"], deepest_mm: float) -> Float[np.n
         deepest_mm: inserted length of the device with that tip.
     """
     nodes = nodes[np.isfinite(nodes).all(axis=1)]
-    return nodes[_along(nodes) <= deepest_mm + SHOWN_BEHIND_MM]
-
-
-def _along(nodes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """Return how far from the first node each one lies along the line, mm."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
+    return nodes[length_along(nodes) <= deepest_mm + SHOWN_BEHIND_MM]
 
 
 def _at(nodes: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n"], at_mm: float) -> Float[np.ndarray, "3"]:

@@ -34,7 +34,8 @@ class LoopConfig:
     """Robot and C-arm of a navigation loop, and the settings of the simulated reality."""
 
     robot: RobotConfig = field(default_factory=RobotConfig)
-    """The robot as it truly is; a policy is not told."""
+    """The robot as it truly is; a seed draws gains and plays if their spreads are given. `Navigation.robot` is what is
+    known of it."""
     fluoroscope: FluoroscopeConfig = field(default_factory=FluoroscopeConfig)
     """The C-arm."""
     xray: XrayKind = "assumed"
@@ -126,7 +127,8 @@ class NavigationLoop:
         """
         self.config = config = config or LoopConfig()
         truth = truth or ModelMismatch()
-        self.navigation = navigation = replace(navigation, xray=config.xray)
+        known = navigation.robot or config.robot
+        self.navigation = navigation = replace(navigation, xray=config.xray, robot=known)
         self.policy = make_policy(policy) if isinstance(policy, str) else policy
         self.simulator = start_world(navigation, truth, config.simulator, robot=config.robot, motion=config.motion)
         limits = [DriveLimits.of(device, navigation.anatomy) for device in navigation.devices]

@@ -49,13 +49,16 @@ class Columns:
         return InputError(f"{self.path}: row {self.lines[row]}: {name} = {self.values[name][row]:.10g}{what}")
 
 
-def read_columns(path: Path, needed: Sequence[str], optional: Sequence[str] = ()) -> Columns:
+def read_columns(
+    path: Path, needed: Sequence[str], optional: Sequence[str] = (), *, sparse: Sequence[str] = ()
+) -> Columns:
     """Read columns of finite numbers from a CSV file.
 
     Args:
         path: the file.
         needed: names of the columns that must be there.
         optional: names of others to read where they are there; all else in the file is left out.
+        sparse: likewise; cells of these may be empty, and are NaN.
 
     Raises:
         InputError: not such a table; the line names file, row, column and mend.
@@ -70,14 +73,14 @@ def read_columns(path: Path, needed: Sequence[str], optional: Sequence[str] = ()
     reader = csv.reader(io.StringIO(text, newline=None), delimiter=separator, skipinitialspace=True, strict=True)
     try:
         rows = ((reader.line_num + skipped, row) for row in reader if row)
-        header = _header(path, next(rows)[1], needed, optional)
-        names = [name for name in (*needed, *optional) if name in header]
+        header = _header(path, next(rows)[1], needed, (*optional, *sparse))
+        names = [name for name in (*needed, *optional, *sparse) if name in header]
         cells, lines = _cells(path, rows, header, names)
     except csv.Error as error:
         raise InputError(f"{path}: row {reader.line_num + skipped}: no CSV ({error}); correct the file") from error
     if not lines:
         raise InputError(f"{path}: has no rows below the names of its columns; give one for each period")
-    values = _numbers(path, cells, lines, separator)
+    values = _numbers(path, cells, lines, separator, sparse)
     return Columns(Path(path), values, np.array(lines), tuple(header))
 
 
@@ -143,7 +146,7 @@ def _cells(
 
 
 def _numbers(
-    path: Path, cells: dict[str, list[str]], lines: list[int], separator: str
+    path: Path, cells: dict[str, list[str]], lines: list[int], separator: str, sparse: Sequence[str]
 ) -> dict[str, Float[np.ndarray, "rows"]]:
     if separator != "," and any("," in cell for column in cells.values() for cell in column):
         if any("." in cell for column in cells.values() for cell in column):
@@ -153,7 +156,8 @@ def _numbers(
     values = {}
     for name, column in cells.items():
         numbers = np.array([float(cell) if _NUMBER.fullmatch(cell) else np.nan for cell in column])
-        bad = np.flatnonzero(~np.isfinite(numbers))
+        empty = np.array([not cell for cell in column]) if name in sparse else False
+        bad = np.flatnonzero(~np.isfinite(numbers) & ~empty)
         if len(bad):
             cell, line = column[bad[0]], lines[bad[0]]
             if not cell:

@@ -11,6 +11,7 @@ from pydantic import InstanceOf, model_validator
 from endopilot.devices.catheter import Catheter, check_nested
 from endopilot.devices.device import Device, Wire
 from endopilot.devices.drive_limits import Numbers
+from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.settings import CountOrZero, Finite, NonNegative, Positive, Seconds, Within, settings
 from endopilot.simulation.motion import Motion
@@ -80,6 +81,8 @@ class Navigation:
         known_motion: how heart and breath are known to move the vessel, which the C-arm takes off what it measures and
             policies simulate; it is taken to lie still if not given.
         xray: how an exposure finds the tip; `NavigationLoop` says what its C-arm does.
+        robot: as it is known, not what a seed draws of it. `NavigationLoop` takes its own if not given; else encoders
+            sit at the devices.
     """
 
     anatomy: InstanceOf[Anatomy]
@@ -94,6 +97,7 @@ class Navigation:
     force_limit_n: Positive = 0.5
     known_motion: Motion | None = None
     xray: XrayKind = "assumed"
+    robot: RobotConfig | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Navigation:

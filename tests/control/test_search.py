@@ -10,8 +10,8 @@ import pytest
 from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.agent import AgentConfig, AgentPolicy, OpenLoopPolicy, OraclePolicy
 from endopilot.control.course import Course
-from endopilot.control.search import ManoeuvreConfig
-from endopilot.control.stack_search import StackSearch
+from endopilot.control.search import Search
+from endopilot.control.search_config import ManoeuvreConfig
 from endopilot.devices.catheter import read_catheter
 from endopilot.errors import InputError
 from endopilot.ladder.attempt import Recording, attempt, repeat
@@ -50,11 +50,11 @@ def agent_config(navigation: Navigation, turns: int = 4) -> AgentConfig:
     return replace(own, search=replace(own.search, manoeuvres=ManoeuvreConfig(turns=turns)), belief=BELIEF)
 
 
-def search(navigation: Navigation, turns: int = 4) -> tuple[StackSearch, Belief, Course]:
+def search(navigation: Navigation, turns: int = 4) -> tuple[Search, Belief, Course]:
     """Return a search, the belief that it began with, and what it found."""
     belief = Belief(navigation, np.array([[1.0, 1.0, 0.0]]), BELIEF)
     route = Route.to(navigation.anatomy, navigation.target)
-    one = StackSearch(navigation, route, belief, config=agent_config(navigation, turns).search)
+    one = Search(navigation, route, belief, config=agent_config(navigation, turns).search, seed=0)
     return one, belief, one.find(belief, seconds=navigation.seconds)
 
 
@@ -91,7 +91,7 @@ def test_the_controls_of_a_course_lead_where_it_says(side_branch, found) -> None
 
 
 def test_a_wire_that_leads_by_little_ends_little_beyond_the_target(side_branch, monkeypatch) -> None:
-    monkeypatch.setattr("endopilot.control.stack_search._LEADS_MM", (3.0,))
+    monkeypatch.setattr("endopilot.control.manoeuvre._LEADS_MM", (3.0,))
     _, _, course = search(side_branch)
     assert course.reached == 1.0
     assert course.tip.abscissa[-1, 0] - side_branch.target.abscissa == pytest.approx(3.0, abs=2.0)

@@ -1,0 +1,85 @@
+"""`endopilot calibrate`: robot's logs -> the robot as a file, and how sure each of its constants is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from endopilot.anatomy.io import read_anatomy
+from endopilot.cli.arguments import Answer, Existing, OutputFile
+from endopilot.devices.device import read_device, write_device
+from endopilot.devices.robot import read_robot
+from endopilot.files import input_hash, manifest, write_json
+from endopilot.robot.calibrate import CalibrateConfig, RobotCalibration, calibrate
+from endopilot.robot.log import read_log
+from endopilot.robot.replay import summary
+
+_BY = "endopilot calibrate"
+
+
+def command(
+    logs: Positional[tuple[Existing, ...]],
+    /,
+    *,
+    anatomy: Existing,
+    output: OutputFile,
+    device: str = "workhorse-014",
+    robot: str = "assumed",
+    config: CalibrateConfig = CalibrateConfig(),
+) -> Answer:
+    """Find gain, lag, plays, tip shape, friction and stiffness of a robot and its wire, each with an interval.
+
+    What the logs do not tell is said, and stays as it was. `navigate`, `ladder` and `replay` take the files.
+
+    Args:
+        logs: CSV files of commands and tips, driven through one vessel with one wire; docs/reality.md describes them.
+        anatomy: folder made by `endopilot anatomy` of what the wire was driven through.
+        output: robot.yaml; beside it robot.device.yaml, the wire, and robot.json, all intervals.
+        device: name of a device (`endopilot devices`) or a YAML file, as the wire is known.
+        robot: name of a robot or a YAML file, as the robot is known.
+        config: how logs are fitted.
+    """
+    read, patient = [read_log(path) for path in logs], read_anatomy(anatomy)
+    found = calibrate(read, patient, read_device(device), read_robot(robot), config)
+    names = ", ".join(log.name for log in read)
+    _write(found, output, names)
+    figures = summary(found.replays)
+    about = {"band_of_90_percent_mm": None if found.band_mm is None else round(found.band_mm, 2)}
+    inputs = {name: digest for path in (*logs, anatomy) for name, digest in input_hash(path).items()}
+    intervals = {
+        name: {
+            "value": each.value,
+            "interval": [each.low, each.high],
+            "identified": each.identified,
+            "searched": list(each.searched),
+            "unit": each.unit,
+        }
+        for name, each in found.estimates.items()
+    }
+    record = {"estimates": intervals} | about | figures
+    write_json(output.with_suffix(".json"), manifest(config=config, seed=config.seed, inputs=inputs) | record)
+    told = {name: str(each) for name, each in found.estimates.items()}
+    files = {"robot": output, "wire": _beside(output)}
+    return Answer(record | files, shown=[told | {"encoders_at": found.robot.encoders_at} | about | figures | files])
+
+
+def _write(found: RobotCalibration, output: Path, names: str) -> None:
+    """Write the robot and the wire, with the source of what was found."""
+    told = {name: each for name, each in found.estimates.items() if each.identified}
+    sources = tuple(f"{name}: {each}, 95 %, by {_BY} from {names}" for name, each in told.items())
+    kept = tuple(line for line in found.robot.sources if line.partition(":")[0] not in told)
+    replace(found.robot, sources=(*kept, *sources)).write(output)
+    of_wire = {"tip_bend": ("tip_bend_deg", "tip_bend_length_mm"), "friction": ("friction",)}
+    of_wire |= dict.fromkeys(("bend_stiffness_n_mm2", "twist_stiffness_n_mm2"), ("tip_stiffness_factor",))
+    changed = {field: by for field, by in of_wire.items() if any(name in told for name in by)}
+    texts = {
+        field: f"by {_BY} from {names}: " + ", ".join(f"{name} {told[name]}" for name in by if name in told)
+        for field, by in changed.items()
+    }
+    write_device(replace(found.wire, sources=dict(found.wire.sources) | texts), _beside(output))
+
+
+def _beside(output: Path) -> Path:
+    return output.with_suffix(".device.yaml")

@@ -1,0 +1,219 @@
+"""What a robot logged: `RobotLog`, and its file, a table that a spreadsheet or any robot's own program writes.
+
+A CSV file with a row for each moment at which something was commanded, read or seen. A cell is empty where a row says
+nothing of its column. All lengths are mm, angles rad, times s, and forward and clockwise (for the operator) count
+positive. Columns of catheters begin with `catheter_1_` and `catheter_2_`.
+
+=================================================  =====================================================================
+columns                                            meaning
+=================================================  =====================================================================
+`time_s`                                           by one clock, never going back
+`translation_mm`, `rotation_rad`                   where the drive is sent, by its own count; it gets there by the next
+                                                   command
+`translation_mm_s`, `rotation_rad_s`               or with what velocity it is sent, until the next command
+`encoder_mm`, `encoder_rad`                        what the encoders read
+`force_n`, `torque_nmm`                            load of the drive: positive where it pushes, and turns clockwise
+`tip_x_mm`, `tip_y_mm`, `tip_z_mm`                 the wire's tip as it was seen, LPS
+`tip_column_px`, `tip_row_px`                      or the pixel that shows it, by the camera of `camera.yaml` beside it
+`episode`                                          whole number; another one wherever the device was moved by hand, or
+                                                   was reset: what is known of a position ends there. One if not given
+`flag`                                             0; another number where what was seen is not to be used
+=================================================  =====================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from endopilot.devices.stack import column_prefixes
+from endopilot.errors import InputError
+from endopilot.files import writing
+from endopilot.simulation.csv_file import Columns, read_columns
+from endopilot.types import VesselTree
+from endopilot.xray.camera import CAMERA_FILE, Camera, points_in_vessel, read_camera
+
+_POSITION = ("translation_mm", "rotation_rad")
+_VELOCITY = ("translation_mm_s", "rotation_rad_s")
+_ENCODER = ("encoder_mm", "encoder_rad")
+_LOAD = ("force_n", "torque_nmm")
+_TIP = ("tip_x_mm", "tip_y_mm", "tip_z_mm")
+_PIXEL = ("tip_column_px", "tip_row_px")
+_MOST_DEVICES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class RobotLog:
+    """What a robot was asked for, and what was seen of its wire. NaN where a row says nothing.
+
+    Attributes:
+        name: of the log.
+        time_s: of each row, s.
+        episode: number of the episode that each row belongs to.
+        command: positions that the drives were sent to, mm and rad, of each device.
+        encoders: what encoders read, mm and rad.
+        load: force (N) and torque (N·mm) of the drives.
+        tip: the wire's tip as it was seen, LPS mm; from a pixel once the vessel is known (`in_vessel`).
+        pixel: column and row that showed it.
+        used: whether what was seen is to be used.
+        camera: what pixels belong to; None where tips were seen in space.
+        by_velocity: whether the drives were sent along by velocity, and `command` is what these sum up to.
+    """
+
+    name: str
+    time_s: Float[np.ndarray, "rows"]
+    episode: Int[np.ndarray, "rows"]
+    command: Float[np.ndarray, "rows devices 2"]
+    encoders: Float[np.ndarray, "rows devices 2"]
+    load: Float[np.ndarray, "rows devices 2"]
+    tip: Float[np.ndarray, "rows 3"]
+    pixel: Float[np.ndarray, "rows 2"]
+    used: Bool[np.ndarray, "rows"]
+    camera: Camera | None = None
+    by_velocity: bool = False
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.time_s)
+
+    @property
+    def commanded(self) -> Bool[np.ndarray, "rows"]:
+        """Rows with a command."""
+        return np.isfinite(self.command[:, 0, 0])
+
+    @property
+    def seen(self) -> Bool[np.ndarray, "rows"]:
+        """Rows in which the tip was seen, and is to be used."""
+        return self.used & (np.isfinite(self.tip).all(axis=1) | np.isfinite(self.pixel).all(axis=1))
+
+    def in_vessel(self, tree: VesselTree) -> RobotLog:
+        """Return the log with the tip of each pixel where its ray passes nearest to a vessel's centerlines."""
+        if self.camera is None:
+            return self
+        return replace(self, tip=points_in_vessel(self.camera, self.pixel, tree))
+
+    def episodes(self) -> Iterator[RobotLog]:
+        """Yield each episode as a log of its own, in the order of time."""
+        for number in dict.fromkeys(self.episode.tolist()):
+            yield self.rows(self.episode == number)
+
+    def rows(self, chosen: Bool[np.ndarray, "rows"]) -> RobotLog:
+        """Return the log with some of its rows."""
+        arrays = {name: value[chosen] for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+        return replace(self, **arrays)
+
+    def _velocities(self) -> Float[np.ndarray, "rows devices 2"]:
+        """Return the velocities that `command` is the sum of; the last one of an episode moves nothing."""
+        velocity = np.full_like(self.command, np.nan)
+        for number in np.unique(self.episode):
+            rows = np.flatnonzero((self.episode == number) & self.commanded)
+            holds = np.diff(self.time_s[rows], append=np.inf)[:, None, None]
+            velocity[rows] = np.diff(self.command[rows], axis=0, prepend=0.0) / holds
+        return velocity
+
+    def write(self, path: Path) -> None:
+        """Write it as `read_log` reads it, whole or not at all; the camera's file is not written."""
+        import pandas as pd
+
+        columns: dict[str, np.ndarray] = {"time_s": self.time_s, "episode": self.episode}
+        command = self._velocities() if self.by_velocity else self.command
+        for k, prefix in enumerate(column_prefixes(self.command.shape[1])):
+            for names, values in (
+                (_VELOCITY if self.by_velocity else _POSITION, command),
+                (_ENCODER, self.encoders),
+                (_LOAD, self.load),
+            ):
+                columns |= {prefix + name: values[:, k, i] for i, name in enumerate(names)}
+        seen = (_TIP, self.tip) if self.camera is None else (_PIXEL, self.pixel)
+        columns |= {name: seen[1][:, i] for i, name in enumerate(seen[0])}
+        columns["flag"] = (~self.used).astype(int)
+        table = pd.DataFrame(columns).dropna(axis="columns", how="all")
+        with writing(Path(path)) as partial:
+            table.to_csv(partial, index=False)
+
+
+def read_log(path: Path | str, *, camera: Camera | None = None) -> RobotLog:
+    """Read a robot's log.
+
+    Args:
+        path: the CSV file.
+        camera: what its pixels belong to; that of `camera.yaml` beside it if not given.
+
+    Raises:
+        InputError: no such table, or no camera for its pixels; the line names file, row, column and mend.
+    """
+    path = Path(path)
+    prefixes = column_prefixes(_MOST_DEVICES)
+    of_devices = [p + name for p in prefixes for name in (*_POSITION, *_VELOCITY, *_ENCODER, *_LOAD)]
+    table = read_columns(path, ["time_s"], ["episode", "flag"], sparse=[*of_devices, *_TIP, *_PIXEL])
+    devices = max(k + 1 for k, p in enumerate(prefixes) if k == 0 or p + _POSITION[0] in table.values
+                  or p + _VELOCITY[0] in table.values)  # fmt: skip
+    time_s = table.values["time_s"]
+    back = np.flatnonzero(np.diff(time_s) < 0)
+    if len(back):
+        raise table.fault(int(back[0]) + 1, "time_s", " is before the row above; sort the rows by time")
+    episode = _whole(table, "episode", len(time_s))
+    command = np.stack([_command(table, p, time_s, episode) for p in prefixes[:devices]], axis=1)
+    if not np.isfinite(command[:, 0, 0]).any():
+        raise InputError(f"{path}: translation_mm: holds no command; give one")
+    pixel = _group(table, "", _PIXEL)
+    if np.isfinite(pixel).any() and camera is None:
+        camera = read_camera(path.with_name(CAMERA_FILE))
+    return RobotLog(
+        name=path.stem,
+        time_s=time_s,
+        episode=episode,
+        command=command,
+        encoders=np.stack([_group(table, p, _ENCODER) for p in prefixes[:devices]], axis=1),
+        load=np.stack([_group(table, p, _LOAD) for p in prefixes[:devices]], axis=1),
+        tip=_group(table, "", _TIP),
+        pixel=pixel,
+        used=_whole(table, "flag", len(time_s)) == 0,
+        camera=camera if np.isfinite(pixel).any() else None,
+        by_velocity=_VELOCITY[0] in table.values,
+    )
+
+
+def _whole(table: Columns, name: str, rows: int) -> Int[np.ndarray, "rows"]:
+    values = table.values.get(name, np.zeros(rows))
+    odd = np.flatnonzero(values != np.round(values))
+    if len(odd):
+        raise table.fault(int(odd[0]), name, "; give a whole number")
+    return values.astype(np.int64)
+
+
+def _group(table: Columns, prefix: str, names: tuple[str, ...]) -> Float[np.ndarray, "rows n"]:
+    """Return columns that belong together, NaN where they are not there; all of them, or none."""
+    there = [name for name in names if prefix + name in table.values]
+    if there and len(there) < len(names) and names in (_TIP, _PIXEL):
+        absent = next(name for name in names if name not in there)
+        raise InputError(f"{table.path}: column {absent} is missing where {there[0]} is there; give all, or none")
+    nothing = np.full(len(table.lines), np.nan)
+    values = np.column_stack([table.values.get(prefix + name, nothing) for name in names])
+    half = np.flatnonzero(np.isfinite(values).any(axis=1) & ~np.isfinite(values).all(axis=1))
+    if len(half) and len(there) == len(names):
+        row = int(half[0])
+        name = names[int(np.argmin(np.isfinite(values[row])))]
+        raise InputError(f"{table.path}: row {table.lines[row]}: {prefix}{name} is empty; give all, or none")
+    return values
+
+
+def _command(
+    table: Columns, prefix: str, time_s: Float[np.ndarray, "rows"], episode: Int[np.ndarray, "rows"]
+) -> Float[np.ndarray, "rows 2"]:
+    """Return positions that a drive was sent to; velocities are summed up from 0 at the start of each episode."""
+    position, velocity = _group(table, prefix, _POSITION), _group(table, prefix, _VELOCITY)
+    if np.isfinite(position).any() and np.isfinite(velocity).any():
+        raise InputError(f"{table.path}: holds {prefix}translation_mm and {prefix}translation_mm_s; give one of them")
+    if np.isfinite(velocity).any():
+        for number in np.unique(episode):
+            rows = np.flatnonzero((episode == number) & np.isfinite(velocity).all(axis=1))
+            holds = np.diff(time_s[rows], append=time_s[rows[-1:]])
+            position[rows] = np.cumsum(velocity[rows] * holds[:, None], axis=0)
+    elif prefix + _POSITION[0] in table.values and prefix + _POSITION[1] not in table.values:
+        position[:, 1] = np.where(np.isfinite(position[:, 0]), 0.0, np.nan)
+    return position

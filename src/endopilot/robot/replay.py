@@ -1,0 +1,338 @@
+"""A log replayed: its commands drive a simulated wire, and the tip that was seen is compared with the simulated one.
+
+Nobody logs how deep the wire lies when an episode begins, or to which side its tip is bent. Both are taken from what
+was seen in the given first part of the episode: of worlds whose wires are turned by equal angles, the one whose tip
+comes nearest to the real one there. What follows is predicted from the commands alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from endopilot.anatomy.projection import TipProjector
+from endopilot.anatomy.tree import tangents
+from endopilot.devices.robot import RobotConfig
+from endopilot.devices.stack import Stack
+from endopilot.errors import InputError
+from endopilot.robot.course import STARTS, Courses
+from endopilot.robot.log import RobotLog
+from endopilot.settings import OpenShare, Within, settings
+from endopilot.simulation.config import PRESETS, SimulatorConfig
+from endopilot.simulation.simulator import Simulator
+from endopilot.types import Anatomy
+
+LEAST_TIPS = 20
+"""Tips that an episode must have to be replayed: half of them say where the wire lies."""
+_PERIOD_S = 0.05
+_LEAD_S = 2.0
+"""A simulation begins so long before the first tip was seen, or with the first command, s."""
+_TOGETHER = 8
+"""Episodes that are simulated side by side, for as long as the longest of them takes."""
+FAR_MM = 2.0
+"""No tip counts as farther from the real one than this, mm, when a world is chosen: one in a wrong branch is wrong."""
+
+
+@settings
+class ReplayConfig:
+    """How a log is replayed."""
+
+    given: OpenShare = 0.5
+    """Share of each episode's tips that say where the wire lies; the rest is predicted."""
+    rotations: Annotated[int, Within(1, 360)] = 12
+    """Rotations that the wire may begin with, at equal angles."""
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeReplay:
+    """One episode, seen and simulated.
+
+    Attributes:
+        number: of the episode in its log.
+        time_s: at which the tip was seen, by the log's clock, s.
+        given: which of the tips told where the wire lies; the others were predicted.
+        seen: the real tip, LPS mm.
+        simulated: the simulated tip at the same times, LPS mm.
+        abscissa: Δtip of both, seen and simulated, mm.
+        driven: Δ of the simulated drive without the vessel: what lag, gain and play alone make of the commands, mm.
+        in_view: the difference of both tips, as the camera sees it, mm.
+        along: unit vector along the vessel at the real tip.
+        branch: of both tips.
+        force: of the drive, N, as the log has it and simulated, at each of its readings after the first tip.
+        rotation_rad: φ that the simulated wire began with.
+    """
+
+    number: int
+    time_s: Float[np.ndarray, "tips"]
+    given: Bool[np.ndarray, "tips"]
+    seen: Float[np.ndarray, "tips 3"]
+    simulated: Float[np.ndarray, "tips 3"]
+    abscissa: Float[np.ndarray, "tips 2"]
+    driven: Float[np.ndarray, "tips"]
+    in_view: Float[np.ndarray, "tips 3"]
+    along: Float[np.ndarray, "tips 3"]
+    branch: Float[np.ndarray, "tips 2"]
+    force: Float[np.ndarray, "readings 2"]
+    rotation_rad: float
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """Median errors of what was predicted, mm: of Δtip, across the vessel, and in the camera's view."""
+        rest = ~self.given
+        along = (self.in_view * self.along).sum(axis=1, keepdims=True) * self.along
+        sizes = (
+            np.abs(np.diff(self.abscissa, axis=1)[:, 0]),
+            np.linalg.norm(self.in_view - along, axis=1),
+            np.linalg.norm(self.in_view, axis=1),
+        )
+        return {
+            name: float(np.median(size[rest])) for name, size in zip(("along", "across", "in_view"), sizes, strict=True)
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Episodes and what was seen in them, with the vessel."""
+
+    logs: list[RobotLog]
+    courses: Courses
+    anatomy: Anatomy
+    project: TipProjector
+    abscissa: Float[np.ndarray, "episodes tips"]
+    branch: Float[np.ndarray, "episodes tips"]
+    given: Bool[np.ndarray, "episodes tips"]
+
+
+def usable_episodes(logs: Sequence[RobotLog], anatomy: Anatomy) -> list[RobotLog]:
+    """Return the episodes that can be replayed, with tips in space.
+
+    Raises:
+        InputError: there is none.
+    """
+    found = [episode for log in logs for episode in log.in_vessel(anatomy.tree).episodes()]
+    found = [each for each in found if each.seen.sum() >= LEAST_TIPS and each.commanded.sum() > 1]
+    if not found:
+        names = ", ".join(log.name for log in logs)
+        raise InputError(f"{names}: no episode shows the tip {LEAST_TIPS} times; log longer ones, or mark fewer resets")
+    return found
+
+
+def replay_log(
+    logs: Sequence[RobotLog],
+    anatomy: Anatomy,
+    device: Stack,
+    robot: RobotConfig,
+    config: ReplayConfig | None = None,
+    *,
+    simulator: SimulatorConfig | None = None,
+) -> list[EpisodeReplay]:
+    """Replay logs.
+
+    Args:
+        logs: what a robot was asked for, and what was seen.
+        anatomy: the vessel.
+        device: the wire.
+        robot: latency, gains and plays of the drive.
+        config: what is given, and which starts are tried.
+        simulator: settings of the rod core; the preset `fast` if not given.
+
+    Raises:
+        InputError: no episode shows the tip often enough.
+    """
+    config = config or ReplayConfig()
+    prepared = prepare(usable_episodes(logs, anatomy), anatomy, config.given, robot)
+    return replay_prepared(prepared, device, robot, config, simulator=simulator)
+
+
+def prepare(logs: list[RobotLog], anatomy: Anatomy, given: float, robot: RobotConfig) -> Prepared:
+    """Project what was seen in episodes onto a vessel, once for many replays."""
+    courses, project = Courses.of(logs, robot.wire), TipProjector(anatomy.tree, anatomy.insertion)
+    abscissa, branch = np.full(courses.seen.shape, np.nan), np.full(courses.seen.shape, -1.0)
+    share = np.zeros(courses.seen.shape, dtype=bool)
+    for k, log in enumerate(logs):
+        count, tip = int(log.seen.sum()), project(log.tip[log.seen])
+        abscissa[k, :count], branch[k, :count] = tip.abscissa, tip.branch
+        share[k, : max(1, round(given * count))] = True
+    return Prepared(logs, courses, anatomy, project, abscissa, branch, share & courses.seen)
+
+
+def replay_prepared(
+    of: Prepared,
+    device: Stack,
+    robot: RobotConfig,
+    config: ReplayConfig,
+    *,
+    simulator: SimulatorConfig | None = None,
+) -> list[EpisodeReplay]:
+    """Replay episodes that are prepared, as `replay_log` does."""
+    times, course = _proximal(of, robot)
+    at_tips = _at(times, course[..., 0], of.courses.seen_s)
+    depth = np.nanmedian(np.where(of.given, of.abscissa - at_tips, np.nan), axis=1)
+    angles = np.tile(2 * np.pi * np.arange(config.rotations) / config.rotations, (len(of.logs), 1))
+    tried = _simulated(of, device, times, course, depth, angles, simulator)
+    first = np.argmin(tried.cost, axis=1)
+    rows = np.arange(len(of.logs))
+    # Once more where the wire lay deeper, or less deep, than without the vessel, and from around the best rotation.
+    behind = np.where(of.given, of.abscissa - tried.abscissa[rows, first], np.nan)
+    depth = depth + np.nanmedian(behind, axis=1)
+    step = 2 * np.pi / config.rotations
+    near = angles[rows, first][:, None] + step * np.array([-0.5, -0.25, 0.0, 0.25, 0.5])
+    tried = _simulated(of, device, times, course, depth, near, simulator)
+    best = np.argmin(tried.cost, axis=1)
+    return [
+        _episode(of, k, tried, int(best[k]), at_tips[k] + depth[k], float(near[k, best[k]]), times[k, 1:])
+        for k in range(len(best))
+    ]
+
+
+def _proximal(of: Prepared, robot: RobotConfig) -> tuple[Float[np.ndarray, "episodes times"], np.ndarray]:
+    """Return equal times of each episode, and where the drive then has the wire, mm and rad, from its first place."""
+    drive, courses = robot.wire, of.courses
+    begin = np.maximum(courses.seen_s[:, 0] - _LEAD_S, 0.0)
+    count = int(np.ceil((courses.seen_s.max(axis=1) - begin).max() / _PERIOD_S)) + 1
+    times = begin[:, None] + _PERIOD_S * np.arange(count + 1)
+    along, around = ((drive.gain_translation, drive.play_mm), (drive.gain_rotation, drive.play_rad))
+
+    def followed(axis: int, at_s: np.ndarray, start: float | np.ndarray) -> np.ndarray:
+        gain, play = (np.array([value]) for value in (along, around)[axis])
+        late = np.array([robot.latency_s])
+        return courses.followed(axis, at_s=at_s, latency_s=late, gain=gain, play=play, start=start)[0]
+
+    missed = []
+    for start in STARTS:
+        error = np.where(of.given, of.abscissa - followed(0, courses.seen_s, start), np.nan)
+        missed.append(np.nanmean(np.abs(error - np.nanmedian(error, axis=1, keepdims=True)), axis=1))
+    begun = np.array(STARTS)[np.argmin(missed, axis=0)]
+    return times, np.stack([followed(0, times, begun), followed(1, times, 0.0)], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Tried:
+    """Worlds of each episode: their tips where the real one was seen, and how far they were from it while given.
+
+    Forces are those of the drive at the ends of periods, N; NaN beyond an episode's end.
+    """
+
+    tip: Float[np.ndarray, "episodes worlds tips 3"]
+    abscissa: Float[np.ndarray, "episodes worlds tips"]
+    branch: Float[np.ndarray, "episodes worlds tips"]
+    force: Float[np.ndarray, "episodes worlds periods"]
+    cost: Float[np.ndarray, "episodes worlds"]
+
+
+def _simulated(
+    of: Prepared,
+    device: Stack,
+    times: Float[np.ndarray, "episodes times"],
+    course: Float[np.ndarray, "episodes times 2"],
+    depth: Float[np.ndarray, "episodes"],
+    angles: Float[np.ndarray, "episodes worlds"],
+    simulator: SimulatorConfig | None,
+) -> _Tried:
+    """Simulate worlds that begin at some depth, with some rotations; short episodes together, and long ones."""
+    place = course.copy()
+    place[..., 0] = np.maximum(place[..., 0] + depth[:, None], 0.0)
+    fastest = device.fastest[0]
+    control = np.clip(np.diff(place, axis=1) / _PERIOD_S, -fastest, fastest)
+    seen_s = of.courses.seen_s
+    samples = np.ceil((seen_s.max(axis=1) - times[:, 0]) / _PERIOD_S - 1e-9).astype(int)
+    tip = np.empty((*angles.shape, seen_s.shape[1], 3))
+    abscissa, branch = np.empty(tip.shape[:-1]), np.empty(tip.shape[:-1])
+    force = np.full((*angles.shape, control.shape[1]), np.nan)
+    made: Simulator | None = None
+    for some in np.array_split(np.argsort(samples), max(1, len(samples) // _TOGETHER)):
+        last, worlds = int(samples[some].max()), angles[some].size
+        initial = np.repeat(place[some, None, 0], angles.shape[1], axis=1)
+        initial[..., 1] += angles[some]
+        deepest = float(place[..., 0].max())
+        config = simulator or PRESETS["fast"]
+        made = Simulator(of.anatomy, device, worlds=worlds, config=config, sharing=made, reach_mm=deepest)
+        made.reset(inserted_length=initial[..., 0].reshape(-1, 1), rotation=initial[..., 1].reshape(-1, 1))
+        driven = np.repeat(control[some, :last], angles.shape[1], axis=0)[:, :, None]
+        moved = made.run(driven, period_s=_PERIOD_S)
+        for row, (k, j) in enumerate((k, j) for k in some for j in range(angles.shape[1])):
+            ends = times[k, 1 : last + 1]
+            places = np.column_stack([moved.tip_position[row, :, 0], moved.tip.abscissa[row, :, 0]])
+            at_tips = np.column_stack([np.interp(seen_s[k], ends, column) for column in places.T])
+            tip[k, j], abscissa[k, j] = at_tips[:, :3], at_tips[:, 3]
+            nearest = np.clip(np.searchsorted(ends, seen_s[k]), 0, last - 1)
+            branch[k, j], force[k, j, :last] = moved.tip.branch[row, nearest, 0], moved.drive_force[row, :, 0]
+    return _Tried(tip, abscissa, branch, force, _costs(of, tip, of.given))
+
+
+def _costs(of: Prepared, tip: np.ndarray, used: Bool[np.ndarray, "episodes tips"]) -> np.ndarray:
+    """Return how far tips are from the real ones on average, at most `FAR_MM`, as the camera sees them, mm."""
+    cost = np.zeros(tip.shape[:2])
+    for k, log in enumerate(of.logs):
+        count = int(log.seen.sum())
+        far = np.linalg.norm(_in_view(log, tip[k, :, :count]), axis=-1)
+        cost[k] = np.minimum(far, FAR_MM)[:, used[k, :count]].mean(axis=1)
+    return cost
+
+
+def _in_view(log: RobotLog, tip: Float[np.ndarray, "*worlds tips 3"]) -> Float[np.ndarray, "*worlds tips 3"]:
+    """Return the difference of simulated tips from those seen, without what a camera does not see of it, mm."""
+    apart = tip - log.tip[log.seen]
+    if log.camera is None:
+        return apart
+    _, ray = log.camera.rays(log.pixel[log.seen])
+    return apart - (apart * ray).sum(axis=-1, keepdims=True) * ray
+
+
+def _at(
+    times: Float[np.ndarray, "episodes times"],
+    values: Float[np.ndarray, "episodes times"],
+    seen_s: Float[np.ndarray, "episodes tips"],
+) -> Float[np.ndarray, "episodes tips"]:
+    return np.stack([np.interp(seen_s[k], times[k], values[k]) for k in range(len(times))])
+
+
+def _episode(
+    of: Prepared,
+    k: int,
+    tried: _Tried,
+    world: int,
+    driven: Float[np.ndarray, "tips"],
+    rotation: float,
+    ends: Float[np.ndarray, "periods"],
+) -> EpisodeReplay:
+    log, count = of.logs[k], int(of.courses.seen[k].sum())
+    line = of.anatomy.tree.path(int(of.branch[k, count - 1]))
+    nearest = np.clip(np.searchsorted(line.abscissa, of.abscissa[k, :count]), 0, len(line.points) - 1)
+    simulated = tried.force[k, world]
+    measured = np.isfinite(log.load[:, 0, 0]) & (log.time_s >= log.time_s[log.seen][0])
+    pushed = np.interp(
+        log.time_s[measured] - log.time_s[0], ends[np.isfinite(simulated)], simulated[np.isfinite(simulated)]
+    )
+    return EpisodeReplay(
+        number=int(log.episode[0]),
+        time_s=log.time_s[log.seen],
+        given=of.given[k, :count],
+        seen=log.tip[log.seen],
+        simulated=tried.tip[k, world, :count],
+        abscissa=np.column_stack([of.abscissa[k, :count], tried.abscissa[k, world, :count]]),
+        driven=driven[:count],
+        in_view=_in_view(log, tried.tip[k, world, :count]),
+        along=tangents(line.points)[nearest],
+        branch=np.column_stack([of.branch[k, :count], tried.branch[k, world, :count]]),
+        force=np.column_stack([log.load[measured, 0, 0], pushed]),
+        rotation_rad=rotation,
+    )
+
+
+def summary(found: Sequence[EpisodeReplay]) -> dict[str, float | int | None]:
+    """Return medians over episodes of their errors, mm, and how often the real branch was taken."""
+    errors = [each.errors for each in found]
+    figures: dict[str, float | int | None] = {"episodes": len(found)}
+    for name in ("along", "across", "in_view"):
+        figures[f"error_{name}_mm"] = round(float(np.median([each[name] for each in errors])), 3)
+    drive_alone = [np.median(np.abs(each.abscissa[:, 0] - each.driven)[~each.given]) for each in found]
+    figures["error_along_of_the_drive_alone_mm"] = round(float(np.median(drive_alone)), 3)
+    figures["real_branch_share"] = round(
+        float(np.mean([each.branch[-1, 0] == each.branch[-1, 1] for each in found])), 3
+    )
+    return figures

@@ -1,0 +1,117 @@
+"""A camera that sees a tip as a pixel of an image: planar, as over a phantom, or a C-arm; and its file, `camera.yaml`.
+
+Pixels are counted as images are: columns to the right and rows downwards, from 0 at the middle of the first one.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import model_validator
+from scipy.spatial import KDTree
+
+from endopilot.files import read_yaml
+from endopilot.settings import Finite, Within, read_settings, settings
+from endopilot.types import VesselTree
+from endopilot.xray.carm import CArmGeometry, View, view_at
+
+CAMERA_FILE = "camera.yaml"
+"""Name of the camera's file beside a log."""
+Point = tuple[Finite, Finite, Finite]
+_UNIT = 1e-3
+"""Directions are taken as given if their lengths are 1, and right angles right, to this."""
+
+
+@settings
+class PlanarCamera:
+    """A camera that looks straight onto a plane: a pixel is as many mm everywhere, and depth is not seen."""
+
+    mm_per_pixel: Annotated[float, Within(1e-4, 100)]
+    """Size of a pixel in the plane, mm."""
+    origin_mm: Point = (0.0, 0.0, 0.0)
+    """Where the middle of pixel (0, 0) lies, LPS mm."""
+    columns: Point = (1.0, 0.0, 0.0)
+    """Direction, LPS, in which columns grow, to the right in the image: a unit vector."""
+    rows: Point = (0.0, -1.0, 0.0)
+    """Direction, LPS, in which rows grow, downwards in the image: a unit vector across `columns`."""
+
+    @model_validator(mode="after")
+    def _axes_stand_across(self) -> PlanarCamera:
+        across, down = np.array(self.columns), np.array(self.rows)
+        for name, axis in (("columns", across), ("rows", down)):
+            if abs(np.linalg.norm(axis) - 1) > _UNIT:
+                raise ValueError(f"{name}: {axis.tolist()} has length {np.linalg.norm(axis):.4g}; give a unit vector")
+        if abs(across @ down) > _UNIT:
+            raise ValueError(f"rows: {down.tolist()} is not across columns; give two directions at right angles")
+        return self
+
+    def project(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
+        """Return column and row, pixels, of points, LPS mm."""
+        return (points - self.origin_mm) @ np.array([self.columns, self.rows]).T / self.mm_per_pixel
+
+    def rays(self, pixels: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+        """Return a point, LPS mm, on what each pixel shows, and the unit vector along it."""
+        through = np.array(self.origin_mm) + self.mm_per_pixel * pixels @ np.array([self.columns, self.rows])
+        return through, np.broadcast_to(np.cross(self.columns, self.rows), through.shape)
+
+
+@settings
+class CArmCamera:
+    """A C-arm that stands still, and whose images are as large as its detector's pixels make them."""
+
+    angles_deg: tuple[Finite, Finite]
+    """LAO (positive) or RAO, and cranial (positive) or caudal angle, degrees."""
+    isocenter_mm: Point
+    """Point about which the C-arm turns, LPS mm."""
+    centre_px: tuple[Finite, Finite]
+    """Column and row, pixels, that show the isocenter."""
+    geometry: CArmGeometry = CArmGeometry()
+    """Distances and pixels."""
+
+    @property
+    def view(self) -> View:
+        """Source and detector."""
+        return view_at(self.angles_deg, np.array(self.isocenter_mm), self.geometry)
+
+    def project(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
+        """Return column and row, pixels, of points, LPS mm."""
+        return self.view.project(points) * [1.0, -1.0] + self.centre_px
+
+    def rays(self, pixels: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+        """Return a point, LPS mm, on what each pixel shows, and the unit vector along it."""
+        view = self.view
+        across = (pixels - self.centre_px) * [1.0, -1.0] / view.scale
+        along = across @ view.axes[:2] + view.axes[2]
+        return np.broadcast_to(view.source, along.shape), along / np.linalg.norm(along, axis=1, keepdims=True)
+
+
+Camera = PlanarCamera | CArmCamera
+
+
+def read_camera(path: Path) -> Camera:
+    """Read a camera from a YAML file: a `PlanarCamera` where it holds `mm_per_pixel`, else a `CArmCamera`.
+
+    Raises:
+        InputError: no such file; the line names file, field, value and mend.
+    """
+    content = read_yaml(path)
+    if isinstance(content, dict) and "angles_deg" in content:
+        return read_settings(path, CArmCamera)
+    return read_settings(path, PlanarCamera)
+
+
+def points_in_vessel(camera: Camera, pixels: Float[np.ndarray, "n 2"], tree: VesselTree) -> Float[np.ndarray, "n 3"]:
+    """Return what pixels show if it lies in a vessel: on each one's ray the point nearest to a centerline, LPS mm.
+
+    NaN stays NaN. Where two branches cover each other in the image, it is that which lies nearer to the ray.
+    """
+    lines = np.concatenate([branch.centerline.points for branch in tree.branches])
+    found = np.full((len(pixels), 3), np.nan)
+    seen = np.isfinite(pixels).all(axis=1)
+    _, nearest = KDTree(camera.project(lines)).query(pixels[seen])
+    through, along = camera.rays(pixels[seen])
+    found[seen] = through + ((lines[nearest] - through) * along).sum(axis=1, keepdims=True) * along
+    return found

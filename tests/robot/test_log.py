@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from endopilot.errors import InputError
+from endopilot.robot.log import RobotLog, read_log
+from endopilot.xray.camera import PlanarCamera
+
+LOG = """time_s,episode,translation_mm,rotation_rad,encoder_mm,encoder_rad,tip_column_px,tip_row_px,flag
+0.0,1,0.5,0,,,,,0
+0.1,1,,,0.48,0.01,,,0
+0.1,1,,,,,100,500,0
+0.2,1,1.0,0.1,,,,,0
+0.3,1,,,,,100,495,1
+0.4,2,0.0,0,,,,,0
+0.5,2,,,,,100,500,0
+"""
+
+
+def written(tmp_path: Path, text: str, camera: bool = True) -> Path:
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    if camera:
+        (tmp_path / "camera.yaml").write_text(
+            "mm_per_pixel: 0.1\norigin_mm: [0, 0, 0]\ncolumns: [1, 0, 0]\nrows: [0, -1, 0]\n"
+        )
+    return path
+
+
+def refused(tmp_path: Path, text: str, camera: bool = True) -> str:
+    with pytest.raises(InputError) as caught:
+        read_log(written(tmp_path, text, camera))
+    return str(caught.value).removeprefix(f"{tmp_path}/")
+
+
+def test_a_log_is_read(tmp_path) -> None:
+    log = read_log(written(tmp_path, LOG))
+    assert log.commanded.tolist() == [True, False, False, True, False, True, False]
+    assert log.seen.tolist() == [False, False, True, False, False, False, True]  # the flagged tip is left out
+    np.testing.assert_array_equal(log.command[log.commanded, 0], [[0.5, 0], [1.0, 0.1], [0, 0]])
+    np.testing.assert_array_equal(log.encoders[1, 0], [0.48, 0.01])
+    assert np.isnan(log.load).all() and np.isnan(log.tip).all()
+    assert log.camera == PlanarCamera(mm_per_pixel=0.1)
+    assert [len(episode) for episode in log.episodes()] == [5, 2]
+
+
+def test_velocities_are_summed_up_to_where_a_command_ends(tmp_path) -> None:
+    text = (
+        "time_s,episode,translation_mm_s,rotation_rad_s,tip_x_mm,tip_y_mm,tip_z_mm\n0,0,2,1,,,\n0.5,0,-4,0,1,2,3\n"
+        "1,0,0,0,,,\n1,1,2,0,,,\n1.5,1,0,0,,,\n"
+    )
+    log = read_log(written(tmp_path, text, camera=False))
+    np.testing.assert_allclose(log.command[:, 0], [[1, 0.5], [-1, 0.5], [-1, 0.5], [1, 0], [1, 0]])
+    log.write(tmp_path / "again.csv")
+    again = read_log(tmp_path / "again.csv")
+    np.testing.assert_allclose(again.command, log.command)
+    assert again.by_velocity
+    assert log.camera is None and log.seen.tolist() == [False, True, False, False, False]
+
+
+def test_a_table_of_a_spreadsheet_is_read(tmp_path) -> None:
+    path = written(tmp_path, LOG.replace(",", ";").replace(".", ","))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        log = read_log(path)
+    assert np.array_equal(log.command, read_log(written(tmp_path, LOG)).command, equal_nan=True)
+
+
+def test_a_log_is_written_as_it_is_read(tmp_path) -> None:
+    log = read_log(written(tmp_path, LOG))
+    pair = dataclasses.replace(log, **{name: np.repeat(getattr(log, name), 2, axis=1) for name in
+                                       ("command", "encoders", "load")})  # fmt: skip
+    for given in (log, pair, dataclasses.replace(log, camera=None, tip=log.pixel[:, [0, 1, 1]])):
+        given.write(tmp_path / "again.csv")
+        again = read_log(tmp_path / "again.csv")
+        for name in ("time_s", "episode", "command", "encoders", "load", "used"):
+            assert np.array_equal(getattr(again, name), getattr(given, name), equal_nan=True), name
+        assert np.array_equal(again.seen, given.seen)
+        assert isinstance(again, RobotLog) and (again.camera is None) == (given.camera is None)
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        (LOG.replace("0.2,1,1.0,0.1", "0.2,1,,"), None),
+        (LOG.replace("0.2,1,1.0,0.1", "0.05,1,1.0,0.1"),
+         "log.csv: row 5: time_s = 0.05 is before the row above; sort the rows by time"),
+        (LOG.replace("0.1,1,,,0.48,0.01", "0.1,1,,,0.48,"),
+         "log.csv: row 3: encoder_rad is empty; give all, or none"),
+        (LOG.replace("0.0,1,0.5", "0.0,1.5,0.5"), "log.csv: row 2: episode = 1.5; give a whole number"),
+        (LOG.replace(",tip_row_px,", ",,"),
+         "log.csv: column tip_row_px is missing where tip_column_px is there; give all, or none"),
+        (LOG.replace("encoder_mm,encoder_rad", "translation_mm_s,rotation_rad_s"),
+         "log.csv: holds translation_mm and translation_mm_s; give one of them"),
+        ("time_s,encoder_mm\n0,1\n", "log.csv: translation_mm: holds no command; give one"),
+        (LOG.replace("0.0,1,0.5", "0.0,1,five"),
+         "log.csv: row 2: translation_mm = five is no finite number; correct it"),
+    ],
+)  # fmt: skip
+def test_a_table_that_is_no_log_is_refused(tmp_path, text, line) -> None:
+    if line is None:
+        assert read_log(written(tmp_path, text)).commanded.sum() == 2
+    else:
+        assert refused(tmp_path, text) == line
+
+
+def test_pixels_need_a_camera(tmp_path) -> None:
+    assert refused(tmp_path, LOG, camera=False) == "camera.yaml: no such file; check the path"

@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from endopilot.errors import InputError
+from endopilot.xray.camera import CArmCamera, PlanarCamera, points_in_vessel, read_camera
+
+POINTS = np.array([[0.0, 0, 0], [10, 5, -3], [-4, 20, 7]])
+CAMERAS = [
+    PlanarCamera(mm_per_pixel=0.1, origin_mm=(-20, 30, 0)),
+    PlanarCamera(mm_per_pixel=0.2, columns=(0.0, 0.6, 0.8), rows=(1.0, 0.0, 0.0)),
+    CArmCamera(angles_deg=(30.0, -20.0), isocenter_mm=(2.0, 3.0, 4.0), centre_px=(512.0, 400.0)),
+]
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=["planar", "planar-tilted", "c-arm"])
+def test_a_point_lies_on_the_ray_of_its_pixel(camera) -> None:
+    through, along = camera.rays(camera.project(POINTS))
+    np.testing.assert_allclose(np.linalg.norm(along, axis=1), 1)
+    np.testing.assert_allclose(np.cross(POINTS - through, along), 0, atol=1e-9)
+
+
+def test_columns_grow_to_the_right_and_rows_downwards() -> None:
+    planar = PlanarCamera(mm_per_pixel=0.1, origin_mm=(1, 2, 0))
+    np.testing.assert_allclose(planar.project(np.array([[3.0, 1.0, 9.0]])), [[20, 10]])
+    front = CArmCamera(angles_deg=(0.0, 0.0), isocenter_mm=(0.0, 0.0, 0.0), centre_px=(100.0, 100.0))
+    (left_of_patient, head) = front.project(np.array([[5.0, 0, 0], [0, 0, 5.0]]))
+    assert left_of_patient[0] > 110 and left_of_patient[1] == pytest.approx(100)
+    assert head[1] < 90 and head[0] == pytest.approx(100)
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=["planar", "planar-tilted", "c-arm"])
+def test_a_pixel_of_a_vessel_is_found_on_it(anatomy, camera) -> None:
+    line = anatomy.tree.branches[0].centerline.points
+    pixels = np.vstack([camera.project(line[5:40:5]), [[np.nan, np.nan]]])
+    found = points_in_vessel(camera, pixels, anatomy.tree)
+    np.testing.assert_allclose(found[:-1], line[5:40:5], atol=1e-6)
+    assert np.isnan(found[-1]).all()
+
+
+def test_files(tmp_path) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text("mm_per_pixel: 0.095\norigin_mm: [1, 2, 3]\ncolumns: [1, 0, 0]\nrows: [0, -1, 0]\n")
+    assert read_camera(path) == PlanarCamera(mm_per_pixel=0.095, origin_mm=(1.0, 2.0, 3.0))
+    path.write_text(
+        "angles_deg: [30, 0]\nisocenter_mm: [0, 0, 0]\ncentre_px: [512, 512]\n"
+        "geometry: {source_to_isocenter_mm: 765, source_to_detector_mm: 1100, pixel_mm: 0.3}\n"
+    )
+    camera = read_camera(path)
+    assert isinstance(camera, CArmCamera) and camera.geometry.pixel_mm == 0.3
+    path.write_text("mm_per_pixel: 0.095\norigin_mm: [1, 2, 3]\ncolumns: [1, 0, 0]\nrows: [1, -1, 0]\n")
+    with pytest.raises(InputError, match=r"camera.yaml: rows: .* has length 1.414; give a unit vector"):
+        read_camera(path)
