@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 import yaml
@@ -18,6 +18,7 @@ from pydantic import model_validator
 
 from endopilot.devices.device import Device
 from endopilot.devices.device_files import there
+from endopilot.devices.transmission import Transmission
 from endopilot.errors import InputError
 from endopilot.files import writing
 from endopilot.settings import NonNegative, Positive, Within, read_settings, settings
@@ -25,13 +26,14 @@ from endopilot.settings import NonNegative, Positive, Within, read_settings, set
 ASSUMED, IDEAL = "assumed", "ideal"
 """Names of the robot whose numbers are assumptions, which is the default, and of the one that does as it is told."""
 _SHIPPED = Path(__file__).parent / "robots"
+Kind = TypeVar("Kind", bound=Device)
 _MOST_SPREADS = 3.0
 """A gain that is drawn lies no farther from its mean than this many standard deviations."""
 
 
 @settings
 class DriveConfig:
-    """The drive of one device: motor, gears and grip."""
+    """The drive of one device: motor, gears and grip, and what lies between it and the ostium."""
 
     max_acceleration_mm_s2: Positive = 200.0
     """Largest change of the translation's speed, mm/s²."""
@@ -63,8 +65,10 @@ class DriveConfig:
     """Standard deviation of a reading of the axial force, N."""
     load_sd_n_mm: NonNegative = 0.01
     """Standard deviation of a reading of the torque, N·mm."""
+    transmission: Transmission = Transmission()
+    """The length of the device in its guiding catheter, which twists there under friction."""
 
-    def gripped(self, device: Device) -> Device:
+    def gripped(self, device: Kind) -> Kind:
         """Return a device with the limits at which it slips in this drive."""
         push, pull, torque = device.push_limit_n, device.pull_limit_n, device.torque_limit_n_mm
         if self.grip_n is not None:
