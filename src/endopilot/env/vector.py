@@ -72,7 +72,7 @@ class NavigationState:
     safe: np.ndarray
     ended: np.ndarray
     generators: tuple[dict[str, Any], ...]
-    robots: Robots | None
+    robots: Any
     readings: np.ndarray | None
 
 
