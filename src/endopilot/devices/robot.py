@@ -51,7 +51,7 @@ class DriveConfig:
     """Motion that is lost where the translation reverses, mm."""
     play_rad: Annotated[float, Within(0, 50, unit="rad", mistaken=(("°", np.pi / 180),))] = 0.035
     """Motion that is lost where the rotation reverses, rad."""
-    play_sd: Annotated[float, Within(0, 0.5)] = 0.0
+    play_sd_share: Annotated[float, Within(0, 0.5)] = 0.0
     """Standard deviation of both plays from robot to robot, a share of them; a seed draws the robot."""
     grip_n: Positive | None = None
     """Axial force beyond which the device slips in the drive's grip, N; the device's own limits hold if not given."""
@@ -122,7 +122,7 @@ class RobotConfig:
     def plays(self, count: int, random: np.random.Generator) -> Float[np.ndarray, "devices 2"]:
         """Return the plays of one robot's drives, drawn, mm and rad."""
         drawn = np.clip(random.standard_normal((count, 2)), -_MOST_SPREADS, _MOST_SPREADS)
-        spread = self.of_drives(count, "play_sd")
+        spread = self.of_drives(count, "play_sd_share")
         return self.of_drives(count, "play_mm", "play_rad") * np.maximum(1 + spread * drawn, 0.0)
 
     def run_out(self, velocity: Float[np.ndarray, "devices 2"]) -> Float[np.ndarray, "devices 2"]:
