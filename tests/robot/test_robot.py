@@ -10,14 +10,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
+from endopilot.devices.catheter import read_catheter
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import RobotConfig, read_robot
+from endopilot.devices.stack import Stack
+from endopilot.devices.transmission import Transmission
 from endopilot.errors import InputError
 from endopilot.navigation.loop import start_world
 from endopilot.robot.remote import RemoteRobot
 from endopilot.robot.robot import CYCLE_S, Robot, SimulatedRobot
-from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.config import SimulatorConfig, wall_stiffness
 from endopilot.simulation.mismatch import ModelMismatch
+from endopilot.simulation.robots import in_grip
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation, Target
 
@@ -185,3 +189,17 @@ def test_what_was_measured_is_kept_beside_what_was_true_and_the_same_seed_repeat
     true = robot.recorder.trajectory()
     assert np.abs(encoders[0, :, 0, 0] - true.inserted_length[0, :, 0]).max() > 0.4  # half the play, and more
     assert (load[0, :, 0, 0] - true.drive_force[0, :, 0]).std() == pytest.approx(0.02, rel=0.4)
+
+
+def test_a_robot_brings_what_lies_between_its_drives_and_the_ostium(wire) -> None:
+    catheter = read_catheter("microcatheter-1.7f")
+    behind = Transmission(length_mm=900.0, twist_friction_n_mm_mm=1e-4)
+    robot = replace(IDEAL, wire=replace(IDEAL.wire, transmission=behind))
+    held, core = in_grip(Stack(wire, (catheter,)), robot, SimulatorConfig())
+    assert held.transmissions == (behind, Transmission()) and held.devices == (wire, catheter)
+    assert core == SimulatorConfig()  # the wall stays as hard as it was, without a weaker grip
+    own = Stack(wire, transmissions=(behind,))
+    assert in_grip(own, IDEAL, core) == (own, core)
+    weak, core = in_grip(own, replace(IDEAL, wire=replace(IDEAL.wire, grip_n=0.1)), SimulatorConfig())
+    assert weak.wire.push_limit_n == 0.1
+    assert core.wall_stiffness_n_mm == wall_stiffness(SimulatorConfig(), wire.push_limit_n)
