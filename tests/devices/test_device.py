@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import endopilot
-from endopilot.devices.device import Wire, read_device
+from endopilot.devices.device import Wire, read_device, write_device
 from endopilot.devices.device_files import list_devices
 from endopilot.errors import InputError
 
@@ -108,3 +108,14 @@ def test_another_tip_leaves_the_shaft_as_it_is() -> None:
     assert device.bend_stiffness(at)[2] < other.bend_stiffness(at)[2] < 2 * device.bend_stiffness(at)[2]
     np.testing.assert_array_equal(other.bend_stiffness(at)[3:], device.bend_stiffness(at)[3:])
     assert device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=1.0) == device
+
+
+@pytest.mark.parametrize("name", list_devices())
+def test_a_written_device_is_read_with_the_same_constants(tmp_path: Path, name: str) -> None:
+    device = read_device(name)
+    changed = device.with_tip(bend_rad=1.234567 * device.tip_bend_rad, stiffness_factor=1.1)
+    for each in (device, device.shaped(75.0, 5.0), replace(changed, friction=0.123)):
+        write_device(each, tmp_path / "wire.yaml")
+        back = read_device(tmp_path / "wire.yaml")
+        assert back.constants == each.constants and back.tip_shaping == each.tip_shaping
+        assert back.sources == each.sources

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, Generic, TypeVar
 
 import numpy as np
+import yaml
 from jaxtyping import Float
 from pydantic import model_validator
 
@@ -38,6 +39,7 @@ from endopilot.devices.device_ranges import (
     check_tip,
 )
 from endopilot.errors import InputError
+from endopilot.files import writing
 from endopilot.settings import NonNegative, Positive, Text, Within, read_settings, settings
 from endopilot.types import Anatomy
 
@@ -276,6 +278,31 @@ def read_device(name_or_path: str | Path) -> Wire:
         return device
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def write_device(device: Wire, path: Path) -> None:
+    """Write a device as a file that `read_device` reads, with the same constants.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+
+    def sourced(name: str) -> dict[str, Any]:
+        value = getattr(device, name)
+        return {"value": list(value) if isinstance(value, tuple) else value, "source": device.sources[name]}
+
+    names = [field.name for field in fields(_DeviceFile) if field.name not in ("name", "tip_bend", "tip_shaping")]
+    angle_deg = round(math.degrees(device.tip_bend_rad), 10)
+    if math.radians(angle_deg) != device.tip_bend_rad:
+        angle_deg = math.degrees(device.tip_bend_rad)
+    bend = {"angle_deg": angle_deg, "length_mm": device.tip_bend_length_mm, "source": device.sources["tip_bend"]}
+    content = {"name": device.name} | {name: sourced(name) for name in names} | {"tip_bend": bend}
+    shaping = device.tip_shaping
+    if shaping is not None:
+        limits = {"angle_deg": list(shaping.angle_deg), "length_mm": list(shaping.length_mm)}
+        content["tip_shaping"] = limits | {"source": device.sources["tip_shaping"]}
+    with writing(path) as partial:
+        partial.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
 
 
 def check_fits(device: Device, anatomy: Anatomy) -> None:
