@@ -31,7 +31,7 @@ import matplotlib.pyplot as plt
 PAGE = Path(__file__).parents[1] / "reality.md"
 IMAGES = Path(__file__).parents[1] / "images"
 BEGIN, END = "<!-- reality:begin -->", "<!-- reality:end -->"
-EPISODES = 8
+EPISODES = 6
 """Of each session, evenly chosen."""
 ROBOTS = ("ideal", "assumed", "kweon-2021-2d")
 LEAST_RUN_MM, LEAST_TURNS = 3.5, 1.2
