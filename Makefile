@@ -55,13 +55,13 @@ readme: $(INSTALLED)
 LEARNING := runs/causal
 recipe-laptop: $(INSTALLED)
 	$(BIN)/endopilot atlas --count 100 --seed 51 -o $(LEARNING)/patients
-	$(BIN)/endopilot atlas --anatomy lca --count 100 --seed 51 -o $(LEARNING)/patients
+	$(BIN)/endopilot atlas --vessel lca --count 100 --seed 51 -o $(LEARNING)/patients
 	$(BIN)/endopilot dataset $(LEARNING)/patients/* -o $(LEARNING)/dataset --sequences 8 --seed 51 \
 	  --friction 0.08 0.12 --tip-stiffness-factor 0.8 1.2 --anatomy-shares 0.725 0.125 0.15 --seen-test-share 0.125
 	$(BIN)/endopilot dataset $(LEARNING)/patients/* -o $(LEARNING)/fixed --sequences 2 --seed 52 \
 	  --anatomy-shares 0.725 0.125 0.15 --seen-test-share 0.5
 	$(BIN)/endopilot atlas --count 20 --seed 151 -o $(LEARNING)/new-patients
-	$(BIN)/endopilot atlas --anatomy lca --count 20 --seed 151 -o $(LEARNING)/new-patients
+	$(BIN)/endopilot atlas --vessel lca --count 20 --seed 151 -o $(LEARNING)/new-patients
 	$(BIN)/endopilot dataset $(LEARNING)/new-patients/* -o $(LEARNING)/new --sequences 6 --seed 4 --anatomy-shares 0 0 1
 	$(BIN)/endopilot train $(LEARNING)/dataset $(LEARNING)/fixed -o $(LEARNING)/seed-0 --model causal --epochs 10 \
 	  --learning-rate 0.002

@@ -50,10 +50,10 @@ _WATCH = """() => {
     addEventListener("keydown", (event) => {
         if (event.repeat) return;
         pressed = event.timeStamp;
-        before = cockpit.shown.inserted_mm;
+        before = cockpit.shown.inserted_length_mm;
     }, true);
     const look = () => {
-        if (pressed !== null && Math.abs(cockpit.shown.inserted_mm - before) > 0.002) {
+        if (pressed !== null && Math.abs(cockpit.shown.inserted_length_mm - before) > 0.002) {
             found.push(performance.now() - pressed);
             pressed = null;
         }
@@ -100,7 +100,7 @@ def bench_cockpit(*, catheter: str | None = None) -> dict[str, Any]:
     figures: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
         patient = Path(folder) / "patient"
-        write_anatomy(reference_navigation().anatomy, patient)
+        write_anatomy(reference_navigation().anatomy, output=patient)
         browser = driver.chromium.launch(executable_path=browser_path, args=list(BROWSER_FLAGS))
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         began = time.perf_counter()

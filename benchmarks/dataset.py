@@ -12,7 +12,7 @@ from endopilot.cli.arguments import OutputFolder
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.schema import MANIFEST_PATH
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.files import processor_name, read_json
 from endopilot.progress import progress
 from endopilot.runs import claim
@@ -52,10 +52,10 @@ def bench_dataset(*, output: OutputFolder = Path("runs/bench-dataset"), share: A
     with progress("Synthetic patients", count) as advance:
         for index, folder in enumerate(folders):
             if not (folder / "anatomy.json").exists():
-                write_anatomy(make_patient(AtlasConfig(count=count), index), folder)
+                write_anatomy(make_patient(AtlasConfig(count=count), index), output=folder)
             advance()
     config = DatasetConfig(sequences=size, anatomy_shares=(1.0, 0.0, 0.0))
-    generate_dataset(folders, output / "dataset", read_device(_DEVICE), config)
+    generate_dataset(folders, output=output / "dataset", device=read_wire(_DEVICE), config=config)
     record = read_json(output / "dataset" / MANIFEST_PATH)
     work, files = record["work"], [file for file in (output / "dataset").rglob("*") if file.is_file()]
     samples = count * size * config.samples

@@ -36,16 +36,16 @@ class ScriptedHand:
 
 def drive_session(number: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Return what the scripted hand saw in one training patient, and what it did."""
-    navigation = TASK.navigation(TASK.patient(TASK.training, number), start_rotation=0.6 * number)
-    record = endopilot.navigate(replace(navigation, seconds=20.0), ScriptedHand(), seed=number)
+    navigation = TASK.navigation(TASK.patient(TASK.training, number), start_rotation_rad=0.6 * number)
+    record = endopilot.NavigationLoop(replace(navigation, seconds=20.0), ScriptedHand(), seed=number).run()
     left_mm = navigation.target.abscissa - record.tip.abscissa[:-1, 0]
     return features(left_mm, record.tip.offset[:-1, 0]), torch.tensor(record.control[:-1, 0] / SCALE).float()
 
 
 def read_session(session: Path, folder: Path) -> tuple[torch.Tensor, torch.Tensor]:
     """Return what a hand at the cockpit saw, and what it did."""
-    endopilot.write_session_episode(session, folder)
-    data = endopilot.load_dataset(folder)
+    endopilot.write_session_episode(session, output=folder)
+    data = endopilot.read_dataset(folder)
     left_mm = data.manifest["settings"]["target_mm"] - data.tip_abscissa[0, :-1, 0]
     return features(left_mm, data.tip_offset[0, :-1, 0]), torch.tensor(data.control[0, 1:, 0] / SCALE).float()
 
@@ -93,7 +93,7 @@ def main() -> None:
         given = [read_session(Path(path), Path(name) / str(k)) for k, path in enumerate(sys.argv[1:])]
     network = clone(given or [drive_session(number) for number in range(SESSIONS)])
     navigation = replace(TASK.ladder_navigation(0), seconds=60.0)
-    record = endopilot.navigate(navigation, Clone(network), seed=1)
+    record = endopilot.NavigationLoop(navigation, Clone(network), seed=1).run()
     print(
         f"in a new patient: {record.reason} after {record.seconds:g} s, largest wall force {record.peak_force_n:.3f} N"
     )

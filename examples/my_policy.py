@@ -27,13 +27,13 @@ class TurnBack:
         self.turn_to_rad: float | None = None
 
     def decide(self, observation: endopilot.Observation) -> endopilot.Decision:
-        tip, (inserted_mm, rotation_rad) = observation.tip, observation.devices[0]  # of the wire
+        tip, (inserted_length_mm, rotation_rad) = observation.tip, observation.devices[0]  # of the wire
         if tip is not None and math.isfinite(fork := float(self.fork_mm[tip.branch])):
             # The wire lies in a wrong branch: this much of it has to come out.
-            self.pull_to_mm = inserted_mm - (tip.abscissa - fork) - BEFORE_FORK_MM
+            self.pull_to_mm = inserted_length_mm - (tip.abscissa - fork) - BEFORE_FORK_MM
             self.turn_to_rad = rotation_rad + 2 * math.pi / 3
         if self.pull_to_mm is not None:
-            if inserted_mm > max(self.pull_to_mm, 0.0):
+            if inserted_length_mm > max(self.pull_to_mm, 0.0):
                 return endopilot.Decision(((PULL_MM_S, 0.0),))
             self.pull_to_mm = None
         if self.turn_to_rad is not None:
@@ -46,10 +46,10 @@ class TurnBack:
 
 def main() -> None:
     # The second diagonal branch in the first of the ladder's patients, which pushing alone does not reach.
-    navigation = endopilot.find_task("diagonal", 1).ladder_navigation(0)
+    navigation = endopilot.find_task("diagonal", version=1).ladder_navigation(0)
     policy = endopilot.make_policy("my_policy:TurnBack")  # as `endopilot ladder --policy` finds it
-    record = endopilot.navigate(navigation, policy, seed=1)
-    pushed = endopilot.navigate(navigation, endopilot.make_policy("forward"), seed=1)
+    record = endopilot.NavigationLoop(navigation, policy, seed=1).run()
+    pushed = endopilot.NavigationLoop(navigation, endopilot.make_policy("forward"), seed=1).run()
     print(f"TurnBack: {record.reason} after {record.seconds:g} s and {record.exposures} exposures")
     print(f"forward: {pushed.reason}")
     assert record.success and record.safe and not pushed.success

@@ -42,7 +42,7 @@ def main() -> None:
         seeds=((7.5, 12.5, 15.0),),
         options=("above=250",),
     )
-    mask = endopilot.segment(volume, config)
+    mask = endopilot.segment(volume, config=config)
     found_ml = mask.volume.voxels.sum() * 0.5**3 / 1000
     true_ml = np.pi * 4.0**2 * 30.0 / 1000
     print(f"found {found_ml:.3f} ml, the tube holds {true_ml:.3f} ml")

@@ -11,6 +11,27 @@ from shape_checks import check_quickly
 check_quickly()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def here():
+    """Let work on several items be done in this process, and make each of the tasks' patients once: both save time."""
+    from functools import lru_cache
+
+    from endopilot import parallel
+    from endopilot.tasks import task
+
+    make_patient = lru_cache(maxsize=12)(task.make_patient)
+    with patch.object(parallel, "MOST_PROCESSES", 1), patch.object(task, "make_patient", make_patient):
+        yield
+
+
+@pytest.fixture
+def in_processes(monkeypatch):
+    """Let work on several items be done in processes of their own, as for users."""
+    from endopilot import parallel
+
+    monkeypatch.setattr(parallel, "MOST_PROCESSES", 2)
+
+
 @pytest.fixture(scope="session")
 def toy_dataset(tmp_path_factory):
     """Return the folder of a dataset of six toy patients with 24 navigations each; do not write into it."""
@@ -59,7 +80,7 @@ def evaluated(toy_dataset, tmp_path_factory):
     make_untrained_run(toy_dataset, folder / "run")
     with patch("endopilot.dataset.again.simulate", toy_simulate):
         settings = EvaluateConfig(sequences=8)
-        metrics = evaluate(folder / "run", folder / "evaluation", settings, other_seeds=[folder / "run"])
+        metrics = evaluate(folder / "run", output=folder / "evaluation", config=settings, other_seeds=[folder / "run"])
     torch.set_num_threads(threads)
     return folder, metrics
 
@@ -75,9 +96,9 @@ def fork():
 @pytest.fixture(scope="session")
 def wire():
     """Return the workhorse wire."""
-    from endopilot.devices.device import read_device
+    from endopilot.devices.device import read_wire
 
-    return read_device("workhorse-014")
+    return read_wire("workhorse-014")
 
 
 @pytest.fixture(scope="session")
@@ -86,7 +107,7 @@ def vessel(fork, tmp_path_factory):
     from endopilot.anatomy.io import write_anatomy
 
     folder = tmp_path_factory.mktemp("vessel") / "fork"
-    write_anatomy(fork, folder)
+    write_anatomy(fork, output=folder)
     return folder
 
 
@@ -96,4 +117,4 @@ def found(vessel):
     from endopilot.control.plan import plan
     from endopilot.control.plan_config import PlanConfig
 
-    return plan(vessel, "0,0,33", PlanConfig(seconds=30.0, start_rotation=0.1, seed=4))
+    return plan(vessel, "0,0,33", config=PlanConfig(seconds=30.0, start_rotation_rad=0.1, seed=4))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import re
 import subprocess
@@ -26,8 +27,26 @@ LARGE = {
 SLOW = {"Axes": Axes, "Figure": Figure}
 """Of other libraries, which a module imports only to be type-checked."""
 ASKED = {
-    "Anatomy", "read_anatomy", "extract_anatomy", "segment", "Wire", "read_device", "Simulator", "simulate", "plan",
+    "Anatomy", "read_anatomy", "extract_anatomy", "segment", "Wire", "read_wire", "Simulator", "simulate", "plan",
     "make_atlas", "generate_dataset", "train", "load_model", "navigate", "evaluate", "InputError", "read_volume",
+}  # fmt: skip
+
+
+VERBS = {
+    "calibrate", "check", "climb", "evaluate", "extract", "find", "generate", "list", "load", "make", "navigate",
+    "plan", "read", "replay", "segment", "simulate", "take", "train", "write",
+}  # fmt: skip
+SUBJECTS = {
+    "anatomies", "anatomy", "control", "dataset", "device", "devices", "driven", "folder", "logs", "name",
+    "name_or_path", "navigation", "num_envs", "path", "plan", "policy", "run", "session", "source", "target", "version",
+    "volume", "wire", "wire_radius_mm",
+}  # fmt: skip
+"""What a function does something with, or to. All else goes by keyword."""
+UNITS = re.compile(r"(^|_)(mm2?|s2?|n|hu|rad|deg|ugy|seconds|pixel_sd|along_sd|play_sd|share|factor|weight|ratio)$")
+WITHOUT_UNIT = {
+    "calcium", "dose", "efficiency", "friction", "gain_rotation", "gain_sd_rotation", "gain_sd_translation",
+    "gain_translation", "largest_jump", "learning_rate", "mismatch", "right_heart", "scale",
+    "scatter", "temperature", "true_friction", "true_tip_stiffness", "window", "zoom",
 }  # fmt: skip
 
 
@@ -43,7 +62,7 @@ def test_the_import_brings_no_library() -> None:
     assert imported_by("import endopilot; endopilot.__version__; dir(endopilot)") == set()
 
 
-@pytest.mark.parametrize("name", ["simulate", "Simulator", "read_device", "read_anatomy"])
+@pytest.mark.parametrize("name", ["simulate", "Simulator", "read_wire", "read_anatomy"])
 def test_the_rod_core_brings_no_large_library(name: str) -> None:
     assert imported_by(f"import endopilot; endopilot.{name}") <= {"numpy", "scipy", "yaml", "pydantic"}
 
@@ -102,6 +121,65 @@ def test_every_type_in_a_public_signature_is_public() -> None:
         if each.__module__.startswith("endopilot.") and each not in public.values()
     }
     assert not hidden
+
+
+def public_calls() -> Iterator[tuple[str, inspect.Signature]]:
+    """Yield the public functions, and the classes that are made by an `__init__` of their own."""
+    for name in endopilot.__all__:
+        thing = inspect.unwrap(getattr(endopilot, name))
+        made = inspect.isclass(thing) and inspect.isfunction(vars(thing).get("__init__"))
+        fields = dataclasses.is_dataclass(thing) or getattr(thing, "_is_protocol", False)
+        if inspect.isfunction(thing) or (made and not fields):
+            yield name, inspect.signature(thing)
+
+
+CALLS = dict(public_calls())
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_a_public_function_is_a_verb_with_subjects_and_keywords(name: str) -> None:
+    if name[0].islower():
+        assert name.partition("_")[0] in VERBS
+    for parameter in CALLS[name].parameters.values():
+        by_keyword = parameter.kind is inspect.Parameter.KEYWORD_ONLY
+        assert by_keyword or parameter.name in SUBJECTS, f"{parameter.name}: not by keyword alone"
+        if parameter.name in ("config", "output", "seed"):
+            assert by_keyword
+        if parameter.name == "output":
+            assert parameter.default is inspect.Parameter.empty and parameter.annotation == "str | Path"
+        if parameter.name == "config" and name[0].islower():
+            assert re.fullmatch(r"\w+Config \| None", parameter.annotation) and parameter.default is None
+
+
+def test_a_file_is_read_and_a_trained_model_loaded() -> None:
+    assert [name for name in CALLS if name.startswith("load_")] == ["load_model"]
+    for name in endopilot.__all__:  # a load that is no function is a force and a torque
+        assert not any(callable(getattr(getattr(endopilot, name), verb, None)) for verb in ("load", "save"))
+
+
+def test_parameters_of_one_name_take_one_kind_of_thing() -> None:
+    takes: dict[str, list[tuple[str, set[str]]]] = {}
+    for name, signature in CALLS.items():
+        for parameter in signature.parameters.values():
+            kinds = set(re.findall(r"\w+", parameter.annotation)) - {"None", "Sequence"}
+            takes.setdefault(parameter.name, []).append((name, kinds))
+    for parameter, uses in takes.items():
+        first, kinds = uses[0]
+        for name, others in uses if parameter != "config" else ():
+            assert kinds & others, f"{parameter}: {first} takes {kinds}, {name} takes {others}"
+
+
+def test_numbers_of_settings_name_their_units() -> None:
+    silent = {
+        f"{name}.{field.name}"
+        for name in endopilot.__all__
+        if name.endswith("Config")
+        for field in dataclasses.fields(getattr(endopilot, name))
+        if re.search(r"float\b|Positive|NonNegative|Finite", str(field.type))
+        and field.name not in WITHOUT_UNIT | {"seeds", "precision"}
+        and not UNITS.search(field.name)
+    }
+    assert not silent
 
 
 def test_another_name_is_no_attribute() -> None:

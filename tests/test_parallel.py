@@ -23,7 +23,7 @@ def write_process(item: Path) -> None:
     item.write_text(str(os.getpid()))
 
 
-def test_every_item_is_worked_on_and_bad_ones_are_returned(tmp_path):
+def test_every_item_is_worked_on_and_bad_ones_are_returned(tmp_path, in_processes):
     items = [tmp_path / name for name in ("a", "bad", "c")]
     bad = each("Test", items, write_process)
     assert list(bad) == [items[1]] and str(bad[items[1]]).endswith("mend it")
@@ -37,7 +37,7 @@ def test_one_item_is_worked_on_here(tmp_path):
     assert (tmp_path / "a").read_text() == str(os.getpid())
 
 
-def test_a_defect_ends_the_work(tmp_path):
+def test_a_defect_ends_the_work(tmp_path, in_processes):
     with pytest.raises(RuntimeError, match="a defect"):
         each("Test", [tmp_path / "defect", tmp_path / "b"], write_process)
     deadline = time.monotonic() + 20

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError, model_validator
 
 import endopilot
-from endopilot.devices.device import Wire, read_device
+from endopilot.devices.device import Wire, read_wire
 from endopilot.errors import InputError
 from endopilot.files import json_text
 from endopilot.settings import Ascending, Count, Finite, NonNegative, Positive, Within, from_record, read_settings
@@ -155,7 +155,7 @@ def valid(hint: Any) -> Any:
     if origin is not None and issubclass(origin, Mapping):
         return {}
     if hint is Wire:
-        return read_device("workhorse-014")
+        return read_wire("workhorse-014")
     if is_settings(hint):
         return hint(**{name: valid(hints_of(hint)[name]) for name in required(hint)})
     return hint() if hint is bool else "text" if hint is str else object.__new__(hint)

@@ -17,7 +17,7 @@ PLACE_MM = {"rca": np.zeros(3), "lca": LEFT_FROM_RIGHT_MM}
 
 def artery(vessel, index=0, seed=5):
     """A synthetic artery whose ostium lies at `PLACE_MM`: the true ostium, and its distance map."""
-    tree, _ = make_patient_tree(AtlasConfig(anatomy=vessel, seed=seed), index)
+    tree, _ = make_patient_tree(AtlasConfig(vessel=vessel, seed=seed), index)
     lumen = distance_map_from_spheres(tree, spacing_mm=VOXEL_MM)
     shift = PLACE_MM[vessel] - tree.branches[0].centerline.points[0]
     return replace(lumen, origin_mm=lumen.origin_mm + shift)

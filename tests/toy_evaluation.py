@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import KDTree
 
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
 from endopilot.evaluation.results import SplitResult, TipSeries
 from endopilot.simulation.config import SimulatorConfig
@@ -54,7 +54,7 @@ def make_trajectory(samples: int = 6) -> Trajectory:
     start = np.array([[[4.0, 0.0]]])
     of_wire = np.zeros((1, samples, 1))
     inserted = depth[None, :, None]
-    stack, friction = Stack(read_device("workhorse-014")), np.full((1, 1), 0.1)
+    stack, friction = Stack(read_wire("workhorse-014")), np.full((1, 1), 0.1)
     return Trajectory(
         set_up=SimulationSetUp([make_anatomy()], [stack], start, friction, "velocity", None, SimulatorConfig()),
         period_s=0.5,

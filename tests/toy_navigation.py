@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -17,7 +18,7 @@ from endopilot import _core
 from endopilot.anatomy.io import write_anatomy
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
 from endopilot.files import read_json, write_json
 from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
@@ -100,9 +101,9 @@ def toy_simulate(
     )
 
 
-def toy_outputs(each: tuple[int, ...], devices: int, **known: np.ndarray) -> dict[str, np.ndarray]:
+def toy_outputs(each: tuple[int, ...], devices: int, **known: np.ndarray) -> dict[str, Any]:
     """Return all that the core records of worlds: 0, and valid, but for what is known."""
-    outputs = {
+    outputs: dict[str, Any] = {
         name: np.zeros((*each, *([devices] if of == "device" else []), *([numbers] if numbers > 1 else [])))
         for name, of, numbers, *_ in _core.OUTPUTS
         if of in ("device", "sample")
@@ -123,14 +124,14 @@ def write_toy_anatomies(folder: Path, patients: int) -> list[Path]:
         if not where.exists():
             vessel = toy_anatomy(f"patient-{i}{'x' * i}")
             catheter_mm = vessel.catheter_radius_mm + 1e-3 * i  # the toy wire does not feel it
-            write_anatomy(replace(vessel, catheter_radius_mm=catheter_mm), where)
+            write_anatomy(replace(vessel, catheter_radius_mm=catheter_mm), output=where)
     return folders
 
 
 def toy_navigate(simulate=toy_simulate):
     """Return a stand-in for `simulate_navigations`: the drawn controls, driven as they are through the toy."""
 
-    def simulate_navigations(anatomy, stacks, initial, control, friction, config, *, actuation, motion, advance):
+    def simulate_navigations(anatomy, stacks, initial, control, friction, config, *, advance, **_):
         control = control.astype(np.float32).astype(float)
         trajectory = simulate(anatomy, stacks[0], control, initial=initial, config=config, friction=friction)
         advance(control.shape[0] * control.shape[1])
@@ -154,7 +155,7 @@ def make_toy_dataset(
     config = DatasetConfig(**({"sequences": sequences, "anatomy_shares": shares} | settings))
     with patch("endopilot.dataset.block.simulate_navigations", toy_navigate(simulate)):
         anatomies = write_toy_anatomies(folder.parent / "anatomies", patients)
-        generate_dataset(anatomies, folder, read_device(device), config, scheduler=scheduler)
+        generate_dataset(anatomies, output=folder, device=read_wire(device), config=config, scheduler=scheduler)
 
 
 def make_untrained_run(dataset_folder, run_folder):

@@ -25,13 +25,13 @@ from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, nar
 from endopilot.control.agent import CALIBRATIONS, IN_CATHETER, AgentConfig, AgentPolicy
 from endopilot.files import read_json, write_json
 from endopilot.ladder.ladder import identity
-from endopilot.navigation.navigate import NavigateConfig, navigate
+from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Decision, Observation
 from endopilot.runs import claim, make_missing
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import Motion, motion_named
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
-from endopilot.tasks.task import CORE, NEWEST, LadderVersion, Task, find_task, ladder_tasks
+from endopilot.tasks.task import CORE, NEWEST, LadderVersion, Task, find_task, list_tasks
 
 KindName = Literal["assumed", "images", "coaxial"]
 LEVEL, EXPOSED_EVERY, SECONDS = 0.9, 20, 30.0
@@ -64,7 +64,7 @@ KINDS: dict[KindName, Kind] = {
     "assumed": Kind(
         config=AgentConfig(),
         version=NEWEST,
-        tasks=ladder_tasks(),
+        tasks=list_tasks(),
         roles={"fit": range(4), "calibrate": range(4, 9), "test": range(3)},
         folder=CALIBRATIONS["assumed", 1],
         mark="agent",
@@ -73,7 +73,7 @@ KINDS: dict[KindName, Kind] = {
     "images": Kind(
         config=AgentConfig(),
         version=NEWEST,
-        tasks=tuple(task for task in ladder_tasks() if task.anatomy in ("rca", "lca")),
+        tasks=tuple(task for task in list_tasks() if task.vessel in ("rca", "lca")),
         roles={"calibrate": range(2)},
         folder=CALIBRATIONS["images", 1],
         mark="agent-images",
@@ -82,7 +82,7 @@ KINDS: dict[KindName, Kind] = {
     "coaxial": Kind(
         config=IN_CATHETER,
         version="coaxial",
-        tasks=ladder_tasks("coaxial"),
+        tasks=list_tasks("coaxial"),
         roles={"fit": range(3), "calibrate": range(3, 7), "test": range(3)},
         folder=CALIBRATIONS["assumed", 2],
         mark="agent-coaxial",
@@ -125,26 +125,26 @@ def truth_of(task: Task, place: int, role: str, kind: Kind) -> ModelMismatch:
 def measure(path: Path, name: KindName) -> None:
     """Navigate in a patient, and write prediction and truth of each period after the first."""
     kind, moves = KINDS[name], name == "images"
-    task, role, place = find_task(path.parent.name, kind.version), *path.stem.split("-")
+    task, role, place = find_task(path.parent.name, version=kind.version), *path.stem.split("-")
     number = int(place)
     if role == "test":
         navigation = task.ladder_navigation(number)
     else:
         turn = np.random.default_rng([task.training.seed, number]).uniform(0.0, 2 * np.pi)
-        navigation = task.navigation(task.patient(task.training, number), start_rotation=turn)
+        navigation = task.navigation(task.patient(task.training, number), start_rotation_rad=turn)
     policy = MonitoredAgent(replace(kind.config, tries=2), calibration=NO_BANDS)
     seed = 1000 + 100 * task.level + number
-    record = navigate(
+    record = NavigationLoop(
         replace(navigation, seconds=min(SECONDS, navigation.seconds), known_motion=Motion() if moves else None),
         policy,
-        config=NavigateConfig(
+        config=LoopConfig(
             simulator=replace(CORE, threads=1),
             xray="images" if moves else "assumed",
             motion=motion_named("both", seed) if moves else None,
         ),
         seed=seed,
         truth=truth_of(task, number, role, kind),
-    )
+    ).run()
     kept, count = np.array(policy.kept), len(policy.kept)
     true = np.column_stack([record.tip.abscissa[:, 0], record.tip.offset[:, 0]])[:count]
     exposed = record.exposed[:count]

@@ -10,7 +10,8 @@ import numpy as np
 from tyro.conf import Positional
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.control.navigate_patient import NavigatePatientConfig, navigate_patient, set_up_navigation
+from endopilot.control.navigate import NavigateConfig, navigate
+from endopilot.devices.stack import Stack
 from endopilot.types import Anatomy
 
 ARTERIES = {"LAD": ("6", "7", "8"), "LCx": ("11", "13"), "RCA": ("1", "2", "3")}
@@ -45,7 +46,10 @@ def navigate_coronaries(
     patients: Positional[tuple[Path, ...]],
     /,
     *,
-    config: NavigatePatientConfig = NavigatePatientConfig(mismatch=0.2),
+    policy: str = "agent",
+    device: str = "workhorse-014",
+    catheter: tuple[str, ...] = (),
+    config: NavigateConfig = NavigateConfig(mismatch=0.2),
 ) -> None:
     """Drive a policy into the distal thirds of coronary arteries; print each navigation, and the share that was safe.
 
@@ -53,7 +57,10 @@ def navigate_coronaries(
 
     Args:
         patients: folders that `endopilot anatomy` or `endopilot atlas` made.
-        config: policy, wire, limits, and how reality differs from what the policy is given.
+        policy: what decides.
+        device: name of the wire.
+        catheter: names of the catheters around it, from the inside out.
+        config: limits, X-ray, and how reality differs from what the policy is given.
     """
     safe = []
     print("| patient | artery | safe | reached | peak force, N | exposures | seconds | processor, s | outcome |")
@@ -62,7 +69,8 @@ def navigate_coronaries(
         anatomy = read_anatomy(folder)
         for artery, place in targets(anatomy):
             began = time.process_time()
-            record = navigate_patient(set_up_navigation(anatomy, place, config)).record
+            stack = Stack.of(device, *catheter)
+            record = navigate(anatomy, place, policy=policy, device=stack, config=config).record
             spent = time.process_time() - began
             safe.append(record.success and record.safe)
             print(

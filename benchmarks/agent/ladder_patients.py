@@ -32,7 +32,7 @@ from endopilot.tasks.task import (
     NEWEST,
     LadderVersion,
     Task,
-    ladder_tasks,
+    list_tasks,
     without_catheter,
 )
 from endopilot.types import TipProjection, VesselTree
@@ -92,7 +92,9 @@ class _Search:
     def __post_init__(self) -> None:
         navigation = self.navigation
         self.simulator = Simulator(navigation.anatomy, navigation.device, worlds=TRIES, config=CORE)
-        self.simulator.reset(inserted_length=np.full(TRIES, navigation.start_inserted_mm), rotation=np.zeros(TRIES))
+        self.simulator.reset(
+            inserted_length=np.full(TRIES, navigation.start_inserted_length_mm), rotation=np.zeros(TRIES)
+        )
         self.deepest = float(navigation.anatomy.tree.longest_path().abscissa[-1]) + 19.0
         self.peak, self.seconds = np.zeros(TRIES), np.zeros(TRIES)
 
@@ -169,7 +171,7 @@ def wire_alone_fails(navigation: Navigation) -> bool:
     count = 8
     simulator = Simulator(navigation.anatomy, navigation.device, worlds=count, config=CORE)
     turn = 2 * np.pi * np.arange(count) / count
-    simulator.reset(inserted_length=np.full(count, navigation.start_inserted_mm), rotation=turn)
+    simulator.reset(inserted_length=np.full(count, navigation.start_inserted_length_mm), rotation=turn)
     longest = float(navigation.anatomy.tree.longest_path().abscissa[-1]) + 19.0
     deepest, arrived = min(navigation.target.abscissa + 20.0, longest), np.zeros(count, dtype=bool)
     for _ in range(round(deepest / (PUSH_MM_S * PERIOD_S))):
@@ -222,7 +224,7 @@ def choose_patients(
         version: of the ladder: 1, 2 or coaxial.
         write: write the numbers into the tasks' files.
     """
-    for task in ladder_tasks(version):
+    for task in list_tasks(version):
         if tasks and task.name not in tasks:
             continue
         path = TASKS / f"ladder_{task.version}" / f"{task.name}.yaml"

@@ -16,7 +16,7 @@ from tyro.conf import Positional
 from endopilot.control.agent import AgentPolicy
 from endopilot.devices.robot import RobotConfig
 from endopilot.ladder.mismatch import CASES, mismatch_of
-from endopilot.navigation.navigate import NavigateConfig, navigate
+from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.settings import Count
 from endopilot.tasks.task import CORE, find_task
 from endopilot.xray.fluoroscope import TipMeasurement
@@ -42,8 +42,8 @@ def drive(name: str, place: int, case: str, rule: type[AgentPolicy]) -> list[flo
     task, policy = find_task(name), rule()
     navigation = task.ladder_navigation(place)
     mismatch, robot = mismatch_of(case, MISMATCH, navigation, task, place, RobotConfig())
-    config, began = NavigateConfig(robot=robot, simulator=replace(CORE, threads=1)), time.process_time()
-    record = navigate(navigation, policy, config=config, seed=100 * task.level + place, truth=mismatch)
+    config, began = LoopConfig(robot=robot, simulator=replace(CORE, threads=1)), time.process_time()
+    record = NavigationLoop(navigation, policy, config=config, seed=100 * task.level + place, truth=mismatch).run()
     spent = time.process_time() - began
     return [record.success and record.safe, record.exposures, record.seconds, policy.plans, spent]
 

@@ -22,12 +22,12 @@ from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import navigation_events, navigation_seed
 from endopilot.ladder.ladder import identity
-from endopilot.navigation.navigate import NavigateConfig, XrayKind, navigate
+from endopilot.navigation.loop import LoopConfig, NavigationLoop, XrayKind
 from endopilot.runs import claim, make_missing
 from endopilot.settings import Count
 from endopilot.simulation.mismatch import drawn_sides, mismatch_by
 from endopilot.simulation.motion import Motion, motion_named
-from endopilot.tasks.task import CORE, NEWEST, find_task, ladder_tasks
+from endopilot.tasks.task import CORE, NEWEST, find_task, list_tasks
 
 FOLDER = Path("runs/xray-conditions")
 Condition = Literal["assumed", "images", "moving", "together", "measured"]
@@ -50,7 +50,7 @@ def measure(path: Path) -> None:
     _, xray, moves, measured = CONDITIONS[path.parent.parent.name]
     navigation, seed = task.ladder_navigation(place), navigation_seed(task, place)
     change = drawn_sides(MISMATCH, np.random.default_rng([seed, 3]))
-    config = NavigateConfig(
+    config = LoopConfig(
         robot=RobotConfig().delayed(1 + change["latency"]),
         simulator=replace(CORE, threads=1),
         xray=xray,
@@ -60,7 +60,7 @@ def measure(path: Path) -> None:
     truth = mismatch_by(change, navigation.anatomy)
     navigation = replace(navigation, known_motion=Motion() if moves else None)
     try:
-        record = navigate(navigation, AgentPolicy(), config=config, seed=seed, truth=truth)
+        record = NavigationLoop(navigation, AgentPolicy(), config=config, seed=seed, truth=truth).run()
     except InputError as error:  # the patient is not recognised in the images
         write_json(path, {"reason": str(error), "success": False, "safe": True})
         return
@@ -114,7 +114,7 @@ def drive_under_conditions(
     Raises:
         InputError: the folder belongs to another run.
     """
-    tasks = [task for task in ladder_tasks() if task.anatomy in ("rca", "lca")]
+    tasks = [task for task in list_tasks() if task.vessel in ("rca", "lca")]
     wanted = {
         name: [FOLDER / name / task.name / f"{place:02d}.json" for place in range(patients) for task in tasks]
         for name in only

@@ -64,7 +64,7 @@ def compare_with_atlas(folders: Sequence[Path], atlas: AtlasConfig) -> list[dict
     for kind in sorted(given, key=list(KINDS).index):
         drawn = []
         with progress(f"Atlas, {kind}", atlas.count) as advance:
-            for anatomy in make_atlas(replace(atlas, anatomy=kind)):
+            for anatomy in make_atlas(config=replace(atlas, vessel=kind)):
                 drawn.append(vessel_shape(anatomy))
                 advance()
         rows += compared(kind, together(given[kind]), together(drawn))

@@ -195,7 +195,7 @@ def _found_again(truth: Anatomy, name: str) -> Judged:
     found = extract_anatomy(mask, name=name, config=AnatomyConfig(vessel=name))  # pyright: ignore[reportArgumentType]
     agreement = compare_trees(found.tree, truth.tree, smallest_radius_mm=0.0)
     with tempfile.TemporaryDirectory() as folder:
-        write_anatomy(found, Path(folder) / name)
+        write_anatomy(found, output=Path(folder) / name)
         stored = (Path(folder) / name / "lumen.nrrd").stat().st_size / 1e6
     return {
         "overlap OV": (agreement.overlap, OVERLAP_BAR),
@@ -218,7 +218,7 @@ def _projection_speed() -> Judged:
         project_tip(patient.tree, patient.insertion, points)
         spent.append(time.process_time() - started)
     with tempfile.TemporaryDirectory() as folder:
-        write_anatomy(patient, Path(folder) / "patient")
+        write_anatomy(patient, output=Path(folder) / "patient")
         stored = (Path(folder) / "patient" / "lumen.nrrd").stat().st_size / 1e6
     return {
         "points projected a second of processor time": (PROJECTED / min(spent), SPEED_BAR),

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.figures import Bar
 from endopilot.anatomy.labels import Scheme, dominance, label_tree
-from endopilot.atlas.atlas import ANATOMIES, AtlasConfig, make_patient_tree
+from endopilot.atlas.atlas import VESSELS, AtlasConfig, make_patient_tree
 from endopilot.settings import Count, Seed
 from endopilot.types import VesselTree
 
@@ -31,7 +31,7 @@ def measure_labels(*, count: Count = 40, seed: Seed = 0) -> list[dict[str, Any]]
         the worst one), `dominance_right` (share of patients, None where there is none), `confusions` (the three pairs
         "truth as label" with the largest shares of the length) and `passed` (`right` reaches `BAR`).
     """
-    return [_measure(anatomy, count, seed) for anatomy in ANATOMIES]
+    return [_measure(anatomy, count, seed) for anatomy in VESSELS]
 
 
 Lengths = dict[tuple[str, str], float]
@@ -49,7 +49,7 @@ def label_agreement(truth: VesselTree, found: VesselTree) -> Lengths:
 
 
 def _measure(anatomy: str, count: int, seed: int) -> dict[str, Any]:
-    config = AtlasConfig(anatomy=anatomy, count=count, seed=seed)
+    config = AtlasConfig(vessel=anatomy, count=count, seed=seed)
     total: Lengths = defaultdict(float)
     shares, dominances = [], []
     for index in range(count):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.simulation.config import FREE_BEHIND_MM, PRESETS, Preset, SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.core import make_lumen, run_core
@@ -52,7 +52,7 @@ def bench_gpu(
         InputError: there is no GPU, or no build of the core for it.
     """
     core_for("cuda")  # refuses at once where there is none
-    anatomy, device = make_patient(AtlasConfig(population="textbook"), 0), read_device(DEVICE)
+    anatomy, device = make_patient(AtlasConfig(population="textbook"), 0), read_wire(DEVICE)
     longest = float(anatomy.tree.longest_path().abscissa[-1])
     initial, control = random_controls(
         ControlConfig(), n_sequences=min(DRAWN, max(worlds)), n_samples=samples, seed=0, max_inserted_length_mm=longest

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.devices.catheter import list_catheters, read_catheter
-from endopilot.devices.device import Device, read_device
-from endopilot.devices.device_files import list_devices
+from endopilot.devices.device import Device, read_wire
+from endopilot.devices.device_files import list_wires
 from endopilot.devices.drive_limits import within_travel
 from endopilot.devices.stack import Stack
 from endopilot.simulation.controls import ControlConfig, random_controls
@@ -37,7 +37,7 @@ def stacks_of(index: int, *, seed: int, catheters: bool) -> list[Stack]:
         seed: key of the random pairs.
         catheters: whether there are catheters.
     """
-    wires = [read_device(name) for name in list_devices()]
+    wires = [read_wire(name) for name in list_wires()]
     if not catheters:
         return [Stack(wire) for wire in wires]
     around = [read_catheter(name) for name in list_catheters()]
@@ -49,11 +49,6 @@ def stacks_of(index: int, *, seed: int, catheters: bool) -> list[Stack]:
     ]
     drawn = np.random.default_rng([seed, index]).choice(len(pairs), _PAIRS, replace=False)
     return [pairs[pair] for pair in drawn]
-
-
-def name_of(stack: Stack) -> str:
-    """Return the names of a wire and of the catheters around it."""
-    return " in ".join(device.name for device in stack.devices)
 
 
 def seed_of(index: int, *, seed: int) -> int:

@@ -21,14 +21,14 @@ from typing import Annotated, Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from benchmarks.core.manoeuvres import MANOEUVRES, name_of, paired_controls, seed_of, stacks_of
+from benchmarks.core.manoeuvres import MANOEUVRES, paired_controls, seed_of, stacks_of
 from benchmarks.figures import Bar
 from endopilot import __version__, _core
 from endopilot.anatomy.io import read_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.catheter import list_catheters, read_catheter
-from endopilot.devices.device import read_device
-from endopilot.devices.device_files import list_devices
+from endopilot.devices.device import read_wire
+from endopilot.devices.device_files import list_wires
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import read_json, sha256, write_json, writing
@@ -130,7 +130,7 @@ def measure_robustness(config: RobustnessConfig = RobustnessConfig()) -> dict[st
                 path = _path(config, index, stack)
                 if count > 0 and not _done(path):
                     worker.run(path, config, index, stack, count)
-                advance(remark=f"{name_of(stack)}, anatomy {index}")
+                advance(remark=f"{stack.name}, anatomy {index}")
     return _summarise(config)
 
 
@@ -160,7 +160,7 @@ def run_chunk(path: Path, config: RobustnessConfig, index: int, stack: Stack, ro
         rollout = simulate(anatomy, stack, control, initial=initial, config=simulator)
     chunk = _describe(anatomy, stack, rollout, simulator, time.process_time() - began)
     invalid = [
-        f"{anatomy.name}, {name_of(stack)}, rollout {world} ({MANOEUVRES[world % len(MANOEUVRES)]}): "
+        f"{anatomy.name}, {stack.name}, rollout {world} ({MANOEUVRES[world % len(MANOEUVRES)]}): "
         + rollout.why_invalid(world)
         for world in np.flatnonzero(rollout.reason).tolist()
     ]
@@ -255,7 +255,7 @@ class _Worker:
         except Exception as error:  # a crash is what is being counted
             what = "the process died" if isinstance(error, BrokenProcessPool) else f"{type(error).__name__}: {error}"
             name = config.given[index].name if config.given else f"patient {index}"
-            write_json(path.with_suffix(".json"), {"anatomy": name, "crash": f"{name}, {name_of(stack)}: {what}"})
+            write_json(path.with_suffix(".json"), {"anatomy": name, "crash": f"{name}, {stack.name}: {what}"})
             self._pool.shutdown(wait=False)
             self._pool = None
 
@@ -274,7 +274,7 @@ def _done(path: Path) -> bool:
 
 def _identity(config: RobustnessConfig) -> dict[str, Any]:
     """Return what the results of the chunks follow from."""
-    devices = [read_device(name) for name in list_devices()]
+    devices = [read_wire(name) for name in list_wires()]
     catheters = [read_catheter(name) for name in list_catheters() if config.catheters]
     return {
         "config": {name: value for name, value in asdict(config).items() if name not in ("threads", "folder", "given")},
@@ -300,7 +300,7 @@ def _summarise(config: RobustnessConfig) -> dict[str, Any]:
         non_finite += int(chunk.non_finite.sum())
         seconds += float(chunk.seconds)
         kind = np.arange(len(chunk.valid)) % len(MANOEUVRES)
-        groups = [("all", "all", slice(None)), ("by_device", name_of(stack), slice(None))]
+        groups = [("all", "all", slice(None)), ("by_device", stack.name, slice(None))]
         groups += [("by_anatomy", record["anatomy"], slice(None))]
         groups += [("by_manoeuvre", name, kind == place) for place, name in enumerate(MANOEUVRES)]
         for group, name, rows in groups:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.catheter_axis import with_world_zero
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.devices.device import Wire, read_device
+from endopilot.devices.device import Wire, read_wire
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.motion import Motion
@@ -69,7 +69,7 @@ def make_scenes(worlds: int = WORLDS, samples: int = SAMPLES) -> list[Scene]:
     """
     scenes = []
     for place, (name, kind) in enumerate(KINDS.items()):
-        anatomy = with_world_zero(make_patient(AtlasConfig(anatomy=kind, seed=SEED, population="textbook"), 0))
+        anatomy = with_world_zero(make_patient(AtlasConfig(vessel=kind, seed=SEED, population="textbook"), 0))
         initial, control = random_controls(
             ControlConfig(),
             n_sequences=worlds,
@@ -78,7 +78,7 @@ def make_scenes(worlds: int = WORLDS, samples: int = SAMPLES) -> list[Scene]:
             max_inserted_length_mm=float(anatomy.tree.longest_path().abscissa[-1]),
             first=place * worlds,
         )
-        scenes.append(Scene(name, anatomy, read_device(DEVICE), initial, control))
+        scenes.append(Scene(name, anatomy, read_wire(DEVICE), initial, control))
     return scenes
 
 

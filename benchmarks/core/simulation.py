@@ -22,7 +22,7 @@ from benchmarks.core.scenes import DEVICE, Solution, make_scenes, simulated_s
 from benchmarks.figures import in_turns, timed
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.catheter import read_catheter
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.simulation.config import PRESETS, Preset, SimulatorConfig, wall_stiffness
 from endopilot.simulation.motion import MotionName, motion_named
@@ -138,7 +138,7 @@ def bench_scaling() -> list[dict[str, Any]]:
         Rows of `element_mm`, `worlds`, `seconds` (processor time of the core), `us_per_node_and_iteration` (of the
         nodes ahead of the catheter) and `kilobytes_per_world` (growth of the process's memory; the map is shared).
     """
-    anatomy, device = make_patient(AtlasConfig(population="textbook"), 0), read_device(DEVICE)
+    anatomy, device = make_patient(AtlasConfig(population="textbook"), 0), read_wire(DEVICE)
     depth = 0.6 * float(anatomy.tree.longest_path().abscissa[-1])
     rows = []
     for element_mm, worlds in (

@@ -24,7 +24,7 @@ def draw_case(seed: int, index: int, difficulty: Difficulty = "clean") -> tuple[
     """Return the patient and the scan of a case: voxels, calcium, background and all that the phantom draws."""
     key = np.array([seed, index], dtype=np.uint64)
     generator = np.random.Generator(np.random.Philox(key=key, counter=1))
-    patients = AtlasConfig(anatomy=VESSELS[index % len(VESSELS)], seed=seed, stenosis_share=0.5)
+    patients = AtlasConfig(vessel=VESSELS[index % len(VESSELS)], seed=seed, stenosis_share=0.5)
     right_heart = float(generator.uniform(0.2, 0.95))
     scan = PhantomConfig(
         in_plane_mm=float(generator.uniform(0.32, 0.45)),

@@ -105,13 +105,13 @@ def _measure(path: Path, *, seed: int, difficulty: Difficulty) -> None:
     index = int(path.stem)
     patients, scan = draw_case(seed, index, difficulty)
     truth = make_patient(patients, index)
-    volume = make_phantom(truth, scan, seed * 1_000_003 + index)
-    vessel = "lca" if patients.anatomy == "lca" else "rca"
+    volume = make_phantom(truth, config=scan, seed=seed * 1_000_003 + index)
+    vessel = "lca" if patients.vessel == "lca" else "rca"
     row: dict[str, Any] = {"case": index, "failed": None, "warnings": []}
     wall, processor = time.perf_counter(), time.process_time()
     mask = None
     try:
-        mask = segment(volume, SegmentConfig(method="coronary", vessel=vessel))
+        mask = segment(volume, config=SegmentConfig(method="coronary", vessel=vessel))
     except InputError as error:
         row["failed"] = str(error)
     row |= {"seconds": time.perf_counter() - wall, "processor_seconds": time.process_time() - processor}
@@ -122,7 +122,7 @@ def _measure(path: Path, *, seed: int, difficulty: Difficulty) -> None:
             row |= asdict(score_anatomy(mask, extracted, truth))
         except InputError as error:
             row["failed"] = str(error)
-    drawn = {name: truth.provenance.get(name) for name in ("anatomy", "dominance", "stenoses")}
+    drawn = {name: truth.provenance.get(name) for name in ("vessel", "dominance", "stenoses")}
     write_json(path, row | {"patient": drawn, "scan": scan, "manifest": manifest(config=patients, seed=seed)})
 
 

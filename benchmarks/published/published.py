@@ -27,8 +27,8 @@ from benchmarks.published.straightening import (
 from benchmarks.published.three_point import SPAN_MM, flexural_modulus
 from benchmarks.published.tubing import BORE_MM, LENGTH_MM, draw_tubing, push_through
 from endopilot.devices.catheter import Catheter, read_catheter
-from endopilot.devices.device import Wire, read_device
-from endopilot.devices.device_files import list_devices
+from endopilot.devices.device import Wire, read_wire
+from endopilot.devices.device_files import list_wires
 from endopilot.progress import progress
 from endopilot.settings import Within, settings
 from endopilot.simulation.tip_load import simulate_tip_load
@@ -146,7 +146,7 @@ def bending(config: PublishedConfig) -> list[Comparison]:
     should be no stiffer than the softest of them.
     """
     random = np.random.default_rng([config.seed, 0])
-    device = read_device("j-035")
+    device = read_wire("j-035")
     shaft_mm = device.abscissa_mm[-1] + SPAN_MM
     moduli = tuple(
         flexural_modulus(
@@ -163,7 +163,7 @@ def bending(config: PublishedConfig) -> list[Comparison]:
 
 def tip_loads() -> list[Comparison]:
     """Push the tip of each shipped wire whose catalogue states a tip load against a plate."""
-    stated = [(device, device.tip_load_n) for device in map(read_device, list_devices())]
+    stated = [(device, device.tip_load_n) for device in map(read_wire, list_wires())]
     return [
         Comparison(
             f"tip load: {device.name}",
@@ -193,7 +193,7 @@ class _Test:
 
 def tubing_tests() -> list[_Test]:
     """Return the pushes through tubing: those that were published, then some with another assumption."""
-    soft, stiff = (read_device(name) for name in ("workhorse-014", "stiff-014"))
+    soft, stiff = (read_wire(name) for name in ("workhorse-014", "stiff-014"))
     small, large = (read_catheter(name) for name in ("microcatheter-1.7f", "microcatheter-2.4f"))
     pair = f"{small.name} over {soft.name}"
     return [

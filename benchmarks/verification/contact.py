@@ -108,7 +108,7 @@ def pull_string(
             time_step_s=0.02, tolerance_mm=1e-5, stick_velocity_mm_s=0.02, wall_stiffness_n_mm=5.0, threads=1
         ),
         insertion=insertion,
-        inserted_mm=2.0,
+        inserted_length_mm=2.0,
         free_behind_mm=0.5 * size,
     )
     time = 0.5 * np.arange(len(control))

@@ -145,7 +145,7 @@ def pushed_into_a_bend() -> list[Case]:
         lumen=make_lumen(field, WIRE_RADIUS_MM),
         config=SimulatorConfig(time_step_s=0.05, wall_stiffness_n_mm=50.0, threads=1),
         insertion=Insertion(position=np.array([-LEAD_MM, 0.0, 0.0]), direction=np.array([1.0, 0.0, 0.0])),
-        inserted_mm=FIRST_INSERTED_MM,
+        inserted_length_mm=FIRST_INSERTED_MM,
     )
     push, theirs = bend_mujoco()
     ours = result["shape"][-1][:elements][::-1]

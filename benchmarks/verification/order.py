@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.motion import Motion
@@ -121,7 +121,7 @@ def navigation_order(
     Raises:
         RuntimeError: a navigation did not converge.
     """
-    anatomy, device = patient(), read_device("workhorse-014")
+    anatomy, device = patient(), read_wire("workhorse-014")
 
     def tips(step_s: float) -> Float[np.ndarray, "worlds samples 3"]:
         config = SimulatorConfig(time_step_s=step_s, tolerance_mm=1e-6, threads=1)

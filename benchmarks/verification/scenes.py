@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.integrate import solve_ivp
 from scipy.spatial import KDTree
 
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import make_lumen
 from endopilot.simulation.rod import RodLayout, lay_out
@@ -133,7 +133,7 @@ def drag_through_bends(bends: int, *, friction: float = 0.2, bend_n_mm2: float =
         tube(axis, 0.6),
         control,
         entry_mm=-lead,
-        inserted_mm=2.0,
+        inserted_length_mm=2.0,
         friction=friction,
         config=SimulatorConfig(tolerance_mm=1e-5, stick_velocity_mm_s=0.02, wall_stiffness_n_mm=5.0, threads=1),
         free_behind_mm=size,
@@ -181,7 +181,7 @@ def stick_slip(*, friction: float = 0.1) -> Pushed:
     Args:
         friction: Coulomb coefficient.
     """
-    device = read_device("workhorse-014")
+    device = read_wire("workhorse-014")
     axis, radius = ridged_vessel()
     speed, samples, start = 0.5, 120, 35.0
     path = np.pi / 2 * CURVE_RADIUS_MM + 60.0
@@ -190,7 +190,7 @@ def stick_slip(*, friction: float = 0.1) -> Pushed:
         tube(axis, radius, spacing_mm=0.15),
         np.tile([speed, 0.0], (samples, 1)),
         entry_mm=-5.0,
-        inserted_mm=start,
+        inserted_length_mm=start,
         friction=friction,
         config=SimulatorConfig(threads=1, wall_stiffness_n_mm=5.0),
         approach=True,
@@ -210,14 +210,14 @@ def push_against_a_plate(*, friction: float, tip_bend_deg: float) -> Pushed:
         friction: Coulomb coefficient of the plate.
         tip_bend_deg: angle by which the last 3 mm are bent, degrees; no wire is perfectly straight.
     """
-    device = replace(read_device("workhorse-014"), tip_bend_rad=float(np.deg2rad(tip_bend_deg)), tip_bend_length_mm=3.0)
+    device = replace(read_wire("workhorse-014"), tip_bend_rad=float(np.deg2rad(tip_bend_deg)), tip_bend_length_mm=3.0)
     start, speed, samples = PLATE_GAP_MM - 0.3, 0.1, 60
     result = _drive(
         lay_out(device, element_mm=0.15, length_mm=20.0),
         _chamber(PLATE_GAP_MM + device.tip_radius_mm, 6.0),
         np.tile([speed, 0.0], (samples, 1)),
         entry_mm=0.0,
-        inserted_mm=start,
+        inserted_length_mm=start,
         friction=friction,
         config=SimulatorConfig(threads=1, wall_stiffness_n_mm=5.0),
         free_behind_mm=0.0,
@@ -265,7 +265,7 @@ def turn_in_a_bend(curved_mm: float, *, turns: float = 2.25, friction: float = 0
         tube(axis, 1.3 * radius, spacing_mm=0.1),
         control,
         entry_mm=-_WHIP_LEAD_MM,
-        inserted_mm=0.0,
+        inserted_length_mm=0.0,
         friction=friction,
         config=SimulatorConfig(threads=1, wall_stiffness_n_mm=20.0),
         free_behind_mm=size,
@@ -329,7 +329,7 @@ def _drive(
     control: Float[np.ndarray, "samples 2"],
     *,
     entry_mm: float,
-    inserted_mm: float,
+    inserted_length_mm: float,
     friction: float,
     config: SimulatorConfig,
     approach: bool = False,
@@ -344,7 +344,7 @@ def _drive(
     return driven(
         rod,
         control,
-        initial=np.array([inserted_mm, 0.0]),
+        initial=np.array([inserted_length_mm, 0.0]),
         config=config,
         loading=loading,
         lumen=make_lumen(field, float(rod.radius_mm[0])),

@@ -83,7 +83,7 @@ def mesh(length_mm: float, *, elements: int = ELEMENTS, drag: float = 1e-12) -> 
 def drive(
     rod: RodLayout,
     tubes: TubeLayout,
-    inserted_mm: Float[np.ndarray, "tubes"],
+    inserted_length_mm: Float[np.ndarray, "tubes"],
     *,
     rotation: Float[np.ndarray, "tubes"] | None = None,
     control: Float[np.ndarray, "samples tubes 2"] | None = None,
@@ -97,7 +97,7 @@ def drive(
     Args:
         rod: the nodes.
         tubes: the tubes.
-        inserted_mm: free length of each at the start.
+        inserted_length_mm: free length of each at the start.
         rotation: of each at the start, rad; 0 if not given.
         control: mm/s and rad/s of each.
         samples: number of samples of 0.5 s, if no control is given.
@@ -105,11 +105,11 @@ def drive(
         config: settings of the core.
         approach: push them out together from within the clamp; else they start there, straight.
     """
-    turned = np.zeros(len(inserted_mm)) if rotation is None else rotation
+    turned = np.zeros(len(inserted_length_mm)) if rotation is None else rotation
     return driven(
         rod,
-        np.zeros((samples, len(inserted_mm), 2)) if control is None else control,
-        initial=np.column_stack([inserted_mm, turned]),
+        np.zeros((samples, len(inserted_length_mm), 2)) if control is None else control,
+        initial=np.column_stack([inserted_length_mm, turned]),
         config=replace(config, sample_tolerance_mm=1e-8),
         tubes=tubes,
         loading=loading,

@@ -15,7 +15,7 @@ sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
 
 from benchmarks.anatomy.labels import measure_labels
 from endopilot.atlas import curves as shape
-from endopilot.atlas.atlas import ANATOMIES, AtlasConfig, make_patient, make_patient_tree
+from endopilot.atlas.atlas import VESSELS, AtlasConfig, make_patient, make_patient_tree
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.types import VesselTree
 
@@ -31,7 +31,7 @@ SHOWN = {"rca": (0, 2), "lca": (0, 2), "cerebral": (0, 2), "portal": (0, 2), "ar
 
 def patients_of(anatomy: str, count: int = 60) -> Patients:
     """Return the textbook's trees of seed 0."""
-    config = AtlasConfig(anatomy=anatomy, seed=0, population="textbook")
+    config = AtlasConfig(vessel=anatomy, seed=0, population="textbook")
     return [make_patient_tree(config, index) for index in range(count)]
 
 
@@ -209,10 +209,10 @@ def label_table() -> str:
 def cost_table(count: int = 5) -> str:
     """Return processor seconds a patient with its distance map, on one core."""
     rows = ["| anatomy | s a patient | 100 patients on 2 cores, min |", "| --- | --- | --- |"]
-    for anatomy in ANATOMIES:
+    for anatomy in VESSELS:
         started = time.process_time()
         for index in range(count):
-            make_patient(AtlasConfig(anatomy=anatomy, seed=0), index)
+            make_patient(AtlasConfig(vessel=anatomy, seed=0), index)
         each = (time.process_time() - started) / count
         rows.append(f"| {anatomy} | {each:.2f} | {100 * each / 2 / 60:.1f} |")
     return "\n".join(rows)
@@ -246,11 +246,11 @@ def draw_tree(axes: Any, tree: VesselTree, anatomy: str) -> None:
 
 def draw_trees() -> None:
     """Draw six patients of each anatomy."""
-    figure, rows = plt.subplots(len(ANATOMIES), 6, figsize=(12, 12), layout="constrained")
+    figure, rows = plt.subplots(len(VESSELS), 6, figsize=(12, 12), layout="constrained")
     drawn = ("dominance", "arch_type", "side", "variant")
-    for anatomy, row in zip(ANATOMIES, rows, strict=True):
+    for anatomy, row in zip(VESSELS, rows, strict=True):
         for index, axes in enumerate(row):
-            tree, truth = make_patient_tree(AtlasConfig(anatomy=anatomy, seed=1), index)
+            tree, truth = make_patient_tree(AtlasConfig(vessel=anatomy, seed=1), index)
             draw_tree(axes, tree, anatomy)
             what = next(f"{truth[name]}" for name in drawn if name in truth)
             axes.set_title(f"{anatomy}: {what}{', bovine' if truth.get('bovine') else ''}", fontsize=8)
@@ -260,7 +260,7 @@ def draw_trees() -> None:
 def draw_phantom() -> None:
     """Draw four views of one phantom."""
     figure = plt.figure(figsize=(12, 3.2), layout="constrained")
-    volume = make_phantom(make_patient(AtlasConfig(seed=1), 0), PhantomConfig(), 1)
+    volume = make_phantom(make_patient(AtlasConfig(seed=1), 0), config=PhantomConfig(), seed=1)
     voxels, (dx, dy, dz), (x, y, z) = volume.voxels, volume.spacing_mm, volume.origin_mm
     (nz, ny, nx), rows = voxels.shape, [round((at - y) / dy) for at in (-8, -24, 20)]
     axial, coronal = (x, x + nx * dx, y + ny * dy, y), (x, x + nx * dx, z, z + nz * dz)

@@ -45,7 +45,7 @@ def spread(values: list[float]) -> str:
 def rows(kind: str, given: Values) -> list[str]:
     """Return the table's rows of one kind of tree."""
     drawn = {
-        name: together(vessel_shape(anatomy) for anatomy in make_atlas(replace(config, anatomy=kind)))
+        name: together(vessel_shape(anatomy) for anatomy in make_atlas(config=replace(config, vessel=kind)))
         for name, config in ATLAS.items()
     }
     lines = []

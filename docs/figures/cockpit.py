@@ -43,7 +43,7 @@ def opened(catheter: str | None = None) -> Iterator[Page]:
     """Serve the cockpit in the reference patient, with a catheter if one is named, and give its page in a browser."""
     with tempfile.TemporaryDirectory() as name, sync_playwright() as driver:
         folder = Path(name)
-        write_anatomy(reference_navigation().anatomy, folder / "patient")
+        write_anatomy(reference_navigation().anatomy, output=folder / "patient")
         browser = driver.chromium.launch(executable_path=find_browser(), args=list(BROWSER_FLAGS))
         page = browser.new_page(viewport=SIZE)
         with serving(folder / "patient", folder / "recordings", catheter) as address:
@@ -61,9 +61,9 @@ def catheter() -> None:
         hold(page, "KeyC", "cockpit.shown.xray.contrast > 0.9")
         hold(page, "KeyX", "cockpit.shown.xray.has_roadmap")
         page.check("#roadmap")
-        hold(page, "KeyW", f"cockpit.shown.inserted_mm > {WIRE_MM}")
+        hold(page, "KeyW", f"cockpit.shown.inserted_length_mm > {WIRE_MM}")
         page.keyboard.press("KeyQ")
-        hold(page, "KeyW", f"cockpit.shown.catheters[0].inserted_mm > {CATHETER_MM}")
+        hold(page, "KeyW", f"cockpit.shown.catheters[0].inserted_length_mm > {CATHETER_MM}")
         wait_for(page, "cockpit.shown.xray.contrast === 0")
         hold(page, "KeyX", "cockpit.shown.xray.age_s < 0.05 && cockpit.shown.xray.on")
         page.click("text=to the tip")

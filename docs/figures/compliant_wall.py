@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from endopilot.anatomy.distance import sample
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.devices.device import Wire, read_device
+from endopilot.devices.device import Wire, read_wire
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.rod import lay_out
@@ -45,7 +45,7 @@ def main() -> None:
             ControlConfig(), n_sequences=SEQUENCES, n_samples=60, seed=5, max_inserted_length_mm=0.9 * longest
         )
         for name in ("workhorse-014", "stiff-014"):
-            wire = read_device(name)
+            wire = read_wire(name)
             for stiffness in STIFFNESS_N_MM2:
                 config = SimulatorConfig(compliant_wall_n_mm2=stiffness)
                 with warnings.catch_warnings():

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from endopilot.dataset.loader import load_dataset
+from endopilot.dataset.loader import read_dataset
 from endopilot.models.episodes import Episodes
 from endopilot.simulation.config import PRESETS, SimulatorConfig
 from endopilot.simulation.simulate import simulate
@@ -38,7 +38,7 @@ def main(folders: list[str]) -> None:
     """Replace what stands between the page's marks."""
     rows = [HEAD, ["---"] * len(HEAD)]
     for folder in map(Path, folders):
-        data = load_dataset(folder)
+        data = read_dataset(folder)
         episodes = Episodes.of_dataset(data.select(data.sequence < NAVIGATIONS))
         truth, _ = _simulated(episodes, REFERENCE)
         rows += [[folder.name, name, *_compared(episodes, truth, config)] for name, config in SETTINGS.items()]

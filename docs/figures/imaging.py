@@ -22,7 +22,7 @@ def main() -> None:
     """Segment the real aorta and one synthetic coronary tree, and draw both."""
     sample = fetch_sample("cta-thorax")
     volume = read_volume(sample)
-    mask = segment(volume, SegmentConfig(method="aorta", seeds=SEEDS))
+    mask = segment(volume, config=SegmentConfig(method="aorta", seeds=SEEDS))
     reference = read_mask(sample.with_name("seg_aorta.nii.gz"))
     draw_overlay(
         volume, mask, IMAGES / "imaging-aorta.png", reference=reference, through=np.array([25.0, -110.0, 700.0])
@@ -36,8 +36,8 @@ def main() -> None:
         f"of what is cut off {low:.2f} is below 130 HU; most of it lies between z {heights[0]:.0f} and {heights[1]:.0f}"
     )
     patient = make_patient(AtlasConfig(seed=1003, population="textbook"), 0)
-    phantom = make_phantom(patient, PhantomConfig(), 1003)
-    draw_overlay(phantom, segment(phantom, SegmentConfig()), IMAGES / "imaging-coronary.png")
+    phantom = make_phantom(patient, config=PhantomConfig(), seed=1003)
+    draw_overlay(phantom, segment(phantom, config=SegmentConfig()), IMAGES / "imaging-coronary.png")
 
 
 if __name__ == "__main__":

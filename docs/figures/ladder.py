@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 from endopilot.ladder.mismatch import title_of
-from endopilot.tasks.task import NEWEST, LadderVersion, ladder_tasks
+from endopilot.tasks.task import NEWEST, LadderVersion, list_tasks
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "ladder.md"
@@ -30,10 +30,10 @@ def fill(name: str, lines: list[str]) -> None:
 def tasks() -> list[str]:
     """Return the table of the tasks."""
     lines = ["| level | task | what | atlas | wire, tip | time, s | patients |", "|---|---|---|---|---|---|---|"]
-    for task in ladder_tasks():
+    for task in list_tasks():
         tip = f"{task.device}, {task.tip_bend_deg:g}° over {task.tip_bend_mm:g} mm"
         what = f"{task.title}: {task.depth_mm:g} mm into {task.section}"
-        row = (task.level, task.name, what, task.anatomy, tip, f"{task.seconds:g}", task.chosen_for)
+        row = (task.level, task.name, what, task.vessel, tip, f"{task.seconds:g}", task.chosen_for)
         lines.append("| " + " | ".join(str(cell) for cell in row) + " |")
     return lines
 
@@ -42,10 +42,10 @@ def coaxial_tasks() -> list[str]:
     """Return the table of the tasks of wire and catheter."""
     head = ("level", "task", "what", "atlas", "wire, catheter", "time, s", "limit, N", "patients")
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    for task in ladder_tasks("coaxial"):
+    for task in list_tasks("coaxial"):
         tip = f"{task.device}, {task.tip_bend_deg:g}° over {task.tip_bend_mm:g} mm; {task.catheter}"
         what = f"{task.title}: {task.depth_mm:g} mm into {task.section}"
-        row = (task.level, task.name, what, task.anatomy, tip, f"{task.seconds:g}", task.force_limit_n, task.chosen_for)
+        row = (task.level, task.name, what, task.vessel, tip, f"{task.seconds:g}", task.force_limit_n, task.chosen_for)
         lines.append("| " + " | ".join(str(cell) for cell in row) + " |")
     return lines
 
@@ -67,7 +67,7 @@ def scores(folder: Path, version: LadderVersion, mark: str) -> list[str]:
             column |= {_MISSED: f"{100 * over['missed_events']:.1f}"} if "missed_events" in over else {}
         columns[path.parent.name] = column | {"patients a task": str(content["patients"])}
     sums = ["all coaxial"] if version == "coaxial" else ["lower four", "upper eight", "all twelve"]
-    names = [task.name for task in ladder_tasks(version)] + sums
+    names = [task.name for task in list_tasks(version)] + sums
     names += [*(title for title, _ in _MEANS), _MISSED, "patients a task"]
     policies = sorted(columns)
     lines = ["| task | " + " | ".join(policies) + " |", "|---|" + "---|" * len(policies)]

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from endopilot.dataset.loader import Dataset, load_dataset
-from endopilot.devices.device import read_device
+from endopilot.dataset.loader import Dataset, read_dataset
+from endopilot.devices.device import read_wire
 from endopilot.evaluation.metrics import OFF_WALL_MM
 from endopilot.evaluation.prediction_baselines import hold_slack
 from endopilot.files import read_json
@@ -33,7 +33,7 @@ RUNS = {"`pretrained`": "seed-0", "seed 1": "seed-1", "seed 2": "seed-2", "`pape
 OURS = next(iter(RUNS))
 PATIENTS = {"atlas, wires of ±20 %": "dataset", "real, wires of ±20 %": "real-varied", "atlas": "new", "real": "real"}
 """Datasets whose split test is measured on, by the name of the patients; those that are not there are left out."""
-RADIUS_MM = read_device("workhorse-014").tip_radius_mm
+RADIUS_MM = read_wire("workhorse-014").tip_radius_mm
 SPANS = ((30, 50), (50, 90), (90, 120))
 LIKELY = 0.1
 """Probability from which on a jump counts as announced."""
@@ -51,7 +51,7 @@ def measured(folder: Path) -> Iterator[tuple[str, Dataset]]:
     """Yield the valid navigations of patients that nothing was trained on, by the name of the patients."""
     for patients, name in PATIENTS.items():
         if (folder / name / "meta" / "manifest.json").is_file():
-            data = load_dataset(folder / name).of_split("test")
+            data = read_dataset(folder / name).of_split("test")
             yield patients, data.select(data.valid.all(axis=1))
 
 
@@ -96,7 +96,7 @@ def jump_rows(folder: Path) -> Iterator[str]:
 
 def speed_rows(folder: Path) -> Iterator[str]:
     """Yield the processor time of a rollout, ms a step and sequence, on one thread."""
-    data = Episodes.of_dataset(load_dataset(folder / "dataset").of_split("test"))
+    data = Episodes.of_dataset(read_dataset(folder / "dataset").of_split("test"))
     run = load_model(folder / RUNS[OURS])
     for count, repeats in ((1, 5), (256, 1)):
         few = data.select(np.arange(count) % len(data))

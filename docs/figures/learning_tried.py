@@ -16,7 +16,7 @@ import torch
 from learning import PAGE, row, written
 from torch import Tensor
 
-from endopilot.dataset.loader import Dataset, load_dataset
+from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.evaluation.prediction_baselines import hold_slack
 from endopilot.models import play
 from endopilot.models.causal import CausalNetwork, ForwardNetwork, InverseNetwork, Mixture
@@ -136,7 +136,7 @@ def _trained(
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    data = load_dataset(Path(sys.argv[1]) / "dataset")
+    data = read_dataset(Path(sys.argv[1]) / "dataset")
     held_out = data.of_split("calibrate")
     rows = [*guess_rows(held_out), *variant_rows(data.of_split("train"), held_out)]
     PAGE.write_text(written(PAGE.read_text(encoding="utf-8"), "tried", rows), encoding="utf-8")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.control.navigate_patient import NavigatePatientConfig, navigate_patient, set_up_navigation
+from endopilot.control.navigate import NavigateConfig, navigate
 
 PAGE = Path(__file__).parents[1] / "navigation.md"
 BEGIN, END = "<!-- moving:begin -->\n", "<!-- moving:end -->"
@@ -33,11 +33,11 @@ def main() -> None:
     for case in CASES:
         records = []
         for seed, (kind, number) in enumerate(PATIENTS):
-            patient = make_patient(AtlasConfig(anatomy=kind, seed=70), number)
+            patient = make_patient(AtlasConfig(vessel=kind, seed=70), number)
             path = patient.tree.longest_path()
             place = path.points[np.searchsorted(path.abscissa, DEPTH_SHARE * path.abscissa[-1])]
-            config = NavigatePatientConfig(mismatch=0.2, seed=seed, motion_seed=seed, **case)
-            found = navigate_patient(set_up_navigation(patient, ",".join(f"{x:.2f}" for x in place), config))
+            config = NavigateConfig(mismatch=0.2, seed=seed, motion_seed=seed, **case)
+            found = navigate(patient, ",".join(f"{x:.2f}" for x in place), config=config)
             records.append(found.record)
         inside = np.concatenate([record.in_bands for record in records])
         minutes = sum(record.seconds for record in records) / 60

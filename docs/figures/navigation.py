@@ -30,7 +30,7 @@ def main() -> None:
     command = [sys.executable, "-m", "endopilot.cli"]
     patients = ROOT / "runs" / "patients"
     if not (patients / "lca-41-0000").exists():
-        subprocess.run([*command, "atlas", "-o", patients, "--anatomy", "lca", "--seed", "41"], check=True)
+        subprocess.run([*command, "atlas", "-o", patients, "--vessel", "lca", "--seed", "41"], check=True)
     navigate = [*command, "navigate", patients / "lca-41-0000", "--target", "12", "--mismatch", "0.2"]
     pair = ("--catheter", "microcatheter-2.4f", "--arrives", "catheter")
     for options, folder, picture, part in (
@@ -47,7 +47,7 @@ def main() -> None:
 
 def _dissection() -> str:
     """Return where the J wire goes in the dissected aorta, pushed and driven."""
-    aorta, wire = endopilot.read_anatomy(CTA / "anatomy"), endopilot.read_device("j-035")
+    aorta, wire = endopilot.read_anatomy(CTA / "anatomy"), endopilot.read_wire("j-035")
     lumens = [_lumen(name) for name in ("true", "false")]
     rows = ["| section | from, to, mm | in the true lumen, % | in the false lumen, % |", "| --- " * 4 + "|"]
     for branch in aorta.tree.branches:

@@ -116,7 +116,7 @@ def draw_buckling() -> None:
         left.plot(*run.shapes_mm[sample, :, :2].T, color=colour, linewidth=1.3)
         first = run.force_n[(run.pushed_mm > 0) & (run.pushed_mm < 0.5)].max()
         print(f"plate, µ {friction:g}, bent {bend:g}°: {1e3 * first:.1f} mN within the first 0.5 mm")
-    device = scenarios.read_device("workhorse-014")
+    device = scenarios.read_wire("workhorse-014")
     stiffness = device.bend_stiffness_n_mm2[0] / scenarios.PLATE_GAP_MM**2
     for load, name in ((np.pi**2 / 4 * stiffness, "clamped-free"), (20.19 * stiffness, "clamped-pinned")):
         right.axhline(1e3 * load, color="0.6", linewidth=1, linestyle="--")

@@ -14,8 +14,8 @@ import numpy as np
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.control.agent import AgentPolicy, OraclePolicy
-from endopilot.devices.device import Wire, read_device
-from endopilot.navigation.navigate import navigate
+from endopilot.devices.device import Wire, read_wire
+from endopilot.navigation.loop import NavigationLoop
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import Policy
 from endopilot.simulation.mismatch import ModelMismatch
@@ -42,7 +42,7 @@ def side_branches(anatomy: Anatomy) -> Iterator[Target]:
 
 def shaped(angle_deg: float, length_mm: float) -> Wire:
     """Return the workhorse with its tip shaped."""
-    wire = read_device("workhorse-014").with_tip(bend_rad=float(np.deg2rad(angle_deg)), stiffness_factor=1.0)
+    wire = read_wire("workhorse-014").with_tip(bend_rad=float(np.deg2rad(angle_deg)), stiffness_factor=1.0)
     return replace(wire, tip_bend_length_mm=length_mm)
 
 
@@ -50,13 +50,13 @@ def drive(name: str, navigation: Navigation, truth: ModelMismatch) -> tuple[bool
     """Return safe success, exposures and processor seconds of one navigation."""
     kinds: dict[str, Policy] = {"oracle": OraclePolicy(truth), "agent": AgentPolicy()}
     policy, began = kinds.get(name) or make_policy(name), time.process_time()
-    record = navigate(navigation, policy, seed=1, truth=truth)
+    record = NavigationLoop(navigation, policy, seed=1, truth=truth).run()
     return record.success and record.safe, record.exposures, time.process_time() - began
 
 
 def measure() -> list[str]:
     """Return the rows of the table."""
-    patients = [make_patient(AtlasConfig(anatomy=kind, seed=SEED), number) for kind, number in PATIENTS]
+    patients = [make_patient(AtlasConfig(vessel=kind, seed=SEED), number) for kind, number in PATIENTS]
     rows = ["| tip | policy | safe success | exposures | processor, s |", "|---|---|---|---|---|"]
     for angle_deg, length_mm in TIPS:
         for name in POLICIES:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from endopilot.dataset.loader import Dataset, load_dataset
+from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.devices.device import Wire
 from endopilot.models.config import WINDOW, TwinConfig
 from endopilot.models.episodes import Episodes
@@ -63,7 +63,7 @@ def rows(episodes: Dataset, sequences: int, deeper_mm: float) -> Iterator[str]:
 def measure(folder: Path) -> Iterator[str]:
     """Yield the rows of the table."""
     yield from ("| navigations | span | Δ MAE, median, mm | γ MAE, mm |", "|---|---|---|---|")
-    episodes = load_dataset(folder / "dataset").of_split("test")
+    episodes = read_dataset(folder / "dataset").of_split("test")
     yield from rows(episodes, 2, 0.0)
     yield from rows(episodes, 1, DEEPER_MM)
 

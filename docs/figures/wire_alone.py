@@ -14,7 +14,7 @@ from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import attempt, navigation_seed
 from endopilot.ladder.scores import score_navigations
 from endopilot.runs import make_missing
-from endopilot.tasks.task import Task, find_task, ladder_tasks, without_catheter
+from endopilot.tasks.task import Task, find_task, list_tasks, without_catheter
 
 PAGE = Path(__file__).parents[1] / "ladder.md"
 BEGIN, END = "<!-- wire alone:begin -->\n", "<!-- wire alone:end -->"
@@ -24,7 +24,7 @@ SIMPLE, PLANS = ("forward", "spin"), "agent"
 def navigate(path: Path) -> None:
     """Let a policy drive the wire of a task without its catheter, from the task's start and with its seed."""
     policy, name, place = path.parts[-3], path.parts[-2], int(path.stem)
-    task = find_task(name, "coaxial")
+    task = find_task(name, version="coaxial")
     navigation = without_catheter(task.ladder_navigation(place))
     write_json(path, attempt(policy, navigation, seed=navigation_seed(task, place)))
 
@@ -40,7 +40,7 @@ def table(folder: Path, patients: int) -> list[str]:
     policies = (*SIMPLE, PLANS)
     lines = ["| task | " + " | ".join(f"`{policy}`" for policy in policies) + " |", "|---|" + "---|" * len(policies)]
     together: dict[str, list[dict[str, Any]]] = {policy: [] for policy in policies}
-    for task in ladder_tasks("coaxial"):
+    for task in list_tasks("coaxial"):
         results = {
             policy: [read_json(path) for path in paths_of(folder, policy, task, patients)] for policy in policies
         }
@@ -48,7 +48,7 @@ def table(folder: Path, patients: int) -> list[str]:
         for policy in policies:
             together[policy] += results[policy]
     lines.append("| all coaxial | " + " | ".join(cell(together[policy]) for policy in policies) + " |")
-    counts = [len(together[policy]) // len(ladder_tasks("coaxial")) for policy in policies]
+    counts = [len(together[policy]) // len(list_tasks("coaxial")) for policy in policies]
     return [*lines, "| patients a task | " + " | ".join(map(str, counts)) + " |"]
 
 
@@ -62,7 +62,7 @@ def main() -> None:
     """Do what is missing, and fill the page."""
     folder, patients = Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 5
     for policy in (*SIMPLE, PLANS):
-        paths = [path for task in ladder_tasks("coaxial") for path in paths_of(folder, policy, task, patients)]
+        paths = [path for task in list_tasks("coaxial") for path in paths_of(folder, policy, task, patients)]
         make_missing(f"Wire alone, {policy}", paths, navigate)
     page = PAGE.read_text(encoding="utf-8")
     head, tail = page.split(BEGIN)[0], page.split(END)[1]

@@ -12,7 +12,7 @@ from typing import Any
 
 from endopilot.belief.advise import FIGURES_FILE
 from endopilot.cli import main as endopilot
-from endopilot.dataset.loader import load_dataset
+from endopilot.dataset.loader import read_dataset
 from endopilot.files import read_json
 
 PAGE = Path(__file__).parents[1] / "xray.md"
@@ -46,7 +46,7 @@ def make(folder: Path) -> dict[str, Any]:
     usual = ["--friction", 0.08, 0.12]
     run("dataset", *patients, "-o", folder / "data", *shared, "--anatomy-shares", 0.2, 0.5, 0.3, *usual)
     tested = [
-        folder / "patients" / name for name in sorted(set(load_dataset(folder / "data").of_split("test").anatomy))
+        folder / "patients" / name for name in sorted(set(read_dataset(folder / "data").of_split("test").anatomy))
     ]
     for name, (_, options) in MADE.items():
         friction = [] if "--friction" in options else usual

@@ -13,11 +13,11 @@ import numpy as np
 
 import endopilot
 
-anatomy = next(endopilot.make_atlas(endopilot.AtlasConfig(anatomy="lca", seed=41, population="textbook")))
+anatomy = next(endopilot.make_atlas(config=endopilot.AtlasConfig(vessel="lca", seed=41, population="textbook")))
 worlds, samples = 16, 24
 start = np.column_stack([np.full(worlds, 2.0), np.linspace(0, 2 * np.pi, worlds, endpoint=False)])
 push = np.tile([5.0, 0.0], (worlds, samples, 1))
-device = replace(endopilot.read_device("workhorse-014"), tip_bend_rad=np.deg2rad(75), tip_bend_length_mm=5.0)
+device = replace(endopilot.read_wire("workhorse-014"), tip_bend_rad=np.deg2rad(75), tip_bend_length_mm=5.0)
 rollout = endopilot.simulate(anatomy, device, push, initial=start, record_shape=True)
 
 figure, panels = plt.subplots(1, 3, figsize=(11, 4.6), sharex=True, sharey=True, layout="constrained")

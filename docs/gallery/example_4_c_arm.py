@@ -11,8 +11,8 @@ import numpy as np
 
 import endopilot
 
-anatomy = next(endopilot.make_atlas(endopilot.AtlasConfig(anatomy="rca", seed=0, population="textbook")))
-device = endopilot.read_device("workhorse-014")
+anatomy = next(endopilot.make_atlas(config=endopilot.AtlasConfig(vessel="rca", seed=0, population="textbook")))
+device = endopilot.read_wire("workhorse-014")
 push = np.tile([5.0, 0.0], (1, 16, 1))
 rollout = endopilot.simulate(anatomy, device, push)
 tip, direction = rollout.tip_position[0, -1, 0], rollout.tip_direction[0, -1, 0]
@@ -22,7 +22,7 @@ figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
 medians = {}
 for name, biplane, color in (("two views", True, "C0"), ("one view", False, "C1")):
     config = endopilot.FluoroscopeConfig(biplane=biplane)
-    c_arm = endopilot.Fluoroscope(anatomy, device.tip_radius_mm, config)
+    c_arm = endopilot.Fluoroscope(anatomy, device.tip_radius_mm, config=config)
     random = np.random.default_rng(0)
     shown = np.array([c_arm.measure(tip, direction, length, random).position for _ in range(400)])
     error_mm = np.linalg.norm(shown - tip, axis=1)

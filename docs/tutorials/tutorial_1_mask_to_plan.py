@@ -23,8 +23,8 @@ import numpy as np
 import endopilot
 
 folder = Path(tempfile.mkdtemp())
-patient = next(endopilot.make_atlas(endopilot.AtlasConfig(anatomy="rca", seed=0, population="textbook")))
-ct = endopilot.make_phantom(patient, endopilot.PhantomConfig(), seed=0)
+patient = next(endopilot.make_atlas(config=endopilot.AtlasConfig(vessel="rca", seed=0, population="textbook")))
+ct = endopilot.make_phantom(patient, config=endopilot.PhantomConfig(), seed=0)
 print(f"{patient.name}: {ct.voxels.shape[::-1]} voxels of {ct.spacing_mm} mm")
 
 # %%
@@ -33,7 +33,7 @@ print(f"{patient.name}: {ct.voxels.shape[::-1]} voxels of {ct.spacing_mm} mm")
 # :func:`endopilot.segment` finds one coronary tree and its ostium without any seed. On the command
 # line this is ``endopilot segment CT -o mask.nii.gz``. If you have a mask already, start at the next step.
 
-mask = endopilot.segment(ct, endopilot.SegmentConfig(method="coronary", vessel="rca"))
+mask = endopilot.segment(ct, config=endopilot.SegmentConfig(method="coronary", vessel="rca"))
 error_mm = np.linalg.norm(mask.ostium.position - patient.insertion.position)
 print(f"{mask.volume.voxels.sum()} lumen voxels; the ostium errs by {error_mm:.2f} mm")
 
@@ -45,7 +45,7 @@ print(f"{mask.volume.voxels.sum()} lumen voxels; the ostium errs by {error_mm:.2
 # command line: ``endopilot anatomy mask.nii.gz --vessel rca -o patient``.
 
 anatomy = endopilot.extract_anatomy(mask, name="patient", config=endopilot.AnatomyConfig(vessel="rca"))
-endopilot.write_anatomy(anatomy, folder / "patient")
+endopilot.write_anatomy(anatomy, output=folder / "patient")
 print(f"{len(anatomy.tree.branches)} branches, sections {', '.join(anatomy.tree.section_names)}")
 
 # %%
@@ -71,7 +71,7 @@ plt.show()
 # is reached and the wall force stays below the limit. On the command line:
 # ``endopilot plan patient --target 4 -o plan``.
 
-route = endopilot.plan(anatomy, "4", endopilot.PlanConfig(force_limit_n=0.3))
+route = endopilot.plan(anatomy, "4", config=endopilot.PlanConfig(force_limit_n=0.3))
 print(f"reached: {route.reached}, peak wall force {route.force.max():.3f} N, planned in {route.seconds_to_plan:.1f} s")
 
 # %%

@@ -24,17 +24,18 @@ import yaml
 import endopilot
 
 folder = Path(tempfile.mkdtemp())
-content = yaml.safe_load(endopilot.device_yaml("workhorse-014")[1])
+my_file = folder / "my-wire.yaml"
+endopilot.write_device(endopilot.read_wire("workhorse-014"), output=my_file)
+content = yaml.safe_load(my_file.read_text(encoding="utf-8"))
 content["name"] = "my-wire"
 content["bend_stiffness_n_mm2"] = {"value": [0.2, 0.2, 1.2, 8, 30, 80], "source": "three-point bending, our bench"}
 content["twist_stiffness_n_mm2"] = {"value": [0.154, 0.154, 0.92, 6.2, 23, 62], "source": "EI / 1.3, round section"}
 content["tip_load_n"] = {"value": 0.0049, "source": "0.5 gf, our data sheet"}
 content["tip_bend"] = {"angle_deg": 75, "length_mm": 5, "source": "shaped over a needle"}
 content["friction"] = {"value": 0.06, "source": "hydrophilic coating, pulled over a wet plate"}
-my_file = folder / "my-wire.yaml"
 my_file.write_text(yaml.safe_dump(content, allow_unicode=True), encoding="utf-8")
 
-mine, shipped = endopilot.read_device(my_file), endopilot.read_device("workhorse-014")
+mine, shipped = endopilot.read_wire(my_file), endopilot.read_wire("workhorse-014")
 for device in (shipped, mine):
     print(f"{device.name}: EI at the tip {device.bend_stiffness_n_mm2[0]} N·mm², friction {device.friction}")
 
@@ -44,7 +45,7 @@ for device in (shipped, mine):
 wrong = folder / "wrong.yaml"
 wrong.write_text(my_file.read_text(encoding="utf-8").replace("0.06", "-0.06"), encoding="utf-8")
 try:
-    endopilot.read_device(wrong)
+    endopilot.read_wire(wrong)
 except endopilot.InputError as error:
     print(str(error).replace(str(folder), "FOLDER"))
 
@@ -74,7 +75,7 @@ plt.show()
 # start with the tip bend turned to a side each, then push on at 5 mm/s for 12 s. All worlds run side by side, and no
 # result depends on another world.
 
-anatomy = next(endopilot.make_atlas(endopilot.AtlasConfig(anatomy="lca", seed=41, population="textbook")))
+anatomy = next(endopilot.make_atlas(config=endopilot.AtlasConfig(vessel="lca", seed=41, population="textbook")))
 worlds, samples = 12, 24
 control = np.tile([5.0, 0.0], (worlds, samples, 1))
 start = np.column_stack([np.full(worlds, 2.0), np.linspace(0, 2 * np.pi, worlds, endpoint=False)])

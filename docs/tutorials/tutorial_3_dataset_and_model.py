@@ -22,9 +22,11 @@ import endopilot
 
 folder = Path(tempfile.mkdtemp())
 patients = []
-for anatomy in endopilot.make_atlas(endopilot.AtlasConfig(anatomy="rca", count=10, seed=7, population="textbook")):
+for anatomy in endopilot.make_atlas(
+    config=endopilot.AtlasConfig(vessel="rca", count=10, seed=7, population="textbook")
+):
     patients.append(folder / anatomy.name)
-    endopilot.write_anatomy(anatomy, patients[-1])
+    endopilot.write_anatomy(anatomy, output=patients[-1])
 
 # %%
 # A dataset
@@ -35,9 +37,12 @@ for anatomy in endopilot.make_atlas(endopilot.AtlasConfig(anatomy="rca", count=1
 # processes simulate: in a script of your own, make the call under ``if __name__ == "__main__":``.
 
 endopilot.generate_dataset(
-    patients, folder / "dataset", endopilot.read_device("workhorse-014"), endopilot.DatasetConfig(sequences=12, seed=7)
+    patients,
+    output=folder / "dataset",
+    device=endopilot.read_wire("workhorse-014"),
+    config=endopilot.DatasetConfig(sequences=12, seed=7),
 )
-dataset = endopilot.load_dataset(folder / "dataset")
+dataset = endopilot.read_dataset(folder / "dataset")
 for split in ("train", "seen_test", "calibrate", "test"):
     part = dataset.of_split(split)
     print(f"{split}: {len(part)} navigations of {len(set(part.anatomy))} patients")
@@ -69,8 +74,8 @@ plt.show()
 
 endopilot.train(
     folder / "dataset",
-    folder / "run",
-    endopilot.TrainConfig(model="causal", network="ff", epochs=6, batch_size=8, learning_rate=0.002),
+    output=folder / "run",
+    config=endopilot.TrainConfig(model="causal", network="ff", epochs=6, batch_size=8, learning_rate=0.002),
 )
 
 # %%

@@ -38,9 +38,9 @@ print(inspect.getsource(TurnBack))
 # Try a policy on one navigation first. The task ``diagonal`` asks for the second diagonal branch of a left coronary
 # artery within 90 s and below 0.2 N. The shipped policy ``forward`` pushes and nothing else.
 
-navigation = endopilot.find_task("diagonal", 1).ladder_navigation(0)
+navigation = endopilot.find_task("diagonal", version=1).ladder_navigation(0)
 records = {
-    name: endopilot.navigate(navigation, policy, seed=1)
+    name: endopilot.NavigationLoop(navigation, policy, seed=1).run()
     for name, policy in (("forward", endopilot.make_policy("forward")), ("TurnBack", TurnBack()))
 }
 for name, record in records.items():
@@ -65,7 +65,7 @@ plt.show()
 # The ladder
 # ----------
 # A ladder score counts *safe success*: the target in time, with the wall force below the limit, through a robot with
-# latency, backlash and encoder noise. On the command line:
+# latency, play and encoder noise. On the command line:
 # ``endopilot ladder --policy my_policy:TurnBack --tasks diagonal --patients 4``. All twelve tasks in all twenty
 # patients take some minutes. Several processes drive the navigations: in a script of your own, make the call under
 # ``if __name__ == "__main__":``.
@@ -74,7 +74,7 @@ folder = Path(tempfile.mkdtemp())
 safe_success = {}
 for policy in ("forward", "my_policy:TurnBack"):
     config = endopilot.LadderConfig(policy=policy, tasks=("diagonal",), patients=4, version=1)
-    row = endopilot.climb(folder / policy.replace(":", "-"), config)[0]
+    row = endopilot.climb(output=folder / policy.replace(":", "-"), config=config)[0]
     safe_success[policy] = row["safe_success"]
     print(f"{policy}: safe success {100 * row['safe_success']:.0f} %, {row['exposures']:.1f} exposures on average")
 

@@ -2,8 +2,8 @@
 
 The same sources are built for up to three levels of x86-64 instructions: `baseline`, `avx2` and `avx512`
 (F, BW, CD, DQ, VL). On other processors there is `baseline` alone. All give the same results to the bit. The highest
-level that the processor supports is taken, or the one that the environment variable `ENDOPILOT_CORE` names. Importing
-this module gives the module of that level; its `LEVEL` says which it is.
+level that is built and that the processor supports is taken, or the one that the environment variable `ENDOPILOT_CORE`
+names. Importing this module gives the module of that level; its `LEVEL` says which it is.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import sys
 from importlib import import_module
+from importlib.util import find_spec
 
 from endopilot.errors import InputError
 
@@ -20,6 +21,7 @@ _VARIABLE = "ENDOPILOT_CORE"
 
 def _choose() -> str:
     supported: list[str] = import_module("endopilot._core_baseline").supported_levels()
+    supported = [level for level in supported if find_spec(f"endopilot._core_{level}")]
     asked = os.environ.get(_VARIABLE)
     if not asked:
         return supported[-1]

@@ -25,7 +25,7 @@ def anatomy():
 
 
 def test_round_trip_is_exact(anatomy, tmp_path):
-    write_anatomy(anatomy, tmp_path / "a")
+    write_anatomy(anatomy, output=tmp_path / "a")
     back = read_anatomy(tmp_path / "a")
     assert back.name == anatomy.name and back.catheter_radius_mm == 1.5 and back.provenance == anatomy.provenance
     assert np.array_equal(back.insertion.direction, anatomy.insertion.direction)
@@ -42,7 +42,7 @@ def test_round_trip_is_exact(anatomy, tmp_path):
 def test_identity_is_that_of_the_vessel_in_memory_as_on_disk(anatomy, tmp_path):
     double = replace(anatomy.distance_map, values=anatomy.distance_map.values.astype(float) * (1 + 1e-12))
     made = replace(anatomy, distance_map=double)  # more digits than the disk keeps
-    write_anatomy(made, tmp_path / "a")
+    write_anatomy(made, output=tmp_path / "a")
     assert read_anatomy(tmp_path / "a").identity == made.identity == anatomy.identity
     assert replace(anatomy, name="other", provenance={}).identity == anatomy.identity
 
@@ -66,7 +66,7 @@ def test_identity_changes_with_everything_that_affects_a_wire(anatomy):
 
 
 def test_a_record_of_another_vessel_is_refused(anatomy, tmp_path):
-    write_anatomy(anatomy, tmp_path / "a")
+    write_anatomy(anatomy, output=tmp_path / "a")
     path = tmp_path / "a" / "anatomy.json"
     record = json.loads(path.read_text())
     assert record["identity"] == anatomy.identity
@@ -80,7 +80,7 @@ def test_other_programs_read_it(anatomy, tmp_path):
     import pyvista
     import SimpleITK
 
-    write_anatomy(anatomy, tmp_path / "a")
+    write_anatomy(anatomy, output=tmp_path / "a")
     lines = pyvista.read(tmp_path / "a" / "centerline.vtp")
     assert lines.n_lines == 3 and "MaximumInscribedSphereRadius" in lines.point_data
     image = SimpleITK.ReadImage(str(tmp_path / "a" / "lumen.nrrd"))
@@ -89,20 +89,20 @@ def test_other_programs_read_it(anatomy, tmp_path):
 
 
 def test_writing_again_replaces_an_anatomy_but_nothing_else(anatomy, tmp_path):
-    write_anatomy(anatomy, tmp_path / "a")
-    write_anatomy(anatomy, tmp_path / "a")
+    write_anatomy(anatomy, output=tmp_path / "a")
+    write_anatomy(anatomy, output=tmp_path / "a")
     other = tmp_path / "other"
     other.mkdir()
     (other / "thesis.txt").write_text("dear")
     with pytest.raises(InputError, match="not an anatomy"):
-        write_anatomy(anatomy, other)
+        write_anatomy(anatomy, output=other)
     assert (other / "thesis.txt").read_text() == "dear"
 
 
 @pytest.mark.parametrize("file", ["centerline.vtp", "lumen.nrrd", "anatomy.json"])
 @pytest.mark.parametrize("damage", ["missing", "truncated"])
 def test_damage_gives_one_line(anatomy, tmp_path, file, damage):
-    write_anatomy(anatomy, tmp_path / "a")
+    write_anatomy(anatomy, output=tmp_path / "a")
     path = tmp_path / "a" / file
     content = path.read_bytes()
     path.unlink()
@@ -114,7 +114,7 @@ def test_damage_gives_one_line(anatomy, tmp_path, file, damage):
 
 
 def test_other_versions_and_missing_fields_are_refused(anatomy, tmp_path):
-    write_anatomy(anatomy, tmp_path / "a")
+    write_anatomy(anatomy, output=tmp_path / "a")
     path = tmp_path / "a" / "anatomy.json"
     record = json.loads(path.read_text())
     path.write_text(json.dumps(record | {"schema_version": 99}))
@@ -130,7 +130,7 @@ def test_other_versions_and_missing_fields_are_refused(anatomy, tmp_path):
 
 def test_the_zero_of_the_rotation_is_kept_and_decides_the_identity(anatomy, tmp_path):
     zero = anatomy.insertion.rotation_zero
-    write_anatomy(anatomy, tmp_path / "a")
+    write_anatomy(anatomy, output=tmp_path / "a")
     back = read_anatomy(tmp_path / "a").insertion.rotation_zero
     assert isinstance(back, np.ndarray) and np.array_equal(back, zero)
     other = replace(anatomy, insertion=replace(anatomy.insertion, rotation_zero=-zero))
@@ -145,14 +145,14 @@ def test_the_zero_of_the_rotation_is_kept_and_decides_the_identity(anatomy, tmp_
 
 def test_a_record_of_schema_version_1_keeps_the_zero_of_the_world_axes(anatomy, tmp_path):
     before = with_world_zero(anatomy)
-    write_anatomy(before, tmp_path / "a")
+    write_anatomy(before, output=tmp_path / "a")
     path = tmp_path / "a" / "anatomy.json"
     record = json.loads(path.read_text())
     del record["insertion"]["rotation_zero"]
     path.write_text(json.dumps(record | {"schema_version": 1}))
     back = read_anatomy(tmp_path / "a")
     assert back.insertion.rotation_zero == "world axes" and back.identity == before.identity
-    write_anatomy(back, tmp_path / "b")
+    write_anatomy(back, output=tmp_path / "b")
     again = read_anatomy(tmp_path / "b")
     assert again.insertion.rotation_zero == "world axes" and again.identity == before.identity
 

@@ -17,7 +17,7 @@ from endopilot.errors import InputError
 def test_right_coronary_sections_agree_with_the_atlas():
     right = total = 0
     for index in range(6):
-        truth, _ = make_patient_tree(AtlasConfig(anatomy="rca", count=6, seed=7), index)
+        truth, _ = make_patient_tree(AtlasConfig(vessel="rca", count=6, seed=7), index)
         found = label_tree(truth, "rca")
         for one, two in zip(truth.branches, found.branches, strict=True):
             names = [truth.section_names[i] for i in one.section]
@@ -55,6 +55,6 @@ def test_helix_has_its_curvature_and_torsion_and_untwisted_normals():
 
 
 def test_a_tree_names_only_the_sections_that_it_has():
-    tree, _ = make_patient_tree(AtlasConfig(anatomy="rca", count=1, seed=7), 0)
+    tree, _ = make_patient_tree(AtlasConfig(vessel="rca", count=1, seed=7), 0)
     root = replace(tree, branches=tree.branches[:1])
     assert len(tree.sections_present) > 1 and root.sections_present == ("1",)

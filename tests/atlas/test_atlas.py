@@ -10,6 +10,7 @@ from endopilot.atlas import curves as shape
 from endopilot.atlas.atlas import AtlasConfig, make_atlas, make_patient, make_patient_tree
 from endopilot.atlas.branching import Vessel, lumens_collide
 from endopilot.errors import InputError
+from endopilot.lines import length_along
 
 COUNT = 60
 
@@ -27,7 +28,7 @@ def assert_mean(values, mean, sd):
 
 def test_course_statistics_match_the_published_ones(patients):
     paths = [tree.longest_path().points for tree, _ in patients]
-    lengths = np.array([shape.abscissa(points)[-1] for points in paths])
+    lengths = np.array([length_along(points)[-1] for points in paths])
     assert_mean(lengths, 164, 30)
     assert lengths.min() > 111 and lengths.max() < 224
     assert_mean([shape.tortuosity(points) for points in paths], 2.07, 0.23)
@@ -121,7 +122,7 @@ def test_a_patient_depends_on_seed_and_index_alone():
 
 
 def test_anatomy_holds_lumen_and_catheter():
-    (anatomy,) = make_atlas(AtlasConfig(seed=2, stenosis_share=1.0))
+    (anatomy,) = make_atlas(config=AtlasConfig(seed=2, stenosis_share=1.0))
     path = anatomy.tree.longest_path()
     depth = sample(anatomy.distance_map, path.points)
     # Linear interpolation on the grid rounds off the ridge on the axis.
@@ -165,7 +166,7 @@ def test_side_branches_stay_outside_the_heart():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"anatomy": "spleen"}, "'spleen'; choose from .*rca"),
+        ({"vessel": "spleen"}, "'spleen'; choose from .*rca"),
         ({"count": 0}, "count: 0"),
         ({"seed": -1}, "seed: -1"),
         ({"stenosis_share": 1.5}, "stenosis_share: 1.5"),

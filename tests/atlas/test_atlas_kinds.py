@@ -20,8 +20,7 @@ ROOTS = {"lca": "5", "arch": "descending aorta", "cerebral": "ICA", "portal": "M
 def atlas():
     return {
         kind: [
-            make_patient_tree(AtlasConfig(anatomy=kind, seed=11, population="textbook"), index)
-            for index in range(COUNT)
+            make_patient_tree(AtlasConfig(vessel=kind, seed=11, population="textbook"), index) for index in range(COUNT)
         ]
         for kind in KINDS
     }
@@ -60,7 +59,7 @@ def test_trees_are_connected_and_fork(atlas, kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_patient_depends_on_seed_and_index_alone(atlas, kind):
-    again, truth = make_patient_tree(AtlasConfig(anatomy=kind, seed=11, count=5, population="textbook"), 1)
+    again, truth = make_patient_tree(AtlasConfig(vessel=kind, seed=11, count=5, population="textbook"), 1)
     tree, truth_before = atlas[kind][1]
     assert truth == truth_before
     for one, two in zip(tree.branches, again.branches, strict=True):
@@ -156,7 +155,7 @@ def test_sections_agree_with_the_atlas(atlas, kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_distance_maps_hold_lumen_stenosis_and_catheter(kind):
-    anatomy = make_patient(AtlasConfig(anatomy=kind, seed=3, stenosis_share=1.0), 0)
+    anatomy = make_patient(AtlasConfig(vessel=kind, seed=3, stenosis_share=1.0), 0)
     path = anatomy.tree.longest_path()
     depth = sample(anatomy.distance_map, path.points)
     # Linear interpolation on the grid rounds off the ridge on the axis, by about half a spacing.

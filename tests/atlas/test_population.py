@@ -12,7 +12,7 @@ from benchmarks.anatomy.vessel_shape import vessel_shape
 from endopilot.anatomy.distance import distance_map_from_spheres, sample
 from endopilot.anatomy.tree import Line, sampled, tree_from_lines
 from endopilot.atlas import curves as shape
-from endopilot.atlas.atlas import ANATOMIES, AtlasConfig, make_patient, make_patient_tree
+from endopilot.atlas.atlas import VESSELS, AtlasConfig, make_patient, make_patient_tree
 from endopilot.atlas.branching import SidePlan, Vessel, lumens_collide, stenoses, with_side_branches
 from endopilot.atlas.population import Population, population_of
 from endopilot.atlas.through_ct import rasterised, visible
@@ -54,7 +54,7 @@ def measured():
     for kind in REAL:
         values = defaultdict(list)
         for index in range(COUNT):
-            for name, own in vessel_shape(make_patient(AtlasConfig(anatomy=kind, seed=0), index)).items():
+            for name, own in vessel_shape(make_patient(AtlasConfig(vessel=kind, seed=0), index)).items():
                 values[name] += own
         found[kind] = values
     return found
@@ -83,10 +83,10 @@ def test_sections_are_as_far_from_round_as_real_ones(measured):
         assert 0.028 <= np.median(measured[kind]["non-circularity"]) <= 0.048
 
 
-@pytest.mark.parametrize("kind", ANATOMIES)
+@pytest.mark.parametrize("kind", VESSELS)
 def test_lumens_are_valid_and_trees_connected(kind):
     for index in range(4):
-        tree, drawn = make_patient_tree(AtlasConfig(anatomy=kind, seed=5), index)
+        tree, drawn = make_patient_tree(AtlasConfig(vessel=kind, seed=5), index)
         assert drawn["redrawn"] < 60
         for branch in tree.branches[1:]:
             parent = tree.branches[branch.parent].centerline
@@ -97,10 +97,10 @@ def test_lumens_are_valid_and_trees_connected(kind):
             assert np.all(np.abs(steps - shape.STEP_MM) < 0.05)
 
 
-@pytest.mark.parametrize("kind", ANATOMIES)
+@pytest.mark.parametrize("kind", VESSELS)
 def test_the_two_populations_differ_and_each_is_the_same_every_time(kind):
     one, other = (
-        [make_patient(AtlasConfig(anatomy=kind, seed=3, population=name), 1) for _ in range(2)]
+        [make_patient(AtlasConfig(vessel=kind, seed=3, population=name), 1) for _ in range(2)]
         for name in ("patients", "textbook")
     )
     assert one[0].identity == one[1].identity != other[0].identity == other[1].identity
@@ -308,7 +308,7 @@ def test_an_ectasia_widens_a_vessel_where_it_is_recorded():
 def test_left_mains_widen_at_their_fork():
     widened = []
     for index in range(16):
-        first = make_patient_tree(AtlasConfig(anatomy="lca", seed=4), index)[0].branches[0].centerline
+        first = make_patient_tree(AtlasConfig(vessel="lca", seed=4), index)[0].branches[0].centerline
         if first.abscissa[-1] > 8.0:
             widened.append(first.radius[-1] / np.interp(first.abscissa[-1] - 7.0, first.abscissa, first.radius))
     # The textbook's left mains keep their calibre within 5 %; the flare is drawn from 0 to 35 %.

@@ -18,8 +18,8 @@ from endopilot.belief.image_exposures import Exposures
 from endopilot.belief.monitoring import AdviseConfig
 from endopilot.belief.online_predictors import OnlineTwin, OnlineWindowed, online_predictor
 from endopilot.cli import main
-from endopilot.dataset.loader import load_dataset
-from endopilot.devices.device import read_device
+from endopilot.dataset.loader import read_dataset
+from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.files import write_json
 from endopilot.models.config import WINDOW, TwinConfig, run_path
@@ -55,7 +55,7 @@ def folder(tmp_path_factory) -> Path:
     shares = (1 / 12, 10 / 12, 1 / 12)
     shape = {"patients": 12, "sequences": 1, "seconds": 25.0}
     make_toy_dataset(folder / "dataset", **shape, anatomy_shares=shares, seen_test_share=0.0)
-    record = {"config": {}, "networks": {}, "device": asdict(read_device("workhorse-014"))}
+    record = {"config": {}, "networks": {}, "device": asdict(read_wire("workhorse-014"))}
     write_json(folder / "run" / "manifest.json", record)
     return folder
 
@@ -67,13 +67,13 @@ def hold_slack(monkeypatch) -> None:
 
 @pytest.fixture(scope="module")
 def split(folder) -> monitoring.Monitored:
-    return monitoring.monitor(HoldSlack(), load_dataset(folder / "dataset").of_split("calibrate"), AdviseConfig())
+    return monitoring.monitor(HoldSlack(), read_dataset(folder / "dataset").of_split("calibrate"), AdviseConfig())
 
 
 def test_tips_are_given_as_x_ray_measures_them_and_lengths_as_the_encoder_does(split, folder) -> None:
     error = split.episodes.tip[..., 0] - split.truth[..., 0]
     assert 0.1 < error.std() < 0.8
-    truth = load_dataset(folder / "dataset").of_split("calibrate")
+    truth = read_dataset(folder / "dataset").of_split("calibrate")
     ostium = truth.inserted_length[..., 0] - split.episodes.proximal[..., 0]
     assert np.ptp(ostium, axis=1).max() < 1e-4 and 0.1 < np.abs(ostium).max() <= 0.3
     np.testing.assert_allclose(truth.initial[:, 0, 0] - split.episodes.initial[:, 0], ostium[:, 0], atol=1e-4)
@@ -120,7 +120,7 @@ def test_an_image_in_which_no_wire_is_found_shows_nothing_and_is_taken_again(spl
 
 
 def test_models_know_the_motion_that_images_have_measured(folder, split, monkeypatch) -> None:
-    truth = load_dataset(folder / "dataset").of_split("calibrate")
+    truth = read_dataset(folder / "dataset").of_split("calibrate")
     moves = replace(Motion(), breathing_caudal_mm=7.0)
 
     def images(dataset, settings) -> tuple[dict[str, Exposures], tuple[str, ...]]:
@@ -271,7 +271,7 @@ def test_a_twin_weights_its_wires_by_what_is_observed(split, monkeypatch) -> Non
     monkeypatch.setattr(TwinPredictor, "ensemble", lambda self, episodes, observed: paths)
     config = TwinConfig(members=3, abscissa_sd_mm=0.05)
     model = OnlineTwin(
-        TwinPredictor(device=read_device("workhorse-014"), simulator=SimulatorConfig(), config=config),
+        TwinPredictor(device=read_wire("workhorse-014"), simulator=SimulatorConfig(), config=config),
         given,
         split.found,
     )
@@ -325,7 +325,7 @@ def test_too_few_patients_or_another_wire_leave_nothing_behind(folder, hold_slac
     config = AdviseConfig(adviser=AdviserConfig(level=0.95))
     with pytest.raises(InputError, match="needs at least 19 patients"):
         advise(folder / "run", folder / "dataset", tmp_path / "out", config)
-    record = {"config": {}, "networks": {}, "device": asdict(read_device("j-035"))}
+    record = {"config": {}, "networks": {}, "device": asdict(read_wire("j-035"))}
     write_json(tmp_path / "manifest.json", record)
     with pytest.raises(InputError, match=r"its wire is workhorse-014, and that of .* is j-035"):
         advise(tmp_path, folder / "dataset", tmp_path / "out", AdviseConfig())

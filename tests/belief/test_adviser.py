@@ -163,6 +163,20 @@ def test_the_adviser_heeds_a_share_of_the_band_across_and_all_of_that_along() ->
     assert adviser.half_width[0, 1] == 0.05
 
 
+def test_what_a_play_adds_widens_both_bands_at_once() -> None:
+    """90 % of a normal distribution lie within 1.645 standard deviations."""
+    adviser = XrayAdviser(calibration(abscissa=0.0, offset=0.3), AdviserConfig(), wire_radius_mm=0.2)
+    adviser.start(np.zeros((1, 2)), np.zeros((1, 2)), np.full(1, 9.0))
+    args = np.zeros((1, 2)), np.zeros((1, 2)), np.zeros((1, 2)), np.full(1, 9.0)
+    adviser.advise(*args)
+    known = adviser.half_width
+    adviser.advise(*args, np.zeros((1, 2)))
+    assert np.array_equal(adviser.half_width, known)
+    due = adviser.advise(*args, np.array([[1.5, 0.2]]))
+    np.testing.assert_allclose(adviser.half_width, [[1.645 * 1.5, np.hypot(0.3, 1.645 * 0.2)]], rtol=1e-3)
+    assert due[0]  # Δtip is known to no more than 2 mm
+
+
 def test_exposures_keep_their_distance() -> None:
     offset = [0.3, 0.58, 0.62, 0.66, 0.66, 0.3, 0.3, 0.9, 0.3, 0.9, 0.3, 0.9, 0.9]
     due = advices(offset, [10.0] * len(offset), config=AdviserConfig(wall_ratio=0.6), abscissa=0.0, offset=0.01)

@@ -11,7 +11,7 @@ import pytest
 from endopilot import parallel
 from endopilot.belief import image_exposures as module
 from endopilot.belief.image_exposures import ImageSettings, deeper_ostium_mm, image_exposures
-from endopilot.dataset.loader import load_dataset
+from endopilot.dataset.loader import read_dataset
 from endopilot.errors import InputError
 from endopilot.simulation.motion import Motion
 from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement
@@ -56,7 +56,7 @@ def dataset(tmp_path, monkeypatch):
     monkeypatch.setattr("endopilot.dataset.again.simulate", toy_simulate)
     Arm.made.clear()
     Arm.refined.clear()
-    return load_dataset(tmp_path / "data").of_split("test")
+    return read_dataset(tmp_path / "data").of_split("test")
 
 
 def test_each_sample_is_measured_by_the_wire_driven_again_and_kept_for_the_next_model(dataset) -> None:

@@ -167,9 +167,9 @@ def test_a_row_holds_medians_and_percentiles_of_both_sets():
 
 
 def test_anatomies_are_compared_with_the_atlas_of_their_kind(tmp_path):
-    config = AtlasConfig(anatomy="lca", seed=3, count=2)
+    config = AtlasConfig(vessel="lca", seed=3, count=2)
     for index in range(2):
-        write_anatomy(make_patient(config, index), tmp_path / str(index))
+        write_anatomy(make_patient(config, index), output=tmp_path / str(index))
     rows = compare_with_atlas([tmp_path], replace(config, anatomy="rca"))
     assert {row["kind"] for row in rows} == {"lca"}
     by_name = {row["quantity"]: row for row in rows}
@@ -184,6 +184,6 @@ def test_anatomies_are_compared_with_the_atlas_of_their_kind(tmp_path):
 def test_a_tree_of_another_kind_is_refused(tmp_path):
     line = straight((0, 0, 0), (0, 0, 1), 40)
     anatomy = anatomy_of([(line, constant(line, 2.0), -1, 0)], names=("G0", "vessel"))
-    write_anatomy(anatomy, tmp_path / "generic")
+    write_anatomy(anatomy, output=tmp_path / "generic")
     with pytest.raises(InputError, match="sections are not those"):
         compare_with_atlas([tmp_path / "generic"], AtlasConfig())

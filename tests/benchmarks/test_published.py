@@ -25,14 +25,14 @@ from benchmarks.published.straightening import AortoIliac, Straightened
 from benchmarks.published.three_point import flexural_modulus
 from benchmarks.published.tubing import BORE_MM, LENGTH_MM, Push, draw_tubing, push_through
 from endopilot.devices.catheter import read_catheter
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.simulation.config import PRESETS
 
 
 def test_a_full_round_wire_shows_the_modulus_of_its_steel() -> None:
     # E = 64 EI / (π d⁴); shear and the length that a deflection of span / 40 adds stay below 0.5 %.
     device = replace(
-        read_device("j-035"), abscissa_mm=(0.0,), bend_stiffness_n_mm2=(5000.0,), twist_stiffness_n_mm2=(3846.0,)
+        read_wire("j-035"), abscissa_mm=(0.0,), bend_stiffness_n_mm2=(5000.0,), twist_stiffness_n_mm2=(3846.0,)
     )
     expected = 64 * 5000.0 / (np.pi * 0.89**4) / 1000
     found = flexural_modulus(device, at_mm=100.0, deflection_mm=1.0, diameter_mm=0.89)
@@ -67,7 +67,7 @@ def test_more_friction_takes_more_force_and_a_drive_at_its_limit_does_not_pass(m
     monkeypatch.setattr(tubing, "LENGTH_MM", 70.0)
     monkeypatch.setattr(tubing, "ANGLES_DEG", ((80.0, 100.0),))
     vessel = draw_tubing(np.random.default_rng(3)).anatomy()
-    wire, catheter = read_device("workhorse-014"), read_catheter("microcatheter-1.7f")
+    wire, catheter = read_wire("workhorse-014"), read_catheter("microcatheter-1.7f")
     push = partial(push_through, vessel, config=PRESETS["fast"])
     smooth, rough = (push(replace(wire, friction=friction)) for friction in (0.02, 0.3))
     assert smooth.valid and smooth.through and rough.valid and rough.through

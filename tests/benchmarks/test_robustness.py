@@ -15,8 +15,8 @@ from benchmarks.core.robustness import RobustnessConfig, measure_robustness
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.catheter import read_catheter
-from endopilot.devices.device import Wire, read_device
-from endopilot.devices.device_files import list_devices
+from endopilot.devices.device import Wire, read_wire
+from endopilot.devices.device_files import list_wires
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import read_json
@@ -24,7 +24,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
 from endopilot.types import Centerline
 
-DEVICE = read_device("workhorse-014")
+DEVICE = read_wire("workhorse-014")
 
 
 def small(folder: Path) -> RobustnessConfig:
@@ -40,7 +40,7 @@ def test_a_small_run_holds_its_bars_and_goes_on_where_it_stopped(tmp_path: Path)
     measured = measure_robustness(small(tmp_path / "run"))
     figures = {row["figure"]: row for row in measured["figures"]}
     assert measured["rollouts"] == 20
-    assert set(measured["by_device"]) == set(list_devices()) and set(measured["by_manoeuvre"]) == set(MANOEUVRES)
+    assert set(measured["by_device"]) == set(list_wires()) and set(measured["by_manoeuvre"]) == set(MANOEUVRES)
     for name in ("invalid worlds, share", "non-finite numbers in valid worlds", "crashes"):
         assert figures[name]["value"] == 0 and figures[name]["passed"], measured
     depth = figures["penetration, 99.9th percentile, mm"]
@@ -180,7 +180,7 @@ def test_a_crash_and_an_invalid_world_miss_their_bars(tmp_path: Path) -> None:
         non_finite=np.array([2]),
         seconds=1.0,
     )
-    first, second = (tmp_path / f"0000-{name}.npz" for name in list_devices()[:2])
+    first, second = (tmp_path / f"0000-{name}.npz" for name in list_wires()[:2])
     np.savez(first, **vars(chunk))
     robustness.write_json(first.with_suffix(".json"), {"anatomy": "rca", "invalid": ["did not converge"]})
     robustness.write_json(second.with_suffix(".json"), {"anatomy": "rca", "crash": "patient 0: the process died"})
@@ -200,14 +200,14 @@ def test_a_crash_and_an_invalid_world_miss_their_bars(tmp_path: Path) -> None:
 def test_anatomies_of_ones_own_are_driven_through(tmp_path: Path, patient) -> None:
     folders = (tmp_path / "one", tmp_path / "two")
     for folder in folders:
-        write_anatomy(replace(patient, name=folder.name), folder)
+        write_anatomy(replace(patient, name=folder.name), output=folder)
     measured = measure_robustness(replace(small(tmp_path / "run"), given=folders, rollouts=4, seconds=5.0))
     assert measured["rollouts"] == 4
     assert {name: row["rollouts"] for name, row in measured["by_anatomy"].items()} == {"one": 2, "two": 2}
     assert all(row["largest_push_n"] > 0 for row in measured["by_anatomy"].values())
     with pytest.raises(InputError, match="no such folder"):
         measure_robustness(replace(small(tmp_path / "other"), given=(tmp_path / "absent",)))
-    write_anatomy(replace(patient, name="two", catheter_radius_mm=2 * patient.catheter_radius_mm), folders[1])
+    write_anatomy(replace(patient, name="two", catheter_radius_mm=2 * patient.catheter_radius_mm), output=folders[1])
     with pytest.raises(InputError, match="was begun with given"):  # another vessel in the same folder
         measure_robustness(replace(small(tmp_path / "run"), given=folders, rollouts=4, seconds=5.0))
 

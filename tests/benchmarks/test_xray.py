@@ -54,7 +54,7 @@ def test_a_tip_found_elsewhere_is_missed_and_one_found_without_a_wire_is_a_false
 
 def test_anatomies_of_ones_own_lie_on_the_table(tmp_path):
     patient = make_patient(AtlasConfig(population="textbook"), 0)
-    write_anatomy(patient, tmp_path / "mine")
+    write_anatomy(patient, output=tmp_path / "mine")
     (scene,) = draw_scenes(SceneConfig(given=(tmp_path / "mine",)))
     assert scene.anatomy.identity == patient.identity
     with pytest.raises(InputError, match="no such folder"):

@@ -53,12 +53,12 @@ def test_keys_move_the_wire_and_the_pedal_counts(context, server):
     page = opened(context, server)
     page.on("pageerror", lambda error: errors.append(str(error)))
     assert "Not a medical device" in page.inner_text("header")
-    began = value(page, "cockpit.shown.inserted_mm")
-    hold(page, "KeyW", f"cockpit.shown.inserted_mm > {began + 3}")
+    began = value(page, "cockpit.shown.inserted_length_mm")
+    hold(page, "KeyW", f"cockpit.shown.inserted_length_mm > {began + 3}")
     page.keyboard.up("KeyW")
     until(page, "cockpit.shown.velocity[0] === 0")
     until(page, "cockpit.space.canvas.width === cockpit.space.canvas.clientWidth")  # a view at rest is sharp
-    held = value(page, "cockpit.shown.inserted_mm")
+    held = value(page, "cockpit.shown.inserted_length_mm")
     hold(page, "ArrowLeft", "cockpit.shown.rotation_deg < -20")
     page.keyboard.up("ArrowLeft")
     assert value(page, "cockpit.shown.xray.frames") == 0
@@ -67,7 +67,7 @@ def test_keys_move_the_wire_and_the_pedal_counts(context, server):
     page.keyboard.up("KeyX")
     until(page, "!cockpit.shown.xray.on")
     frames, image = value(page, "cockpit.shown.xray.frames"), value(page, IMAGE)
-    hold(page, "KeyS", f"cockpit.shown.inserted_mm < {held - 2}")
+    hold(page, "KeyS", f"cockpit.shown.inserted_length_mm < {held - 2}")
     page.keyboard.up("KeyS")
     assert value(page, "cockpit.shown.xray.frames") == frames
     assert value(page, IMAGE) == image  # the last image is held while X-ray is off
@@ -79,9 +79,9 @@ def test_keys_move_the_wire_and_the_pedal_counts(context, server):
 def test_a_gamepad_drives_turns_and_exposes(context, server):
     context.add_init_script(f"({PAD})()")
     page = opened(context, server)
-    began = value(page, "cockpit.shown.inserted_mm")
+    began = value(page, "cockpit.shown.inserted_length_mm")
     page.evaluate("() => { pad.axes[1] = -0.5; pad.axes[2] = 1; pad.buttons[7].pressed = true; }")
-    until(page, f"cockpit.shown.inserted_mm > {began + 2}")
+    until(page, f"cockpit.shown.inserted_length_mm > {began + 2}")
     until(page, "Math.abs(cockpit.shown.rotation_deg) > 10 && cockpit.shown.xray.frames >= 2")
     half = value(page, "cockpit.shown.command[0]")
     page.evaluate("() => { pad.axes[1] = -1; pad.buttons[5].pressed = true; }")
@@ -115,16 +115,16 @@ def test_two_pages_watch_and_one_drives(context, server):
     first, second = opened(context, server), opened(context, server)
     until(second, "cockpit.role.taken && !cockpit.role.drives")
     first.bring_to_front()
-    began = value(second, "cockpit.state.inserted_mm")
+    began = value(second, "cockpit.state.inserted_length_mm")
     second.evaluate("() => cockpit.connection.send('drive', {translation: 5, rotation: 0})")
     until(second, "document.getElementById('banner').textContent.includes('watches')")
-    assert value(second, "cockpit.state.inserted_mm") == pytest.approx(began, abs=0.01)
+    assert value(second, "cockpit.state.inserted_length_mm") == pytest.approx(began, abs=0.01)
     first.click("#wheel")
     until(second, "!document.getElementById('wheel').hidden && !cockpit.role.taken")
     second.bring_to_front()
     second.click("#wheel")
     until(second, "cockpit.role.drives")
-    hold(second, "KeyW", f"cockpit.state.inserted_mm > {began + 2}", watcher=first)
+    hold(second, "KeyW", f"cockpit.state.inserted_length_mm > {began + 2}", watcher=first)
     second.keyboard.up("KeyW")
 
 
@@ -164,7 +164,7 @@ def test_a_policy_drives_and_a_hand_takes_over(context, server):
 
 def test_a_killed_server_goes_on_and_a_replay_shows_what_was(context, server):
     page = opened(context, server)
-    hold(page, "KeyW", "cockpit.shown.inserted_mm > 12")
+    hold(page, "KeyW", "cockpit.shown.inserted_length_mm > 12")
     page.keyboard.up("KeyW")
     hold(page, "KeyD", "cockpit.shown.rotation_deg > 40")
     page.keyboard.up("KeyD")
@@ -175,8 +175,8 @@ def test_a_killed_server_goes_on_and_a_replay_shows_what_was(context, server):
     until(page, "!document.getElementById('banner').hidden")
     with serving("--resume", server.recording) as again:
         resumed = opened(context, again)
-        assert value(resumed, "cockpit.shown.inserted_mm") == pytest.approx(13, abs=3.0)
-        hold(resumed, "KeyS", "cockpit.shown.inserted_mm < 11")
+        assert value(resumed, "cockpit.shown.inserted_length_mm") == pytest.approx(13, abs=3.0)
+        hold(resumed, "KeyS", "cockpit.shown.inserted_length_mm < 11")
         resumed.keyboard.up("KeyS")
     recording = read_recording(Path(server.recording))
     then = next((world.snapshot().nodes for world, _ in replayed(recording) if world.cycle == cycle), None)
@@ -217,24 +217,24 @@ def test_the_hand_takes_the_catheter_and_both(context, vessel, tmp_path):
         page.on("pageerror", lambda error: errors.append(str(error)))
         assert "in microcatheter-1.7f" in page.inner_text("#patient")
         says(page, "#holds .on", "wire")
-        hold(page, "KeyW", "cockpit.shown.inserted_mm > 9")
-        assert value(page, "cockpit.shown.catheters[0].inserted_mm") == 0
+        hold(page, "KeyW", "cockpit.shown.inserted_length_mm > 9")
+        assert value(page, "cockpit.shown.catheters[0].inserted_length_mm") == 0
         page.keyboard.press("KeyQ")  # W stays pressed, and moves nothing more
         says(page, "#holds .on", "microcatheter-1.7f")
         until(page, "cockpit.shown.velocity.every((v) => v === 0)")
         page.keyboard.up("KeyW")
-        wire = value(page, "cockpit.shown.inserted_mm")
-        hold(page, "KeyW", "cockpit.shown.catheters[0].inserted_mm > 4")
+        wire = value(page, "cockpit.shown.inserted_length_mm")
+        hold(page, "KeyW", "cockpit.shown.catheters[0].inserted_length_mm > 4")
         page.keyboard.up("KeyW")
         until(page, "cockpit.shown.velocity.every((v) => v === 0)")
-        assert value(page, "cockpit.shown.inserted_mm") == pytest.approx(wire, abs=0.2)
+        assert value(page, "cockpit.shown.inserted_length_mm") == pytest.approx(wire, abs=0.2)
         says(page, "#figures", "microcatheter-1.7f")
         says(page, "#figures", ", microcatheter-1.7f ")  # where its tip is
         page.click("#holds button:last-child")
         says(page, "#holds .on", "both")
-        hold(page, "KeyS", "cockpit.shown.catheters[0].inserted_mm < 3")
+        hold(page, "KeyS", "cockpit.shown.catheters[0].inserted_length_mm < 3")
         page.keyboard.up("KeyS")
-        assert value(page, "cockpit.shown.inserted_mm") < wire - 0.5
+        assert value(page, "cockpit.shown.inserted_length_mm") < wire - 0.5
         drawn = "cockpit.space.catheters[0].mesh.geometry.drawRange.count"
         assert 0 < value(page, drawn) < value(page, "cockpit.space.wire.mesh.geometry.drawRange.count")
         page.click("#holds button >> nth=0")

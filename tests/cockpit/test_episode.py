@@ -21,20 +21,20 @@ def drive(session, seconds, translation, rotation):
 
 def test_an_episode_holds_the_wire_as_it_was(session, tmp_path):
     from endopilot.cockpit.episode import write_session_episode
-    from endopilot.dataset.loader import load_dataset
+    from endopilot.dataset.loader import read_dataset
 
     session.handle(Target(type="target", branch=0, abscissa=14.0), 0.0)
     drive(session, 1.2, 12.0, 2.0)
     drive(session, 0.9, -4.0, 1.0)
     session.close()
     path = tmp_path / "a.cockpit.jsonl"
-    write_session_episode(path, tmp_path / "episode")
-    data = load_dataset(tmp_path / "episode")
+    write_session_episode(path, output=tmp_path / "episode")
+    data = read_dataset(tmp_path / "episode")
     ends = [world.snapshot() for world, _ in replayed(read_recording(path)) if world.cycle and world.cycle % 40 == 0]
     assert data.inserted_length.shape == (1, 4, 1) == (1, len(ends), 1)
     np.testing.assert_allclose(data.tip_position[0, :, 0], [end.nodes[0] for end in ends], atol=1e-4)
-    np.testing.assert_allclose(data.inserted_length[0, :, 0], [end.inserted_mm for end in ends], atol=1e-4)
-    moved = np.diff([5.0 - 3.0, *(end.inserted_mm for end in ends)]) / 0.5
+    np.testing.assert_allclose(data.inserted_length[0, :, 0], [end.inserted_length_mm for end in ends], atol=1e-4)
+    moved = np.diff([5.0 - 3.0, *(end.inserted_length_mm for end in ends)]) / 0.5
     np.testing.assert_allclose(data.control[0, 1:, 0, 0], moved[1:], atol=1e-3)
     assert data.manifest["settings"]["target_mm"] == 14.0
 
@@ -45,5 +45,5 @@ def test_a_session_without_a_sample_is_refused(session, tmp_path):
     drive(session, 0.3, 5.0, 0.0)
     session.close()
     with pytest.raises(InputError, match="drive for longer"):
-        write_session_episode(tmp_path / "a.cockpit.jsonl", tmp_path / "episode")
+        write_session_episode(tmp_path / "a.cockpit.jsonl", output=tmp_path / "episode")
     assert not (tmp_path / "episode").exists()

@@ -59,7 +59,7 @@ def test_a_rollout_is_driven_again(fork, wire, vessel, tmp_path):
     film = driven(open_film(tmp_path / "r.npz", vessel, world=1))
     assert len(film.frames) == 31
     last = film.frames[-1].snapshot
-    assert last.inserted_mm == pytest.approx(rollout.inserted_length[1, -1, 0], abs=1e-9)
+    assert last.inserted_length_mm == pytest.approx(rollout.inserted_length[1, -1, 0], abs=1e-9)
     np.testing.assert_allclose(last.nodes[0], rollout.tip_position[1, -1, 0], atol=0.02)
     with pytest.raises(InputError, match="worlds 0 to 1"):
         open_film(tmp_path / "r.npz", vessel, world=2)
@@ -70,14 +70,14 @@ def test_a_rollout_is_driven_again(fork, wire, vessel, tmp_path):
 def test_a_plan_is_shown(found, vessel, tmp_path):
     from endopilot.control.plan_file import write_plan
 
-    write_plan(found, tmp_path / "plan")
+    write_plan(found, output=tmp_path / "plan")
     film = driven(open_film(tmp_path / "plan", vessel))
     np.testing.assert_allclose(film.frames[-1].snapshot.nodes[0], found.trajectory.tip_position[0, -1, 0], atol=0.05)
 
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_a_navigation_of_the_ladder_is_the_same_to_the_bit(tmp_path, version):
-    task = find_task("straight", version)
+    task = find_task("straight", version=version)
     result = attempt("forward", task.ladder_navigation(0), seed=navigation_seed(task, 0))
     of_version = {} if version == 1 else {"ladder": version}  # as files were before there was a version 2
     write_json(tmp_path / "straight" / "00.json", of_version | result)
@@ -92,11 +92,11 @@ def test_an_episode_of_a_data_set_is_shown(fork, wire, vessel, tmp_path):
     pytest.importorskip("pyarrow", reason="the extra `learn` is not installed")
     from endopilot.dataset.config import DatasetConfig
     from endopilot.dataset.generate import generate_dataset
-    from endopilot.dataset.loader import load_dataset
+    from endopilot.dataset.loader import read_dataset
 
     config = DatasetConfig(sequences=2, seconds=4.0, anatomy_shares=(1.0, 0.0, 0.0), seen_test_share=0.0)
-    generate_dataset([vessel], tmp_path / "data", wire, config)
-    data = load_dataset(tmp_path / "data")
+    generate_dataset([vessel], output=tmp_path / "data", device=wire, config=config)
+    data = read_dataset(tmp_path / "data")
     film = driven(open_film(tmp_path / "data", world=1))
     np.testing.assert_allclose(film.frames[-1].snapshot.nodes[0], data.tip_position[1, -1, 0], atol=0.05)
 

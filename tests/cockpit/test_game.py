@@ -105,7 +105,7 @@ def test_a_task_has_the_ladders_world():
     ladder = tried.task.ladder_navigation(1)
     assert world.navigation.anatomy.identity == ladder.anatomy.identity
     assert world.config.simulator.element_mm == 1.25
-    assert np.isclose(world.snapshot().rotation, ladder.start_rotation)
+    assert np.isclose(world.snapshot().rotation, ladder.start_rotation_rad)
 
 
 def test_a_killed_game_goes_on_and_is_scored_as_if_it_had_not_been(tmp_path, xray):

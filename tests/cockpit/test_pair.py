@@ -21,7 +21,8 @@ from endopilot.cockpit.recording import read_recording, replayed
 from endopilot.cockpit.session import SILENCE_S, Session
 from endopilot.cockpit.world import World
 from endopilot.devices.catheter import read_catheter
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
@@ -34,7 +35,7 @@ NAME = "microcatheter-1.7f"
 
 @pytest.fixture
 def navigation(navigation):
-    return replace(navigation, device=read_device("workhorse-014"), catheters=(read_catheter(NAME),))
+    return replace(navigation, device=read_wire("workhorse-014"), catheters=(read_catheter(NAME),))
 
 
 def both(wire=(0.0, 0.0), catheter=(0.0, 0.0)):
@@ -46,9 +47,12 @@ def test_each_device_follows_its_own_drive(session):
     assert header["command"] == header["velocity"] == [12.0, 2.0, 9.0, -1.0]
     snapshot = session.world.snapshot()
     (catheter,) = snapshot.catheters
-    assert 5.0 < catheter.inserted_mm < 9.0 * 0.8 < snapshot.inserted_mm
+    assert 5.0 < catheter.inserted_length_mm < 9.0 * 0.8 < snapshot.inserted_length_mm
     assert header["catheters"] == [
-        {"inserted_mm": round(catheter.inserted_mm, 3), "rotation_deg": round(np.degrees(catheter.rotation), 2)}
+        {
+            "inserted_length_mm": round(catheter.inserted_length_mm, 3),
+            "rotation_deg": round(np.degrees(catheter.rotation), 2),
+        }
     ]
     assert header["catheter_tips_mm"][0] < header["tip_mm"]
     simulator = session.world.loop.simulator
@@ -136,15 +140,15 @@ def test_a_session_replays_to_the_bit_and_goes_on(session, tmp_path):
 def test_a_session_becomes_an_episode_of_both(session, tmp_path):
     pytest.importorskip("pyarrow", reason="the extra `learn` is not installed")
     from endopilot.cockpit.episode import write_session_episode
-    from endopilot.dataset.loader import load_dataset
+    from endopilot.dataset.loader import read_dataset
 
     run(session, 1.0, message=both((12.0, 2.0), (8.0, 1.0)))
     snapshot = session.world.snapshot()
     session.close()
-    write_session_episode(tmp_path / "a.cockpit.jsonl", tmp_path / "episode")
-    data = load_dataset(tmp_path / "episode")
+    write_session_episode(tmp_path / "a.cockpit.jsonl", output=tmp_path / "episode")
+    data = read_dataset(tmp_path / "episode")
     assert [catheter.name for catheter in data.stack.catheters] == [NAME]
-    assert data.inserted_length[0, -1, 1] == pytest.approx(snapshot.catheters[0].inserted_mm, abs=1e-4)
+    assert data.inserted_length[0, -1, 1] == pytest.approx(snapshot.catheters[0].inserted_length_mm, abs=1e-4)
     np.testing.assert_allclose(data.tip_position[0, -1, 0], snapshot.nodes[0], atol=1e-4)
     made = np.diff([data.initial[0, 1, 0], *data.inserted_length[0, :, 1]])
     asked = 0.5 * data.control[0, :, 1, 0]
@@ -218,24 +222,24 @@ def test_a_rollout_of_a_pair_is_driven_again(fork, vessel, navigation, tmp_path)
     film._drive()
     last = film.frames[-1].snapshot
     assert not film.failure
-    assert last.inserted_mm == pytest.approx(rollout.inserted_length[0, -1, 0], abs=1e-9)
-    assert last.catheters[0].inserted_mm == pytest.approx(rollout.inserted_length[0, -1, 1], abs=1e-9)
+    assert last.inserted_length_mm == pytest.approx(rollout.inserted_length[0, -1, 0], abs=1e-9)
+    assert last.catheters[0].inserted_length_mm == pytest.approx(rollout.inserted_length[0, -1, 1], abs=1e-9)
     np.testing.assert_allclose(last.catheters[0].nodes[0], rollout.tip_position[0, -1, 1], atol=0.02)
 
 
 def test_a_navigation_of_a_pair_is_shown(vessel, tmp_path):
-    from endopilot.control.navigate_patient import NavigatePatientConfig
+    from endopilot.control.navigate import NavigateConfig
     from endopilot.pipeline.navigation import navigate_into
 
-    config = NavigatePatientConfig(policy="in-turn", catheter=(NAME,), seconds=2.0)
-    navigate_into(vessel, "0,0,15", tmp_path / "navigation", config)
+    folder, config = tmp_path / "navigation", NavigateConfig(seconds=2.0)
+    navigate_into(vessel, "0,0,15", output=folder, policy="in-turn", catheter=(NAME,), config=config)
     film = open_film(tmp_path / "navigation", vessel)
     film._drive()
     assert not film.failure
     last = film.frames[-1].snapshot
     table = np.genfromtxt(tmp_path / "navigation" / "navigation.csv", delimiter=",", names=True)
-    assert last.inserted_mm == table["inserted_length_mm"][-1]
-    assert last.catheters[0].inserted_mm == table["catheter_1_inserted_length_mm"][-1]
+    assert last.inserted_length_mm == table["inserted_length_mm"][-1]
+    assert last.catheters[0].inserted_length_mm == table["catheter_1_inserted_length_mm"][-1]
     shown = [frame.snapshot.time_s for frame in film.frames if frame.exposed]
     assert shown == table["time_s"][table["xray"] == 1].tolist()
     assert film.navigation.target.abscissa == pytest.approx(15.0, abs=1.0)
@@ -245,12 +249,12 @@ def test_an_episode_of_pairs_is_shown(navigation, vessel, tmp_path):
     pytest.importorskip("pyarrow", reason="the extra `learn` is not installed")
     from endopilot.dataset.config import DatasetConfig
     from endopilot.dataset.generate import generate_dataset
-    from endopilot.dataset.loader import load_dataset
+    from endopilot.dataset.loader import read_dataset
 
     # With this seed no device jumps within a sample: then the replay is exact.
     config = DatasetConfig(sequences=1, seconds=3.0, anatomy_shares=(1.0, 0.0, 0.0), seen_test_share=0.0, seed=1)
-    generate_dataset([vessel], tmp_path / "data", navigation.stack, config)
-    data = load_dataset(tmp_path / "data")
+    generate_dataset([vessel], output=tmp_path / "data", device=navigation.stack, config=config)
+    data = read_dataset(tmp_path / "data")
     film = open_film(tmp_path / "data")
     film._drive()
     assert not film.failure
@@ -264,8 +268,8 @@ def test_a_plan_of_a_pair_is_shown(vessel, tmp_path):
     from endopilot.control.plan_config import PlanConfig
     from endopilot.control.plan_file import write_plan
 
-    made = plan(vessel, "0,0,9", PlanConfig(seconds=20.0, tip="own"), catheters=[read_catheter(NAME)])
-    write_plan(made, tmp_path / "plan")
+    made = plan(vessel, "0,0,9", config=PlanConfig(seconds=20.0, tip="own"), device=Stack.of("workhorse-014", NAME))
+    write_plan(made, output=tmp_path / "plan")
     film = open_film(tmp_path / "plan", vessel)
     film._drive()
     last = film.frames[-1].snapshot

@@ -26,12 +26,12 @@ def run(session, seconds, *, message=None, start=0.0):
 
 
 def test_the_wire_follows_the_drive_within_its_limits(session):
-    before = session.world.snapshot().inserted_mm
+    before = session.world.snapshot().inserted_length_mm
     (header, arrays), _ = run(session, 1.0, message=Drive(type="drive", translation=900.0, rotation=0.0))
     fastest = session.world.navigation.device.max_velocity_mm_s
     assert header["command"] == [fastest, 0.0]
     # 50 ms of latency and a ramp of 40/200 s: the rest at full speed; what the drive slips over is lost.
-    assert 10 < header["inserted_mm"] - before <= fastest * (1.0 - 0.05 - 0.1)
+    assert 10 < header["inserted_length_mm"] - before <= fastest * (1.0 - 0.05 - 0.1)
     assert np.isfinite(arrays["nodes"]).all() and len(arrays["nodes"]) == len(arrays["node_force"])
 
 
@@ -168,7 +168,7 @@ def test_a_killed_session_goes_on(session, tmp_path):
 
     run(session, 1.0, message=Drive(type="drive", translation=10.0, rotation=1.0))
     path = tmp_path / "a.cockpit.jsonl"
-    digest, inserted = session.world.digest(), session.world.snapshot().inserted_mm
+    digest, inserted = session.world.digest(), session.world.snapshot().inserted_length_mm
     with path.open("a") as stream:
         stream.write('{"at": 81, "mo')  # what a killed server may leave
     opened = resume_session(path)
@@ -176,7 +176,7 @@ def test_a_killed_session_goes_on(session, tmp_path):
     assert isinstance(resumed, Session)
     assert resumed.world.digest() == digest
     run(resumed, 0.5, message=Drive(type="drive", translation=-5.0, rotation=0.0))
-    assert resumed.world.snapshot().inserted_mm < inserted
+    assert resumed.world.snapshot().inserted_length_mm < inserted
     end = resumed.world.digest()
     resumed.close()
     *_, (world, _events) = replayed(read_recording(path))

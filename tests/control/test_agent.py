@@ -13,14 +13,15 @@ from hypothesis import strategies as st
 from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig
-from endopilot.control import wire_search
+from endopilot.control import push
 from endopilot.control.agent import CALIBRATIONS, AgentConfig, AgentPolicy, OpenLoopPolicy, OraclePolicy
-from endopilot.control.course import Course, Log, Period
+from endopilot.control.course import Course
 from endopilot.control.halt import describe_halt
-from endopilot.control.period import drive_period
-from endopilot.control.wire_search import WireSearch
+from endopilot.control.search import Search
+from endopilot.control.trials import Period, drive_period
 from endopilot.devices.drive_limits import DriveLimits
-from endopilot.navigation.navigate import NavigationLoop, navigate, start_world
+from endopilot.devices.robot import DriveConfig, RobotConfig
+from endopilot.navigation.loop import LoopConfig, NavigationLoop, start_world
 from endopilot.navigation.policy import Decision, Hand, Observation, Policy
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import motion_named
@@ -53,11 +54,11 @@ def side_branch(fork, shaped) -> Navigation:
 
 
 def test_the_oracle_gets_into_a_side_branch_that_pushing_misses(side_branch) -> None:
-    failed = navigate(replace(side_branch, seconds=8.0), Forward(), seed=1)
+    failed = NavigationLoop(replace(side_branch, seconds=8.0), Forward(), seed=1).run()
     assert not failed.success
     policy = OraclePolicy(config=QUICK)
     assert isinstance(policy, Policy)
-    record = navigate(side_branch, policy, seed=1)
+    record = NavigationLoop(side_branch, policy, seed=1).run()
     assert record.success and record.safe and record.faults == 0
     assert record.tip.branch[-1, 0] == 2
     assert record.exposures == len(record.time_s) - 1  # X-ray is always on
@@ -80,7 +81,7 @@ def test_a_course_is_what_the_simulator_does_under_its_controls(side_branch, kno
     policy.start(side_branch, 0)
     course = policy.find_course(side_branch.seconds)
     assert course.reached == 1.0
-    moved = side_branch.start_inserted_mm + 0.5 * np.cumsum(course.control[:, 0, 0])
+    moved = side_branch.start_inserted_length_mm + 0.5 * np.cumsum(course.control[:, 0, 0])
     assert np.allclose(course.proximal[:, 0, 0], moved, atol=1e-9)
     simulator = Belief(side_branch, np.array([[1.0, 1.0, 0.0]]), QUICK.belief).simulator
     for k in range(len(course.control)):
@@ -92,7 +93,7 @@ def test_a_course_is_what_the_simulator_does_under_its_controls(side_branch, kno
 
 def test_the_agent_arrives_though_the_wire_is_another_than_believed(side_branch) -> None:
     truth = ModelMismatch(friction_factor=1.2, stiffness_factor=0.8, ostium_mm=0.3)
-    record = navigate(side_branch, AgentPolicy(QUICK), seed=2, truth=truth)
+    record = NavigationLoop(side_branch, AgentPolicy(QUICK), seed=2, truth=truth).run()
     assert record.success and record.safe and record.faults == 0
     assert 1 <= record.exposures < (len(record.time_s) - 1) / 2  # it looks seldom
     held, half = record.in_bands, record.half_width
@@ -103,6 +104,58 @@ def test_the_agent_arrives_though_the_wire_is_another_than_believed(side_branch)
         and not replace(record, half_width=0 * half).in_bands.any()
     )
     assert len(replace(record, half_width=None).in_bands) == 0
+
+
+@pytest.fixture(scope="module")
+def with_play() -> RobotConfig:
+    """Return a robot whose encoders do not see a play of 2.6 mm and 0.9 turn; a seed draws both, ± 15 %."""
+    wire = DriveConfig(play_mm=2.6, play_rad=2 * np.pi * 0.9, play_sd_share=0.15)
+    return RobotConfig(encoders_at="motor", wire=wire)
+
+
+def test_the_agent_arrives_though_encoders_sit_in_front_of_a_wide_play(side_branch, with_play) -> None:
+    config = LoopConfig(robot=with_play)
+    for seed in (1, 2):
+        record = NavigationLoop(side_branch, AgentPolicy(QUICK), config=config, seed=seed).run()
+        assert record.success and record.safe and record.faults == 0
+        assert record.exposures <= 12
+    unaware = replace(side_branch, robot=RobotConfig())  # what it is given of the robot
+    blind = NavigationLoop(unaware, AgentPolicy(QUICK), config=config, seed=2).run()
+    assert not blind.success or blind.exposures > 2 * record.exposures
+
+
+def test_without_play_what_is_known_of_the_robot_changes_nothing(side_branch) -> None:
+    told, untold = (
+        NavigationLoop(replace(side_branch, robot=known), AgentPolicy(QUICK), seed=2).run()
+        for known in (RobotConfig(), None)
+    )
+    assert np.array_equal(told.tip_position, untold.tip_position) and np.array_equal(told.control, untold.control)
+
+
+def test_the_first_decision_goes_by_the_first_reading(side_branch) -> None:
+    policy = AgentPolicy(QUICK)
+    policy.start(side_branch, 0)
+    (velocity,) = policy.decide(Observation(0.0, ((2.3, 0.1),), None)).devices
+    assert policy._course is not None
+    assert velocity == tuple(((policy._course.proximal[0, 0] - [2.3, 0.1]) / 0.5).tolist())
+
+
+def test_an_exposure_says_how_a_wire_is_turned_that_its_encoder_does_not(side_branch, with_play) -> None:
+    """The real drive had all of its play before it, of which the belief knows nothing."""
+    belief = Belief(replace(side_branch, robot=with_play), np.array([[1.0, 1.0, 0.0]]), QUICK.belief)
+    true = Belief(side_branch, np.array([[1.0, 1.0, 0.0]]), QUICK.belief)
+    belief.follow(((12.6, 0.0),))
+    true.follow(((10.0, 0.0),))  # the play was ahead
+    belief.weigh(measured(true, 0))
+    belief.follow(((12.6, 5.0),))
+    true.follow(((10.0, 1.5),))
+    unsure = belief.drives.sd[0].copy()
+    for _ in range(3):
+        belief.weigh(measured(true, 0))
+    assert unsure[1] > 1.0 and belief.drives.sd[0, 1] < 0.4
+    np.testing.assert_allclose(belief.drives.proximal[0], [10.0, 1.5], atol=0.35)
+    np.testing.assert_allclose(belief.simulator.proximal[0, 0], [10.0, 1.5], atol=0.35)  # and there its wires are
+    assert belief.play_spread()[0] == belief.drives.sd[0, 0]
 
 
 def measured(belief: Belief, member: int) -> TipMeasurement:
@@ -225,7 +278,7 @@ def test_images_have_a_calibration_of_their_own(side_branch) -> None:
 
 def test_open_loop_plans_once_and_looks_no_more(side_branch) -> None:
     policy = OpenLoopPolicy(config=QUICK)
-    record = navigate(side_branch, policy, seed=1)
+    record = NavigationLoop(side_branch, policy, seed=1).run()
     assert record.success and record.exposures == 1 and policy.plans == 1
     policy.start(side_branch, 0)
     far = replace(measured(policy.belief, 0), position=np.full(3, 50.0))
@@ -267,7 +320,7 @@ def test_whatever_the_model_returns_a_drive_takes_what_is_finite_and_within_limi
 
 @pytest.mark.timeout(60)
 def test_a_search_ends_though_pushing_seems_to_arrive_and_the_target_is_not_reached(side_branch, monkeypatch) -> None:
-    monkeypatch.setattr(WireSearch, "_push_on", lambda *_: None)
+    monkeypatch.setattr(Search, "_straight", lambda *_: None)
     policy = OraclePolicy(config=QUICK)
     policy.start(side_branch, 0)
     course = policy.find_course(5.0)
@@ -278,14 +331,14 @@ def test_a_search_begins_farther_before_a_wide_junction(side_branch, monkeypatch
     """The junction is at 20 mm in a vessel of 1 mm: 4 mm before it, or as many radii as a mouth needs."""
     begun = []
     for radii in (1.4, 8.0):
-        monkeypatch.setattr(wire_search, "_LEAD_RADII", radii)
+        monkeypatch.setattr(push, "_MOUTH_RADII", radii)
         policy = OraclePolicy(config=QUICK)
         policy.start(side_branch, 0)
         one = policy._search
-        one._single.put(np.zeros(1, dtype=int), policy.belief.simulator)
-        one._weight = np.ones(1)
-        one._approach(20, 22.5, np.inf)
-        begun.append(float(one._tip.abscissa[0]))
+        one._course.put(np.zeros(1, dtype=int), policy.belief.simulator, np.ones(1))
+        one._periods, one._hard = 20, np.inf
+        one._approach(22.5)
+        begun.append(float(one._course.foremost.abscissa[0]))
     assert begun == pytest.approx([16.0, 12.0], abs=1.1)
 
 
@@ -319,17 +372,16 @@ def test_no_attempt_wins_without_a_wire_that_arrives(side_branch) -> None:
     straight = replace(side_branch.device, tip_bend_rad=0.0, tip_bend_length_mm=0.0)
     policy.start(replace(side_branch, device=straight), 0)
     one = policy._search
-    one._single.put(np.zeros(1, dtype=int), policy.belief.simulator)
-    one._weight = np.ones(1)
+    one._course.put(np.zeros(1, dtype=int), policy.belief.simulator, np.ones(1))
     for attempt in (0, 5, 9):
-        _, _, won = one._attempt(22.5, 2, attempt)
+        _, _, won = one._population.attempt(one._course, 22.5, 2, attempt, 0.9)
         assert not won
 
 
 def test_an_agent_gives_up_early_and_names_the_fork(side_branch) -> None:
     straight = replace(side_branch.device, tip_bend_rad=0.0, tip_bend_length_mm=0.0)
     config = replace(QUICK, search=replace(QUICK.search, attempts=1, rounds=2), tries=2)
-    record = navigate(replace(side_branch, device=straight), AgentPolicy(config), seed=2)
+    record = NavigationLoop(replace(side_branch, device=straight), AgentPolicy(config), seed=2).run()
     assert record.reason == "gave up" and not record.success
     assert record.seconds < 0.5 * side_branch.seconds
     assert "at the fork into section vessel (branch 2) at 20.0 mm" in record.gives_up
@@ -371,6 +423,13 @@ def test_a_force_that_a_snap_ends_within_a_period_counts(side_branch) -> None:
     assert (peaks >= last).all() and (peaks > 2 * last).any()
 
 
+def nowhere_to_go() -> Course:
+    """Return the course of a wire that lies at its target."""
+    none, tip = np.zeros((0, 1, 2)), np.zeros((0, 1))
+    tips, no = TipProjection(tip, tip, tip.astype(int), tip), np.zeros(0, dtype=bool)
+    return Course(control=none, proximal=none, tip=tips, force=tip, checked=no, exposed=no, reached=1.0)
+
+
 def test_a_wire_that_should_have_arrived_goes_by_the_image(side_branch) -> None:
     """No simulated wire says why the target is not reached: X-ray shows how far it is off."""
     policy = AgentPolicy(QUICK)
@@ -379,7 +438,7 @@ def test_a_wire_that_should_have_arrived_goes_by_the_image(side_branch) -> None:
     for off_mm, translation in ((0.4, 0.8), (-0.4, -0.8), (1.9, 2.0)):  # at most 2 mm/s
         navigation = replace(side_branch, target=Target(branch=0, abscissa=here + off_mm))
         policy.start(navigation, 0)
-        policy._search.find = lambda *_, **__: Log().course((3, 1), reached=1.0)
+        policy._search.find = lambda *_, **__: nowhere_to_go()
         blind = policy.decide(Observation(0.0, ((2.0, 0.0),), None))
         assert blind.expose and blind.devices[0][0] == 0.0
         assert policy.believed().asks == "the tip should be at the target"
@@ -391,17 +450,16 @@ def test_a_course_may_begin_with_a_turn(side_branch) -> None:
     policy = OraclePolicy(config=QUICK)
     policy.start(side_branch, 0)
     course = policy._search.find_turned(policy.belief, np.pi, seconds=20.0)
-    assert course.proximal[1, 0, 1] - side_branch.start_rotation == pytest.approx(np.pi)
+    assert course.proximal[1, 0, 1] - side_branch.start_rotation_rad == pytest.approx(np.pi)
     assert (course.control[:2, 0, 0] == 0.0).all() and course.reached == 1.0
 
 
 def test_a_path_that_does_not_arrive_ends_before_it_presses_too_hard(side_branch) -> None:
     policy = OraclePolicy(config=QUICK)
     policy.start(side_branch, 0)
-    one, log, tip = policy._search, policy._search._single.log, policy.belief.tip
-    one._weight = np.ones(1)
+    one, tip = policy._search, policy.belief.tip
     for share in (0.5, 1.0, 1.5, 0.5):
         force = np.array([share * side_branch.force_limit_n])
-        log.rows.append(Period(np.zeros((1, 1, 2)), np.zeros((1, 1, 2)), tip, force))
+        one._course.rows.append(Period(np.zeros((1, 1, 2)), np.zeros((1, 1, 2)), tip, force))
     one._cut_hard()
-    assert log.periods == 2
+    assert len(one._course.rows) == 2

@@ -57,7 +57,7 @@ def test_cost_charges_what_is_unsafe():
 
 
 def test_a_written_plan_is_read_back_and_drives_the_simulator(found, vessel, tmp_path):
-    figures = write_plan(found, tmp_path / "plan")
+    figures = write_plan(found, output=tmp_path / "plan")
     assert figures["reached"] is True
     assert {path.name for path in (tmp_path / "plan").iterdir()} == {
         "plan.csv",
@@ -80,7 +80,7 @@ def test_a_written_plan_is_read_back_and_drives_the_simulator(found, vessel, tmp
 
 
 def test_a_plan_whose_manifest_lacks_what_was_asked_is_refused(found, vessel, tmp_path):
-    write_plan(found, tmp_path / "plan")
+    write_plan(found, output=tmp_path / "plan")
     path = tmp_path / "plan" / "manifest.json"
     record = read_json(path)
     assert record["seed"] == 4 and record["config"]["seconds"] == 30.0
@@ -94,19 +94,19 @@ def test_a_path_that_does_not_arrive_in_the_rod_core_is_no_plan(vessel, monkeypa
     still = np.zeros((4, 2)), np.full((4, 2), 33.0)
     monkeypatch.setattr(plan_module, "_search", lambda *_: still)
     with pytest.raises(InputError, match=r"target: not reached on the path .* ends at \d\.\d of 33\.0 mm"):
-        plan(vessel, "0,0,33", PlanConfig(seconds=30.0))
+        plan(vessel, "0,0,33", config=PlanConfig(seconds=30.0))
 
 
 def test_a_plan_of_another_method_says_that_it_breaks_the_force_limit(found, vessel, tmp_path):
-    made = plan(vessel, "0,0,33", PlanConfig(method="forward", force_limit_n=1e-6))
-    assert write_plan(made, tmp_path / "pushed")["within_force_limit"] is False
+    made = plan(vessel, "0,0,33", config=PlanConfig(method="forward", force_limit_n=1e-6))
+    assert write_plan(made, output=tmp_path / "pushed")["within_force_limit"] is False
     assert read_json(tmp_path / "pushed" / "manifest.json")["within_force_limit"] is False
-    assert write_plan(found, tmp_path / "found")["within_force_limit"] is True
+    assert write_plan(found, output=tmp_path / "found")["within_force_limit"] is True
 
 
 def test_a_plan_for_another_vessel_or_wire_is_refused(found, vessel, tmp_path):
     folder = tmp_path / "plan"
-    write_plan(found, folder)
+    write_plan(found, output=folder)
     anatomy, device = read_anatomy(vessel), found.navigation.device
     values = anatomy.distance_map.values.copy()
     values[40, 10, 10] += 0.5
@@ -158,7 +158,7 @@ def run(found, tmp_path, monkeypatch):
 
 
 def test_the_inverse_network_is_asked_for_the_desired_tips(vessel, run):
-    made = plan(vessel, "0,0,33", PlanConfig(method="inverse", seconds=30.0), model=run)
+    made = plan(vessel, "0,0,33", config=PlanConfig(method="inverse", seconds=30.0), model=run)
     assert np.allclose(made.predicted[:, 0], made.desired[:, 0])
     assert made.trajectory.proximal[0, -1, 0, 0] == pytest.approx(made.desired[-1, 0] / SLACK, abs=1e-6)
 
@@ -171,14 +171,14 @@ def test_sampling_brings_the_predicted_tip_nearer_to_the_desired_one(vessel, run
     many = replace(many, sample=replace(many.sample, iterations=6, candidates=24))
     error = [
         np.abs(made.predicted - made.desired).mean()
-        for made in (plan(vessel, "0,0,33", c, model=run) for c in (few, many))
+        for made in (plan(vessel, "0,0,33", config=c, model=run) for c in (few, many))
     ]
     assert error[1] < 0.8 * error[0]
 
 
 def test_the_model_of_the_package_plans_to_a_target_and_leaves_the_patients_folder_alone(vessel):
     before = sorted(vessel.parent.rglob("*"))
-    made = plan(vessel, "0,0,33", PlanConfig(method="inverse", seconds=30.0), model=Path("pretrained"))
+    made = plan(vessel, "0,0,33", config=PlanConfig(method="inverse", seconds=30.0), model=Path("pretrained"))
     assert made.reached and made.model == "pretrained"
     assert np.abs(made.predicted[:, 0] - made.tip.abscissa[:, 0]).max() < 0.5
     assert sorted(vessel.parent.rglob("*")) == before
@@ -186,9 +186,9 @@ def test_the_model_of_the_package_plans_to_a_target_and_leaves_the_patients_fold
 
 def test_a_model_of_another_wire_is_refused(vessel, run):
     with pytest.raises(InputError, match="trained with workhorse-014"):
-        plan(vessel, "0,0,33", PlanConfig(method="inverse"), model=run, device="stiff-014")
+        plan(vessel, "0,0,33", config=PlanConfig(method="inverse"), model=run, device="stiff-014")
     with pytest.raises(InputError, match="--model"):
-        plan(vessel, "0,0,33", PlanConfig(method="mppi"))
+        plan(vessel, "0,0,33", config=PlanConfig(method="mppi"))
 
 
 def test_desired_tips_are_followed(vessel, tmp_path):

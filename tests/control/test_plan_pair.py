@@ -30,7 +30,7 @@ CONFIG = PlanConfig(arrives="catheter", seconds=40.0, tip="own")
 @pytest.fixture(scope="module")
 def pair(vessel) -> Plan:
     """Return a plan that brings the tip of a microcatheter along the vessel."""
-    return plan(vessel, "0,0,25", CONFIG, catheters=[CATHETER])
+    return plan(vessel, "0,0,25", config=CONFIG, device=Stack.of("workhorse-014", CATHETER))
 
 
 def test_the_catheter_s_tip_arrives_with_the_wire_no_deeper_in_it_than_allowed(pair):
@@ -45,7 +45,7 @@ def test_the_catheter_s_tip_arrives_with_the_wire_no_deeper_in_it_than_allowed(p
 
 
 def test_a_written_plan_is_read_back_and_drives_both_devices(pair, vessel, tmp_path):
-    figures = write_plan(pair, tmp_path / "plan")
+    figures = write_plan(pair, output=tmp_path / "plan")
     assert figures["tip_error_mm"] == pytest.approx(pair.cost_terms()["end"], abs=1e-3)
     anatomy, wire = read_anatomy(vessel), pair.navigation.device
     back = read_plan(tmp_path / "plan", anatomy, pair.navigation.stack)
@@ -64,9 +64,9 @@ def test_a_written_plan_is_read_back_and_drives_both_devices(pair, vessel, tmp_p
 
 
 def test_the_agent_s_ensemble_forecasts_the_x_ray_of_both(pair):
-    own = read_calibration(pair.config, None, devices=2)
-    assert own == Calibration.read(CALIBRATIONS["assumed", 2]) != read_calibration(pair.config, None)
-    xray = plan_xray(pair, own)
+    own = read_calibration(pair.config.method, None, 2)
+    assert own == Calibration.read(CALIBRATIONS["assumed", 2]) != read_calibration(pair.config.method, None, 1)
+    xray = plan_xray(pair)
     assert (xray.half_width > 0).all() and xray.exposure.sum() < len(pair.control) / 2
 
 
@@ -90,8 +90,8 @@ def test_the_commands_plan_and_simulate_take_a_catheter(vessel, tmp_path, capsys
         ({"config": replace(CONFIG, method="spin")}, {}, "method: spin; a wire in a catheter is planned by search"),
         ({"target": "tips.csv"}, {}, "desired tips are followed by a wire alone"),
         ({}, {"model": "pretrained"}, "--model pretrained: models are of a wire alone"),
-        ({}, {"catheters": [CATHETER, read_catheter("straight-5f")]}, "catheter: 2; the search drives one"),
-        ({}, {"catheters": []}, "arrives: catheter; there is none"),
+        ({}, {"device": Stack.of("workhorse-014", CATHETER, "straight-5f")}, "catheter: 2; the search drives one"),
+        ({}, {"device": None}, "arrives: catheter; there is none"),
         ({"config": replace(CONFIG, seconds=4.0)}, {}, r"seconds: 4 s are too few .* in microcatheter-1\.7f; give \d"),
         ({"config": replace(CONFIG, force_limit_n=1e-6)}, {}, "no path found to branch"),
     ],
@@ -99,4 +99,9 @@ def test_the_commands_plan_and_simulate_take_a_catheter(vessel, tmp_path, capsys
 def test_what_cannot_be_planned_is_refused(vessel, change, others, line):
     asked = {"target": "0,0,25", "config": CONFIG} | change
     with pytest.raises(InputError, match=line):
-        plan(vessel, asked["target"], asked["config"], **({"catheters": [CATHETER]} | others))
+        plan(
+            vessel,
+            asked["target"],
+            config=asked["config"],
+            **({"device": Stack.of("workhorse-014", CATHETER)} | others),
+        )

@@ -91,7 +91,7 @@ def due(xray: PlannedXray) -> list[int]:
 
 def test_a_networks_band_grows_from_exposure_to_exposure(by_network):
     # half-width 0.15 mm a mm of travel: 2 mm are reached after 14 mm, which are 7 periods of 2 mm
-    xray = plan_xray(by_network(Lagging()), calibration(abscissa=(0.0, 0.0, 0.15, 0.0)))
+    xray = plan_xray(by_network(Lagging()), calibration=calibration(abscissa=(0.0, 0.0, 0.15, 0.0)))
     assert due(xray) == [7, 14]
     travel = 2.0 * np.array([*range(1, 8), *range(1, 8), *range(1, 7)])
     np.testing.assert_allclose(xray.half_width[:, 0], 0.15 * travel, atol=1e-5)
@@ -99,7 +99,7 @@ def test_a_networks_band_grows_from_exposure_to_exposure(by_network):
 
 def test_a_networks_own_spread_widens_its_band_until_the_tip_is_observed(by_network):
     # 0.3 mm a period: 2 mm are reached after 7 of them
-    xray = plan_xray(by_network(Unsure()), calibration(abscissa=(0.0, 0.0, 0.0, 1.0)))
+    xray = plan_xray(by_network(Unsure()), calibration=calibration(abscissa=(0.0, 0.0, 0.0, 1.0)))
     assert due(xray) == [7, 14]
     np.testing.assert_allclose(xray.half_width[:, 0], 0.3 * np.array([*range(1, 8), *range(1, 8), *range(1, 7)]))
 
@@ -108,7 +108,7 @@ def test_a_networks_band_of_the_offset_reaches_the_wall(by_network):
     plan = by_network(Lagging())
     # clearance 1 − r_w mm: γ + 0.05 mm a period reaches 0.7 of it
     first = int(np.ceil((0.7 * (1.0 - plan.navigation.device.tip_radius_mm) - 0.1) / 0.05))
-    assert due(plan_xray(plan, calibration(offset=(0.0, 0.1, 0.0, 0.0))))[0] == first
+    assert due(plan_xray(plan, calibration=calibration(offset=(0.0, 0.1, 0.0, 0.0))))[0] == first
 
 
 class Branched(Lagging):
@@ -126,7 +126,7 @@ class Branched(Lagging):
 def test_a_network_observes_the_tip_in_the_branch_that_the_route_takes(by_network):
     model = Branched()
     plan = by_network(model)
-    xray = plan_xray(plan, calibration(abscissa=(0.0, 0.0, 0.15, 0.0)))
+    xray = plan_xray(plan, calibration=calibration(abscissa=(0.0, 0.0, 0.15, 0.0)))
     route = Route.to(plan.navigation.anatomy, plan.navigation.target)
     beyond = plan.predicted[xray.exposure, 0] > route.junctions[0]
     assert model.branches[-1] == np.where(beyond, *route.branches[::-1]).tolist() and len(set(model.branches[-1])) == 2
@@ -146,16 +146,16 @@ def test_the_agents_wires_follow_the_plan_and_observe_its_tip(found, monkeypatch
 
     monkeypatch.setattr(Belief, "weigh", watched_weigh)
     monkeypatch.setattr(Belief, "follow", watched_follow)
-    xray = plan_xray(found, calibration(abscissa=(5.0, 0.0, 0.0, 0.0)))  # wider than 2 mm from the start
+    xray = plan_xray(found, calibration=calibration(abscissa=(5.0, 0.0, 0.0, 0.0)))  # wider than 2 mm from the start
     assert due(xray) == list(range(3, 1 + len(found.control), 3))  # not sooner than 1.5 s after the last
     np.testing.assert_array_equal(observed, found.trajectory.tip_position[0, xray.exposure, 0])
     np.testing.assert_array_equal(followed, found.trajectory.proximal[0])
 
 
 def test_the_agents_own_calibration_asks_seldom_along_a_straight_vessel(found):
-    own = read_calibration(found.config, None)
+    own = read_calibration("search", None, 1)
     assert own == Calibration.read(CALIBRATIONS["assumed", 1])
-    xray = plan_xray(found, own)
+    xray = plan_xray(found)
     assert (xray.half_width > 0).all()
     assert xray.exposure.sum() < len(found.control) / 3
 
@@ -165,8 +165,8 @@ def test_it_is_written_beside_the_plan(found, vessel, tmp_path):
 
     from endopilot.anatomy.io import read_anatomy
 
-    xray = plan_xray(found, calibration(abscissa=(5.0, 0.0, 0.0, 0.0)))
-    figures = write_plan(found, tmp_path / "plan", xray)
+    xray = plan_xray(found, calibration=calibration(abscissa=(5.0, 0.0, 0.0, 0.0)))
+    figures = write_plan(found, output=tmp_path / "plan", xray=xray)
     table = pd.read_csv(tmp_path / "plan" / "plan.csv")
     assert (
         figures["xray_due_s"]
@@ -176,13 +176,13 @@ def test_it_is_written_beside_the_plan(found, vessel, tmp_path):
     assert figures["xray_due_s"]
     np.testing.assert_allclose(table[["band_tip_abscissa_mm", "band_tip_offset_mm"]], xray.half_width)
     read_plan(tmp_path / "plan", read_anatomy(vessel))
-    assert "xray_due_s" not in write_plan(found, tmp_path / "plan")
+    assert "xray_due_s" not in write_plan(found, output=tmp_path / "plan")
 
 
 def test_a_model_without_calibration_is_refused(tmp_path):
     (tmp_path / "run").mkdir()
     with pytest.raises(InputError, match=r"run: the model has no calibration.*endopilot advise"):
-        read_calibration(PlanConfig(method="inverse"), tmp_path / "run")
-    assert read_calibration(PlanConfig(method="search"), tmp_path / "run") == read_calibration(PlanConfig(), None)
+        read_calibration("inverse", tmp_path / "run", 1)
+    assert read_calibration("search", tmp_path / "run", 1) == read_calibration("search", None, 1)
     with pytest.raises(InputError, match="no such run"):
-        read_calibration(PlanConfig(method="mppi"), Path("nowhere"))
+        read_calibration("mppi", Path("nowhere"), 1)

@@ -84,7 +84,7 @@ def test_a_tip_is_chosen_that_enters(wide, wire) -> None:
 
 
 def test_a_fixed_tip_is_kept_and_the_fork_that_refuses_it_is_named(wide) -> None:
-    choice = choose_tip(wide, "45/3", catheter_tilt_deg=0.0)
+    choice = choose_tip(wide, tip="45/3", catheter_tilt_deg=0.0)
     assert choice.tip == "45/3"
     assert choice.refused is not None and choice.refused.branch == 2
     assert f"does not enter {choice.refused}" in choice.why and "at 20.0 mm" in choice.why
@@ -115,11 +115,11 @@ def test_a_catheter_is_turned_towards_a_route_that_leaves_its_axis_steeply(wide,
 )
 def test_a_tip_that_no_hand_can_shape_is_refused(wide, tip, message) -> None:
     with pytest.raises(InputError, match=message):
-        choose_tip(wide, tip)
+        choose_tip(wide, tip=tip)
 
 
 def test_a_wire_that_keeps_its_shape_is_tried_with_its_own_tip_alone(wide, wire) -> None:
     fixed = replace(wide, device=replace(wire, tip_shaping=None))
     assert choose_tip(fixed).tip == "45/3"
     with pytest.raises(InputError, match="its tip keeps its shape"):
-        choose_tip(fixed, "75/5")
+        choose_tip(fixed, tip="75/5")

@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.verification.contact import bent_tube
 from endopilot import _core
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.simulation.config import FREE_BEHIND_MM, Actuation, SimulatorConfig
 from endopilot.simulation.core import make_lumen, run_core
 from endopilot.simulation.rod import lay_out
@@ -32,7 +32,7 @@ def navigate(
     actuation: Actuation, lanes: int, *, worlds: slice = slice(None), walled: bool = True
 ) -> dict[str, np.ndarray]:
     """Return what the core records of random controls in a bent tube, or without a wall and faster."""
-    device, random = read_device("workhorse-014"), np.random.default_rng(11)
+    device, random = read_wire("workhorse-014"), np.random.default_rng(11)
     rod = lay_out(device, element_mm=CONFIG.element_mm, length_mm=90.0 + FREE_BEHIND_MM)
     low, high = ((-4, -2), (8, 2)) if actuation == "velocity" else ((-0.08, -0.2), (0.08, 0.2))
     return run_core(

@@ -13,7 +13,7 @@ from test_generate import data_hashes
 
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.files import read_json
 from toy_navigation import make_toy_dataset, write_toy_anatomies
@@ -74,7 +74,9 @@ def test_a_cluster_gives_the_same_bits_though_a_worker_dies(tmp_path, monkeypatc
         monkeypatch.setattr(_Ledger, "add", kill_one)
         config = DatasetConfig(anatomy_shares=(2 / 3, 0.0, 1 / 3), **SETTINGS)
         folders = write_toy_anatomies(tmp_path / "anatomies", 3)
-        generate_dataset(folders, tmp_path / "there", read_device("workhorse-014"), config, scheduler=address)
+        generate_dataset(
+            folders, output=tmp_path / "there", device=read_wire("workhorse-014"), config=config, scheduler=address
+        )
         assert killed
         assert processes[1].wait(timeout=60) != 0
     finally:

@@ -21,7 +21,7 @@ from endopilot.anatomy.io import write_anatomy
 from endopilot.cli import main
 from endopilot.dataset import layout
 from endopilot.dataset.config import DatasetConfig
-from endopilot.dataset.loader import load_dataset
+from endopilot.dataset.loader import read_dataset
 from endopilot.devices.device_files import device_yaml
 from endopilot.errors import InputError
 from endopilot.files import read_json, sha256
@@ -57,14 +57,14 @@ def test_pandas_reads_the_layout_of_lerobot(toy_dataset):
 
 
 def test_motion_is_the_integral_of_the_control(toy_dataset):
-    data = load_dataset(toy_dataset)
+    data = read_dataset(toy_dataset)
     travel = data.sample_period_s * np.cumsum(data.control.astype(float), axis=1)
     np.testing.assert_allclose(data.inserted_length, data.initial[:, None, :, 0] + travel[..., 0], atol=1e-5)
     np.testing.assert_allclose(data.rotation, data.initial[:, None, :, 1] + travel[..., 1], atol=1e-5)
 
 
 def test_an_episode_repeats_exactly_from_the_disk(toy_dataset):
-    data = load_dataset(toy_dataset)
+    data = read_dataset(toy_dataset)
     chosen = data.select(data.anatomy == data.anatomy[0])
     options = {"initial": chosen.initial, "config": SimulatorConfig(), "friction": chosen.friction}
     again = toy_simulate(toy_anatomy(str(chosen.anatomy[0])), data.stack, chosen.control.astype(float), **options)
@@ -73,7 +73,7 @@ def test_an_episode_repeats_exactly_from_the_disk(toy_dataset):
 
 
 def test_statistics_are_those_of_the_samples(toy_dataset):
-    data, stats = load_dataset(toy_dataset), read_json(toy_dataset / "meta/stats.json")
+    data, stats = read_dataset(toy_dataset), read_json(toy_dataset / "meta/stats.json")
     flat = data.control.reshape(-1, 2).astype(float)
     np.testing.assert_allclose(stats["action"]["mean"], flat.mean(axis=0), atol=1e-9)
     np.testing.assert_allclose(stats["action"]["std"], flat.std(axis=0), rtol=1e-9)
@@ -82,7 +82,7 @@ def test_statistics_are_those_of_the_samples(toy_dataset):
 
 
 def test_no_anatomy_of_test_is_trained_on(toy_dataset):
-    data = load_dataset(toy_dataset)
+    data = read_dataset(toy_dataset)
     assert not set(data.of_split("train").anatomy) & set(data.of_split("test").anatomy)
     assert set(data.of_split("seen_test").anatomy) == set(data.of_split("train").anatomy)
     pairs = {(a, s) for split in ("train", "seen_test") for a, s in _keys(data.of_split(split))}
@@ -100,7 +100,7 @@ def test_no_anatomy_is_in_two_of_the_three_splits_that_are_stored(tmp_path):
 
 def test_bits_do_not_depend_on_how_sequences_are_put_into_files(tmp_path, toy_dataset):
     make_toy_dataset(tmp_path / "small-files", patients=6, sequences=24, sequences_per_file=7)
-    whole, split = load_dataset(toy_dataset), load_dataset(tmp_path / "small-files")
+    whole, split = read_dataset(toy_dataset), read_dataset(tmp_path / "small-files")
     assert split.manifest["files"] == 6 * 4
     for name in ("control", "tip_abscissa", "friction", "initial", "split", "anatomy"):
         assert (getattr(whole, name) == getattr(split, name)).all(), name
@@ -108,7 +108,7 @@ def test_bits_do_not_depend_on_how_sequences_are_put_into_files(tmp_path, toy_da
 
 def test_friction_is_drawn_from_its_range(tmp_path):
     make_toy_dataset(tmp_path / "d", patients=1, sequences=40, friction=(0.05, 0.2), seconds=2.0)
-    friction = load_dataset(tmp_path / "d").friction
+    friction = read_dataset(tmp_path / "d").friction
     assert 0.05 <= friction.min() < 0.08 < 0.17 < friction.max() <= 0.2
 
 
@@ -135,7 +135,7 @@ def test_killed_and_resumed_gives_the_same_bits(tmp_path):
             process.send_signal(signal.SIGKILL)
             process.wait()
     with pytest.raises(InputError, match="unfinished"):
-        load_dataset(tmp_path / "killed")
+        read_dataset(tmp_path / "killed")
     (tmp_path / "killed/data/chunk-000/.part-1-file-007.parquet").write_bytes(b"cut off by the kill")
     make_toy_dataset(tmp_path / "killed", **settings)
     assert data_hashes(tmp_path / "killed") == data_hashes(tmp_path / "whole")
@@ -153,7 +153,7 @@ def test_a_lost_file_is_made_again(tmp_path):
     before = data_hashes(tmp_path / "d")
     (tmp_path / "d/data/chunk-000/file-001.parquet").unlink()
     with pytest.raises(InputError, match=r"file-001\.parquet: missing"):
-        load_dataset(tmp_path / "d")
+        read_dataset(tmp_path / "d")
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4, sequences_per_file=2)
     assert data_hashes(tmp_path / "d") == before
 
@@ -165,16 +165,16 @@ def test_a_lost_description_is_made_again(tmp_path, name):
     (tmp_path / "d/meta" / name).unlink()
     if name == "info.json":
         with pytest.raises(InputError, match=r"info\.json: missing"):
-            load_dataset(tmp_path / "d")
+            read_dataset(tmp_path / "d")
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
     assert (tmp_path / "d/meta" / name).read_bytes() == before
 
 
 def test_another_anatomy_in_the_place_of_the_dataset_s_own_is_refused(tmp_path):
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
-    data, folder = load_dataset(tmp_path / "d"), tmp_path / "anatomies/patient-0"
+    data, folder = read_dataset(tmp_path / "d"), tmp_path / "anatomies/patient-0"
     assert data.anatomy_folder("patient-0") == folder.resolve()
-    write_anatomy(replace(toy_anatomy("patient-0"), catheter_radius_mm=1.0), folder)
+    write_anatomy(replace(toy_anatomy("patient-0"), catheter_radius_mm=1.0), output=folder)
     with pytest.raises(InputError, match="is not the anatomy that"):
         data.anatomy_folder("patient-0")
 
@@ -183,7 +183,7 @@ def test_other_settings_are_refused_by_name(tmp_path):
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
     with pytest.raises(InputError, match=r"config\.sequences = 4, now it is 5"):
         make_toy_dataset(tmp_path / "d", patients=1, sequences=5)
-    write_anatomy(replace(toy_anatomy("patient-0"), catheter_radius_mm=1.0), tmp_path / "anatomies/patient-0")
+    write_anatomy(replace(toy_anatomy("patient-0"), catheter_radius_mm=1.0), output=tmp_path / "anatomies/patient-0")
     with pytest.raises(InputError, match=r"anatomies\.patient-0 ="):
         make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
 
@@ -198,7 +198,7 @@ def test_a_folder_of_other_things_is_refused(tmp_path):
 
 def test_two_anatomies_of_one_name_are_refused(tmp_path):
     for folder in ("patient-0", "patient-1"):
-        write_anatomy(toy_anatomy("twin"), tmp_path / "anatomies" / folder)
+        write_anatomy(toy_anatomy("twin"), output=tmp_path / "anatomies" / folder)
     with pytest.raises(InputError, match="2 are named 'twin'"):
         make_toy_dataset(tmp_path / "d", patients=2, sequences=4)
     assert not (tmp_path / "d").exists()
@@ -238,7 +238,7 @@ def test_invalid_worlds_are_listed_and_never_trained_on(tmp_path):
     assert record["episodes"] == 1
     assert record["which"][0]["sequence"] == 3
     assert record["which"][0]["invalid_reason"] == "did not converge after 25 s"
-    data = load_dataset(tmp_path / "d")
+    data = read_dataset(tmp_path / "d")
     assert not data.valid[3].all()
     for split in ("train", "seen_test"):
         assert 3 not in data.of_split(split).sequence
@@ -275,7 +275,7 @@ def _keys(data):
 
 def test_loader_names_what_is_damaged(tmp_path):
     with pytest.raises(InputError, match="no dataset here"):
-        load_dataset(tmp_path)
+        read_dataset(tmp_path)
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4, sequences_per_file=2)
     make_toy_dataset(tmp_path / "other", patients=1, sequences=4, sequences_per_file=2, seed=9)
     file = tmp_path / "d/data/chunk-000/file-001.parquet"
@@ -283,32 +283,32 @@ def test_loader_names_what_is_damaged(tmp_path):
 
     file.write_bytes(whole[:-40])
     with pytest.raises(InputError, match=r"file-001\.parquet: damaged"):
-        load_dataset(tmp_path / "d")
+        read_dataset(tmp_path / "d")
     file.write_bytes((tmp_path / "other/data/chunk-000/file-001.parquet").read_bytes())
     with pytest.raises(InputError, match=r"file-001\.parquet: written by another version or with other settings"):
-        load_dataset(tmp_path / "d")
+        read_dataset(tmp_path / "d")
     file.write_bytes(whole)
     info = read_json(tmp_path / "d/meta/info.json")
     (tmp_path / "d/meta/info.json").write_text(json.dumps(info | {"codebase_version": "v2.1"}))
     with pytest.raises(InputError, match=r"codebase_version is v2\.1"):
-        load_dataset(tmp_path / "d")
+        read_dataset(tmp_path / "d")
     (tmp_path / "d/meta/info.json").write_text(json.dumps(info))
     manifest = read_json(tmp_path / "d/meta/manifest.json")
     older = manifest["settings"] | {"version": "endopilot 0.0.9, format 1"}
     (tmp_path / "d/meta/manifest.json").write_text(json.dumps(manifest | {"settings": older}))
     with pytest.raises(InputError, match=r"made by endopilot 0\.0\.9, format 1, which .* cannot read"):
-        load_dataset(tmp_path / "d")
+        read_dataset(tmp_path / "d")
     (tmp_path / "d/meta/manifest.json").write_text(json.dumps({"key": "0"}))
     with pytest.raises(InputError, match=r"manifest\.json: settings: missing; make the dataset again"):
-        load_dataset(tmp_path / "d")
+        read_dataset(tmp_path / "d")
     for name, odd in (("settings", None), ("anatomies", "x"), ("files", []), ("key", 3), ("samples_per_episode", None)):
         (tmp_path / "d/meta/manifest.json").write_text(json.dumps(manifest | {name: odd}))
         with pytest.raises(InputError, match="; make the dataset again"):
-            load_dataset(tmp_path / "d")
+            read_dataset(tmp_path / "d")
     (tmp_path / "d/meta/manifest.json").write_text(json.dumps(manifest))
     (tmp_path / "d/meta/info.json").unlink()
     with pytest.raises(InputError, match=r"info\.json: missing from the dataset"):
-        load_dataset(tmp_path / "d")
+        read_dataset(tmp_path / "d")
 
 
 def test_files_of_two_devices_are_not_mixed(tmp_path):
@@ -318,7 +318,7 @@ def test_files_of_two_devices_are_not_mixed(tmp_path):
         file = f"{path}/chunk-000/file-001.parquet"
         (tmp_path / "d" / file).write_bytes((tmp_path / "e" / file).read_bytes())
     with pytest.raises(InputError, match=r"file-001\.parquet: written by another version or with other settings"):
-        load_dataset(tmp_path / "d")
+        read_dataset(tmp_path / "d")
     with pytest.raises(InputError, match=r"was begun with device\.name = workhorse-014, now it is stiff-014"):
         make_toy_dataset(tmp_path / "d", patients=1, sequences=4, sequences_per_file=2, device="stiff-014")
 
@@ -368,7 +368,7 @@ def test_a_bad_dataset_gives_one_line_at_the_command_line(tmp_path, capsys):
 def test_an_absent_split_is_named(tmp_path):
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
     with pytest.raises(InputError, match=r"no valid episode in split 'test' \(it has seen_test, train\)"):
-        load_dataset(tmp_path / "d").of_split("test")
+        read_dataset(tmp_path / "d").of_split("test")
 
 
 def test_importing_needs_no_torch():

@@ -9,7 +9,7 @@ import pytest
 
 from endopilot.cli import main
 from endopilot.dataset.info import describe_dataset, draw_pictures
-from endopilot.dataset.loader import load_dataset
+from endopilot.dataset.loader import read_dataset
 from toy_navigation import make_toy_dataset, toy_simulate
 
 
@@ -28,7 +28,7 @@ def folder(tmp_path_factory):
 
 
 def test_figures_are_those_of_the_samples(folder):
-    data, figures = load_dataset(folder), describe_dataset(folder).figures
+    data, figures = read_dataset(folder), describe_dataset(folder).figures
     assert (figures["anatomies"], figures["navigations"], figures["samples"]) == (3, 30, 3600)
     assert figures["hours"] == 0.5
     assert figures["splits"] == {name: int((data.split == name).sum()) for name in set(data.split.tolist())}
@@ -46,7 +46,7 @@ def test_figures_are_those_of_the_samples(folder):
 
 
 def test_manoeuvres_are_those_that_were_driven(folder):
-    data = load_dataset(folder)
+    data = read_dataset(folder)
     velocity = data.control[data.valid][:, 0]
     shares = describe_dataset(folder).figures["manoeuvres"]
     assert shares["insertion"] == pytest.approx((velocity[:, 0] > 0.1).mean(), abs=1e-4)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from endopilot.dataset import join
-from endopilot.dataset.join import load_joined
-from endopilot.dataset.loader import load_dataset
+from endopilot.dataset.join import read_joined
+from endopilot.dataset.loader import read_dataset
 from endopilot.errors import InputError
 from toy_navigation import make_toy_dataset
 
@@ -24,7 +24,7 @@ def second(tmp_path_factory) -> Path:
 
 
 def test_episodes_stand_behind_each_other(toy_dataset, second):
-    parts, both = [load_dataset(folder) for folder in (toy_dataset, second)], load_joined([toy_dataset, second])
+    parts, both = [read_dataset(folder) for folder in (toy_dataset, second)], read_joined([toy_dataset, second])
     assert len(both) == sum(map(len, parts))
     for name in ("tip_abscissa", "control", "valid", "friction", "anatomy"):
         np.testing.assert_array_equal(getattr(both, name), np.concatenate([getattr(part, name) for part in parts]))
@@ -34,9 +34,9 @@ def test_episodes_stand_behind_each_other(toy_dataset, second):
 
 
 def test_a_patient_that_is_kept_for_a_test_trains_in_no_dataset(toy_dataset, second):
-    first, both = load_dataset(toy_dataset), load_joined([toy_dataset, second])
+    first, both = read_dataset(toy_dataset), read_joined([toy_dataset, second])
     kept = {str(name) for name in first.anatomy[np.isin(first.split, ("calibrate", "test"))]}
-    later = load_dataset(second)
+    later = read_dataset(second)
     at_odds = [name for name in kept if ((later.anatomy == name) & (later.split == "train")).any()]
     assert at_odds, "the second dataset trains on a patient that the first one keeps"
     assert not kept & {str(name) for name in both.anatomy[both.split == "train"]}
@@ -44,8 +44,8 @@ def test_a_patient_that_is_kept_for_a_test_trains_in_no_dataset(toy_dataset, sec
 
 def test_what_does_not_go_together_is_refused(toy_dataset, second, monkeypatch):
     with pytest.raises(InputError, match="dataset: none given"):
-        load_joined([])
-    other = load_dataset(second)
+        read_joined([])
+    other = read_dataset(second)
     device = other.manifest["device"]
     cases = {
         "another tip_bend_rad; join datasets of one wire": {"device": device | {"tip_bend_rad": 1.0}},
@@ -54,10 +54,10 @@ def test_what_does_not_go_together_is_refused(toy_dataset, second, monkeypatch):
         },
     }
     for message, changed in cases.items():
-        made = {toy_dataset: load_dataset(toy_dataset), second: replace(other, manifest=other.manifest | changed)}
-        monkeypatch.setattr(join, "load_dataset", made.__getitem__)
+        made = {toy_dataset: read_dataset(toy_dataset), second: replace(other, manifest=other.manifest | changed)}
+        monkeypatch.setattr(join, "read_dataset", made.__getitem__)
         with pytest.raises(InputError, match=message):
-            load_joined([toy_dataset, second])
+            read_joined([toy_dataset, second])
     same = replace(other, manifest=other.manifest | {"device": device | {"friction": 0.3, "name": "mine"}})
-    monkeypatch.setattr(join, "load_dataset", {toy_dataset: load_dataset(toy_dataset), second: same}.__getitem__)
-    assert len(load_joined([toy_dataset, second])) > len(other)
+    monkeypatch.setattr(join, "read_dataset", {toy_dataset: read_dataset(toy_dataset), second: same}.__getitem__)
+    assert len(read_joined([toy_dataset, second])) > len(other)

@@ -9,7 +9,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from endopilot.dataset.loader import load_dataset
+from endopilot.dataset.loader import read_dataset
 
 READER = """
 import json, sys
@@ -34,7 +34,7 @@ def test_lerobot_reads_a_dataset(toy_dataset):
         [python, "-c", READER, str(toy_dataset), "250"], capture_output=True, text=True, env=environment, check=False
     )
     assert result.returncode == 0, result.stderr
-    read, data = json.loads(result.stdout.splitlines()[-1]), load_dataset(toy_dataset)
+    read, data = json.loads(result.stdout.splitlines()[-1]), read_dataset(toy_dataset)
     assert (read["samples"], read["episodes"], read["fps"]) == (144 * 120, 144, 2)
     assert read["task"] == "random navigation"
     assert read["names"] == ["translation_mm_s", "rotation_rad_s"]

@@ -18,11 +18,12 @@ from endopilot.dataset.draw import draw_navigations
 from endopilot.dataset.episode import write_episode
 from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.info import describe_dataset
-from endopilot.dataset.join import load_joined
-from endopilot.dataset.loader import Dataset, load_dataset
+from endopilot.dataset.join import read_joined
+from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.dataset.navigations import STOP_SHORT_MM, simulate_navigations
+from endopilot.dataset.schema import OF_ROBOT
 from endopilot.devices.catheter import read_catheter
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import read_json
@@ -32,7 +33,7 @@ from endopilot.simulation.signals import Outputs
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.trajectory import Trajectory
 
-WIRE, CATHETER = read_device("workhorse-014"), read_catheter("microcatheter-1.7f")
+WIRE, CATHETER = read_wire("workhorse-014"), read_catheter("microcatheter-1.7f")
 WEAK = replace(CATHETER, push_limit_n=0.03, pull_limit_n=0.021)
 CONFIG = DatasetConfig(sequences=3, seconds=10.0, seed=7)
 OF_EPISODES = ("folder", "manifest", "sample_period_s", "anatomy", "sequence", "split", "device", "friction")
@@ -45,7 +46,7 @@ EXACT = {"command": np.float64, "slip": np.float64, "rotation_slip": np.float64,
 @pytest.fixture(scope="module")
 def patient(tmp_path_factory):
     folder = tmp_path_factory.mktemp("anatomies") / "patient"
-    write_anatomy(make_patient(AtlasConfig(count=1, seed=4, population="textbook"), 0), folder)
+    write_anatomy(make_patient(AtlasConfig(count=1, seed=4, population="textbook"), 0), output=folder)
     return folder
 
 
@@ -53,12 +54,12 @@ def patient(tmp_path_factory):
 def pairs(patient, tmp_path_factory):
     """Return a dataset of a wire in a weakly driven catheter, which slips."""
     folder = tmp_path_factory.mktemp("pairs") / "dataset"
-    generate_dataset([patient], folder, Stack(WIRE, (WEAK,)), CONFIG)
+    generate_dataset([patient], output=folder, device=Stack(WIRE, (WEAK,)), config=CONFIG)
     return folder
 
 
 def test_the_commands_of_both_devices_repeat_an_episode_to_the_bit(pairs, patient):
-    data = load_dataset(pairs)
+    data = read_dataset(pairs)
     assert data.valid.all() and data.command.shape == (3, 20, 2, 2)
     assert (data.slip[:, :, 1] != 0).any()
     ((chosen, again),) = simulate_again(data, read_anatomy(patient), data.command)
@@ -84,12 +85,13 @@ def test_every_number_of_every_device_is_read_back(patient, tmp_path):
     assert (made.command != made.command.astype(np.float32)).any() and (made.slip != 0).any()
     told = {"task": "navigate", "seed": 7, "origin": {}, "tip_stiffness_factor": 1.0}
     write_episode(made, patient, tmp_path / "episode", stack, **told)
-    data = load_dataset(tmp_path / "episode")
+    data = read_dataset(tmp_path / "episode")
     _assert_same(data, made)
     np.testing.assert_array_equal(data.initial, initial)
     np.testing.assert_array_equal(data.friction, made.set_up.friction)
     kept = {field.name for field in fields(data)} - set(OF_EPISODES)
-    assert kept == {*OF_TRAJECTORY, *OF_TIP}
+    assert kept == {*OF_TRAJECTORY, *OF_TIP, *OF_ROBOT}
+    assert all(getattr(data, name) is None for name in OF_ROBOT)  # no robot drove
     ((_, again),) = simulate_again(data, read_anatomy(patient), data.command)
     for name in OF_TRAJECTORY:
         np.testing.assert_array_equal(getattr(again, name), getattr(made, name), err_msg=name)
@@ -107,7 +109,7 @@ def _assert_same(data: Dataset, trajectory: Trajectory) -> None:
 
 
 def test_devices_and_columns_are_named(pairs):
-    data, info = load_dataset(pairs), read_json(pairs / "meta/info.json")
+    data, info = read_dataset(pairs), read_json(pairs / "meta/info.json")
     assert [catheter.name for catheter in data.stack.catheters] == ["microcatheter-1.7f"]
     assert data.stack.catheters[0].push_limit_n == 0.03
     assert describe_dataset(pairs).figures["catheters"] == ["microcatheter-1.7f"]
@@ -156,7 +158,7 @@ def test_a_catheter_stops_short_of_the_end_of_the_vessel(patient):
 
 
 def test_models_refuse_it_with_one_line(pairs, capsys, tmp_path):
-    data = load_dataset(pairs)
+    data = read_dataset(pairs)
     line = "its wires lie in microcatheter-1.7f, and a model takes a wire alone; make a dataset without --catheter"
     for refused in (lambda: Episodes.of_dataset(data), lambda: check_wire(pairs, {"device": {}}, data)):
         with pytest.raises(InputError, match=line):
@@ -169,14 +171,16 @@ def test_models_refuse_it_with_one_line(pairs, capsys, tmp_path):
 
 
 def test_what_does_not_go_together_is_refused(pairs, patient, tmp_path, monkeypatch):
-    data = load_dataset(pairs)
+    data = read_dataset(pairs)
     bare = replace(data, folder=tmp_path, manifest=data.manifest | {"catheters": []})
-    monkeypatch.setattr(join, "load_dataset", {pairs: data, tmp_path: bare}.__getitem__)
+    monkeypatch.setattr(join, "read_dataset", {pairs: data, tmp_path: bare}.__getitem__)
     with pytest.raises(InputError, match=r"lies in no catheter, and that of .* in microcatheter-1\.7f; join"):
-        load_joined([pairs, tmp_path])
-    assert len(load_joined([pairs, pairs]).slip) == 2 * len(data)
+        read_joined([pairs, tmp_path])
+    assert len(read_joined([pairs, pairs]).slip) == 2 * len(data)
     with pytest.raises(InputError, match="control: 'force' with catheters; give 'velocity'"):
-        generate_dataset([patient], tmp_path / "f", Stack(WIRE, (CATHETER,)), replace(CONFIG, control="force"))
+        generate_dataset(
+            [patient], output=tmp_path / "f", device=Stack(WIRE, (CATHETER,)), config=replace(CONFIG, control="force")
+        )
     with pytest.raises(InputError, match="too wide for the bore"):
-        generate_dataset([patient], tmp_path / "w", Stack(read_device("j-035"), (CATHETER,)), CONFIG)
+        generate_dataset([patient], output=tmp_path / "w", device=Stack(read_wire("j-035"), (CATHETER,)), config=CONFIG)
     assert not (tmp_path / "f").exists() and not (tmp_path / "w").exists()

@@ -14,30 +14,33 @@ from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.draw import TIP_GROUP, draw_navigations, patient_motion
 from endopilot.dataset.episode import write_episode
 from endopilot.dataset.generate import generate_dataset
-from endopilot.dataset.loader import load_dataset
+from endopilot.dataset.loader import read_dataset
 from endopilot.dataset.navigations import PULL_BACK_MM, STOP_SHORT_MM, simulate_navigations
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
+from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.devices.stack import Stack
+from endopilot.errors import InputError
 from endopilot.evaluation.replay import Recorded
 from endopilot.models.config import WINDOW
+from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import motion_named
 from endopilot.simulation.simulate import simulate
 
-DEVICE = read_device("workhorse-014")
+DEVICE = read_wire("workhorse-014")
 
 
 @pytest.fixture(scope="module")
 def patient(tmp_path_factory):
     folder = tmp_path_factory.mktemp("anatomies") / "patient"
-    write_anatomy(make_patient(AtlasConfig(count=1, seed=4, population="textbook"), 0), folder)
+    write_anatomy(make_patient(AtlasConfig(count=1, seed=4, population="textbook"), 0), output=folder)
     return folder
 
 
 def test_an_episode_simulated_from_the_disk_repeats_to_the_bit(tmp_path, patient):
     ranges = {"friction": (0.05, 0.2), "tip_bend_factor": (0.5, 1.5), "tip_stiffness_factor": (0.5, 2.0)}
     config = DatasetConfig(sequences=TIP_GROUP + 2, seconds=4.0, seed=2, **ranges)
-    generate_dataset([patient], tmp_path / "dataset", DEVICE, config)
-    data = load_dataset(tmp_path / "dataset")
+    generate_dataset([patient], output=tmp_path / "dataset", device=DEVICE, config=config)
+    data = read_dataset(tmp_path / "dataset")
     assert data.valid.all()
     assert set(data.device) == {DEVICE.name}
     assert (data.anatomy_folder(str(data.anatomy[0]))) == patient.resolve()
@@ -62,8 +65,8 @@ def test_an_episode_simulated_from_the_disk_repeats_to_the_bit(tmp_path, patient
 def test_where_the_drive_slipped_its_commands_repeat_the_navigation(tmp_path, patient):
     weak = replace(DEVICE, push_limit_n=0.1, pull_limit_n=0.02, torque_limit_n_mm=0.005)
     config = DatasetConfig(sequences=6, seconds=30.0, seed=6, friction=(0.2, 0.3))
-    generate_dataset([patient], tmp_path / "dataset", weak, config)
-    data = load_dataset(tmp_path / "dataset")
+    generate_dataset([patient], output=tmp_path / "dataset", device=weak, config=config)
+    data = read_dataset(tmp_path / "dataset")
     assert (data.slip != 0).any() and (data.rotation_slip != 0).any()
     slips = ((data.slip != 0) | (data.rotation_slip != 0)).any(axis=(1, 2))
 
@@ -78,6 +81,46 @@ def test_where_the_drive_slipped_its_commands_repeat_the_navigation(tmp_path, pa
     np.testing.assert_array_equal(again.rotation_slip, data.rotation_slip)
     # what was made of it, driven evenly, does not
     assert np.abs(retraced(data.control.astype(float)).tip.abscissa - data.tip_abscissa)[slips].max() > 0.01
+
+
+def test_a_robot_makes_the_motions_and_what_it_was_told_and_measured_stands_beside_what_was_true(tmp_path, patient):
+    play = DriveConfig(play_mm=2.4, play_rad=1.0, gain_sd_translation=0.05, grip_n=0.3)
+    robot = RobotConfig(encoders_at="motor", jitter_s=0.05, wire=play)
+    config = DatasetConfig(sequences=5, seconds=20.0, seed=2, sequences_per_file=3, friction=(0.05, 0.2))
+    generate_dataset([patient], device=DEVICE, output=tmp_path / "all", config=config, robot=robot)
+    data = read_dataset(tmp_path / "all")
+    assert data.robot == robot and data.stack.wire.push_limit_n == 0.3
+    assert data.decided is not None and data.encoders is not None and data.load is not None
+    # encoders at the motors follow what the robot was told, late; the devices lie off them by gain and play
+    motor = data.encoders[..., 0, 0] - data.initial[:, None, 0, 0]
+    told = 0.5 * np.cumsum(data.decided[..., 0, 0].astype(float), axis=1)
+    assert np.abs(motor - told).max() < 12.0 * (0.05 + 0.05 + 0.1)
+    true = data.inserted_length[..., 0] - data.initial[:, None, 0, 0]
+    assert np.abs(true - motor).max() > 1.2
+    reversals = np.abs(np.diff(np.sign(data.decided[..., 0, 0]), axis=1)) == 2
+    assert reversals.any()
+    noise = data.load[..., 0, 0] - data.drive_force[..., 0]
+    assert noise.std() == pytest.approx(play.load_sd_n, rel=0.2)
+    # what the drives made of it repeats the navigation
+    again = simulate(
+        read_anatomy(patient),
+        data.stack,
+        data.command,
+        initial=data.initial,
+        config=SimulatorConfig(**data.manifest["config"]["simulator"]),
+        friction=data.friction,
+    )
+    np.testing.assert_array_equal(again.tip.abscissa.astype(np.float32), data.tip_abscissa)
+    np.testing.assert_array_equal(again.inserted_length.astype(np.float32), data.inserted_length)
+    # a navigation's robot does not depend on the others
+    fewer = replace(config, sequences=2)
+    generate_dataset([patient], device=DEVICE, output=tmp_path / "few", config=fewer, robot=robot)
+    few = read_dataset(tmp_path / "few")
+    for name in ("decided", "encoders", "load", "inserted_length"):
+        np.testing.assert_array_equal(getattr(few, name), getattr(data, name)[:2])
+    forced = replace(config, control="force")
+    with pytest.raises(InputError, match="control: 'force' with a robot, which takes velocities; give 'velocity'"):
+        generate_dataset([patient], device=DEVICE, output=tmp_path / "no", config=forced, robot=robot)
 
 
 def test_wires_stay_inside_the_imaged_vessel_and_repeat_from_the_recorded_controls(patient):
@@ -122,12 +165,12 @@ def test_a_draw_does_not_depend_on_the_others(patient):
 
 def test_a_dataset_driven_by_force(tmp_path, patient):
     config = DatasetConfig(sequences=2, seconds=12.0, control="force", sequences_per_file=1, seed=6)
-    generate_dataset([patient], tmp_path / "dataset", DEVICE, config)
+    generate_dataset([patient], output=tmp_path / "dataset", device=DEVICE, config=config)
     samples = pd.read_parquet(tmp_path / "dataset/data/chunk-000/file-001.parquet")
     load, velocity = np.stack(samples["action"]), np.stack(samples["velocity"])
     assert np.array_equal(load, samples[["drive_force_n", "drive_torque_nmm"]].to_numpy())
     assert 0.05 < np.abs(load[:, 0]).max() < DEVICE.push_limit_n
-    data = load_dataset(tmp_path / "dataset")
+    data = read_dataset(tmp_path / "dataset")
     one = data.select(np.array([1]))
     assert np.array_equal(one.command[0, :, 0], load)
     assert np.array_equal(one.control[0, :, 0], velocity)
@@ -149,8 +192,8 @@ def test_a_dataset_driven_by_force(tmp_path, patient):
 
 def test_vessels_move_as_it_is_drawn_for_each_patient(tmp_path, patient):
     config = DatasetConfig(sequences=2, seconds=16.0, seed=2, motion="both", anatomy_shares=(1.0, 0.0, 0.0))
-    generate_dataset([patient], tmp_path / "dataset", DEVICE, config)
-    data = load_dataset(tmp_path / "dataset")
+    generate_dataset([patient], output=tmp_path / "dataset", device=DEVICE, config=config)
+    data = read_dataset(tmp_path / "dataset")
     name = str(data.anatomy[0])
     assert data.motion(name) == patient_motion(config, name) != patient_motion(config, "somebody else")
     assert patient_motion(replace(config, motion="still"), name) is None
@@ -174,7 +217,7 @@ def test_an_episode_names_the_motion_of_its_vessel_and_is_replayed_in_it(tmp_pat
     assert (drawn.control != drawn.control.astype(np.float32)).any()
     told = {"task": "navigate", "seed": 7, "origin": {}, "tip_stiffness_factor": 1.0}
     write_episode(trajectory, patient, tmp_path / "episode", Stack(DEVICE), **told)
-    data = load_dataset(tmp_path / "episode")
+    data = read_dataset(tmp_path / "episode")
     assert data.motion(str(data.anatomy[0])) == motion
     ((_, again),) = Recorded.of(data).simulated({"true_replay": data.command[:, WINDOW:, 0]})
     for name in ("tip_position", "tip_direction", "drive_force", "drive_torque", "contact_force_sum"):
@@ -183,4 +226,4 @@ def test_an_episode_names_the_motion_of_its_vessel_and_is_replayed_in_it(tmp_pat
     np.testing.assert_array_equal(again.command, trajectory.command)
     still = replace(trajectory, set_up=replace(trajectory.set_up, motion=None))
     write_episode(still, patient, tmp_path / "still", Stack(DEVICE), **told)
-    assert load_dataset(tmp_path / "still").motion(str(data.anatomy[0])) is None
+    assert read_dataset(tmp_path / "still").motion(str(data.anatomy[0])) is None

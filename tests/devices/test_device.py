@@ -7,16 +7,19 @@ import numpy as np
 import pytest
 
 import endopilot
-from endopilot.devices.device import Wire, read_device, write_device
-from endopilot.devices.device_files import list_devices
+from endopilot.devices.catheter import read_catheter
+from endopilot.devices.device import Wire, read_wire
+from endopilot.devices.device_files import list_wires
+from endopilot.devices.stack import Stack
+from endopilot.devices.write import write_device
 from endopilot.errors import InputError
 
 SHIPPED = Path(endopilot.__file__).parent / "devices/wires"
 
 
-@pytest.mark.parametrize("name", list_devices())
+@pytest.mark.parametrize("name", list_wires())
 def test_shipped_devices_are_whole(name: str) -> None:
-    device = read_device(name)
+    device = read_wire(name)
     assert device.name == name
     assert all(len(source) > 10 for source in device.sources.values())
     assert Wire(**asdict(device)) == device
@@ -74,7 +77,7 @@ def test_bad_file_is_refused(tmp_path: Path, old: str, new: str, message: str) -
     path = tmp_path / "wire.yaml"
     path.write_text(text.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(InputError) as error:
-        read_device(path)
+        read_wire(path)
     assert str(error.value).startswith(f"{path}: {message}")
     assert "\n" not in str(error.value)
 
@@ -83,23 +86,23 @@ def test_a_file_that_is_no_device_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "wire.yaml"
     path.write_text("- 1\n")
     with pytest.raises(InputError, match="no mapping of fields"):
-        read_device(path)
+        read_wire(path)
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="no text"):
-        read_device(path)
+        read_wire(path)
     with pytest.raises(InputError, match="no such device or file"):
-        read_device(tmp_path)
+        read_wire(tmp_path)
 
 
 def test_unknown_device_is_refused() -> None:
     with pytest.raises(InputError, match="workhorse-014"):
-        read_device("no-such-wire")
+        read_wire("no-such-wire")
     with pytest.raises(InputError, match="tip_load_n"):
-        replace(read_device("workhorse-014"), tip_load_n=-1.0)
+        replace(read_wire("workhorse-014"), tip_load_n=-1.0)
 
 
 def test_another_tip_leaves_the_shaft_as_it_is() -> None:
-    device = read_device("workhorse-014")
+    device = read_wire("workhorse-014")
     other = device.with_tip(bend_rad=1.0, stiffness_factor=2.0)
     at = np.array([0.0, 10.0, 15.0, 20.0, 60.0, 400.0])
     assert other.tip_bend_rad == 1.0
@@ -110,12 +113,18 @@ def test_another_tip_leaves_the_shaft_as_it_is() -> None:
     assert device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=1.0) == device
 
 
-@pytest.mark.parametrize("name", list_devices())
+@pytest.mark.parametrize("name", list_wires())
 def test_a_written_device_is_read_with_the_same_constants(tmp_path: Path, name: str) -> None:
-    device = read_device(name)
+    device = read_wire(name)
     changed = device.with_tip(bend_rad=1.234567 * device.tip_bend_rad, stiffness_factor=1.1)
     for each in (device, device.shaped(75.0, 5.0), replace(changed, friction=0.123)):
-        write_device(each, tmp_path / "wire.yaml")
-        back = read_device(tmp_path / "wire.yaml")
+        write_device(each, output=tmp_path / "wire.yaml")
+        back = read_wire(tmp_path / "wire.yaml")
         assert back.constants == each.constants and back.tip_shaping == each.tip_shaping
         assert back.sources == each.sources
+
+
+def test_a_stack_is_made_of_names() -> None:
+    named, around = Stack.of("workhorse-014", "microcatheter-1.7f"), read_catheter("microcatheter-1.7f")
+    assert named == Stack(read_wire("workhorse-014"), (around,)) == Stack.of(Stack.of("workhorse-014"), around)
+    assert Stack.of(named) == named

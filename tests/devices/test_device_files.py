@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from endopilot.cli import main
-from endopilot.devices.device import read_device
-from endopilot.devices.device_files import device_yaml, list_devices, user_devices
+from endopilot.devices.device import read_wire
+from endopilot.devices.device_files import device_yaml, list_wires, user_devices
 from endopilot.errors import InputError
 
 
@@ -30,10 +30,10 @@ def folders(tmp_path, monkeypatch) -> tuple[Path, Path]:
 def test_devices_in_both_folders_are_read_by_their_names(folders):
     assert user_devices() == ("mine", "ours")
     for name in ("mine", "ours"):
-        assert read_device(name).diameter_mm == 0.5
-    assert "mine" not in list_devices()  # tasks and benchmarks use shipped devices alone
+        assert read_wire(name).diameter_mm == 0.5
+    assert "mine" not in list_wires()  # tasks and benchmarks use shipped devices alone
     with pytest.raises(InputError, match=r"device 'theirs': no such device or file; .*workhorse-014, mine, ours"):
-        read_device("theirs")
+        read_wire("theirs")
 
 
 def test_without_a_variable_the_folder_is_in_the_user_s_home(folders, tmp_path, monkeypatch):
@@ -47,7 +47,7 @@ def test_without_a_variable_the_folder_is_in_the_user_s_home(folders, tmp_path, 
 
 def test_the_same_folder_named_twice_is_one(folders, monkeypatch):
     monkeypatch.setenv("ENDOPILOT_DEVICES", str(folders[0] / ".." / "devices"))
-    assert user_devices() == ("mine",) and read_device("mine").diameter_mm == 0.5
+    assert user_devices() == ("mine",) and read_wire("mine").diameter_mm == 0.5
 
 
 @pytest.mark.parametrize("name", ["ours", "workhorse-014"])
@@ -56,15 +56,15 @@ def test_a_name_that_two_files_bear_is_refused(folders, name):
     with pytest.raises(
         InputError, match=f"device '{name}': .*{name}.yaml and .*{name}.yaml both hold it; rename yours"
     ):
-        read_device(name)
-    assert read_device(folders[0] / f"{name}.yaml").name == name  # by its path it can be read
-    assert read_device("mine").name == "mine"  # other names are not concerned
+        read_wire(name)
+    assert read_wire(folders[0] / f"{name}.yaml").name == name  # by its path it can be read
+    assert read_wire("mine").name == "mine"  # other names are not concerned
 
 
 def test_a_variable_that_names_no_folder_is_refused(folders, monkeypatch):
     monkeypatch.setenv("ENDOPILOT_DEVICES", "/nowhere/devices")
     with pytest.raises(InputError, match="ENDOPILOT_DEVICES=/nowhere/devices: no such folder"):
-        read_device("workhorse-014")
+        read_wire("workhorse-014")
 
 
 def test_the_command_lists_devices_with_their_origin(folders, capsys):
@@ -72,5 +72,5 @@ def test_the_command_lists_devices_with_their_origin(folders, capsys):
         main(["devices", "--json"])
     assert leaving.value.code == 0
     rows = {row["name"]: row["origin"] for row in json.loads(capsys.readouterr().out)}
-    assert list(rows) == [*list_devices(), "mine", "ours"]
+    assert list(rows) == [*list_wires(), "mine", "ours"]
     assert rows["j-035"] == "endopilot" and rows["ours"] == str(folders[1] / "ours.yaml")

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.devices.drive_limits import DriveLimits, far_end_mm, within_travel
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulator import Simulator
@@ -14,7 +14,7 @@ ASKED = np.array([[50.0, -9.0], [-50.0, 1.0], [2.0, 0.0]])
 
 
 def test_the_limits_of_a_wire_in_a_vessel_are_the_drives_speed_the_ostium_and_the_far_end():
-    wire, vessel = read_device("workhorse-014"), make_anatomy()
+    wire, vessel = read_wire("workhorse-014"), make_anatomy()
     length_mm = vessel.tree.longest_path().abscissa[-1]
     limits = DriveLimits.of(wire, vessel)
     assert limits.fastest.tolist() == [wire.max_velocity_mm_s, wire.max_rotation_rad_s]
@@ -55,7 +55,7 @@ def test_controls_within_the_limits_stay_the_same_to_the_last_bit():
 
 def test_a_simulator_takes_what_has_been_clipped():
     """A wire that is pushed on and on stops at the far end; rounding takes it no farther, which would be refused."""
-    wire, tube = read_device("workhorse-014"), make_anatomy()
+    wire, tube = read_wire("workhorse-014"), make_anatomy()
     line = tube.tree.branches[0].centerline
     start = replace(line, **{name: values[:31] for name, values in vars(line).items()})
     vessel = replace(tube, tree=VesselTree((Branch(start, -1, np.zeros(31, dtype=int)),), ("1",)))

@@ -88,6 +88,21 @@ def test_gains_are_drawn_for_each_robot_and_the_same_seed_draws_the_same() -> No
     assert (ordered(drive_of(config, seed=7), 10.0, 1.0, 1.0) == moved[7]).all()
 
 
+def test_plays_are_drawn_for_each_robot_and_begin_anywhere_where_encoders_do_not_see_them() -> None:
+    wire = replace(STIFF, play_mm=2.0, play_sd_share=0.1)
+    lost, begun = [], []
+    for seed in range(60):
+        seen, unseen = (drive_of(replace(IDEAL, encoders_at=at, wire=wire), seed=seed) for at in ("wire", "motor"))
+        assert seen._half_play.tolist() == unseen._half_play.tolist()
+        ordered(seen, 10.0, 0.0, 1.0)
+        lost.append(10.0 + ordered(seen, -10.0, 0.0, 1.0)[0])  # the whole play, from the side that it lies at
+        begun.append((10.0 - ordered(unseen, 10.0, 0.0, 1.0)[0]) / lost[-1])  # of it, in the first motion
+    assert np.mean(lost) == pytest.approx(2.0, abs=0.1) and np.std(lost) == pytest.approx(0.2, abs=0.06)
+    assert min(begun) < 0.1 and max(begun) > 0.9 and np.mean(begun) == pytest.approx(0.5, abs=0.12)
+    again = drive_of(replace(IDEAL, encoders_at="motor", wire=wire), seed=0)
+    assert (10.0 - ordered(again, 10.0, 0.0, 1.0)[0]) / lost[0] == begun[0]
+
+
 def test_jitter_makes_commands_late_and_none_overtakes_another() -> None:
     config = replace(IDEAL, latency_s=0.02, jitter_s=0.1, wire=STIFF)
     began = []

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.devices.robot import DriveConfig, RobotConfig, list_robots, read_robot
 from endopilot.errors import InputError
 
@@ -70,7 +70,7 @@ def test_a_name_that_is_none_is_refused_with_those_there_are() -> None:
 
 
 def test_a_grip_weakens_a_device_and_never_strengthens_it() -> None:
-    wire = read_device("workhorse-014")
+    wire = read_wire("workhorse-014")
     assert DriveConfig().gripped(wire) is wire and DriveConfig(grip_n=9.0, grip_n_mm=9.0).gripped(wire) is wire
     held = DriveConfig(grip_n=0.2, grip_n_mm=0.1).gripped(wire)
     assert (held.push_limit_n, held.pull_limit_n, held.torque_limit_n_mm) == (0.2, 0.2, 0.1)

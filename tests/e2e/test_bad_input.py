@@ -23,7 +23,7 @@ from endopilot.types import Insertion, LumenMask, Volume
 @pytest.fixture(scope="module")
 def patient(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("patient") / "rca"
-    write_anatomy(make_patient(AtlasConfig(seed=7), 0), folder)
+    write_anatomy(make_patient(AtlasConfig(seed=7), 0), output=folder)
     return folder
 
 
@@ -112,7 +112,7 @@ def test_wire_and_controls(tmp_path, capsys, patient):
 def test_a_lumen_too_narrow_for_the_wire(tmp_path, capsys, patient):
     anatomy = make_patient(AtlasConfig(seed=7), 0)
     narrow = replace(anatomy, catheter_radius_mm=0.1, name="narrow")
-    write_anatomy(narrow, tmp_path / "narrow")
+    write_anatomy(narrow, output=tmp_path / "narrow")
     assert "catheter" in refused(capsys, "simulate", tmp_path / "narrow", "-o", tmp_path / "rollout.csv")
 
 

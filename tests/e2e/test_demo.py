@@ -12,7 +12,7 @@ import time
 import command
 
 from endopilot import __version__
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.files import read_json
 from endopilot.pipeline.study import DemoConfig
 from endopilot.runs import claim
@@ -82,7 +82,7 @@ def test_another_size_in_the_same_folder_is_refused(tmp_path, capsys):
         tmp_path,
         "endopilot demo",
         config=DemoConfig(patients=6),
-        device=read_device("workhorse-014"),
+        device=read_wire("workhorse-014"),
         version=__version__,
     )
     (tmp_path / "stages.json").write_text("{}")

@@ -21,7 +21,7 @@ _COARSE = ("--in-plane-mm", "1.0", "--slice-mm", "1.2", "--margin-mm", "8")
 @pytest.fixture(scope="module")
 def patient(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("patient") / "rca"
-    write_anatomy(make_patient(AtlasConfig(seed=7), 0), folder)
+    write_anatomy(make_patient(AtlasConfig(seed=7), 0), output=folder)
     return folder
 
 
@@ -135,7 +135,7 @@ def test_a_straightened_ct_is_told_by_every_command(patient, tmp_path, capsys, m
     figures = run(capsys, "segment", skewed, "-o", tmp_path / "mask.nii.gz", *method)
     assert figures["warnings"][0].startswith(note)
     assert read_mask(tmp_path / "mask.nii.gz").warnings[0].startswith(note)
-    image = run(capsys, "xray", patient, "-o", tmp_path / "image.png", "--ct", skewed, "--inserted-mm", "10")
+    image = run(capsys, "xray", patient, "-o", tmp_path / "image.png", "--ct", skewed, "--inserted-length-mm", "10")
     assert image["ct_notes"][0].startswith(note)
     monkeypatch.setattr(study, "_study", lambda run, anatomies: {"notes": list(run.notes)})
     figures = run(capsys, "run", skewed, "-o", tmp_path / "run", *method)

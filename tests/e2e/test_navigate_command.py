@@ -12,10 +12,11 @@ from command import refused, run
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cli import main
-from endopilot.control.navigate_patient import NavigatePatientConfig, navigate_patient, set_up_navigation
+from endopilot.control.navigate import NavigateConfig, navigate, set_up_navigation
 from endopilot.control.outcome import tell_outcome
-from endopilot.dataset.loader import load_dataset
+from endopilot.dataset.loader import read_dataset
 from endopilot.devices.catheter import read_catheter
+from endopilot.devices.stack import Stack
 from endopilot.files import read_json
 from endopilot.pipeline import navigation
 from endopilot.report.navigation_figure import navigation_figure
@@ -32,7 +33,7 @@ def patient(tmp_path_factory):
     """Return the folder of a synthetic patient."""
     folder = tmp_path_factory.mktemp("atlas")
     with pytest.raises(SystemExit) as leaving:
-        main(["atlas", "-o", str(folder), "--anatomy", "rca", "--count", "1", "--seed", "41"])
+        main(["atlas", "-o", str(folder), "--vessel", "rca", "--count", "1", "--seed", "41"])
     assert leaving.value.code == 0
     return folder / "rca-41-0000"
 
@@ -43,7 +44,7 @@ def driven(patient, tmp_path_factory):
     folder = tmp_path_factory.mktemp("driven") / "navigation"
     robot = folder.with_name("robot.yaml")
     robot.write_text("latency_s: 0.1\njitter_s: 0.02\n", encoding="utf-8")
-    config = NavigatePatientConfig(
+    config = NavigateConfig(
         tip="own",
         seconds=20.0,
         seed=3,
@@ -52,7 +53,7 @@ def driven(patient, tmp_path_factory):
         true_ostium_mm=0.4,
         robot=str(robot),
     )
-    return folder, navigation.navigate_into(patient, "2", folder, config)
+    return folder, navigation.navigate_into(patient, "2", output=folder, config=config)
 
 
 def test_the_folder_tells_what_happened(driven, patient):
@@ -159,7 +160,7 @@ def test_a_catheter_follows_its_wire_and_both_are_written(patient, capsys, tmp_p
     table = pd.read_csv(folder / "navigation.csv")
     assert table["catheter_1_inserted_length_mm"].iloc[-1] > 0.8 * figures["target_mm"]
     assert abs(table["catheter_1_tip_abscissa_mm"].iloc[-1] - figures["target_mm"]) <= 2.0
-    given, episode = read_catheter("microcatheter-1.7f"), load_dataset(folder / "episode")
+    given, episode = read_catheter("microcatheter-1.7f"), read_dataset(folder / "episode")
     lengths = episode.inserted_length[0, : len(table) - 1, 1]
     np.testing.assert_allclose(lengths, table["catheter_1_inserted_length_mm"][1:], atol=1e-4)
     true = read_trajectory(folder / "trajectory.npz").set_up
@@ -181,10 +182,9 @@ def test_a_catheter_follows_its_wire_and_both_are_written(patient, capsys, tmp_p
 
 
 def test_the_picture_shows_wire_and_catheter(patient):
-    config = NavigatePatientConfig(
-        tip="own", seconds=6.0, policy="in-turn", catheter=("microcatheter-1.7f",), arrives="catheter"
-    )
-    found = navigate_patient(set_up_navigation(patient, "2", config))
+    config = NavigateConfig(tip="own", seconds=6.0, arrives="catheter")
+    stack = Stack.of("workhorse-014", "microcatheter-1.7f")
+    found = navigate(patient, "2", policy="in-turn", device=stack, config=config)
     record, motion = found.record, found.record.trajectory
     np.testing.assert_array_equal(record.tip_position[1:], motion.tip_position[0])
     outcome = tell_outcome(found)
@@ -204,7 +204,7 @@ def test_the_picture_shows_wire_and_catheter(patient):
 
 
 def test_the_replayed_wire_is_the_navigations_to_the_bit(patient):
-    found = navigate_patient(set_up_navigation(patient, "2", NavigatePatientConfig(tip="own", seconds=20.0, seed=3)))
+    found = navigate(patient, "2", config=NavigateConfig(tip="own", seconds=20.0, seed=3))
     samples = len(found.record.time_s) - 1
     motion, again = found.record.trajectory, found.record.cycles.replay()
     np.testing.assert_array_equal(motion.tip_position[0], found.record.tip_position[1:])
@@ -222,7 +222,7 @@ def test_the_replayed_wire_is_the_navigations_to_the_bit(patient):
 
 def test_the_episode_trains_beside_simulated_data(driven, patient, capsys, tmp_path):
     folder, _ = driven
-    episode = load_dataset(folder / "episode")
+    episode = read_dataset(folder / "episode")
     assert len(episode) == 1 and episode.valid.all() and episode.split.tolist() == ["train"]
     table = pd.read_csv(folder / "navigation.csv")
     np.testing.assert_allclose(episode.tip_abscissa[0, : len(table) - 1, 0], table["tip_abscissa_mm"][1:], atol=1e-4)
@@ -246,7 +246,7 @@ def test_the_episode_trains_beside_simulated_data(driven, patient, capsys, tmp_p
 def test_the_episode_of_a_moving_patient_names_the_motion(patient, capsys, tmp_path):
     moved = ("--motion", "both", "--motion-seed", "3", "--policy", "forward", "--tip", "own", "--seconds", "5")
     run(capsys, "navigate", patient, "--target", "2", *moved, "-o", tmp_path / "moving")
-    assert load_dataset(tmp_path / "moving" / "episode").motion(patient.name) == motion_named("both", 3)
+    assert read_dataset(tmp_path / "moving" / "episode").motion(patient.name) == motion_named("both", 3)
 
 
 def test_a_finished_folder_is_left_alone_and_another_run_is_refused(driven, patient, capsys):
@@ -264,7 +264,9 @@ def test_an_interrupted_navigation_is_finished_by_the_same_command(patient, caps
     output = tmp_path / "killed"
     monkeypatch.setattr(navigation, "_manifest", lambda *_: 1 / 0)  # dies late, after most files
     with pytest.raises(ZeroDivisionError):
-        navigation.navigate_into(patient, "1", output, NavigatePatientConfig(policy="forward", tip="own", seconds=20.0))
+        navigation.navigate_into(
+            patient, "1", output=output, policy="forward", config=NavigateConfig(tip="own", seconds=20.0)
+        )
     monkeypatch.undo()
     assert not (output / "manifest.json").exists() and not (output / "navigation.html").exists()
     again = run(capsys, "navigate", patient, "--target", "1", "-o", output, "--policy", "forward", *SHORT)
@@ -322,7 +324,7 @@ def test_what_does_not_arrive_says_why(vessel, fork, capsys, tmp_path):
 
 def test_mismatch_is_drawn_with_the_seed(patient):
     def set_up(**changed):
-        return set_up_navigation(patient, "1", NavigatePatientConfig(tip="own", mismatch=0.2, **changed))
+        return set_up_navigation(patient, "1", config=NavigateConfig(tip="own", mismatch=0.2, **changed))
 
     def truth(**changed):
         return set_up(**changed).truth

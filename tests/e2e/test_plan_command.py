@@ -31,7 +31,7 @@ def fork() -> Anatomy:
 
 @pytest.fixture
 def patient(fork, tmp_path) -> Path:
-    write_anatomy(fork, tmp_path / "patient")
+    write_anatomy(fork, output=tmp_path / "patient")
     return tmp_path / "patient"
 
 
@@ -50,7 +50,9 @@ def test_a_plan_is_driven_where_it_was_made_and_nowhere_else(fork, patient, tmp_
     again = run(capsys, "simulate", patient, *drive)
     assert again["samples"] == 2 * planned["seconds"] and again["deepest_tip_mm"] == pytest.approx(33.0, abs=2.0)
     (tmp_path / "again.csv").unlink()
-    write_anatomy(replace(fork, insertion=Insertion(np.zeros(3), np.array([0.1, 0.0, 0.995]))), tmp_path / "other")
+    write_anatomy(
+        replace(fork, insertion=Insertion(np.zeros(3), np.array([0.1, 0.0, 0.995]))), output=tmp_path / "other"
+    )
     assert "another anatomy" in refused(capsys, "simulate", tmp_path / "other", *drive)
     assert "another device" in refused(capsys, "simulate", patient, *drive, "--device", "wire-018")
     assert not (tmp_path / "again.csv").exists()
@@ -114,7 +116,7 @@ def test_a_target_behind_an_occlusion(fork, tmp_path, capsys):
     radius = np.where(np.abs(line.abscissa - 26.0) < 0.6, 0.1, line.radius)
     branches[1] = Branch(replace(line, radius=radius), 0, branches[1].section)
     closed = replace(fork, tree=VesselTree(tuple(branches), fork.tree.section_names))
-    write_anatomy(closed, tmp_path / "closed")
+    write_anatomy(closed, output=tmp_path / "closed")
     line = refused(capsys, "plan", tmp_path / "closed", "--target", "0,0,33", "-o", tmp_path / "plan")
     assert "occlusion" in line and "0.20 mm" in line and "workhorse-014" in line
     assert not (tmp_path / "plan").exists()

@@ -14,10 +14,11 @@ import numpy as np
 import pydicom
 import pytest
 
+from endopilot.anatomy.io import read_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.device_files import device_yaml
 from endopilot.files import input_hash, read_json
-from endopilot.imaging.volume import write_volume
+from endopilot.imaging.volume import read_mask, write_volume
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.pipeline import study
 from endopilot.types import Volume
@@ -30,12 +31,14 @@ SIZE = ("--sequences", "5", "--seconds", "20", "--training-seconds", "0.5")
 def case(tmp_path_factory):
     """Return a folder with the CT of a patient, a wire's file, and a run on both that was killed on its way."""
     folder = tmp_path_factory.mktemp("case")
-    patient = make_patient(AtlasConfig(anatomy="rca", count=1, seed=1), 0)
-    write_volume(make_phantom(patient, PhantomConfig(in_plane_mm=0.6, slice_mm=0.7), 1), folder / "ct.nii.gz")
+    patient = make_patient(AtlasConfig(vessel="rca", count=1, seed=1), 0)
+    write_volume(
+        make_phantom(patient, config=PhantomConfig(in_plane_mm=0.6, slice_mm=0.7), seed=1), folder / "ct.nii.gz"
+    )
     shutil.copy(device_yaml("workhorse-014")[0], folder / "wire.yaml")
     line = [sys.executable, "-m", "endopilot.cli", *map(str, arguments(folder))]
     with subprocess.Popen(line, stderr=subprocess.DEVNULL) as first:
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + 300
         while not masks(folder):
             assert first.poll() is None and time.monotonic() < deadline
             time.sleep(0.05)
@@ -50,6 +53,15 @@ def arguments(folder: Path, volume: Path | None = None) -> tuple[str | Path, ...
 def masks(folder: Path) -> dict[Path, int]:
     """Return when each finished mask was written."""
     return {path: path.stat().st_mtime_ns for path in (folder / "run" / "masks").glob("[!.]*.nii.gz")}
+
+
+@pytest.fixture
+def made_before(case, monkeypatch):
+    """Let a run take mask and anatomy of the same CT from the run before: no other settings are used for them here."""
+    mask, anatomy = case / "run" / "masks" / "patient.nii.gz", case / "run" / "anatomies" / "patient"
+    monkeypatch.setattr(study, "segment", lambda volume, config: read_mask(mask))
+    if anatomy.exists():
+        monkeypatch.setattr(study, "extract_anatomy", lambda source, name, config: read_anatomy(anatomy))
 
 
 def test_a_killed_run_goes_on_to_its_report_and_is_then_left_alone(case, capsys):
@@ -73,7 +85,7 @@ def test_a_killed_run_goes_on_to_its_report_and_is_then_left_alone(case, capsys)
     assert {path: path.stat().st_mtime_ns for path in case.rglob("*")} == written
 
 
-def test_a_target_is_driven_to_with_the_packaged_networks_beside(case, tmp_path, capsys):
+def test_a_target_is_driven_to_with_the_packaged_networks_beside(case, made_before, tmp_path, capsys):
     line = ("run", case / "ct.nii.gz", "-o", tmp_path / "run", "--sequences", "3", "--seconds", "20")
     found = command.run(capsys, *line, "--target", "2")
     assert list(found)[:2] == ["outcome", "page"] and found["outcome"].startswith("reached section 2 at ")
@@ -88,7 +100,7 @@ def test_a_target_is_driven_to_with_the_packaged_networks_beside(case, tmp_path,
     assert sorted(path.name for path in (tmp_path / "run" / "navigation").iterdir()) == ["1", "2"]
 
 
-def test_a_wire_that_the_packaged_networks_do_not_know_is_driven_without_them(case, tmp_path, capsys):
+def test_a_wire_that_the_packaged_networks_do_not_know_is_driven_without_them(case, made_before, tmp_path, capsys):
     (tmp_path / "wire.yaml").write_text((case / "wire.yaml").read_text().replace("value: 0.36", "value: 0.35", 1))
     line = ("run", case / "ct.nii.gz", "-o", tmp_path / "run", "--device", tmp_path / "wire.yaml")
     found = command.run(capsys, *line, "--target", "1")

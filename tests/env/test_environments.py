@@ -14,6 +14,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
+from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.env.single import NavigateEnv
 from endopilot.env.vector import (
     CONTROL_PERIOD_S,
@@ -170,16 +171,16 @@ def test_wire_and_catheter_are_driven_and_observed_each_by_itself(near):
     env = NavigateEnv(navigation=navigation)
     start, _ = env.reset(seed=0)
     assert start.shape == (39,) and env.action_space.shape == (4,)
-    assert start[31] == 0.0 and start[0] == pytest.approx(near.start_inserted_mm / 100)
+    assert start[31] == 0.0 and start[0] == pytest.approx(near.start_inserted_length_mm / 100)
     action = np.array([0.0, 0.0, 0.5, 0.25])
     seen, _, _, _, info = [env.step(action) for _ in range(8)][-1]
     advance, turn = 8 * CONTROL_PERIOD_S * 6.0, 8 * CONTROL_PERIOD_S * 0.25 * 3.14
-    assert info["inserted_length"] == pytest.approx(near.start_inserted_mm, abs=1e-6)
+    assert info["inserted_length"] == pytest.approx(near.start_inserted_length_mm, abs=1e-6)
     assert info["catheter_1_inserted_length"] == pytest.approx(advance, abs=1e-6)
     assert info["catheter_1_rotation"] == pytest.approx(turn, abs=1e-6)
     # the catheter is the foremost now: each tip is told by itself
     assert info["catheter_1_tip_abscissa"] == pytest.approx(advance, abs=0.5)
-    assert info["tip_abscissa"] == pytest.approx(near.start_inserted_mm, abs=0.5)
+    assert info["tip_abscissa"] == pytest.approx(near.start_inserted_length_mm, abs=0.5)
     told = [info[f"catheter_1_{name}"] for name in ("inserted_length", "tip_abscissa")]
     assert seen[[31, 34]] == pytest.approx(np.array(told) / 100, abs=1e-6)
     assert seen[32:34] == pytest.approx([np.cos(turn), np.sin(turn)], abs=1e-6)
@@ -223,7 +224,7 @@ def test_the_time_limit_truncates_and_the_next_step_begins_anew(near):
     assert infos["time_s"][0] == pytest.approx(steps * CONTROL_PERIOD_S)
     _, rewards, terminations, truncations, infos = env.step(np.ones((WORLDS, 2)))
     assert (rewards == 0).all() and not (terminations | truncations).any() and (infos["time_s"] == 0).all()
-    assert np.allclose(infos["inserted_length"], near.start_inserted_mm)
+    assert np.allclose(infos["inserted_length"], near.start_inserted_length_mm)
 
 
 def test_only_the_worlds_of_the_mask_are_reset(near):
@@ -284,7 +285,7 @@ def test_bad_actions_are_refused(near, action):
 
 
 def test_pushing_on_for_ever_stops_at_the_end_of_the_wire():
-    navigation = replace(reference_navigation(), seconds=60.0, start_inserted_mm=130.0)
+    navigation = replace(reference_navigation(), seconds=60.0, start_inserted_length_mm=130.0)
     env = NavigateEnv(navigation=navigation)
     env.reset(seed=0)
     longest = navigation.anatomy.tree.longest_path().abscissa[-1]
@@ -327,3 +328,40 @@ def test_vessels_move_where_a_motion_is_given_and_go_on_from_a_pickle(near):
         assert np.array_equal(one.step(row[1])[0], moved[0][step, 1])
     copy = pickle.loads(pickle.dumps(env))
     assert _same(_rollout(copy, actions), _rollout(env, actions))
+
+
+PLAY = RobotConfig(
+    encoders_at="motor", jitter_s=0.05, wire=DriveConfig(play_mm=2.4, play_rad=1.0, gain_sd_translation=0.05)
+)
+
+
+def test_a_robot_drives_and_its_encoders_are_observed(near):
+    env = NavigateVectorEnv(WORLDS, navigations=near, robot=PLAY)
+    begun = env.reset(seed=2)[0]
+    for push in (1.0, 1.0, 1.0, -1.0):
+        observation, *_, infos = env.step(np.tile([[push, 0.0]], (WORLDS, 1)))
+    moved = 2 / 15 * 12.0 * (3 - 1)
+    motor = infos["encoder_inserted_length"] - near.start_inserted_length_mm
+    assert (np.abs(motor - moved) < 12.0 * 0.1 * 2 + 0.2).all()  # latency, jitter and ramps
+    assert (np.abs(infos["inserted_length"] - infos["encoder_inserted_length"]) > 0.2).all()  # play and gain
+    np.testing.assert_allclose(observation[:, 0], infos["encoder_inserted_length"] / 100.0, rtol=1e-5)
+    np.testing.assert_allclose(observation[:, 1], np.cos(infos["encoder_rotation"]), rtol=1e-4, atol=1e-6)
+    assert np.ptp(infos["load_n"]) > 0 and np.ptp(begun[:, 0]) > 0  # noise of their own
+    named = NavigateVectorEnv(1, navigations=near, robot="kweon-2021-2d")
+    assert "load_nmm" in named.reset(seed=0)[1]
+    with pytest.raises(InputError, match="robot 'none': no such robot or file"):
+        NavigateEnv(navigation=near, robot="none")
+
+
+def test_worlds_with_robots_do_not_depend_on_each_other_and_go_on_from_a_state(near):
+    env = NavigateVectorEnv(WORLDS, navigations=near, robot=PLAY)
+    start, actions = env.reset(seed=5)[0], _actions(near, steps=40)  # past the time limit
+    kept, stored = env.state, pickle.dumps(env)
+    went = _rollout(env, actions)
+    assert went[3].any()
+    env.set_state(pickle.loads(pickle.dumps(kept)))
+    assert _same(_rollout(env, actions), went)
+    assert _same(_rollout(pickle.loads(stored), actions), went)
+    alone = NavigateVectorEnv(1, navigations=near, robot=PLAY)
+    assert np.array_equal(alone.reset(seed=6)[0][0], start[1])
+    assert _same([values[:, 0] for values in _rollout(alone, actions[:, 1:2])], [values[:, 1] for values in went])

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
@@ -9,11 +10,13 @@ import numpy as np
 import pytest
 
 from endopilot.cli import main
-from endopilot.dataset.loader import load_dataset
+from endopilot.dataset.loader import read_dataset
 from endopilot.devices.drive_limits import SPARE_MM
+from endopilot.devices.robot import read_robot
 from endopilot.errors import InputError
 from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
 from endopilot.evaluation.protocols import count_steps, run_protocols
+from endopilot.evaluation.replay import Recorded
 from endopilot.evaluation.results import read_results
 from endopilot.files import read_json, write_json
 from endopilot.models.config import WINDOW
@@ -33,7 +36,7 @@ def test_metrics_are_on_disk_as_returned(evaluated):
 
 def test_both_splits_are_evaluated_on_navigations_that_were_not_trained_on(evaluated, toy_dataset):
     folder, metrics = evaluated
-    dataset = load_dataset(toy_dataset)
+    dataset = read_dataset(toy_dataset)
     assert list(metrics["splits"]) == ["seen_test", "test"]
     trained = set(dataset.anatomy[dataset.split == "train"].tolist())
     assert not trained & set(metrics["splits"]["test"]["anatomies"])
@@ -75,7 +78,7 @@ class Parroting:
 
 
 def test_patients_are_predicted_one_after_the_other_with_the_error_so_far(toy_dataset):
-    data = load_dataset(toy_dataset)
+    data = read_dataset(toy_dataset)
     data = data.select(np.random.default_rng(0).permutation(len(data)))
     remarks, predictor = [], Parroting()
     with patch("endopilot.dataset.again.simulate", toy_simulate):
@@ -107,8 +110,8 @@ def test_the_core_is_replayed_with_other_friction(toy_dataset, evaluated):
         return toy_simulate(anatomy, device, control, friction=friction, **others)
 
     with patch("endopilot.dataset.again.simulate", watched):
-        metrics = evaluate(evaluated[0] / "run", evaluated[0] / "again", EvaluateConfig(sequences=2))
-    true = load_dataset(toy_dataset).friction[0]
+        metrics = evaluate(evaluated[0] / "run", output=evaluated[0] / "again", config=EvaluateConfig(sequences=2))
+    true = read_dataset(toy_dataset).friction[0]
     for friction in asked.values():
         assert set(np.round(friction / true, 6).ravel().tolist()) == {0.9, 1.0, 1.1}
     assert {"friction_90", "friction_110"} <= metrics["splits"]["test"]["tip"].keys()
@@ -137,7 +140,7 @@ def trained_on(evaluated, tmp_path):
     def made(dataset: Path, names: set[str], name: str = "run") -> Path:
         run = tmp_path / name
         shutil.copytree(evaluated[0] / "run", run)
-        patients = [sha for patient, sha in load_dataset(dataset).patients.items() if patient in names]
+        patients = [sha for patient, sha in read_dataset(dataset).patients.items() if patient in names]
         write_json(run / "manifest.json", read_json(run / "manifest.json") | {"patients": patients})
         return run
 
@@ -153,9 +156,9 @@ def chosen(dataset, mask) -> set[tuple[str, int]]:
 
 
 def test_all_navigations_of_a_dataset_of_new_patients_are_evaluated(elsewhere, trained_on, tmp_path):
-    dataset, out = load_dataset(elsewhere), tmp_path / "out"
+    dataset, out = read_dataset(elsewhere), tmp_path / "out"
     with patch("endopilot.dataset.again.simulate", toy_simulate):
-        metrics = evaluate(trained_on(elsewhere, set()), out, EvaluateConfig(), elsewhere)
+        metrics = evaluate(trained_on(elsewhere, set()), output=out, config=EvaluateConfig(), dataset=elsewhere)
     results = read_results(out / "evaluation.npz")
     assert {"train", "calibrate", "test"} <= set(dataset.split.tolist())
     assert list(metrics["splits"]) == list(results) == ["test"]
@@ -170,11 +173,13 @@ def test_all_navigations_of_a_dataset_of_new_patients_are_evaluated(elsewhere, t
 
 
 def test_known_patients_among_new_ones_stay_known(elsewhere, trained_on, tmp_path):
-    dataset = load_dataset(elsewhere)
+    dataset = read_dataset(elsewhere)
     names = {str(dataset.anatomy[dataset.split == split][0]) for split in ("train", "calibrate", "test")}
     known, training = np.isin(dataset.anatomy, sorted(names)), dataset.split == "train"
     with patch("endopilot.dataset.again.simulate", toy_simulate):
-        metrics = evaluate(trained_on(elsewhere, names), tmp_path / "out", EvaluateConfig(), elsewhere)
+        metrics = evaluate(
+            trained_on(elsewhere, names), output=tmp_path / "out", config=EvaluateConfig(), dataset=elsewhere
+        )
     results = read_results(tmp_path / "out" / "evaluation.npz")
     assert rows(results["test"]) == chosen(dataset, ~known)
     assert rows(results["seen_test"]) == chosen(dataset, known & ~training)
@@ -190,18 +195,23 @@ def test_known_patients_among_new_ones_stay_known(elsewhere, trained_on, tmp_pat
 
 
 def test_seeds_of_other_patients_are_refused(elsewhere, trained_on, tmp_path):
-    first, second = (str(name) for name in np.unique(load_dataset(elsewhere).anatomy)[:2])
+    first, second = (str(name) for name in np.unique(read_dataset(elsewhere).anatomy)[:2])
     run, other = trained_on(elsewhere, {first}), trained_on(elsewhere, {second}, "other")
     with pytest.raises(InputError, match=r"other: was trained on other patients than .*run; give runs of one training"):
-        evaluate(run, tmp_path / "out", EvaluateConfig(), elsewhere, [other])
+        evaluate(run, output=tmp_path / "out", config=EvaluateConfig(), dataset=elsewhere, other_seeds=[other])
     assert not (tmp_path / "out").exists()
 
 
 def test_a_dataset_that_was_trained_on_as_a_whole_is_refused(trained_on, tmp_path):
     make_toy_dataset(tmp_path / "all", patients=1, sequences=3, seen_test_share=0.0)
-    names = set(load_dataset(tmp_path / "all").anatomy.tolist())
+    names = set(read_dataset(tmp_path / "all").anatomy.tolist())
     with pytest.raises(InputError, match=r"was trained on all its navigations; make it with seen_test_share above 0"):
-        evaluate(trained_on(tmp_path / "all", names), tmp_path / "out", EvaluateConfig(), tmp_path / "all")
+        evaluate(
+            trained_on(tmp_path / "all", names),
+            output=tmp_path / "out",
+            config=EvaluateConfig(),
+            dataset=tmp_path / "all",
+        )
 
 
 def test_the_command_prints_errors_findings_and_paths(evaluated, monkeypatch, capsys):
@@ -232,7 +242,7 @@ def test_another_seed_stands_beside_the_run(evaluated):
 def test_replayed_controls_are_simulated_from_the_start_of_the_episode(evaluated, toy_dataset):
     # The toy wire in closed form: Δtip = Δ − slack, with the slack of a play operator over the whole history.
     result = read_results(evaluated[0] / "evaluation" / "evaluation.npz")["test"]
-    data = load_dataset(toy_dataset)
+    data = read_dataset(toy_dataset)
     name, sequence = result.anatomies[result.anatomy[0]], result.sequence[0]
     episode = data.select(np.flatnonzero((data.anatomy == name) & (data.sequence == sequence)))
     held = np.repeat(episode.control[:, 29:30, 0], 90, axis=1)
@@ -244,18 +254,38 @@ def test_replayed_controls_are_simulated_from_the_start_of_the_episode(evaluated
     assert (slack <= curliness * inserted + 1.5 + 1e-3).all()
 
 
+def test_controls_pass_the_drives_of_a_robot(toy_dataset):
+    data = read_dataset(toy_dataset)
+    data = data.select((data.inserted_length[:, WINDOW - 1, 0] > 10) & (data.inserted_length[:, WINDOW - 1, 0] < 30))
+    data = data.select(np.arange(3))
+    control = np.tile([2.0, 0.5], (3, 12, 1))
+    control[:, 6:, 0] = -2.0
+    control[1, 9:] = np.nan
+    ideal = read_robot("ideal")
+    robot = replace(ideal, latency_s=0.1, wire=replace(ideal.wire, play_mm=3.0, play_rad=0.4))
+    made = Recorded.of(data, robot).drivable(control)
+    assert np.isnan(made[1, 9:]).all() and np.isfinite(made[[0, 2]]).all()
+    # v t less half the play on the way in, and v (t - latency) less all of it on the way back; it comes late by 0.1 s
+    np.testing.assert_allclose(
+        0.5 * made[0].sum(axis=0), [2 * 2.9 - 1.5 + 0.2 - (2 * 2.9 - 3.0), 0.5 * 5.9 - 0.2], atol=1e-3
+    )
+    np.testing.assert_array_equal(made[1, :9], Recorded.of(data, robot).drivable(control)[1, :9])
+    exact = Recorded.of(data, ideal).drivable(control)[[0, 2]]
+    np.testing.assert_allclose(exact, Recorded.of(data).drivable(control)[[0, 2]], atol=1e-4)
+
+
 def test_a_run_without_its_dataset_is_refused(evaluated, tmp_path):
     folder = evaluated[0]
     record = read_json(folder / "run" / "manifest.json")
     write_json(tmp_path / "manifest.json", record | {"dataset": "elsewhere"})
     with pytest.raises(InputError, match="is not here; name one with --dataset"):
-        evaluate(tmp_path, tmp_path / "out", EvaluateConfig())
+        evaluate(tmp_path, output=tmp_path / "out", config=EvaluateConfig())
     assert not (tmp_path / "out").exists()
 
 
 def test_the_packaged_model_asks_for_a_dataset(tmp_path):
     with pytest.raises(InputError, match="not in the package; name one with --dataset"):
-        evaluate(Path("pretrained"), tmp_path / "out", EvaluateConfig())
+        evaluate(Path("pretrained"), output=tmp_path / "out", config=EvaluateConfig())
 
 
 @pytest.mark.parametrize("record", [None, {"config": {}, "stages": {}}])
@@ -263,7 +293,7 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path, record):
     if record is not None:
         write_json(tmp_path / "manifest.json", record)
     with pytest.raises(InputError, match=r"no finished run here .* make one with `endopilot train`"):
-        evaluate(tmp_path, tmp_path / "out", EvaluateConfig())
+        evaluate(tmp_path, output=tmp_path / "out", config=EvaluateConfig())
 
 
 @pytest.mark.parametrize(("field", "value"), [("sequences", 0), ("seed", -1)])

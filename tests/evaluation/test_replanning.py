@@ -8,7 +8,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from endopilot.dataset.loader import load_dataset
+from endopilot.dataset.loader import read_dataset
 from endopilot.evaluation.replanning import EXPOSURE_PERIOD_S, exposures, replanned
 from endopilot.evaluation.replay import Recorded, replay
 from endopilot.models.episodes import Episodes
@@ -39,7 +39,7 @@ class HoldSlack:
 
 @pytest.fixture(scope="module")
 def recorded(toy_dataset) -> Recorded:
-    return Recorded.of(load_dataset(toy_dataset).of_split("test").select(np.arange(12)))
+    return Recorded.of(read_dataset(toy_dataset).of_split("test").select(np.arange(12)))
 
 
 def planned(recorded, predictor):

@@ -43,7 +43,7 @@ def unequal(image):
 def test_a_distance_map_on_other_axes_is_refused(anatomy, tmp_path, edit, message):
     import SimpleITK
 
-    write_anatomy(anatomy, tmp_path / "a")
+    write_anatomy(anatomy, output=tmp_path / "a")
     path = tmp_path / "a" / "lumen.nrrd"
     image = SimpleITK.ReadImage(str(path))
     edit(image)
@@ -54,7 +54,7 @@ def test_a_distance_map_on_other_axes_is_refused(anatomy, tmp_path, edit, messag
 
 
 def test_a_distance_map_in_another_space_is_refused(anatomy, tmp_path):
-    write_anatomy(anatomy, tmp_path / "a")
+    write_anatomy(anatomy, output=tmp_path / "a")
     path = tmp_path / "a" / "lumen.nrrd"
     path.write_bytes(path.read_bytes().replace(b"left-posterior-superior", b"right-anterior-superior"))
     resigned(tmp_path / "a")
@@ -76,7 +76,7 @@ def test_a_distance_map_in_another_space_is_refused(anatomy, tmp_path):
     ],
 )
 def test_a_damaged_record_without_identity_is_refused(anatomy, tmp_path, change):
-    write_anatomy(anatomy, tmp_path / "a")
+    write_anatomy(anatomy, output=tmp_path / "a")
     resigned(tmp_path / "a", **change)
     with pytest.raises(InputError, match="make the anatomy again") as error:
         read_anatomy(tmp_path / "a")
@@ -84,6 +84,6 @@ def test_a_damaged_record_without_identity_is_refused(anatomy, tmp_path, change)
 
 
 def test_a_record_without_identity_is_read_where_the_rest_is_whole(anatomy, tmp_path):
-    write_anatomy(anatomy, tmp_path / "a")
+    write_anatomy(anatomy, output=tmp_path / "a")
     resigned(tmp_path / "a")
     assert read_anatomy(tmp_path / "a").identity == anatomy.identity

@@ -10,8 +10,8 @@ import pytest
 from make_devices import catheter, uniform, wire, write
 
 from endopilot.devices.catheter import list_catheters, read_catheter
-from endopilot.devices.device import read_device
-from endopilot.devices.device_files import list_devices
+from endopilot.devices.device import read_wire
+from endopilot.devices.device_files import list_wires
 from endopilot.errors import InputError
 
 SOURCED = "{name}.value: {value}; give a number from"
@@ -21,7 +21,7 @@ def refused(tmp_path: Path, content: Any) -> str:
     """Return the line that refuses a device's or a catheter's file."""
     path = write(tmp_path / "device.yaml", content)
     with pytest.raises(InputError) as error:
-        (read_catheter if "inner_diameter_mm" in content else read_device)(path)
+        (read_catheter if "inner_diameter_mm" in content else read_wire)(path)
     line = str(error.value)
     assert line.startswith(f"{path}: ") and "\n" not in line
     return line.removeprefix(f"{path}: ")
@@ -166,11 +166,11 @@ def test_a_profile_of_a_million_values_is_refused(tmp_path) -> None:
 )  # fmt: skip
 def test_extreme_devices_are_read(tmp_path, content) -> None:
     path = write(tmp_path / "device.yaml", content)
-    device = read_catheter(path) if "inner_diameter_mm" in content else read_device(path)
+    device = read_catheter(path) if "inner_diameter_mm" in content else read_wire(path)
     assert device.diameter_mm == content["diameter_mm"]["value"]
     assert list(device.bend_stiffness_n_mm2) == content["bend_stiffness_n_mm2"]["value"]
 
 
 def test_shipped_devices_are_read() -> None:
-    assert all(read_device(name).name == name for name in list_devices())
+    assert all(read_wire(name).name == name for name in list_wires())
     assert all(read_catheter(name).name == name for name in list_catheters())

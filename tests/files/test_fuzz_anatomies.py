@@ -71,7 +71,7 @@ def replaced(content: object, steps: list[int], value: object) -> object:
 def folder(tmp_path_factory) -> Path:
     line = arc()
     made = tmp_path_factory.mktemp("anatomies") / "vessel"
-    write_anatomy(extract_anatomy(Polylines((line,), (np.full(len(line), 2.0),)), name="vessel"), made)
+    write_anatomy(extract_anatomy(Polylines((line,), (np.full(len(line), 2.0),)), name="vessel"), output=made)
     return made
 
 

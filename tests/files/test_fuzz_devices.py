@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from make_devices import catheter, wire
 
 from endopilot.devices.catheter import read_catheter
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 
 BOUNDED = settings(
@@ -65,7 +65,7 @@ def changed(content: Any, place: tuple, value: Any) -> Any:
     return content
 
 
-@pytest.mark.parametrize(("content", "read"), [(wire(), read_device), (catheter(), read_catheter)])
+@pytest.mark.parametrize(("content", "read"), [(wire(), read_wire), (catheter(), read_catheter)])
 @BOUNDED
 @given(data=st.data())
 def test_anything_in_the_place_of_a_value(tmp_path, content, read, data) -> None:
@@ -76,7 +76,7 @@ def test_anything_in_the_place_of_a_value(tmp_path, content, read, data) -> None
         assert 0.15 <= device.diameter_mm <= 10 and all(map(math.isfinite, device.bend_stiffness_n_mm2))
 
 
-@pytest.mark.parametrize(("content", "read"), [(wire(), read_device), (catheter(), read_catheter)])
+@pytest.mark.parametrize(("content", "read"), [(wire(), read_wire), (catheter(), read_catheter)])
 @BOUNDED
 @given(data=st.data())
 def test_numbers_by_many_orders_of_magnitude(tmp_path, content, read, data) -> None:
@@ -98,7 +98,7 @@ def value_at(content: Any, place: tuple) -> Any:
 @BOUNDED
 @given(text=st.binary(max_size=60) | st.text(alphabet="[]{}:,-&*a1.!? \n\t'\"#|>%@`~<é\ufeff\x00", max_size=60))
 def test_any_bytes(tmp_path, text) -> None:
-    assert isinstance(outcome(tmp_path / "device.yaml", text, read_device), str)
+    assert isinstance(outcome(tmp_path / "device.yaml", text, read_wire), str)
 
 
 @BOUNDED
@@ -106,4 +106,4 @@ def test_any_bytes(tmp_path, text) -> None:
 def test_a_device_file_cut_or_garbled_anywhere(tmp_path, data) -> None:
     text = yaml.safe_dump(wire())
     start, end = sorted(data.draw(st.tuples(*[st.integers(0, len(text))] * 2)))
-    outcome(tmp_path / "device.yaml", text[:start] + data.draw(st.text(max_size=5)) + text[end:], read_device)
+    outcome(tmp_path / "device.yaml", text[:start] + data.draw(st.text(max_size=5)) + text[end:], read_wire)

@@ -40,7 +40,7 @@ def arch():
 
 def test_the_arch_is_found_and_leaks_and_branches_are_cut(arch):
     volume, aorta = arch
-    mask = segment(volume, SegmentConfig(method="aorta", seeds=(DESCENDING, ASCENDING)))
+    mask = segment(volume, config=SegmentConfig(method="aorta", seeds=(DESCENDING, ASCENDING)))
     between = positions(volume)[..., 2] > -36.0
     assert dice(mask.volume.voxels & between, aorta & between) > 0.93
     far = np.linalg.norm(positions(volume) - [0.0, -22.0, -25.0], axis=-1) < 18.0
@@ -60,8 +60,8 @@ def test_the_mask_lies_on_the_grid_of_any_orientation(arch):
         volume.index_to_world(np.array([0.0, 0.0, volume.voxels.shape[0] - 1])),
         volume.direction[:, [1, 2, 0]] * [1, -1, 1],
     )
-    straight = segment(volume, SegmentConfig(method="aorta", seeds=(DESCENDING, ASCENDING)))
-    again = segment(turned, SegmentConfig(method="aorta", seeds=(DESCENDING, ASCENDING)))
+    straight = segment(volume, config=SegmentConfig(method="aorta", seeds=(DESCENDING, ASCENDING)))
+    again = segment(turned, config=SegmentConfig(method="aorta", seeds=(DESCENDING, ASCENDING)))
     back = again.volume.voxels[:, ::-1].transpose(1, 2, 0)
     assert dice(back, straight.volume.voxels) > 0.99
 
@@ -75,7 +75,7 @@ def test_seeds_that_cannot_be_used_are_refused(arch):
         (DESCENDING,): "joined to one of radius 2[0-9] mm.*second seed",
     }.items():
         with pytest.raises(InputError, match=expected):
-            segment(volume, SegmentConfig(method="aorta", seeds=seeds))
+            segment(volume, config=SegmentConfig(method="aorta", seeds=seeds))
 
 
 def test_seeds_in_separate_vessels_are_refused():
@@ -85,7 +85,7 @@ def test_seeds_in_separate_vessels_are_refused():
     for x in (20.0, 60.0):
         hu[inside_tube(grid, along + np.array([x, 30.0, 0.0]), 8.0)] = BLOOD_HU
     with pytest.raises(InputError, match="no contrast-filled path"):
-        segment(scan(grid, hu), SegmentConfig(method="aorta", seeds=((20.0, 30.0, 10.0), (60.0, 30.0, 10.0))))
+        segment(scan(grid, hu), config=SegmentConfig(method="aorta", seeds=((20.0, 30.0, 10.0), (60.0, 30.0, 10.0))))
 
 
 def test_one_seed_follows_a_plain_vessel_to_its_far_end():
@@ -93,7 +93,7 @@ def test_one_seed_follows_a_plain_vessel_to_its_far_end():
     line = np.linspace(6, 70, 200)[:, None] * [0.0, 0.0, 1.0] + [30.0, 28.0, 0.0]
     tube = inside_tube(grid, line, 9.0)
     volume = scan(grid, np.where(tube, BLOOD_HU, 40.0))
-    mask = segment(volume, SegmentConfig(method="aorta", seeds=((30.0, 28.0, 8.0),)))
+    mask = segment(volume, config=SegmentConfig(method="aorta", seeds=((30.0, 28.0, 8.0),)))
     between = (positions(volume)[..., 2] > 14.0) & (positions(volume)[..., 2] < 68.0)
     assert dice(mask.volume.voxels & between, tube & between) > 0.93
 
@@ -105,7 +105,7 @@ def test_the_real_aorta_agrees_with_the_network_s_mask():
     given = read_mask(_SAMPLE / "seg_aorta.nii.gz").volume
     given = Volume(given.voxels.astype(np.float32), given.spacing_mm, given.origin_mm, given.direction)
     reference = interpolate_like(given, volume, outside=0.0) > 0.5
-    mask = segment(volume, SegmentConfig(method="aorta", seeds=((2.0, -143.0, 543.0), (2.0, -184.0, 657.0))))
+    mask = segment(volume, config=SegmentConfig(method="aorta", seeds=((2.0, -143.0, 543.0), (2.0, -184.0, 657.0))))
     found = mask.volume.voxels
     assert dice(found, reference) > 0.84
     assert (found & reference).sum() > 0.92 * found.sum()

@@ -61,7 +61,7 @@ def heart():
 
 @pytest.fixture(scope="module")
 def right_tree(heart):
-    return segment(heart[0], SegmentConfig(vessel="rca"))
+    return segment(heart[0], config=SegmentConfig(vessel="rca"))
 
 
 def test_the_right_coronary_tree_is_found(heart, right_tree):
@@ -84,7 +84,7 @@ def test_the_ostium_is_within_a_millimetre_and_the_mask_ends_there(heart, right_
 
 
 def test_the_left_tree_is_another_one(heart):
-    left = segment(heart[0], SegmentConfig(vessel="lca"))
+    left = segment(heart[0], config=SegmentConfig(vessel="lca"))
     assert left.ostium is not None
     assert left.ostium.position[0] > 15.0
     assert positions(heart[0])[left.volume.voxels][:, 0].min() > 14.0
@@ -92,33 +92,33 @@ def test_the_left_tree_is_another_one(heart):
 
 def test_an_artery_beside_a_chamber_is_not_taken_for_a_part_of_it():
     """A Gaussian of 1 mm closes the fat between them, and another vessel, 36 mm away, is taken for the right artery."""
-    patient = make_patient(AtlasConfig(anatomy="rca", seed=0, population="textbook"), 0)
-    ct = make_phantom(patient, PhantomConfig(in_plane_mm=1.0, slice_mm=1.0), 0)
-    found = segment(ct, SegmentConfig(method="coronary", vessel="rca"))
+    patient = make_patient(AtlasConfig(vessel="rca", seed=0, population="textbook"), 0)
+    ct = make_phantom(patient, config=PhantomConfig(in_plane_mm=1.0, slice_mm=1.0), seed=0)
+    found = segment(ct, config=SegmentConfig(method="coronary", vessel="rca"))
     assert np.linalg.norm(found.ostium.position - patient.insertion.position) < 0.5
 
 
 def test_seeds_choose_the_vessel(heart, right_tree):
-    by_seed = segment(heart[0], SegmentConfig(vessel="lca", seeds=(tuple(_axis()[20]), tuple(_branch()[-4]))))
+    by_seed = segment(heart[0], config=SegmentConfig(vessel="lca", seeds=(tuple(_axis()[20]), tuple(_branch()[-4]))))
     assert dice(by_seed.volume.voxels, right_tree.volume.voxels) > 0.9
 
 
 def test_a_volume_cut_off_at_zero_is_segmented_with_seeds_and_one_that_lost_its_rescale_is_not(heart):
     cut = replace(heart[0], voxels=np.maximum(heart[0].voxels, 0))
     with pytest.raises(InputError, match="give seeds if it was cut off at 0"):
-        segment(cut, SegmentConfig())
+        segment(cut, config=SegmentConfig())
     seeds = (tuple(_axis()[0]), tuple(_axis()[-6]))
-    whole, found = (segment(volume, SegmentConfig(seeds=seeds)).volume.voxels for volume in (heart[0], cut))
+    whole, found = (segment(volume, config=SegmentConfig(seeds=seeds)).volume.voxels for volume in (heart[0], cut))
     assert 2 * (whole & found).sum() / (whole.sum() + found.sum()) > 0.9
     lost = replace(heart[0], voxels=heart[0].voxels + 1024 - min(int(heart[0].voxels.min()), 0))
     with pytest.raises(InputError, match="as at the seeds: the rescale is lost"):
-        segment(lost, SegmentConfig(seeds=seeds))
+        segment(lost, config=SegmentConfig(seeds=seeds))
 
 
 def test_a_seed_serves_where_the_aorta_is_not_in_the_volume(heart, right_tree):
     volume, _ = heart
     bottom = Volume(volume.voxels[:70], volume.spacing_mm, volume.origin_mm, volume.direction)
-    lower = segment(bottom, SegmentConfig(seeds=(tuple(_axis()[70]),)))
+    lower = segment(bottom, config=SegmentConfig(seeds=(tuple(_axis()[70]),)))
     assert lower.ostium is not None
     assert np.linalg.norm(lower.ostium.position - _axis()[70]) < 2.5
     inside = (positions(bottom) - lower.ostium.position) @ lower.ostium.direction > 1.0
@@ -129,27 +129,27 @@ def test_a_volume_without_contrast_is_refused(heart):
     volume, _ = heart
     plain = Volume(np.minimum(volume.voxels, 60), volume.spacing_mm, volume.origin_mm, volume.direction)
     with pytest.raises(InputError, match="no contrast: homogeneous soft tissue peaks at 65 HU"):
-        segment(plain, SegmentConfig())
+        segment(plain, config=SegmentConfig())
 
 
 @pytest.mark.parametrize("seeds", [(), ((0.0, 0.0, 0.0),)])
 def test_voxels_too_coarse_for_coronary_arteries_are_refused_with_their_size(heart, seeds):
     thick = Volume(heart[0].voxels[::3], heart[0].spacing_mm * [1.0, 1.0, 3.0], heart[0].origin_mm, heart[0].direction)
     with pytest.raises(InputError, match=r"too coarse for coronary arteries \(1.8 mm; 1.25 mm at most\)"):
-        segment(thick, SegmentConfig(seeds=seeds))
+        segment(thick, config=SegmentConfig(seeds=seeds))
 
 
 @pytest.mark.skipif(not CTA.exists(), reason="the real CT angiogram is not here")
 def test_a_thoracic_ct_of_1_5_mm_is_told_to_be_too_coarse():
     with pytest.raises(InputError, match=r"too coarse for coronary arteries \(1.5 mm"):
-        segment(CTA, SegmentConfig())
+        segment(CTA, config=SegmentConfig())
 
 
 def test_a_volume_without_aorta_is_refused():
     grid = empty_grid((60, 60, 60), 1.0, (0.0, 0.0, 0.0))
     ball = np.linalg.norm(positions(grid) - 30.0, axis=-1) < 28.0
     with pytest.raises(InputError, match="ascending aorta was not found"):
-        segment(scan(grid, np.where(ball, BLOOD_HU, FAT_HU)), SegmentConfig())
+        segment(scan(grid, np.where(ball, BLOOD_HU, FAT_HU)), config=SegmentConfig())
 
 
 def test_an_aorta_without_artery_is_refused():
@@ -158,9 +158,9 @@ def test_an_aorta_without_artery_is_refused():
     tube = np.hypot(x[..., 0] - 30, x[..., 1] - 30) < AORTA_RADIUS_MM
     volume = scan(grid, np.where(tube, BLOOD_HU, FAT_HU))
     with pytest.raises(InputError, match="vessel='rca': no such artery"):
-        segment(volume, SegmentConfig())
+        segment(volume, config=SegmentConfig())
     with pytest.raises(InputError, match="no vessel"):
-        segment(volume, SegmentConfig(seeds=((10.0, 10.0, 10.0),)))
+        segment(volume, config=SegmentConfig(seeds=((10.0, 10.0, 10.0),)))
 
 
 def changed(volume, where, hu):
@@ -176,12 +176,12 @@ def test_what_comes_to_a_chamber_below_the_aorta_is_no_coronary_tree(heart):
     flat = changed(heart[0], below & (np.abs(across) < 16.0), 50.0)
     flat = changed(flat, below & (np.abs(across) < 5.0), BLOOD_HU)
     with pytest.raises(InputError, match=r"no such artery .* holds the aortic root"):
-        segment(flat, SegmentConfig(vessel="rca"))
+        segment(flat, config=SegmentConfig(vessel="rca"))
 
 
 def test_a_stump_is_no_coronary_tree(heart):
     with pytest.raises(InputError, match="no such artery"):
-        segment(changed(heart[0], positions(heart[0])[..., 0] > 36.0, FAT_HU), SegmentConfig(vessel="lca"))
+        segment(changed(heart[0], positions(heart[0])[..., 0] > 36.0, FAT_HU), config=SegmentConfig(vessel="lca"))
 
 
 @pytest.fixture(scope="module")
@@ -211,7 +211,7 @@ RIVAL = "two vessels may be the ascending aorta"
 
 def test_a_pulmonary_trunk_as_bright_as_the_aorta_is_not_taken_for_it(two_trunks):
     grid, hu = two_trunks
-    found = segment(scan(grid, hu, blur_mm=0.4, noise_hu=20.0), SegmentConfig(vessel="rca"))
+    found = segment(scan(grid, hu, blur_mm=0.4, noise_hu=20.0), config=SegmentConfig(vessel="rca"))
     assert found.ostium is not None
     assert np.linalg.norm(found.ostium.position) < 1.5
     assert not any(RIVAL in told for told in found.warnings)
@@ -220,7 +220,7 @@ def test_a_pulmonary_trunk_as_bright_as_the_aorta_is_not_taken_for_it(two_trunks
 def test_a_second_trunk_that_an_artery_opens_into_is_told(two_trunks):
     grid, hu = two_trunks
     both = np.where(_through(grid, [[12.5, -37, 8], [4, -45, 9], [-12, -40, 10], [-17, -15, 10]]), BLOOD_HU, hu)
-    found = segment(scan(grid, both, blur_mm=0.4, noise_hu=20.0), SegmentConfig(vessel="rca"))
+    found = segment(scan(grid, both, blur_mm=0.4, noise_hu=20.0), config=SegmentConfig(vessel="rca"))
     assert sum(RIVAL in told for told in found.warnings) == 1
 
 

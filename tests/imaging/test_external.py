@@ -81,7 +81,7 @@ def _model(folder: Path) -> Path:
 
 def test_totalsegmentator_is_run_and_its_mask_taken(program, ct):
     program("TotalSegmentator", _TOTALSEGMENTATOR.format(device="gpu", above=200))
-    mask = segment(ct, SegmentConfig(method="totalsegmentator"))
+    mask = segment(ct, config=SegmentConfig(method="totalsegmentator"))
     np.testing.assert_array_equal(mask.volume.voxels, ct.voxels > 200)
     np.testing.assert_allclose(mask.volume.direction, ct.direction)
     assert mask.ostium is None and mask.method == "totalsegmentator"
@@ -91,30 +91,30 @@ def test_another_task_and_device_are_passed_on_and_the_first_seed_is_the_ostium(
     program("TotalSegmentator", _TOTALSEGMENTATOR.format(device="cpu", above=200))
     options = ("task=total", "structure=aorta", "device=cpu")
     end = ((0.0, 0.0, -20.0), (0.0, 0.0, 15.0))
-    mask = segment(ct, SegmentConfig(method="totalsegmentator", options=options, seeds=end))
+    mask = segment(ct, config=SegmentConfig(method="totalsegmentator", options=options, seeds=end))
     assert mask.ostium is not None
     np.testing.assert_allclose(mask.ostium.position, end[0])
     assert mask.ostium.direction[2] > 0.95
     away = SegmentConfig(method="totalsegmentator", options=options, seeds=((20.0, 0.0, 0.0),))
     with pytest.raises(InputError, match=r"seeds: the lumen found is 7 mm from \(20.0, 0.0, 0.0\)"):
-        segment(ct, away)
+        segment(ct, config=away)
 
 
 def test_nnunet_is_run_with_all_folds_in_the_model_s_own_format(program, ct, tmp_path):
     program("nnUNetv2_predict_from_modelfolder", _NNUNET)
     model = f"model={_model(tmp_path / 'model')}"
     with pytest.raises(InputError, match=r"marked 2 labels \(1, 2\); choose one"):
-        segment(ct, SegmentConfig(method="nnunet", options=(model,)))
-    mask = segment(ct, SegmentConfig(method="nnunet", options=(model, "label=2")))
+        segment(ct, config=SegmentConfig(method="nnunet", options=(model,)))
+    mask = segment(ct, config=SegmentConfig(method="nnunet", options=(model, "label=2")))
     np.testing.assert_array_equal(mask.volume.voxels, ct.voxels > 300)
     with pytest.raises(InputError, match="no voxel with label 3"):
-        segment(ct, SegmentConfig(method="nnunet", options=(model, "label=3")))
+        segment(ct, config=SegmentConfig(method="nnunet", options=(model, "label=3")))
 
 
 @pytest.mark.parametrize("options", [(), ("model=/nowhere",)])
 def test_nnunet_without_a_model_is_refused(ct, options):
     with pytest.raises(InputError, match=r"holds no trained nnU-Net; give --options model=FOLDER"):
-        segment(ct, SegmentConfig(method="nnunet", options=options))
+        segment(ct, config=SegmentConfig(method="nnunet", options=options))
 
 
 @pytest.mark.parametrize(
@@ -138,14 +138,14 @@ def test_a_program_that_does_not_answer_is_reported_in_one_line(program, ct, tex
     if text is not None:
         program("TotalSegmentator", text)
     with pytest.raises(InputError, match=expected) as caught:
-        segment(ct, SegmentConfig(method="totalsegmentator"))
+        segment(ct, config=SegmentConfig(method="totalsegmentator"))
     assert "\n" not in str(caught.value)
 
 
 def test_the_program_gets_nothing_but_geometry_and_hu(program, ct, tmp_path):
     program("TotalSegmentator", f"import shutil, sys; shutil.copy(sys.argv[2], {str(tmp_path / 'got.nii.gz')!r})")
     with pytest.raises(InputError, match="wrote nothing"):
-        segment(ct, SegmentConfig(method="totalsegmentator"))
+        segment(ct, config=SegmentConfig(method="totalsegmentator"))
     from endopilot.imaging.volume import read_volume
 
     np.testing.assert_array_equal(read_volume(tmp_path / "got.nii.gz").voxels, ct.voxels)

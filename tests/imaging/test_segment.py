@@ -60,12 +60,12 @@ def test_every_shipped_method_is_found_by_its_name():
 
 
 def test_a_method_of_one_s_own_segments_from_a_file_beside_the_user(plain_method):
-    mask = segment(_ball(), SegmentConfig(method=PLAIN))
+    mask = segment(_ball(), config=SegmentConfig(method=PLAIN))
     assert mask.method == PLAIN
     np.testing.assert_array_equal(mask.volume.voxels, _ball().voxels > 0)
     with pytest.raises(InputError, match="method: 'plain_method:plain' found no lumen"):
-        segment(_ball(), SegmentConfig(method=PLAIN, options=("above=500",)))
-    function = segment(_ball(), SegmentConfig(method="plain_method:above"))
+        segment(_ball(), config=SegmentConfig(method=PLAIN, options=("above=500",)))
+    function = segment(_ball(), config=SegmentConfig(method="plain_method:above"))
     np.testing.assert_array_equal(function.volume.voxels, mask.volume.voxels)
 
 
@@ -80,7 +80,7 @@ def test_a_method_of_one_s_own_segments_from_a_file_beside_the_user(plain_method
 )
 def test_a_method_that_returns_no_mask_of_the_volume_is_refused(plain_method, name, expected):
     with pytest.raises(InputError, match=expected):
-        segment(_ball(), SegmentConfig(method=f"plain_method:{name}"))
+        segment(_ball(), config=SegmentConfig(method=f"plain_method:{name}"))
 
 
 def test_a_method_says_whether_the_volume_must_hold_contrast(plain_method):
@@ -88,9 +88,9 @@ def test_a_method_says_whether_the_volume_must_hold_contrast(plain_method):
     grid.voxels[:] = -90
     grid.voxels[8:12, 8:12, 8:12] = 300  # 0.06 ml
     with pytest.raises(InputError, match="no contrast"):
-        segment(grid, SegmentConfig(method=PLAIN))
+        segment(grid, config=SegmentConfig(method=PLAIN))
     with pytest.raises(InputError, match="begins 0 mm from the volume's edge"):  # it ran: its ostium is a corner
-        segment(grid, SegmentConfig(method="plain_method:head"))
+        segment(grid, config=SegmentConfig(method="plain_method:head"))
 
 
 @pytest.mark.parametrize(
@@ -123,14 +123,14 @@ def test_a_seed_outside_the_volume_is_refused_with_the_volume_s_extent(method):
     grid = empty_grid((10, 20, 30), (1.0, 2.0, 3.0), (-5.0, 0.0, 100.0))
     grid.voxels[:] = -50
     with pytest.raises(InputError, match=r"outside the volume.*x -5…24, y 0…38, z 100…127"):
-        segment(grid, SegmentConfig(method=method, seeds=((0.0, 50.0, 110.0),)))
+        segment(grid, config=SegmentConfig(method=method, seeds=((0.0, 50.0, 110.0),)))
 
 
 def test_a_lost_rescale_is_refused(plain_method):
     ball = _ball()
     raw = Volume(ball.voxels + 1024, ball.spacing_mm, ball.origin_mm, ball.direction)
     with pytest.raises(InputError, match=r"from 934 to 1424, but fat, lung and air are below 0 HU"):
-        segment(raw, SegmentConfig(method=PLAIN, seeds=((0.0, 0.0, 0.0),)))
+        segment(raw, config=SegmentConfig(method=PLAIN, seeds=((0.0, 0.0, 0.0),)))
 
 
 def test_contrast_is_found_by_the_histogram(plain_method):
@@ -143,13 +143,13 @@ def test_contrast_is_found_by_the_histogram(plain_method):
     config = SegmentConfig(method=PLAIN)
     unenhanced = Volume(hu + noise, grid.spacing_mm, grid.origin_mm, grid.direction)
     with pytest.raises(InputError, match=r"no contrast: homogeneous soft tissue peaks at (45|55) HU, .*has 0.\d ml"):
-        segment(unenhanced, config)
-    seeded = segment(unenhanced, SegmentConfig(method=PLAIN, seeds=((30.0, 30.0, 25.0),)))
+        segment(unenhanced, config=config)
+    seeded = segment(unenhanced, config=SegmentConfig(method=PLAIN, seeds=((30.0, 30.0, 25.0),)))
     assert seeded.volume.voxels.any()  # a seed says where blood is
     hu[radius < 15.0] = 200.0
     enhanced = Volume(hu + noise, grid.spacing_mm, grid.origin_mm, grid.direction)
     with pytest.raises(InputError, match="begins 0 mm from the volume's edge"):  # the plain method's ostium is a corner
-        segment(enhanced, config)
+        segment(enhanced, config=config)
 
 
 def test_importing_the_stage_loads_no_method():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from endopilot import runs
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.ladder import attempt as attempts
 from endopilot.ladder import ladder, submission
@@ -18,7 +18,7 @@ from endopilot.ladder.attempt import attempt
 from endopilot.ladder.ladder import LadderConfig, climb
 from endopilot.ladder.scores import score
 from endopilot.report.ladder_page import write_page
-from endopilot.tasks.task import find_task, ladder_tasks
+from endopilot.tasks.task import find_task, list_tasks
 from endopilot.types import TipProjection
 
 
@@ -26,7 +26,7 @@ from endopilot.types import TipProjection
 def climbed(tmp_path_factory):
     """Return a folder in which `forward` did the lowest task in one patient, and its scores."""
     folder = tmp_path_factory.mktemp("ladder") / "forward"
-    return folder, climb(folder, LadderConfig(policy="forward", tasks=("straight",), patients=1))
+    return folder, climb(output=folder, config=LadderConfig(policy="forward", tasks=("straight",), patients=1))
 
 
 def _result(success: bool, safe: bool, seconds: float = 10.0) -> dict:
@@ -46,7 +46,7 @@ def test_pushing_solves_the_straight_run(climbed):
     row = rows[0]
     assert row["safe_success"] == row["success"] == 1.0
     target = find_task("straight")
-    assert row["seconds"] == pytest.approx((target.depth_mm - target.start_inserted_mm) / 5.0, abs=1.0)
+    assert row["seconds"] == pytest.approx((target.depth_mm - target.start_inserted_length_mm) / 5.0, abs=1.0)
     assert 0.9 < row["path_ratio"] < 1.1 and 0 < row["peak_force_n"] < target.force_limit_n
     assert json.loads((folder / "ladder.json").read_text(encoding="utf-8"))["scores"] == rows
 
@@ -55,44 +55,44 @@ def test_an_interrupted_run_goes_on_with_what_is_missing(climbed, monkeypatch):
     folder, rows = climbed
     asked = []
     monkeypatch.setattr(runs, "each", lambda title, items, work: asked.extend(items) or {})
-    assert climb(folder, LadderConfig(policy="forward", tasks=("straight",), patients=1)) == rows
+    assert climb(output=folder, config=LadderConfig(policy="forward", tasks=("straight",), patients=1)) == rows
     assert asked == []
 
 
 def test_a_folder_of_another_policy_or_of_something_else_is_refused(climbed, tmp_path):
     folder, _ = climbed
     with pytest.raises(InputError, match="was begun with policy = forward, now it is spin"):
-        climb(folder, LadderConfig(policy="spin", tasks=("straight",), patients=1))
+        climb(output=folder, config=LadderConfig(policy="spin", tasks=("straight",), patients=1))
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match=r"is not empty and holds no run\.json"):
-        climb(tmp_path, LadderConfig(tasks=("straight",), patients=1))
+        climb(output=tmp_path, config=LadderConfig(tasks=("straight",), patients=1))
 
 
 def test_a_folder_of_another_task_is_refused(climbed, monkeypatch):
     folder, _ = climbed
-    changed = tuple(replace(task, seconds=1.0) for task in ladder_tasks())
-    monkeypatch.setattr(ladder, "ladder_tasks", lambda version: changed)
+    changed = tuple(replace(task, seconds=1.0) for task in list_tasks())
+    monkeypatch.setattr(ladder, "list_tasks", lambda version: changed)
     with pytest.raises(InputError, match=r"was begun with tasks\.straight = "):
-        climb(folder, LadderConfig(policy="forward", tasks=("straight",), patients=1))
+        climb(output=folder, config=LadderConfig(policy="forward", tasks=("straight",), patients=1))
 
 
 def test_a_folder_of_another_version_of_the_ladder_is_refused(climbed):
     folder, _ = climbed
     assert json.loads((folder / "ladder.json").read_text(encoding="utf-8"))["ladder"] == 2
     with pytest.raises(InputError, match=r"was begun with tasks\.straight = "):
-        climb(folder, LadderConfig(policy="forward", tasks=("straight",), patients=1, version=1))
+        climb(output=folder, config=LadderConfig(policy="forward", tasks=("straight",), patients=1, version=1))
 
 
 def test_another_wire_of_the_same_name_or_another_version_is_refused(climbed, monkeypatch):
     folder, _ = climbed
     one = LadderConfig(policy="forward", tasks=("straight",), patients=1)
-    monkeypatch.setattr(submission, "read_device", lambda name: replace(read_device(name), friction=0.5))
+    monkeypatch.setattr(submission, "read_wire", lambda name: replace(read_wire(name), friction=0.5))
     with pytest.raises(InputError, match=r"was begun with tasks\.straight = "):
-        climb(folder, one)
+        climb(output=folder, config=one)
     monkeypatch.undo()
     monkeypatch.setattr(ladder, "__version__", "99.0")
     with pytest.raises(InputError, match=r"was begun with version = 0\.1\.0, now it is 99\.0"):
-        climb(folder, one)
+        climb(output=folder, config=one)
 
 
 def test_a_changed_policy_of_one_s_own_is_refused(tmp_path, monkeypatch):
@@ -100,11 +100,10 @@ def test_a_changed_policy_of_one_s_own_is_refused(tmp_path, monkeypatch):
     policy = tmp_path / "my_changing_policy.py"
     policy.write_text("from endopilot.navigation.baseline_policies import Forward as Mine\n")
     one = LadderConfig(policy="my_changing_policy:Mine", tasks=("straight",), patients=1)
-    monkeypatch.setattr(runs, "each", lambda title, items, work: [work(item) for item in items] and {})
-    climb(tmp_path / "runs", one)
+    climb(output=tmp_path / "runs", config=one)
     policy.write_text("from endopilot.navigation.baseline_policies import Spin as Mine\n")
     with pytest.raises(InputError, match=r"was begun with origin = my_changing_policy\.py sha256:"):
-        climb(tmp_path / "runs", one)
+        climb(output=tmp_path / "runs", config=one)
 
 
 def test_the_page_shows_the_scores_and_links_the_replay(climbed):
@@ -168,12 +167,12 @@ def test_events_are_counted_for_the_agent_alone():
 
 
 def test_the_upper_eight_are_summed_only_where_all_were_done():
-    every = {task.name: [_result(task.level <= 6, True)] for task in ladder_tasks()}
-    rows = {row["task"]: row for row in score(ladder_tasks(), every)}
+    every = {task.name: [_result(task.level <= 6, True)] for task in list_tasks()}
+    rows = {row["task"]: row for row in score(list_tasks(), every)}
     assert rows["lower four"]["safe_success"] == 1.0
     assert rows["upper eight"]["safe_success"] == 0.25
     assert rows["all twelve"]["safe_success"] == 0.5
-    fewer = [task for task in ladder_tasks() if task.level != 9]
+    fewer = [task for task in list_tasks() if task.level != 9]
     assert "upper eight" not in {row["task"] for row in score(fewer, every)}
 
 

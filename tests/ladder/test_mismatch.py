@@ -17,20 +17,12 @@ from endopilot.tasks.task import find_task
 ONE = LadderConfig(policy="forward", tasks=("straight",), patients=1)
 
 
-def here(title, items, work):
-    """Do the work in this process."""
-    for item in items:
-        work(item)
-    return {}
-
-
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
     """Return a folder in which `forward` did the lowest task in one patient in three of the cases, and the rows."""
     folder = tmp_path_factory.mktemp("mismatch") / "forward"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(mismatches, "CASES", ("matched", "ostium-more", "all"))
-        patch.setattr(runs, "each", here)
         return folder, measure_mismatch(folder, ONE, 0.2)
 
 

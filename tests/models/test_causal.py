@@ -13,8 +13,8 @@ from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
-from endopilot.dataset.loader import Dataset, load_dataset
-from endopilot.devices.device import read_device
+from endopilot.dataset.loader import Dataset, read_dataset
+from endopilot.devices.device import read_wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.errors import InputError
 from endopilot.evaluation.prediction_baselines import follow_slack, hold_slack, mean_control
@@ -45,16 +45,16 @@ def folder(tmp_path_factory):
     for index in range(2):
         anatomy = make_patient(AtlasConfig(seed=910), index)
         patients.append(folder / anatomy.name)
-        write_anatomy(anatomy, patients[-1])
+        write_anatomy(anatomy, output=patients[-1])
     config = DatasetConfig(sequences=4, seconds=37.5, anatomy_shares=(0.5, 0.0, 0.5), seed=4)
-    generate_dataset(patients, folder / "dataset", read_device("workhorse-014"), config)
+    generate_dataset(patients, output=folder / "dataset", device=read_wire("workhorse-014"), config=config)
     return folder / "dataset"
 
 
 @pytest.fixture(scope="module")
 def dataset(folder) -> Dataset:
     """Return the navigations of both patients as they were recorded."""
-    return load_dataset(folder)
+    return read_dataset(folder)
 
 
 @pytest.fixture(scope="module")
@@ -279,6 +279,21 @@ def test_a_simulated_wire_of_the_true_friction_retraces_the_navigation_and_is_si
         assert (read_or_simulate(tmp_path, brief.select(some)) == 7.0).all()  # other episodes are other wires
 
 
+@pytest.mark.parametrize("first", [20, 35])
+def test_another_end_of_a_navigation_is_simulated_from_where_it_begins(brief, first):
+    some = brief.select(np.array([0, len(brief) - 1]))
+    wires = SimulatedWires()
+    before = wires.tips(some)
+    later = some.control[:, first:].copy()
+    later[..., 0] *= 0.5
+    other = some.driven(some.proximal[:, first:], later)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("endopilot.models.simulated_wires.Ensemble", None)  # none is brought to its start again
+        tips = wires.tips(other)
+    np.testing.assert_array_equal(tips, simulated_tips(other))
+    assert (tips != before).any()
+
+
 def test_a_wire_whose_simulation_fails_is_where_the_guess_is(brief):
     vessels, patient = prepare_vessels(brief), np.unique(brief.anatomy, return_inverse=True)[1]
     observed = np.broadcast_to(given(brief), brief.branch.shape)
@@ -321,7 +336,7 @@ def test_the_packaged_forward_network_says_where_a_tip_may_jump(packaged, everyo
 
 
 def test_a_seed_repeats_to_the_bit_and_an_interrupted_run_goes_on(folder, tmp_path):
-    train(folder, tmp_path / "once", SHORT)
+    train(folder, output=tmp_path / "once", config=SHORT)
     assert read_json(tmp_path / "once/training.json")["ff"]["parameters"] < 10_000
 
     class Cut(Exception):
@@ -336,8 +351,8 @@ def test_a_seed_repeats_to_the_bit_and_an_interrupted_run_goes_on(folder, tmp_pa
     save = Job._save
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Cut):
         patch.setattr(Job, "_save", stop)
-        train(folder, tmp_path / "cut", SHORT)
-    train(folder, tmp_path / "cut", SHORT)
+        train(folder, output=tmp_path / "cut", config=SHORT)
+    train(folder, output=tmp_path / "cut", config=SHORT)
     assert sha256(tmp_path / "cut/ff.safetensors") == sha256(tmp_path / "once/ff.safetensors")
     assert isinstance(load_model(tmp_path / "cut"), CausalPredictor)
 
@@ -353,7 +368,7 @@ def test_bad_input_is_named(brief, tmp_path):
 
 def test_a_wire_that_the_vessel_holds_ends_where_it_is(folder):
     anatomy = read_anatomy(next(folder.parent.glob("rca-*")))
-    weak = replace(read_device("workhorse-014"), pull_limit_n=1e-9)  # friction holds it
+    weak = replace(read_wire("workhorse-014"), pull_limit_n=1e-9)  # friction holds it
     patient = prepare(anatomy, weak, SimulatorConfig(element_mm=1.25, tolerance_mm=1e-2))
     slack = np.arange(patient.pull_tip.shape[1]) * STEP_MM - patient.pull_tip
     assert (patient.deepest > 20.0).all()

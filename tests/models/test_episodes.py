@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from endopilot.dataset.loader import load_dataset
+from endopilot.dataset.loader import read_dataset
 from endopilot.errors import InputError
 from endopilot.models import patient
 from endopilot.models.episodes import PATIENTS_FOLDER, Episodes, EpisodeSetUp
@@ -20,13 +20,13 @@ from toy_navigation import make_toy_dataset
 
 @pytest.fixture(scope="module")
 def dataset(toy_dataset):
-    return load_dataset(toy_dataset)
+    return read_dataset(toy_dataset)
 
 
 def test_a_dataset_gives_its_navigations_to_the_bit(dataset):
     slip = np.random.default_rng(1).uniform(0, 1, dataset.slip.shape).astype(np.float32)
     asked = dataset.control + np.stack([slip, np.zeros_like(slip)], axis=-1) / dataset.sample_period_s
-    slipped = replace(dataset, slip=slip, command=asked.astype(np.float32).astype(float))
+    slipped = replace(dataset, slip=slip, command=asked.astype(float) + 1e-9)  # with digits that float32 lacks
     episodes = Episodes.of_dataset(slipped)
     assert len(episodes) == len(dataset) and episodes.samples == 120
     np.testing.assert_array_equal(episodes.proximal[..., 0], dataset.inserted_length[:, :, 0])
@@ -115,4 +115,4 @@ def test_a_dataset_keeps_its_prepared_patients(dataset, fork, wire, monkeypatch,
 def test_episodes_no_longer_than_the_given_states_are_refused(tmp_path):
     make_toy_dataset(tmp_path / "d", patients=1, sequences=2, seconds=15.0)
     with pytest.raises(InputError, match=r"30 samples leave nothing to predict .* seconds of 15\.5 or more"):
-        Episodes.of_dataset(load_dataset(tmp_path / "d"))
+        Episodes.of_dataset(read_dataset(tmp_path / "d"))

@@ -24,7 +24,7 @@ SHORT = TrainConfig(network="ff", epochs=2, windows_per_epoch=69, batch_size=32,
 @pytest.fixture(scope="module")
 def plain(toy_dataset, tmp_path_factory):
     run = tmp_path_factory.mktemp("plain") / "run"
-    train(toy_dataset, run, SHORT)
+    train(toy_dataset, output=run, config=SHORT)
     return run
 
 
@@ -55,7 +55,7 @@ def test_mixed_precision_multiplies_in_bfloat16_and_keeps_float32(plain, toy_dat
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(torch.nn.functional, "scaled_dot_product_attention", watched)
-        train(toy_dataset, tmp_path / "run", TrainConfig(**{**vars(SHORT), "precision": "bfloat16"}))
+        train(toy_dataset, output=tmp_path / "run", config=TrainConfig(**{**vars(SHORT), "precision": "bfloat16"}))
     assert torch.bfloat16 in dtypes
     ours, theirs = (read_tensors(run / "ff.safetensors")[0] for run in (tmp_path / "run", plain))
     assert {weights.dtype for weights in ours.values()} == {torch.float32}
@@ -67,5 +67,5 @@ def test_mixed_precision_multiplies_in_bfloat16_and_keeps_float32(plain, toy_dat
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
 def test_a_gpu_that_is_not_there_is_refused(toy_dataset, tmp_path):
     with pytest.raises(InputError, match="torch finds no GPU here"):
-        train(toy_dataset, tmp_path / "run", TrainConfig(processor="cuda"))
+        train(toy_dataset, output=tmp_path / "run", config=TrainConfig(processor="cuda"))
     assert not (tmp_path / "run").exists()

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from endopilot.dataset.loader import Dataset, load_dataset
-from endopilot.devices.device import read_device
+from endopilot.dataset.loader import Dataset, read_dataset
+from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.files import read_json
 from endopilot.models.config import PRETRAINED, TrainConfig, TransformerConfig, run_path
@@ -22,14 +22,18 @@ RUN = Path("a-run")
 
 @pytest.fixture(scope="module")
 def own(toy_dataset) -> Dataset:
-    return load_dataset(toy_dataset)
+    return read_dataset(toy_dataset)
 
 
 @pytest.fixture(scope="module")
 def record(toy_dataset, tmp_path_factory) -> dict:
     """Return the manifest of a run on the toy patients."""
     run = tmp_path_factory.mktemp("provenance") / "run"
-    train(toy_dataset, run, TrainConfig(network="ff", epochs=1, windows_per_epoch=16, batch_size=16, size=SMALL))
+    train(
+        toy_dataset,
+        output=run,
+        config=TrainConfig(network="ff", epochs=1, windows_per_epoch=16, batch_size=16, size=SMALL),
+    )
     return read_json(run / "manifest.json")
 
 
@@ -38,7 +42,7 @@ def elsewhere(tmp_path_factory) -> Dataset:
     """Return a dataset of twelve patients, of which six are those of the run's own dataset."""
     folder = tmp_path_factory.mktemp("elsewhere") / "dataset"
     make_toy_dataset(folder, patients=12, sequences=4)
-    return load_dataset(folder)
+    return read_dataset(folder)
 
 
 def test_a_run_knows_the_patients_that_it_was_trained_on(own, record):
@@ -61,7 +65,7 @@ def test_an_older_run_knows_its_own_dataset_alone(own, elsewhere, record):
 
 
 def test_the_twin_knows_nobody(toy_dataset, own, tmp_path):
-    train(toy_dataset, tmp_path, TrainConfig(model="twin"))
+    train(toy_dataset, output=tmp_path, config=TrainConfig(model="twin"))
     record = read_json(tmp_path / "manifest.json")
     assert record["patients"] == []
     assert trained_patients(RUN, record, own) == frozenset()
@@ -92,6 +96,6 @@ def test_a_dataset_of_another_wire_is_refused(own, record, change, refused):
 
 
 def test_a_profile_of_another_length_is_another_wire(own, record):
-    device = asdict(read_device("j-035"))
+    device = asdict(read_wire("j-035"))
     with pytest.raises(InputError, match=r"its wire is j-035, and that of a-run is workhorse-014"):
         trained_patients(RUN, record, replace(own, manifest=own.manifest | {"device": device}))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from endopilot.dataset.loader import load_dataset
+from endopilot.dataset.loader import read_dataset
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.errors import InputError
 from endopilot.models.config import TrainConfig, TransformerConfig
@@ -26,7 +26,9 @@ def learnt(toy_dataset, tmp_path_factory):
     """Return a predictor trained for some seconds on the toy wire."""
     run = tmp_path_factory.mktemp("learnt") / "run"
     train(
-        toy_dataset, run, TrainConfig(epochs=6, windows_per_epoch=4000, batch_size=32, learning_rate=3e-3, size=SMALL)
+        toy_dataset,
+        output=run,
+        config=TrainConfig(epochs=6, windows_per_epoch=4000, batch_size=32, learning_rate=3e-3, size=SMALL),
     )
     return load_model(run)
 
@@ -34,7 +36,7 @@ def learnt(toy_dataset, tmp_path_factory):
 @pytest.fixture(scope="module")
 def episodes(toy_dataset):
     """Return navigations of patients that were not trained on."""
-    return Episodes.of_dataset(load_dataset(toy_dataset).of_split("test").select(np.arange(16)))
+    return Episodes.of_dataset(read_dataset(toy_dataset).of_split("test").select(np.arange(16)))
 
 
 def untrained(limits=(1e9, 1e9)) -> TransformerPredictor:
@@ -165,6 +167,6 @@ def test_forward_beats_holding_the_slack_on_new_patients(learnt, episodes):
 def test_inverse_beats_the_mean_and_the_held_control_on_new_patients(learnt, episodes, toy_dataset):
     truth = episodes.control[:, GIVEN:, 0]
     error = np.abs(learnt.rollout_inverse(episodes).control[..., 0] - truth).mean()
-    mean = load_dataset(toy_dataset).of_split("train").control[..., 0].mean()
+    mean = read_dataset(toy_dataset).of_split("train").control[..., 0].mean()
     assert error < 0.5 * np.abs(episodes.control[:, GIVEN - 1 : GIVEN, 0] - truth).mean()
     assert error < 0.5 * np.abs(mean - truth).mean()

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from endopilot.dataset.loader import load_dataset
+from endopilot.dataset.loader import read_dataset
 from endopilot.errors import InputError
 from endopilot.files import read_json, sha256
 from endopilot.models.checkpoint import read_network, read_tensors
@@ -34,13 +34,13 @@ SHORT = {"epochs": 3, "windows_per_epoch": 64, "batch_size": 16, "size": SMALL}
 def short_run(toy_dataset, tmp_path_factory):
     """Return a run of both networks, three short epochs each."""
     run = tmp_path_factory.mktemp("short") / "run"
-    train(toy_dataset, run, TrainConfig(**SHORT))
+    train(toy_dataset, output=run, config=TrainConfig(**SHORT))
     return run
 
 
 @pytest.mark.parametrize("name", ["ff", "if"])
 def test_windows_hold_what_the_paper_says(toy_dataset, name):
-    data = load_dataset(toy_dataset).of_split("train")
+    data = read_dataset(toy_dataset).of_split("train")
     tip, proximal, control, truth = Windows.of(Episodes.of_dataset(data)).window(
         name, torch.tensor([[2, 30], [5, 119]])
     )
@@ -55,7 +55,7 @@ def test_windows_hold_what_the_paper_says(toy_dataset, name):
 
 @pytest.mark.parametrize("name", ["ff", "if"])
 def test_overfits_one_batch(toy_dataset, name):
-    windows = Windows.of(Episodes.of_dataset(load_dataset(toy_dataset).of_split("train")))
+    windows = Windows.of(Episodes.of_dataset(read_dataset(toy_dataset).of_split("train")))
     *window, truth = windows.window(name, windows.targets()[:: len(windows.targets()) // 16][:16])
     torch.manual_seed(0)
     network = NETWORKS[name](replace(SMALL, dropout=0.0))
@@ -82,9 +82,9 @@ def test_writes_what_a_run_holds(short_run, toy_dataset):
 
 
 def test_a_seed_repeats_to_the_bit(short_run, toy_dataset, tmp_path):
-    train(toy_dataset, tmp_path / "again", TrainConfig(**SHORT, network="ff"))
+    train(toy_dataset, output=tmp_path / "again", config=TrainConfig(**SHORT, network="ff"))
     assert sha256(tmp_path / "again/ff.safetensors") == sha256(short_run / "ff.safetensors")
-    train(toy_dataset, tmp_path / "other", TrainConfig(**SHORT, network="ff", seed=1))
+    train(toy_dataset, output=tmp_path / "other", config=TrainConfig(**SHORT, network="ff", seed=1))
     assert sha256(tmp_path / "other/ff.safetensors") != sha256(short_run / "ff.safetensors")
 
 
@@ -108,7 +108,7 @@ def test_killed_and_resumed_continues_the_same_curve(short_run, toy_dataset, tmp
         process.send_signal(signal.SIGKILL)
         process.wait()
     assert not (run / "manifest.json").exists()
-    train(toy_dataset, run, TrainConfig(**SHORT))
+    train(toy_dataset, output=run, config=TrainConfig(**SHORT))
     for name in ("ff", "if"):
         assert sha256(run / f"{name}.safetensors") == sha256(short_run / f"{name}.safetensors")
         curves = [read_json(folder / "training.json")[name]["curve"] for folder in (run, short_run)]
@@ -149,28 +149,28 @@ def test_an_epoch_that_was_shown_but_not_kept_is_shown_as_it_was_trained_again(t
 
 def test_a_finished_run_returns_at_once(short_run, toy_dataset):
     before = sha256(short_run / "checkpoints/ff.safetensors")
-    train(toy_dataset, short_run, TrainConfig(**SHORT))
+    train(toy_dataset, output=short_run, config=TrainConfig(**SHORT))
     assert sha256(short_run / "checkpoints/ff.safetensors") == before
 
 
 def test_other_settings_are_refused(short_run, toy_dataset):
     with pytest.raises(InputError, match=r"begun with config\.epochs = 3, now it is 4"):
-        train(toy_dataset, short_run, TrainConfig(**(SHORT | {"epochs": 4})))
+        train(toy_dataset, output=short_run, config=TrainConfig(**(SHORT | {"epochs": 4})))
 
 
 def test_another_dataset_or_version_is_refused(short_run, toy_dataset, tmp_path, monkeypatch):
     make_toy_dataset(tmp_path / "other", patients=6, sequences=24, seed=9)
     with pytest.raises(InputError, match="was begun with dataset = "):
-        train(tmp_path / "other", short_run, TrainConfig(**SHORT))
+        train(tmp_path / "other", output=short_run, config=TrainConfig(**SHORT))
     monkeypatch.setattr(sys.modules["endopilot.models.train"], "__version__", "99.0")
     with pytest.raises(InputError, match=r"was begun with version = 0\.1\.0, now it is 99\.0"):
-        train(toy_dataset, short_run, TrainConfig(**SHORT))
+        train(toy_dataset, output=short_run, config=TrainConfig(**SHORT))
 
 
 def test_a_folder_of_other_things_is_refused(toy_dataset, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match=r"is not empty and holds no run\.json"):
-        train(toy_dataset, tmp_path, TrainConfig(**SHORT))
+        train(toy_dataset, output=tmp_path, config=TrainConfig(**SHORT))
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
@@ -188,7 +188,7 @@ def test_the_first_bad_loss_stops_and_the_last_good_checkpoint_stays(toy_dataset
 
     monkeypatch.setattr(Windows, "window", window)
     with pytest.raises(InputError, match=r"loss of ff became nan in epoch 2, batch 2 .* checkpoint of epoch 1 is kept"):
-        train(toy_dataset, tmp_path / "run", config)
+        train(toy_dataset, output=tmp_path / "run", config=config)
     monkeypatch.undo()
     _, facts = read_tensors(tmp_path / "run/checkpoints/ff.safetensors")
     assert [entry["epoch"] for entry in facts["curve"]] == [1]
@@ -197,19 +197,19 @@ def test_the_first_bad_loss_stops_and_the_last_good_checkpoint_stays(toy_dataset
 
 
 def test_samples_that_are_not_finite_are_named(toy_dataset, tmp_path, monkeypatch):
-    data = load_dataset(toy_dataset)
+    data = read_dataset(toy_dataset)
     poisoned = replace(data, tip_abscissa=data.tip_abscissa.copy())
     episode = int(np.flatnonzero(data.split == "train")[5])
     poisoned.tip_abscissa[episode, 60] = np.nan
-    monkeypatch.setattr("endopilot.models.train.load_joined", lambda folders: poisoned)
+    monkeypatch.setattr("endopilot.models.train.read_joined", lambda folders: poisoned)
     where = f"tip_abscissa of {data.anatomy[episode]}, sequence {data.sequence[episode]}, is not finite"
     with pytest.raises(InputError, match=where):
-        train(toy_dataset, tmp_path / "run", TrainConfig(**SHORT))
+        train(toy_dataset, output=tmp_path / "run", config=TrainConfig(**SHORT))
 
 
 def test_the_time_allowed_is_kept(toy_dataset, tmp_path):
     config = TrainConfig(network="ff", epochs=2, batch_size=16, max_seconds=2.0)
-    train(toy_dataset, tmp_path / "run", config)
+    train(toy_dataset, output=tmp_path / "run", config=config)
     result = read_json(tmp_path / "run/training.json")["ff"]
     assert result["parameters"] == 650_754
     everything = 77 * 90 / 16
@@ -231,4 +231,4 @@ def test_damaged_checkpoints_are_named(short_run, tmp_path):
 def test_episodes_without_a_future_are_refused(tmp_path):
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4, seconds=15.0)
     with pytest.raises(InputError, match=r"seconds of 15\.5 or more"):
-        train(tmp_path / "d", tmp_path / "run", TrainConfig(**SHORT))
+        train(tmp_path / "d", output=tmp_path / "run", config=TrainConfig(**SHORT))

@@ -11,8 +11,8 @@ from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
-from endopilot.dataset.loader import load_dataset
-from endopilot.devices.device import read_device
+from endopilot.dataset.loader import read_dataset
+from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.models import twin as twin_module
 from endopilot.models.config import TrainConfig, TwinConfig
@@ -32,17 +32,17 @@ def folder(tmp_path_factory):
     """Return the folder of a twin's run, whose wires have 14 to 20 % more friction than the nominal device."""
     folder = tmp_path_factory.mktemp("twin")
     anatomy = make_patient(AtlasConfig(seed=77), 0)
-    write_anatomy(anatomy, folder / "anatomy")
+    write_anatomy(anatomy, output=folder / "anatomy")
     config = DatasetConfig(sequences=4, seconds=22.5, friction=(0.114, 0.12), seed=3)
-    generate_dataset([folder / "anatomy"], folder / "dataset", read_device("workhorse-014"), config)
-    train(folder / "dataset", folder / "run", TrainConfig(model="twin", twin=TwinConfig(members=12)))
+    generate_dataset([folder / "anatomy"], output=folder / "dataset", device=read_wire("workhorse-014"), config=config)
+    train(folder / "dataset", output=folder / "run", config=TrainConfig(model="twin", twin=TwinConfig(members=12)))
     return folder
 
 
 @pytest.fixture(scope="module")
 def episodes(folder):
     """Return navigations whose ostium lies 0.3 mm deeper than the predictor is given it."""
-    true = Episodes.of_dataset(load_dataset(folder / "dataset"))
+    true = Episodes.of_dataset(read_dataset(folder / "dataset"))
     error = np.array([OSTIUM_MM, 0.0], dtype=true.proximal.dtype)
     return replace(true, initial=true.initial - error, proximal=true.proximal - error)
 
@@ -99,8 +99,8 @@ def test_a_wire_that_is_held_while_it_is_pulled_starts_where_it_lies(folder, epi
 
 def test_in_a_patient_who_moves_its_wires_move_as_far_as_is_known(folder, tmp_path) -> None:
     config = DatasetConfig(sequences=3, seconds=22.5, seed=4, motion="both")
-    generate_dataset([folder / "anatomy"], tmp_path / "moving", read_device("workhorse-014"), config)
-    moving = Episodes.of_dataset(load_dataset(tmp_path / "moving"))
+    generate_dataset([folder / "anatomy"], output=tmp_path / "moving", device=read_wire("workhorse-014"), config=config)
+    moving = Episodes.of_dataset(read_dataset(tmp_path / "moving"))
     blind = replace(moving, setup=replace(moving.setup, known_motions={}))
     twin, later = load_model(folder / "run"), slice(30, None)
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endopilot.control.navigate_patient import NavigatePatientConfig, set_up_navigation
+from endopilot.control.navigate import NavigateConfig, set_up_navigation
 from endopilot.devices.robot import read_robot
 from endopilot.errors import InputError
-from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, navigate
+from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Decision, Hand, Observation, Policy
 from endopilot.robot.robot import CYCLE_S
 from endopilot.simulation.mismatch import ModelMismatch
@@ -45,7 +45,7 @@ def straight(fork, wire) -> Navigation:
 def test_a_policy_that_pushes_on_reaches_a_target_straight_ahead(straight) -> None:
     policy = Forward(6.0, expose_every=3)
     assert isinstance(policy, Policy)
-    record = navigate(straight, policy, seed=1)
+    record = NavigationLoop(straight, policy, seed=1).run()
     assert record.reason == "reached" and record.success
     assert abs(record.tip.abscissa[-1, 0] - 30.0) <= 2.0 and record.tip.branch[-1, 0] == 1
     assert (np.abs(record.tip.abscissa[:-1, 0] - 30.0) > 2.0).all()  # it ends at once
@@ -66,8 +66,8 @@ def test_a_policy_that_pushes_on_reaches_a_target_straight_ahead(straight) -> No
 
 
 def test_it_ends_in_time_and_the_same_seed_repeats_it(straight) -> None:
-    first, again = (navigate(straight, Forward(1.0, 2, 0.7), seed=5) for _ in range(2))
-    other = navigate(straight, Forward(1.0, 2, 0.7), seed=6)
+    first, again = (NavigationLoop(straight, Forward(1.0, 2, 0.7), seed=5).run() for _ in range(2))
+    other = NavigationLoop(straight, Forward(1.0, 2, 0.7), seed=6).run()
     assert first.reason == "time" and not first.success and first.seconds == 10.0
     np.testing.assert_array_equal(first.tip_position, again.tip_position)
     assert first.measured[2].position.tolist() == again.measured[2].position.tolist()
@@ -76,17 +76,19 @@ def test_it_ends_in_time_and_the_same_seed_repeats_it(straight) -> None:
 
 def test_encoders_count_from_where_the_ostium_is_believed_to_be(straight) -> None:
     policy = Forward(4.0)
-    record = navigate(straight, policy, config=NavigateConfig(robot=PERFECT), truth=ModelMismatch(ostium_mm=1.5))
+    record = NavigationLoop(
+        straight, policy, config=LoopConfig(robot=PERFECT), truth=ModelMismatch(ostium_mm=1.5)
+    ).run()
     encoder = np.array([observation.devices[0][0] for observation in policy.given])
     np.testing.assert_allclose(record.inserted_length[:-1, 0] - encoder, 1.5, atol=1e-9)
     np.testing.assert_allclose(np.diff(record.inserted_length[:, 0]), 2.0, atol=1e-6)
 
 
 def test_friction_and_stiffness_of_the_truth_change_what_happens(straight) -> None:
-    config = NavigateConfig(robot=PERFECT)
-    plain = navigate(straight, Forward(3.0, rotation=2.0), config=config)
+    config = LoopConfig(robot=PERFECT)
+    plain = NavigationLoop(straight, Forward(3.0, rotation=2.0), config=config).run()
     for truth in (ModelMismatch(friction_factor=2.0), ModelMismatch(stiffness_factor=0.5)):
-        changed = navigate(straight, Forward(3.0, rotation=2.0), config=config, truth=truth)
+        changed = NavigationLoop(straight, Forward(3.0, rotation=2.0), config=config, truth=truth).run()
         both = min(len(plain.time_s), len(changed.time_s))
         assert np.abs(changed.tip_position[:both] - plain.tip_position[:both]).max() > 1e-3
 
@@ -106,8 +108,8 @@ def test_a_catheter_that_leans_in_reality_leads_the_wire_elsewhere(straight) -> 
 
 @pytest.mark.parametrize("xray", ["assumed", "images"])
 def test_xray_shows_how_the_guiding_catheter_leans_before_the_wire_is_shaped(fork, xray) -> None:
-    config = NavigatePatientConfig(tip="own", policy="forward", true_axis_deg=20.0, xray=xray)
-    set_up = set_up_navigation(fork, "0,0,33", config)
+    config = NavigateConfig(tip="own", true_axis_deg=20.0, xray=xray)
+    set_up = set_up_navigation(fork, "0,0,33", policy="forward", config=config)
     seen, real = set_up.navigation.anatomy.insertion.direction, set_up.true_anatomy.insertion.direction
     off_deg = [float(np.degrees(np.arccos(axis @ real))) for axis in (fork.insertion.direction, seen)]
     assert off_deg[0] == pytest.approx(20.0, abs=1e-6)
@@ -119,7 +121,7 @@ def test_xray_shows_how_the_guiding_catheter_leans_before_the_wire_is_shaped(for
 
 def test_what_a_policy_asks_is_kept_within_the_limits(straight) -> None:
     for asked in ((np.nan, 1.0), (1e9, 0.0), (5.0, -np.inf)):
-        record = navigate(straight, Forward(asked[0], rotation=asked[1]))
+        record = NavigationLoop(straight, Forward(asked[0], rotation=asked[1])).run()
         bound = [straight.device.max_velocity_mm_s, straight.device.max_rotation_rad_s]
         assert np.isfinite(record.control).all() and (np.abs(record.control) <= bound).all()
         assert record.faults == len(record.time_s) - 1
@@ -135,19 +137,19 @@ def test_what_is_no_pair_for_each_device_is_refused_in_a_line(straight, devices)
             return decision
 
     with pytest.raises(InputError, match=r"policy: Odd decided devices = .*; give a pair of velocities for each"):
-        navigate(straight, Odd(1.0))
+        NavigationLoop(straight, Odd(1.0)).run()
 
 
 def test_one_view_alone_locates_the_tip_by_the_vessel(straight) -> None:
-    config = NavigateConfig(fluoroscope=FluoroscopeConfig(biplane=False))
-    record = navigate(straight, Forward(5.0, expose_every=1), config=config)
+    config = LoopConfig(fluoroscope=FluoroscopeConfig(biplane=False))
+    record = NavigationLoop(straight, Forward(5.0, expose_every=1), config=config).run()
     shown = [measured for measured in record.measured if measured is not None]
     error = np.array([tip.abscissa for tip in shown]) - record.tip.abscissa[: len(shown), 0]
     assert np.abs(error).max() < 2.0
 
 
 def test_steps_of_the_loop_are_the_navigation_to_the_bit(straight) -> None:
-    whole = navigate(straight, Forward(3.0, 2, 0.7), seed=5)
+    whole = NavigationLoop(straight, Forward(3.0, 2, 0.7), seed=5).run()
     loop = NavigationLoop(straight, Forward(3.0, 2, 0.7), seed=5)
     while loop.reason is None:  # in the smallest pieces, and asking for more than is left
         loop.begin()
@@ -204,10 +206,10 @@ def test_a_navigation_that_is_over_goes_on_to_another_target_without_a_limit_of_
 
 def test_a_cycle_of_the_drives_divides_the_time_between_two_decisions(straight) -> None:
     with pytest.raises(InputError, match=r"cycle_s: 0\.03; give what divides 0\.5 s"):
-        NavigateConfig(cycle_s=0.03)
+        LoopConfig(cycle_s=0.03)
     ends = {}
     for cycle_s in (CYCLE_S, 0.0125):
-        record = navigate(straight, Forward(3.0), config=NavigateConfig(robot=PERFECT, cycle_s=cycle_s), seed=1)
+        record = NavigationLoop(straight, Forward(3.0), config=LoopConfig(robot=PERFECT, cycle_s=cycle_s), seed=1).run()
         assert record.cycles.command.shape[1] == record.seconds / cycle_s
         ends[cycle_s] = record.tip_position[-1]
     np.testing.assert_allclose(ends[CYCLE_S], ends[0.0125], atol=0.05)
@@ -222,7 +224,7 @@ class Watching(Forward):
 
 def test_hands_take_over_and_hand_back(straight) -> None:
     policy = Watching(4.0)
-    loop = NavigationLoop(straight, policy, config=NavigateConfig(robot=PERFECT))
+    loop = NavigationLoop(straight, policy, config=LoopConfig(robot=PERFECT))
     loop.step()
     loop.hand_over(Hand(((-1.0, 1.0),)))
     for _ in range(3):
@@ -243,7 +245,7 @@ def test_hands_take_over_and_hand_back(straight) -> None:
 def test_images_show_the_tip(straight) -> None:
     """In a patient who lies in a pose of their own: as far along as the tip is, and how sure that is."""
     policy = Forward(8.0, expose_every=4)
-    record = navigate(straight, policy, config=NavigateConfig(xray="images"), seed=2)
+    record = NavigationLoop(straight, policy, config=LoopConfig(xray="images"), seed=2).run()
     assert policy.navigation.xray == "images" and straight.xray == "assumed"
     assert record.reason == "reached" and record.exposures >= 2
     for sample in np.flatnonzero(record.exposed):
@@ -275,10 +277,12 @@ def breathing(**changed: float) -> Motion:
 def test_an_exposure_shows_a_moving_vessel_where_it_is_less_what_the_c_arm_knows(straight) -> None:
     """The ostium's axis is z: a breath of 6 mm towards the feet, sin⁴(πt/4 s), moves the tip by so much along it."""
     sharp = FluoroscopeConfig(pixel_sd=1e-3, along_sd=1e-3)
-    config = NavigateConfig(robot=PERFECT, fluoroscope=sharp, motion=breathing())
+    config = LoopConfig(robot=PERFECT, fluoroscope=sharp, motion=breathing())
 
     def errors(known: Motion | None) -> np.ndarray:
-        record = navigate(replace(straight, known_motion=known), Forward(3.0, expose_every=1), config=config)
+        record = NavigationLoop(
+            replace(straight, known_motion=known), Forward(3.0, expose_every=1), config=config
+        ).run()
         shown = [tip for tip in record.measured if tip is not None]
         return np.array([tip.position for tip in shown]) - record.tip_position[: len(shown), 0]
 
@@ -293,9 +297,10 @@ def test_an_exposure_shows_a_moving_vessel_where_it_is_less_what_the_c_arm_knows
 
 
 def test_a_heartbeat_moves_the_wire_in_the_vessel(straight) -> None:
-    config = NavigateConfig(robot=PERFECT)
+    config = LoopConfig(robot=PERFECT)
     still, beating = (
-        navigate(straight, Forward(3.0), config=replace(config, motion=motion)) for motion in (None, Motion())
+        NavigationLoop(straight, Forward(3.0), config=replace(config, motion=motion)).run()
+        for motion in (None, Motion())
     )
     both = min(len(still.time_s), len(beating.time_s))
     assert beating.reason != "invalid"
@@ -305,8 +310,8 @@ def test_a_heartbeat_moves_the_wire_in_the_vessel(straight) -> None:
 def test_images_show_a_moving_vessel_where_it_is_less_what_is_known(straight) -> None:
     """A breath of 6 mm, of which 5 mm are known, moves the tip by 1 mm along the vessel's axis, z, when inspired."""
     known = replace(straight, known_motion=breathing(breathing_caudal_mm=5.0))
-    config = NavigateConfig(robot=PERFECT, xray="images", motion=breathing())
-    record = navigate(replace(known, seconds=4.0), Forward(6.0, expose_every=2), config=config, seed=2)
+    config = LoopConfig(robot=PERFECT, xray="images", motion=breathing())
+    record = NavigationLoop(replace(known, seconds=4.0), Forward(6.0, expose_every=2), config=config, seed=2).run()
     at = np.flatnonzero([tip is not None and k >= 2 for k, tip in enumerate(record.measured)])
     assert len(at) >= 3
     seen = np.array([record.measured[k].position[2] for k in at])
@@ -319,7 +324,7 @@ def test_a_run_of_contrast_before_the_wire_shows_how_the_patient_moves(straight)
     """The patient breathes by 7 mm, which the navigation takes to be 4.9 at first."""
     deep, mean = breathing(breathing_caudal_mm=7.0), breathing(breathing_caudal_mm=4.9)
     navigation = replace(straight, known_motion=mean, seconds=1.0)
-    config = NavigateConfig(robot=PERFECT, xray="images", motion=deep, measure_motion=True)
+    config = LoopConfig(robot=PERFECT, xray="images", motion=deep, measure_motion=True)
     loop = NavigationLoop(navigation, Forward(6.0, expose_every=2), config=config, seed=2)
     assert loop.navigation.known_motion.breathing_caudal_mm == pytest.approx(7.0, abs=0.3)
     assert loop.c_arm.known_motion == loop.navigation.known_motion
@@ -328,18 +333,18 @@ def test_a_run_of_contrast_before_the_wire_shows_how_the_patient_moves(straight)
 
 
 def test_a_motion_is_measured_by_images_alone(fork) -> None:
-    config = NavigatePatientConfig(tip="own", motion="both", motion_seed=3, motion_known="measured")
+    config = NavigateConfig(tip="own", motion="both", motion_seed=3, motion_known="measured")
     with pytest.raises(InputError, match="motion_known: measured; only X-ray images measure it"):
-        set_up_navigation(fork, "0,0,33", config)
-    ready = set_up_navigation(fork, "0,0,33", replace(config, xray="images"))
+        set_up_navigation(fork, "0,0,33", config=config)
+    ready = set_up_navigation(fork, "0,0,33", config=replace(config, xray="images"))
     assert ready.navigation.known_motion == Motion()
 
 
 def test_what_is_known_of_the_motion_stands_in_the_navigation(fork) -> None:
     own = motion_named("both", 3)
     for known, wanted in (("nothing", None), ("published", Motion()), ("exact", own)):
-        config = NavigatePatientConfig(tip="own", motion="both", motion_seed=3, motion_known=known)
-        set_up = set_up_navigation(fork, "0,0,33", config)
+        config = NavigateConfig(tip="own", motion="both", motion_seed=3, motion_known=known)
+        set_up = set_up_navigation(fork, "0,0,33", config=config)
         assert set_up.motion == own and set_up.navigation.known_motion == wanted
-    at_rest = set_up_navigation(fork, "0,0,33", NavigatePatientConfig(tip="own"))
+    at_rest = set_up_navigation(fork, "0,0,33", config=NavigateConfig(tip="own"))
     assert at_rest.motion is None and at_rest.navigation.known_motion is None

@@ -13,14 +13,14 @@ from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.errors import InputError
 from endopilot.ladder.attempt import Recording, Repeated, attempt, repeat
 from endopilot.navigation.baseline_policies import BEHIND_MM, LEAD_MM, CatheterAlone, InTurn
-from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, navigate, start_world
+from endopilot.navigation.loop import LoopConfig, NavigationLoop, start_world
 from endopilot.navigation.policy import Decision, Hand, Observation
 from endopilot.robot.robot import SimulatedRobot
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.tasks.navigation import Navigation, Target
 
-COARSE = NavigateConfig(simulator=SimulatorConfig(element_mm=1.5, time_step_s=0.05, threads=1))
+COARSE = LoopConfig(simulator=SimulatorConfig(element_mm=1.5, time_step_s=0.05, threads=1))
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def test_wire_and_catheter_are_driven_by_drives_of_their_own(over_the_wire) -> N
 
 
 def test_the_catheter_follows_in_turn_and_the_same_controls_simulate_the_same(over_the_wire) -> None:
-    record = navigate(over_the_wire, "in-turn", config=COARSE, seed=1)
+    record = NavigationLoop(over_the_wire, "in-turn", config=COARSE, seed=1).run()
     assert record.reason == "reached" and record.faults == 0
     periods = len(record.time_s) - 1
     assert record.control.shape == (periods + 1, 2, 2) and record.cycles.command.shape == (1, 10 * periods, 2, 2)
@@ -85,11 +85,11 @@ def test_the_catheter_follows_in_turn_and_the_same_controls_simulate_the_same(ov
 
 def test_a_catheter_that_a_policy_does_not_name_stands_still(over_the_wire) -> None:
     wire_first = replace(over_the_wire, arrives="wire")
-    record = navigate(wire_first, "forward", config=COARSE)
+    record = NavigationLoop(wire_first, "forward", config=COARSE).run()
     assert record.reason == "reached" and np.ptp(record.inserted_length[:, 1]) == 0.0
     assert not record.control[:, 1].any() and record.faults == 0
     # the wire alone does not bring the catheter's tip there
-    assert navigate(over_the_wire, "forward", config=COARSE).reason == "time"
+    assert NavigationLoop(over_the_wire, "forward", config=COARSE).run().reason == "time"
 
 
 def test_orders_are_kept_within_each_drive_s_limits(over_the_wire, catheter) -> None:
@@ -143,8 +143,8 @@ def test_a_recording_of_both_is_driven_again_to_the_bit(over_the_wire) -> None:
 def test_what_takes_a_wire_alone_says_so(over_the_wire) -> None:
     line = "takes a wire alone, and there is microcatheter-1.7f around it; leave the catheter out"
     with pytest.raises(InputError, match=line):
-        navigate(over_the_wire, "in-turn", config=replace(COARSE, xray="images"))
+        NavigationLoop(over_the_wire, "in-turn", config=replace(COARSE, xray="images")).run()
     alone = replace(over_the_wire, catheters=(), arrives="wire")
     for policy in ("in-turn", "catheter-alone"):
         with pytest.raises(InputError, match="policy: drives a catheter too, and there is none"):
-            navigate(alone, policy, config=COARSE)
+            NavigationLoop(alone, policy, config=COARSE).run()

@@ -33,7 +33,7 @@ def anatomy():
 
 @pytest.fixture(scope="module")
 def quiet(anatomy):
-    return make_phantom(anatomy, QUIET, 2)
+    return make_phantom(anatomy, config=QUIET, seed=2)
 
 
 def at(volume, points):
@@ -43,7 +43,7 @@ def at(volume, points):
 
 
 def test_the_heart_jumps_by_the_step_between_slabs_and_the_chest_stays(anatomy, quiet):
-    moved = make_phantom(anatomy, replace(QUIET, step_mm=6.0, slab_mm=24.0), 2)
+    moved = make_phantom(anatomy, config=replace(QUIET, step_mm=6.0, slab_mm=24.0), seed=2)
     change = np.abs(moved.voxels.astype(int) - quiet.voxels)
     lung = maximum_filter(quiet.voxels, 9) < -700
     assert lung.sum() > 1000 and change[lung].max() == 0
@@ -70,20 +70,20 @@ def test_grain_is_coarser_at_equal_standard_deviation():
 
 
 def test_grain_leaves_edges_as_sharp(anatomy, quiet):
-    coarse = make_phantom(anatomy, replace(QUIET, grain_mm=1.0), 2)
+    coarse = make_phantom(anatomy, config=replace(QUIET, grain_mm=1.0), seed=2)
     np.testing.assert_array_equal(coarse.voxels, quiet.voxels)
 
 
 def test_calcium_blooms_over_the_lumen(anatomy):
     ill = replace(QUIET, calcium=6.0)
-    plain, bloomed = (make_phantom(anatomy, replace(ill, blooming_mm=b), 7).voxels for b in (0.0, 0.8))
+    plain, bloomed = (make_phantom(anatomy, config=replace(ill, blooming_mm=b), seed=7).voxels for b in (0.0, 0.8))
     bright = [np.count_nonzero(voxels > 520) for voxels in (plain, bloomed)]
     assert bright[1] > 1.5 * bright[0] > 0
     assert bloomed.max() <= 1250
 
 
 def test_a_stent_is_a_bright_tube_around_the_lumen(anatomy, quiet):
-    stented = make_phantom(anatomy, replace(QUIET, stents=1), 2)
+    stented = make_phantom(anatomy, config=replace(QUIET, stents=1), seed=2)
     change = stented.voxels.astype(int) - quiet.voxels
     places = quiet.index_to_world(np.argwhere(change > 250)[:, ::-1].astype(float))
     path = anatomy.tree.longest_path()
@@ -95,7 +95,7 @@ def test_a_stent_is_a_bright_tube_around_the_lumen(anatomy, quiet):
 
 
 def test_a_lead_runs_through_the_right_heart_and_draws_streaks(anatomy, quiet):
-    wired = make_phantom(anatomy, replace(QUIET, leads=1), 2)
+    wired = make_phantom(anatomy, config=replace(QUIET, leads=1), seed=2)
     heart = chest.place(anatomy.tree)
     (lead,) = metal.leads(heart, 1)
     index = quiet.world_to_index(lead.points)
@@ -137,7 +137,7 @@ def test_metal_at_rest_that_hardens_no_beam_draws_no_streaks(monkeypatch):
 
 
 def test_bright_veins_touch_the_artery(anatomy, quiet):
-    bright = make_phantom(anatomy, replace(QUIET, veins=0.9), 2)
+    bright = make_phantom(anatomy, config=replace(QUIET, veins=0.9), seed=2)
     change = bright.voxels.astype(int) - quiet.voxels
     places = quiet.index_to_world(np.argwhere(change > 120)[:, ::-1].astype(float))
     path = anatomy.tree.longest_path()
@@ -151,8 +151,8 @@ def test_bright_veins_touch_the_artery(anatomy, quiet):
 
 
 def test_a_larger_appendage_comes_to_the_left_artery():
-    left = make_patient(AtlasConfig(anatomy="lca", seed=1000), 1)
-    usual, larger = (make_phantom(left, replace(QUIET, appendage_mm=a), 0) for a in (0.0, 5.0))
+    left = make_patient(AtlasConfig(vessel="lca", seed=1000), 1)
+    usual, larger = (make_phantom(left, config=replace(QUIET, appendage_mm=a), seed=0) for a in (0.0, 5.0))
     more = (larger.voxels.astype(int) - usual.voxels) > 150
     assert np.count_nonzero(more) * usual.spacing_mm.prod() > 1500.0
     lumen = np.concatenate([b.centerline.points for b in left.tree.branches])
@@ -162,8 +162,8 @@ def test_a_larger_appendage_comes_to_the_left_artery():
 
 @pytest.mark.parametrize("vessel", ["rca", "lca"])
 def test_a_graft_joins_the_aorta_to_the_artery(vessel):
-    patient = make_patient(AtlasConfig(anatomy=vessel, seed=1000), 1)
-    volume = make_phantom(patient, replace(QUIET, graft=True), 0)
+    patient = make_patient(AtlasConfig(vessel=vessel, seed=1000), 1)
+    volume = make_phantom(patient, config=replace(QUIET, graft=True), seed=0)
     graft = chest.bypass_graft(chest.place(patient.tree), patient.tree)
     assert np.quantile(at(volume, graft.points[5:-5]), 0.1) > 330
     path = chest.main_paths(patient.tree)[0]
@@ -175,9 +175,9 @@ def test_a_graft_joins_the_aorta_to_the_artery(vessel):
 
 def test_what_disturbs_leaves_the_scanner_and_the_noise_as_they_are(anatomy):
     noisy = replace(QUIET, noise_hu=(20.0, 40.0), lumen_hu=(300.0, 500.0), calcium=3.0)
-    plain = make_phantom(anatomy, noisy, 4).voxels.astype(int)
+    plain = make_phantom(anatomy, config=noisy, seed=4).voxels.astype(int)
     for disturbed in ({"stents": 1}, {"veins": 0.8}):  # a graft widens the field of view
-        change = make_phantom(anatomy, replace(noisy, **disturbed), 4).voxels - plain
+        change = make_phantom(anatomy, config=replace(noisy, **disturbed), seed=4).voxels - plain
         assert np.mean(change == 0) > 0.9 and np.abs(change).max() > 100
 
 

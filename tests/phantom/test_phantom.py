@@ -10,9 +10,10 @@ from scipy.ndimage import map_coordinates, maximum_filter
 
 from endopilot.anatomy.tree import tangents
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.atlas.curves import abscissa, curve_through
+from endopilot.atlas.curves import curve_through
 from endopilot.atlas.heart_reference import TO_CRUX, aorta, fit_heart
 from endopilot.errors import InputError
+from endopilot.lines import length_along
 from endopilot.phantom import phantom
 from endopilot.phantom.painter import Grid, Painter
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
@@ -37,7 +38,7 @@ def anatomy():
 
 @pytest.fixture(scope="module")
 def clean(anatomy):
-    return make_phantom(anatomy, CLEAN, 0)
+    return make_phantom(anatomy, config=CLEAN, seed=0)
 
 
 def at(volume, points):
@@ -111,8 +112,8 @@ def test_partial_volume_of_a_sphere():
 def test_noise_has_its_standard_deviation(anatomy):
     # The voxels are fine enough for the point-spread function to spread the noise.
     fine = replace(CLEAN, in_plane_mm=0.4, slice_mm=1.2)
-    quiet = make_phantom(anatomy, fine, 5)
-    noisy = make_phantom(anatomy, replace(fine, noise_hu=(30.0, 30.0)), 5)
+    quiet = make_phantom(anatomy, config=fine, seed=5)
+    noisy = make_phantom(anatomy, config=replace(fine, noise_hu=(30.0, 30.0)), seed=5)
     inside = quiet.voxels > -1000
     noise = (noisy.voxels.astype(float) - quiet.voxels)[inside]
     assert noise.std() == pytest.approx(30, rel=0.03)
@@ -120,14 +121,14 @@ def test_noise_has_its_standard_deviation(anatomy):
 
 
 def test_same_seed_same_bits_and_contrast_varies(anatomy):
-    first, second, other = (make_phantom(anatomy, COARSE, seed) for seed in (1, 1, 2))
+    first, second, other = (make_phantom(anatomy, config=COARSE, seed=seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first.voxels, second.voxels)
     assert np.quantile(first.voxels, 0.99) != np.quantile(other.voxels, 0.99)
 
 
 def test_calcium_is_bright_and_leaves_the_lumen_free(anatomy):
-    without = make_phantom(anatomy, replace(CLEAN, in_plane_mm=0.6, slice_mm=1.0), 7)
-    with_it = make_phantom(anatomy, replace(CLEAN, in_plane_mm=0.6, slice_mm=1.0, calcium=6.0), 7)
+    without = make_phantom(anatomy, config=replace(CLEAN, in_plane_mm=0.6, slice_mm=1.0), seed=7)
+    with_it = make_phantom(anatomy, config=replace(CLEAN, in_plane_mm=0.6, slice_mm=1.0, calcium=6.0), seed=7)
     change = with_it.voxels.astype(int) - without.voxels
     assert change.max() > 250
     path = anatomy.tree.longest_path()
@@ -140,8 +141,8 @@ def test_soft_plaque_lies_around_a_stenosis():
     path = ill.tree.longest_path()
     here = int(np.searchsorted(path.abscissa, stenosis["abscissa_mm"]))
     thick = replace(CLEAN, in_plane_mm=0.6, slice_mm=1.0)
-    volume = make_phantom(ill, thick, 0)
-    bare = make_phantom(replace(ill, provenance={}), thick, 0)
+    volume = make_phantom(ill, config=thick, seed=0)
+    bare = make_phantom(replace(ill, provenance={}), config=thick, seed=0)
     tangent = path.points[here + 1] - path.points[here - 1]
     side = np.cross(tangent / np.linalg.norm(tangent), path.normals[here])
     ring = path.points[here] + (path.radius[here] + 0.8) * np.array(
@@ -153,13 +154,13 @@ def test_soft_plaque_lies_around_a_stenosis():
 def test_a_tree_without_section_labels_is_accepted(anatomy):
     branches = tuple(Branch(b.centerline, b.parent, np.zeros_like(b.section)) for b in anatomy.tree.branches)
     bare = replace(anatomy, tree=VesselTree(branches, ("vessel",)), provenance={})
-    volume = make_phantom(bare, COARSE, 0)
+    volume = make_phantom(bare, config=COARSE, seed=0)
     assert np.mean(at(volume, anatomy.tree.branches[0].centerline.points)) > 200
 
 
 def test_a_moving_heart_is_smeared_and_the_chest_is_not(anatomy):
     quiet = replace(CLEAN, in_plane_mm=1.0, slice_mm=1.0)
-    still, moved = (make_phantom(anatomy, replace(quiet, motion_mm=way), 4) for way in (0.0, 4.0))
+    still, moved = (make_phantom(anatomy, config=replace(quiet, motion_mm=way), seed=4) for way in (0.0, 4.0))
     change = np.abs(moved.voxels.astype(int) - still.voxels)
     lung = maximum_filter(still.voxels, 9) < -700  # farther from the heart than the point-spread function reaches
     assert lung.sum() > 1000 and change[lung].max() == 0
@@ -172,24 +173,29 @@ def test_a_moving_heart_is_smeared_and_the_chest_is_not(anatomy):
 
 
 def test_the_volume_has_the_requested_voxels(anatomy):
-    usual, asked = make_phantom(anatomy, COARSE, 0), make_phantom(anatomy, replace(COARSE, voxels=(90, 80, 70)), 0)
+    usual, asked = (
+        make_phantom(anatomy, config=COARSE, seed=0),
+        make_phantom(anatomy, config=replace(COARSE, voxels=(90, 80, 70)), seed=0),
+    )
     assert asked.voxels.shape == (70, 80, 90)
     middles = [v.index_to_world((np.array(v.voxels.shape[::-1]) - 1) / 2) for v in (usual, asked)]
     np.testing.assert_allclose(*middles, atol=1.2)
 
 
 def test_the_right_heart_is_as_bright_as_requested(anatomy):
-    washed, full = (make_phantom(anatomy, replace(COARSE, right_heart=(s, s)), 1).voxels for s in (0.2, 0.9))
+    washed, full = (
+        make_phantom(anatomy, config=replace(COARSE, right_heart=(s, s)), seed=1).voxels for s in (0.2, 0.9)
+    )
     assert np.mean(full > 250) > 1.3 * np.mean(washed > 250)
 
 
 @pytest.fixture(scope="module")
 def left():
-    return make_patient(AtlasConfig(anatomy="lca", seed=1000), 1)
+    return make_patient(AtlasConfig(vessel="lca", seed=1000), 1)
 
 
 def test_a_left_tree_leaves_the_aorta_and_runs_on_its_own_heart(left):
-    volume = make_phantom(left, replace(CLEAN, in_plane_mm=0.7, slice_mm=1.0), 0)
+    volume = make_phantom(left, config=replace(CLEAN, in_plane_mm=0.7, slice_mm=1.0), seed=0)
     steps = np.linspace(-10.0, 2.0, 40)
     assert at(volume, left.insertion.position + steps[:, None] * left.insertion.direction).min() > 350
     for path in phantom.chest.main_paths(left.tree):
@@ -217,7 +223,7 @@ def test_fit_recovers_a_moved_heart():
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     course = curve_through(TO_CRUX)
     moved = np.array([10.0, -20, 30]) + 1.2 * course @ turn.T
-    heart = fit_heart(moved, float(abscissa(moved)[-1]), "3")
+    heart = fit_heart(moved, float(length_along(moved)[-1]), "3")
     np.testing.assert_allclose(heart.to_reference(moved), course, atol=0.2)
     np.testing.assert_allclose(heart.from_reference(course), moved, atol=0.3)
     assert heart.scale == pytest.approx(1.2, rel=1e-2)

@@ -55,7 +55,7 @@ class Page(HTMLParser):
 def material(tmp_path_factory, anatomy, results):
     """Return a folder with an anatomy, its CT and mask, an evaluation and a training record."""
     folder = tmp_path_factory.mktemp("material")
-    write_anatomy(anatomy, folder / "anatomy")
+    write_anatomy(anatomy, output=folder / "anatomy")
     inside = np.asarray(anatomy.distance_map.values) > 0
     grid = (np.full(3, anatomy.distance_map.spacing_mm), anatomy.distance_map.origin_mm, np.eye(3))
     write_volume(Volume(np.where(inside, 400, -80).astype(np.int16), *grid), folder / "ct.nii.gz")

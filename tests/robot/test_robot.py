@@ -10,14 +10,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
+from endopilot.devices.catheter import read_catheter
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import RobotConfig, read_robot
+from endopilot.devices.stack import Stack
+from endopilot.devices.transmission import Transmission
 from endopilot.errors import InputError
-from endopilot.navigation.navigate import start_world
+from endopilot.navigation.loop import start_world
 from endopilot.robot.remote import RemoteRobot
 from endopilot.robot.robot import CYCLE_S, Robot, SimulatedRobot
-from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.config import SimulatorConfig, wall_stiffness
 from endopilot.simulation.mismatch import ModelMismatch
+from endopilot.simulation.robots import in_grip
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation, Target
 
@@ -107,9 +111,15 @@ def ideal(fork, wire, config: RobotConfig, **given) -> tuple[SimulatedRobot, Sim
 def test_encoders_in_front_of_play_and_gain_do_not_see_them(fork, wire, at) -> None:
     drive = replace(IDEAL.wire, play_mm=2.4, play_rad=1.0, gain_translation=0.9)
     robot, simulator = ideal(fork, wire, replace(IDEAL, encoders_at=at, wire=drive), ostium_mm=0.5)
-    robot.command(((6.0, 2.0),))
+    robot.command(((3.0, 1.2),))
+    robot.run(1.0)  # through the play, wherever the wire lay in it
+    lost = 10.0 + 0.9 * 3.0 - robot.proximal[0, 0], 0.3 + 1.2 - robot.proximal[0, 1]
+    middle = at == "wire"  # there the start is known
+    assert lost[0] == pytest.approx(1.2, abs=1e-3 if middle else 1.2)
+    assert lost[1] == pytest.approx(0.5, abs=1e-3 if middle else 0.5)
+    robot.command(((3.0, 0.8),))
     robot.run(1.0)
-    motor, true = (9.5 + 6.0, 0.3 + 2.0), (10.0 + 0.9 * 6.0 - 1.2, 0.3 + 2.0 - 0.5)
+    motor, true = (9.5 + 6.0, 0.3 + 2.0), (10.0 + 0.9 * 6.0 - lost[0], 0.3 + 2.0 - lost[1])
     assert robot.proximal[0] == pytest.approx(true, abs=1e-3)
     read = motor if at == "motor" else (true[0] - 0.5, true[1])
     assert robot.proximal_state().devices[0] == pytest.approx(read, abs=1e-3)
@@ -179,3 +189,17 @@ def test_what_was_measured_is_kept_beside_what_was_true_and_the_same_seed_repeat
     true = robot.recorder.trajectory()
     assert np.abs(encoders[0, :, 0, 0] - true.inserted_length[0, :, 0]).max() > 0.4  # half the play, and more
     assert (load[0, :, 0, 0] - true.drive_force[0, :, 0]).std() == pytest.approx(0.02, rel=0.4)
+
+
+def test_a_robot_brings_what_lies_between_its_drives_and_the_ostium(wire) -> None:
+    catheter = read_catheter("microcatheter-1.7f")
+    behind = Transmission(length_mm=900.0, twist_friction_n_mm_mm=1e-4)
+    robot = replace(IDEAL, wire=replace(IDEAL.wire, transmission=behind))
+    held, core = in_grip(Stack(wire, (catheter,)), robot, SimulatorConfig())
+    assert held.transmissions == (behind, Transmission()) and held.devices == (wire, catheter)
+    assert core == SimulatorConfig()  # the wall stays as hard as it was, without a weaker grip
+    own = Stack(wire, transmissions=(behind,))
+    assert in_grip(own, IDEAL, core) == (own, core)
+    weak, core = in_grip(own, replace(IDEAL, wire=replace(IDEAL.wire, grip_n=0.1)), SimulatorConfig())
+    assert weak.wire.push_limit_n == 0.1
+    assert core.wall_stiffness_n_mm == wall_stiffness(SimulatorConfig(), wire.push_limit_n)

@@ -13,7 +13,7 @@ import endopilot
 from benchmarks.core.manoeuvres import paired_controls, seed_of
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.catheter import Catheter, list_catheters, read_catheter
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack, lines_from_tips
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
@@ -27,7 +27,7 @@ SHIPPED = Path(endopilot.__file__).parent / "devices/catheters"
 
 @pytest.fixture(scope="module")
 def vessel() -> Anatomy:
-    return next(iter(endopilot.make_atlas(endopilot.AtlasConfig())))
+    return next(iter(endopilot.make_atlas(config=endopilot.AtlasConfig())))
 
 
 @pytest.fixture(scope="module")
@@ -77,18 +77,18 @@ def test_what_is_too_wide_is_refused(vessel: Anatomy, catheter: Catheter) -> Non
     with pytest.raises(
         InputError, match=r"diameter_mm = 0\.89 is too wide for the bore of catheter microcatheter-1\.7f"
     ):
-        endopilot.simulate(vessel, Stack(read_device("j-035"), (catheter,)), control)
+        endopilot.simulate(vessel, Stack(read_wire("j-035"), (catheter,)), control)
     wide = replace(catheter, diameter_mm=9.0)
     with pytest.raises(InputError, match="wider than the"):
-        endopilot.simulate(vessel, Stack(read_device("workhorse-014"), (wide,)), control)
+        endopilot.simulate(vessel, Stack(read_wire("workhorse-014"), (wide,)), control)
     with pytest.raises(InputError, match="catheter 'none'"):
         read_catheter("none")
     with pytest.raises(InputError, match="'force' with catheters"):
-        endopilot.simulate(vessel, Stack(read_device("workhorse-014"), (catheter,)), control, actuation="force")
+        endopilot.simulate(vessel, Stack(read_wire("workhorse-014"), (catheter,)), control, actuation="force")
 
 
 def test_worlds_do_not_notice_each_other(vessel: Anatomy, catheter: Catheter) -> None:
-    stack = Stack(read_device("workhorse-014"), (catheter,))
+    stack = Stack(read_wire("workhorse-014"), (catheter,))
     start, control = random_drives(9, 6, 5)
     together = endopilot.simulate(vessel, stack, control, initial=start)
     assert together.valid.all()
@@ -104,7 +104,7 @@ def tight() -> tuple[Anatomy, Stack, np.ndarray, np.ndarray]:
     """Drives of a catheter in an artery that is hardly wider, often at their limits."""
     artery, stack = (
         make_patient(AtlasConfig(seed=0), 20),
-        Stack(read_device("workhorse-014"), (read_catheter("jl4-5f"),)),
+        Stack(read_wire("workhorse-014"), (read_catheter("jl4-5f"),)),
     )
     seed = int(np.random.SeedSequence([0, 20]).generate_state(1, np.uint64)[0])
     return artery, stack, *paired_controls(artery, stack, rollouts=20, samples=120, seed=seed)
@@ -137,16 +137,16 @@ def test_a_catheter_that_snaps_while_its_drive_pushes_with_all_its_force_goes_on
 def test_step_by_step_and_from_a_saved_state_the_bits_are_the_same(
     vessel: Anatomy, catheter: Catheter, tmp_path: Path
 ) -> None:
-    stack = Stack(read_device("workhorse-014"), (catheter,))
+    stack = Stack(read_wire("workhorse-014"), (catheter,))
     start, control = random_drives(3, 5, 6)
     whole = endopilot.simulate(vessel, stack, control, initial=start)
     simulator = endopilot.Simulator(vessel, stack, worlds=3)
     simulator.reset(inserted_length=start[..., 0], rotation=start[..., 1])
     for sample in range(3):
         simulator.step(control[:, sample], 0.5)
-    simulator.state.save(tmp_path / "state.npz")
+    simulator.state.write(tmp_path / "state.npz")
     again = endopilot.Simulator(vessel, stack, worlds=3)
-    again.set_state(type(simulator.state).load(tmp_path / "state.npz"))
+    again.set_state(type(simulator.state).read(tmp_path / "state.npz"))
     again.step(control[:, 3], 0.5)
     step = again.step(control[:, 4], 0.5)
     assert np.array_equal(step.tip_position, whole.tip_position[:, -1])
@@ -172,7 +172,7 @@ def test_a_withdrawn_wire_leaves_the_catheter_where_it_is(vessel: Anatomy, cathe
     start = np.array([[[40.0, 0.0], [30.0, 0.0]]])
     control = np.zeros((1, 10, 2, 2))
     control[0, :8, 0, 0] = -10.0
-    stack = Stack(read_device("workhorse-014"), (catheter,))
+    stack = Stack(read_wire("workhorse-014"), (catheter,))
     trajectory = endopilot.simulate(vessel, stack, control, initial=start)
     assert trajectory.valid.all()
     assert trajectory.inserted_length[0, -1, 0] == pytest.approx(0.0, abs=1e-9)
@@ -183,7 +183,7 @@ def test_a_withdrawn_wire_leaves_the_catheter_where_it_is(vessel: Anatomy, cathe
 
 def robust_world(index: int, catheter: str, world: int, *, samples: int, rollouts: int) -> tuple[Stack, Trajectory]:
     """Simulate the first samples of a world of `bench robustness --catheters`: the workhorse wire in a catheter."""
-    vessel, stack = make_patient(AtlasConfig(), index), Stack(read_device("workhorse-014"), (read_catheter(catheter),))
+    vessel, stack = make_patient(AtlasConfig(), index), Stack(read_wire("workhorse-014"), (read_catheter(catheter),))
     seed, one = seed_of(index, seed=0), slice(world, world + 1)
     initial, control = paired_controls(vessel, stack, rollouts=rollouts, samples=120, seed=seed)
     config = SimulatorConfig(threads=1)
@@ -195,7 +195,7 @@ def test_drives_keep_their_limits(vessel: Anatomy, catheter: Catheter) -> None:
     start = np.array([[[60.0, 0.0], [20.0, 0.0]]])
     control = np.zeros((1, 16, 2, 2))
     control[0, :, 1] = 8.0, 2.0
-    wire = read_device("workhorse-014")
+    wire = read_wire("workhorse-014")
     free = endopilot.simulate(vessel, Stack(wire, (catheter,)), control, initial=start)
     held = endopilot.simulate(vessel, Stack(wire, (weak,)), control, initial=start)
     assert free.base_force[..., 1].max() > 0.03 and np.abs(free.base_torque[..., 1]).max() > 3e-4
@@ -210,7 +210,7 @@ def test_neither_drive_passes_its_limit_where_both_meet_an_obstacle() -> None:
     # Rough devices in a bend with a blind end, pushed together, in turn and against each other. Friction
     # between them turns within 0.04 mm and moves load from one drive to the other.
     limit = {"push_limit_n": 0.3, "pull_limit_n": 0.3}
-    wire = replace(read_device("workhorse-014"), friction=0.3, **limit)
+    wire = replace(read_wire("workhorse-014"), friction=0.3, **limit)
     catheter = read_catheter("microcatheter-1.7f")
     catheter = replace(catheter, bore_friction=0.3, friction=0.3, **limit)
     control = np.zeros((4, 43, 2, 2))
@@ -234,7 +234,7 @@ def test_neither_drive_passes_its_limit_where_both_meet_an_obstacle() -> None:
 def test_drives_of_random_pairs_keep_their_limits() -> None:
     # A force that would leap beyond its limit because friction turns is kept within 5 % of it.
     vessel = make_patient(AtlasConfig(), 5)
-    stack = Stack(read_device("workhorse-014"), (read_catheter("microcatheter-1.7f"),))
+    stack = Stack(read_wire("workhorse-014"), (read_catheter("microcatheter-1.7f"),))
     initial, control = paired_controls(vessel, stack, rollouts=16, samples=240, seed=11)
     worlds = [10, 15]  # those in which it would leap to 1.07 and 1.14 times its limit
     config = SimulatorConfig(threads=1)
@@ -266,7 +266,7 @@ def test_tubes_that_rest_at_a_drive_limit_end_their_steps() -> None:
 
 def test_a_trajectory_written_as_csv_is_simulated_again(vessel: Anatomy, catheter: Catheter, tmp_path: Path) -> None:
     start, control = random_drives(2, 4, 8)
-    stack = Stack(read_device("workhorse-014"), (catheter,))
+    stack = Stack(read_wire("workhorse-014"), (catheter,))
     first = endopilot.simulate(vessel, stack, control, initial=start)
     write_trajectory(first, tmp_path / "trajectory.csv")
     script = read_controls_csv(tmp_path / "trajectory.csv", devices=2)
@@ -278,7 +278,7 @@ def test_a_trajectory_written_as_csv_is_simulated_again(vessel: Anatomy, cathete
 
 @pytest.mark.parametrize(("wire_mm", "catheter_mm"), [(30.0, 12.3), (12.3, 30.0), (20.0, 20.0)])
 def test_the_line_that_devices_share_is_cut_at_each_tip(vessel, catheter, wire_mm, catheter_mm) -> None:
-    simulator = endopilot.Simulator(vessel, Stack(read_device("workhorse-014"), (catheter,)))
+    simulator = endopilot.Simulator(vessel, Stack(read_wire("workhorse-014"), (catheter,)))
     simulator.reset(inserted_length=[[wire_mm, catheter_mm]], rotation=[[0.0, 0.0]])
     lines = lines_from_tips(simulator.position[0], simulator.inserted_length[0])
     for device, line in enumerate(lines):

@@ -11,7 +11,7 @@ from bend import vessel
 from endopilot.anatomy.distance import sample
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.catheter import read_catheter
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.simulation.config import (
@@ -22,7 +22,7 @@ from endopilot.simulation.config import (
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
 
-STIFF = read_device("stiff-014")
+STIFF = read_wire("stiff-014")
 PUSH = np.tile([5.0, 0.3], (2, 24, 1))
 RIGID, SOFT = SimulatorConfig(), SimulatorConfig(compliant_wall_n_mm2=0.01)
 
@@ -66,7 +66,7 @@ def test_a_simulator_steps_a_compliant_wall_to_the_same_bits_and_shares_no_rigid
 
 
 def test_a_catheter_straightens_more_than_its_wire() -> None:
-    anatomy, wire = vessel(), read_device("workhorse-014")
+    anatomy, wire = vessel(), read_wire("workhorse-014")
     stack, push = Stack(wire, (read_catheter("microcatheter-1.7f"),)), PUSH[:, :18]
     alone = simulate(anatomy, wire, push, config=SOFT)
     inside = simulate(anatomy, stack, np.stack([push, push], axis=2), config=SOFT)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from bend import vessel
 
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, free_wire_load, random_controls, read_controls_csv
@@ -31,7 +31,7 @@ def test_later_sequences_are_those_of_a_whole_draw() -> None:
 
 
 def test_the_load_of_a_free_wire_moves_it_at_the_drawn_speed() -> None:
-    device = replace(read_device("workhorse-014"), tip_bend_rad=0.0)
+    device = replace(read_wire("workhorse-014"), tip_bend_rad=0.0)
     config = SimulatorConfig()
     velocity = np.repeat([[[-1.5, 1.0]], [[1.0, -3.0]]], 2, axis=1)
     load = free_wire_load(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from endopilot.devices.catheter import read_catheter
-from endopilot.devices.device import Wire, read_device
+from endopilot.devices.device import Wire, read_wire
 from endopilot.devices.stack import Stack
 from endopilot.devices.transmission import Transmission
 from endopilot.errors import InputError
@@ -28,7 +28,7 @@ BEHIND = Transmission(length_mm=1000.0, twist_friction_n_mm_mm=2e-4)
 
 @pytest.fixture(scope="module")
 def wire() -> Wire:
-    return read_device("workhorse-014")
+    return read_wire("workhorse-014")
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +132,7 @@ def test_the_same_bits_for_any_number_of_lanes(vessel, wire: Wire) -> None:
 def test_a_trajectory_keeps_what_lies_behind(vessel, wire: Wire, tmp_path: Path) -> None:
     trajectory = simulator(vessel, Stack(wire, (), (BEHIND,)), 1).run(commands(1, 4))
     trajectory.write(tmp_path / "t.npz")
-    read = read_trajectory(tmp_path / "t.npz", vessel)
+    read = read_trajectory(tmp_path / "t.npz", anatomy=vessel)
     assert read.set_up.stacks[0].transmissions == (BEHIND,)
     assert np.array_equal(read.replay().tip_position, trajectory.tip_position)
 

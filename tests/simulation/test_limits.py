@@ -9,7 +9,7 @@ import pytest
 from bend import vessel
 
 from endopilot import _core
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import of_device, run_core
 from endopilot.simulation.simulate import simulate
@@ -28,7 +28,7 @@ START_MM = LENGTH_MM - 0.5 * HALF_MM
 """Inserted length; the drive holds the rod from the next node on."""
 STIFF = 1e4
 """Of the springs that hold the tip, N/mm and N mm/rad."""
-DEVICE = replace(read_device("workhorse-014"), friction=0.5)
+DEVICE = replace(read_wire("workhorse-014"), friction=0.5)
 WEAK = replace(DEVICE, push_limit_n=0.015, pull_limit_n=0.004, torque_limit_n_mm=0.003)
 """A drive that slips in every direction in the bent vessel."""
 CONFIG = SimulatorConfig(threads=1, wall_stiffness_n_mm=10.0)
@@ -162,9 +162,9 @@ def test_a_drive_that_slips_gives_the_same_bits_in_any_company_and_from_any_stat
         step = simulator.step(control[:, t], SAMPLE_PERIOD_S)
         for name in ("tip_position", "slip", "rotation_slip"):
             np.testing.assert_array_equal(getattr(step, name), getattr(one, name)[:, t])
-        simulator.state.save(tmp_path / "state.npz")
+        simulator.state.write(tmp_path / "state.npz")
         simulator = Simulator(anatomy, WEAK, worlds=len(control), config=CONFIG)
-        simulator.set_state(SimulatorState.load(tmp_path / "state.npz"))
+        simulator.set_state(SimulatorState.read(tmp_path / "state.npz"))
     for name in names:
         np.testing.assert_array_equal(getattr(shuffled, name), getattr(one, name)[order])
         np.testing.assert_array_equal(getattr(alone, name), getattr(one, name)[[4]])

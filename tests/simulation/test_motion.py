@@ -14,7 +14,7 @@ from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.heart_reference import LEFT_VENTRICLE_AXIS, TO_CRUX
 from endopilot.cli import simulate as command
 from endopilot.devices.catheter import read_catheter
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
@@ -24,7 +24,7 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState
 from endopilot.types import Anatomy
 
-DEVICE = read_device("workhorse-014")
+DEVICE = read_wire("workhorse-014")
 OSTIUM = np.array([10.0, -20.0, 30.0])
 MOTION = Motion()
 BEATS = Motion(breathing_caudal_mm=0.0, breathing_anterior_mm=0.0, breathing_dorsal_deg=0.0, breathing_dextral_deg=0.0)
@@ -153,9 +153,9 @@ def test_steps_are_those_of_simulate_to_the_bit_and_a_state_keeps_the_phase(anat
     np.testing.assert_array_equal(simulator.time, 0)
     for t in range(2):
         simulator.step(control[:, t], 0.5)
-    simulator.state.save(tmp_path / "state.npz")
+    simulator.state.write(tmp_path / "state.npz")
     again = Simulator(anatomy, DEVICE, worlds=3, motion=MOTION)
-    again.set_state(SimulatorState.load(tmp_path / "state.npz"))
+    again.set_state(SimulatorState.read(tmp_path / "state.npz"))
     np.testing.assert_array_equal(again.time, 1.0)
     for t in (2, 3):
         np.testing.assert_array_equal(again.step(control[:, t], 0.5).tip_position, whole.tip_position[:, t])
@@ -183,7 +183,7 @@ def test_wires_in_catheters_move_with_the_vessel_too(anatomy: Anatomy) -> None:
 
 
 def test_the_command_tells_tips_in_the_vessel_and_in_the_laboratory(anatomy: Anatomy, tmp_path: Path) -> None:
-    write_anatomy(anatomy, tmp_path / "bend")
+    write_anatomy(anatomy, output=tmp_path / "bend")
     random = command.RandomConfig(sequences=2, seconds=2.0)
     command.command(tmp_path / "bend", output=tmp_path / "still.csv", random=random)
     command.command(tmp_path / "bend", output=tmp_path / "both.csv", motion="both", motion_seed=5, random=random)

@@ -15,7 +15,7 @@ from bend import vessel
 
 from benchmarks.core.gpu import bench_gpu
 from endopilot import _core
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.processor import core_for
@@ -24,7 +24,7 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy
 
 ROOT = Path(__file__).parents[2]
-DEVICE = read_device("workhorse-014")
+DEVICE = read_wire("workhorse-014")
 GPU = SimulatorConfig(element_mm=1.5, processor="cuda")
 CPU = SimulatorConfig(element_mm=1.5)
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import make_lumen, run_core
 from endopilot.simulation.rod import lay_out
@@ -16,7 +16,7 @@ from endopilot.types import DistanceMap, Insertion
 
 @pytest.mark.parametrize("element_mm", [0.2, 0.5, 0.75, 1.0, 1.5])
 def test_a_free_bent_tip_lies_where_the_arc_ends(element_mm: float) -> None:
-    device, inserted = read_device("workhorse-014"), 6.0
+    device, inserted = read_wire("workhorse-014"), 6.0
     rested = run_core(
         lay_out(device, element_mm=element_mm, length_mm=30.0),
         _wide_lumen(),
@@ -41,7 +41,7 @@ def test_a_free_bent_tip_lies_where_the_arc_ends(element_mm: float) -> None:
 
 
 def test_an_element_has_its_middle_where_the_bend_of_the_tip_ends() -> None:
-    device = read_device("workhorse-014")
+    device = read_wire("workhorse-014")
     for element_mm in (0.2, 0.5, 0.75, 1.0, 1.5, 4.0):
         rod = lay_out(device, element_mm=element_mm, length_mm=100.0)
         length = np.diff(rod.abscissa_mm)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from endopilot.anatomy.catheter_axis import turned_axis, with_axis, with_world_zero
 from endopilot.anatomy.distance import add_catheter, distance_map_from_spheres
 from endopilot.anatomy.tree import Line, tree_from_lines
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
@@ -51,7 +51,7 @@ def tips(anatomy: Anatomy) -> np.ndarray:
     control = np.zeros((2, 14, 2))
     control[:, :, 0], control[:, 4:, 1] = 4.0, np.array([[0.4], [-0.6]])
     initial, config = np.array([[5.0, 0.0], [5.0, 2.0]]), SimulatorConfig(element_mm=1.0)
-    trajectory = simulate(anatomy, read_device("workhorse-014"), control, initial=initial, config=config)
+    trajectory = simulate(anatomy, read_wire("workhorse-014"), control, initial=initial, config=config)
     assert trajectory.valid.all()
     return trajectory.tip_position[:, :, 0]
 
@@ -85,7 +85,7 @@ def test_the_bend_points_to_the_zero_and_turns_clockwise_as_the_operator_sees_it
     insertion = Insertion(np.zeros(3), axis)
     lumen = add_catheter(distance_map_from_spheres(tree, spacing_mm=1.5), insertion, 8.0)
     anatomy = Anatomy("wide", tree, lumen, insertion, 8.0)
-    device, start = read_device("workhorse-014"), np.array([[15.0, phi]])
+    device, start = read_wire("workhorse-014"), np.array([[15.0, phi]])
     trajectory = simulate(anatomy, device, np.zeros((1, 1, 2)), initial=start)
     zero = zero_of(anatomy)
     right = np.cross(axis, zero)  # of the operator, who looks along the axis with the zero above

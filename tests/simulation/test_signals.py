@@ -5,6 +5,7 @@ from __future__ import annotations
 import runpy
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,7 +22,8 @@ RECORDED = {name: (of, numbers) for name, of, numbers, *_ in _core.OUTPUTS if of
 
 
 def test_a_step_has_each_output_of_the_core_with_its_axes() -> None:
-    declared = {each.name: each.type.dim_str for each in fields(Step)}
+    types: dict[str, Any] = {each.name: each.type for each in fields(Step)}
+    declared = {name: each.dim_str for name, each in types.items()}
     axes = {"device": "*each devices", "sample": "*each"}
     assert declared == {name: axes[of] + (f" {n}" if n > 1 else "") for name, (of, n) in RECORDED.items()}
     assert set(declared) <= {each.name for each in fields(Trajectory)}
@@ -54,7 +56,8 @@ def test_further_signals_are_columns_of_a_table_by_their_rows_or_their_own_name(
     further = {"believed": np.arange(4.0).reshape(1, 2, 2), "mine": np.array([[5.0, 6.0]])}
     table = trajectory_table(replace(made, columns=further))
     expected = {"believed_tip_abscissa_mm": [0, 2], "believed_tip_offset_mm": [1, 3], "mine": [5, 6]}
-    pd.testing.assert_frame_equal(table[list(expected)], pd.DataFrame(expected, dtype=float))
+    found = pd.DataFrame({name: table[name] for name in expected})
+    pd.testing.assert_frame_equal(found, pd.DataFrame(expected, dtype=float))
 
 
 def test_the_documentation_lists_the_signals() -> None:

@@ -12,7 +12,7 @@ import pytest
 from bend import BEND, vessel
 from jaxtyping import Float
 
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import WALL_FORCE_LIMIT_N, WallForceEvent, simulate, wall_force_events
@@ -20,7 +20,7 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy, Insertion
 
 WORLDS, SAMPLES = 6, 16
-DEVICE = read_device("workhorse-014")
+DEVICE = read_wire("workhorse-014")
 
 
 @pytest.fixture(scope="module")
@@ -185,6 +185,7 @@ def test_a_wall_force_that_no_vessel_should_bear_is_told(anatomy: Anatomy) -> No
         (lambda c, i: (c, i - [50, 0]), "world 0: .* give 0 to"),
         (lambda c, i: (c[:0], i[:0]), "at least one"),
         (lambda c, i: (c, i * np.inf), "finite"),
+        (lambda c, i: (c, i + np.array([1e6, 0.0])), "initial: world 1: 1.*e.06 mm inserted; give at most 5000"),
     ],
 )
 def test_refuses_bad_controls(anatomy: Anatomy, change, message: str) -> None:
@@ -192,6 +193,11 @@ def test_refuses_bad_controls(anatomy: Anatomy, change, message: str) -> None:
     control, initial = change(control, initial)
     with pytest.raises(InputError, match=message):
         simulate(anatomy, DEVICE, control, initial=initial)
+
+
+def test_refuses_wires_that_the_memory_does_not_hold_before_they_are_laid_out(anatomy: Anatomy) -> None:
+    with pytest.raises(InputError, match=r"^reach_mm: wires of 1e\+12 mm need .* GiB of .*; push less far$"):
+        Simulator(anatomy, DEVICE, reach_mm=1e12)
 
 
 def test_refuses_bad_anatomies(anatomy: Anatomy) -> None:
@@ -219,10 +225,10 @@ import numpy as np, sys
 sys.path.insert(0, sys.argv[1])
 from bend import BEND, vessel
 from endopilot.errors import InputError
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.simulation.simulate import WALL_FORCE_LIMIT_N, WallForceEvent, simulate, wall_force_events
 from endopilot.simulation.simulator import Simulator
-anatomy, device, good = vessel(), read_device("workhorse-014"), np.zeros((2, 4, 2))
+anatomy, device, good = vessel(), read_wire("workhorse-014"), np.zeros((2, 4, 2))
 for control, others in (
     (np.zeros((2, 4, 3)), {}),
     (np.zeros((4, 2)), {}),

@@ -14,7 +14,7 @@ import pytest
 from bend import vessel
 from scipy.spatial.transform import Rotation
 
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.readout import Readout
@@ -23,8 +23,8 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState
 from endopilot.types import Anatomy
 
-DEVICE = read_device("workhorse-014")
-STIFF = read_device("stiff-014")
+DEVICE = read_wire("workhorse-014")
+STIFF = read_wire("stiff-014")
 PERIOD = 0.5
 
 
@@ -134,7 +134,7 @@ def test_restored_state_goes_on_with_the_same_bits(anatomy: Anatomy, tmp_path: P
     for t in range(3):
         simulator.step(control[t], 0.2)
     state = simulator.state
-    state.save(tmp_path / "state.npz")
+    state.write(tmp_path / "state.npz")
     for t in range(3, 6):
         step = simulator.step(control[t], 0.2)
     after = simulator.state.values[0]
@@ -149,14 +149,14 @@ def test_restored_state_goes_on_with_the_same_bits(anatomy: Anatomy, tmp_path: P
 import sys; sys.path[:0] = [{str(Path(__file__).parent)!r}, {str(Path(__file__).parents[2])!r}]
 import numpy as np
 from bend import vessel
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.simulation.state import SimulatorState
 from endopilot.simulation.readout import Readout
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState
 from pathlib import Path
-simulator = Simulator(vessel(), read_device("workhorse-014"), worlds=3)
-simulator.set_state(SimulatorState.load(Path("state.npz")))
+simulator = Simulator(vessel(), read_wire("workhorse-014"), worlds=3)
+simulator.set_state(SimulatorState.read(Path("state.npz")))
 for row in np.load("control.npy")[3:]:
     simulator.step(row, 0.2)
 np.save("after.npy", simulator.state.values[0])
@@ -183,14 +183,14 @@ def test_worlds_go_over_into_another_simulator_of_the_same_kind(anatomy: Anatomy
 def test_equal_anatomies_and_devices_are_stepped_together(anatomy: Anatomy) -> None:
     again = replace(anatomy, name="read again", distance_map=replace(anatomy.distance_map))
     bent = replace(DEVICE, tip_bend_rad=0.5)
-    devices = [DEVICE, read_device("workhorse-014"), replace(DEVICE, name="mine", sources={}), bent]
+    devices = [DEVICE, read_wire("workhorse-014"), replace(DEVICE, name="mine", sources={}), bent]
     simulator = begun(Simulator([anatomy, again, anatomy, again], devices), 4)
     assert [group.index.tolist() for group in simulator._groups] == [[0, 1, 2], [3]]
     shared = begun(Simulator(anatomy, [DEVICE, DEVICE, DEVICE, bent]), 4)
     for control in controls(2, 4):
         step, wanted = simulator.step(control, PERIOD), shared.step(control, PERIOD)
         assert np.array_equal(step.tip_position, wanted.tip_position)
-    elsewhere = Simulator(again, read_device("workhorse-014"), worlds=2, sharing=simulator)
+    elsewhere = Simulator(again, read_wire("workhorse-014"), worlds=2, sharing=simulator)
     assert elsewhere._groups[0].lumen is simulator._groups[0].lumen
     elsewhere.copy_worlds([2, 1], of=simulator)
     assert np.array_equal(elsewhere.position, simulator.position[[2, 1]])
@@ -351,7 +351,7 @@ def test_pulling_out_stops_at_the_ostium(anatomy: Anatomy) -> None:
             "control: world 1: 1000: translation in mm/s exceeds workhorse-014's limit of 40; slow",
         ),
         (np.array([[40.0, 0], [0, 0]]), 60.0, "world 0: may insert .* laid out for .* push less"),
-        (np.zeros((2, 2)), 0.0, "duration: 0.0; give a positive"),
+        (np.zeros((2, 2)), 0.0, "duration_s: 0.0; give a positive"),
     ],
 )
 def test_bad_controls_move_no_world(anatomy: Anatomy, control: np.ndarray, duration: float, message: str) -> None:
@@ -379,11 +379,11 @@ def test_bad_starts_and_states_are_refused(anatomy: Anatomy, wider: Anatomy, tmp
     state = Simulator(anatomy, DEVICE, worlds=2).state
     with pytest.raises(InputError, match="state: format version 7, not 4; make the state again"):
         Simulator(anatomy, DEVICE, worlds=2).set_state(replace(state, format_version=7))
-    replace(state, format_version=7).save(tmp_path / "new.npz")
+    replace(state, format_version=7).write(tmp_path / "new.npz")
     with pytest.raises(InputError, match=r"new\.npz: format version 7, not 4; make the state again"):
-        SimulatorState.load(tmp_path / "new.npz")
+        SimulatorState.read(tmp_path / "new.npz")
     with pytest.raises(InputError, match=r"no such file|no saved state"):
-        SimulatorState.load(tmp_path / "absent.npz")
+        SimulatorState.read(tmp_path / "absent.npz")
     with pytest.raises(InputError, match="give fewer"):
         Simulator(anatomy, DEVICE, worlds=100_000_000)
     with pytest.raises(InputError, match="wider"):

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endopilot.devices.device import read_device
-from endopilot.devices.device_files import list_devices
+from endopilot.devices.device import read_wire
+from endopilot.devices.device_files import list_wires
 from endopilot.simulation.tip_load import HELD_MM, TOLERANCE, simulate_tip_load, tip_load_row
 
 
-@pytest.mark.parametrize("name", list_devices())
+@pytest.mark.parametrize("name", list_wires())
 def test_every_shipped_device_has_its_catalogue_tip_load(name: str) -> None:
-    device = read_device(name)
+    device = read_wire(name)
     row = tip_load_row(device)
     if device.tip_load_n is None:
         assert row["error"] is None and row["passed"] is None
@@ -26,7 +26,7 @@ def test_every_shipped_device_has_its_catalogue_tip_load(name: str) -> None:
 def test_a_uniform_tip_buckles_at_the_column_formula() -> None:
     # F = π² EI / (4 L²); pushed on by 2 % of its length, a buckled column carries 1 % more (elastica).
     device = replace(
-        read_device("workhorse-014"),
+        read_wire("workhorse-014"),
         abscissa_mm=[0.0],
         bend_stiffness_n_mm2=[0.5],
         twist_stiffness_n_mm2=[0.4],
@@ -41,7 +41,7 @@ def test_a_uniform_tip_buckles_at_the_column_formula() -> None:
 
 
 def test_a_taper_that_reaches_into_the_tip_raises_the_load() -> None:
-    soft = read_device("workhorse-014")
+    soft = read_wire("workhorse-014")
     stiff_behind = replace(soft, bend_stiffness_n_mm2=[0.3, 1.2, 2.0, 8.0, 30.0, 80.0])
     row = tip_load_row(stiff_behind)
     assert row["passed"] is False

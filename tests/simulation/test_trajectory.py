@@ -12,7 +12,7 @@ import pytest
 import endopilot
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.catheter import read_catheter
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
@@ -22,7 +22,7 @@ from endopilot.simulation.trajectory import Trajectory
 from endopilot.simulation.trajectory_file import read_trajectory, write_trajectory
 from endopilot.types import Anatomy, TipProjection
 
-WIRE, CATHETER = read_device("workhorse-014"), read_catheter("microcatheter-1.7f")
+WIRE, CATHETER = read_wire("workhorse-014"), read_catheter("microcatheter-1.7f")
 PAIR = Stack(WIRE, (CATHETER,))
 SAMPLES = 6
 BY_DEVICE = "worlds samples devices"
@@ -113,6 +113,7 @@ def test_every_third_sample_has_the_means_and_sums_of_its_period(vessel) -> None
     assert coarse.period_s == 1.5 and coarse.valid.shape == (2, 2)
     for name in ("inserted_length", "rotation", "tip_position", "base_force", "wall_force", "shape"):
         np.testing.assert_array_equal(getattr(coarse, name), getattr(fine, name)[:, [2, 5]])
+    assert fine.vessel_to_laboratory is not None
     np.testing.assert_array_equal(coarse.vessel_to_laboratory, fine.vessel_to_laboratory[:, [2, 5]])
     np.testing.assert_array_equal(coarse.tip.abscissa, fine.tip.abscissa[:, [2, 5]])
     for name, take in (("command", np.mean), ("control", np.mean), ("iterations", np.mean)):
@@ -130,7 +131,7 @@ def test_every_third_sample_has_the_means_and_sums_of_its_period(vessel) -> None
 
 def test_a_file_gives_every_array_back_to_the_bit_and_is_replayed(vessel, moving_pair, tmp_path) -> None:
     write_trajectory(moving_pair, tmp_path / "pair.npz")
-    read = read_trajectory(tmp_path / "pair.npz", vessel)
+    read = read_trajectory(tmp_path / "pair.npz", anatomy=vessel)
     assert_same(read, moving_pair)
     assert [each.identity for each in read.set_up.anatomies] == [vessel.identity] * 2
     for name in ("stacks", "actuation", "motion", "config"):
@@ -188,7 +189,7 @@ def test_what_is_no_trajectory_of_the_vessel_is_refused_in_one_line(vessel, wire
 
 def _refused(path: Path, anatomy, message: str) -> None:
     with pytest.raises(InputError) as error:
-        read_trajectory(path, anatomy)
+        read_trajectory(path, anatomy=anatomy)
     assert str(error.value).startswith(f"{path}: ") and message in str(error.value)
     assert "\n" not in str(error.value)
 

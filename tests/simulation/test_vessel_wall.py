@@ -8,7 +8,7 @@ import pytest
 import endopilot
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.catheter import read_catheter
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import make_lumen
@@ -23,7 +23,7 @@ def vessel() -> Anatomy:
 
 @pytest.fixture(scope="module")
 def wide() -> Stack:
-    return Stack(read_device("workhorse-014"), (read_catheter("straight-5f"),))
+    return Stack(read_wire("workhorse-014"), (read_catheter("straight-5f"),))
 
 
 def axis_of_guiding_catheter(anatomy: Anatomy) -> np.ndarray:
@@ -59,7 +59,7 @@ def test_a_finer_wall_lies_where_the_wall_was(vessel: Anatomy, wide: Stack) -> N
 
 @pytest.mark.parametrize("catheters", [(), ("microcatheter-1.7f",), ("microcatheter-2.4f",)])
 def test_the_wall_stays_as_it_is_for_devices_that_find_room_in_it(vessel: Anatomy, catheters: tuple[str, ...]) -> None:
-    stack = Stack(read_device("workhorse-014"), tuple(read_catheter(name) for name in catheters))
+    stack = Stack.of("workhorse-014", *catheters)
     wall, plain = make_wall(vessel, stack, SimulatorConfig()), make_lumen(vessel.distance_map, stack.outer_radius_mm)
     points = vessel.tree.branches[0].centerline.points
     assert wall.bytes == plain.bytes

@@ -15,7 +15,7 @@ from endopilot.ladder.scores import COAXIAL
 from endopilot.settings import read_settings
 from endopilot.tasks import task
 from endopilot.tasks.targets import find_target, turn_rad
-from endopilot.tasks.task import Task, find_task, ladder_tasks, without_catheter
+from endopilot.tasks.task import Task, find_task, list_tasks, without_catheter
 
 FOLDER = Path(task.__file__).parent
 FILES = sorted(FOLDER.glob("ladder_*/*.yaml"))
@@ -24,11 +24,11 @@ VERSIONS = (1, 2, "coaxial")
 
 def test_there_are_twelve_tasks_one_a_level_each_with_its_environment():
     for version in (1, 2):
-        assert [task.level for task in ladder_tasks(version)] == list(range(1, 13))
+        assert [task.level for task in list_tasks(version)] == list(range(1, 13))
         own = [path for path in FILES if path.parent.name == f"ladder_{version}"]
-        assert [path.stem for path in own] == sorted(task.name for task in ladder_tasks(version))
-        assert {task.version for task in ladder_tasks(version)} == {version}
-        assert {name.lower() for name in endopilot.env.TASKS} == {task.name for task in ladder_tasks(version)}
+        assert [path.stem for path in own] == sorted(task.name for task in list_tasks(version))
+        assert {task.version for task in list_tasks(version)} == {version}
+        assert {name.lower() for name in endopilot.env.TASKS} == {task.name for task in list_tasks(version)}
     for name in endopilot.env.TASKS:
         assert f"endopilot/{name}-v0" in gymnasium.registry
 
@@ -38,26 +38,30 @@ def test_a_task_has_twenty_patients_and_others_to_learn_on(path):
     task = read_settings(path, Task)
     assert len(set(task.ladder.numbers)) == len(set(task.training.numbers)) == 20
     assert task.ladder.seed != task.training.seed
-    seeds = [other.ladder.seed for version in VERSIONS for other in ladder_tasks(version)]
+    seeds = [other.ladder.seed for version in VERSIONS for other in list_tasks(version)]
     assert len(set(seeds)) == len(seeds) == len(FILES) and task.training.seed not in seeds
 
 
 def test_coaxial_tasks_are_done_by_the_tip_of_a_catheter():
-    tasks = ladder_tasks("coaxial")
+    tasks = list_tasks("coaxial")
     assert [each.level for each in tasks] == list(COAXIAL)
     for each in tasks:
         tree, _ = make_patient_tree(each.atlas(each.ladder.seed), each.ladder.numbers[0])
         target = find_target(tree, each.section, depth_mm=each.depth_mm)
-        assert each.start_catheter_mm < each.start_inserted_mm < target.abscissa
-    navigation = find_task("follow", "coaxial").ladder_navigation(0)
+        assert each.start_catheter_mm < each.start_inserted_length_mm < target.abscissa
+    navigation = find_task("follow", version="coaxial").ladder_navigation(0)
     assert navigation.arrives == "catheter" and [c.name for c in navigation.catheters] == ["microcatheter-1.7f"]
     alone = without_catheter(navigation)
-    assert alone.arrives == "wire" and not alone.catheters and alone.start_inserted_mm == navigation.start_inserted_mm
-    assert (alone.target, alone.start_rotation) == (navigation.target, navigation.start_rotation)
+    assert (
+        alone.arrives == "wire"
+        and not alone.catheters
+        and alone.start_inserted_length_mm == navigation.start_inserted_length_mm
+    )
+    assert (alone.target, alone.start_rotation_rad) == (navigation.target, navigation.start_rotation_rad)
 
 
 def test_the_side_branch_leaves_at_ninety_degrees_or_more():
-    steep = find_task("side-branch", "coaxial")
+    steep = find_task("side-branch", version="coaxial")
     for place in (0, 7):
         tree, _ = make_patient_tree(steep.atlas(steep.ladder.seed), steep.ladder.numbers[place])
         assert turn_rad(tree, find_target(tree, steep.section, depth_mm=0.5).branch) >= np.pi / 2
@@ -75,7 +79,11 @@ def test_the_target_lies_in_its_section(name):
 
 def test_a_ladder_navigation_is_the_same_every_time():
     one, other = (find_task("straight").ladder_navigation(3) for _ in range(2))
-    assert one.start_rotation == other.start_rotation != find_task("straight").ladder_navigation(4).start_rotation
+    assert (
+        one.start_rotation_rad
+        == other.start_rotation_rad
+        != find_task("straight").ladder_navigation(4).start_rotation_rad
+    )
     assert one.target == other.target
     assert np.array_equal(one.anatomy.distance_map.values, other.anatomy.distance_map.values)
     assert one.device.tip_bend_rad == pytest.approx(np.deg2rad(find_task("straight").tip_bend_deg))
@@ -87,7 +95,7 @@ def test_a_ladder_navigation_is_the_same_every_time():
         ("level: 6", "level: 17", "level: 17; give a whole number from 1 to 16"),
         ("seconds: 90", "seconds: -1", "seconds: -1; give a number above 0, at most 86400"),
         ("force_limit_n: 0.2", "force_limit_n: .nan", "force_limit_n: nan; give a positive number"),
-        ("anatomy: rca", "anatomy: knee", "anatomy: 'knee'; choose from"),
+        ("vessel: rca", "vessel: knee", "vessel: 'knee'; choose from"),
         ("device: workhorse-014", "device: rope", "device: 'rope'; choose from"),
         ("level: 6", "level: 6\nlength: 3", "length: no such field; the fields are name, level,"),
         ("name: crux", "name: [", "line 4: not valid YAML"),

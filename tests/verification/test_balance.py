@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.simulate import simulate
@@ -16,7 +16,7 @@ def test_the_push_balances_the_wall() -> None:
     # At rest and without friction the drive's push along the catheter's axis d and the wall's forces on the wire
     # cancel: push = -d · Σ k (r - φ) ∇φ over the contact points with φ < r, φ being the quadratic spline of the
     # distance map. They are the nodes and the middles of elements, where the wire's curve passes them.
-    anatomy, device = make_patient(AtlasConfig(population="textbook"), 0), read_device("workhorse-014")
+    anatomy, device = make_patient(AtlasConfig(population="textbook"), 0), read_wire("workhorse-014")
     longest = float(anatomy.tree.longest_path().abscissa[-1])
     initial, control = random_controls(
         ControlConfig(), n_sequences=6, n_samples=24, seed=3, max_inserted_length_mm=longest

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.verification import scenes as scenarios
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 
 
 def test_a_string_is_dragged_as_the_capstan_equation_says() -> None:
@@ -56,7 +56,7 @@ def test_a_short_curved_wire_lags_and_a_long_one_whips() -> None:
 
 
 def test_a_tip_buckles_on_a_plate_as_its_hold_allows() -> None:
-    stiffness = read_device("workhorse-014").bend_stiffness_n_mm2[0] / scenarios.PLATE_GAP_MM**2
+    stiffness = read_wire("workhorse-014").bend_stiffness_n_mm2[0] / scenarios.PLATE_GAP_MM**2
 
     def load(friction: float, bend_deg: float) -> float:
         run = scenarios.push_against_a_plate(friction=friction, tip_bend_deg=bend_deg)

@@ -40,7 +40,7 @@ def exposed(imager, planes, nodes, **how):
 
 
 def found_in(imager, planes, signals, length: float, shown=(0, 1), dose: float = 1.0):
-    detector = TipDetector(imager.anatomy, imager.device)
+    detector = TipDetector(imager.anatomy, imager.stack.wire)
     views, photons = [planes[i].view for i in shown], [imager.photons(planes[i], dose) for i in shown]
     return detector.find(views, [signals[i] for i in shown], photons, length)
 

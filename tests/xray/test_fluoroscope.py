@@ -15,7 +15,7 @@ PIXEL_MM = 0.308 * 765 / 1100  # at the isocenter
 
 def located(fork, config: FluoroscopeConfig, count: int = 120) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return true places inside the straight vessel, along the wire there, and where they are found."""
-    arm, random = Fluoroscope(fork, RADIUS, config), np.random.default_rng(0)
+    arm, random = Fluoroscope(fork, RADIUS, config=config), np.random.default_rng(0)
     height, turn = random.uniform(5, 15, count), random.uniform(0, 2 * np.pi, count)
     true = np.stack([0.7 * np.cos(turn), 0.7 * np.sin(turn), height], axis=1)
     along = np.array([0.0, 0.0, 1.0])
@@ -73,7 +73,7 @@ def test_two_views_show_how_the_guiding_catheter_leans(fork) -> None:
 
 def test_one_view_shows_the_lean_across_its_beam_alone(fork) -> None:
     """What it does not show is taken to be as given: the catheter leans not at all along the beam."""
-    arm = Fluoroscope(fork, RADIUS, FluoroscopeConfig(biplane=False, pixel_sd=1e-3))
+    arm = Fluoroscope(fork, RADIUS, config=FluoroscopeConfig(biplane=False, pixel_sd=1e-3))
     beam, across = np.array([-0.5, -np.sqrt(0.75), 0.0]), np.array([np.sqrt(0.75), -0.5, 0.0])  # RAO 30°
     for side in range(0, 360, 45):
         true = leaning(fork, side)

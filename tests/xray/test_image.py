@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
 from endopilot.devices.catheter import read_catheter
+from endopilot.devices.stack import Stack
 from endopilot.types import Insertion, Volume
 from endopilot.xray.absorbers import (
     CATHETER_MM,
@@ -42,7 +43,7 @@ def test_a_wire_takes_away_what_its_metal_does(imager):
     side = imager.config.geometry.pixel_mm / magnification(imager)
     nodes = imager.isocenter + np.linspace(-20, 20, 9)[:, None] * np.array([0.6, 0.0, 0.8])
     wire = imager.wire(plane, nodes)
-    radius = imager.device.tip_radius_mm
+    radius = imager.stack.wire.tip_radius_mm
     metal = np.pi * radius**2 * (30.0 * COIL_MM + 10.0 * STEEL_MM)
     assert wire.sum() * side**2 == pytest.approx(metal, rel=2e-3)
 
@@ -51,7 +52,7 @@ def test_a_wire_takes_away_what_its_metal_does(imager):
 def test_a_driven_catheter_takes_away_what_its_wall_and_marker_do(fork, wire, name):
     """Summed over the image, attenuation × pixel area = μ π (R² - r²) L of the wall, and that of the tip's ring."""
     catheter = read_catheter(name)
-    imager = XrayImager(fork, wire, catheters=[catheter])
+    imager = XrayImager(fork, Stack(wire, (catheter,)))
     plane = imager.plane((0.0, 0.0))
     side = imager.config.geometry.pixel_mm / magnification(imager)
     nodes = imager.isocenter + np.linspace(-15, 15, 9)[:, None] * np.array([0.6, 0.0, 0.8])
@@ -67,7 +68,7 @@ def test_a_driven_catheter_takes_away_what_its_wall_and_marker_do(fork, wire, na
 
 
 def test_a_frame_adds_the_catheter_to_the_wire(fork, wire, imager):
-    pair = XrayImager(fork, wire, catheters=[read_catheter("microcatheter-1.7f")])
+    pair = XrayImager(fork, Stack(wire, (read_catheter("microcatheter-1.7f"),)))
     plane = pair.plane((0.0, 0.0))
     nodes = pair.isocenter + np.linspace(0, 20, 41)[:, None] * np.array([0, 0, 1.0])
     alone, both = (pair.signal(plane, nodes, dose=1e8, catheters=shown) for shown in ([], [nodes[20:]]))
@@ -111,7 +112,7 @@ def test_a_slab_of_water_takes_away_what_water_does(fork, wire):
     size = np.array([60, 40, 60])  # x, y, z voxels of 3 mm
     start = np.concatenate([branch.centerline.points for branch in fork.tree.branches]).mean(axis=0)
     water = Volume(np.zeros(tuple(size[::-1])), np.full(3, 3.0), start - 3.0 * (size - 1) / 2, np.eye(3))
-    imager = XrayImager(fork, wire, water, ImageConfig(pixels=128))
+    imager = XrayImager(fork, wire, ct=water, config=ImageConfig(pixels=128))
     background = imager.plane((0.0, 0.0), 0.25, rays=64).background
     # The rays run between the middles of the outermost voxels, in steps of 1.5 mm.
     assert background[64, 64] == pytest.approx(WATER_MM * 117.0, rel=0.02)
@@ -131,7 +132,7 @@ def test_quantum_noise_is_that_of_the_counted_photons(imager):
         impulse = np.zeros((15, 15))
         impulse[7, 7] = 1.0
         kernel = gaussian_filter(impulse, scintillator_mm / config.geometry.pixel_mm)
-        blurred = XrayImager(imager.anatomy, imager.device, config=config)
+        blurred = XrayImager(imager.anatomy, imager.stack, config=config)
         for dose in (1.0, 4.0):
             signal = blurred.signal(even, np.zeros((0, 3)), dose=dose, seed=1)
             photons = PHOTONS_MM2_UGY * config.efficiency * config.detector_ugy * dose * config.geometry.pixel_mm**2

@@ -16,7 +16,7 @@ from endopilot.xray.take_image import TakeImageConfig, take_image
 
 
 def shown(fork, **changes):
-    return take_image(fork, TakeImageConfig(view_deg=(0.0, 0.0), inserted_mm=12.0, **changes))
+    return take_image(fork, config=TakeImageConfig(view_deg=(0.0, 0.0), inserted_length_mm=12.0, **changes))
 
 
 def darker(image, row: int, column: int) -> float:
@@ -46,10 +46,23 @@ def test_dsa_and_roadmap_show_the_vessel_and_take_two_frames(fork):
 
 
 def test_the_command_writes_the_image(fork, tmp_path, capsys):
-    write_anatomy(fork, tmp_path / "fork")
+    write_anatomy(fork, output=tmp_path / "fork")
     path = tmp_path / "image.png"
     with pytest.raises(SystemExit) as left:
-        main(["xray", str(tmp_path / "fork"), "-o", str(path), "--view-deg", "0", "0", "--inserted-mm", "12", "--json"])
+        main(
+            [
+                "xray",
+                str(tmp_path / "fork"),
+                "-o",
+                str(path),
+                "--view-deg",
+                "0",
+                "0",
+                "--inserted-length-mm",
+                "12",
+                "--json",
+            ]
+        )
     assert left.value.code == 0
     figures = json.loads(capsys.readouterr().out)
     image = shown(fork)
@@ -75,7 +88,7 @@ def test_a_catheter_is_shown_up_to_its_own_tip(fork, monkeypatch):
     signal = XrayImager.signal
     monkeypatch.setattr(XrayImager, "signal", lambda *given, **how: seen.update(how) or signal(*given, **how))
     for deep in (7.0, 14.0):  # behind the wire's tip, at 12 mm, and ahead of it
-        image = shown(fork, catheter=("microcatheter-1.7f",), catheter_inserted_mm=deep)
+        image = shown(fork, catheter=("microcatheter-1.7f",), catheter_inserted_length_mm=deep)
         (line,) = seen["catheters"]
         assert line[0, 2] == pytest.approx(deep, abs=0.3)
         assert np.linalg.norm(image.tip_pixel - shown(fork).tip_pixel) * image.mm_per_pixel < 1.0

@@ -49,7 +49,7 @@ def extract_all(
 
 def _make(source: Path, *, folders: dict[Path, Path], label: int | str | None, config: AnatomyConfig) -> None:
     folder = folders[source]
-    write_anatomy(extract_anatomy(read_source(source, label=label), name=folder.name, config=config), folder)
+    write_anatomy(extract_anatomy(read_source(source, label=label), name=folder.name, config=config), output=folder)
 
 
 def _names(sources: Sequence[Path]) -> list[str]:

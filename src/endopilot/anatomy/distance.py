@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.errors import InputError
+from endopilot.lines import length_along
 from endopilot.types import Centerline, DistanceMap, Insertion, VesselTree, Volume
 
 BAND_MM = 2.5
@@ -324,7 +325,7 @@ def _tube_field(
 
 def _thinned(line: Centerline, step: float) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
     """Return the points and radii of a line, leaving out points that lie closer together than `step`."""
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line.points, axis=0), axis=1))])
+    length = length_along(line.points)
     if len(length) < 3 or length[-1] < step:
         return line.points, line.radius
     keep = np.unique(np.searchsorted(length, np.arange(0.0, length[-1], step)))

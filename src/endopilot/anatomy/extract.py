@@ -80,7 +80,7 @@ def extract_anatomy(
     *,
     name: str | None = None,
     label: int | str | None = None,
-    config: AnatomyConfig = AnatomyConfig(),
+    config: AnatomyConfig | None = None,
 ) -> Anatomy:
     """Make an anatomy: centerline tree with section labels, distance map with guiding catheter, insertion.
 
@@ -94,6 +94,7 @@ def extract_anatomy(
         InputError: the file cannot be read, or the source is empty, is no vessel, is not where the ostium is, or
             cannot be closed.
     """
+    config = config or AnatomyConfig()
     if isinstance(source, str | Path):
         source = read_source(source, label=label)
     wrapped = source if isinstance(source, AnatomySource) else AnatomySource(source)

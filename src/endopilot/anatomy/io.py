@@ -35,13 +35,17 @@ _SPACE = "left-posterior-superior"
 _CENTERLINE, _LUMEN, _RECORD = "centerline.vtp", "lumen.nrrd", "anatomy.json"
 
 
-def write_anatomy(anatomy: Anatomy, folder: str | Path) -> None:
+def write_anatomy(anatomy: Anatomy, *, output: str | Path) -> None:
     """Write an anatomy as a folder, whole or not at all; an anatomy that stands there already is replaced.
+
+    Args:
+        anatomy: the vessel.
+        output: the folder.
 
     Raises:
         InputError: the folder cannot be written, or holds something that is not an anatomy.
     """
-    folder = Path(folder)
+    folder = Path(output)
     if folder.exists() and not (folder.is_dir() and ((folder / _RECORD).exists() or not any(folder.iterdir()))):
         raise InputError(f"{folder}: exists and is not an anatomy; choose another output folder")
     with files.writing(folder) as partial:

@@ -10,6 +10,7 @@ from endopilot.anatomy.line_graph import STEP_MM, LineNodes
 from endopilot.anatomy.lumen_graph import groups, pieces
 from endopilot.anatomy.sources import Polylines
 from endopilot.errors import place_text
+from endopilot.lines import length_along
 from endopilot.types import VesselTree
 
 _SHORTEST_MM = 2.0
@@ -199,8 +200,7 @@ def _way(
 
 def _has_hole(points: Float[np.ndarray, "w 3"], radius: Float[np.ndarray, "w"]) -> bool:
     """Return whether the two halves of a way that comes back to its start lie apart somewhere in between."""
-    step = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    length = np.concatenate([[0.0], np.cumsum(step)])
+    length = length_along(points)
     half = length <= 0.5 * length[-1]
     first, second = np.flatnonzero(half), np.flatnonzero(~half)
     gap = (

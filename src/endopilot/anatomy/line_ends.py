@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from endopilot.anatomy.distance import sample
 from endopilot.anatomy.lumen_graph import LumenGraph
 from endopilot.anatomy.tree import Line, cross_axes, resampled, smoothed
+from endopilot.lines import length_along
 from endopilot.types import DistanceMap, Insertion
 
 _RING = 12
@@ -117,7 +118,7 @@ def from_ostium(
         ostium: where the vessel begins.
         step_mm: distance between points.
     """
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(drawn, axis=0), axis=1))])
+    along = length_along(drawn)
     shift = ostium.position - drawn[0]
     beside = shift - (shift @ ostium.direction) * ostium.direction
     if np.linalg.norm(shift) <= 2 * width[0] and np.linalg.norm(beside) <= 0.5 * width[0]:

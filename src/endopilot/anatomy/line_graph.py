@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 
 from endopilot.anatomy.lumen_graph import pieces
 from endopilot.anatomy.sources import Polylines
+from endopilot.lines import length_along, places_on
 
 STEP_MM = 0.5
 """Distance between the points of the tree, mm."""
@@ -104,9 +105,9 @@ def dense_nodes(source: Polylines) -> LineNodes:
     """Return the nodes of all lines, about `STEP_MM` / 2 apart; lines have no points that coincide in succession."""
     parts = []
     for number, (line, size) in enumerate(zip(source.points, source.radius, strict=True)):
-        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+        length = length_along(line)
         wanted = np.linspace(0.0, length[-1], max(2, round(length[-1] / (0.5 * STEP_MM)) + 1))
-        points = np.stack([np.interp(wanted, length, line[:, axis]) for axis in range(3)], axis=1)
+        points = places_on(line, length, wanted)
         ends = np.zeros(len(wanted), dtype=bool)
         ends[[0, -1]] = True
         share = np.full(len(wanted), wanted[1] - wanted[0])

@@ -28,6 +28,7 @@ from endopilot.anatomy.line_order import in_order
 from endopilot.anatomy.sources import Polylines
 from endopilot.anatomy.tree import Line, tree_from_lines
 from endopilot.errors import InputError, place_text
+from endopilot.lines import length_along, places_on
 from endopilot.types import Insertion, VesselTree
 
 PARENT_VESSEL_RATIO = 2.5
@@ -221,8 +222,8 @@ def _lines(
 def _resampled(
     points: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, "n"]
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    length = length_along(points)
     distinct = np.concatenate([[True], np.diff(length) > 1e-9])
     wanted = np.linspace(0.0, length[-1], max(3, round(length[-1] / STEP_MM) + 1))
-    line = np.stack([np.interp(wanted, length[distinct], points[distinct, axis]) for axis in range(3)], axis=1)
+    line = places_on(points[distinct], length[distinct], wanted)
     return line, np.interp(wanted, length[distinct], radius[distinct])

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from endopilot.lines import length_along, places_on
 from endopilot.types import Branch, Centerline, VesselTree
 
 SAMPLE_STEP_MM = 0.1
@@ -69,8 +70,7 @@ def make_centerline(
         first_abscissa: abscissa of the first point, mm.
         first_normal: normal to carry along; any perpendicular one if None.
     """
-    step = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    abscissa = first_abscissa + np.concatenate([[0.0], np.cumsum(step)])
+    abscissa = first_abscissa + length_along(points)
     return Centerline(points=points, radius=radius, abscissa=abscissa, normals=parallel_transport(points, first_normal))
 
 
@@ -118,7 +118,7 @@ def sampled(tree: VesselTree) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarra
     for branch in tree.branches:
         line = branch.centerline
         at = np.arange(line.abscissa[0], line.abscissa[-1], SAMPLE_STEP_MM)
-        points.append(np.stack([np.interp(at, line.abscissa, line.points[:, axis]) for axis in range(3)], axis=-1))
+        points.append(places_on(line.points, line.abscissa, at))
         radius.append(np.interp(at, line.abscissa, line.radius))
     return np.concatenate(points), np.concatenate(radius)
 
@@ -131,7 +131,7 @@ def resampled(points: Float[np.ndarray, "n 3"], step_mm: float) -> Float[np.ndar
     points = points[distinct]
     if len(points) < 2:
         return points
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    length = length_along(points)
     count = max(2, round(length[-1] / step_mm) + 1)
     return np.asarray(PchipInterpolator(length, points, axis=0)(np.linspace(0.0, length[-1], count)))
 

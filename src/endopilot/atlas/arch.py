@@ -36,6 +36,7 @@ from endopilot.atlas.branching import (
 )
 from endopilot.atlas.population import Population
 from endopilot.atlas.variation import bent, varied
+from endopilot.lines import length_along
 from endopilot.types import VesselTree
 
 HEIGHT_MM, WIDTH_MM = {"man": 49.3, "woman": 40.1}, {"man": 83.6, "woman": 73.3}
@@ -100,7 +101,7 @@ def _draw(
     drop = wide["left common carotid"] * float(generator.uniform(low, high))
     origins = _origins(generator, points, drop, wide, bovine)
     first, last = origins["left subclavian"], origins["brachiocephalic trunk"]
-    along, place = shape.abscissa(points), np.arange(len(points))
+    along, place = length_along(points), np.arange(len(points))
     marks = along[[0, first - 60, first, (first + last) // 2, last, last + 60, -1]]
     radius = 0.5 * np.interp(along, marks, AORTA_DIAMETER_MM) * uneven(generator, along)
     radius = radius * truncated(generator, 1.0, 0.13, 0.7, 1.3)

@@ -34,7 +34,7 @@ _KINDS: dict[str, Callable[[np.random.Generator, float, Population], tuple[Vesse
     "arch": make_arch,
 }
 
-ANATOMIES = tuple(_KINDS)
+VESSELS = tuple(_KINDS)
 """Names of the kinds of vessel trees."""
 
 
@@ -42,7 +42,7 @@ ANATOMIES = tuple(_KINDS)
 class AtlasConfig:
     """Which synthetic patients to make."""
 
-    anatomy: str = "rca"
+    vessel: str = "rca"
     """Kind of vessel tree: rca or lca (right or left coronary artery), cerebral (internal carotid with middle and
     anterior cerebral arteries), arch (aortic arch with its branches), portal (portal vein)."""
     count: Annotated[int, Within(1, 100000)] = 1
@@ -61,13 +61,14 @@ class AtlasConfig:
 
     @model_validator(mode="after")
     def _consistent(self) -> AtlasConfig:
-        if self.anatomy not in _KINDS:
-            raise ValueError(f"anatomy: {self.anatomy!r}; choose from {', '.join(sorted(_KINDS))}")
+        if self.vessel not in _KINDS:
+            raise ValueError(f"vessel: {self.vessel!r}; choose from {', '.join(sorted(_KINDS))}")
         return self
 
 
-def make_atlas(config: AtlasConfig = AtlasConfig()) -> Iterator[Anatomy]:
+def make_atlas(*, config: AtlasConfig | None = None) -> Iterator[Anatomy]:
     """Yield the patients of an atlas, one after another."""
+    config = config or AtlasConfig()
     for index in range(config.count):
         yield make_patient(config, index)
 
@@ -79,9 +80,9 @@ def make_patient(config: AtlasConfig, index: int) -> Anatomy:
     what was drawn: dominance, length, tortuosity, curvature, stenoses.
     """
     tree, drawn = make_patient_tree(config, index)
-    population = population_of(config.anatomy, config.population)
+    population = population_of(config.vessel, config.population)
     generator = _stream(config, index, 1)
-    name, source = f"{config.anatomy}-{config.seed}-{index:04d}", {"source": "atlas", "anatomy": config.anatomy}
+    name, source = f"{config.vessel}-{config.seed}-{index:04d}", {"source": "atlas", "vessel": config.vessel}
     source |= {"population": config.population, "seed": config.seed, "index": index}
     direction, catheter = catheter_direction(generator, tree, population, CATHETER_RADIUS_MM, CATHETER_LENGTH_MM)
     if config.seen_through_ct:
@@ -89,7 +90,7 @@ def make_patient(config: AtlasConfig, index: int) -> Anatomy:
     lumen = distance.distance_map_from_spheres(tree, beside=flattened(generator, tree, population))
     if config.seen_through_ct:
         first = tangents(tree.branches[0].centerline.points)[0]
-        found, scan = seen_through_ct(generator, config.anatomy, tree, lumen, first, name, CATHETER_RADIUS_MM)
+        found, scan = seen_through_ct(generator, config.vessel, tree, lumen, first, name, CATHETER_RADIUS_MM)
         return replace(found, provenance=source | drawn | {"seen_through_ct": scan})
     insertion = Insertion(position=tree.branches[0].centerline.points[0], direction=direction)
     return Anatomy(
@@ -104,8 +105,8 @@ def make_patient(config: AtlasConfig, index: int) -> Anatomy:
 
 def make_patient_tree(config: AtlasConfig, index: int) -> tuple[VesselTree, dict[str, Any]]:
     """Return the centerline tree of patient `index`, and what was drawn for it, without a distance map."""
-    population = population_of(config.anatomy, config.population)
-    return _KINDS[config.anatomy](_stream(config, index, 0), config.stenosis_share, population)
+    population = population_of(config.vessel, config.population)
+    return _KINDS[config.vessel](_stream(config, index, 0), config.stenosis_share, population)
 
 
 def _stream(config: AtlasConfig, index: int, purpose: int) -> np.random.Generator:

@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from endopilot.atlas import curves as shape
+from endopilot.lines import length_along
 from endopilot.types import Branch, Centerline, VesselTree
 
 Depth = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]
@@ -157,10 +158,10 @@ def narrowed(
     The mouths of its branches, which lie in its lumen, narrow with it.
     """
     vessel = vessels[index]
-    along, above = shape.abscissa(vessel.points), vessel
+    along, above = length_along(vessel.points), vessel
     while above.parent >= 0:
         parent = vessels[above.parent]
-        along = along + shape.abscissa(parent.points)[above.origin]
+        along = along + length_along(parent.points)[above.origin]
         above = parent
     drawn, factor = stenoses(generator, along, shares, tandem_share)
     found = [one | {"section": vessel.section[int(np.searchsorted(along, one["abscissa_mm"]))]} for one in drawn]
@@ -168,7 +169,7 @@ def narrowed(
     for i, other in enumerate(vessels):
         scale = factor if i == index else np.ones(len(other.radius))
         if other.parent == index:
-            inside = np.exp(-((shape.abscissa(other.points) / vessel.radius[other.origin]) ** 2))
+            inside = np.exp(-((length_along(other.points) / vessel.radius[other.origin]) ** 2))
             scale = factor[other.origin] * inside + (1 - inside)
         changed.append(replace(other, radius=other.radius * scale))
     return found, changed
@@ -275,7 +276,7 @@ def build_tree(vessels: Sequence[Vessel], section_names: tuple[str, ...]) -> Ves
 
     def grow(index: int, parent: int, before_mm: float, normal: Float[np.ndarray, "3"] | None) -> None:
         vessel = vessels[index]
-        along = before_mm + shape.abscissa(vessel.points)
+        along = before_mm + length_along(vessel.points)
         normals = shape.parallel_normals(shape.tangents(vessel.points), normal)
         labels = np.array([number[name] for name in vessel.section])
         children = [i for i, other in enumerate(vessels) if other.parent == index]
@@ -305,7 +306,7 @@ def lumens_collide(vessels: Sequence[Vessel], carina_mm: float = _BEND_MM) -> bo
     """
     points = np.concatenate([vessel.points for vessel in vessels])
     radii = np.concatenate([vessel.radius for vessel in vessels])
-    place = np.concatenate([shape.abscissa(vessel.points) for vessel in vessels])
+    place = np.concatenate([length_along(vessel.points) for vessel in vessels])
     owner = np.repeat(np.arange(len(vessels)), [len(vessel.points) for vessel in vessels])
     near = KDTree(points).query_pairs(2 * radii.max() + _CLEARANCE_MM, output_type="ndarray")
     reach = radii[near].sum(axis=1)
@@ -328,7 +329,7 @@ def _meetings(vessels: Sequence[Vessel]) -> tuple[np.ndarray, np.ndarray, np.nda
     That is: the vessel that they meet on, the place (mm) where a's path enters it, and the length of a's path between
     the vessel a itself and that place, mm.
     """
-    lengths = [shape.abscissa(vessel.points) for vessel in vessels]
+    lengths = [length_along(vessel.points) for vessel in vessels]
     paths: list[dict[int, tuple[float, float]]] = []
     for vessel in vessels:
         path, beyond = {}, 0.0

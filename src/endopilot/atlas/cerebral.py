@@ -37,6 +37,7 @@ from endopilot.atlas.branching import (
 )
 from endopilot.atlas.population import Population
 from endopilot.atlas.variation import Fork, bent, factor, forks_of, varied
+from endopilot.lines import length_along
 from endopilot.types import VesselTree
 
 SIPHON_MM, SIPHON_SD_MM = 33.1, 6.1
@@ -113,11 +114,11 @@ def _draw(
         narrow, vessels = narrowed(generator, vessels, 0, shares, population.tandem_share)
     whole = {vessel.section[-1]: index for index, vessel in enumerate(vessels)}
     aca = vessels[whole["A1"]]
-    beyond = shape.abscissa(aca.points) > a1_mm
+    beyond = length_along(aca.points) > a1_mm
     vessels[whole["A1"]] = replace(aca, section=np.where(beyond, "A2", "A1").tolist())
     if side == "right":
         vessels = [replace(vessel, points=vessel.points * np.array([-1.0, 1.0, 1.0])) for vessel in vessels]
-    along = shape.abscissa(points)
+    along = length_along(points)
     carotid = points[: marks["terminus"] + 1]
     drawn = {
         "side": side,
@@ -155,7 +156,7 @@ def _main(
         points = _rounded(points[::4])
         names = {"cavernous": siphon[0], "ophthalmic": siphon[4], "terminus": siphon[-1], "M2": ends[2]}
         marks = {name: int(np.argmin(np.linalg.norm(points - at, axis=1))) for name, at in names.items()}
-        along = shape.abscissa(points)
+        along = length_along(points)
         found = along[[marks["terminus"], marks["M2"]]] - along[[marks["cavernous"], marks["terminus"]]]
         stretch = stretch * np.array([siphon_mm, m1_mm]) / np.maximum(found, 1.0)
     if shape.curvature(points).max() > _SHARPEST_PER_MM or marks["M2"] - marks["terminus"] < 8:
@@ -177,7 +178,7 @@ def _radius(
     wide = DIAMETER_MM
     diameter = [4.8, wide["cavernous"], wide["terminus"], wide["M1"], 2.8, wide["M2"], 1.5]
     own = np.interp(np.arange(len(points)), place, diameter)
-    return 0.5 * calibre * own * uneven(generator, shape.abscissa(points)), calibre
+    return 0.5 * calibre * own * uneven(generator, length_along(points)), calibre
 
 
 def _plans(

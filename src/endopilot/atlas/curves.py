@@ -10,6 +10,8 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from endopilot.lines import length_along
+
 STEP_MM = 0.5
 """Distance between neighbouring centerline points, mm."""
 
@@ -17,16 +19,11 @@ _HEIGHT_MM = 3.0
 """Side branches run this far above the surface that they follow, mm: in epicardial fat."""
 
 
-def abscissa(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """Return the length along a polyline up to each point, mm."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-
-
 def curve_through(waypoints: Float[np.ndarray, "n 3"], step_mm: float = STEP_MM) -> Float[np.ndarray, "m 3"]:
     """Return points about `step_mm` apart, evenly spaced, on the cubic spline through `waypoints`."""
-    spline = CubicSpline(abscissa(waypoints), waypoints)
+    spline = CubicSpline(length_along(waypoints), waypoints)
     dense = spline(np.linspace(0.0, spline.x[-1], 4 * round(spline.x[-1] / step_mm) + 1))
-    length = abscissa(dense)
+    length = length_along(dense)
     even = np.linspace(0.0, length[-1], round(length[-1] / step_mm) + 1)
     return CubicSpline(length, dense)(even)
 
@@ -39,13 +36,13 @@ def tangents(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 
 def curvature(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
     """Return the curvature of a curve given by evenly spaced points, 1/mm."""
-    spacing = abscissa(points)[-1] / (len(points) - 1)
+    spacing = length_along(points)[-1] / (len(points) - 1)
     return np.linalg.norm(np.gradient(tangents(points), spacing, axis=0), axis=1)
 
 
 def tortuosity(points: Float[np.ndarray, "n 3"]) -> float:
     """Return the length of a curve divided by the distance between its ends."""
-    return float(abscissa(points)[-1] / np.linalg.norm(points[-1] - points[0]))
+    return float(length_along(points)[-1] / np.linalg.norm(points[-1] - points[0]))
 
 
 def parallel_normals(
@@ -108,7 +105,7 @@ class Wiggle:
         `normal` holds unit vectors across the curve that turn smoothly along it.
         """
         tangent = tangents(points)
-        along = abscissa(points)
+        along = length_along(points)
         sines = np.sin(along[:, None, None] * self.wave_number[:, None] + self.phase)
         offset = amplitude * np.sum(self.weight * sines, axis=1)
         fade = np.clip(along / quiet_mm, 0.0, 1.0)

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from endopilot.atlas import curves as shape
 from endopilot.atlas.heart_reference import BEYOND_CRUX, TO_CRUX, HeartFit
+from endopilot.lines import length_along, places_on
 
 LEFT_OSTIUM = np.array([26.0, 14.0, 2.0])
 """The left coronary ostium on the reference heart's aortic root, mm in the frame of `heart_reference`."""
@@ -123,6 +124,6 @@ def reference_courses() -> Float[np.ndarray, "n 3"]:
 
 
 def _evenly(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    along = shape.abscissa(points)
+    along = length_along(points)
     places = np.linspace(0.0, along[-1], _KNOTS)
-    return np.stack([np.interp(places, along, points[:, axis]) for axis in range(3)], axis=1)
+    return places_on(points, along, places)

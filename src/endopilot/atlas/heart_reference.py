@@ -19,6 +19,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from endopilot.atlas import curves as shape
+from endopilot.lines import length_along, places_on
 
 TO_CRUX = np.array(
     [
@@ -112,18 +113,18 @@ def fit_heart(main: Float[np.ndarray, "n 3"], crux_mm: float, last_section: str)
         crux_mm: abscissa of the crux.
         last_section: "4" or "16", where the tip lies; anything else ignores what lies beyond the crux.
     """
-    along = shape.abscissa(main)
-    course = _at(main, along, np.linspace(0.0, crux_mm, 20))
+    along = length_along(main)
+    course = places_on(main, along, np.linspace(0.0, crux_mm, 20))
     to_crux = shape.curve_through(TO_CRUX)
-    reference = _at(to_crux, shape.abscissa(to_crux), np.linspace(0.0, shape.abscissa(to_crux)[-1], 20))
+    reference = places_on(to_crux, length_along(to_crux), np.linspace(0.0, length_along(to_crux)[-1], 20))
     rotation, scale = _similarity(course - course[0], reference)
     if last_section in BEYOND_CRUX:
         beyond = shape.curve_through(np.concatenate([TO_CRUX, BEYOND_CRUX[last_section]]))
-        start = shape.abscissa(to_crux)[-1]
-        end = min(shape.abscissa(beyond)[-1] - start, (along[-1] - crux_mm) / scale)
+        start = length_along(to_crux)[-1]
+        end = min(length_along(beyond)[-1] - start, (along[-1] - crux_mm) / scale)
         steps = np.linspace(0.0, end, 12)[1:]
-        course = np.concatenate([course, _at(main, along, crux_mm + steps * scale)])
-        reference = np.concatenate([reference, _at(beyond, shape.abscissa(beyond), start + steps)])
+        course = np.concatenate([course, places_on(main, along, crux_mm + steps * scale)])
+        reference = np.concatenate([reference, places_on(beyond, length_along(beyond), start + steps)])
     knots = (course - course[0]) @ rotation / scale
     return HeartFit(main[0], rotation, scale, knots, reference - knots)
 
@@ -142,10 +143,10 @@ def fit_heart_along(lines: Sequence[Float[np.ndarray, "_ 3"]], courses: Sequence
     for _ in range(4):
         course, reference = [], []
         for line, ideal in zip(lines, courses, strict=True):
-            along, ideal_along = shape.abscissa(line), shape.abscissa(ideal)
+            along, ideal_along = length_along(line), length_along(ideal)
             places = np.linspace(0.0, min(ideal_along[-1], along[-1] / scale), 16)
-            course.append(_at(line, along, scale * places))
-            reference.append(_at(ideal, ideal_along, places))
+            course.append(places_on(line, along, scale * places))
+            reference.append(places_on(ideal, ideal_along, places))
         found, wanted = np.concatenate(course) - ostium, np.concatenate(reference) - anchor
         rotation, scale = _similarity(found, wanted)
     origin = ostium - scale * rotation @ anchor
@@ -243,9 +244,3 @@ def _solid_grid() -> Float32[np.ndarray, "nz ny nx"]:
         pulmonary_artery(at) + 1.3,
     )
     return np.max(walls, axis=0)
-
-
-def _at(
-    points: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n"], places: Float[np.ndarray, "m"]
-) -> Float[np.ndarray, "m 3"]:
-    return np.stack([np.interp(places, along, points[:, axis]) for axis in range(3)], axis=1)

@@ -40,6 +40,7 @@ from endopilot.atlas.branching import (
 from endopilot.atlas.heart_reference import HeartFit
 from endopilot.atlas.population import Population
 from endopilot.atlas.variation import bent, drawn_from, ectasia, factor, forks_of, opened_fork, varied
+from endopilot.lines import length_along
 from endopilot.types import VesselTree
 
 LEFT_MAIN_MM, LEFT_MAIN_SD_MM, LEFT_MAIN_DIAMETER_MM = 13.1, 3.5, 4.5
@@ -192,9 +193,9 @@ def _draw(
     lad = _lad(generator, trunk, calibre)
     flare = factor(generator, population.left_main_flare) - 1
     if flare:
-        away = (shape.abscissa(trunk.lad) - shape.STEP_MM * trunk.fork) / _FLARE_MM
+        away = (length_along(trunk.lad) - shape.STEP_MM * trunk.fork) / _FLARE_MM
         lad = replace(lad, radius=lad.radius * (1 + flare * np.exp(-(away**2))))
-    wide, widening = ectasia(generator, shape.abscissa(trunk.lad), population)
+    wide, widening = ectasia(generator, length_along(trunk.lad), population)
     lad = replace(lad, radius=lad.radius * widening)
     vessels, narrow = [lad, _lcx(generator, trunk, lad, dominance, calibre)], []
     plans = varied(generator, _plan_branches(generator, trunk, vessels, dominance, calibre, population), population)
@@ -210,13 +211,13 @@ def _draw(
         narrow, vessels = narrowed(generator, vessels, which, shares, population.tandem_share)
     vessels = with_side_branches(generator, vessels, plans, population.carina_mm)
     tree = build_tree(vessels, LCA_SECTIONS)
-    along, bends = shape.abscissa(lad.points), shape.curvature(lad.points)
+    along, bends = length_along(lad.points), shape.curvature(lad.points)
     drawn = {
         "dominance": dominance,
         "ramus": any(plan.section == "17" for plan in plans),
         "length_mm": float(along[-1]),
         "left_main_length_mm": float(along[trunk.fork]),
-        "circumflex_length_mm": float(shape.abscissa(vessels[1].points)[-1]),
+        "circumflex_length_mm": float(length_along(vessels[1].points)[-1]),
         "tortuosity": shape.tortuosity(lad.points),
         "curvature_mean_per_mm": float(bends.mean()),
         "curvature_p90_per_mm": float(np.quantile(bends, 0.9)),
@@ -293,9 +294,9 @@ def _calibre(generator: np.random.Generator) -> float:
 
 
 def _lad(generator: np.random.Generator, trunk: _Trunk, calibre: float) -> Vessel:
-    along = shape.abscissa(trunk.lad)
+    along = length_along(trunk.lad)
     beyond = along - along[trunk.fork]
-    whole = trunk.size * float(shape.abscissa(_templates()[0])[-1])
+    whole = trunk.size * float(length_along(_templates()[0])[-1])
     own = PchipInterpolator(list(LAD_DIAMETER_MM), list(LAD_DIAMETER_MM.values()))(np.clip(beyond / whole, 0, 1))
     # The left main's lumen changes into that of the anterior descending artery just behind the fork.
     share = np.clip((beyond + 1.0) / 4.0, 0.0, 1.0)
@@ -304,7 +305,7 @@ def _lad(generator: np.random.Generator, trunk: _Trunk, calibre: float) -> Vesse
 
 
 def _lcx(generator: np.random.Generator, trunk: _Trunk, lad: Vessel, dominance: str, calibre: float) -> Vessel:
-    along = shape.abscissa(trunk.lcx)
+    along = length_along(trunk.lcx)
     profile = LCX_DIAMETER_MM[dominance]
     own = PchipInterpolator(list(profile), list(profile.values()))(along / along[-1])
     radius = np.minimum(0.5 * own * calibre * uneven(generator, along), lad.radius[trunk.fork])
@@ -332,7 +333,7 @@ def _plan_branches(
                 continue
             mean, sd = (trunk.size * value for value in kind.origin_mm)
             origin = first + free_origin(generator, mean, sd, taken)
-            if origin * shape.STEP_MM > shape.abscissa(vessels[parent].points)[-1] - 8.0:
+            if origin * shape.STEP_MM > length_along(vessels[parent].points)[-1] - 8.0:
                 continue
             taken.append(origin - first)
             plans.append(_plan(generator, name.split()[0], kind, parent, origin, trunk, calibre))

@@ -38,6 +38,7 @@ from endopilot.atlas.branching import (
 )
 from endopilot.atlas.population import Population
 from endopilot.atlas.variation import Fork, bent, varied
+from endopilot.lines import length_along
 from endopilot.types import VesselTree
 
 MAIN_MM, MAIN_SD_MM = 78.0, 9.0
@@ -98,7 +99,7 @@ def _draw(
     diameter = truncated(generator, MAIN_DIAMETER_MM, MAIN_DIAMETER_SD_MM, 9.0, 15.0)
     calibre = diameter / MAIN_DIAMETER_MM
     radius = 0.5 * calibre * _profile(len(points), left, posterior, anterior)
-    radius = radius * uneven(generator, shape.abscissa(points))
+    radius = radius * uneven(generator, length_along(points))
     origins = {"LPV": left, "RPPV": posterior, "S5": anterior}
     forks = [Fork(origin, _SIDES[name][0][1]) for name, origin in origins.items()]
     points = bent(generator, points, radius, population, forks=forks)
@@ -113,7 +114,7 @@ def _draw(
         narrow, vessels = narrowed(generator, vessels, which, shares, population.tandem_share)
     drawn = {
         "variant": variant,
-        "main_length_mm": float(shape.abscissa(points)[min(left, posterior)]),
+        "main_length_mm": float(length_along(points)[min(left, posterior)]),
         "main_diameter_mm": diameter,
         "stenoses": narrow,
     }
@@ -123,7 +124,7 @@ def _draw(
 def _main(generator: np.random.Generator, main_mm: float, size: float) -> tuple[Float[np.ndarray, "n 3"], int]:
     """Return the line from the confluence into segment 8, and the index of its first division."""
     turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, 8, 3)))
-    main = _COURSE * main_mm / shape.abscissa(shape.curve_through(_COURSE))[-1]
+    main = _COURSE * main_mm / length_along(shape.curve_through(_COURSE))[-1]
     right = main[-1] + size * turn.apply(_RIGHT)
     points = shape.curve_through(np.concatenate([main, right]))
     points = wiggled(generator, points, (0.8, 2.2), quiet_mm=25.0, wavelengths_mm=(25.0, 80.0))

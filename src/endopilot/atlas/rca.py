@@ -36,6 +36,7 @@ from endopilot.atlas.branching import (
 from endopilot.atlas.heart_reference import BEYOND_CRUX, TO_CRUX, fit_heart
 from endopilot.atlas.population import Population
 from endopilot.atlas.variation import bent, ectasia, factor, forks_of, varied
+from endopilot.lines import length_along
 from endopilot.types import VesselTree
 
 LENGTH_MM, LENGTH_SD_MM, LENGTH_RANGE_MM = 164.0, 30.0, (112.0, 223.0)
@@ -146,9 +147,9 @@ def _draw(
     healthy, calibre = _main_radius(generator, targets.dominance, main)
     radius, narrow = healthy, []
     if generator.random() < stenosis_share:
-        narrow, narrowing = stenoses(generator, shape.abscissa(main), (0.12, 0.75), population.tandem_share)
+        narrow, narrowing = stenoses(generator, length_along(main), (0.12, 0.75), population.tandem_share)
         radius = healthy * narrowing
-    wide, widening = ectasia(generator, shape.abscissa(main), population)
+    wide, widening = ectasia(generator, length_along(main), population)
     radius = radius * widening
     plans = varied(generator, _plan_branches(generator, healthy, crux, targets, calibre, population), population)
     main = bent(generator, main, radius, population, forks=forks_of(plans, 0))
@@ -159,7 +160,7 @@ def _draw(
     bends = shape.curvature(main)
     drawn = {
         "dominance": targets.dominance,
-        "length_mm": float(shape.abscissa(main)[-1]),
+        "length_mm": float(length_along(main)[-1]),
         "tortuosity": shape.tortuosity(main),
         "curvature_mean_per_mm": float(bends.mean()),
         "curvature_p90_per_mm": float(np.quantile(bends, 0.9)),
@@ -182,8 +183,8 @@ def _main_vessel(generator: np.random.Generator, targets: _Targets) -> tuple[Flo
     length, ends_in = targets.length_mm, targets.ends_in
     waypoints = TO_CRUX if ends_in == "3" else np.concatenate([TO_CRUX, BEYOND_CRUX[ends_in]])
     template = shape.curve_through(waypoints, 1.0)
-    template_crux = float(shape.abscissa(shape.curve_through(TO_CRUX))[-1])
-    along = shape.abscissa(template)
+    template_crux = float(length_along(shape.curve_through(TO_CRUX))[-1])
+    along = length_along(template)
     if ends_in == "3":
         keep = 0.97 * along[-1]
     else:
@@ -207,7 +208,7 @@ def _main_vessel(generator: np.random.Generator, targets: _Targets) -> tuple[Flo
 
     def misfit(knobs: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
         points = curve(np.clip(knobs, (-1, -2, -4), (1, 2, 3)))
-        found = (shape.abscissa(points)[-1], shape.tortuosity(points), shape.curvature(points).mean())
+        found = (length_along(points)[-1], shape.tortuosity(points), shape.curvature(points).mean())
         return np.log(np.array(found) / wanted)
 
     solve = cast("Callable[..., Any]", root)  # what it returns without stubs takes type checkers half a minute to infer
@@ -230,7 +231,7 @@ def _main_radius(
     diameter = PchipInterpolator([0.0, *DIAMETER_MM, 1.0], [4.1, *DIAMETER_MM.values(), 2.15])(share)
     if dominance == "left":
         diameter = diameter * (1 - 0.2 * share)
-    return 0.5 * diameter * calibre * uneven(generator, shape.abscissa(main)), calibre
+    return 0.5 * diameter * calibre * uneven(generator, length_along(main)), calibre
 
 
 def _main_sections(main: Float[np.ndarray, "n 3"], crux: int, ends_in: str) -> list[str]:

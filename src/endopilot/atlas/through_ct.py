@@ -64,7 +64,7 @@ def _cut(branch: Branch, count: int, parent: int) -> Branch:
 
 def seen_through_ct(
     generator: np.random.Generator,
-    anatomy: str,
+    vessel: str,
     tree: VesselTree,
     lumen: DistanceMap,
     direction: Float[np.ndarray, "3"],
@@ -75,7 +75,7 @@ def seen_through_ct(
 
     Args:
         generator: random stream.
-        anatomy: kind of vessel tree.
+        vessel: kind of vessel tree.
         tree: the patient's vessels.
         lumen: distance to the wall, without a catheter.
         direction: the vessel's first direction.
@@ -85,8 +85,8 @@ def seen_through_ct(
     Raises:
         InputError: no vessel was found in four masks.
     """
-    vessel = anatomy if anatomy in ("rca", "lca") else "generic"
-    config = AnatomyConfig(vessel=vessel, catheter_radius_mm=catheter_radius_mm)  # pyright: ignore[reportArgumentType]
+    scheme = vessel if vessel in ("rca", "lca") else "generic"
+    config = AnatomyConfig(vessel=scheme, catheter_radius_mm=catheter_radius_mm)  # pyright: ignore[reportArgumentType]
     ostium = Insertion(position=tree.branches[0].centerline.points[0], direction=direction)
     why = ""
     for rejected in range(_SCANS):
@@ -98,10 +98,10 @@ def seen_through_ct(
         except InputError as error:
             why = str(error)
             continue
-        if vessel == "generic":
+        if scheme == "generic":
             found = Anatomy(
                 name=found.name,
-                tree=label_tree(found.tree, cast(Scheme, anatomy)),
+                tree=label_tree(found.tree, cast(Scheme, vessel)),
                 distance_map=found.distance_map,
                 insertion=found.insertion,
                 catheter_radius_mm=found.catheter_radius_mm,

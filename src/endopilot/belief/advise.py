@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from endopilot.belief import monitoring
 from endopilot.belief.bands import CALIBRATION_FILE, Calibration, check_enough
 from endopilot.belief.monitoring import AdviseConfig, Monitored
-from endopilot.dataset.loader import Dataset, load_dataset
+from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.errors import InputError
 from endopilot.files import manifest, write_json, writing
 from endopilot.models.config import PRETRAINED, WINDOW, read_run
@@ -60,7 +60,7 @@ def advise(
 
     start = time.perf_counter()
     beside = output if str(run) == PRETRAINED else run
-    episodes, predictor = load_dataset(dataset), load_model(run)
+    episodes, predictor = read_dataset(dataset), load_model(run)
     check_wire(run, read_run(run), episodes)
     splits = [episodes.of_split(name) for name in ("train", "calibrate", "test")]
     check_enough(len(set(splits[1].anatomy)), config.adviser.level)
@@ -143,7 +143,7 @@ def _other(run: Path, folder: Path, ours: Sequence[Dataset]) -> Dataset:
     Raises:
         InputError: it is of another wire, or tests on patients of `ours`.
     """
-    made = load_dataset(folder)
+    made = read_dataset(folder)
     check_wire(run, read_run(run), made)
     test = made.of_split("test")
     fitted = {split.patients[name] for split in ours for name in split.anatomy.tolist()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.stats import norm
 
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.belief.bands import Calibration, Tips
@@ -87,7 +88,12 @@ class XrayAdviser:
         self._beyond = [self._ratio(tip[:, 1], radius_mm) >= self._config.wall_ratio] * 3
 
     def advise(
-        self, proximal: Float[np.ndarray, "n 2"], tip: Tips, spread: Tips, radius_mm: Float[np.ndarray, "n"]
+        self,
+        proximal: Float[np.ndarray, "n 2"],
+        tip: Tips,
+        spread: Tips,
+        radius_mm: Float[np.ndarray, "n"],
+        play: Tips | None = None,
     ) -> Bool[np.ndarray, "n"]:
         """Return for which navigations X-ray is due now, a period after the last call.
 
@@ -96,10 +102,15 @@ class XrayAdviser:
             tip: predicted for now, mm.
             spread: the model's estimate of its own error, mm.
             radius_mm: of the lumen at the predicted Δtip, mm.
+            play: standard deviation that the plays of the drives add, which the calibration does not know, mm; none if
+                not given.
         """
         self._since, self._travel = self._since + 1, self._travel + np.abs(proximal[:, 0] - self._proximal[:, 0])
         self._proximal = proximal
-        self.half_width = half = self._calibration.half_width(self._since * DECISION_PERIOD_S, self._travel, spread)
+        half = self._calibration.half_width(self._since * DECISION_PERIOD_S, self._travel, spread)
+        if play is not None and play.any():
+            half = np.hypot(half, norm.ppf(0.5 + 0.5 * self._calibration.level) * play)
+        self.half_width = half
         heeded = self._calibration.heeded * half[:, 1]
         edges = [tip[:, 1] + side * heeded for side in (1.0, 0.0, -1.0)]
         beyond = [self._ratio(edge, radius_mm) >= self._config.wall_ratio for edge in edges]

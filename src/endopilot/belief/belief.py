@@ -2,6 +2,10 @@
 
 Each follows the robot's encoders, in a vessel that moves as it is known to. Catheters around the real wire are around
 each simulated one too, and driven like the real ones. A measurement of the tip weights the members by their errors.
+
+Where the encoders sit in front of the drives' play, a measurement first says where the proximal end of the wire is: its
+tip is compared with that of the likeliest wire, turned to all sides and moved along the vessel. All members are then
+brought to where the device most likely is.
 """
 
 from __future__ import annotations
@@ -13,14 +17,23 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.stats import qmc
 
+from endopilot.belief.drives import Drives
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Proximals
 from endopilot.models.ensemble import Ensemble, likelihoods
 from endopilot.settings import NonNegative, Positive, ShareBelowOne, Within, settings
 from endopilot.simulation.config import PRESETS, SimulatorConfig
+from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.types import TipProjection
 from endopilot.xray.fluoroscope import TipMeasurement
+
+_SIDES = 16
+"""Angles that a wire is turned to where its rotation is looked for."""
+_PLACED_MM = 0.5, 0.15
+"""Scales of the errors, along and across the wire, of a tip whose proximal end is where it is believed, mm."""
+_SURE_RAD = 0.08
+"""A rotation that is known as well is not looked for, rad."""
 
 
 @settings
@@ -64,6 +77,8 @@ class Belief(Ensemble):
 
     Attributes:
         tip: of each member's wire.
+        drives: where the proximal ends are.
+        error: of each member at the last measurement, along and across its wire, mm.
     """
 
     def __init__(
@@ -80,6 +95,10 @@ class Belief(Ensemble):
         )
         self._accuracy_mm = config.along_sd_mm, config.across_sd_mm
         self._limits = [DriveLimits.of(each, navigation.anatomy) for each in navigation.devices]
+        fastest = np.array([limits.fastest for limits in self._limits])
+        self.drives = Drives(navigation.robot, navigation.start, fastest)
+        self._navigation, self._fans = navigation, dict[float, Simulator]()
+        self.error = np.zeros((len(parameters), 2))
         self._score, self._coaxial = np.zeros(len(parameters)), bool(navigation.catheters)
         self.tip = self.simulator.project()[:, 0]
 
@@ -101,14 +120,19 @@ class Belief(Ensemble):
         return likelihoods(score)
 
     def follow(self, devices: Proximals) -> None:
-        """Move every member's proximal ends to where the encoders say that they are, in one decision period.
+        """Move every member's proximal ends to where they are by the encoders, in one decision period.
 
         Args:
-            devices: inserted length (mm) and rotation (rad) of the wire, then of each catheter.
+            devices: inserted length (mm) and rotation (rad) of the wire, then of each catheter, as encoders read them.
         """
+        self.drives.follow(devices)
+        self._move()
+
+    def _move(self) -> None:
+        """Move every member's proximal ends to where they are believed to be, in one decision period."""
         simulator = self.simulator
         now, control = simulator.proximal, np.empty((simulator.worlds, simulator.devices, 2))
-        for k, (length, turn) in enumerate(devices):
+        for k, (length, turn) in enumerate(self.drives.proximal.tolist()):
             ahead = self._deeper(np.full(len(now), length)) - now[:, k, 0]
             motion = np.column_stack([ahead, turn - now[:, k, 1]])
             control[:, k] = self._limits[k].clip(motion / DECISION_PERIOD_S, now[:, k, 0], DECISION_PERIOD_S)
@@ -117,26 +141,109 @@ class Belief(Ensemble):
             simulator.step(control, DECISION_PERIOD_S)
         self.tip = simulator.project()[:, 0]
 
-    def errors(self, measured: TipMeasurement) -> Float[np.ndarray, "members 2"]:
-        """Return the distances of the members' tips from a measured one, along and across each wire, mm."""
+    def errors(self, position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "members 2"]:
+        """Return the distances of the members' tips from a place, along and across each wire, mm."""
         if self._coaxial:  # the first nodes are the foremost tube's
             end, along = self.simulator.tip_position[:, 0], self.simulator.tip_direction[:, 0]
         else:
             nodes = self.simulator.position[:, :2]
             end, along = nodes[:, 0], nodes[:, 0] - nodes[:, 1]
             along /= np.linalg.norm(along, axis=1, keepdims=True)
-        error = measured.position - end
+        error = position - end
         shift = np.einsum("mi,mi->m", error, along)
         return np.column_stack([np.abs(shift), np.linalg.norm(error - shift[:, None] * along, axis=1)])
 
     def weigh(self, measured: TipMeasurement) -> None:
-        """Update the likelihoods by a measurement.
+        """Update the likelihoods by a measurement, and before them where the proximal end of the wire is believed.
 
         The density is a Cauchy density. Its tails are heavy: a tip that snapped a moment too early says little about
         friction. Its scales are no smaller than the measurement's own standard deviations.
         """
-        scaled = self.errors(measured) / np.maximum(self._accuracy_mm, measured.sd_mm)
+        position = measured.position - self._relocate(measured) if self.drives.lose else measured.position
+        self.error = self.errors(position)
+        scaled = self.error / np.maximum(self._accuracy_mm, measured.sd_mm)
         self._score = self._score - np.log1p((scaled**2).sum(axis=1))
+        if self.drives.lose and self.set_up.motion is None:  # a vessel that moves takes them there in the next period
+            self._move()
+
+    def play_spread(self) -> Float[np.ndarray, "2"]:
+        """Return the standard deviations of (Δtip, γtip) that the plays of the wire's drive make, mm."""
+        along, turn = self.drives.sd[0].tolist()
+        wire = self._navigation.device
+        bend = max(abs(wire.tip_bend_rad), 1e-9)
+        reach = wire.tip_bend_length_mm * (1 - np.cos(bend)) / bend
+        return np.array([along, reach * min(turn, 1.0)])
+
+    def _relocate(self, measured: TipMeasurement) -> Float[np.ndarray, "3"]:
+        """Update where the wire's proximal end is believed; return how far the likeliest tip moves by that, mm."""
+        best, drives = int(np.argmax(self.weight)), self.drives
+        before = drives.proximal[0].copy()
+        fan = self._fan(best) if drives.sd[0, 1] > _SURE_RAD else None
+        left = drives.samples(0) - before
+        tip, along = self._turned(best, left[:, 1], fan)
+        error = measured.position - tip - self._shifted(best, left[:, 0])
+        shift = np.einsum("si,si->s", error, along)
+        across = np.linalg.norm(error - shift[:, None] * along, axis=1)
+        scaled = np.column_stack([shift, across]) / np.maximum(_PLACED_MM, measured.sd_mm)
+        drives.weigh(0, -np.log1p(scaled**2).sum(axis=1))
+        moved = (drives.proximal[0] - before)[:, None]
+        return (self._turned(best, moved[1], fan)[0] - self._end(self.simulator)[best] + self._shifted(best, moved[0]))[
+            0
+        ]
+
+    def _turned(
+        self, best: int, turn: Float[np.ndarray, "n"], fan: Simulator | None
+    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+        """Return the end of a member's wire, turned by some angles, rad, and its direction there; LPS mm."""
+        if fan is None:
+            source = self.simulator
+            return tuple(np.tile(of[best], (len(turn), 1)) for of in (self._end(source), source.tip_direction[:, 0]))
+        ends, directions = self._end(fan), fan.tip_direction[:, 0]
+        place = (turn % (2 * np.pi)) * _SIDES / (2 * np.pi)
+        low = place.astype(int) % _SIDES
+        share = (place % 1.0)[:, None]
+        mixed = [(1 - share) * each[low] + share * each[(low + 1) % _SIDES] for each in (ends, directions)]
+        return mixed[0], mixed[1] / np.maximum(np.linalg.norm(mixed[1], axis=1, keepdims=True), 1e-9)
+
+    def _end(self, simulator: Simulator) -> Float[np.ndarray, "worlds 3"]:
+        """Return the end that X-ray shows of each world's devices, LPS mm."""
+        return simulator.tip_position[:, 0]
+
+    def _fan(self, best: int) -> Simulator:
+        """Return copies of a member, each turned by another angle, those to more than half a turn backwards."""
+        factor = float(self.parameters[best, 1])
+        if factor not in self._fans:
+            stack = self.set_up.stacks[best]
+            self._fans[factor] = Simulator(
+                self.set_up.anatomies[best],
+                stack,
+                worlds=_SIDES,
+                motion=self.set_up.motion,
+                config=self.simulator.config,
+                sharing=self.simulator,
+            )
+        fan, side = self._fans[factor], 2 * np.pi * np.arange(_SIDES) / _SIDES
+        fan.copy_worlds(np.full(_SIDES, best), of=self.simulator)
+        control = np.zeros((_SIDES, fan.devices, 2))
+        control[:, 0, 1] = np.where(side > np.pi, side - 2 * np.pi, side) / DECISION_PERIOD_S
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # one that fails stays where it was
+            fan.step(control, DECISION_PERIOD_S)
+        return fan
+
+    def _shifted(self, best: int, along_mm: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
+        """Return how far a member's tip moves, mm, that goes some way along the vessel."""
+        line = self._navigation.anatomy.tree.path(int(self.tip.branch[best]))
+        at = float(self.tip.abscissa[best])
+        insertion = self._navigation.anatomy.insertion
+        behind = np.array([-20.0, -10.0])
+        abscissa = np.concatenate([behind, line.abscissa])
+        points = np.concatenate([insertion.position + behind[:, None] * insertion.direction, line.points])
+        there, here = (
+            np.column_stack([np.interp(x, abscissa, axis) for axis in points.T])
+            for x in (at + along_mm, np.array([at]))
+        )
+        return there - here
 
     def likeliest(self) -> tuple[Int[np.ndarray, "levels"], Float[np.ndarray, "levels"]]:
         """Return the likeliest member of every stiffness, and how likely each stiffness is."""

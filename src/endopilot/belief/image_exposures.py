@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.again import simulate_again
-from endopilot.dataset.loader import Dataset, load_dataset
+from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.errors import InputError
 from endopilot.files import json_text, writing
 from endopilot.models.config import WINDOW
@@ -125,7 +125,7 @@ def _expose_patient(path: Path, *, dataset: Path, split: str, settings: ImageSet
         NotRegistered: the patient cannot be registered.
         InputError: the anatomy is missing or damaged.
     """
-    data, name = load_dataset(dataset).of_split(split), path.stem
+    data, name = read_dataset(dataset).of_split(split), path.stem
     data = data.select(data.anatomy == name)
     made = expose_navigations(data, read_anatomy(data.anatomy_folder(name)), settings)
     with writing(path) as partial_path, partial_path.open("wb") as stream:
@@ -149,7 +149,7 @@ def expose_navigations(data: Dataset, anatomy: Anatomy, settings: ImageSettings)
     """
     seed, name = settings.seed, anatomy.name
     pose_seed = int(np.random.default_rng([seed, 5, *name.encode()]).integers(2**31))
-    arm = ImageFluoroscope(anatomy, data.stack.wire, settings.fluoroscope, pose_seed)
+    arm = ImageFluoroscope(anatomy, data.stack.wire, config=settings.fluoroscope, seed=pose_seed)
     shape = data.valid.shape
     ostium, samples = np.asarray(anatomy.insertion.position), min(shape[1], settings.samples)
     known, motion = None, data.motion(name)

@@ -165,7 +165,7 @@ def monitor(predictor: Predictor, dataset: Dataset, config: AdviseConfig, *, sam
                 if seen.known_motion is not None:
                     known_motions[str(name)] = seen.known_motion
             else:
-                arm = Fluoroscope(anatomy, wire_radius, config.fluoroscope)
+                arm = Fluoroscope(anatomy, wire_radius, config=config.fluoroscope)
                 shown = arm.expose_episodes(dataset.select(mine), proximal[mine, :, 0], config.seed)
                 tip[mine], branch[mine] = np.stack([shown.abscissa, shown.offset], axis=-1), shown.branch
             advance()

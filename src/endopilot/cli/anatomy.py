@@ -59,7 +59,7 @@ def command(
     source = next(iter(sources))
     content = read_source(existing(source), label=label)
     anatomy = extract_anatomy(content, name=name or output.resolve().name, config=config)
-    write_anatomy(anatomy, output)
+    write_anatomy(anatomy, output=output)
     figures = {"anatomy": output, **describe(anatomy)}
     if picture is not None:
         from endopilot.anatomy.anatomy_picture import draw_anatomy  # matplotlib is slow to import

@@ -21,8 +21,8 @@ def command(
     """
     rows = []
     with progress("Synthetic patients", config.count) as advance:
-        for anatomy in make_atlas(config):
-            write_anatomy(anatomy, output / anatomy.name)
+        for anatomy in make_atlas(config=config):
+            write_anatomy(anatomy, output=output / anatomy.name)
             path = anatomy.tree.longest_path()
             rows.append(
                 {

@@ -80,5 +80,5 @@ def _write_episode(session: Path | None, output: Path) -> None:
 
     if session is None:
         raise InputError("episode: names no session; give --replay SESSION too")
-    write_session_episode(session, output)
+    write_session_episode(session, output=output)
     print(f"episode    {output}")

@@ -6,7 +6,7 @@ from tyro.conf import Positional
 
 from endopilot.cli.arguments import Existing, Figures, OutputFolder
 from endopilot.dataset.config import DatasetConfig
-from endopilot.devices.device import read_device
+from endopilot.devices.robot import read_robot
 from endopilot.devices.stack import Stack
 from endopilot.files import read_json
 
@@ -18,6 +18,7 @@ def command(
     output: OutputFolder,
     device: str = "workhorse-014",
     catheter: tuple[str, ...] = (),
+    robot: str | None = None,
     scheduler: str | None = None,
     config: DatasetConfig = DatasetConfig(),
 ) -> Figures:
@@ -31,6 +32,8 @@ def command(
         device: name of a device (`endopilot devices`) or a YAML file.
         catheter: up to two catheters around it, from the inside out: names (docs/devices.md) or YAML files; each is
             driven at random and independently, by velocity.
+        robot: name of a robot (docs/robot.md) or a YAML file that makes the motions, and measures them; if not given,
+            they are made as drawn.
         scheduler: address of a Dask scheduler (tcp://host:8786) whose workers simulate and share these folders; the
             cores of this machine if not given.
         config: how many navigations, how long, and how they are split.
@@ -39,9 +42,10 @@ def command(
 
     generate_dataset(
         anatomies,
-        output,
-        Stack(read_device(device), tuple(read_catheter(name) for name in catheter)),
-        config,
+        output=output,
+        device=Stack.of(device, *catheter),
+        config=config,
+        robot=None if robot is None else read_robot(robot),
         scheduler=scheduler,
     )
     info = read_json(output / "meta" / "info.json")

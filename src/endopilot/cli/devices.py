@@ -7,8 +7,8 @@ from typing import Any
 from tyro.conf import Positional
 
 from endopilot.cli.arguments import Answer
-from endopilot.devices.device import read_device
-from endopilot.devices.device_files import device_file, device_yaml, is_shipped, list_devices, user_devices
+from endopilot.devices.device import read_wire
+from endopilot.devices.device_files import device_file, device_yaml, is_shipped, list_wires, user_devices
 from endopilot.errors import InputError
 from endopilot.simulation.tip_load import tip_load_row
 
@@ -29,14 +29,14 @@ def command(
     if yaml:
         if len(devices) != 1:
             raise InputError(f"--yaml: {len(devices)} devices; name the one to print")
-        read_device(devices[0])
+        read_wire(devices[0])
         print(device_yaml(devices[0])[1], end="")
         return None
-    names = devices or (*list_devices(), *user_devices())
-    rows = [tip_load_row(read_device(name)) if tip_load else _row(name) for name in names]
+    names = devices or (*list_wires(), *user_devices())
+    rows = [tip_load_row(read_wire(name)) if tip_load else _row(name) for name in names]
     return Answer(rows, passed=all(row.get("passed") is not False for row in rows))
 
 
 def _row(name: str) -> dict[str, Any]:
     path = device_file(name)
-    return read_device(name).summary() | {"origin": "endopilot" if is_shipped(path) else str(path)}
+    return read_wire(name).summary() | {"origin": "endopilot" if is_shipped(path) else str(path)}

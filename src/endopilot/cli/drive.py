@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from endopilot.cli.arguments import ListenConfig
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import ASSUMED, read_robot
 from endopilot.robot.drive import Drive
@@ -35,7 +35,7 @@ def command(
         listen: the drive's address.
         robot: name of a robot (docs/robot.md) or a YAML file: latency, accelerations and noise.
     """
-    wire = read_device(device)
+    wire = read_wire(device)
     limits = DriveLimits(
         max_velocity_mm_s=wire.max_velocity_mm_s,
         max_rotation_rad_s=wire.max_rotation_rad_s,

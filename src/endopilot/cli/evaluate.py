@@ -33,7 +33,7 @@ def command(
     """
     from endopilot.report.evaluation_report import report_evaluation  # matplotlib and plotly are slow to import
 
-    metrics = evaluate(run, output, config, dataset, other_seeds)
+    metrics = evaluate(run, output=output, config=config, dataset=dataset, other_seeds=other_seeds)
     report_evaluation(output)
     shown: list[Figures | str] = []
     for split, record in metrics["splits"].items():

@@ -40,7 +40,7 @@ def command(
 
     name = config.policy.replace(":", ".")
     folder = output or Path("runs") / ("ladder-mismatch" if mismatch else "ladder") / name
-    rows = measure_mismatch(folder, config, mismatch) if mismatch else climb(folder, config)
+    rows = measure_mismatch(folder, config, mismatch) if mismatch else climb(output=folder, config=config)
     if mismatch:
         made = {"picture": folder / PICTURE_FILE}
     else:

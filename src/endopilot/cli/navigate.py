@@ -5,7 +5,7 @@ from __future__ import annotations
 from tyro.conf import Positional
 
 from endopilot.cli.arguments import Existing, Figures, OutputFolder
-from endopilot.control.navigate_patient import NavigatePatientConfig
+from endopilot.control.navigate import NavigateConfig
 from endopilot.pipeline.navigation import navigate_into
 
 
@@ -15,7 +15,10 @@ def command(
     *,
     target: str,
     output: OutputFolder,
-    config: NavigatePatientConfig = NavigatePatientConfig(),
+    policy: str = "agent",
+    device: str = "workhorse-014",
+    catheter: tuple[str, ...] = (),
+    config: NavigateConfig = NavigateConfig(),
 ) -> Figures:
     """Let a policy drive a wire to a place of a patient's vessel: simulated robot, X-ray only when the policy asks.
 
@@ -28,6 +31,10 @@ def command(
         target: section label such as 4 or LAD, or point X,Y,Z in LPS mm (--target=-1.5,2,3 where it begins with a
             minus).
         output: folder of the results.
-        config: policy, wire, limits, and how reality differs from what the policy is given.
+        policy: what decides: agent, oracle (which is given the truth), open-loop, forward, spin, retract-rotate, with a
+            catheter in-turn or catheter-alone, or MODULE:OBJECT of your own.
+        device: name of a device (`endopilot devices`) or a YAML file.
+        catheter: up to two catheters around it, from the inside out: names such as microcatheter-1.7f, or YAML files.
+        config: limits, X-ray, and how reality differs from what the policy is given.
     """
-    return navigate_into(anatomy, target, output, config)
+    return navigate_into(anatomy, target, output=output, policy=policy, device=device, catheter=catheter, config=config)

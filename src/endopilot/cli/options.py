@@ -41,7 +41,7 @@ LISTED: Mapping[str, str] = MappingProxyType(
         "train": "output model epochs batch_size learning_rate max_seconds seed processor precision json",
         "plan": "target output device catheter model method seconds force_limit_n xray json",
         "navigate": "target output policy device catheter robot xray mismatch seed json",
-        "xray": "output show view_deg zoom device inserted_mm catheter catheter_inserted_mm ct json",
+        "xray": "output show view_deg zoom device inserted_length_mm catheter catheter_inserted_length_mm ct json",
         "advise": "output also_test xray level wall_ratio abscissa_mm missed ostium_mm seed json",
         "cockpit": "device catheter task world replay resume ct output browser port",
     }

@@ -28,7 +28,7 @@ def command(
         config: scanner and contrast.
     """
     check_output(output)
-    volume = make_phantom(read_anatomy(anatomy), config, seed)
+    volume = make_phantom(read_anatomy(anatomy), config=config, seed=seed)
     write_volume(volume, output)
     nz, ny, nx = volume.voxels.shape
     return {"volume": output, "voxels": [nx, ny, nz], "spacing_mm": volume.spacing_mm.tolist()}

@@ -11,7 +11,7 @@ from endopilot.control.plan import plan
 from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import write_plan
 from endopilot.control.plan_xray import plan_xray, read_calibration
-from endopilot.devices.catheter import read_catheter
+from endopilot.devices.stack import Stack
 
 
 def command(
@@ -43,8 +43,8 @@ def command(
             (inverse, mppi), or with that of the agent's simulated wires (other methods).
         config: method, limits and cost.
     """
-    calibration = read_calibration(config, model, devices=1 + len(catheter)) if xray else None
-    catheters = [read_catheter(name) for name in catheter]
-    found = plan(anatomy, target, config, model=model, device=device, catheters=catheters)
-    needed = None if calibration is None else plan_xray(found, calibration)
-    return write_plan(found, output, needed)
+    if xray:
+        read_calibration(config.method, model, 1 + len(catheter))  # refused before the search, which takes its time
+    stack = Stack.of(device or "workhorse-014", *catheter) if device or catheter else None
+    found = plan(anatomy, target, device=stack, model=model, config=config)
+    return write_plan(found, output=output, xray=plan_xray(found) if xray else None)

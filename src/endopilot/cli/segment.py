@@ -40,7 +40,7 @@ def command(
     check_output(output, mask=True)
     other = read_mask(reference) if reference is not None else None
     ct = read_volume(volume, series=series, phase=phase)
-    mask = segment(ct, config)
+    mask = segment(ct, config=config)
     agreement = compare_masks(mask, other) if other is not None else None
     write_mask(mask, output, manifest=manifest(config=config, inputs=input_hash(volume, ct.files)))
     volume_ml = float(mask.volume.voxels.sum() * mask.volume.spacing_mm.prod() / 1000)

@@ -14,8 +14,6 @@ from endopilot.anatomy.io import read_anatomy
 from endopilot.cli.arguments import Existing, Figures, OutputFile
 from endopilot.control.plan_file import read_plan
 from endopilot.dataset.navigations import simulate_navigations
-from endopilot.devices.catheter import read_catheter
-from endopilot.devices.device import read_device
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.progress import progress
@@ -79,7 +77,7 @@ def command(
         config: settings of the rod core.
     """
     patient = read_anatomy(anatomy)
-    stack = Stack(read_device(device or "workhorse-014"), tuple(read_catheter(name) for name in catheter))
+    stack = Stack.of(device or "workhorse-014", *catheter)
     moves, period_s = motion_named(motion, motion_seed), SAMPLE_PERIOD_S
     recorded = None
     if controls is not None and (controls.is_dir() or controls.suffix == ".npz"):
@@ -152,10 +150,12 @@ def _recorded(path: Path, patient: Anatomy, asked: Stack | None) -> Trajectory:
     """Return what a plan's folder or a file holds; devices that are asked for must be its own."""
     if path.is_dir():
         return read_plan(path, patient, asked).trajectory
-    recorded = read_trajectory(path, patient)
+    recorded = read_trajectory(path, anatomy=patient)
     if asked is not None and any(stack.constants != asked.constants for stack in recorded.set_up.stacks):
-        names = [" in ".join(each.name for each in stack.devices) for stack in (recorded.set_up.stacks[0], asked)]
-        raise InputError(f"device: {path} was made with another ({names[0]}), not with this {names[1]}; leave it out")
+        made_with = recorded.set_up.stacks[0].name
+        raise InputError(
+            f"device: {path} was made with another ({made_with}), not with this {asked.name}; leave it out"
+        )
     return recorded
 
 

@@ -30,7 +30,7 @@ def command(
     """
     from endopilot.models.train import train  # torch takes seconds to import; --help must not wait for it
 
-    train(dataset, output, config)
+    train(dataset, output=output, config=config)
     if os.environ.get("RANK", "0") != "0":  # torchrun runs several processes; one of them prints
         return None
     training = read_json(output / "training.json")

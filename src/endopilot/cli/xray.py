@@ -27,7 +27,7 @@ def command(
         config: what is shown, from where, at which dose.
     """
     volume = None if ct is None else read_volume(ct)
-    image = take_image(read_anatomy(anatomy), config, volume)
+    image = take_image(read_anatomy(anatomy), config=config, ct=volume)
     image.write(output)
     tip = None if image.tip_pixel is None else [round(float(value), 2) for value in image.tip_pixel]
     figures = {"image": output, "tip_row_column": tip, "mm_per_pixel": round(image.mm_per_pixel, 4)}

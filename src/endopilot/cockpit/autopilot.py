@@ -201,8 +201,8 @@ class Autopilot:
         (inserted, turned), *around = observation.devices
         return replace(
             self._world.navigation,
-            start_inserted_mm=max(inserted, 0.0),
-            start_rotation=turned,
+            start_inserted_length_mm=max(inserted, 0.0),
+            start_rotation_rad=turned,
             start_catheter_mm=max([0.0, *(at for at, _ in around)]),
             seconds=SECONDS,
         )

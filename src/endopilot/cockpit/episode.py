@@ -11,7 +11,7 @@ from endopilot.errors import InputError
 from endopilot.tasks.navigation import DECISION_PERIOD_S
 
 
-def write_session_episode(session: Path, output: Path) -> None:
+def write_session_episode(session: str | Path, *, output: str | Path) -> None:
     """Write a recorded session as a data set of one episode. `endopilot train` reads that of a wire alone.
 
     The session is driven again and sampled every 0.5 s; what is left after the last whole sample is dropped. The vessel
@@ -25,6 +25,7 @@ def write_session_episode(session: Path, output: Path) -> None:
         InputError: no such session, one shorter than a sample, or an output folder that holds
             something else.
     """
+    session, output = Path(session), Path(output)
     recording = read_recording(session)
     per_sample = round(DECISION_PERIOD_S / recording.config.cycle_s)
     samples = recording.cycles // per_sample
@@ -37,7 +38,7 @@ def write_session_episode(session: Path, output: Path) -> None:
     folder = recording.where.patient
     if folder is None:
         folder = output.with_name(f"{output.name}-anatomy")
-        write_anatomy(navigation.anatomy, folder)
+        write_anatomy(navigation.anatomy, output=folder)
     target = targets[-1] if targets else [navigation.target.branch, navigation.target.abscissa]
     write_episode(
         cycles.every(per_sample),

@@ -19,7 +19,7 @@ from endopilot.cockpit.recording import SUFFIX, read_recording, replayed
 from endopilot.cockpit.world import Snapshot, loop_snapshot, take_snapshot
 from endopilot.control.plan_file import read_plan
 from endopilot.dataset.again import episode_set_up
-from endopilot.dataset.loader import load_dataset
+from endopilot.dataset.loader import read_dataset
 from endopilot.errors import InputError
 from endopilot.files import reading
 from endopilot.ladder.attempt import Recording, begun, navigation_seed
@@ -102,7 +102,7 @@ def open_film(path: Path, patient: Path | None = None, *, world: int = 0, task: 
         return _session(path)
     if (path / "meta").is_dir():
         with reading(path, "make the data set again"):
-            data = load_dataset(path)
+            data = read_dataset(path)
             set_up, title = episode_set_up(data, world), f"episode {world} of {path.name}"
             return _film(set_up, data.command[world], data.sample_period_s, {}, title)
     if path.suffix == ".json":
@@ -119,7 +119,7 @@ def open_film(path: Path, patient: Path | None = None, *, world: int = 0, task: 
     vessel = read_anatomy(patient)
     if (path / "plan.csv").exists():
         return _of_trajectory(read_plan(path, vessel).trajectory, 0, f"plan {path.name}")
-    trajectory = read_trajectory(recorded, vessel)
+    trajectory = read_trajectory(recorded, anatomy=vessel)
     worlds = len(trajectory.valid)
     if not 0 <= world < worlds:
         raise InputError(f"world: {world}; {path} has worlds 0 to {worlds - 1}")

@@ -56,12 +56,7 @@ class Loop:
         self._inbox: queue.SimpleQueue[Message | str] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="cockpit", daemon=True)
         self._wanted, self._over = threading.Event(), threading.Event()
-        self.late_cycles, self._busy_s = 0, 0.0
-
-    @property
-    def busy_share(self) -> float:
-        """Share of a cycle that is spent on it, lately."""
-        return self._busy_s / self._cycle_s
+        self.late_cycles = 0
 
     def start(self) -> None:
         """Start the thread; time passes while `run` is set."""
@@ -113,7 +108,6 @@ class Loop:
                 self._publish(channel, message)
             due += self._cycle_s
             done = time.perf_counter()
-            self._busy_s += 0.02 * (done - now - self._busy_s)
             if done - due > _LATE_S:
                 due, self.late_cycles = done, self.late_cycles + 1
             if due > done:

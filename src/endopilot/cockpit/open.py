@@ -18,8 +18,7 @@ from endopilot.cockpit.loop import Stage
 from endopilot.cockpit.recording import SUFFIX, Recorder, Where, read_recording, replayed
 from endopilot.cockpit.session import Session
 from endopilot.cockpit.world import World
-from endopilot.devices.catheter import Catheter, read_catheter
-from endopilot.devices.device import Wire, read_device
+from endopilot.devices.stack import Stack
 from endopilot.navigation.policies import POLICIES
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import Anatomy, Volume
@@ -71,8 +70,7 @@ def open_session(
         InputError: a file that is missing or bad, or a device that does not fit.
     """
     patient = patient or _synthetic(output)
-    around = tuple(read_catheter(name) for name in catheters)
-    navigation = _start_of(read_anatomy(patient), read_device(device), around)
+    navigation = _start_of(read_anatomy(patient), Stack.of(device, *catheters))
     return _driven(World(navigation), Where(patient=patient), output, ct)
 
 
@@ -169,8 +167,8 @@ def _driven(
 
 def xray_unit(navigation: Navigation, ct: Volume | None) -> XrayUnit:
     """Return the X-ray unit around a navigation's patient, with a CT of theirs or without."""
-    anatomy, device, catheters = navigation.anatomy, navigation.device, navigation.catheters
-    return XrayUnit(anatomy, lambda volume: XrayImager(anatomy, device, volume, catheters=catheters), ct)
+    anatomy, stack = navigation.anatomy, navigation.stack
+    return XrayUnit(anatomy, lambda volume: XrayImager(anatomy, stack, ct=volume), ct)
 
 
 def scene_of(navigation: Navigation, about: dict[str, Any]) -> Callable[[], bytes]:
@@ -197,13 +195,15 @@ def read_ct(path: Path | None) -> Volume | None:
     return volume
 
 
-def _start_of(anatomy: Anatomy, device: Wire, catheters: tuple[Catheter, ...]) -> Navigation:
+def _start_of(anatomy: Anatomy, stack: Stack) -> Navigation:
     """Return a navigation from the ostium to a first target, far down the longest path."""
     tree = anatomy.tree
     leaf = tree.longest_leaf()
     line = tree.branches[leaf].centerline.abscissa
     target = Target(branch=leaf, abscissa=float(max(_DEEP * line[-1], line[0])))
-    return Navigation(anatomy=anatomy, device=device, target=target, catheters=catheters, start_inserted_mm=_START_MM)
+    return Navigation(
+        anatomy=anatomy, device=stack.wire, target=target, catheters=stack.catheters, start_inserted_length_mm=_START_MM
+    )
 
 
 def _synthetic(output: Path) -> Path:
@@ -212,7 +212,7 @@ def _synthetic(output: Path) -> Path:
     if not (folder / "anatomy.json").exists():
         from endopilot.tasks.task import reference_navigation
 
-        write_anatomy(reference_navigation().anatomy, folder)
+        write_anatomy(reference_navigation().anatomy, output=folder)
     return folder
 
 

@@ -24,7 +24,7 @@ from endopilot.devices.device import Wire
 from endopilot.devices.stack import Proximals
 from endopilot.errors import InputError
 from endopilot.files import json_text, reading
-from endopilot.navigation.navigate import NavigateConfig
+from endopilot.navigation.loop import LoopConfig
 from endopilot.settings import from_record
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.tasks.navigation import Navigation, Target
@@ -106,7 +106,7 @@ class Recording:
 
     path: Path
     navigation: Navigation
-    config: NavigateConfig
+    config: LoopConfig
     truth: ModelMismatch
     seed: int
     where: Where
@@ -139,7 +139,7 @@ def read_recording(path: Path) -> Recording:
         np.random.default_rng(int(header["seed"]))  # which must not be negative
         for event in events:
             _check(event)
-        config, truth = from_record(NavigateConfig, header["config"]), from_record(ModelMismatch, header["truth"])
+        config, truth = from_record(LoopConfig, header["config"]), from_record(ModelMismatch, header["truth"])
         at = np.array([0, *(int(event["at"]) for event in events)])
         between = _between_checks(config)
         if (apart := np.diff(np.sort(at)).max(initial=0)) > between:
@@ -148,7 +148,7 @@ def read_recording(path: Path) -> Recording:
         return Recording(path, navigation, config, truth, int(header["seed"]), where, events, cycles)
 
 
-def _between_checks(config: NavigateConfig) -> int:
+def _between_checks(config: LoopConfig) -> int:
     """Return the number of cycles from one check to the next."""
     return max(1, round(CHECK_S / config.cycle_s))
 
@@ -209,7 +209,7 @@ def _header(world: World, where: Where, seed: int) -> dict[str, Any]:
         "identity": navigation.anatomy.identity,
         "device": asdict(navigation.device),
         "target": asdict(navigation.target),
-        "start": [navigation.start_inserted_mm, navigation.start_rotation],
+        "start": [navigation.start_inserted_length_mm, navigation.start_rotation_rad],
         "seconds": navigation.seconds,
         "force_limit_n": navigation.force_limit_n,
         "config": asdict(world.config),
@@ -237,8 +237,8 @@ def _navigation(path: Path, header: dict[str, Any], where: Where) -> Navigation:
         anatomy=anatomy,
         device=from_record(Wire, header["device"]),
         target=from_record(Target, header["target"]),
-        start_inserted_mm=header["start"][0],
-        start_rotation=header["start"][1],
+        start_inserted_length_mm=header["start"][0],
+        start_rotation_rad=header["start"][1],
         seconds=header["seconds"],
         force_limit_n=header["force_limit_n"],
         catheters=tuple(from_record(Catheter, catheter) for catheter in header.get("catheters", ())),

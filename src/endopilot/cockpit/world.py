@@ -14,7 +14,8 @@ from jaxtyping import Float
 
 from endopilot.devices.stack import Proximals, lines_from_tips, shown_part
 from endopilot.errors import InputError
-from endopilot.navigation.navigate import NavigateConfig, NavigationLoop
+from endopilot.lines import length_along
+from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Hand, Observation
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.simulator import Simulator
@@ -22,7 +23,7 @@ from endopilot.simulation.state import Step
 from endopilot.tasks.navigation import Navigation
 from endopilot.types import TipProjection
 
-BY_HAND = NavigateConfig(cycle_s=0.0125)
+BY_HAND = LoopConfig(cycle_s=0.0125)
 """A hand's commands act sooner than a policy's, and pages show as many pictures."""
 
 
@@ -34,14 +35,14 @@ class ShownCatheter:
         nodes: of its axis from its tip to a little behind the ostium, LPS mm.
         node_force: of the wall at each of them, N; 0 where it lies in another catheter.
         tip: Δtip, γtip, branch and lumen radius, as arrays of one.
-        inserted_mm: inserted length as it truly is, mm.
+        inserted_length_mm: inserted length as it truly is, mm.
         rotation: of its drive, rad.
     """
 
     nodes: Float[np.ndarray, "n 3"]
     node_force: Float[np.ndarray, "n"]
     tip: TipProjection
-    inserted_mm: float
+    inserted_length_mm: float
     rotation: float
 
 
@@ -56,7 +57,7 @@ class Snapshot:
         node_force: of the wall at each of them, N; 0 where it lies in a catheter.
         tip_direction: unit vector along the wire at its tip.
         tip: Δtip, γtip, branch and lumen radius, as arrays of one.
-        inserted_mm: Δ, mm, as it truly is.
+        inserted_length_mm: Δ, mm, as it truly is.
         rotation: φ, rad.
         velocity: of the drive's motor, mm/s and rad/s of the wire, then of each catheter.
         force_n: largest wall force on one node during the cycle, N.
@@ -73,7 +74,7 @@ class Snapshot:
     node_force: Float[np.ndarray, "n"]
     tip_direction: Float[np.ndarray, "3"]
     tip: TipProjection
-    inserted_mm: float
+    inserted_length_mm: float
     rotation: float
     velocity: tuple[float, ...]
     force_n: float
@@ -86,7 +87,7 @@ class Snapshot:
     @property
     def deepest_mm(self) -> float:
         """Largest inserted length, mm."""
-        return max([self.inserted_mm, *(catheter.inserted_mm for catheter in self.catheters)])
+        return max([self.inserted_length_mm, *(catheter.inserted_length_mm for catheter in self.catheters)])
 
 
 class World:
@@ -107,7 +108,7 @@ class World:
     def __init__(
         self,
         navigation: Navigation,
-        config: NavigateConfig = BY_HAND,
+        config: LoopConfig = BY_HAND,
         *,
         seed: int = 0,
         truth: ModelMismatch | None = None,
@@ -245,7 +246,7 @@ def take_snapshot(
         node_force=force,
         tip_direction=simulator.tip_direction[0, 0],
         tip=tip[:, 0],
-        inserted_mm=float(inserted[0]),
+        inserted_length_mm=float(inserted[0]),
         rotation=turned[0],
         velocity=velocity,
         force_n=force_n,
@@ -258,20 +259,20 @@ def take_snapshot(
 
 
 def _lines(
-    simulator: Simulator, inserted_mm: Float[np.ndarray, "devices"]
+    simulator: Simulator, inserted_length_mm: Float[np.ndarray, "devices"]
 ) -> list[tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_"]]]:
     """Return what is shown of each device: nodes from its tip on, LPS mm, and the wall's force at each, N.
 
     The wall presses on the outermost device alone.
     """
-    nodes, force = shown_part(simulator.position[0], float(inserted_mm.max())), simulator.contacts[0]
+    nodes, force = shown_part(simulator.position[0], float(inserted_length_mm.max())), simulator.contacts[0]
     found, covered = [], -np.inf
-    for device, line in reversed(list(enumerate(lines_from_tips(nodes, inserted_mm)))):
+    for device, line in reversed(list(enumerate(lines_from_tips(nodes, inserted_length_mm)))):
         own = force[len(nodes) - len(line) : len(nodes)]
-        if len(inserted_mm) > 1:
-            along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+        if len(inserted_length_mm) > 1:
+            along = length_along(line)
             line[0] = simulator.tip_position[0, device]
-            own = np.where(inserted_mm[device] - along > covered, own, 0.0)
-            covered = max(covered, float(inserted_mm[device]))
+            own = np.where(inserted_length_mm[device] - along > covered, own, 0.0)
+            covered = max(covered, float(inserted_length_mm[device]))
         found.append((line, own))
     return found[::-1]

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
+from endopilot.control.push import Halt
 from endopilot.control.reach import Fork, forks
 from endopilot.control.set_up import tip_name
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.route import BEYOND_MM, Route
-
-Halt = Literal["off", "stalled", "slipped", "pressed", "late"]
-"""A wire leaves the route, does not come forward though it is pushed, cannot be pushed without the drive's slipping,
-presses on the wall too hard, or the time is over."""
 
 SPARE_SHARE = 0.9
 """Share of the force limit that a path is followed under: what is uncertain takes the rest."""
@@ -39,6 +34,8 @@ def describe_halt(halt: Halt, at_mm: float, route: Route, navigation: Navigation
     device = navigation.device
     if halt == "late":
         return f"the {navigation.seconds:g} s are over; give more seconds"
+    if navigation.catheters:
+        return f"no manoeuvre leads past {at_mm:.0f} mm; give another catheter, wire or tip"
     near = near_fork(at_mm, route, navigation)
     where = f"at {near}" if near else f"at {at_mm:.0f} mm, where no branch leaves,"
     if halt == "pressed":

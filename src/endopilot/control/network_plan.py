@@ -78,7 +78,7 @@ def _sample(
             drawn = random.standard_normal((sampling.candidates, *mean.shape))
             drawn = convolve1d(drawn, _SMOOTH, axis=1, mode="constant") * sd
             drawn[0] = 0.0
-            control = limits.clip_sequence(mean + drawn, navigation.start_inserted_mm, SAMPLE_PERIOD_S)
+            control = limits.clip_sequence(mean + drawn, navigation.start_inserted_length_mm, SAMPLE_PERIOD_S)
             wanted = np.repeat(desired[None], len(control), axis=0)
             tip = predictor.rollout_forward(start.episodes(wanted, control)).tip
             cost = _cost(tip, control, desired, route, limits.fastest, navigation.device.tip_radius_mm, config)
@@ -128,7 +128,7 @@ class RestingStart:
         config = SimulatorConfig(**read_run(model).get("simulator", {}))
         self._setup = EpisodeSetUp.of_anatomy(navigation.anatomy, navigation.device, config)
         simulator = Simulator(navigation.anatomy, navigation.device, config=SimulatorConfig(threads=1))
-        simulator.reset(inserted_length=[navigation.start_inserted_mm], rotation=[navigation.start_rotation])
+        simulator.reset(inserted_length=[navigation.start_inserted_length_mm], rotation=[navigation.start_rotation_rad])
         tip = simulator.project()[:, 0]
         self.tip = np.array([tip.abscissa[0], tip.offset[0]])
 
@@ -137,7 +137,7 @@ class RestingStart:
         rest = np.zeros((len(tips), WINDOW, 2))
         return Episodes.of_controls(
             self._setup,
-            initial=np.array([self.navigation.start_inserted_mm, self.navigation.start_rotation]),
+            initial=np.array([self.navigation.start_inserted_length_mm, self.navigation.start_rotation_rad]),
             control=np.concatenate([rest, control], axis=1),
             tip=np.concatenate([rest + self.tip, tips], axis=1),
         )

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.control.navigate_patient import PatientNavigation, SetUp
+from endopilot.control.navigate import PatientNavigation, SetUp
 from endopilot.robot.robot import CYCLE_S
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM

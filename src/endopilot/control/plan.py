@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,14 +16,14 @@ from endopilot.control.course import Controls
 from endopilot.control.desired import last_place, read_tips, tips_along
 from endopilot.control.plan_config import NETWORK_METHODS, Plan, PlanConfig, Steps
 from endopilot.control.set_up import TipChoice, choose_tip
-from endopilot.devices.catheter import Catheter
-from endopilot.devices.device import Wire, read_device
+from endopilot.devices.device import Wire, read_wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import IDEAL, read_robot
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.models.config import read_run
-from endopilot.navigation.navigate import NavigateConfig, navigate
+from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.progress import progress
 from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
@@ -40,22 +40,21 @@ _TRIALS = 3
 def plan(
     anatomy: Anatomy | str | Path,
     target: str,
-    config: PlanConfig | None = None,
     *,
+    device: Wire | Stack | str | Path | None = None,
     model: str | Path | None = None,
-    device: Wire | str | Path | None = None,
-    catheters: Sequence[Catheter] = (),
+    config: PlanConfig | None = None,
 ) -> Plan:
     """Plan a navigation.
 
     Args:
         anatomy: the vessel, or its folder.
         target: a section such as "4" or "PDA", a point "X,Y,Z" in LPS mm, or the path of a CSV of desired tips.
-        config: method, time, limits and cost.
+        device: the wire, its name or its YAML file; or the wire and a catheter, which is then planned for too, by the
+            method search. The model's wire if not given, the workhorse if there is no model.
         model: run made by `endopilot train`, or "pretrained", the model of the package; needed for the methods inverse
             and mppi.
-        device: the wire, its name or its YAML file; the model's if not given, the workhorse if there is none.
-        catheters: one around the wire, which is then planned for too, by the method search.
+        config: method, time, limits and cost.
 
     Raises:
         InputError: a target outside the tree, behind an occlusion or too far for the time; a model of another device or
@@ -66,21 +65,24 @@ def plan(
     config = config or PlanConfig()
     vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
     model = None if model is None else Path(model)
+    catheters = device.catheters if isinstance(device, Stack) else ()
     if catheters:
         _check_for_stack(config, target, model)
     wire = _wire(model, device, config.method)
     tips = (
-        read_tips(Path(target), wire.max_velocity_mm_s, config.start_inserted_mm) if target.endswith(".csv") else None
+        read_tips(Path(target), wire.max_velocity_mm_s, config.start_inserted_length_mm)
+        if target.endswith(".csv")
+        else None
     )
     goal = find_target(vessel.tree, target) if tips is None else last_place(vessel, tips, target)
     navigation = Navigation(
         anatomy=vessel,
         device=wire,
         target=goal,
-        catheters=tuple(catheters),
+        catheters=catheters,
         arrives=config.arrives,
-        start_inserted_mm=config.start_inserted_mm,
-        start_rotation=config.start_rotation,
+        start_inserted_length_mm=config.start_inserted_length_mm,
+        start_rotation_rad=config.start_rotation_rad,
         seconds=config.seconds if tips is None else len(tips) * DECISION_PERIOD_S,
         force_limit_n=config.force_limit_n,
     )
@@ -89,7 +91,7 @@ def plan(
         check_passable(route, each)
     choice, began = None, _clock()
     if model is None:
-        choice = choose_tip(navigation, config.tip, catheter_tilt_deg=config.catheter_tilt_deg)
+        choice = choose_tip(navigation, tip=config.tip, catheter_tilt_deg=config.catheter_tilt_deg)
         navigation = choice.navigation
         route = Route.to(navigation.anatomy, goal)
     elif config.tip not in ("auto", "own"):
@@ -102,7 +104,7 @@ def plan(
         desired = tips_along(
             route,
             wire.tip_radius_mm,
-            start_mm=config.start_inserted_mm,
+            start_mm=config.start_inserted_length_mm,
             speed_mm_s=config.speed_mm_s,
             seconds=config.seconds,
             safe_ratio=config.cost.safe_ratio,
@@ -163,15 +165,15 @@ def _check_for_stack(config: PlanConfig, target: str, model: Path | None) -> Non
         )
 
 
-def _wire(model: Path | None, device: Wire | str | Path | None, method: str) -> Wire:
+def _wire(model: Path | None, device: Wire | Stack | str | Path | None, method: str) -> Wire:
     """Return the wire: the one that is asked for, else the model's; both must be the same."""
-    asked = device if isinstance(device, Wire | None) else read_device(device)
+    asked = None if device is None else Stack.of(device).wire
     if model is None:
         if method in NETWORK_METHODS:
             raise InputError(
                 f"--model: none given, and method {method} needs one; give a run of `endopilot train`, or pretrained"
             )
-        return asked or read_device("workhorse-014")
+        return asked or read_wire("workhorse-014")
     trained = from_record(Wire, read_run(model)["device"])
     if asked is not None and asked.constants != trained.constants:
         raise InputError(
@@ -181,7 +183,7 @@ def _wire(model: Path | None, device: Wire | str | Path | None, method: str) -> 
 
 
 def _check_time(navigation: Navigation, config: PlanConfig) -> None:
-    length_mm = navigation.target.abscissa - navigation.start_inserted_mm
+    length_mm = navigation.target.abscissa - navigation.start_inserted_length_mm
     fastest = min(navigation.device.max_velocity_mm_s, config.speed_mm_s)
     if length_mm / fastest > navigation.seconds:
         raise InputError(
@@ -201,19 +203,18 @@ def _search(navigation: Navigation, config: PlanConfig, trial: int) -> tuple[Con
     policy.start(navigation, config.seed + trial)
     with progress("plan: searching in the rod core", total=navigation.target.abscissa) as advance:
         course = policy.find_course(navigation.seconds, advance)
-    names = " in ".join(device.name for device in navigation.devices)
+    to = f"branch {navigation.target.branch} of {navigation.anatomy.name}"
     if course.reached < 0.5:
-        came = float(course.tip.abscissa[-1, 0]) if len(course.control) else navigation.start_inserted_mm
+        came = float(course.tip.abscissa[-1, 0]) if len(course.control) else navigation.start_inserted_length_mm
         raise InputError(
-            f"target: no path found to branch {navigation.target.branch} of {navigation.anatomy.name} in "
-            f"{navigation.seconds:g} s under {navigation.force_limit_n:g} N with {names}; the tip came to "
-            f"{came:.0f} of {navigation.target.abscissa:.0f} mm; {policy.halt}"
+            f"target: no path found to {to} in {navigation.seconds:g} s under {navigation.force_limit_n:g} N with "
+            f"{navigation.stack.name}; the tip came to {came:.0f} of {navigation.target.abscissa:.0f} mm; {policy.halt}"
         )
     needed_s = DECISION_PERIOD_S * len(course.control)
     if needed_s > navigation.seconds:
         raise InputError(
-            f"seconds: {navigation.seconds:g} s are too few for the course found to branch "
-            f"{navigation.target.branch} of {navigation.anatomy.name} with {names}; give {needed_s:g} s or more"
+            f"seconds: {navigation.seconds:g} s are too few for the course found to {to} with {navigation.stack.name}; "
+            f"give {needed_s:g} s or more"
         )
     return course.control, np.column_stack([course.tip.abscissa[:, 0], course.tip.offset[:, 0]])
 
@@ -252,7 +253,7 @@ def _track(navigation: Navigation, desired: Steps) -> tuple[Steps, Steps]:
         navigation.anatomy,
         [navigation.device],
         friction=np.array([navigation.device.friction]),
-        start=np.array([[navigation.start_inserted_mm, navigation.start_rotation]]),
+        start=np.array([[navigation.start_inserted_length_mm, navigation.start_rotation_rad]]),
         given=np.zeros((1, 0, 2)),
         desired=desired[None],
         config=core,
@@ -264,8 +265,8 @@ def _by_policy(navigation: Navigation, config: PlanConfig) -> tuple[Steps, Steps
     """Let a policy drive the rod core with an ideal drive, and record what it did."""
     from endopilot.navigation.policies import make_policy
 
-    ideal = NavigateConfig(robot=read_robot(IDEAL))
-    record = navigate(navigation, make_policy(config.method), config=ideal, seed=config.seed)
+    ideal = LoopConfig(robot=read_robot(IDEAL))
+    record = NavigationLoop(navigation, make_policy(config.method), config=ideal, seed=config.seed).run()
     proximal, tip = np.column_stack([record.inserted_length[:, 0], record.rotation[:, 0]]), record.tip[:, 0]
     control = np.diff(proximal, axis=0) / DECISION_PERIOD_S
     return control, np.column_stack([tip.abscissa, tip.offset])[1:]
@@ -299,13 +300,13 @@ def _checked(
     )
 
 
-def within_limits(control: Steps, limits: DriveLimits, inserted_mm: float) -> Steps:
+def within_limits(control: Steps, limits: DriveLimits, inserted_length_mm: float) -> Steps:
     """Return controls that are finite and within the drive's limits and its travel, whatever a model proposes.
 
     Args:
         control: mm/s and rad/s of each period.
         limits: of the drive.
-        inserted_mm: inserted length at the start, mm.
+        inserted_length_mm: inserted length at the start, mm.
     """
     finite = np.isfinite(control).all(axis=1, keepdims=True)
-    return limits.clip_sequence(np.where(finite, control, 0.0), inserted_mm, DECISION_PERIOD_S)
+    return limits.clip_sequence(np.where(finite, control, 0.0), inserted_length_mm, DECISION_PERIOD_S)

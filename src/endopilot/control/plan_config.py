@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.cost import Cost
+from endopilot.control.course import Controls
 from endopilot.control.set_up import TILT_DEG
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.settings import Finite, Positive, Seconds, Seed, Text, Within, settings
@@ -21,7 +22,6 @@ Method = Literal["search", "inverse", "mppi", "forward", "spin", "retract-rotate
 NETWORK_METHODS = ("inverse", "mppi")
 """Methods that ask a trained network."""
 Steps = Float[np.ndarray, "samples 2"]
-Controls = Float[np.ndarray, "samples devices 2"]
 
 
 @settings
@@ -58,9 +58,9 @@ class PlanConfig:
     """How far the guiding catheter may be turned at the ostium where a fork cannot be entered otherwise, degrees."""
     arrives: Arrives = "wire"
     """Whose tip is to go to the target: wire, or catheter, the one around the wire."""
-    start_inserted_mm: Annotated[float, Within(0, 5000)] = 2.0
+    start_inserted_length_mm: Annotated[float, Within(0, 5000)] = 2.0
     """Inserted length at the start, mm."""
-    start_rotation: Finite = 0.0
+    start_rotation_rad: Finite = 0.0
     """Rotation at the start, rad."""
     force_limit_n: Positive = 0.5
     """Largest force of the wall on one node that is safe, N."""

@@ -52,12 +52,12 @@ from endopilot.types import Anatomy, TipProjection
 _TABLE, _RECORD, PICTURE = "plan.csv", "manifest.json", "plan.png"
 
 
-def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dict[str, Any]:
+def write_plan(plan: Plan, *, output: str | Path, xray: PlannedXray | None = None) -> dict[str, Any]:
     """Write a plan as a folder, whole or not at all; a plan that stands there already is replaced. Return its figures.
 
     Args:
         plan: the plan.
-        folder: where to.
+        output: the folder.
         xray: the X-ray that it will need, if that is known.
 
     Raises:
@@ -65,7 +65,7 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
     """
     from endopilot.control.plan_picture import draw_plan  # matplotlib is slow to import
 
-    folder = Path(folder)
+    folder = Path(output)
     if folder.exists() and not (folder.is_dir() and ((folder / _TABLE).exists() or not any(folder.iterdir()))):
         raise InputError(f"{folder}: exists and is not a plan; choose another output folder")
     navigation = plan.navigation
@@ -106,7 +106,10 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
             catheter_axis=navigation.anatomy.insertion.direction.tolist() if plan.tilt_deg else None,
             model=plan.model,
             target=asdict(navigation.target),
-            start={"inserted_length_mm": navigation.start_inserted_mm, "rotation_rad": navigation.start_rotation},
+            start={
+                "inserted_length_mm": navigation.start_inserted_length_mm,
+                "rotation_rad": navigation.start_rotation_rad,
+            },
             limits={"seconds": navigation.seconds, "force_n": navigation.force_limit_n},
             trajectory_sha256=sha256(partial / TRAJECTORY),
             **figures,
@@ -178,14 +181,14 @@ def _plan_in(folder: Path, anatomy: Anatomy, stack: Stack | None) -> Plan:
     made_for = Stack(planned, around)
     given = made_for if stack is None else replace(stack, wire=replace(stack.wire, **tip))
     if made_for.constants != given.constants:
-        names = [" in ".join(device.name for device in each.devices) for each in (made_for, given)]
         raise InputError(
-            f"{folder}: the plan is for another device ({names[0]}), not for {names[1]}; plan anew, or give the plan's"
+            f"{folder}: the plan is for another device ({made_for.name}), not for {given.name}; plan anew, or give "
+            "the plan's"
         )
     path = folder / TRAJECTORY
     if not path.exists() or sha256(path) != record["trajectory_sha256"]:
         raise InputError(f"{path}: is missing or differs from what {_RECORD} records; plan anew")
-    trajectory = read_trajectory(path, anatomy)
+    trajectory = read_trajectory(path, anatomy=anatomy)
     return Plan(
         navigation=Navigation(
             anatomy=anatomy,
@@ -193,8 +196,8 @@ def _plan_in(folder: Path, anatomy: Anatomy, stack: Stack | None) -> Plan:
             target=Target(**record["target"]),
             catheters=around,
             arrives=config.arrives,
-            start_inserted_mm=record["start"]["inserted_length_mm"],
-            start_rotation=record["start"]["rotation_rad"],
+            start_inserted_length_mm=record["start"]["inserted_length_mm"],
+            start_rotation_rad=record["start"]["rotation_rad"],
             seconds=record["limits"]["seconds"],
             force_limit_n=record["limits"]["force_n"],
         ),

@@ -28,8 +28,7 @@ def draw_plan(plan: Plan, path: Path, xray: PlannedXray | None = None) -> None:
     """Write a PNG of a plan, with the X-ray that it will need if that is known."""
     figure = plt.figure(figsize=(13, 8), facecolor="white", layout="constrained")
     grid = figure.add_gridspec(4, 2, width_ratios=(1.0, 1.25))
-    names = " in ".join(device.name for device in plan.navigation.devices)
-    title = f"{plan.navigation.anatomy.name}, {names}: {plan.config.method}"
+    title = f"{plan.navigation.anatomy.name}, {plan.navigation.stack.name}: {plan.config.method}"
     wire, *around = np.moveaxis(plan.trajectory.tip_position[0], 1, 0)
     draw_route(figure.add_subplot(grid[:, 0]), plan.navigation, wire, title, around)
     time_s = DECISION_PERIOD_S * np.arange(1, len(plan.control) + 1)

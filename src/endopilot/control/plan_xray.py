@@ -19,7 +19,7 @@ from endopilot.belief.adviser import AdviserConfig, XrayAdviser
 from endopilot.belief.bands import Calibration
 from endopilot.belief.online_predictors import online_predictor
 from endopilot.control.agent import AdviserInput, AgentPolicy, read_agent_calibration
-from endopilot.control.plan_config import NETWORK_METHODS, Plan, PlanConfig
+from endopilot.control.plan_config import NETWORK_METHODS, Plan
 from endopilot.models.config import WINDOW, run_path
 from endopilot.tasks.route import Route
 from endopilot.xray.fluoroscope import TipMeasurement
@@ -38,29 +38,35 @@ class PlannedXray:
     half_width: Float[np.ndarray, "samples 2"]
 
 
-def read_calibration(config: PlanConfig, model: Path | None, *, devices: int = 1) -> Calibration:
+def read_calibration(method: str, model: str | Path | None, devices: int) -> Calibration:
     """Return the calibration of the model that predicts a plan's tip: the run that makes it, or else the agent's wires.
 
     Args:
-        config: of the plan; its method says whether a network makes it.
+        method: of the plan; it says whether a network makes it.
         model: the trained run, or "pretrained".
         devices: 1 for a wire alone, 2 with a catheter.
 
     Raises:
         InputError: the run has no calibration, or a damaged one.
     """
-    if config.method in NETWORK_METHODS and model is not None:
+    if method in NETWORK_METHODS and model is not None:
         return Calibration.read(run_path(model))
     return read_agent_calibration("assumed", devices)
 
 
-def plan_xray(plan: Plan, calibration: Calibration) -> PlannedXray:
+def plan_xray(plan: Plan, *, calibration: Calibration | None = None) -> PlannedXray:
     """Return the X-ray that a plan will need if all goes as planned; the tip is observed at the start.
 
     Args:
         plan: the plan.
-        calibration: of the model that predicts its tip, see `read_calibration`.
+        calibration: of the model that predicts its tip; if not given, that of the plan's model, or of the agent's
+            simulated wires where no network made the plan.
+
+    Raises:
+        InputError: the plan's model has no calibration, or a damaged one.
     """
+    if calibration is None:
+        calibration = read_calibration(plan.config.method, plan.model, len(plan.navigation.devices))
     model: _Model = _Networks(plan) if plan.config.method in NETWORK_METHODS else _Wires(plan)
     adviser = XrayAdviser(calibration, AdviserConfig(), plan.navigation.device.tip_radius_mm)
     proximal, tip, _, radius = model.start()

@@ -13,7 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int
 
-from endopilot.control.sweep import middle, sweep
+from endopilot.control.push import TURN_PERIODS, Push, middle, sides, stand_off, turn
+from endopilot.control.search_config import SearchConfig
+from endopilot.control.trials import Trials
 from endopilot.devices.device import Wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.simulation.config import PRESETS
@@ -23,9 +25,6 @@ from endopilot.tasks.route import ENTERED_MM, Route
 
 ROTATIONS = 24
 """Rotations of the wire that are tried at a fork, evenly over a full turn."""
-_LEAD_MM, _LEAD_RADII = 4.0, 1.4
-"""The wire is turned this far before a fork, mm, or lumen radii where that is more."""
-_SPEED_MM_S = 10.0
 _MORE_PERIODS = 8
 """Decision periods that a wire has for its turn and its detours, beside half as many again as the straight advance."""
 
@@ -78,7 +77,7 @@ def forks(route: Route, device: Wire) -> tuple[Fork, ...]:
 def rotations_that_enter(navigation: Navigation, device: Wire) -> Int[np.ndarray, "forks"]:
     """Return with how many of `ROTATIONS` rotations a wire enters the right branch at each fork of the route.
 
-    A wire is brought up to each fork of the route, turned to all sides and pushed on straight (`sweep`). It goes on
+    A wire is brought up to each fork of the route, turned to all sides and pushed on straight (`Push`). It goes on
     with the rotation in the middle of those that enter. Behind a fork that no rotation enters, or that the wire does
     not come up to, the numbers are 0. A rotation that presses on the wall with more than the navigation's force limit
     does not count.
@@ -91,32 +90,25 @@ def rotations_that_enter(navigation: Navigation, device: Wire) -> Int[np.ndarray
     route = Route.to(navigation.anatomy, replace(navigation.target, abscissa=end))  # a fork may lie next to the target
     simulator = Simulator(navigation.anatomy, device, worlds=ROTATIONS, config=PRESETS["fast"])
     simulator.reset(
-        inserted_length=np.full(ROTATIONS, navigation.start_inserted_mm),
-        rotation=np.full(ROTATIONS, navigation.start_rotation),
+        inserted_length=np.full(ROTATIONS, navigation.start_inserted_length_mm),
+        rotation=np.full(ROTATIONS, navigation.start_rotation_rad),
     )
-    travel = DriveLimits.of(device, navigation.anatomy)
+    limits, config = [DriveLimits.of(device, navigation.anatomy)], SearchConfig()
 
     def go_on(waypoint: float) -> int:
-        """Sweep up to a waypoint, put all wires where the middle of those is that pass it; return how many do."""
-        here = float(route.progress(simulator.project()[:, 0])[0])
-        made = sweep(
-            simulator,
-            route,
-            waypoint,
-            weight=np.ones(1),
-            travel=travel,
-            force_limit_n=navigation.force_limit_n,
-            speed_mm_s=_SPEED_MM_S,
-            periods=int(1.5 * max(waypoint - here, 0.0) / (_SPEED_MM_S * DECISION_PERIOD_S)) + _MORE_PERIODS,
-        )
-        simulator.copy_worlds(np.full(ROTATIONS, middle(made.passed)))
-        return int(made.passed.sum())
+        """Turn and push up to a waypoint, put all where the middle of those is that pass it; return how many do."""
+        here, trials = float(route.progress(simulator.project()[:, 0])[0]), Trials(simulator, limits)
+        straight = int(1.5 * max(waypoint - here, 0.0) / (config.speed_mm_s * DECISION_PERIOD_S))
+        turn(trials, sides(ROTATIONS))
+        push = Push(route, navigation, config, waypoint)
+        passed = push.run(trials, straight + _MORE_PERIODS - TURN_PERIODS).passed
+        trials.copy_trials(np.full(ROTATIONS, middle(passed)))
+        return int(passed.sum())
 
     places = forks(Route.to(navigation.anatomy, navigation.target), device)
     count = np.zeros(len(places), dtype=int)
     for index, fork in enumerate(places):
-        radius = float(route.radius(np.array([fork.abscissa]))[0])
-        before = fork.abscissa - max(_LEAD_MM, _LEAD_RADII * radius)
+        before = fork.abscissa - stand_off(route, fork.abscissa, config.lead_mm)
         if before > route.progress(simulator.project()[:, 0])[0] + 1.0 and not go_on(before - ENTERED_MM):
             return count
         count[index] = go_on(float(route.waypoints[index]))

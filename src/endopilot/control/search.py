@@ -1,73 +1,328 @@
-"""What searches of courses have in common: `Search`, and its settings, `SearchConfig`."""
+"""Search for a course that brings a stack of devices to a target, in the rod core: `Search`.
+
+A wire alone is a stack of one. The course grows from waypoint to waypoint. A *waypoint* lies just within the branch
+that the route takes at a fork; with a catheter, others lie between forks that are far apart. What leads past one is a
+*manoeuvre*: it advances, rotates and retracts each device (`Move`). Its *trials* are driven side by side, in a world
+for each wire that is held possible (`Trials`). One that brings all of these wires past the waypoint becomes part of
+the course. Manoeuvres are tried in this order, until one passes:
+
+1. *Straight on* (`Push`). The wire advances and a catheter follows; trials differ in how far the wire leads.
+2. *Turned* (`Grid`). Devices are placed before, at or beyond the *obstacle*: the fork, or what ended the straight push.
+   They are rotated to all sides, retracted perhaps, and pushed on. Of the places that most rotations pass, the rotation
+   in the middle of those is taken: it bears errors best.
+3. *Drawn* (`Population`), for a wire alone. Candidates move at random; the cheapest are kept and go on.
+
+Each manoeuvre has to stay within a share of the force limit. The last resort of the turned ones may use more of it than
+the first. `manoeuvre_cost` decides between trials that are else as good.
+"""
 
 from __future__ import annotations
 
-from dataclasses import field
-from typing import Annotated, Protocol
+import sys
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
 
 from endopilot.belief.belief import Belief
-from endopilot.control.cost import Cost
 from endopilot.control.course import Course
+from endopilot.control.halt import SPARE_SHARE, describe_halt, near_fork
+from endopilot.control.manoeuvre import STRAIGHT, Grid, Repertoire, place, retract
+from endopilot.control.population import Population
+from endopilot.control.push import TURN_PERIODS, Each, Halt, Push, Pushed, middle, sides, stand_off, turn
+from endopilot.control.search_config import SearchConfig
+from endopilot.control.trials import STALL_PERIODS, WIRE, Kept, Move, Trials
+from endopilot.errors import InputError
 from endopilot.progress import Advance
-from endopilot.settings import OpenShare, Positive, Seconds, Within, settings
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.route import ENTERED_MM, Route
+
+_ENDLESS = sys.maxsize
+_BACK_MM_S = 2.0
+"""Speed at which a wire that has gone past its target is retracted, mm/s."""
+_LOOKOUT_MM, _LOOKOUT_RADII = 12.0, 3.0
+"""A waypoint that is searched for lies no farther ahead than this, mm, or lumen radii where that is more: beyond, a
+chord says little."""
+_STRETCH_MM = 20.0
+"""A wire in a catheter passes the route in stretches of this length at most, mm."""
+_TURNS = (0.0, np.pi)
+"""Angles by which a wire alone may be turned before it goes in, rad."""
+_REPEATED = 3
+"""Trials of a manoeuvre that the course tries, one after another."""
 
 
-@settings
-class ManoeuvreConfig:
-    """Settings of the manoeuvres of a wire in a catheter."""
-
-    turns: Annotated[int, Within(1, 1000)] = 12
-    """Rotations that are tried at each place."""
-    behind_mm: Positive = 10.0
-    """The catheter follows to this far behind the wire's tip, mm, except to the target if its own tip is to arrive."""
-    longest_s: Seconds = 30.0
-    """A catheter is brought to its place in this time at most, s, and a wire past a fork."""
-
-
-@settings
-class SearchConfig:
-    """Settings of the search; those of candidates are of a wire alone."""
-
-    speed_mm_s: Annotated[float, Within(0.1, 1000)] = 10.0
-    """Translation of a device that is pushed straight on, mm/s."""
-    candidates: Annotated[int, Within(1, 4096)] = 32
-    """Candidates that are tried side by side where pushing straight on fails."""
-    rounds: Annotated[int, Within(1, 1000)] = 6
-    """Rounds of one attempt, at most."""
-    attempts: Annotated[int, Within(1, 1000)] = 4
-    """Attempts, each from the same state, before a search is given up."""
-    round_periods: Annotated[int, Within(1, 1000)] = 2
-    """Decision periods of 0.5 s in a round."""
-    keep_share: OpenShare = 0.25
-    """Share of the candidates that a round keeps."""
-    turn_rad_s: Annotated[float, Within(0.01, 1000)] = 7.0
-    """Fastest rotation that is tried, rad/s."""
-    lead_mm: Positive = 4.0
-    """A search begins this far before a junction, mm, or 1.4 lumen radii where that is more."""
-    cost: Cost = field(default_factory=Cost)
-    """What the candidates are compared by."""
-    manoeuvres: ManoeuvreConfig = field(default_factory=ManoeuvreConfig)
-    """What is tried where there is a catheter."""
-
-
-class Search(Protocol):
+class Search:
     """Searches courses for a navigation, from whatever is believed of its devices.
 
     Attributes:
         halt: where and why the last search ended before the target, in words; empty if it arrived.
-        draws: whether it draws at random, so that another search from the same belief may find another course.
     """
 
-    halt: str
-    draws: bool
+    def __init__(
+        self, navigation: Navigation, route: Route, belief: Belief, *, config: SearchConfig, seed: int
+    ) -> None:
+        """Lay out the trials.
+
+        Args:
+            navigation: what is to be done.
+            route: to its target.
+            belief: whose wires they are, and whose settings of the rod core are taken.
+            config: settings of the search.
+            seed: of what is drawn at random.
+
+        Raises:
+            InputError: there is more than one catheter.
+        """
+        if len(navigation.catheters) > 1:
+            raise InputError(f"catheter: {len(navigation.catheters)}; the search drives one: give one")
+        self._navigation, self.route, self.config = navigation, route, config
+        self._alone, self._repertoire = not navigation.catheters, Repertoire.of(navigation.catheters, config)
+        trials_of = partial(Trials.of, navigation, list(belief.wires.values()), like=belief.simulator)
+        self._course, self._many = trials_of(count=1), trials_of(count=self._repertoire.trials)
+        self._few = self._course if self._alone else trials_of(count=len(self._repertoire.leads))
+        self._population = Population(navigation, route, self._many, config, np.random.default_rng([seed, 0x5EA]))
+        self.halt = ""
+
+    @property
+    def draws(self) -> bool:
+        """Whether it draws at random, so that another search from the same belief may find another course."""
+        return self._alone
 
     def find(self, belief: Belief, *, seconds: float, first: bool = False, advance: Advance | None = None) -> Course:
         """Find a course from where the likeliest devices are to the target.
 
+        In a tortuous vessel forces depend on the side that the bent tip of a wire alone looks to as it goes in. So
+        where the first course presses hard, or none is found though no fork refuses, others are searched with the wire
+        turned.
+
         Args:
             belief: of the devices; nothing of it is changed.
-            seconds: time that is left, s.
+            seconds: time that is left, s. With a catheter a course may take longer.
             first: whether it is the first of the navigation, which may turn the devices before all else.
             advance: called with every millimetre along the route.
         """
-        ...
+        gentle_n = SPARE_SHARE * self._navigation.force_limit_n
+        best: Course | None = None
+        halt = ""
+        for angle in _TURNS if first and self._alone else _TURNS[:1]:
+            course = self.find_turned(belief, angle, seconds=seconds, advance=advance)
+            if best is None or _merit(course) > _merit(best):
+                best, halt = course, self.halt
+            if (course.reached > 0.5 and course.force.max(initial=0.0) <= gentle_n) or self._at_fork:
+                break
+        assert best is not None
+        self.halt = halt
+        return best
+
+    def find_turned(self, belief: Belief, angle: float, *, seconds: float, advance: Advance | None = None) -> Course:
+        """Find a course that begins with a turn of the devices, rad; the other arguments are those of `find`."""
+        course, reported, settled = self._course, 0.0, []
+        source, weight = belief.likeliest()
+        course.put(source, belief.simulator, weight)
+        self.halt, self._at_fork = "", False
+        self._periods = max(1, int(seconds / DECISION_PERIOD_S)) if self._alone else _ENDLESS
+        if angle:
+            turn(course, np.array([angle]), periods=self._periods)
+        places = self._places()
+        while len(course.rows) < self._periods:
+            here = self._here()
+            if advance is not None:
+                advance(max(here - reported, 0.0))
+                reported = max(here, reported)
+            waypoint, kept, self._tried = self._next(places, here), course.kept(), {}
+            halt = self._straight(waypoint)
+            if halt is None:
+                settled.append(len(course.rows) - 1)
+                if self._reached() > 0.5:
+                    break
+                if len(course.rows) == kept.periods:  # some wire lies beyond the waypoint, others before it
+                    course.move(course.control(Move(WIRE, -_BACK_MM_S)))
+            elif any(self._turned(grid, share, waypoint, kept) for share, grid in self._repertoire.ways):
+                settled.append(len(course.rows) - 1)
+            elif not (self._alone and self._drawn(waypoint, kept)):
+                self._halted(halt, waypoint)
+                break
+        else:
+            self._halted("late", 0.0)
+        reached = self._reached()
+        if reached <= 0.5:
+            self._cut_hard()
+        return course.as_course(
+            reached=reached,
+            ostium_mm=float(belief.parameters[source[0], 2]),
+            settled=None if self._alone else settled,
+        )
+
+    def manoeuvre_cost(self, pushed: Pushed) -> Each:
+        """Return what each trial of a manoeuvre costs, by which those that pass are compared: its largest force, N."""
+        return pushed.force
+
+    def _places(self) -> Sequence[float]:
+        """Return the places that are passed one after another, mm: waypoints, and with a catheter others between."""
+        route, begun = self.route, self._here()
+        if self._alone:
+            return route.waypoints.tolist()
+        places: list[float] = []
+        for goal in [*route.waypoints[:-1][route.waypoints[:-1] > begun].tolist(), route.target.abscissa]:
+            begin = places[-1] if places else begun
+            count = max(1, int(np.ceil((goal - begin) / _STRETCH_MM)))
+            places += [begin + (goal - begin) * (k + 1) / count for k in range(count - 1)] + [goal]
+        return places
+
+    def _next(self, places: Sequence[float], here: float) -> float:
+        """Return the first place that devices which have come to an abscissa, mm, have not passed."""
+        beyond = ENTERED_MM if self._alone else 0.0
+        return next((place for place in places if place + beyond > here), self.route.target.abscissa)
+
+    def _straight(self, waypoint: float) -> Halt | None:
+        """Push straight on past a place; return why not, or None if the course has passed it."""
+        course, push = self._course, self._push(waypoint, strict=self._alone)
+        if push.arrived(course)[0]:
+            return None
+        trials = course if self._alone else self._few.copy_of(course)
+        pushed = self._tried[STRAIGHT] = push.run(trials, self._left, np.array(self._repertoire.leads))
+        self._hard = float(pushed.farthest.max())
+        passes = pushed.passed[0] if self._alone else self._follow(pushed, SPARE_SHARE, waypoint, turns=1)
+        return None if passes else pushed.halt[int(np.argmax(pushed.farthest))]
+
+    def _turned(self, grid: Grid, share: float, waypoint: float, kept: Kept) -> bool:
+        """Try a grid before a place, and follow the best of it; return whether any passes.
+
+        Args:
+            grid: that is tried; what became of it is kept until the place is passed.
+            share: of the force limit, which the trial that is followed stays within.
+            waypoint: the place, mm.
+            kept: where the devices are.
+        """
+        course, tried = self._course, self._tried.get(grid)
+        if tried is not None and not tried.within(share * self._navigation.force_limit_n).any():
+            return False
+        course.restore(kept)
+        if self._alone and grid[0].beyond is not None:
+            self._approach(waypoint)
+        if tried is None:
+            tried = self._tried[grid] = self._try(grid, waypoint)
+        return self._follow(tried, share, waypoint, turns=self._repertoire.turns if grid else 1)
+
+    def _try(self, grid: Grid, waypoint: float) -> Pushed:
+        """Place devices as a grid has them, turn them to all sides, and push them on."""
+        many, limit_n = self._many.copy_of(self._course), self._navigation.force_limit_n
+        left, turns = self._left, self._repertoire.turns
+        beyond, lead, back, push_lead = (
+            np.repeat(each, turns) for each in np.array([(*at, at.push_lead_mm) for at in grid], dtype=float).T
+        )
+        obstacle, step = self._obstacle(waypoint)
+        if not self._alone:
+            wanted = np.maximum(obstacle + beyond * step, 0.0)
+            place(many, wanted, lead, config=self.config, force_n=limit_n)
+        turn(many, np.tile(sides(turns), len(grid)), periods=left, force_n=limit_n)
+        retract(many, back * step, config=self.config, force_n=limit_n)
+        return self._push(waypoint).run(many, left - TURN_PERIODS, push_lead)
+
+    def _push(self, waypoint: float, *, strict: bool = False) -> Push:
+        return Push(self.route, self._navigation, self.config, waypoint, strict)
+
+    def _follow(self, pushed: Pushed, share: float, waypoint: float, *, turns: int) -> bool:
+        """Let the course do what the best trial of a manoeuvre did; return whether any passes within a share of force.
+
+        Of the places that most rotations pass, and among these of the cheapest, it is the rotation in the middle. Where
+        there is a catheter, trials have waited for each other. The course does not, and so has to pass again.
+        """
+        course, limit_n, cost = self._course, share * self._navigation.force_limit_n, self.manoeuvre_cost(pushed)
+        rows, kept = pushed.within(limit_n).reshape(-1, turns), course.kept()
+        trials = [at * turns + middle(row) for at, row in enumerate(rows) if row.any()]
+        trials.sort(key=lambda trial: (-int(rows[trial // turns].sum()), cost[trial]))
+        for trial in trials[:_REPEATED]:
+            for control in pushed.controls(trial):
+                if self._alone or control.any():
+                    course.still |= course.move(control[None], force_n=limit_n)
+            if (self._push(waypoint).arrived(course) & ~course.still)[0]:
+                return True
+            course.restore(kept)
+        return False
+
+    def _obstacle(self, waypoint: float) -> tuple[float, float]:
+        """Return what lies in the way of a place, and the steps in which devices are placed about it, mm.
+
+        That is the fork before the place, unless it is well behind, or where the straight push came to.
+        """
+        route = self.route
+        near = float(route.junctions[route.junctions < waypoint].max(initial=0.0))
+        width = 2 * float(route.radius(np.array([near]))[0])
+        obstacle = min(near, self._hard) if near > max(self._here() - width, 0.0) else self._hard
+        return obstacle, stand_off(route, obstacle, self.config.lead_mm)
+
+    def _approach(self, waypoint: float) -> None:
+        """Push a wire alone on, or pull it back, to where it is turned for a waypoint, mm.
+
+        That is before the fork, or before where the straight push came to: a bend that turns a wire back may lie there.
+        """
+        course, route, speed = self._course, self.route, self.config.speed_mm_s
+        before = route.junctions[route.junctions < waypoint]
+        begin = waypoint - _LOOKOUT_MM
+        if len(before) and waypoint < route.target.abscissa:
+            begin = float(before[-1]) - stand_off(route, float(before[-1]), self.config.lead_mm)
+        begin = min(begin, self._hard - self.config.lead_mm)
+        for _ in range(self._left):
+            here, on_route = self._here(), course.all(route.off_route(course.foremost) == 0)[0]
+            rests = len(course.rows) >= STALL_PERIODS and course.stalled(lambda tip: tip.abscissa, STALL_PERIODS - 1)
+            if not on_route and course.lengths[:, WIRE].min() > 1.0:
+                course.move(course.control(Move(WIRE, -speed)))
+            elif here < begin - 1.0 and not rests:
+                course.move(course.control(Move(WIRE, min(speed, (begin - here) / DECISION_PERIOD_S))))
+            else:
+                return
+
+    def _drawn(self, waypoint: float, kept: Kept) -> bool:
+        """Let candidates draw their motions, and follow the best; return whether it passes the next place.
+
+        A course that does not goes as far as it can. Wires that do not pass are left behind.
+        """
+        course, route, config = self._course, self.route, self.config
+        course.restore(kept)
+        self._approach(waypoint)
+        here = self._here()
+        lookout = max(_LOOKOUT_MM, _LOOKOUT_RADII * float(route.radius(np.array([here]))[0]))
+        waypoint = min(route.next_waypoint(here), here + lookout)
+        rounds = min(config.rounds, self._left // config.round_periods)
+        controls, won = self._population.find(course, waypoint, rounds=rounds, spare_share=SPARE_SHARE)
+        for control in controls:
+            course.move(control[None])
+        passed = np.where(won & route.passed(course.foremost, waypoint), course.weight, 0.0)
+        if passed.sum() > 0:
+            course.weight = passed / passed.sum()
+        return won and len(course.rows) > kept.periods
+
+    @property
+    def _left(self) -> int:
+        """Decision periods that the course may still take."""
+        return self._periods - len(self._course.rows)
+
+    def _here(self) -> float:
+        """Return how far along the route the devices have come, mm."""
+        return float(self._course.mean(self.route.progress(self._course.foremost))[0])
+
+    def _reached(self) -> float:
+        return float(self._course.mean(self._navigation.reached(self._course.tips))[0])
+
+    def _halted(self, halt: Halt, waypoint: float) -> None:
+        """Say where and why no course goes on."""
+        at_mm = self._hard if self._alone and halt != "late" else waypoint
+        self.halt = describe_halt(halt, at_mm, self.route, self._navigation)
+        fork = near_fork(at_mm, self.route, self._navigation)
+        self._at_fork = halt in ("off", "stalled") and fork is not None
+
+    def _cut_hard(self) -> None:
+        """Forget what a course that does not arrive does from where it presses too hard."""
+        course, limit_n = self._course, self._navigation.force_limit_n
+        hard = [bool((row.force[course.counted] > limit_n).any()) for row in course.rows]
+        if any(hard):
+            del course.rows[hard.index(True) :]
+
+
+def _merit(course: Course) -> tuple[bool, float]:
+    """Return how good a course is: whether it arrives, and how gently, or how far it comes."""
+    arrives = course.reached > 0.5
+    if arrives or not len(course.force):
+        return arrives, -float(course.force.max(initial=0.0)) if arrives else 0.0
+    return False, float(course.tip.abscissa[-1].mean())

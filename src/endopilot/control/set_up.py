@@ -64,7 +64,7 @@ class TipChoice:
         return tip_name(self.navigation.device)
 
 
-def choose_tip(navigation: Navigation, tip: str = "auto", *, catheter_tilt_deg: float = TILT_DEG) -> TipChoice:
+def choose_tip(navigation: Navigation, *, tip: str = "auto", catheter_tilt_deg: float = TILT_DEG) -> TipChoice:
     """Choose the shape of the wire's tip for a navigation, and turn the guiding catheter where that alone helps.
 
     Args:

@@ -48,6 +48,8 @@ def write_block(
             replace(config.simulator, threads=threads),
             actuation=config.control,
             motion=patient_motion(config, anatomy.name),
+            robot=context.robot,
+            seeds=draw.seeds,
             advance=advance,
         )
     store_block(context, block, draw, trajectory, stopped)

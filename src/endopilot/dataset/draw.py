@@ -36,6 +36,7 @@ class Draw:
         friction: friction coefficient.
         tip_bend_rad: angle of the unloaded tip.
         tip_stiffness_factor: factor on the stiffness of the distal 10 mm.
+        seeds: of each navigation's robot.
     """
 
     initial: Float[np.ndarray, "n devices 2"]
@@ -43,6 +44,7 @@ class Draw:
     friction: Float[np.ndarray, "n"]
     tip_bend_rad: Float[np.ndarray, "n"]
     tip_stiffness_factor: Float[np.ndarray, "n"]
+    seeds: tuple[tuple[int, int], ...] = ()
 
     def stacks(self, given: Stack) -> list[Stack]:
         """Return each navigation's devices; those of one tip share one object, and `given` itself where nothing is
@@ -68,7 +70,7 @@ def draw_navigations(
         sequences: their indices among those of the anatomy.
         devices: their number, each driven independently; the wire's draw is the same with and without catheters.
     """
-    controls, friction, tip, surplus, _ = _streams(config, anatomy.name)
+    controls, friction, tip, surplus, _, robots = _streams(config, anatomy.name)
     initial, control = random_controls(
         config.navigation,
         devices=devices,
@@ -90,6 +92,7 @@ def draw_navigations(
         friction=_uniform(friction, own, sequences.stop)[sequences.start :],
         tip_bend_rad=device.tip_bend_rad * _within(config.tip_bend_factor, bend),
         tip_stiffness_factor=_within(config.tip_stiffness_factor, stiffness),
+        seeds=tuple((int(robots.generate_state(1, np.uint64)[0]), index) for index in sequences),
     )
 
 
@@ -100,13 +103,13 @@ def patient_motion(config: DatasetConfig, anatomy: str) -> Motion | None:
         config: of the dataset.
         anatomy: its name.
     """
-    return motion_named(config.motion, int(_streams(config, anatomy)[-1].generate_state(1, np.uint64)[0]))
+    return motion_named(config.motion, int(_streams(config, anatomy)[4].generate_state(1, np.uint64)[0]))
 
 
 def _streams(config: DatasetConfig, anatomy: str) -> list[np.random.SeedSequence]:
-    """Return the random streams of an anatomy: of controls, friction, tip, surplus and motion."""
+    """Return the random streams of an anatomy: of controls, friction, tip, surplus, motion and robots."""
     name_number = int.from_bytes(hashlib.sha256(anatomy.encode()).digest()[:8], "little")
-    return np.random.SeedSequence([config.seed, name_number]).spawn(5)
+    return np.random.SeedSequence([config.seed, name_number]).spawn(6)
 
 
 def _uniform(

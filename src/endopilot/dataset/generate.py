@@ -21,21 +21,24 @@ from endopilot.dataset.layout import Block, Layout, make_layout
 from endopilot.dataset.splits import SPLITS
 from endopilot.dataset.workers import run_locally, run_on_cluster
 from endopilot.devices.device import Wire
+from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.progress import progress
 from endopilot.runs import claim, remove_partial_files
+from endopilot.simulation.robots import in_grip
 
 _WORK_PATH = "meta/work.json"
 """What the files written so far have cost; it moves into the manifest when the dataset is complete."""
 
 
 def generate_dataset(
-    anatomy_folders: Sequence[str | Path],
-    output: str | Path,
-    device: Wire | Stack,
-    config: DatasetConfig | None = None,
+    anatomies: Sequence[str | Path],
     *,
+    device: Wire | Stack | str | Path,
+    output: str | Path,
+    config: DatasetConfig | None = None,
+    robot: RobotConfig | None = None,
     scheduler: str | None = None,
 ) -> None:
     """Simulate random navigations of every anatomy and store them in the LeRobot v3 layout.
@@ -44,20 +47,24 @@ def generate_dataset(
     one returns at once.
 
     Args:
-        anatomy_folders: anatomies on disk, with different names.
+        anatomies: folders of anatomies with different names.
+        device: the wire or its name, or the wire and its catheters; each is driven at random and independently.
         output: folder of the dataset.
-        device: the wire, or the wire and its catheters; each is driven at random and independently.
         config: number, length, distribution and split of the navigations; the defaults if not given.
+        robot: what makes the motions and measures them; if not given, they are made as drawn.
         scheduler: address of a Dask scheduler whose workers simulate; the cores of this machine if not given.
 
     Raises:
         InputError: too few anatomies for the split, two anatomies of one name, an output folder that holds something
             else or was begun with other settings, catheters that do not fit around the wire or are to be driven by
-            force, a scheduler that cannot be reached, or a full disk.
+            force, or a robot that is, a scheduler that cannot be reached, or a full disk.
     """
     config = config or DatasetConfig()
-    folders = [Path(folder) for folder in anatomy_folders]
-    layout = make_layout(folders, Path(output), Stack.of(device), config)
+    folders, stack = [Path(folder) for folder in anatomies], Stack.of(device)
+    if robot is not None:
+        stack, core = in_grip(stack, robot, config.simulator)
+        config = replace(config, simulator=core)
+    layout = make_layout(folders, Path(output), stack, config, robot=robot)
     blocks = layout.blocks()
     claim(layout.context.output, "endopilot dataset", **layout.settings)
     if _is_finished(layout, blocks):
@@ -140,7 +147,8 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
     with writing(context.output / schema.TASKS_PATH) as partial:
         tasks.to_parquet(partial)
     samples = context.config.samples
-    write_json(context.output / schema.INFO_PATH, schema.info(context.config.control, len(episodes), samples, devices))
+    info = schema.info(context.config.control, len(episodes), samples, devices, by_robot=context.robot is not None)
+    write_json(context.output / schema.INFO_PATH, info)
     reported = ("episode_index", "anatomy", "sequence", "invalid_reason")
     invalid = [{name: row[name] for name in reported} for row in episodes if not row["valid"]]
     counts = Counter(row["split"] for row in episodes)
@@ -154,6 +162,7 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
         samples_per_episode=samples,
         device=asdict(context.stack.wire),
         catheters=[asdict(catheter) for catheter in context.stack.catheters],
+        robot=None if context.robot is None else asdict(context.robot),
         anatomies=[_anatomy_record(layout, i) for i in range(len(layout.names))],
         splits={name: counts[name] for name in SPLITS if counts[name]},
         manoeuvres=shares,

@@ -1,4 +1,4 @@
-"""Several datasets as one: `load_joined`."""
+"""Several datasets as one: `read_joined`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from endopilot.dataset.loader import Dataset, load_dataset
+from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.errors import InputError
 
 _DRIVE = ("max_velocity_mm_s", "max_rotation_rad_s", "push_limit_n", "pull_limit_n", "torque_limit_n_mm")
@@ -18,7 +18,7 @@ _OTHER = ("name", "friction", "tip_load_n", "tip_shaping", "sources", *_DRIVE)
 """What does not make another wire: names and sources, limits of the drive, and friction, which is the navigation's."""
 
 
-def load_joined(folders: Sequence[Path]) -> Dataset:
+def read_joined(folders: Sequence[Path]) -> Dataset:
     """Read datasets as one: the first one, with the episodes of the others behind its own.
 
     A patient that the first dataset holds keeps the split that it has there, so nothing that is kept for a test is
@@ -33,7 +33,7 @@ def load_joined(folders: Sequence[Path]) -> Dataset:
     """
     if not folders:
         raise InputError("dataset: none given; name at least one folder made by `endopilot dataset`")
-    first, *others = (load_dataset(folder) for folder in folders)
+    first, *others = (read_dataset(folder) for folder in folders)
     for other in others:
         first = _joined(first, other)
     return first
@@ -55,7 +55,12 @@ def _joined(first: Dataset, other: Dataset) -> Dataset:
         "anatomies": list(records.values()),
     }
     names = [field.name for field in fields(Dataset) if field.name not in ("folder", "manifest", "sample_period_s")]
-    arrays = {name: np.concatenate([getattr(first, name), getattr(other, name)]) for name in names}
+    pairs = {name: (getattr(first, name), getattr(other, name)) for name in names}
+    # where one of them has no robot, neither has what it measured
+    arrays = {
+        name: np.concatenate(pair) if all(isinstance(part, np.ndarray) for part in pair) else None
+        for name, pair in pairs.items()
+    }
     return replace(first, manifest=manifest, **arrays)
 
 

@@ -19,6 +19,7 @@ from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.draw import patient_motion
 from endopilot.dataset.splits import assign_splits
 from endopilot.devices.catheter import check_nested
+from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import json_text, read_json
@@ -61,6 +62,7 @@ class BlockContext:
         stack: the wire, and the catheters around it.
         key: marks the files of this dataset; it follows from all settings.
         task: what the navigations do, as LeRobot names it.
+        robot: what makes the motions; None where they are made as drawn.
     """
 
     output: Path
@@ -68,6 +70,7 @@ class BlockContext:
     stack: Stack
     key: str
     task: str = schema.TASK
+    robot: RobotConfig | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +113,7 @@ def make_layout(
     config: DatasetConfig,
     *,
     task: str = schema.TASK,
+    robot: RobotConfig | None = None,
     origin: Mapping[str, Any] | None = None,
 ) -> Layout:
     """Read the anatomies' records, and lay out the dataset in blocks.
@@ -120,6 +124,7 @@ def make_layout(
         stack: the wire, and the catheters around it.
         config: number, length, distribution and split of the navigations.
         task: what they do.
+        robot: what makes the motions; they are made as drawn if not given.
         origin: what else they follow from, where they were not drawn at random.
 
     Raises:
@@ -129,6 +134,8 @@ def make_layout(
     check_nested(stack.wire, stack.catheters)
     if stack.catheters and config.control == "force":
         raise InputError("control: 'force' with catheters; give 'velocity'")
+    if robot is not None and config.control == "force":
+        raise InputError("control: 'force' with a robot, which takes velocities; give 'velocity'")
     if not folders:
         raise InputError("anatomies: none given; name at least one folder made by `endopilot anatomy`")
     names, identities = zip(*(identify(Path(folder)) for folder in folders), strict=True)
@@ -146,11 +153,12 @@ def make_layout(
         "anatomies": dict(zip(names, identities, strict=True)),
         "version": version(),
         **({"catheters": [asdict(catheter) for catheter in stack.catheters]} if stack.catheters else {}),
+        **({} if robot is None else {"robot": asdict(robot)}),
         **(origin or {}),
     }
     settings = json.loads(json_text(settings))  # as JSON gives them back, so that they compare equal
     key = hashlib.sha256(json_text(settings).encode()).hexdigest()
-    context = BlockContext(Path(output), config, stack, key, task)
+    context = BlockContext(Path(output), config, stack, key, task, robot)
     motions = tuple(patient_motion(config, name) for name in names)
     return Layout(context, tuple(map(Path, folders)), names, identities, splits, motions, settings)
 

@@ -14,15 +14,18 @@ from endopilot.dataset.schema import (
     INFO_PATH,
     LEROBOT_VERSION,
     MANIFEST_PATH,
+    OF_ROBOT,
     OWN_COLUMNS,
     STATE,
     actuation_of,
     devices_of,
+    made_by_robot,
     paths_of_file,
     signal_columns,
 )
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire
+from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack, column_prefixes
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
@@ -60,6 +63,10 @@ class Dataset(Outputs):
         control: π = (dΔ/dt mm/s, dφ/dt rad/s), what was made of it.
         tip_abscissa: Δtip, mm.
         tip_offset: γtip, mm.
+        decided: what the robot was told, mm/s and rad/s; None where no robot made the motions, and `command` is what
+            its drives made of that, as the mean over a sample.
+        encoders: inserted length, mm, and rotation, rad, as the robot measured them, likewise.
+        load: force, N, and torque, N·mm, of the drives as the robot measured them, likewise.
         branch: index of the branch that the tip lies in.
         lumen_radius: lumen radius at the tip's projection, mm.
     """
@@ -81,6 +88,9 @@ class Dataset(Outputs):
     tip_offset: Float[np.ndarray, "episodes samples devices"]
     branch: Int[np.ndarray, "episodes samples devices"]
     lumen_radius: Float[np.ndarray, "episodes samples devices"]
+    decided: Float[np.ndarray, "episodes samples devices 2"] | None = None
+    encoders: Float[np.ndarray, "episodes samples devices 2"] | None = None
+    load: Float[np.ndarray, "episodes samples devices 2"] | None = None
 
     def __len__(self) -> int:
         """Return the number of episodes."""
@@ -110,8 +120,9 @@ class Dataset(Outputs):
 
     def select(self, episodes: Shaped[np.ndarray, "chosen"]) -> Dataset:
         """Return the chosen episodes, given as a mask or as indices."""
-        names = [f.name for f in fields(self) if f.name not in ("folder", "manifest", "sample_period_s")]
-        return replace(self, **{name: getattr(self, name)[episodes] for name in names})
+        arrays = {each.name: getattr(self, each.name) for each in fields(self)}
+        chosen = {name: values[episodes] for name, values in arrays.items() if isinstance(values, np.ndarray)}
+        return replace(self, **chosen)
 
     def of_split(self, split: str) -> Dataset:
         """Return the episodes of one split that are valid to the end.
@@ -127,6 +138,12 @@ class Dataset(Outputs):
                 "make the dataset with more anatomies or sequences"
             )
         return self.select(chosen)
+
+    @property
+    def robot(self) -> RobotConfig | None:
+        """What made the motions; None where they were made as drawn."""
+        record = self.manifest.get("robot")
+        return None if record is None else from_record(RobotConfig, record)
 
     @property
     def patients(self) -> dict[str, str]:
@@ -183,7 +200,7 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     return manifest, info
 
 
-def load_dataset(folder: Path) -> Dataset:
+def read_dataset(folder: str | Path) -> Dataset:
     """Read a whole dataset made by `endopilot dataset`.
 
     Raises:
@@ -203,6 +220,7 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
 
     samples, total = manifest["samples_per_episode"], info["total_episodes"]
     actuation, devices = actuation_of(info["features"]), devices_of(info["features"])
+    by_robot = made_by_robot(info["features"])
     episodes: dict[str, list[np.ndarray]] = {}
     signal: dict[str, np.ndarray] = {}
     filled = 0
@@ -220,7 +238,7 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
         end = filled + table.num_rows
         if end > total:
             break
-        for name in signal_columns(actuation, devices):
+        for name in signal_columns(actuation, devices, by_robot=by_robot):
             values = column_values(data, name)
             values = values.reshape(table.num_rows, samples, *values.shape[1:])
             if name not in signal:  # in place, so that a large dataset is never held twice
@@ -243,6 +261,7 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
     else:
         slip = np.stack([recorded["slip"], recorded["rotation_slip"]], axis=-1)
         control = (vectors["action"] - slip * info["fps"]).astype(np.float32)
+    recorded |= {name: signal[name].reshape(*shape, 2) for name in OF_ROBOT if by_robot}
     prefixes = column_prefixes(devices)
     starts = [f"{prefix}initial_{name}" for prefix in prefixes for name in ("inserted_length_mm", "rotation_rad")]
     return Dataset(

@@ -10,17 +10,21 @@ navigation again. Catheters around the wire are held back by the same rules, eac
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from endopilot.devices.drive_limits import within_travel
+from endopilot.devices.drive_limits import DriveLimits, within_travel
+from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.simulation.checks import check_shape_memory
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.recorder import Recorder
+from endopilot.simulation.robots import Robots
 from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.state import Step
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, TipProjection, VesselTree
 
@@ -44,6 +48,8 @@ def simulate_navigations(
     *,
     actuation: Actuation = "velocity",
     motion: Motion | None = None,
+    robot: RobotConfig | None = None,
+    seeds: Sequence[Sequence[int]] = (),
     record_shape: bool = False,
     advance: Callable[[int], None] = lambda samples: None,
 ) -> tuple[Trajectory, Bool[np.ndarray, "worlds"]]:
@@ -58,11 +64,16 @@ def simulate_navigations(
         config: settings of the rod core.
         actuation: what the controls are.
         motion: how the vessel moves with time; it lies still if not given.
+        robot: what makes the motions and measures them, its drives' mean over a sample moves the devices; they are made
+            as drawn if not given.
+        seeds: of each world's robot.
         record_shape: record the positions of all nodes too.
         advance: called after each sample with the number of worlds.
 
     Returns:
-        What was driven, and which worlds were stopped short. Commands are float32 numbers.
+        What was driven, and which worlds were stopped short. Commands are float32 numbers. With a robot, its columns
+        are what the robot was told (`decided`), and what it measured (`encoders`, `load`); commands are then what its
+        drives made of that.
     """
     watch = _PushRoom(anatomy.tree, stacks)
     simulator = Simulator(anatomy, stacks, actuation=actuation, motion=motion, config=config)
@@ -73,6 +84,7 @@ def simulate_navigations(
     stopped = np.zeros(len(control), dtype=bool)
     inserted = simulator.inserted_length
     last, slip = np.zeros_like(inserted), np.zeros_like(inserted)
+    robots = None if robot is None else _Driven(simulator, robot, anatomy, stacks, seeds)
     for sample in range(control.shape[1]):
         drawn = control[:, sample, :, 0]
         caught = (slip > 0) | (simulator.base_load[..., 0] > watch.caught_n)
@@ -83,10 +95,40 @@ def simulate_navigations(
         if actuation == "velocity":
             held = within_travel(np.minimum(held, room / SAMPLE_PERIOD_S), inserted, SAMPLE_PERIOD_S)
         stopped |= ((drawn > 0) & (held < drawn)).any(axis=1)
-        step = recorder.step(np.stack([held, control[:, sample, :, 1]], axis=-1).astype(np.float32))
+        told = np.stack([held, control[:, sample, :, 1]], axis=-1).astype(np.float32)
+        step = recorder.step(told) if robots is None else robots.step(told, recorder)
         slip, last, inserted = step.slip, step.inserted_length - inserted, step.inserted_length
         advance(len(control))
-    return recorder.trajectory(), stopped
+    trajectory = recorder.trajectory()
+    return trajectory if robots is None else replace(trajectory, columns=robots.columns), stopped
+
+
+class _Driven:
+    """The robots of the worlds, and what they were told and have measured at each sample."""
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        config: RobotConfig,
+        anatomy: Anatomy,
+        stacks: Sequence[Stack],
+        seeds: Sequence[Sequence[int]],
+    ) -> None:
+        limits = [[DriveLimits.of(device, anatomy) for device in stack.devices] for stack in stacks]
+        self._robots = Robots(simulator, config, limits, seeds=seeds)
+        self._rows: list[Float[np.ndarray, "worlds devices 6"]] = []
+
+    def step(self, told: Float[np.ndarray, "worlds devices 2"], recorder: Recorder) -> Step:
+        self._robots.motion.command(told.astype(float))
+        step = recorder.step(self._robots.advance(recorder.period_s))
+        self._robots.follow(recorder.simulator)
+        self._rows.append(np.concatenate([told, self._robots.read(recorder.simulator)], axis=-1))
+        return step
+
+    @property
+    def columns(self) -> dict[str, Float[np.ndarray, "worlds samples devices 2"]]:
+        decided, encoders, load = np.split(np.stack(self._rows, axis=1), 3, axis=-1)
+        return {"decided": decided, "encoders": encoders, "load": load}
 
 
 class _PushRoom:

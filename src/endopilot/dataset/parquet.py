@@ -10,7 +10,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from endopilot.dataset.schema import INDEX_COLUMNS, MANOEUVRES, OWN_COLUMNS, STATE, manoeuvres, signal_columns
+from endopilot.dataset.schema import (
+    INDEX_COLUMNS,
+    MANOEUVRES,
+    OF_ROBOT,
+    OWN_COLUMNS,
+    STATE,
+    manoeuvres,
+    signal_columns,
+)
 from endopilot.errors import InputError
 from endopilot.progress import Advance
 from endopilot.simulation.config import Actuation
@@ -47,7 +55,9 @@ def sample_table(trajectory: Trajectory, first_episode: int, key: str) -> pa.Tab
         **{column: signals[name] for column, (name, *_) in OWN_COLUMNS.items()},
     }
     kinds = dict.fromkeys(INDEX_COLUMNS, ("int64", None)) | {"timestamp": ("float32", None)}
-    kinds |= signal_columns(trajectory.set_up.actuation, trajectory.devices)
+    columns |= trajectory.columns
+    by_robot = set(OF_ROBOT) <= set(trajectory.columns)
+    kinds |= signal_columns(trajectory.set_up.actuation, trajectory.devices, by_robot=by_robot)
     arrays = {name: _column(columns[name], *kinds[name]) for name in columns if name in kinds}
     return pa.table(arrays).replace_schema_metadata({_KEY: key.encode()})
 
@@ -132,7 +142,8 @@ def statistics(
         count += int(valid.sum())
         velocity = column_values(table, "velocity" if actuation == "force" else "action")[valid]
         driven += np.bincount(manoeuvres(velocity), minlength=len(driven))
-        for name, (dtype, _) in signal_columns(actuation, devices).items():
+        by_robot = set(OF_ROBOT) <= set(table.column_names)
+        for name, (dtype, _) in signal_columns(actuation, devices, by_robot=by_robot).items():
             if dtype == "bool" or not valid.any():
                 continue
             values = column_values(table, name)[valid].astype(np.float64).reshape(int(valid.sum()), -1)

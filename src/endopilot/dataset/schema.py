@@ -53,24 +53,30 @@ OWN_COLUMNS = dict(
     if name not in STATE
 )
 """Signals that have a column of their own: by the column, the signal, its type and the names of its components."""
+OF_ROBOT = ("decided", "encoders", "load")
+"""Signals that a dataset made by a robot has besides: what the robot was told, and what it measured."""
 MANOEUVRES = ("insertion", "retraction", "spin", "pause")
 _MOVES_MM_S, _TURNS_RAD_S = 0.1, 0.02
 """Below these a drive rests: mm/s, rad/s."""
 
 
-def signal_columns(actuation: Actuation, devices: int = 1) -> dict[str, tuple[str, list[str] | None]]:
+def signal_columns(
+    actuation: Actuation, devices: int = 1, *, by_robot: bool = False
+) -> dict[str, tuple[str, list[str] | None]]:
     """Return the name of each simulated column, its type, and the names of its components if it is a vector.
 
     `action` is what the drives were commanded, with all its digits: simulated again it gives the same navigation to the
     bit. Under force control, `velocity` is the resulting velocity. The load of a drive is always in `drive_force_n` and
     `drive_torque_nmm`. With catheters, a column has components of each device, those of catheter k named
-    `catheter_k_...`.
+    `catheter_k_...`. A robot adds what it was told, `decided`, and what it measured, `encoders` and `load`.
     """
     vectors: dict[str, tuple[str, list[str] | None]] = {
         "action": ("float64", LOAD if actuation == "force" else VELOCITY),
         **({"velocity": ("float32", VELOCITY)} if actuation == "force" else {}),
         "observation.state": ("float32", [SIGNALS[name].columns[0] for name in STATE]),
     }
+    if by_robot:
+        vectors |= {name: ("float32", list(SIGNALS[name].columns)) for name in OF_ROBOT}
     found = {column: (kind, _components(names, devices)) for column, (kind, names) in vectors.items()}
     for column, (name, kind, names) in OWN_COLUMNS.items():
         found[column] = (kind, _components(names, devices) if SIGNALS[name].of_devices else names)
@@ -102,11 +108,16 @@ def manoeuvres(velocity: np.ndarray) -> np.ndarray:
     return np.select([along > _MOVES_MM_S, along < -_MOVES_MM_S, turn > _TURNS_RAD_S], [0, 1, 2], 3)
 
 
-def features(actuation: Actuation, devices: int = 1) -> dict[str, dict[str, Any]]:
+def made_by_robot(described: Mapping[str, Any]) -> bool:
+    """Return whether a robot made the motions of a dataset, from the `features` of its `meta/info.json`."""
+    return "encoders" in described
+
+
+def features(actuation: Actuation, devices: int = 1, *, by_robot: bool = False) -> dict[str, dict[str, Any]]:
     """Return the `features` entry of `meta/info.json`: type, shape and component names of every column."""
     described = {"timestamp": {"dtype": "float32", "shape": [1], "names": None}}
     described |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in INDEX_COLUMNS}
-    for name, (dtype, names) in signal_columns(actuation, devices).items():
+    for name, (dtype, names) in signal_columns(actuation, devices, by_robot=by_robot).items():
         described[name] = {"dtype": dtype, "shape": [len(names) if names else 1], "names": names}
     return described
 
@@ -118,7 +129,9 @@ def paths_of_file(folder: Path, number: int) -> tuple[Path, Path]:
     return folder / DATA_PATH.format(**where), folder / EPISODES_PATH.format(**where)
 
 
-def info(actuation: Actuation, episodes: int, samples_per_episode: int, devices: int = 1) -> dict[str, Any]:
+def info(
+    actuation: Actuation, episodes: int, samples_per_episode: int, devices: int = 1, *, by_robot: bool = False
+) -> dict[str, Any]:
     """Return the content of `meta/info.json`.
 
     LeRobot's `splits` are ranges of episodes, which ours are not: they are in the episode table, column `split`.
@@ -134,5 +147,5 @@ def info(actuation: Actuation, episodes: int, samples_per_episode: int, devices:
         "splits": {},
         "data_path": DATA_PATH,
         "video_path": None,
-        "features": features(actuation, devices),
+        "features": features(actuation, devices, by_robot=by_robot),
     }

@@ -81,7 +81,7 @@ class _Shape:
 
 
 @settings
-class _CatheterFile:
+class CatheterFile:
     """What a catheter's file holds; `Wire` and `Catheter` say what each constant means."""
 
     name: Text
@@ -116,7 +116,7 @@ def read_catheter(name_or_path: str | Path) -> Catheter:
     if not there(path):
         names = ", ".join(list_catheters())
         raise InputError(f"catheter '{name_or_path}': no such catheter or file; give a path, or choose from {names}")
-    content = read_settings(path, _CatheterFile)
+    content = read_settings(path, CatheterFile)
     entries = {field.name: getattr(content, field.name) for field in fields(content)}
     constants = {name: entry.value for name, entry in entries.items() if isinstance(entry, Sourced)}
     try:

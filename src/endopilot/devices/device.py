@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Annotated, Any, Generic, TypeVar
 
 import numpy as np
-import yaml
 from jaxtyping import Float
 from pydantic import model_validator
 
@@ -39,7 +38,6 @@ from endopilot.devices.device_ranges import (
     check_tip,
 )
 from endopilot.errors import InputError
-from endopilot.files import writing
 from endopilot.settings import NonNegative, Positive, Text, Within, read_settings, settings
 from endopilot.types import Anatomy
 
@@ -233,7 +231,7 @@ class _Shaping(TipShaping):
 
 
 @settings
-class _DeviceFile:
+class WireFile:
     """What a device's file holds; `Wire` says what each constant means."""
 
     name: Text
@@ -252,14 +250,14 @@ class _DeviceFile:
     tip_shaping: _Shaping | None = None
 
 
-def read_device(name_or_path: str | Path) -> Wire:
+def read_wire(name_or_path: str | Path) -> Wire:
     """Read a device by its name (`endopilot.devices.device_files`), or from a YAML file.
 
     Raises:
         InputError: no such device, or a file that is not a device; the line names file, field, value and mend.
     """
     path = device_file(name_or_path)
-    content = read_settings(path, _DeviceFile)
+    content = read_settings(path, WireFile)
     entries = {field.name: getattr(content, field.name) for field in fields(content) if field.name != "name"}
     entries = {name: entry for name, entry in entries.items() if entry is not None}
     shaping = content.tip_shaping
@@ -278,31 +276,6 @@ def read_device(name_or_path: str | Path) -> Wire:
         return device
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-
-
-def write_device(device: Wire, path: Path) -> None:
-    """Write a device as a file that `read_device` reads, with the same constants.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-
-    def sourced(name: str) -> dict[str, Any]:
-        value = getattr(device, name)
-        return {"value": list(value) if isinstance(value, tuple) else value, "source": device.sources[name]}
-
-    names = [field.name for field in fields(_DeviceFile) if field.name not in ("name", "tip_bend", "tip_shaping")]
-    angle_deg = round(math.degrees(device.tip_bend_rad), 10)
-    if math.radians(angle_deg) != device.tip_bend_rad:
-        angle_deg = math.degrees(device.tip_bend_rad)
-    bend = {"angle_deg": angle_deg, "length_mm": device.tip_bend_length_mm, "source": device.sources["tip_bend"]}
-    content = {"name": device.name} | {name: sourced(name) for name in names} | {"tip_bend": bend}
-    shaping = device.tip_shaping
-    if shaping is not None:
-        limits = {"angle_deg": list(shaping.angle_deg), "length_mm": list(shaping.length_mm)}
-        content["tip_shaping"] = limits | {"source": device.sources["tip_shaping"]}
-    with writing(path) as partial:
-        partial.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
 
 
 def check_fits(device: Device, anatomy: Anatomy) -> None:

@@ -18,7 +18,7 @@ FOLDER_VARIABLE = "ENDOPILOT_DEVICES"
 _SHIPPED = Path(__file__).parent / "wires"
 
 
-def list_devices() -> tuple[str, ...]:
+def list_wires() -> tuple[str, ...]:
     """Return the names of the shipped devices."""
     return tuple(sorted(path.stem for path in _SHIPPED.glob("*.yaml")))
 
@@ -30,7 +30,7 @@ def user_devices() -> tuple[str, ...]:
         InputError: ENDOPILOT_DEVICES names no folder.
     """
     names = {path.stem for folder in _user_folders() for path in folder.glob("*.yaml")}
-    return tuple(sorted(names - set(list_devices())))
+    return tuple(sorted(names - set(list_wires())))
 
 
 def device_file(name_or_path: str | Path) -> Path:
@@ -46,7 +46,7 @@ def device_file(name_or_path: str | Path) -> Path:
         raise InputError(f"device '{name_or_path}': {' and '.join(map(str, files))} both hold it; rename yours")
     path = files[0] if files else Path(name_or_path)
     if not there(path):
-        names = ", ".join((*list_devices(), *user_devices()))
+        names = ", ".join((*list_wires(), *user_devices()))
         raise InputError(f"device '{name_or_path}': no such device or file; give a path, or choose from {names}")
     return path
 

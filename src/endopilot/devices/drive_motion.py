@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 from jaxtyping import Float
 
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.play import through_play
 from endopilot.devices.robot import RobotConfig
 
 _ROUNDING_S = 1e-12
@@ -40,7 +40,7 @@ class DriveMotion:
         *,
         seeds: Sequence[int | Sequence[int]] = (0,),
     ) -> None:
-        """Begin at rest, in the middle of the play.
+        """Begin at rest, in the middle of the play, or somewhere in it if the encoders do not see it.
 
         Args:
             config: latency, jitter, accelerations, gains and plays.
@@ -50,15 +50,15 @@ class DriveMotion:
         """
         robots, devices, _ = position.shape
         self._acceleration = config.of_drives(devices, "max_acceleration_mm_s2", "max_acceleration_rad_s2")[None]
-        self._half_play = config.of_drives(devices, "play_mm", "play_rad")[None] / 2
         self._fastest = np.array([[each.fastest for each in of_robot] for of_robot in limits])
         self._travel = np.moveaxis(np.array([[each.travel_mm for each in of_robot] for of_robot in limits]), -1, 0)
         self._latency_s, self._jitter_s = config.latency_s, config.jitter_s
-        self._draw_gains = partial(config.gains, devices)
+        self._config, self._devices = config, devices
         self._random = [np.random.default_rng(seed) for seed in seeds]
-        self._gain = np.stack([self._draw_gains(random) for random in self._random])
+        drawn = [self._drawn(random) for random in self._random]
+        self._gain, self._half_play, ahead = (np.stack(each) for each in zip(*drawn, strict=True))
         self._top = self._fastest / np.maximum(self._gain, 1.0)  # of the motors: no device goes faster than its limit
-        self._wanted, self._ahead = np.zeros(position.shape), np.zeros(position.shape)
+        self._wanted, self._ahead = np.zeros(position.shape), ahead
         self._ramp = np.broadcast_to(self._acceleration, position.shape).copy()
         self._orders: deque[tuple[Float[np.ndarray, "robots"], Float[np.ndarray, "robots devices 2"]]] = deque()
         self._clock = np.zeros(robots)
@@ -87,15 +87,15 @@ class DriveMotion:
     def reset(
         self, robots: Sequence[int], position: Float[np.ndarray, "chosen devices 2"], seeds: Sequence[Sequence[int]]
     ) -> None:
-        """Put other robots, drawn by their seeds, in the place of some, at rest in the middle of the play."""
+        """Put other robots, drawn by their seeds, in the place of some, at rest where they are."""
         chosen = np.asarray(robots, dtype=int)
         for robot, seed in zip(robots, seeds, strict=True):
             self._random[robot] = np.random.default_rng(seed)
-            self._gain[robot] = self._draw_gains(self._random[robot])
+            self._gain[robot], self._half_play[robot], self._ahead[robot] = self._drawn(self._random[robot])
         self._top = self._fastest / np.maximum(self._gain, 1.0)
         for due, velocity in self._orders:
             due[chosen], velocity[chosen] = -np.inf, 0.0
-        for array in (self._wanted, self._ahead, self.velocity):
+        for array in (self._wanted, self.velocity):
             array[chosen] = 0.0
         self._ramp[chosen] = self._acceleration
         self.motor[chosen], self.position[chosen] = position, position
@@ -109,6 +109,18 @@ class DriveMotion:
             self._move((until - self._clock)[:, None, None])
             self._clock = until
         return self.position - before
+
+    def _drawn(self, random: np.random.Generator) -> tuple[Float[np.ndarray, "devices 2"], ...]:
+        """Draw a robot: its gains, half its plays, and how far the motors are ahead of the devices at the start.
+
+        That is nothing, in the middle of the play, or anywhere in it where encoders at the motors do not see it.
+        """
+        config, devices = self._config, self._devices
+        gain = config.gains(devices, random)
+        apart = random.spawn(1)[0]  # what is drawn from the stream stays the same
+        half_play = config.plays(devices, apart) / 2
+        ahead = apart.uniform(-1.0, 1.0, half_play.shape) * half_play
+        return gain, half_play, ahead * (config.encoders_at == "motor")
 
     def _obey(self) -> None:
         """Take what is due of each robot, and forget what all have taken."""
@@ -131,8 +143,6 @@ class DriveMotion:
         motor = (self.velocity + reached) / 2 * ramp + reached * (duration - ramp)
         self.velocity, self.motor = reached, self.motor + motor
         driven = self._gain * motor
-        ahead = np.clip(self._ahead + driven, -self._half_play, self._half_play)
-        moved = driven - (ahead - self._ahead)
-        self._ahead = ahead
+        self._ahead, moved = through_play(self._ahead, driven, self._half_play)
         self.position = self.position + moved
         self.position[..., 0] = np.clip(self.position[..., 0], *self._travel)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.devices.catheter import Catheter, check_nested
-from endopilot.devices.device import Device, Wire, check_fits
+from endopilot.devices.catheter import Catheter, check_nested, read_catheter
+from endopilot.devices.device import Device, Wire, check_fits, read_wire
 from endopilot.devices.transmission import Transmission
 from endopilot.errors import InputError
+from endopilot.lines import length_along
 from endopilot.types import Anatomy
 
 SHOWN_BEHIND_MM = 20.0
@@ -45,9 +47,21 @@ class Stack:
             object.__setattr__(self, "transmissions", (Transmission(),) * len(self))
 
     @staticmethod
-    def of(device: Wire | Stack) -> Stack:
-        """Return a stack as it is, and a wire as a stack of one."""
-        return device if isinstance(device, Stack) else Stack(device)
+    def of(device: Wire | Stack | str | Path, *catheters: Catheter | str | Path) -> Stack:
+        """Return the stack of a wire and catheters, each given itself, by its name or by its YAML file.
+
+        Args:
+            device: the wire, or a stack that the catheters are put around.
+            catheters: from the inside out; their drives act at the ostium.
+
+        Raises:
+            InputError: no such wire or catheter.
+        """
+        around = tuple(each if isinstance(each, Catheter) else read_catheter(each) for each in catheters)
+        if not isinstance(device, Stack):
+            return Stack(device if isinstance(device, Wire) else read_wire(device), around)
+        further = tuple(Transmission() for _ in around)
+        return replace(device, catheters=device.catheters + around, transmissions=device.transmissions + further)
 
     def __len__(self) -> int:
         """Return the number of devices."""
@@ -57,6 +71,11 @@ class Stack:
     def devices(self) -> tuple[Device, ...]:
         """The wire, then the catheters around it."""
         return (self.wire, *self.catheters)
+
+    @property
+    def name(self) -> str:
+        """The names of its devices, such as "workhorse-014 in microcatheter-1.7f"."""
+        return " in ".join(device.name for device in self.devices)
 
     @property
     def outer_radius_mm(self) -> float:
@@ -106,16 +125,16 @@ def column_prefixes(devices: int) -> tuple[str, ...]:
 
 
 def lines_from_tips(
-    nodes: Float[np.ndarray, "n 3"], inserted_mm: Float[np.ndarray, "devices"]
+    nodes: Float[np.ndarray, "n 3"], inserted_length_mm: Float[np.ndarray, "devices"]
 ) -> list[Float[np.ndarray, "_ 3"]]:
     """Return the line that telescoping devices share, as each of them has it: from its own tip on.
 
     Args:
         nodes: of the line, from the foremost tip on, LPS mm.
-        inserted_mm: inserted length of each device; the foremost tip is that of the largest.
+        inserted_length_mm: inserted length of each device; the foremost tip is that of the largest.
     """
-    behind = inserted_mm.max() - inserted_mm
-    along = _along(nodes)
+    behind = inserted_length_mm.max() - inserted_length_mm
+    along = length_along(nodes)
     return [
         nodes if at == 0 else np.vstack([_at(nodes, along, at), nodes[along > at + _APART_MM]])
         for at in behind.tolist()
@@ -130,12 +149,7 @@ def shown_part(nodes: Float[np.ndarray, "n 3"], deepest_mm: float) -> Float[np.n
         deepest_mm: inserted length of the device with that tip.
     """
     nodes = nodes[np.isfinite(nodes).all(axis=1)]
-    return nodes[_along(nodes) <= deepest_mm + SHOWN_BEHIND_MM]
-
-
-def _along(nodes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """Return how far from the first node each one lies along the line, mm."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
+    return nodes[length_along(nodes) <= deepest_mm + SHOWN_BEHIND_MM]
 
 
 def _at(nodes: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n"], at_mm: float) -> Float[np.ndarray, "3"]:

@@ -34,6 +34,7 @@ class Measured:
         contact_force: largest force of the wall on one node, N.
         inserted_length: Δ of the devices, mm.
         rotation: φ, rad.
+        encoders: both as they are measured: by a robot's encoders where there is a robot.
         valid: false for a world that has failed.
     """
 
@@ -43,11 +44,14 @@ class Measured:
     contact_force: Float[np.ndarray, "worlds"]
     inserted_length: Float[np.ndarray, "worlds devices"]
     rotation: Float[np.ndarray, "worlds devices"]
+    encoders: Float[np.ndarray, "worlds devices 2"]
     valid: Bool[np.ndarray, "worlds"]
 
     @classmethod
-    def after(cls, step: Step, simulator: Simulator) -> Measured:
-        """Return the worlds at the end of a step."""
+    def after(
+        cls, step: Step, simulator: Simulator, encoders: Float[np.ndarray, "worlds devices 2"] | None
+    ) -> Measured:
+        """Return the worlds at the end of a step, with what encoders say; what is true if not given."""
         return cls(
             tip=simulator.project(),
             position=step.tip_position,
@@ -55,12 +59,13 @@ class Measured:
             contact_force=step.contact_force_max,
             inserted_length=step.inserted_length,
             rotation=step.rotation,
+            encoders=simulator.proximal if encoders is None else encoders,
             valid=step.valid,
         )
 
     @classmethod
-    def current(cls, simulator: Simulator) -> Measured:
-        """Return the worlds as they are now."""
+    def current(cls, simulator: Simulator, encoders: Float[np.ndarray, "worlds devices 2"] | None) -> Measured:
+        """Return the worlds as they are now, with what encoders say; what is true if not given."""
         return cls(
             tip=simulator.project(),
             position=simulator.tip_position,
@@ -68,6 +73,7 @@ class Measured:
             contact_force=simulator.contacts.max(axis=1),
             inserted_length=simulator.inserted_length,
             rotation=simulator.rotation,
+            encoders=simulator.proximal if encoders is None else encoders,
             valid=simulator.valid,
         )
 
@@ -88,7 +94,7 @@ def observe(
         force_limit_n: their force limits.
         time_share: share of the time limit that is used up.
     """
-    tip, inserted, turned = now.tip[:, 0], now.inserted_length[:, 0], now.rotation[:, 0]
+    tip, inserted, turned = now.tip[:, 0], now.encoders[:, 0, 0], now.encoders[:, 0, 1]
     place = routes.place(tip)
     outside = np.empty((len(time_share), 3, 2))
     outside[:, :, 0] = now.direction[:, 0]
@@ -111,7 +117,7 @@ def observe(
     on_route = routes.on_route(now.tip)
     for device in range(1, now.rotation.shape[1]):
         begin = _OF_WIRE + _OF_CATHETER * (device - 1)
-        tip, inserted, turned = now.tip[:, device], now.inserted_length[:, device], now.rotation[:, device]
+        tip, (inserted, turned) = now.tip[:, device], now.encoders[:, device].T
         out[:, begin] = inserted / 100.0
         out[:, begin + 1], out[:, begin + 2] = np.cos(turned), np.sin(turned)
         out[:, begin + 3] = tip.abscissa / 100.0

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from endopilot.devices.stack import lines_from_tips, shown_part
+from endopilot.lines import length_along, places_on
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation
 
@@ -53,9 +54,9 @@ class Picture:
         """Draw a line through points, LPS mm, with a dot every half pixel; what lies beyond the picture is left out."""
         across, up = ((points[:, self._axes] - self._middle) * self._px_per_mm).T
         line = np.column_stack([SIZE / 2 - up, SIZE / 2 + across])
-        along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1)))
+        along = length_along(line)
         at = np.linspace(0.0, along[-1], 1 + int(2 * along[-1]))
-        centres = np.column_stack([np.interp(at, along, column) for column in line.T])
+        centres = places_on(line, along, at)
         radius = np.maximum(np.round(4 * np.interp(at, along, radius_px)) / 4, 0.5)
         for each in np.unique(radius):
             reach = np.arange(-np.ceil(each), np.ceil(each) + 1)

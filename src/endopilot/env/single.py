@@ -10,6 +10,7 @@ from gymnasium.vector import AutoresetMode
 from jaxtyping import Float, UInt8
 from numpy.typing import ArrayLike
 
+from endopilot.devices.robot import RobotConfig
 from endopilot.env.vector import NavigateVectorEnv, NavigationState
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
@@ -39,6 +40,7 @@ class NavigateEnv(gymnasium.Env):
         patient: int = 0,
         catheter: str | None = None,
         motion: Motion | None = None,
+        robot: RobotConfig | str | None = None,
         config: SimulatorConfig = CORE,
         render_mode: str | None = None,
     ) -> None:
@@ -50,6 +52,7 @@ class NavigateEnv(gymnasium.Env):
             patient: which of its training patients.
             catheter: name of a catheter around the wire, or a YAML file; its tip is to arrive then.
             motion: how heart and breath move the vessel and its guiding catheter; they lie still if not given.
+            robot: what drives, or its name or YAML file; the devices do as they are told if not given.
             config: settings of the rod core.
             render_mode: "rgb_array" lets `render` return pictures.
         """
@@ -60,6 +63,7 @@ class NavigateEnv(gymnasium.Env):
             catheter=catheter,
             autoreset_mode=AutoresetMode.DISABLED,
             motion=motion,
+            robot=robot,
             config=config,
             render_mode=render_mode,
         )

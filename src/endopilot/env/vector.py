@@ -16,14 +16,17 @@ from jaxtyping import Bool, Float, UInt8
 from numpy.typing import ArrayLike
 
 from endopilot.devices.drive_limits import DriveLimits, within_travel
+from endopilot.devices.robot import RobotConfig, read_robot
+from endopilot.devices.stack import Stack
 from endopilot.env.observation import Measured, observe, space
 from endopilot.env.picture import Picture
 from endopilot.env.route_tables import RouteTables
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
+from endopilot.simulation.robots import Robots, in_grip
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import SimulatorState
+from endopilot.simulation.state import SimulatorState, Step
 from endopilot.tasks.navigation import Navigation, is_safe, reached
 from endopilot.tasks.task import CORE, in_catheter, reference_navigation, training_navigations
 
@@ -44,6 +47,8 @@ _MASKS = tuple(
 """Names of the masks in the info of a vector environment."""
 _OF_CATHETER = ("inserted_length", "rotation", "tip_abscissa", "tip_offset", "tip_branch")
 """What the info tells of each catheter."""
+_MEASURED = ("encoder_inserted_length", "encoder_rotation", "load_n", "load_nmm")
+"""What the info tells of what a robot measures of the wire."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +62,8 @@ class NavigationState:
         safe: worlds whose force has not been too large since their reset.
         ended: worlds whose episode has ended, which the next step resets.
         generators: state of each world's random generator.
+        robots: what drives, as it is kept within the environment; None without a robot.
+        readings: what they measured last; None likewise.
     """
 
     simulator: SimulatorState
@@ -65,6 +72,8 @@ class NavigationState:
     safe: np.ndarray
     ended: np.ndarray
     generators: tuple[dict[str, Any], ...]
+    robots: Any
+    readings: np.ndarray | None
 
 
 class NavigateVectorEnv(VectorEnv):
@@ -77,9 +86,10 @@ class NavigateVectorEnv(VectorEnv):
     does; which branch it enters at a fork depends on where the bend points. All worlds are stepped by one `Simulator`;
     `NavigateEnv` is this class with one world. A world's course does not depend on the others, to the last bit.
 
-    It is no `NavigationLoop`: there is no robot with its latency and backlash, no C-arm, and nobody decides every
-    0.5 s. It shares with the loop what a navigation is: start, rule of success, time and force limit (`Navigation`,
-    `reached`, `is_safe`), and how fast and how far a drive goes (`DriveLimits`).
+    It is no `NavigationLoop`: there is no C-arm, nobody decides every 0.5 s, and the devices do as they are told unless
+    `robot` names a robot with its latency and play. Then Δ and φ are observed as its encoders have them, and each
+    episode draws a robot anew. It shares with the loop what a navigation is: start, rule of success, time and force
+    limit (`Navigation`, `reached`, `is_safe`), and how fast and how far a drive goes (`DriveLimits`).
 
     ## Action space
 
@@ -198,6 +208,7 @@ class NavigateVectorEnv(VectorEnv):
         catheter: str | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         motion: Motion | None = None,
+        robot: RobotConfig | str | None = None,
         config: SimulatorConfig = CORE,
         render_mode: str | None = None,
     ) -> None:
@@ -212,12 +223,13 @@ class NavigateVectorEnv(VectorEnv):
             catheter: name of a catheter around the wire, or a YAML file; its tip is to arrive then.
             autoreset_mode: whether an ended world is reset at the next step.
             motion: how heart and breath move all vessels and their guiding catheters; they lie still if not given.
+            robot: what drives, or its name or YAML file; the devices do as they are told if not given.
             config: settings of the rod core.
             render_mode: "rgb_array" lets `render` return pictures.
 
         Raises:
             InputError: no world, no such task or catheter, a catheter for navigations of one's own; a device that is
-                slower than an action of 1 or does not fit; navigations with different catheters.
+                slower than an action of 1 or does not fit; navigations with different catheters; no such robot.
         """
         if num_envs < 1:
             raise InputError(f"num_envs: {num_envs}; give at least 1")
@@ -231,7 +243,9 @@ class NavigateVectorEnv(VectorEnv):
         elif catheter:
             raise InputError(f"catheter: {catheter}; give it to the navigations")
         given = [navigations] if isinstance(navigations, Navigation) else list(navigations)
-        self._prepare([given[world % len(given)] for world in range(num_envs)], autoreset_mode, motion, config)
+        robot = read_robot(robot) if isinstance(robot, str) else robot
+        worlds = [given[world % len(given)] for world in range(num_envs)]
+        self._prepare(worlds, autoreset_mode, motion, robot, config)
         self.render_mode = render_mode
 
     def _prepare(
@@ -239,6 +253,7 @@ class NavigateVectorEnv(VectorEnv):
         navigations: list[Navigation],
         autoreset_mode: AutoresetMode,
         motion: Motion | None,
+        robot: RobotConfig | None,
         config: SimulatorConfig,
     ) -> None:
         first = navigations[0]
@@ -253,6 +268,8 @@ class NavigateVectorEnv(VectorEnv):
                 )
         count = len(navigations)
         self.navigations, self._motion, self._config = tuple(navigations), motion, config
+        self._robot, self._robots = robot, None
+        self._readings: np.ndarray | None = None
         self.metadata = type(self).metadata | {"autoreset_mode": autoreset_mode}
         self._pictures: dict[int, Picture] = {}
         self.num_envs = count
@@ -262,19 +279,16 @@ class NavigateVectorEnv(VectorEnv):
         self.single_observation_space = space(len(first.catheters))
         self.action_space = batch_space(self.single_action_space, count)
         self.observation_space = batch_space(self.single_observation_space, count)
-        self._simulator = Simulator(
-            [navigation.anatomy for navigation in navigations],
-            [navigation.stack for navigation in navigations],
-            motion=motion,
-            config=config,
-        )
+        anatomies, stacks = [each.anatomy for each in navigations], [each.stack for each in navigations]
+        if robot is not None:
+            stacks, config = _in_grip(stacks, robot, config)
+        self._simulator = Simulator(anatomies, stacks, motion=motion, config=config)
         self._routes = RouteTables.of(navigations)
-        self._far_ends = np.array(
-            [
-                [DriveLimits.of(device, navigation.anatomy).travel_mm[1] for device in navigation.devices]
-                for navigation in navigations
-            ]
-        )
+        limits = [[DriveLimits.of(device, each.anatomy) for device in each.devices] for each in navigations]
+        self._far_ends = np.array([[drive.travel_mm[1] for drive in drives] for drives in limits])
+        if robot is not None:
+            self._robots = Robots(self._simulator, robot, limits, seeds=[(world,) for world in range(count)])
+            self._readings = self._robots.read(self._simulator)
         targets = [navigation.target for navigation in navigations]
         self._target_branch = np.array([target.branch for target in targets])
         self._target_abscissa = np.array([target.abscissa for target in targets])
@@ -308,7 +322,7 @@ class NavigateVectorEnv(VectorEnv):
             for world in np.flatnonzero(mask).tolist():
                 self._generators[world] = seeding.np_random(seeds[world])[0]
         self._begin(mask)
-        now = Measured.current(self._simulator)
+        now = Measured.current(self._simulator, self._encoders)
         distances = self._routes.distance(now.tip)
         return self._observe(now, distances), self._infos(now)
 
@@ -338,15 +352,31 @@ class NavigateVectorEnv(VectorEnv):
         fresh = self._ended & (self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP)
         control = np.minimum(np.maximum(control, -1.0), 1.0) * self._fastest
         control[fresh] = 0.0
-        travel_mm = (-np.inf, self._far_ends)  # it stops by itself at the ostium
-        control, simulator = control.reshape(self.num_envs, self._drives, 2), self._simulator
-        inserted = simulator.inserted_length
-        control[..., 0] = within_travel(control[..., 0], inserted, CONTROL_PERIOD_S, travel_mm=travel_mm)
-        now = Measured.after(simulator.step(control, CONTROL_PERIOD_S), simulator)
+        step = self._driven(control.reshape(self.num_envs, self._drives, 2))
+        now = Measured.after(step, self._simulator, self._encoders)
         if fresh.any():
             self._begin(fresh)
-            now = Measured.current(self._simulator)
+            now = Measured.current(self._simulator, self._encoders)
         return self._judge(now, fresh)
+
+    @property
+    def _encoders(self) -> Float[np.ndarray, "worlds devices 2"] | None:
+        """What the robots' encoders said last."""
+        return None if self._readings is None else self._readings[..., :2]
+
+    def _driven(self, control: Float[np.ndarray, "worlds devices 2"]) -> Step:
+        """Move the devices for a control period, by robots if there are some."""
+        simulator = self._simulator
+        if self._robots is None:
+            travel_mm = (-np.inf, self._far_ends)  # it stops by itself at the ostium
+            inserted = simulator.inserted_length
+            control[..., 0] = within_travel(control[..., 0], inserted, CONTROL_PERIOD_S, travel_mm=travel_mm)
+            return simulator.step(control, CONTROL_PERIOD_S)
+        self._robots.motion.command(control)
+        step = simulator.step(self._robots.advance(CONTROL_PERIOD_S), CONTROL_PERIOD_S)
+        self._robots.follow(simulator)
+        self._readings = self._robots.read(simulator)
+        return step
 
     def _judge(self, now: Measured, fresh: Bool[np.ndarray, "worlds"]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Score what the worlds did in a step, of which those of `fresh` have only begun."""
@@ -382,6 +412,10 @@ class NavigateVectorEnv(VectorEnv):
         worlds = np.flatnonzero(mask)
         turn[worlds, 0] = [self._generators[world].uniform(0.0, 2 * np.pi) for world in worlds]
         self._simulator.reset(inserted_length=self._start[..., 0], rotation=turn, worlds=worlds.tolist())
+        if self._robots is not None and self._readings is not None:
+            seeds = [(int(self._generators[world].integers(2**62)),) for world in worlds]
+            self._robots.reset(self._simulator, worlds.tolist(), seeds)
+            self._readings[mask] = self._robots.read(self._simulator, worlds=worlds.tolist())
         self._steps[mask], self._safe[mask], self._ended[mask] = 0, True, False
         begun = self._routes.distance(self._simulator.project())[:, : self._counted]
         self._distance = np.where(mask[:, None], begun, self._distance)
@@ -402,6 +436,9 @@ class NavigateVectorEnv(VectorEnv):
             "time_s": self._steps * CONTROL_PERIOD_S,
         }
         infos |= dict.fromkeys(_MASKS, self._everyone)
+        if self._readings is not None:
+            for name, values in zip(_MEASURED, np.moveaxis(self._readings[:, 0], -1, 0), strict=True):
+                infos[name], infos[f"_{name}"] = values, self._everyone
         for k in range(1, self._drives):
             tip = now.tip[:, k]
             values = (now.inserted_length[:, k], now.rotation[:, k], tip.abscissa, tip.offset, tip.branch)
@@ -416,6 +453,8 @@ class NavigateVectorEnv(VectorEnv):
             self._simulator.state,
             *(array.copy() for array in (self._steps, self._distance, self._safe, self._ended)),
             generators=tuple(dict(copy.deepcopy(generator.bit_generator.state)) for generator in self._generators),
+            robots=copy.deepcopy(self._robots),
+            readings=None if self._readings is None else self._readings.copy(),
         )
 
     def set_state(self, state: NavigationState) -> None:
@@ -428,6 +467,8 @@ class NavigateVectorEnv(VectorEnv):
         self._steps, self._distance, self._safe, self._ended = (
             array.copy() for array in (state.steps, state.distance, state.safe, state.ended)
         )
+        self._robots = copy.deepcopy(state.robots)
+        self._readings = None if state.readings is None else state.readings.copy()
         for generator, kept in zip(self._generators, state.generators, strict=True):
             generator.bit_generator.state = copy.deepcopy(kept)
 
@@ -452,6 +493,7 @@ class NavigateVectorEnv(VectorEnv):
             "navigations": list(self.navigations),
             "autoreset_mode": self.metadata["autoreset_mode"],
             "motion": self._motion,
+            "robot": self._robot,
             "config": self._config,
             "state": self.state,
             "spec": self.spec,
@@ -459,6 +501,18 @@ class NavigateVectorEnv(VectorEnv):
         }
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
-        self._prepare(kept["navigations"], kept["autoreset_mode"], kept["motion"], kept["config"])
+        self._prepare(kept["navigations"], kept["autoreset_mode"], kept["motion"], kept["robot"], kept["config"])
         self.set_state(kept["state"])
         self.spec, self.render_mode = kept["spec"], kept["render_mode"]
+
+
+def _in_grip(
+    stacks: Sequence[Stack], robot: RobotConfig, config: SimulatorConfig
+) -> tuple[list[Stack], SimulatorConfig]:
+    """Return the devices as `in_grip` does, all with one wall."""
+    held = [in_grip(stack, robot, config) for stack in stacks]
+    if any(core != held[0][1] for _, core in held):
+        raise InputError(
+            "robot: its grip is weaker than devices of different push limits; give config a wall stiffness"
+        )
+    return [stack for stack, _ in held], held[0][1]

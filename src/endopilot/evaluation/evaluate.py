@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from endopilot.dataset.loader import Dataset, load_dataset
+from endopilot.dataset.loader import Dataset, read_dataset
+from endopilot.devices.robot import read_robot
 from endopilot.errors import InputError
 from endopilot.evaluation.metrics import PAPER_ERRORS
 from endopilot.evaluation.results import (
@@ -38,13 +40,17 @@ class EvaluateConfig:
     """Navigations of each split that are evaluated, spread evenly over its patients; all if not given."""
     seed: Seed = 0
     """Seed of the bootstrap that gives the intervals over patients."""
+    robot: str | None = None
+    """Name of a robot (docs/robot.md) or a YAML file: the controls of P4 pass its drives before they move the wire. If
+    not given, they move it as they are."""
 
 
 def evaluate(
-    run_folder: str | Path,
+    run: str | Path,
+    *,
     output: str | Path,
-    config: EvaluateConfig = EvaluateConfig(),
-    dataset_folder: str | Path | None = None,
+    config: EvaluateConfig | None = None,
+    dataset: str | Path | None = None,
     other_seeds: Sequence[str | Path] = (),
 ) -> dict[str, Any]:
     """Evaluate a run on navigations and on patients that it was not trained on.
@@ -58,10 +64,10 @@ def evaluate(
     at all. `report.report_evaluation` makes figures and a page of them.
 
     Args:
-        run_folder: made by `endopilot train`, or "pretrained", the model of the package.
+        run: made by `endopilot train`, or "pretrained", the model of the package.
         output: where the result goes.
         config: how much is evaluated.
-        dataset_folder: dataset to evaluate on; the one that the run was trained on if not given.
+        dataset: folder of the dataset to evaluate on; the one that the run was trained on if not given.
         other_seeds: runs of the same training with other seeds, whose errors in P1 shall stand beside the run's.
 
     Returns:
@@ -69,25 +75,27 @@ def evaluate(
 
     Raises:
         InputError: the run, its dataset or one of its anatomies is missing or damaged, nothing was held out, the
-            dataset was made with another wire, or another seed was trained on other patients.
+            dataset was made with another wire, another seed was trained on other patients, or there is no such robot.
     """
     with extra_named("evaluate"):
         from endopilot.evaluation.protocols import count_steps, run_protocols  # brings torch, slow to import
         from endopilot.models.episodes import Episodes
         from endopilot.models.rollout import load_model
 
-    start, run_folder, output = time.perf_counter(), Path(run_folder), Path(output)
+    config = config or EvaluateConfig()
+    robot = None if config.robot is None else read_robot(config.robot)
+    start, run_folder, output = time.perf_counter(), Path(run), Path(output)
     other_seeds = [Path(run) for run in other_seeds]
-    dataset = load_dataset(Path(dataset_folder or _own_dataset(run_folder, read_run(run_folder))).resolve())
-    known = trained_patients(run_folder, read_run(run_folder), dataset)
+    whole = read_dataset(Path(dataset or _own_dataset(run_folder, read_run(run_folder))).resolve())
+    known = trained_patients(run_folder, read_run(run_folder), whole)
     for other in other_seeds:
-        if trained_patients(other, read_run(other), dataset) != known:
+        if trained_patients(other, read_run(other), whole) != known:
             raise InputError(f"{other}: was trained on other patients than {run_folder}; give runs of one training")
     predictor, others = load_model(run_folder), [load_model(other) for other in other_seeds]
-    held_out, training = _parted(dataset, known)
+    held_out, training = _parted(whole, known)
     if not held_out:
         raise InputError(
-            f"{dataset.folder}: {run_folder} was trained on all its navigations; "
+            f"{whole.folder}: {run_folder} was trained on all its navigations; "
             "make it with seen_test_share above 0 or with more patients"
         )
     chosen = {split: _chosen(data, config.sequences) for split, data in held_out.items()}
@@ -95,10 +103,11 @@ def evaluate(
     steps = sum(count_steps(data) for data in chosen.values())
     with progress("Evaluating", total=steps) as advance:
         for split, data in chosen.items():
-            results[split] = run_protocols(predictor, data, training, advance)
+            results[split] = run_protocols(predictor, data, training, advance, robot)
     metrics = _metrics(results, known, config.seed) | {
         "run": str(run_folder),
-        "dataset": str(dataset.folder),
+        "dataset": str(whole.folder),
+        "robot": None if robot is None else asdict(robot),
         "training_mean": None
         if training is None
         else {"navigations": len(training), "patients": len(set(training.anatomy.tolist()))},
@@ -106,7 +115,7 @@ def evaluate(
             config=config,
             seed=config.seed,
             inputs={path.name: sha256(path) for path in sorted(run_path(run_folder).glob("*.safetensors"))}
-            | {"dataset": dataset.manifest["key"]},
+            | {"dataset": whole.manifest["key"]},
             wall_seconds=time.perf_counter() - start,
         ),
     }

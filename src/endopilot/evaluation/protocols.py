@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from endopilot.dataset.loader import Dataset
+from endopilot.devices.robot import RobotConfig
 from endopilot.evaluation import prediction_baselines as baselines
 from endopilot.evaluation.metrics import tip_events
 from endopilot.evaluation.replanning import exposures, replanned
@@ -28,7 +29,13 @@ def count_steps(data: Dataset) -> int:
     return len(exposures(data)) + (1 + len(PROTOCOLS)) * len(np.unique(data.anatomy))
 
 
-def run_protocols(predictor: Predictor, data: Dataset, training: Dataset | None, advance: Advance) -> SplitResult:
+def run_protocols(
+    predictor: Predictor,
+    data: Dataset,
+    training: Dataset | None,
+    advance: Advance,
+    robot: RobotConfig | None = None,
+) -> SplitResult:
     """Predict the samples after the 30 given states by every protocol, and simulate the controls that were chosen.
 
     P1 is the forward network under the true controls; P2 the inverse network with the true tip as desired; P3 the
@@ -43,8 +50,9 @@ def run_protocols(predictor: Predictor, data: Dataset, training: Dataset | None,
             are left out if there are none.
         advance: called after each protocol in each anatomy, with P1's error so far, each new plan and each anatomy's
             simulation.
+        robot: what the controls of P4 pass before they move the wire; a drive does exactly what it can if not given.
     """
-    recorded, episodes = Recorded.of(data), Episodes.of_dataset(data)
+    recorded, episodes = Recorded.of(data, robot), Episodes.of_dataset(data)
     predicted = _predicted(predictor, episodes, recorded.anatomy_of, advance)
     controls: dict[str, Control] = {
         "P2": predicted["inverse"].control,

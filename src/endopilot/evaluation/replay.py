@@ -13,6 +13,8 @@ from endopilot.dataset.again import simulate_again
 from endopilot.dataset.loader import Dataset
 from endopilot.devices.device import Wire
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.drive_motion import DriveMotion
+from endopilot.devices.robot import RobotConfig
 from endopilot.evaluation.results import REPLAYED, TipSeries
 from endopilot.models.config import WINDOW
 from endopilot.progress import Advance
@@ -33,6 +35,7 @@ class Recorded:
         anatomies: in the order of their names.
         anatomy_of: index of each episode's anatomy.
         device: the wire.
+        robot: what controls pass before they move the wire; None where a drive does exactly what it can.
     """
 
     data: Dataset
@@ -40,28 +43,52 @@ class Recorded:
     anatomies: tuple[Anatomy, ...]
     anatomy_of: Int[np.ndarray, "episodes"]
     device: Wire
+    robot: RobotConfig | None = None
 
     @staticmethod
-    def of(data: Dataset) -> Recorded:
+    def of(data: Dataset, robot: RobotConfig | None = None) -> Recorded:
         """Read what the episodes of a dataset were recorded with.
+
+        Args:
+            data: the episodes.
+            robot: what controls pass.
 
         Raises:
             InputError: an anatomy is missing or damaged.
         """
         names, anatomy_of = np.unique(data.anatomy, return_inverse=True)
         anatomies = tuple(read_anatomy(data.anatomy_folder(str(name))) for name in names)
-        return Recorded(data, tuple(map(str, names)), anatomies, anatomy_of, data.stack.wire)
+        return Recorded(data, tuple(map(str, names)), anatomies, anatomy_of, data.stack.wire, robot)
 
     def drivable(self, control: Control) -> Control:
         """Return what a drive makes of controls: no faster than it can, nor out of the catheter or beyond the vessel.
 
-        Controls that are not finite stay so.
+        Controls that are not finite stay so. A robot's drives begin at rest, in the middle of their play, after the
+        given states; their mean over a sample moves the wire.
         """
         driven, inserted = np.empty(control.shape), self.data.inserted_length[:, WINDOW - 1, 0].astype(float)
         for index, anatomy in enumerate(self.anatomies):
             mine, limits = self.anatomy_of == index, DriveLimits.of(self.device, anatomy)
             driven[mine] = limits.clip_sequence(control[mine], inserted[mine], self.data.sample_period_s)
+            if self.robot is not None:
+                driven[mine] = self._by_robot(self.robot, driven[mine], np.flatnonzero(mine), limits)
         return driven
+
+    def _by_robot(
+        self, robot: RobotConfig, control: Control, episodes: Int[np.ndarray, "episodes"], limits: DriveLimits
+    ) -> Control:
+        """Return what a robot makes of controls; each episode has one of its own."""
+        held = (self.data.inserted_length, self.data.rotation)
+        start = np.stack([each[episodes, WINDOW - 1, :1] for each in held], axis=-1).astype(float)
+        seeds = [(int(self.data.sequence[each]), 7) for each in episodes]
+        motion = DriveMotion(robot, [[limits]] * len(episodes), start, seeds=seeds)
+        made, period = np.empty_like(control), self.data.sample_period_s
+        for sample in range(control.shape[1]):
+            motion.command(np.nan_to_num(control[:, sample, None]))
+            made[:, sample] = motion.advance(period)[:, 0] / period
+        lost = ~np.isfinite(control).all(axis=-1).cumprod(axis=1).astype(bool)
+        made[lost] = np.nan
+        return made
 
     def simulated(
         self, controls: Mapping[str, Control], advance: Advance | None = None

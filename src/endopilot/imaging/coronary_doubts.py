@@ -14,6 +14,7 @@ from endopilot.errors import place_text
 from endopilot.imaging.contour import CALCIUM
 from endopilot.imaging.grid import connected_components, distance_to_outside
 from endopilot.imaging.openings import box_around, openings
+from endopilot.lines import length_along
 from endopilot.types import Volume
 
 _BLOCK_MM = 1.5
@@ -285,7 +286,7 @@ def _veins(found: FoundTree) -> list[str]:
         dim = (ndimage.median_filter(hu, 15, mode="nearest") < _VEIN_SHARE * found.lumen_hu) & (
             radius >= _VEIN_RADIUS_MM
         )
-        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+        along = length_along(path)
         places = np.flatnonzero(dim)
         runs = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1) if len(places) else []
         inside = max(runs, key=lambda run: along[run[-1]] - along[run[0]], default=places)

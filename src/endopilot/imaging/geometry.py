@@ -87,11 +87,11 @@ def geometry(
         if not np.isfinite(values).all():
             raise InputError(f"{path}: {name} holds {_text(values)}, which is not finite; export it again")
     if spacing_mm.min() <= 0:
-        raise InputError(f"{path}: {fields.spacing} gives voxels of {_times(spacing_mm)} mm; export it again")
+        raise InputError(f"{path}: {fields.spacing} gives voxels of {lengths_text(spacing_mm)} mm; export it again")
     lengths = np.linalg.norm(direction, axis=0)
     if np.abs(lengths - 1.0).max() >= AXES_TOLERANCE:
         raise InputError(
-            f"{path}: {fields.direction} holds axes of length {_times(lengths)}, which must be 1; export it again"
+            f"{path}: {fields.direction} holds axes of length {lengths_text(lengths)}, which must be 1; export it again"
         )
     axes = direction / lengths
     skew = float(np.abs(axes.T @ axes - np.eye(3)).max())
@@ -187,7 +187,7 @@ def converted(unit: str, sizes: Float[np.ndarray, "3"], *, path: Path, field: st
     lengths = np.abs(sizes) * factor
     if not (lengths >= least).all() or not (lengths <= most).all():
         raise InputError(
-            f"{path}: {field} says {unit}, but voxels would then have {_times(lengths)} mm; export it in mm"
+            f"{path}: {field} says {unit}, but voxels would then have {lengths_text(lengths)} mm; export it in mm"
         )
     return factor, (f"{path.name}: {field} says {unit}; lengths were converted to mm",)
 
@@ -196,5 +196,6 @@ def _text(values: np.ndarray) -> str:
     return " ".join(f"{value:g}" for value in np.ravel(values))
 
 
-def _times(lengths: np.ndarray) -> str:
+def lengths_text(lengths: np.ndarray) -> str:
+    """Return the edges of a voxel as messages write them."""
     return "×".join(f"{length:.3g}" for length in lengths)

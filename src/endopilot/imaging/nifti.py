@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.errors import InputError
-from endopilot.imaging.geometry import Fields, Geometry, converted, geometry, geometry_of_steps
+from endopilot.imaging.geometry import Fields, Geometry, converted, geometry, geometry_of_steps, lengths_text
 from endopilot.imaging.voxels import Encoding, opened, read_voxels, rescaled
 from endopilot.types import Volume
 
@@ -207,7 +207,7 @@ def _sform(header: _Header, size: tuple[int, int, int], path: Path, factor: floa
     pixdim = np.abs(header["pixdim"][1:4]) * factor
     if not np.allclose(place.spacing_mm, pixdim, rtol=_SPACING_TOLERANCE):
         raise InputError(
-            f"{path}: its affine gives voxels of {_times(place.spacing_mm)}, its pixdim {_times(pixdim)}; "
+            f"{path}: its affine gives voxels of {lengths_text(place.spacing_mm)}, its pixdim {lengths_text(pixdim)}; "
             "one of them is wrong: export it again"
         )
     return place
@@ -260,7 +260,3 @@ def _agreement(
 
 def _placed(place: Geometry, index: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     return place.origin_mm + (index * place.spacing_mm) @ place.direction.T
-
-
-def _times(lengths: np.ndarray) -> str:
-    return "×".join(f"{length:.3g}" for length in lengths)

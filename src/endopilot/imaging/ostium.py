@@ -8,6 +8,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from endopilot.imaging.grid import connected_components, distance_to_outside
+from endopilot.lines import length_along
 from endopilot.types import Insertion, Volume
 
 _BALL_MM = 7.0
@@ -113,7 +114,7 @@ def _middles(
     path: np.ndarray, blood: np.ndarray, height: np.ndarray, corner: np.ndarray, grid: Volume
 ) -> dict[float, Float[np.ndarray, "3"]]:
     """Return the centroid of the artery's blood by height above the wall, mm, from the wall to where it is lost."""
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    along = length_along(path)
     near = path[along < 12.0]
     back = near[0] - np.arange(0.5, 4.0, 0.5)[:, None] * _heading(path)
     outside = blood & (height > _SECTIONS_MM[0] - 0.5)

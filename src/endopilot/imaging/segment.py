@@ -88,7 +88,7 @@ def _method(name: str) -> SegmentationMethod:
     raise InputError(f"method: {name!r} is no function and no SegmentationMethod; name one")
 
 
-def segment(volume: Volume | str | Path, config: SegmentConfig = SegmentConfig()) -> LumenMask:
+def segment(volume: Volume | str | Path, *, config: SegmentConfig | None = None) -> LumenMask:
     """Segment the lumen of one vessel tree from a CT angiogram.
 
     Args:
@@ -103,6 +103,7 @@ def segment(volume: Volume | str | Path, config: SegmentConfig = SegmentConfig()
         InputError: the CT cannot be read, a seed lies outside the volume, there is no contrast, or the vessel was
             not found.
     """
+    config = config or SegmentConfig()
     if not isinstance(volume, Volume):
         volume = read_volume(volume)
     _refuse_seeds_outside(volume, config)

@@ -17,7 +17,7 @@ from endopilot.belief.adviser import AdviserConfig, count_events, near_exposures
 from endopilot.control.agent import AgentPolicy
 from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
-from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, navigate
+from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import Decision, Observation, Policy
 from endopilot.navigation.record import NavigationRecord
@@ -158,14 +158,14 @@ def begun(recording: Recording, navigation: Navigation, *, seed: int) -> Navigat
     return NavigationLoop(navigation, Repeated(recording), config=_config(recording.robot), seed=seed)
 
 
-def _config(robot: RobotConfig) -> NavigateConfig:
-    return NavigateConfig(robot=robot, simulator=replace(CORE, threads=1))
+def _config(robot: RobotConfig) -> LoopConfig:
+    return LoopConfig(robot=robot, simulator=replace(CORE, threads=1))
 
 
 def _drive(
     navigation: Navigation, policy: Policy, seed: int, mismatch: ModelMismatch | None, robot: RobotConfig
 ) -> NavigationRecord:
-    return navigate(navigation, policy, config=_config(robot), seed=seed, truth=mismatch)
+    return NavigationLoop(navigation, policy, config=_config(robot), seed=seed, truth=mismatch).run()
 
 
 class Repeated:

@@ -17,7 +17,7 @@ from endopilot.ladder.submission import MOST_PATIENTS, SUBMISSION_FILE, task_dig
 from endopilot.navigation.policies import POLICIES, make_policy
 from endopilot.runs import claim, make_missing
 from endopilot.settings import Within, settings
-from endopilot.tasks.task import NEWEST, LadderVersion, Task, find_task, ladder_tasks
+from endopilot.tasks.task import NEWEST, LadderVersion, Task, find_task, list_tasks
 
 SCORES_FILE = "ladder.json"
 
@@ -44,16 +44,16 @@ class LadderConfig:
     def _consistent(self) -> LadderConfig:
         POLICIES.check(self.policy)
         for name in self.tasks:
-            find_task(name, self.version)
+            find_task(name, version=self.version)
         return self
 
     @property
     def chosen(self) -> list[Task]:
         """The tasks named, or all."""
-        return [task for task in ladder_tasks(self.version) if not self.tasks or task.name in self.tasks]
+        return [task for task in list_tasks(self.version) if not self.tasks or task.name in self.tasks]
 
 
-def climb(output: Path, config: LadderConfig) -> list[dict[str, Any]]:
+def climb(*, output: str | Path, config: LadderConfig | None = None) -> list[dict[str, Any]]:
     """Let a policy do the tasks in their patients, and score it.
 
     Each navigation leaves one file, `output`/TASK/PATIENT.json; an interrupted run goes on with the others.
@@ -69,6 +69,8 @@ def climb(output: Path, config: LadderConfig) -> list[dict[str, Any]]:
     Raises:
         InputError: the folder belongs to another run, such as that of another policy, or a navigation cannot be begun.
     """
+    config = config or LadderConfig()
+    output = Path(output)
     make_policy(config.policy)
     tasks = config.chosen
     robot = read_robot(config.robot)
@@ -87,14 +89,14 @@ def climb(output: Path, config: LadderConfig) -> list[dict[str, Any]]:
 
 def identity(policy: str, version: LadderVersion, robot: RobotConfig | None = None) -> dict[str, Any]:
     """Return what a policy's results follow from: its source, its tasks, their devices, the robot, the version."""
-    tasks = {task.name: task_digest(task) for task in ladder_tasks(version)}
+    tasks = {task.name: task_digest(task) for task in list_tasks(version)}
     origin = POLICIES.origin(policy)
     return {"policy": policy, "origin": origin, "tasks": tasks, "robot": robot or RobotConfig(), "version": __version__}
 
 
 def _navigate(path: Path, *, policy: str, version: LadderVersion, robot: RobotConfig) -> None:
     """Do one navigation and write what came of it."""
-    task, place = find_task(path.parent.name, version), int(path.stem)
+    task, place = find_task(path.parent.name, version=version), int(path.stem)
     navigation = task.ladder_navigation(place)
     result = attempt(policy, navigation, seed=navigation_seed(task, place), robot=robot)
     about = {"task": task.name, "ladder": version, "robot": robot, "patient": navigation.anatomy.name}

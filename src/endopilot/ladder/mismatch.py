@@ -85,7 +85,7 @@ def mismatch_of(
 
 
 def _navigate(path: Path, *, policy: str, version: LadderVersion, share: float, robot: RobotConfig) -> None:
-    case, task, place = path.parents[1].name, find_task(path.parent.name, version), int(path.stem)
+    case, task, place = path.parents[1].name, find_task(path.parent.name, version=version), int(path.stem)
     navigation = task.ladder_navigation(place)
     mismatch, real = mismatch_of(case, share, navigation, task, place, robot)
     result = attempt(policy, navigation, seed=navigation_seed(task, place), mismatch=mismatch, robot=real)

@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 from endopilot import __version__, _core
 from endopilot.devices.catheter import read_catheter
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, write_json
@@ -26,7 +26,7 @@ from endopilot.ladder.scores import score
 from endopilot.navigation.policies import POLICIES
 from endopilot.parallel import each
 from endopilot.settings import CountOrZero, Seed, from_record, read_settings, settings
-from endopilot.tasks.task import LadderVersion, Task, find_task, ladder_tasks
+from endopilot.tasks.task import LadderVersion, Task, find_task, list_tasks
 
 SUBMISSION_FILE = "submission.json"
 MOST_PATIENTS = 20
@@ -121,11 +121,14 @@ class SubmissionCheck:
 
 def task_digest(task: Task) -> str:
     """Return the SHA-256 of what a task's navigations follow from: its definition and its devices."""
-    # Older tasks had no such fields: their hashes stay.
+    # Older tasks had no such fields, or named them otherwise: their hashes stay.
+    older = {"vessel": "anatomy", "start_inserted_length_mm": "start_inserted_mm"}
     definition = {
-        name: value for name, value in asdict(task).items() if (name, value) != ("version", 1) and value is not None
+        older.get(name, name): value
+        for name, value in asdict(task).items()
+        if (name, value) != ("version", 1) and value is not None
     }
-    content = json_text(definition) + json_text(read_device(task.device))
+    content = json_text(definition) + json_text(read_wire(task.device))
     content += json_text(read_catheter(task.catheter)) if task.catheter else ""
     return hashlib.sha256(content.encode()).hexdigest()
 
@@ -155,7 +158,7 @@ def write_submission(
         origin=POLICIES.origin(policy),
         versions=manifest(config=None)["versions"],
         core=_core.LEVEL,
-        tasks={name: task_digest(find_task(name, version)) for name in results},
+        tasks={name: task_digest(find_task(name, version=version)) for name in results},
         navigations={
             name: tuple(NavigationEntry(**{key: value for key, value in one.items() if key in known}) for one in done)
             for name, done in results.items()
@@ -166,7 +169,7 @@ def write_submission(
     write_json(path, submission)
 
 
-def check_submission(path: Path) -> SubmissionCheck:
+def check_submission(path: str | Path) -> SubmissionCheck:
     """Drive all recordings of a submission file again, without the policy, and compare every figure to the bit.
 
     Args:
@@ -175,6 +178,7 @@ def check_submission(path: Path) -> SubmissionCheck:
     Raises:
         InputError: the file is no submission, or its tasks or seeds are not those of this ladder.
     """
+    path = Path(path)
     submission = read_settings(path, Submission, remedy="give a submission.json of `endopilot ladder`")
     _refuse_another_ladder(path, submission)
     with tempfile.TemporaryDirectory(prefix="endopilot-") as folder:
@@ -197,7 +201,7 @@ def _refuse_another_ladder(path: Path, submission: Submission) -> None:
         raise InputError(f"{path}: navigations: {counts}; each task needs the same first 1 to {MOST_PATIENTS} patients")
     for name, entries in submission.navigations.items():
         try:
-            task = find_task(name, submission.version)
+            task = find_task(name, version=submission.version)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
         if submission.tasks[name] != task_digest(task):
@@ -215,7 +219,7 @@ def _first_difference(submission: Submission, folder: Path) -> str | None:
     entries = {
         folder / name / f"{place:02d}.json": entry
         for name, done in sorted(
-            submission.navigations.items(), key=lambda item: find_task(item[0], submission.version).level
+            submission.navigations.items(), key=lambda item: find_task(item[0], version=submission.version).level
         )
         for place, entry in enumerate(done)
     }
@@ -234,7 +238,7 @@ def _first_difference(submission: Submission, folder: Path) -> str | None:
         name: [read_json(folder / name / f"{place:02d}.json") for place in range(len(done))]
         for name, done in submission.navigations.items()
     }
-    rows = score([task for task in ladder_tasks(submission.version) if task.name in results], results)
+    rows = score([task for task in list_tasks(submission.version) if task.name in results], results)
     for given, again in zip_longest(submission.scores, rows, fillvalue={}):
         remark = _difference(given, again)
         if remark is not None:
@@ -268,14 +272,14 @@ def recorded_navigation(path: Path, name: str | None, place: int) -> tuple[Task,
         name, place, entry = path.parent.name, int(path.stem), content
     else:
         raise InputError(f"{path}: is no file of the ladder; give a submission.json or TASK/NUMBER.json")
-    task = find_task(name, content.get("ladder") or 1)
+    task = find_task(name, version=content.get("ladder") or 1)
     robot = from_record(RobotConfig, content["robot"]) if "robot" in content else None
     return task, place, Recording.unpacked(entry["recording"], 2 if task.catheter else 1, robot)
 
 
 def _repeat(path: Path, *, version: LadderVersion, robot: RobotConfig) -> None:
     """Drive the recording in a file again, and put the figures in its place."""
-    task, place = find_task(path.parent.name, version), int(path.stem)
+    task, place = find_task(path.parent.name, version=version), int(path.stem)
     navigation = task.ladder_navigation(place)
     recording = Recording.unpacked(read_json(path), len(navigation.devices), robot)
     figures = repeat(recording, navigation, seed=navigation_seed(task, place))

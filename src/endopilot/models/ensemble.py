@@ -75,8 +75,13 @@ class Ensemble:
     @cached_property
     def simulator(self) -> Simulator:
         """The worlds of the members, at the start of the navigation before they are driven."""
+        return self.started()
+
+    def started(self, reach_mm: float = 0.0) -> Simulator:
+        """Return the worlds of the members at the start of the navigation, laid out for an inserted length, mm."""
         given = self.set_up
-        simulator = Simulator(given.anatomies, given.stacks, motion=given.motion, config=given.config)
+        layout = {"motion": given.motion, "config": given.config, "reach_mm": reach_mm}
+        simulator = Simulator(given.anatomies, given.stacks, **layout)
         simulator.reset(inserted_length=given.initial[..., 0], rotation=given.initial[..., 1], friction=given.friction)
         return simulator
 

@@ -104,8 +104,8 @@ def begin_after(observed: Observed) -> int:
 
 
 def jumps(
-    tip_mm: Float[np.ndarray, "episodes samples"], inserted_mm: Float[np.ndarray, "episodes samples"]
+    tip_mm: Float[np.ndarray, "episodes samples"], inserted_length_mm: Float[np.ndarray, "episodes samples"]
 ) -> Bool[np.ndarray, "episodes samples"]:
     """Return the samples in which a tip at abscissas Δtip jumps: it moves otherwise than the drive by `JUMP_MM`."""
-    slack = inserted_mm - tip_mm
+    slack = inserted_length_mm - tip_mm
     return np.abs(np.diff(slack, axis=1, prepend=slack[:, :1])) > JUMP_MM

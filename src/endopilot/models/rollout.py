@@ -101,13 +101,13 @@ def _rollout_batch(
     return tuple(signal[:, begin:].double().numpy() for signal in (tip, proximal, control))  # pyright: ignore[reportReturnType]
 
 
-def load_model(run_folder: str | Path = PRETRAINED) -> Predictor:
+def load_model(run: str | Path = PRETRAINED) -> Predictor:
     """Return the predictor of a run made by `endopilot train`, or the packaged one, named "pretrained".
 
     Raises:
         InputError: the run is unfinished, or a file of it is damaged or of another version.
     """
-    record, run_folder = read_run(run_folder), run_path(run_folder)
+    record, run_folder = read_run(run), run_path(run)
     with reading(run_folder, "train anew"):
         return _predictor(record, run_folder)
 

@@ -21,7 +21,7 @@ import torch
 from torch import nn
 
 from endopilot import __version__
-from endopilot.dataset.join import load_joined
+from endopilot.dataset.join import read_joined
 from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
 from endopilot.files import manifest, write_json
@@ -56,9 +56,7 @@ _TIMED_STEPS = 12
 _GRADIENT_NORM = 1.0
 
 
-def train(
-    dataset: str | Path | Sequence[str | Path], run_folder: str | Path, config: TrainConfig | None = None
-) -> None:
+def train(dataset: str | Path | Sequence[str | Path], *, output: str | Path, config: TrainConfig | None = None) -> None:
     """Train the forward and the inverse network on the split "train" and write them into a run folder.
 
     The twin has no networks: its run is a folder with settings alone.
@@ -69,7 +67,7 @@ def train(
 
     Args:
         dataset: folder of a dataset made by `endopilot dataset`, or several that are trained on together.
-        run_folder: where the result goes.
+        output: run folder.
         config: what is trained, and how long; the paper's networks if not given.
 
     Raises:
@@ -79,11 +77,11 @@ def train(
     config = config or TrainConfig()
     with joined(config.processor) as group:
         folders = [dataset] if isinstance(dataset, str | Path) else dataset
-        _train([Path(folder) for folder in folders], Path(run_folder), config, group)
+        _train([Path(folder) for folder in folders], Path(output), config, group)
 
 
 def _train(folders: list[Path], run_folder: Path, config: TrainConfig, group: ProcessGroup) -> None:
-    dataset = load_joined(folders)
+    dataset = read_joined(folders)
     dataset.check_wire_alone("a model")
     with group.first():  # which writes the settings and prepares the patients, where need be
         if group.writes:

@@ -12,6 +12,7 @@ from endopilot.atlas import curves as shape
 from endopilot.atlas import heart_reference as reference
 from endopilot.atlas.heart_left import reference_courses
 from endopilot.atlas.heart_reference import HeartFit, ellipsoid, tube
+from endopilot.lines import length_along
 from endopilot.types import Centerline, VesselTree
 
 _KNOTS = 16
@@ -135,7 +136,7 @@ def other_coronary(heart: HeartFit, tree: VesselTree) -> tuple[Centerline, ...]:
     lines = []
     for waypoints, begin, end in _RIGHT_CORONARY if is_left(tree) else _LEFT_CORONARY:
         points = heart.from_reference(shape.curve_through(np.array(waypoints, dtype=float)))
-        along = shape.abscissa(points)
+        along = length_along(points)
         radius = np.interp(along, [0.0, along[-1]], [begin, end])
         lines.append(Centerline(points, radius, along, shape.parallel_normals(shape.tangents(points))))
     return tuple(lines)
@@ -178,7 +179,7 @@ def bypass_graft(heart: HeartFit, tree: VesselTree) -> Centerline:
 
 
 def _vein(points: Float[np.ndarray, "n 3"], begin_mm: float, end_mm: float) -> Centerline:
-    along = shape.abscissa(points)
+    along = length_along(points)
     radius = np.linspace(begin_mm, end_mm, len(points))
     return Centerline(points, radius, along, shape.parallel_normals(shape.tangents(points)))
 

@@ -11,6 +11,7 @@ from scipy.ndimage import zoom
 
 from endopilot.atlas import curves as shape
 from endopilot.atlas.heart_reference import HeartFit
+from endopilot.lines import length_along
 from endopilot.phantom.painter import Grid
 from endopilot.types import Centerline
 
@@ -62,7 +63,7 @@ def leads(heart: HeartFit, count: int) -> list[Metal]:
         inside = np.hypot(u, v) < _LEAD_MM
         across = u[inside][:, None, None] * normal + v[inside][:, None, None] * side
         points = (line + across).reshape(-1, 3)
-        total = np.pi * _LEAD_MM**2 * float(shape.abscissa(line)[-1]) * _LEAD_HU
+        total = np.pi * _LEAD_MM**2 * float(length_along(line)[-1]) * _LEAD_HU
         found.append(Metal(points, np.full(len(points), total / len(points))))
     return found
 

@@ -87,7 +87,7 @@ class _Plaque:
     depth: Float32[np.ndarray, "nz ny nx"]
 
 
-def make_phantom(anatomy: Anatomy, config: PhantomConfig, seed: int) -> Volume:
+def make_phantom(anatomy: Anatomy, *, config: PhantomConfig | None = None, seed: int = 0) -> Volume:
     """Return a synthetic CT angiogram of a right or left coronary anatomy, in HU.
 
     Args:
@@ -98,6 +98,7 @@ def make_phantom(anatomy: Anatomy, config: PhantomConfig, seed: int) -> Volume:
     Returns:
         int16 voxels along the LPS axes.
     """
+    config = config or PhantomConfig()
     generator = np.random.Generator(np.random.Philox(key=np.array([seed, 0x7068616E], dtype=np.uint64)))
     heart = chest.place(anatomy.tree)
     # A stream of its own, so that the rest of the scan is the same with and without what disturbs it.

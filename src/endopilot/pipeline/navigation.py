@@ -1,9 +1,9 @@
-"""A navigation in one patient, in a folder: page, picture, table, trajectory, episode, manifest; `navigate_into`."""
+"""A navigation in one patient, in a folder: page, picture, table, trajectory, episode, manifest; `write_navigation`."""
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -14,18 +14,12 @@ import pandas as pd
 from endopilot import __version__
 from endopilot.anatomy.io import write_anatomy
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.control.navigate_patient import (
-    NavigatePatientConfig,
-    PatientNavigation,
-    SetUp,
-    navigate_patient,
-    set_up_navigation,
-)
+from endopilot.control.navigate import NavigateConfig, PatientNavigation, SetUp, drive, set_up_navigation
 from endopilot.control.outcome import name_target, slipped_s, tell_outcome, worst_ratio
 from endopilot.control.set_up import tip_name
+from endopilot.devices.stack import Stack
 from endopilot.extras import require_extras
 from endopilot.files import manifest, read_json, write_json, writing
-from endopilot.navigation.policies import POLICIES
 from endopilot.runs import claim
 from endopilot.simulation.signals import table_columns
 from endopilot.simulation.trajectory_file import TRAJECTORY
@@ -37,9 +31,16 @@ EPISODE_FOLDER, ANATOMY_FOLDER, MANIFEST_FILE = "episode", "anatomy", "manifest.
 
 
 def navigate_into(
-    anatomy: str | Path, target: str, output: str | Path, config: NavigatePatientConfig | None = None
+    anatomy: str | Path,
+    target: str,
+    *,
+    output: str | Path,
+    policy: str = "agent",
+    device: str = "workhorse-014",
+    catheter: Sequence[str] = (),
+    config: NavigateConfig | None = None,
 ) -> dict[str, Any]:
-    """Drive a wire to a place in a patient's vessel, in closed loop, and write what happened into a folder.
+    """Drive a wire to a place in a patient's vessel, as `navigate` does, and write what happened into a folder.
 
     A folder that was finished with the same arguments is left as it is.
 
@@ -47,63 +48,98 @@ def navigate_into(
         anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
         target: a section such as "4" or "LAD", or a point "X,Y,Z" in LPS mm, which is moved to the centerline.
         output: folder of the results.
-        config: policy, wire, limits, and how reality differs from what the policy is given.
+        policy: name of what decides.
+        device: name of the wire, or its YAML file.
+        catheter: names of the catheters around it, from the inside out, or YAML files.
+        config: limits, X-ray, and how reality differs from what the policy is given.
 
     Returns:
         The outcome in one line, and figures.
 
     Raises:
-        InputError: the navigation cannot be begun (see `set_up_navigation`), a library is missing, or the folder
-            belongs to another run.
+        InputError: the navigation cannot be begun (see `navigate`), a library is missing, or the folder belongs to
+            another run.
     """
     require_extras("learn", "report")
-    folder, output, config = Path(anatomy), Path(output), config or NavigatePatientConfig()
-    set_up = set_up_navigation(folder, target, config)
+    stack = Stack.of(device, *catheter)
+    set_up = set_up_navigation(anatomy, target, policy=policy, device=stack, config=config)
+    _claim(Path(output), set_up)
+    if (Path(output) / MANIFEST_FILE).exists():
+        return read_json(Path(output) / MANIFEST_FILE)["figures"]
+    return _write(drive(set_up), Path(output), {"policy": policy, "device": device, "catheter": tuple(catheter)})
+
+
+def write_navigation(driven: PatientNavigation, *, output: str | Path) -> dict[str, Any]:
+    """Write a navigation in a patient into a folder: page, picture, table, trajectory, episode and manifest.
+
+    The anatomy is written beside them if the navigation was given it in memory. A page of the documentation, Navigate
+    in a patient, describes the files.
+
+    Args:
+        driven: what `navigate` returned.
+        output: the folder.
+
+    Returns:
+        The outcome in one line, and figures.
+
+    Raises:
+        InputError: a library is missing, or the folder belongs to another run.
+    """
+    require_extras("learn", "report")
+    _claim(Path(output), driven.set_up)
+    return _write(driven, Path(output), None)
+
+
+def _claim(output: Path, set_up: SetUp) -> None:
     claim(
         output,
         "endopilot navigate",
         anatomy=set_up.anatomy.identity,
-        target=target,
-        config=config,
+        target=set_up.target,
+        config=set_up.config,
         device=set_up.navigation.device,
         catheters=set_up.navigation.catheters,
         robot=set_up.robot,
-        policy=POLICIES.origin(config.policy),
+        policy=set_up.policy_name,
+        policy_origin=set_up.policy_origin,
         version=__version__,
     )
-    if not (output / MANIFEST_FILE).exists():
-        found = navigate_patient(set_up)
-        _write(found, folder, target, output)
-    return read_json(output / MANIFEST_FILE)["figures"]
 
 
-def _write(found: PatientNavigation, folder: Path, target: str, output: Path) -> None:
-    """Write all files, the manifest last."""
+def _write(found: PatientNavigation, output: Path, asked: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Write all files, the manifest last, and return the figures.
+
+    Args:
+        found: the navigation.
+        output: the folder.
+        asked: the names that `endopilot navigate` was given; None where it was not called.
+    """
     from endopilot.plotting import png  # matplotlib and plotly are slow to import
     from endopilot.report.navigation_figure import navigation_figure
     from endopilot.report.navigation_page import write_navigation_page
 
     set_up = found.set_up
-    driven_in, real = folder, set_up.true_anatomy
-    if real is not set_up.anatomy:  # the catheter lies otherwise: an anatomy of its own
+    driven_in, real = set_up.folder, set_up.true_anatomy
+    if driven_in is None or real is not set_up.anatomy:  # the catheter lies otherwise: an anatomy of its own
         driven_in = output / ANATOMY_FOLDER
         if not driven_in.exists():
-            write_anatomy(real, driven_in)
+            write_anatomy(real, output=driven_in)
     with writing(output / TABLE_FILE) as partial:
         navigation_table(found).to_csv(partial, index=False)
     cycles = found.record.cycles
     assert cycles is not None  # a navigation has a period at least
-    about = {"policy": set_up.config.policy, "seed": set_up.config.seed, "truth": asdict(set_up.truth)}
+    about = {"policy": set_up.policy_name, "seed": set_up.config.seed, "truth": asdict(set_up.truth)}
     about["robot"] = asdict(set_up.robot)
     replace(cycles, about=cycles.about | about).write(output / TRAJECTORY)
     _write_episode(found, driven_in, output / EPISODE_FOLDER)
     picture = png(navigation_figure(found))
     with writing(output / PICTURE_FILE) as partial:
         partial.write_bytes(picture)
-    record = _manifest(found, target, output)
-    commands = _commands(found, folder, driven_in, target, output)
+    record = _manifest(found, output)
+    commands = _commands(found, driven_in, output, asked)
     write_navigation_page(output / PAGE_FILE, found, picture=picture, commands=commands, manifest=record)
     write_json(output / MANIFEST_FILE, record)
+    return read_json(output / MANIFEST_FILE)["figures"]
 
 
 def navigation_table(found: PatientNavigation) -> pd.DataFrame:
@@ -149,6 +185,7 @@ def _write_episode(found: PatientNavigation, anatomy_folder: Path, output: Path)
         seed=set_up.config.seed,
         origin={
             "target": asdict(set_up.navigation.target),
+            "policy": set_up.policy_name,
             "navigation": asdict(set_up.config),
             "truth": asdict(truth),
             "robot": asdict(set_up.robot),
@@ -156,7 +193,7 @@ def _write_episode(found: PatientNavigation, anatomy_folder: Path, output: Path)
     )
 
 
-def _manifest(found: PatientNavigation, target: str, output: Path) -> dict[str, Any]:
+def _manifest(found: PatientNavigation, output: Path) -> dict[str, Any]:
     set_up, record = found.set_up, found.record
     navigation = set_up.navigation
     figures = {
@@ -164,7 +201,7 @@ def _manifest(found: PatientNavigation, target: str, output: Path) -> dict[str, 
         "reached": record.success,
         "within_force_limit": record.safe,
         "reason": record.reason,
-        "policy": set_up.config.policy,
+        "policy": set_up.policy_name,
         "target": name_target(set_up),
         "snapped_mm": None if set_up.snapped_mm is None else round(set_up.snapped_mm, 2),
         "tip": tip_name(navigation.device),
@@ -190,7 +227,7 @@ def _manifest(found: PatientNavigation, target: str, output: Path) -> dict[str, 
         device=asdict(navigation.device),
         catheters=[asdict(catheter) for catheter in navigation.catheters],
         catheter_axis=None if navigation.anatomy is set_up.anatomy else navigation.anatomy.insertion.direction.tolist(),
-        target={"asked": target, **asdict(navigation.target)},
+        target={"asked": set_up.target, **asdict(navigation.target)},
         truth=asdict(set_up.truth),
         robot=asdict(set_up.robot),
         simulator=asdict(set_up.simulator),
@@ -198,25 +235,26 @@ def _manifest(found: PatientNavigation, target: str, output: Path) -> dict[str, 
     )
 
 
-def _commands(found: PatientNavigation, folder: Path, driven_in: Path, target: str, output: Path) -> Mapping[str, str]:
-    changed = _changed(found.set_up)
-    line = ["endopilot", "navigate", str(folder), f"--target={target}", "-o", str(output), *changed]
+def _commands(
+    found: PatientNavigation, driven_in: Path, output: Path, asked: Mapping[str, Any] | None
+) -> Mapping[str, str]:
     again = ["endopilot", "simulate", str(driven_in), "--controls", str(output / TRAJECTORY), "-o", "again.csv"]
     alone = not found.set_up.navigation.catheters
     beside = ["endopilot", "train", "runs/dataset", str(output / EPISODE_FOLDER), "-o", "runs/training"]
     return {
-        "The navigation": shlex.join(line),
+        **({} if asked is None else {"The navigation": shlex.join(_line(found.set_up, output, asked))}),
         f"The same {'wire' if alone else 'motion'} from the recorded controls, without the policy": shlex.join(again),
         **({"Train on it beside a dataset of the same wire": shlex.join(beside)} if alone else {}),
     }
 
 
-def _changed(set_up: SetUp) -> list[str]:
-    """Return the options that are not at their defaults."""
-    default = asdict(NavigatePatientConfig())
-    options = [(name, value) for name, value in asdict(set_up.config).items() if value != default[name]]
-    return [
+def _line(set_up: SetUp, output: Path, asked: Mapping[str, Any]) -> list[str]:
+    """Return the command that made a navigation, with the options that are not at their defaults."""
+    default = {"policy": "agent", "device": "workhorse-014", "catheter": (), **asdict(NavigateConfig())}
+    options = [(name, value) for name, value in {**asked, **asdict(set_up.config)}.items() if value != default[name]]
+    changed = [
         part
         for name, value in options
         for part in (f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else (value,)))
     ]
+    return ["endopilot", "navigate", str(set_up.folder), f"--target={set_up.target}", "-o", str(output), *changed]

@@ -23,11 +23,11 @@ from endopilot import __version__
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_source
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.control.navigate_patient import NavigatePatientConfig
+from endopilot.control.navigate import NavigateConfig
 from endopilot.dataset.again import episode_set_up
 from endopilot.dataset.config import DatasetConfig
-from endopilot.dataset.loader import load_dataset
-from endopilot.devices.device import Wire, read_device
+from endopilot.dataset.loader import read_dataset
+from endopilot.devices.device import Wire, read_wire
 from endopilot.evaluation.anatomy_score import score_anatomy
 from endopilot.evaluation.results import REPORT_FILE
 from endopilot.extras import require_extras
@@ -146,7 +146,7 @@ class _Run:
     @property
     def evaluates(self) -> bool:
         """Whether there are networks for the wire: those of the package know one wire alone."""
-        packaged = read_device(_PRETRAINED_DEVICE)
+        packaged = read_wire(_PRETRAINED_DEVICE)
         return self.trains or self.device.constants == packaged.constants
 
 
@@ -167,7 +167,7 @@ def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
             could be segmented.
     """
     require_extras(*_EXTRAS)
-    device = read_device(config.device)
+    device = read_wire(config.device)
     claim(output, "endopilot demo", config=config, device=device, version=__version__)
     run = _Run(
         output=output,
@@ -179,7 +179,7 @@ def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
         command="endopilot demo",
         navigation=output / "navigation",
     )
-    atlas = AtlasConfig(anatomy="rca", count=config.patients, seed=config.seed)
+    atlas = AtlasConfig(vessel="rca", count=config.patients, seed=config.seed)
     truths = [output / "truth" / f"patient-{index + 1}" for index in range(config.patients)]
     draw = partial(_make_patient, config=atlas, truths=truths)
     scan = partial(_make_volume, output=output, seed=config.seed, truths=truths)
@@ -220,7 +220,7 @@ def run_volume(
             such target, or the folder belongs to another run, such as that of another volume.
     """
     require_extras(*_EXTRAS)
-    content, device = read_volume(volume, series=series, phase=phase), read_device(config.device)
+    content, device = read_volume(volume, series=series, phase=phase), read_wire(config.device)
     identity = {"volume_sha256": _digest(content), "method": METHODS.origin(config.segmentation.method)}
     claim(output, "endopilot run", **identity, config=config, device=device, version=__version__)
     copy, stages = output / "ct" / f"patient{VOLUME_SUFFIX}", Stages(output)
@@ -246,8 +246,8 @@ def run_volume(
     anatomies = _anatomies(run, [copy])
     if target is None or folder is None:
         return _study(run, anatomies)
-    settings = NavigatePatientConfig(device=config.device, seed=config.seed)
-    navigation = navigate_into(anatomies[0], target, folder, settings)
+    settings = NavigateConfig(seed=config.seed)
+    navigation = navigate_into(anatomies[0], target, output=folder, device=config.device, config=settings)
     found = _study(run, anatomies)
     return {"outcome": navigation["outcome"], "page": navigation["page"], **found}
 
@@ -262,20 +262,20 @@ def _digest(volume: Volume) -> str:
 
 def _make_patient(folder: Path, *, config: AtlasConfig, truths: Sequence[Path]) -> None:
     if not folder.exists():
-        write_anatomy(make_patient(config, truths.index(folder)), folder)
+        write_anatomy(make_patient(config, truths.index(folder)), output=folder)
 
 
 def _make_volume(folder: Path, *, output: Path, seed: int, truths: Sequence[Path]) -> None:
     path = output / "ct" / f"{folder.name}{VOLUME_SUFFIX}"
     if not path.exists():
         seed = seed * len(truths) + truths.index(folder)
-        write_volume(make_phantom(read_anatomy(folder), PhantomConfig(), seed), path)
+        write_volume(make_phantom(read_anatomy(folder), config=PhantomConfig(), seed=seed), path)
 
 
 def _make_mask(volume: Path, *, output: Path, config: SegmentConfig, notes: tuple[str, ...]) -> None:
     path = output / "masks" / volume.name
     if not path.exists():
-        mask = segment(replace(read_volume(volume), notes=notes), config)
+        mask = segment(replace(read_volume(volume), notes=notes), config=config)
         write_mask(mask, path, manifest=manifest(config=config, inputs=input_hash(volume)))
 
 
@@ -283,7 +283,7 @@ def _make_anatomy(volume: Path, *, output: Path, config: AnatomyConfig) -> None:
     name = volume.name.removesuffix(VOLUME_SUFFIX)
     mask, folder = output / "masks" / volume.name, output / "anatomies" / name
     if mask.exists() and not folder.exists():
-        write_anatomy(extract_anatomy(read_source(mask), name=name, config=config), folder)
+        write_anatomy(extract_anatomy(read_source(mask), name=name, config=config), output=folder)
 
 
 def _anatomies(run: _Run, volumes: Sequence[Path]) -> list[Path]:
@@ -304,8 +304,8 @@ def _drive(run: _Run, anatomy: Path) -> None:
     tree = read_anatomy(anatomy).tree
     longest = tree.longest_leaf()
     target = tree.section_names[tree.branches[longest].section[-1]]
-    settings = NavigatePatientConfig(device=run.config.device, seed=run.config.seed)
-    navigate_into(anatomy, target, run.navigation, settings)
+    settings = NavigateConfig(seed=run.config.seed)
+    navigate_into(anatomy, target, output=run.navigation, device=run.config.device, config=settings)
 
 
 def _study(run: _Run, anatomies: Sequence[Path]) -> dict[str, Any]:
@@ -336,14 +336,16 @@ def _learn(run: _Run, anatomies: Sequence[Path]) -> None:
         anatomy_shares=shares,
         seen_test_share=DatasetConfig.seen_test_share if trains else 0.0,  # all are new to the packaged networks
     )
-    run.stages.do("dataset", lambda: generate_dataset(anatomies, output / "dataset", run.device, dataset))
+    run.stages.do(
+        "dataset", lambda: generate_dataset(anatomies, output=output / "dataset", device=run.device, config=dataset)
+    )
     if trains:
         training = TrainConfig(model="paper", max_seconds=config.training_seconds, seed=config.seed)
-        run.stages.do("training", lambda: train(output / "dataset", output / "training", training))
+        run.stages.do("training", lambda: train(output / "dataset", output=output / "training", config=training))
 
     def measure() -> None:
         settings = EvaluateConfig(sequences=EVALUATED, seed=config.seed)
-        evaluate(run.trained, output / "evaluation", settings, output / "dataset")
+        evaluate(run.trained, output=output / "evaluation", config=settings, dataset=output / "dataset")
         report_evaluation(output / "evaluation")
 
     run.stages.do("evaluation", measure)
@@ -402,7 +404,7 @@ def _scores(output: Path, names: Sequence[str]) -> dict[str, dict[str, float]]:
 
 def _replay(output: Path) -> tuple[Path, Trajectory]:
     """Simulate one test navigation again with the wire's shape, that in which the tip travelled farthest."""
-    dataset = load_dataset(output / "dataset")
+    dataset = read_dataset(output / "dataset")
     held_out = dataset.of_split("test" if "test" in dataset.split else "seen_test")
     best = int(np.ptp(held_out.tip_abscissa[:, :, 0], axis=1).argmax())
     folder = dataset.anatomy_folder(str(held_out.anatomy[best]))

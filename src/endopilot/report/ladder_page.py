@@ -24,7 +24,7 @@ from endopilot.plotting import BLACK, BLUE, GREEN, ORANGE, STYLE, VERMILLION, pn
 from endopilot.report.report import image, template_text
 from endopilot.report.scene import mark_target, navigation_scene
 from endopilot.tasks.navigation import Navigation
-from endopilot.tasks.task import Task, find_task, ladder_tasks
+from endopilot.tasks.task import Task, find_task, list_tasks
 
 PAGE_FILE = "index.html"
 SHOWN = 5
@@ -45,7 +45,7 @@ def write_page(output: Path) -> Path:
         InputError: the folder holds no scores.
     """
     content = read_json(output / SCORES_FILE)
-    tasks = [find_task(row["task"], content["ladder"]) for row in content["scores"] if row["level"] is not None]
+    tasks = [find_task(row["task"], version=content["ladder"]) for row in content["scores"] if row["level"] is not None]
     plotly = output / "plotly.min.js"
     if not plotly.exists():
         with writing(plotly) as partial:
@@ -59,7 +59,7 @@ def write_page(output: Path) -> Path:
         lstrip_blocks=True,
     ).get_template("ladder.html.j2")
     page = template.render(
-        of=len(ladder_tasks(content["ladder"])),
+        of=len(list_tasks(content["ladder"])),
         css=Markup(template_text("report.css")),
         policy=content["policy"],
         patients=content["patients"],

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.belief.adviser import AdviserConfig
-from endopilot.control.navigate_patient import PatientNavigation
+from endopilot.control.navigate import PatientNavigation
 from endopilot.control.plan_picture import draw_route, legend_above
 from endopilot.plotting import BLACK, BLUE, CATHETER_COLORS, GREY, ORANGE, PURPLE, STYLE, VERMILLION
 from endopilot.tasks.navigation import DECISION_PERIOD_S

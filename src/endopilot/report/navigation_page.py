@@ -11,7 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
-from endopilot.control.navigate_patient import PatientNavigation, SetUp
+from endopilot.control.navigate import PatientNavigation, SetUp
 from endopilot.control.outcome import name_target, slipped_s, tell_outcome, worst_ratio
 from endopilot.files import json_text, writing
 from endopilot.report.report import image, template_text
@@ -85,7 +85,7 @@ def _facts(found: PatientNavigation) -> list[tuple[str, str]]:
     set_up, navigation = found.set_up, found.set_up.navigation
     truth, device = set_up.truth, navigation.device
     facts = [
-        ("Policy", set_up.config.policy),
+        ("Policy", set_up.policy_name),
         ("Wire", f"{device.name}, {device.diameter_mm:g} mm"),
         *(("Catheter", f"{each.name}, {each.diameter_mm:g} mm") for each in navigation.catheters),
         *((("Arrives", "the catheter's tip"),) if navigation.arriving else ()),

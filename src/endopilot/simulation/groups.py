@@ -17,7 +17,7 @@ from endopilot.simulation.config import FREE_BEHIND_MM, SimulatorConfig
 from endopilot.simulation.core import make_simulation
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.processor import CoreMotion, Lumen, Simulation, core_for
-from endopilot.simulation.rod import RodLayout, lay_out
+from endopilot.simulation.rod import LONGEST_ELEMENTS, RodLayout, lay_out
 from endopilot.simulation.transmission import lay_out_transmission
 from endopilot.simulation.tubes import lay_out_tubes
 from endopilot.simulation.vessel_wall import make_wall
@@ -113,6 +113,8 @@ def make_groups(
             projectors[anatomy.identity] = TipProjector(anatomy.tree, anatomy.insertion)
         path_mm = float(anatomy.tree.longest_path().abscissa[-1])
         longest_mm = max(far_end_mm(anatomy), reach_mm)
+        fewest = int(longest_mm / (LONGEST_ELEMENTS * config.element_mm))
+        check_memory(8 * len(worlds) * 40 * fewest, f"reach_mm: wires of {longest_mm:g} mm", "push less far")
         rod = lay_out(stack.wire, element_mm=config.element_mm, length_mm=longest_mm + FREE_BEHIND_MM)
         check_memory(8 * len(worlds) * (40 * len(rod.abscissa_mm) + 40), f"worlds: {len(worlds)}", "give fewer")
         moving = None if motion is None else motion.core(np.asarray(anatomy.insertion.position), config.processor)
@@ -128,20 +130,6 @@ def make_groups(
             motion=moving,
             transmission=lay_out_transmission(stack, longest_mm=longest_mm + FREE_BEHIND_MM),
         )
-        index, project = np.array(worlds), projectors[anatomy.identity]
-        groups.append(
-            Group(
-                anatomy,
-                stack,
-                rod,
-                lumens[key],
-                config.wall_reach_mm,
-                moving,
-                simulation,
-                index,
-                path_mm,
-                longest_mm,
-                project,
-            )
-        )
+        where = (np.array(worlds), path_mm, longest_mm, projectors[anatomy.identity])
+        groups.append(Group(anatomy, stack, rod, lumens[key], config.wall_reach_mm, moving, simulation, *where))
     return groups

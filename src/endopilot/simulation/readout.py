@@ -204,7 +204,7 @@ class Readout:
 
         Example:
             >>> simulator.reset(seed=0)
-            >>> _ = simulator.step(np.zeros((4, 2)), duration=0.25)
+            >>> _ = simulator.step(np.zeros((4, 2)), duration_s=0.25)
             >>> simulator.time
             array([0.25, 0.25, 0.25, 0.25])
         """

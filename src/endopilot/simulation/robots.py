@@ -23,18 +23,25 @@ Seed = Sequence[int]
 
 
 def in_grip(stack: Stack, robot: RobotConfig, core: SimulatorConfig) -> tuple[Stack, SimulatorConfig]:
-    """Return devices that slip where a robot's grip yields, and settings by which the wall is as hard as before.
+    """Return devices as a robot holds them, and settings by which the wall is as hard as before.
+
+    They slip where its grip yields, and lie behind the ostium as its drives say, or else as the stack says.
 
     Args:
         stack: the devices.
         robot: what holds them.
         core: settings of the rod core, whose wall is as hard as the devices' push limits say if nothing else is given.
     """
-    wire, *around = robot.drives(len(stack))
+    drives = robot.drives(len(stack))
+    wire, *around = drives
     catheters = tuple(drive.gripped(each) for drive, each in zip(around, stack.catheters, strict=True))
-    held = replace(stack, wire=wire.gripped(stack.wire), catheters=catheters)
+    behind = zip(drives, stack.transmissions, strict=True)
+    transmissions = tuple(drive.transmission if drive.transmission.length_mm else given for drive, given in behind)
+    held = replace(stack, wire=wire.gripped(stack.wire), catheters=catheters, transmissions=transmissions)
     if held == stack:
         return stack, core
+    if held.push_limit_n == stack.push_limit_n:
+        return held, core
     return held, replace(core, wall_stiffness_n_mm=wall_stiffness(core, stack.push_limit_n))
 
 
@@ -89,21 +96,32 @@ class Robots:
         self.motion.reset(worlds, self._counted(simulator)[list(worlds)], [[*seed, 7] for seed in seeds])
 
     def read(
-        self, simulator: Simulator, *, encoder_noise: np.random.Generator | None = None
-    ) -> Float[np.ndarray, "worlds devices 4"]:
+        self,
+        simulator: Simulator,
+        *,
+        worlds: Sequence[int] | None = None,
+        encoder_noise: np.random.Generator | None = None,
+    ) -> Float[np.ndarray, "chosen devices 4"]:
         """Return a reading of the encoders, mm and rad, and of the drives' loads, N and N·mm.
 
         Args:
             simulator: whose devices are read.
+            worlds: those that are read; all if not given.
             encoder_noise: of the encoders' noise, where there is one world; the robots' own streams if not given.
         """
-        places = self.motion.motor if self._at_motor else self._counted(simulator)
-        shape = places.shape[1:]
-        streams = [encoder_noise] if encoder_noise is not None else self._random
+        chosen = list(range(len(self._random)) if worlds is None else worlds)
+        places = self.counted(simulator)[chosen]
+        own, shape = [self._random[world] for world in chosen], places.shape[1:]
+        streams = own if encoder_noise is None else [encoder_noise]
         encoders = places + self._noise * np.stack([random.standard_normal(shape) for random in streams])
-        noise = self._load_noise * np.stack([random.standard_normal(shape) for random in self._random])
-        return np.concatenate([encoders, simulator.drive_load + noise], axis=-1)
+        load = simulator.drive_load[chosen]
+        load = load + self._load_noise * np.stack([random.standard_normal(shape) for random in own])
+        return np.concatenate([encoders, load], axis=-1)
+
+    def counted(self, simulator: Simulator) -> Float[np.ndarray, "worlds devices 2"]:
+        """Return what the encoders count, without noise, mm and rad."""
+        return self.motion.motor if self._at_motor else self._counted(simulator)
 
     def _counted(self, simulator: Simulator) -> Float[np.ndarray, "worlds devices 2"]:
-        """Return where the devices are, counted from where the ostium is assumed."""
-        return simulator.proximal - [self._ostium_mm, 0.0]
+        """Return where the devices are at their drives, counted from where the ostium is assumed."""
+        return np.stack([simulator.inserted_length - self._ostium_mm, simulator.drive_rotation], axis=-1)

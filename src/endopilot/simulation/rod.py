@@ -20,7 +20,7 @@ _DRAG_N_S_MM2 = 5e-6
 """Drag of the surrounding blood on one mm of wire, N·s/mm²; far below friction."""
 _GROWTH_MM = 40.0
 """Distance from the tip at which elements are twice as long as there; they grow in proportion to it, mm."""
-_LONGEST = 5.0
+LONGEST_ELEMENTS = 5.0
 """Longest elements, as a multiple of those at the tip: the shaft is stiffer and bends less sharply."""
 
 
@@ -109,7 +109,7 @@ def _nodes(element_mm: float, length_mm: float, bend_mm: float) -> Float[np.ndar
     def nodes(first: float, count: int) -> Float[np.ndarray, "n"]:
         at = np.zeros(count)
         for i in range(1, count):
-            at[i] = at[i - 1] + min(first * (1 + at[i - 1] / _GROWTH_MM), _LONGEST * element_mm)
+            at[i] = at[i - 1] + min(first * (1 + at[i - 1] / _GROWTH_MM), LONGEST_ELEMENTS * element_mm)
         return at
 
     def middle(first: float, element: int) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -27,6 +28,10 @@ blunt tip of a 7 French catheter (pigs; Shah et al., Europace 2011). No such fig
 or cerebral artery."""
 
 
+LONGEST_MM = 5000.0
+"""No wire or catheter is longer, mm: exchange wires have up to 4.5 m."""
+
+
 @dataclass(frozen=True)
 class WallForceEvent:
     """A world whose wire presses the wall harder than `WALL_FORCE_LIMIT_N`.
@@ -44,7 +49,7 @@ class WallForceEvent:
 
 def simulate(
     anatomy: Anatomy,
-    device: Wire | Stack,
+    device: Wire | Stack | str | Path,
     control: Float[np.ndarray, "worlds samples *devices 2"],
     *,
     actuation: Actuation = "velocity",
@@ -64,7 +69,7 @@ def simulate(
 
     Args:
         anatomy: the vessel.
-        device: the wire, or the wire and its catheters; a wire alone needs no axis of devices in what follows.
+        device: the wire or its name, or the wire and its catheters; a wire alone needs no axis of devices below.
         control: proximal velocities (mm/s, rad/s), or force and torque (N, N·mm) of the drive, constant over each
             period, of each device.
         actuation: which of the two: "velocity" or "force"; catheters are driven by velocity.
@@ -133,6 +138,9 @@ def run_set_up(
     if not np.isfinite(set_up.initial).all():
         raise InputError(f"initial: world {int(np.argwhere(~np.isfinite(set_up.initial))[0][0])}: not a finite number")
     start = set_up.initial[..., 0]
+    if (start > LONGEST_MM).any():
+        world = int(np.argmax(start.max(axis=1)))
+        raise InputError(f"initial: world {world}: {start[world].max():g} mm inserted; give at most {LONGEST_MM:g}")
     reach_mm = 0.0
     if set_up.actuation == "velocity":
         # A drive that slips leaves in the vessel what it did not pull back, and pushes on from there.

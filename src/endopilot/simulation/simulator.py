@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -47,7 +48,7 @@ class Simulator(Readout):
     Example:
         >>> simulator = Simulator(anatomy, device, worlds=4)
         >>> simulator.reset(seed=0)
-        >>> step = simulator.step(np.tile([5.0, 0.5], (4, 1)), duration=0.1)
+        >>> step = simulator.step(np.tile([5.0, 0.5], (4, 1)), duration_s=0.1)
         >>> step.tip_position.shape
         (4, 1, 3)
     """
@@ -55,7 +56,7 @@ class Simulator(Readout):
     def __init__(
         self,
         anatomy: Anatomy | Sequence[Anatomy],
-        device: Wire | Stack | Sequence[Wire | Stack],
+        device: Wire | Stack | str | Path | Sequence[Wire | Stack | str | Path],
         *,
         worlds: int = 1,
         actuation: Actuation = "velocity",
@@ -68,7 +69,7 @@ class Simulator(Readout):
 
         Args:
             anatomy: the vessel of all worlds, or one for each.
-            device: the wire, or the wire and its catheters, of all worlds, or one for each.
+            device: the wire or its name, or the wire and its catheters, of all worlds, or one for each.
             worlds: their number, where neither of the above says it.
             actuation: what controls are: "velocity" (mm/s, rad/s; the drive makes exactly that motion, except that it
                 slips rather than push, pull or turn harder than the device's limits) or "force" (axial force N and
@@ -89,7 +90,7 @@ class Simulator(Readout):
             raise InputError(f"actuation: {actuation!r}; give 'velocity' or 'force'")
         config = config or SimulatorConfig()
         check_memory(worlds * _LEAST_BYTES, f"worlds: {worlds}", "give fewer")
-        one = isinstance(device, Wire | Stack)
+        one = isinstance(device, Wire | Stack | str | Path)
         anatomies = [anatomy] * worlds if isinstance(anatomy, Anatomy) else list(anatomy)
         stacks = [Stack.of(device)] * len(anatomies) if one else [Stack.of(each) for each in device]
         if isinstance(anatomy, Anatomy) and not one:
@@ -189,13 +190,13 @@ class Simulator(Readout):
             friction=np.where(resets[:, None], coefficient, self._set_up.friction),
         )
 
-    def step(self, control: ArrayLike | SupportsDLPack, duration: float) -> Step:
+    def step(self, control: ArrayLike | SupportsDLPack, duration_s: float) -> Step:
         """Drive every world for some time with a constant control.
 
         Args:
             control: translation (mm/s) and rotation (rad/s), or axial force (N) and torque (N·mm), of each world and
                 device; numpy, or anything that speaks DLPack, such as a torch tensor on the CPU.
-            duration: s; it is cut into equal time steps of at most `config.time_step_s`.
+            duration_s: time that the control holds, s; it is cut into equal time steps of at most `config.time_step_s`.
 
         Returns:
             The worlds at the end of the step. The drive stops where a device is pulled out to the ostium.
@@ -206,15 +207,15 @@ class Simulator(Readout):
 
         Example:
             >>> before = simulator.inserted_length
-            >>> step = simulator.step([[4.0, 0.0]] * 4, duration=0.25)
+            >>> step = simulator.step([[4.0, 0.0]] * 4, duration_s=0.25)
             >>> (step.inserted_length - before)[:, 0].round(6)
             array([1., 1., 1., 1.])
         """
-        if not (math.isfinite(duration) and duration > 0):
-            raise InputError(f"duration: {duration}; give a positive number of seconds")
-        array = self._checked(control, duration, sequence=False)
-        steps = self.config.steps_of(duration)
-        result = self._run_all(array, duration / steps, steps)
+        if not (math.isfinite(duration_s) and duration_s > 0):
+            raise InputError(f"duration_s: {duration_s}; give a positive number of seconds")
+        array = self._checked(control, duration_s, sequence=False)
+        steps = self.config.steps_of(duration_s)
+        result = self._run_all(array, duration_s / steps, steps)
         return Step(**{name: result[name][:, 0] for name in Step.__dataclass_fields__})
 
     def run(
@@ -289,7 +290,7 @@ class Simulator(Readout):
         """The worlds' state, to be kept and given to `set_state`.
 
         Example:
-            >>> kept = simulator.state  # kept.save(path) writes it to a file
+            >>> kept = simulator.state  # kept.write(path) writes it to a file
         """
         return SimulatorState(tuple(group.simulation.state() for group in self._groups), self._fingerprint)
 

@@ -60,15 +60,15 @@ class SimulatorState:
                 f"{where}: format version {self.format_version}, not {FORMAT_VERSION}; make the state again"
             )
 
-    def save(self, path: Path) -> None:
+    def write(self, path: Path | str) -> None:
         """Write the state to an .npz file, whole or not at all."""
         arrays = {f"values_{k}": v for k, v in enumerate(self.values)}
-        with writing(path) as temporary, temporary.open("wb") as file:
+        with writing(Path(path)) as temporary, temporary.open("wb") as file:
             about = {"fingerprint": np.array(self.fingerprint), "format_version": np.array(self.format_version)}
             np.savez(file, **about, **arrays)  # pyright: ignore[reportArgumentType]
 
     @staticmethod
-    def load(path: Path) -> SimulatorState:
+    def read(path: Path | str) -> SimulatorState:
         """Read a state.
 
         Raises:
@@ -82,7 +82,7 @@ class SimulatorState:
                 state = SimulatorState(tuple(stored[name] for name in names), fingerprint, version)
         except (OSError, ValueError, KeyError, BadZipFile) as error:
             raise InputError(
-                f"{path}: no saved state of a simulator ({error}); save one with SimulatorState.save"
+                f"{path}: no saved state of a simulator ({error}); write one with SimulatorState.write"
             ) from None
         state.check_version(str(path))
         return state

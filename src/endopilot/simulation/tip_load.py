@@ -61,19 +61,19 @@ class TipLoadTest:
     load_n: float
 
 
-def simulate_tip_load(device: Wire) -> TipLoadTest:
-    """Push the distal 10 mm of a device, straight, against a smooth plate until it buckles.
+def simulate_tip_load(wire: Wire) -> TipLoadTest:
+    """Push the distal 10 mm of a wire, straight, against a smooth plate until it buckles.
 
     Args:
-        device: the wire; its tip shape is left out.
+        wire: the wire; its tip shape is left out.
 
     Raises:
         RuntimeError: the rod core did not converge.
     """
-    rod = _distal_rod(device)
+    rod = _distal_rod(wire)
     nodes = len(rod.abscissa_mm)
     dead, plate, anchor = np.zeros((nodes, 3)), np.zeros((nodes, 3)), np.zeros((nodes, 3))
-    dead[0, 1] = _IMPERFECTION * np.pi**2 * device.bend_stiffness_n_mm2[0] / (4 * HELD_MM**2)
+    dead[0, 1] = _IMPERFECTION * np.pi**2 * wire.bend_stiffness_n_mm2[0] / (4 * HELD_MM**2)
     plate[0, 0], anchor[0, 0] = _PLATE_N_MM, HELD_MM
     push = np.zeros((1, _SAMPLES, 2))
     push[..., 0] = _PUSH_SHARE * HELD_MM / _SAMPLES / _STATIC.time_step_s
@@ -99,7 +99,7 @@ def simulate_tip_load(device: Wire) -> TipLoadTest:
         free_behind_mm=HELD_MM,  # more than the wire has: its last two nodes are held, and the free length stays
     )
     if not result["valid"].all():
-        raise RuntimeError(f"the tip-load test of device {device.name} did not converge")
+        raise RuntimeError(f"the tip-load test of wire {wire.name} did not converge")
     force = _PLATE_N_MM * (result["tip_position"][0, :, 0, 0] - HELD_MM)
     pushed = _STATIC.time_step_s * np.cumsum(push[0, :, 0])
     return TipLoadTest(pushed, force, result["shape"][0, -1], float(force.max()))

@@ -105,7 +105,7 @@ def write_trajectory(trajectory: Trajectory, path: Path) -> None:
                 np.savez_compressed(stream, about=np.array(_about(trajectory, arrays)), **arrays)  # pyright: ignore[reportArgumentType]
 
 
-def read_trajectory(path: Path | str, anatomy: Anatomy | Sequence[Anatomy] | None = None) -> Trajectory:
+def read_trajectory(path: str | Path, *, anatomy: Anatomy | Sequence[Anatomy] | None = None) -> Trajectory:
     """Read a trajectory from an .npz file.
 
     Args:

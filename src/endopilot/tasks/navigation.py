@@ -11,6 +11,7 @@ from pydantic import InstanceOf, model_validator
 from endopilot.devices.catheter import Catheter, check_nested
 from endopilot.devices.device import Device, Wire
 from endopilot.devices.drive_limits import Numbers
+from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.settings import CountOrZero, Finite, NonNegative, Positive, Seconds, Within, settings
 from endopilot.simulation.motion import Motion
@@ -72,14 +73,16 @@ class Navigation:
         arrives: whose tip is to go to the target: "wire", or "catheter", the one next to the wire. The wire's tip may
             then not be pulled back into the catheter.
         target: where the tip is to go.
-        start_inserted_mm: inserted length Δ at the start, mm.
-        start_rotation: rotation φ at the start, rad.
+        start_inserted_length_mm: inserted length Δ at the start, mm.
+        start_rotation_rad: rotation φ at the start, rad.
         start_catheter_mm: inserted length of the catheters at the start, mm; their rotations are 0.
         seconds: time in which the target is to be reached, s.
         force_limit_n: largest force of the wall on one node that is safe, N.
         known_motion: how heart and breath are known to move the vessel, which the C-arm takes off what it measures and
             policies simulate; it is taken to lie still if not given.
         xray: how an exposure finds the tip; `NavigationLoop` says what its C-arm does.
+        robot: as it is known, not what a seed draws of it. `NavigationLoop` takes its own if not given; else encoders
+            sit at the devices.
     """
 
     anatomy: InstanceOf[Anatomy]
@@ -87,13 +90,14 @@ class Navigation:
     target: Target
     catheters: tuple[Catheter, ...] = ()
     arrives: Arrives = "wire"
-    start_inserted_mm: Annotated[float, Within(0, 5000)] = 2.0
-    start_rotation: Finite = 0.0
+    start_inserted_length_mm: Annotated[float, Within(0, 5000)] = 2.0
+    start_rotation_rad: Finite = 0.0
     start_catheter_mm: Annotated[float, Within(0, 5000)] = 0.0
     seconds: Seconds = 60.0
     force_limit_n: Positive = 0.5
     known_motion: Motion | None = None
     xray: XrayKind = "assumed"
+    robot: RobotConfig | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Navigation:
@@ -122,7 +126,7 @@ class Navigation:
     def start(self) -> Float[np.ndarray, "devices 2"]:
         """(Δ mm, φ rad) of each device at the start."""
         catheters = [(self.start_catheter_mm, 0.0)] * len(self.catheters)
-        return np.array([(self.start_inserted_mm, self.start_rotation), *catheters])
+        return np.array([(self.start_inserted_length_mm, self.start_rotation_rad), *catheters])
 
     def periods(self, period_s: float) -> int:
         """Return after how many periods of some length, s, the time is over."""

@@ -12,10 +12,10 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from endopilot.anatomy.catheter_axis import with_world_zero
-from endopilot.atlas.atlas import ANATOMIES, AtlasConfig, make_patient
+from endopilot.atlas.atlas import VESSELS, AtlasConfig, make_patient
 from endopilot.devices.catheter import list_catheters, read_catheter
-from endopilot.devices.device import read_device
-from endopilot.devices.device_files import list_devices
+from endopilot.devices.device import read_wire
+from endopilot.devices.device_files import list_wires
 from endopilot.errors import InputError
 from endopilot.settings import CountOrZero, NonNegative, Positive, Seconds, Seed, Share, Within, read_settings, settings
 from endopilot.simulation.config import SimulatorConfig
@@ -54,13 +54,13 @@ class Task:
         name: short name.
         level: place on the ladder, 1 to 12, or 13 to 16 of those with a catheter.
         title: what is to be done, in a few words.
-        anatomy: kind of vessel tree of the atlas.
+        vessel: kind of vessel tree of the atlas.
         device: shipped device.
         tip_bend_deg: angle to which its tip is shaped for this task, degrees.
         tip_bend_mm: length from the tip over which it is bent, mm.
         section: section that the target lies in.
         depth_mm: distance of the target from the section's begin, along the centerline, mm.
-        start_inserted_mm: inserted length at the start, mm.
+        start_inserted_length_mm: inserted length at the start, mm.
         seconds: time limit, s.
         force_limit_n: largest force of the wall on one node that is safe, N.
         stenosis_share: share of the atlas' patients that have a stenosis.
@@ -76,13 +76,13 @@ class Task:
     name: str
     level: Annotated[int, Within(1, 16)]
     title: str
-    anatomy: str
+    vessel: str
     device: str
     tip_bend_deg: Annotated[float, Within(0, 180)]
     tip_bend_mm: Positive
     section: str
     depth_mm: Positive
-    start_inserted_mm: NonNegative
+    start_inserted_length_mm: NonNegative
     seconds: Seconds
     force_limit_n: Positive
     stenosis_share: Share
@@ -97,7 +97,7 @@ class Task:
     @model_validator(mode="after")
     def _consistent(self) -> Task:
         known_catheters = (*list_catheters(), None)
-        for name, known in (("anatomy", ANATOMIES), ("device", list_devices()), ("catheter", known_catheters)):
+        for name, known in (("vessel", VESSELS), ("device", list_wires()), ("catheter", known_catheters)):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name}: {getattr(self, name)!r}; choose from {', '.join(filter(None, known))}")
         return self
@@ -114,7 +114,7 @@ class Task:
     def atlas(self, seed: int) -> AtlasConfig:
         """Return the atlas of a seed that the task's patients come from."""
         return AtlasConfig(
-            anatomy=self.anatomy,
+            vessel=self.vessel,
             seed=seed,
             stenosis_share=self.stenosis_share,
             population="textbook" if self.version == 1 else "patients",
@@ -123,9 +123,9 @@ class Task:
     def ladder_navigation(self, place: int) -> Navigation:
         """Return the task in one of the patients that the ladder is scored on, with its own first rotation."""
         turn = np.random.default_rng([self.ladder.seed, self.ladder.numbers[place]]).uniform(0.0, 2 * np.pi)
-        return self.navigation(self.patient(self.ladder, place), start_rotation=turn)
+        return self.navigation(self.patient(self.ladder, place), start_rotation_rad=turn)
 
-    def navigation(self, anatomy: Anatomy, *, start_rotation: float = 0.0) -> Navigation:
+    def navigation(self, anatomy: Anatomy, *, start_rotation_rad: float = 0.0) -> Navigation:
         """Return what is to be done in one of the task's patients.
 
         Raises:
@@ -134,10 +134,10 @@ class Task:
         bend = {"tip_bend_rad": float(np.deg2rad(self.tip_bend_deg)), "tip_bend_length_mm": self.tip_bend_mm}
         return Navigation(
             anatomy=anatomy,
-            device=replace(read_device(self.device), **bend),
+            device=replace(read_wire(self.device), **bend),
             target=find_target(anatomy.tree, self.section, depth_mm=self.depth_mm),
-            start_inserted_mm=self.start_inserted_mm,
-            start_rotation=start_rotation,
+            start_inserted_length_mm=self.start_inserted_length_mm,
+            start_rotation_rad=start_rotation_rad,
             seconds=self.seconds,
             force_limit_n=self.force_limit_n,
             catheters=(read_catheter(self.catheter),) if self.catheter else (),
@@ -147,19 +147,19 @@ class Task:
 
 
 @cache
-def ladder_tasks(version: LadderVersion = NEWEST) -> tuple[Task, ...]:
+def list_tasks(version: LadderVersion = NEWEST) -> tuple[Task, ...]:
     """Return the tasks of a version of the ladder, the lowest first."""
     tasks = (read_settings(path, Task) for path in _FOLDERS[version].glob("*.yaml"))
     return tuple(sorted(tasks, key=lambda task: task.level))
 
 
-def find_task(name: str, version: LadderVersion = NEWEST) -> Task:
+def find_task(name: str, *, version: LadderVersion = NEWEST) -> Task:
     """Return a task of a version of the ladder by its name.
 
     Raises:
         InputError: the ladder has no such task.
     """
-    return _named(name, ladder_tasks(version))
+    return _named(name, list_tasks(version))
 
 
 def task_by_hand(name: str) -> Task:
@@ -168,7 +168,7 @@ def task_by_hand(name: str) -> Task:
     Raises:
         InputError: there is no such task.
     """
-    return _named(name, ladder_tasks(NEWEST) + ladder_tasks("coaxial"))
+    return _named(name, list_tasks(NEWEST) + list_tasks("coaxial"))
 
 
 def _named(name: str, tasks: Sequence[Task]) -> Task:
@@ -186,7 +186,7 @@ def training_navigations(name: str, first: int, count: int) -> list[Navigation]:
     Raises:
         InputError: the ladder has no such task, or the task fewer patients.
     """
-    task = find_task(name, 1)
+    task = find_task(name, version=1)
     return [task.navigation(task.patient(task.training, first + place)) for place in range(count)]
 
 
@@ -215,8 +215,8 @@ def reference_navigation() -> Navigation:
     anatomy = with_world_zero(make_patient(AtlasConfig(population="textbook"), 0))
     return Navigation(
         anatomy=anatomy,
-        device=read_device("workhorse-014"),
+        device=read_wire("workhorse-014"),
         target=find_target(anatomy.tree, "4", depth_mm=15.0),
-        start_inserted_mm=5.0,
+        start_inserted_length_mm=5.0,
         seconds=60.0,
     )

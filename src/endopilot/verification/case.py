@@ -213,7 +213,7 @@ def equilibrium(
     friction: float = 0.0,
     config: SimulatorConfig = STATIC,
     insertion: Insertion = X_AXIS,
-    inserted_mm: float | None = None,
+    inserted_length_mm: float | None = None,
     free_behind_mm: float = 0.0,
 ) -> dict[str, np.ndarray]:
     """Bring one clamped rod to rest and return the core's arrays, shape and attitude included, without the world axis.
@@ -227,15 +227,15 @@ def equilibrium(
         friction: Coulomb coefficient.
         config: settings of the core.
         insertion: where the wall of the clamp is, and the rod's direction.
-        inserted_mm: free length; the rod's own if not given.
+        inserted_length_mm: free length; the rod's own if not given.
         free_behind_mm: the rod is held this far behind the wall of the clamp.
     """
-    if inserted_mm is None:
-        inserted_mm = (len(rod.abscissa_mm) - 3 - 0.5) * float(rod.abscissa_mm[1])
+    if inserted_length_mm is None:
+        inserted_length_mm = (len(rod.abscissa_mm) - 3 - 0.5) * float(rod.abscissa_mm[1])
     return driven(
         rod,
         np.zeros((samples, 2)) if control is None else control,
-        initial=np.array([inserted_mm, 0.0]),
+        initial=np.array([inserted_length_mm, 0.0]),
         loading=loading,
         lumen=lumen,
         friction=friction,

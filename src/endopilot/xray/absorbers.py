@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.devices.catheter import Catheter
+from endopilot.lines import length_along, places_on
 from endopilot.phantom.chest import is_left
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.types import Anatomy, Volume
@@ -44,7 +45,7 @@ def is_coronary(anatomy: Anatomy) -> bool:
 
 def surroundings(anatomy: Anatomy) -> Volume | None:
     """Return the CT of a synthetic chest around a coronary artery, HU; None for any other vessel."""
-    return make_phantom(anatomy, _SURROUNDINGS, seed=0) if is_coronary(anatomy) else None
+    return make_phantom(anatomy, config=_SURROUNDINGS, seed=0) if is_coronary(anatomy) else None
 
 
 def without_contrast(ct: Volume, anatomy: Anatomy) -> Volume:
@@ -116,8 +117,8 @@ def catheter_lumen_points(anatomy: Anatomy) -> tuple[Places, Float[np.ndarray, "
     """Return the inside of the guiding catheter, through which contrast is injected, as `lumen_points` does."""
     distance, places, heading = catheter_line(anatomy)
     at = np.arange(_STEP_MM / 2, distance[-1], _STEP_MM)
-    middle = np.stack([np.interp(at, distance, axis) for axis in places.T], axis=-1)
-    first, second = _across(np.stack([np.interp(at, distance, part) for part in heading.T], axis=-1))
+    middle = places_on(places, distance, at)
+    first, second = _across(places_on(heading, distance, at))
     turn = np.linspace(0, 2 * np.pi, _SPOKES, endpoint=False)
     shares = (np.arange(_RINGS) + 0.5) / _RINGS
     radius = anatomy.catheter_radius_mm * shares
@@ -133,8 +134,8 @@ def catheter_points(anatomy: Anatomy) -> tuple[Places, float]:
     distance, places, heading = catheter_line(anatomy)
     radius = anatomy.catheter_radius_mm + _CATHETER_WALL_MM / 2
     at = np.arange(_STEP_MM / 2, distance[-1], _STEP_MM)
-    middle = np.stack([np.interp(at, distance, axis) for axis in places.T], axis=-1)
-    first, second = _across(np.stack([np.interp(at, distance, part) for part in heading.T], axis=-1))
+    middle = places_on(places, distance, at)
+    first, second = _across(places_on(heading, distance, at))
     turn = np.linspace(0, 2 * np.pi, _RING, endpoint=False)[:, None, None]
     ring = radius * (np.cos(turn) * first + np.sin(turn) * second)
     size = 2 * np.pi * radius * _CATHETER_WALL_MM * _STEP_MM / _RING
@@ -160,9 +161,9 @@ def wire_points(
         opaque_tip_mm: length of the radiopaque coil.
         step_mm: distance of the places.
     """
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
+    along = length_along(nodes)
     at = np.arange(step_mm / 2, along[-1], step_mm)
-    points = np.stack([np.interp(at, along, axis) for axis in nodes.T], axis=-1)
+    points = places_on(nodes, along, at)
     per_mm = np.where(at <= opaque_tip_mm, COIL_MM, STEEL_MM)
     return points, per_mm * np.pi * radius_mm**2 * step_mm
 
@@ -191,9 +192,9 @@ def _tube(
     nodes: Places, radius_mm: float, wall_mm: float, step_mm: float, per_mm: float, most_mm: float = np.inf
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
     """Return a tube about a line, from its begin up to a length, as `driven_catheter_points` does."""
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
+    along = length_along(nodes)
     at = np.arange(step_mm / 2, min(along[-1], most_mm), step_mm)
-    axis = np.stack([np.interp(at, along, part) for part in nodes.T], axis=-1)
+    axis = places_on(nodes, along, at)
     heading = np.stack([np.interp(at, along, part) for part in np.gradient(nodes, along, axis=0).T], axis=-1)
     first, second = _across(heading)
     spokes = int(np.ceil(2 * np.pi * radius_mm / _SPOKE_MM))

@@ -131,8 +131,8 @@ class Fluoroscope:
         self,
         anatomy: Anatomy,
         wire_radius_mm: float,
-        config: FluoroscopeConfig | None = None,
         *,
+        config: FluoroscopeConfig | None = None,
         known_motion: Motion | None = None,
     ) -> None:
         """Bring the middle of the vessel to the isocenter.
@@ -319,7 +319,7 @@ class Fluoroscope:
         return place - max(beyond, 0.0) * lateral, cost, nearest  # a tip does not leave the lumen
 
 
-def make_c_arm(navigation: Navigation, config: FluoroscopeConfig | None = None, *, seed: int = 0) -> CArm:
+def make_c_arm(navigation: Navigation, *, config: FluoroscopeConfig | None = None, seed: int = 0) -> CArm:
     """Return the C-arm of a navigation, whose exposures are what `Navigation.xray` says.
 
     Args:
@@ -332,7 +332,7 @@ def make_c_arm(navigation: Navigation, config: FluoroscopeConfig | None = None, 
     """
     anatomy, device, known = navigation.anatomy, navigation.device, navigation.known_motion
     if navigation.xray == "assumed":
-        return Fluoroscope(anatomy, device.tip_radius_mm, config, known_motion=known)
+        return Fluoroscope(anatomy, device.tip_radius_mm, config=config, known_motion=known)
     from endopilot.xray.image_fluoroscope import ImageFluoroscope  # slow to import
 
     if navigation.catheters:
@@ -340,4 +340,4 @@ def make_c_arm(navigation: Navigation, config: FluoroscopeConfig | None = None, 
         raise InputError(
             f"xray: images: the detector takes a wire alone, and there is {names} around it; leave the catheter out"
         )
-    return ImageFluoroscope(anatomy, device, config, seed, known_motion=known)
+    return ImageFluoroscope(anatomy, device, config=config, seed=seed, known_motion=known)

@@ -11,14 +11,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from scipy.ndimage import gaussian_filter, zoom
 
-from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire
+from endopilot.devices.stack import Stack
 from endopilot.settings import Finite, Positive, Share, Within, settings
 from endopilot.simulation.motion import place
 from endopilot.types import Anatomy, Volume
@@ -119,23 +120,20 @@ class XrayImager:
     def __init__(
         self,
         anatomy: Anatomy,
-        device: Wire,
+        device: Wire | Stack | str | Path,
+        *,
         ct: Volume | None = None,
         config: ImageConfig | None = None,
-        *,
-        catheters: Sequence[Catheter] = (),
     ) -> None:
         """Bring the middle of the vessel to the isocenter.
 
         Args:
             anatomy: the vessel.
-            device: the wire.
+            device: the wire or its name, or the wire and its catheters.
             ct: of the patient, HU; 200 mm of water if not given. The blood in the vessel loses its contrast.
             config: detector and beam.
-            catheters: driven around the wire, from the inside out.
         """
-        self.anatomy, self.device, self.config = anatomy, device, config or ImageConfig()
-        self.catheters = tuple(catheters)
+        self.anatomy, self.stack, self.config = anatomy, Stack.of(device), config or ImageConfig()
         self.isocenter = isocenter_of(anatomy)
         self._ct = None if ct is None else without_contrast(ct, anatomy)
         self._filled = [lumen_points(anatomy), catheter_lumen_points(anatomy)]
@@ -249,7 +247,7 @@ class XrayImager:
             plane: the view.
             nodes: of the wire from its tip on, LPS mm.
         """
-        radius = self.device.tip_radius_mm
+        radius = self.stack.wire.tip_radius_mm
         points, size = wire_points(in_catheter(self.anatomy, nodes), radius, self.config.opaque_tip_mm)
         blur = self._blur_px(plane.zoom)
         points = place(plane.placed, points)
@@ -265,7 +263,7 @@ class XrayImager:
             nodes: of its axis from its tip on, LPS mm.
             number: which one, from the inside out.
         """
-        catheter = self.catheters[number]
+        catheter = self.stack.catheters[number]
         points, size = driven_catheter_points(catheter, in_catheter(self.anatomy, nodes))
         wall_mm = catheter.tip_radius_mm - catheter.inner_diameter_mm / 2
         blur = self._blur_px(plane.zoom)

@@ -48,9 +48,9 @@ class ImageFluoroscope:
         self,
         anatomy: Anatomy,
         device: Wire,
+        *,
         config: FluoroscopeConfig | None = None,
         seed: int = 0,
-        *,
         known_motion: Motion | None = None,
     ) -> None:
         """Lay the patient on the table, inject contrast and register.
@@ -69,7 +69,9 @@ class ImageFluoroscope:
         random = np.random.default_rng([seed, 0x706F7365])
         angles = config.view_angles_deg[: 2 if config.biplane else 1]
         self.pose, self._anatomy, self.known_motion = Pose.draw(random), anatomy, known_motion
-        self._imager = XrayImager(anatomy, device, surroundings(anatomy), ImageConfig(geometry=config.geometry))
+        self._imager = XrayImager(
+            anatomy, device, ct=surroundings(anatomy), config=ImageConfig(geometry=config.geometry)
+        )
         self._angles_deg = angles
         self._planes = [self._imager.plane(angle, pose=self.pose) for angle in angles]
         self._views = [view_at(angle, self._imager.isocenter, config.geometry) for angle in angles]

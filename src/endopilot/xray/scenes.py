@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.devices.device import Wire, read_device
+from endopilot.devices.device import Wire, read_wire
 from endopilot.progress import progress
 from endopilot.settings import Finite, Seed, Within, settings
 from endopilot.simulation.controls import ControlConfig, random_controls
@@ -105,13 +105,13 @@ def draw_scenes(config: SceneConfig, image: ImageConfig | None = None) -> Iterat
     Raises:
         InputError: a given folder holds no anatomy.
     """
-    device, patients = read_device(config.device), len(config.given) or config.patients
+    device, patients = read_wire(config.device), len(config.given) or config.patients
     with progress("Patients on the table", patients) as advance:
         for index in range(patients):
             random = np.random.default_rng([config.seed, index, 0x7363656E])
-            atlas = AtlasConfig(anatomy=("rca", "lca")[index % 2], seed=config.seed)
+            atlas = AtlasConfig(vessel=("rca", "lca")[index % 2], seed=config.seed)
             anatomy = read_anatomy(config.given[index]) if config.given else make_patient(atlas, index)
-            imager = XrayImager(anatomy, device, surroundings(anatomy), image)
+            imager = XrayImager(anatomy, device, ct=surroundings(anatomy), config=image)
             angles = config.view_angles_deg[index // 2 % len(config.view_angles_deg)]
             pose = Pose.draw(random)
             planes = tuple(imager.plane(angle, pose=pose) for angle in angles)

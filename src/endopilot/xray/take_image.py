@@ -10,8 +10,6 @@ import numpy as np
 import SimpleITK as sitk
 from jaxtyping import Float, UInt8
 
-from endopilot.devices.catheter import read_catheter
-from endopilot.devices.device import read_device
 from endopilot.devices.stack import Stack, lines_from_tips
 from endopilot.errors import InputError
 from endopilot.files import writing
@@ -45,13 +43,13 @@ class TakeImageConfig:
     """Share of the full contrast in the vessel, where it is shown."""
     device: Text = "workhorse-014"
     """Name of a device (`endopilot devices`) or a YAML file."""
-    inserted_mm: Annotated[float, Within(0, 5000)] = 60.0
+    inserted_length_mm: Annotated[float, Within(0, 5000)] = 60.0
     """Length of wire that is pushed in before, mm; 0 shows the vessel without wire and catheters."""
     rotation_rad: Finite = 0.0
     """Rotation of the wire as it goes in, rad."""
     catheter: tuple[Text, ...] = ()
     """Up to two catheters around the wire, from the inside out: names such as microcatheter-1.7f, or YAML files."""
-    catheter_inserted_mm: Annotated[float, Within(0, 5000)] = 40.0
+    catheter_inserted_length_mm: Annotated[float, Within(0, 5000)] = 40.0
     """Length of the catheters that is pushed in with it, mm."""
     speed_mm_s: Finite = 0.0
     """Speed of the wire along its axis while it is exposed, mm/s: it is blurred."""
@@ -97,7 +95,7 @@ class XrayImage:
             sitk.WriteImage(sitk.GetImageFromArray(self.grey), str(partial), useCompression=True)
 
 
-def take_image(anatomy: Anatomy, config: TakeImageConfig | None = None, ct: Volume | None = None) -> XrayImage:
+def take_image(anatomy: Anatomy, *, config: TakeImageConfig | None = None, ct: Volume | None = None) -> XrayImage:
     """Push a wire into a vessel, and take an X-ray image of it.
 
     Args:
@@ -109,11 +107,11 @@ def take_image(anatomy: Anatomy, config: TakeImageConfig | None = None, ct: Volu
         InputError: no such device, or it does not fit the vessel.
     """
     config = config or TakeImageConfig()
-    stack = Stack(read_device(config.device), tuple(read_catheter(name) for name in config.catheter))
+    stack = Stack.of(config.device, *config.catheter)
     motion = motion_named(config.motion, config.motion_seed)
     nodes, *catheters = _pushed(anatomy, stack, config, motion)
     patient = surroundings(anatomy) if ct is None else ct
-    imager = XrayImager(anatomy, stack.wire, patient, config.image, catheters=stack.catheters)
+    imager = XrayImager(anatomy, stack, ct=patient, config=config.image)
     placed, before = np.eye(3, 4), np.eye(3, 4)  # at the end of the pulse and at its start
     if motion is not None:
         times = np.array([config.time_s, config.time_s - config.image.pulse_s])
@@ -160,9 +158,12 @@ def _pushed(
 
     They lie in the vessel as CT shows it. At 0 mm there is a wire without nodes, and nothing else.
     """
-    if config.inserted_mm == 0:
+    if config.inserted_length_mm == 0:
         return [np.zeros((0, 3))]
-    start = [(config.inserted_mm, config.rotation_rad), *[(config.catheter_inserted_mm, 0.0)] * (len(stack) - 1)]
+    start = [
+        (config.inserted_length_mm, config.rotation_rad),
+        *[(config.catheter_inserted_length_mm, 0.0)] * (len(stack) - 1),
+    ]
     period_s = max(config.time_s, _SHORTEST_S) if motion is not None else SAMPLE_PERIOD_S
     rollout = simulate(
         anatomy,

@@ -68,10 +68,10 @@ function devices() {
 function placesOf(state) {
   const speed = (k) => `${state.velocity[2 * k].toFixed(1)} mm/s, ${state.velocity[2 * k + 1].toFixed(1)} rad/s`;
   if (!state.catheters) {
-    return { inserted: `${state.inserted_mm.toFixed(1)} mm`, rotation: `${state.rotation_deg.toFixed(0)}°`, drive: speed(0) };
+    return { inserted: `${state.inserted_length_mm.toFixed(1)} mm`, rotation: `${state.rotation_deg.toFixed(0)}°`, drive: speed(0) };
   }
   const rows = [state, ...state.catheters].map((one, k) => [
-    devices()[k].name, `${one.inserted_mm.toFixed(1)} mm, ${one.rotation_deg.toFixed(0)}°, ${speed(k)}`,
+    devices()[k].name, `${one.inserted_length_mm.toFixed(1)} mm, ${one.rotation_deg.toFixed(0)}°, ${speed(k)}`,
   ]);
   return Object.fromEntries(rows);
 }

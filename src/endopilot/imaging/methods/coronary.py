@@ -28,6 +28,7 @@ from endopilot.imaging.ostium import find_ostium
 from endopilot.imaging.segment import SegmentConfig
 from endopilot.imaging.vessel_tracking import track_tree
 from endopilot.imaging.vesselness import vesselness
+from endopilot.lines import length_along
 from endopilot.progress import progress
 from endopilot.types import Insertion, LumenMask, Volume
 
@@ -403,7 +404,7 @@ def _rough_radius(lines: list[np.ndarray], scan: _Scan) -> list[Float[np.ndarray
     for number, line in enumerate(lines):
         at = np.round(scan.grid.world_to_index(line)).astype(int)[:, ::-1] - [part.start for part in box]
         radius = np.clip(depth[tuple(np.clip(at, 0, np.array(depth.shape) - 1).T)], 0.4, _WIDEST_MM)
-        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+        along = length_along(line)
         beyond = (along > _MOUTH_MM) & (along < 2 * _MOUTH_MM)
         if number == 0 and beyond.any():
             # At its mouth the artery has no wall of its own: take what it has a little farther on.

@@ -1,8 +1,8 @@
-"""One wire driven to a named place of one patient's vessel, in closed loop: `navigate_patient`.
+"""One wire driven to a named place of one patient's vessel, in closed loop: `navigate`.
 
-The navigation is that of `endopilot.navigate`. Here its vessel is read, X-ray shows how the guiding catheter lies, the
-wire is shaped, and reality is made to differ from what the policy is given. The whole wire is kept, as it truly was and
-as the policy believed it to be.
+The vessel is read, X-ray shows how the guiding catheter lies, the wire is shaped, and reality is made to differ from
+what the policy is given. Then `NavigationLoop` drives. The whole wire is kept, as it truly was and as the policy
+believed it to be.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from endopilot.anatomy.catheter_axis import lean_between, with_axis
 from endopilot.anatomy.io import read_anatomy
 from endopilot.control.agent import OraclePolicy
 from endopilot.control.set_up import TILT_DEG, TipChoice, choose_tip
-from endopilot.devices.catheter import read_catheter
-from endopilot.devices.device import Wire, read_device
+from endopilot.devices.device import Wire
 from endopilot.devices.robot import ASSUMED, RobotConfig, read_robot
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
-from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, XrayKind
-from endopilot.navigation.policies import make_policy
+from endopilot.navigation.loop import LoopConfig, NavigationLoop, XrayKind
+from endopilot.navigation.policies import POLICIES, make_policy
 from endopilot.navigation.policy import Believer, Led, Observation, Policy
 from endopilot.navigation.record import NavigationRecord
 from endopilot.progress import progress
@@ -43,16 +43,9 @@ _Factor = Annotated[float, Within(0.2, 5)]
 
 
 @settings
-class NavigatePatientConfig:
-    """Policy, wire, limits, and how reality differs from what the policy is given."""
+class NavigateConfig:
+    """Limits, X-ray, and how reality differs from what the policy is given."""
 
-    policy: Text = "agent"
-    """What decides: agent, oracle (which is given the truth), open-loop, forward, spin, retract-rotate, with a catheter
-    in-turn or catheter-alone, or MODULE:OBJECT of your own."""
-    device: Text = "workhorse-014"
-    """Name of a device (`endopilot devices`) or a YAML file."""
-    catheter: tuple[Text, ...] = ()
-    """Up to two catheters around it, from the inside out: names such as microcatheter-1.7f, or YAML files."""
     arrives: Arrives = "wire"
     """Whose tip is to go to the target: wire, or catheter, the one next to the wire."""
     robot: Text = ASSUMED
@@ -67,9 +60,9 @@ class NavigatePatientConfig:
     """Time in which the target is to be reached, s."""
     force_limit_n: Positive = 0.5
     """Largest force of the wall on one node that is safe, N."""
-    start_inserted_mm: Annotated[float, Within(0, 5000)] = 2.0
+    start_inserted_length_mm: Annotated[float, Within(0, 5000)] = 2.0
     """Inserted length at the start, mm."""
-    start_rotation: Finite = 0.0
+    start_rotation_rad: Finite = 0.0
     """Rotation at the start, rad."""
     xray: XrayKind = "assumed"
     """What an exposure is: assumed (the tip, with the C-arm's errors of detection) or images (the tip is found in X-ray
@@ -103,7 +96,9 @@ class SetUp:
     """A navigation that is ready to begin.
 
     Attributes:
-        config: what it was made of.
+        config: its settings.
+        target: as it was asked for.
+        folder: of the patient's anatomy; None if it was given in memory.
         anatomy: the patient's vessel as it was given; that of `navigation` has its catheter as X-ray shows it, and
             as it was turned.
         navigation: as the policy is given it.
@@ -112,10 +107,14 @@ class SetUp:
         robot: what drives, as it truly is.
         snapped_mm: distance from a target that was given as a point to the centerline, mm; None for a section.
         policy: what decides.
+        policy_name: its name, or that of its class.
+        policy_origin: where it comes from: package and version, or file and hash.
         simulator: settings of the simulated reality.
     """
 
-    config: NavigatePatientConfig
+    config: NavigateConfig
+    target: str
+    folder: Path | None
     anatomy: Anatomy
     navigation: Navigation
     choice: TipChoice
@@ -123,6 +122,8 @@ class SetUp:
     robot: RobotConfig
     snapped_mm: float | None
     policy: Policy
+    policy_name: str
+    policy_origin: str
     simulator: SimulatorConfig
 
     @property
@@ -159,44 +160,73 @@ class PatientNavigation:
     planning_s: float | None
 
 
-def set_up_navigation(anatomy: Anatomy | str | Path, target: str, config: NavigatePatientConfig | None = None) -> SetUp:
-    """Prepare a navigation in a patient.
+def navigate(
+    anatomy: Anatomy | str | Path,
+    target: str,
+    *,
+    policy: Policy | str = "agent",
+    device: Wire | Stack | str | Path = "workhorse-014",
+    config: NavigateConfig | None = None,
+) -> PatientNavigation:
+    """Let a policy drive a wire to a place of a patient's vessel, in closed loop, and return what happened.
+
+    A robot moves the devices, and X-ray shows the tip where the policy asks for it. `write_navigation` writes the
+    result into a folder. `NavigationLoop` drives a `Navigation` of one's own, one decision at a time if wanted.
 
     Args:
         anatomy: the vessel, or its folder.
         target: a section such as "4" or "LAD", or a point "X,Y,Z" in LPS mm, which is moved to the centerline.
-        config: policy, wire, limits and reality.
+        policy: what decides, or its name: agent, oracle (which is given the truth), open-loop, forward, spin,
+            retract-rotate, with a catheter in-turn or catheter-alone, or MODULE:OBJECT of your own.
+        device: the wire, its name or its YAML file, or the wire and its catheters.
+        config: limits, X-ray, and how reality differs from what the policy is given.
 
     Raises:
         InputError: no such section, a point outside the vessel, a target behind an occlusion; no such policy, device,
-            catheter, robot or tip; devices that do not fit; a motion that is measured without X-ray images.
+            robot or tip; devices that do not fit; a motion that is measured without X-ray images.
     """
-    config = config or NavigatePatientConfig()
+    return drive(set_up_navigation(anatomy, target, policy=policy, device=device, config=config))
+
+
+def set_up_navigation(
+    anatomy: Anatomy | str | Path,
+    target: str,
+    *,
+    policy: Policy | str = "agent",
+    device: Wire | Stack | str | Path = "workhorse-014",
+    config: NavigateConfig | None = None,
+) -> SetUp:
+    """Prepare a navigation in a patient; the arguments, and what is raised, are those of `navigate`."""
+    config = config or NavigateConfig()
     if config.motion_known == "measured" and config.xray != "images":
         raise InputError("motion_known: measured; only X-ray images measure it: give xray: images, or published")
     vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
-    device, goal = read_device(config.device), find_target(vessel.tree, target)
-    catheters = tuple(read_catheter(name) for name in config.catheter)
+    stack, goal = Stack.of(device), find_target(vessel.tree, target)
     truth, robot = _truth(config, vessel)
-    seen, truth = _see_catheter(vessel, device, truth, config)
-    policy = OraclePolicy(truth) if config.policy == "oracle" else make_policy(config.policy)
+    seen, truth = _see_catheter(vessel, stack.wire, truth, config)
+    name = policy if isinstance(policy, str) else type(policy).__qualname__
+    origin = POLICIES.origin(policy) if isinstance(policy, str) else type(policy).__module__
+    if isinstance(policy, str):
+        policy = OraclePolicy(truth) if policy == "oracle" else make_policy(policy)
     given = Navigation(
         anatomy=seen,
-        device=device,
+        device=stack.wire,
         target=goal,
-        catheters=catheters,
+        catheters=stack.catheters,
         arrives=config.arrives,
-        start_inserted_mm=config.start_inserted_mm,
-        start_rotation=config.start_rotation,
+        start_inserted_length_mm=config.start_inserted_length_mm,
+        start_rotation_rad=config.start_rotation_rad,
         seconds=config.seconds,
         force_limit_n=config.force_limit_n,
         known_motion=_known_motion(config),
     )
     check_passable(Route.to(seen, goal), given.devices[given.arriving])
-    choice = choose_tip(given, config.tip, catheter_tilt_deg=config.catheter_tilt_deg)
+    choice = choose_tip(given, tip=config.tip, catheter_tilt_deg=config.catheter_tilt_deg)
     place, parts = goal.position(vessel), target.split(",")
     return SetUp(
         config=config,
+        target=target,
+        folder=None if isinstance(anatomy, Anatomy) else Path(anatomy),
         anatomy=vessel,
         navigation=choice.navigation,
         choice=choice,
@@ -204,14 +234,16 @@ def set_up_navigation(anatomy: Anatomy | str | Path, target: str, config: Naviga
         robot=robot,
         snapped_mm=float(np.linalg.norm(place - np.array(parts, dtype=float))) if len(parts) == 3 else None,
         policy=policy,
+        policy_name=name,
+        policy_origin=origin,
         simulator=SimulatorConfig(threads=1),
     )
 
 
-def navigate_patient(set_up: SetUp) -> PatientNavigation:
-    """Let the policy drive the wire in the simulated reality, and return what happened."""
+def drive(set_up: SetUp) -> PatientNavigation:
+    """Let the policy drive the devices in the simulated reality, and return what happened."""
     navigation, policy = set_up.navigation, set_up.policy
-    config = NavigateConfig(
+    config = LoopConfig(
         robot=set_up.robot,
         simulator=set_up.simulator,
         xray=set_up.config.xray,
@@ -220,7 +252,7 @@ def navigate_patient(set_up: SetUp) -> PatientNavigation:
     )
     loop = NavigationLoop(navigation, policy, config=config, seed=set_up.config.seed, truth=set_up.truth)
     wires: list[Float[np.ndarray, "wires nodes 3"]] = []
-    with progress(f"Navigating, {set_up.config.policy}", total=navigation.seconds) as advance:
+    with progress(f"Navigating, {set_up.policy_name}", total=navigation.seconds) as advance:
         while loop.reason is None:
             loop.step()
             if loop.gives_up:
@@ -247,14 +279,14 @@ def navigate_patient(set_up: SetUp) -> PatientNavigation:
     )
 
 
-def _known_motion(config: NavigatePatientConfig) -> Motion | None:
+def _known_motion(config: NavigateConfig) -> Motion | None:
     """Return what is known of how the vessel moves before it is measured."""
     if config.motion_known == "nothing":
         return None
     return motion_named(config.motion, config.motion_seed if config.motion_known == "exact" else None)
 
 
-def _truth(config: NavigatePatientConfig, vessel: Anatomy) -> tuple[ModelMismatch, RobotConfig]:
+def _truth(config: NavigateConfig, vessel: Anatomy) -> tuple[ModelMismatch, RobotConfig]:
     """Return how reality differs, and the robot as it truly is."""
     random = np.random.default_rng([config.seed, 3])
     change = drawn_sides(config.mismatch, random)
@@ -270,7 +302,7 @@ def _truth(config: NavigatePatientConfig, vessel: Anatomy) -> tuple[ModelMismatc
 
 
 def _see_catheter(
-    vessel: Anatomy, device: Wire, truth: ModelMismatch, config: NavigatePatientConfig
+    vessel: Anatomy, device: Wire, truth: ModelMismatch, config: NavigateConfig
 ) -> tuple[Anatomy, ModelMismatch]:
     """Return the vessel with its guiding catheter as an exposure shows it, and how reality differs from that.
 

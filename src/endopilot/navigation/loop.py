@@ -1,6 +1,6 @@
 """One navigation in the simulator: a policy decides, a robot moves the wire, an exposure shows the tip where asked.
 
-`navigate` drives it to its end. `NavigationLoop` is the same, one step at a time.
+`NavigationLoop.run` drives it to its end, `step` by one decision.
 """
 
 from __future__ import annotations
@@ -30,11 +30,12 @@ from endopilot.xray.fluoroscope import FluoroscopeConfig, make_c_arm
 
 
 @settings
-class NavigateConfig:
-    """Robot and C-arm of the policy, and the settings of the simulated reality."""
+class LoopConfig:
+    """Robot and C-arm of a navigation loop, and the settings of the simulated reality."""
 
     robot: RobotConfig = field(default_factory=RobotConfig)
-    """The robot as it truly is; a policy is not told."""
+    """The robot as it truly is; a seed draws gains and plays if their spreads are given. `Navigation.robot` is what is
+    known of it."""
     fluoroscope: FluoroscopeConfig = field(default_factory=FluoroscopeConfig)
     """The C-arm."""
     xray: XrayKind = "assumed"
@@ -52,7 +53,7 @@ class NavigateConfig:
     """Period of the drives' loop, s; it divides the time between two decisions."""
 
     @model_validator(mode="after")
-    def _consistent(self) -> NavigateConfig:
+    def _consistent(self) -> LoopConfig:
         if abs(self.cycles * self.cycle_s - DECISION_PERIOD_S) > 1e-9:
             raise ValueError(f"cycle_s: {self.cycle_s}; give what divides {DECISION_PERIOD_S} s, such as {CYCLE_S}")
         return self
@@ -64,11 +65,19 @@ class NavigateConfig:
 
 
 class NavigationLoop:
-    """One navigation in closed loop, a decision period at a time: it owns the world, the robot and the C-arm.
+    """One navigation in closed loop: it owns the world, the robot and the C-arm.
 
-    `navigate`, the ladder and the cockpit are plain loops over it; a program that shows the navigation starts, pauses
-    and ends it by calling `step` or not. Somebody else may drive, such as a `Hand`: the policy watches then, and goes
-    on with X-ray on once it is handed back to::
+    Every `DECISION_PERIOD_S` the policy is given the encoders' readings and, where its last decision asked for it, what
+    X-ray shows; at the first decision X-ray is always on. The navigation ends when the target is reached at the end of
+    a period, when the time is over, or when the simulation fails.
+
+    `run` drives to the end, and records what truly happens::
+
+        record = NavigationLoop(navigation, "agent", seed=1).run()
+
+    `navigate`, the ladder and the cockpit are plain loops over `step`; a program that shows the navigation starts,
+    pauses and ends it by calling `step` or not. Somebody else may drive, such as a `Hand`: the policy watches then, and
+    goes on with X-ray on once it is handed back to::
 
         loop = NavigationLoop(navigation, "agent", seed=1)
         while loop.reason is None:
@@ -99,26 +108,34 @@ class NavigationLoop:
         navigation: Navigation,
         policy: Policy | str,
         *,
-        config: NavigateConfig | None = None,
+        config: LoopConfig | None = None,
         seed: int = 0,
         truth: ModelMismatch | None = None,
     ) -> None:
-        """Bring the wire to the start; the arguments are those of `navigate`.
+        """Bring the wire to the start.
+
+        Args:
+            navigation: as the policy is given it.
+            policy: what decides, or the name of a policy, such as "agent".
+            config: robot, C-arm and rod core.
+            seed: of encoder noise, detection errors and the policy.
+            truth: how reality differs from the navigation; not at all if not given.
 
         Raises:
             InputError: there is no such policy, or the wire does not fit the vessel, or starts deeper than it is long,
                 or the vessel is not recognised in X-ray images.
         """
-        self.config = config = config or NavigateConfig()
+        self.config = config = config or LoopConfig()
         truth = truth or ModelMismatch()
-        self.navigation = navigation = replace(navigation, xray=config.xray)
+        known = navigation.robot or config.robot
+        self.navigation = navigation = replace(navigation, xray=config.xray, robot=known)
         self.policy = make_policy(policy) if isinstance(policy, str) else policy
         self.simulator = start_world(navigation, truth, config.simulator, robot=config.robot, motion=config.motion)
         limits = [DriveLimits.of(device, navigation.anatomy) for device in navigation.devices]
         self.robot = SimulatedRobot(
             self.simulator, limits, config.robot, seed=seed, ostium_mm=truth.ostium_mm, cycle_s=config.cycle_s
         )
-        self.c_arm = make_c_arm(navigation, config.fluoroscope, seed=seed)
+        self.c_arm = make_c_arm(navigation, config=config.fluoroscope, seed=seed)
         if config.measure_motion:
             measured = self.c_arm.measure_motion(config.motion, np.random.default_rng([seed, 6]))
             self.navigation = navigation = replace(navigation, known_motion=measured)
@@ -169,6 +186,14 @@ class NavigationLoop:
             InputError: the vessel has no such place.
         """
         self.navigation = replace(self.navigation, target=target)
+
+    def run(self) -> NavigationRecord:
+        """Let the policy drive to the end, which is also where it gives up, and return what has happened."""
+        while self.reason is None:
+            self.step()
+            if self.gives_up:
+                self.stop()
+        return self.record()
 
     def step(self) -> Decision:
         """Decide, and let the robot move for one period; return the decision as `take` does."""
@@ -275,38 +300,6 @@ class NavigationLoop:
             self.reason = "reached"
         elif self._period == self._periods:
             self.reason = "time"
-
-
-def navigate(
-    navigation: Navigation,
-    policy: Policy | str,
-    *,
-    config: NavigateConfig | None = None,
-    seed: int = 0,
-    truth: ModelMismatch | None = None,
-) -> NavigationRecord:
-    """Let a policy drive one navigation in the simulator, and record what truly happens.
-
-    Every `DECISION_PERIOD_S` the policy is given the readings of the encoders and the drives' loads and, where its last
-    decision asked for it, what X-ray shows; at the first decision X-ray is always on. It ends when the target is
-    reached at the end of a period, when the time is over, when the policy gives up, or when the simulation fails.
-
-    Args:
-        navigation: as the policy is given it.
-        policy: what decides, or the name of a policy, such as "agent".
-        config: robot, C-arm and rod core.
-        seed: of the robot, its noise, detection errors and the policy.
-        truth: how reality differs; not at all if not given.
-
-    Raises:
-        InputError: there is no such policy, or the wire does not fit the vessel, or starts deeper than it is long.
-    """
-    loop = NavigationLoop(navigation, policy, config=config, seed=seed, truth=truth)
-    while loop.reason is None:
-        loop.step()
-        if loop.gives_up:
-            loop.stop()
-    return loop.record()
 
 
 def start_world(

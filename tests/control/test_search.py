@@ -10,12 +10,12 @@ import pytest
 from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.agent import AgentConfig, AgentPolicy, OpenLoopPolicy, OraclePolicy
 from endopilot.control.course import Course
-from endopilot.control.search import ManoeuvreConfig
-from endopilot.control.stack_search import StackSearch
+from endopilot.control.search import Search
+from endopilot.control.search_config import ManoeuvreConfig
 from endopilot.devices.catheter import read_catheter
 from endopilot.errors import InputError
 from endopilot.ladder.attempt import Recording, attempt, repeat
-from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, navigate
+from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Hand, Observation
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.mismatch import ModelMismatch
@@ -38,8 +38,8 @@ def side_branch(fork, wire) -> Navigation:
         target=Target(branch=side, abscissa=28.0),
         catheters=(read_catheter("microcatheter-1.7f"),),
         arrives="catheter",
-        start_inserted_mm=10.0,
-        start_rotation=np.pi,
+        start_inserted_length_mm=10.0,
+        start_rotation_rad=np.pi,
         seconds=60.0,
         force_limit_n=0.3,
     )
@@ -50,11 +50,11 @@ def agent_config(navigation: Navigation, turns: int = 4) -> AgentConfig:
     return replace(own, search=replace(own.search, manoeuvres=ManoeuvreConfig(turns=turns)), belief=BELIEF)
 
 
-def search(navigation: Navigation, turns: int = 4) -> tuple[StackSearch, Belief, Course]:
+def search(navigation: Navigation, turns: int = 4) -> tuple[Search, Belief, Course]:
     """Return a search, the belief that it began with, and what it found."""
     belief = Belief(navigation, np.array([[1.0, 1.0, 0.0]]), BELIEF)
     route = Route.to(navigation.anatomy, navigation.target)
-    one = StackSearch(navigation, route, belief, config=agent_config(navigation, turns).search)
+    one = Search(navigation, route, belief, config=agent_config(navigation, turns).search, seed=0)
     return one, belief, one.find(belief, seconds=navigation.seconds)
 
 
@@ -91,7 +91,7 @@ def test_the_controls_of_a_course_lead_where_it_says(side_branch, found) -> None
 
 
 def test_a_wire_that_leads_by_little_ends_little_beyond_the_target(side_branch, monkeypatch) -> None:
-    monkeypatch.setattr("endopilot.control.stack_search._LEADS_MM", (3.0,))
+    monkeypatch.setattr("endopilot.control.manoeuvre._LEADS_MM", (3.0,))
     _, _, course = search(side_branch)
     assert course.reached == 1.0
     assert course.tip.abscissa[-1, 0] - side_branch.target.abscissa == pytest.approx(3.0, abs=2.0)
@@ -112,7 +112,7 @@ def test_from_the_target_there_is_nowhere_to_go(side_branch) -> None:
 
 def test_the_agent_arrives_with_little_xray(side_branch) -> None:
     policy = AgentPolicy(agent_config(side_branch))
-    record = navigate(side_branch, policy, config=NavigateConfig(simulator=CORE), seed=2)
+    record = NavigationLoop(side_branch, policy, config=LoopConfig(simulator=CORE), seed=2).run()
     assert record.reason == "reached" and record.safe
     assert policy.plans >= 1 and record.exposures < len(record.time_s) / 2
     along, across = policy.believed().half_width
@@ -140,16 +140,18 @@ def test_a_wire_that_no_simulated_one_explains_is_pulled_back_until_one_does(sid
 
 def test_the_oracle_looks_always_and_a_plan_is_followed_without_a_look(side_branch) -> None:
     truth, config = ModelMismatch(friction_factor=1.2, ostium_mm=0.5), agent_config(side_branch)
-    record = navigate(side_branch, OraclePolicy(truth, config), config=NavigateConfig(simulator=CORE), truth=truth)
+    record = NavigationLoop(
+        side_branch, OraclePolicy(truth, config), config=LoopConfig(simulator=CORE), truth=truth
+    ).run()
     assert record.reason == "reached" and record.safe and record.exposures == len(record.time_s) - 1
     near = replace(side_branch, target=Target(branch=0, abscissa=16.0))
-    record = navigate(near, OpenLoopPolicy(config=config), config=NavigateConfig(simulator=CORE))
+    record = NavigationLoop(near, OpenLoopPolicy(config=config), config=LoopConfig(simulator=CORE)).run()
     assert record.reason == "reached" and record.exposures == 1
 
 
 def test_the_agent_goes_on_after_hands_that_drove_both(side_branch) -> None:
     policy = AgentPolicy(agent_config(side_branch))
-    loop = NavigationLoop(side_branch, policy, config=NavigateConfig(simulator=CORE), seed=2)
+    loop = NavigationLoop(side_branch, policy, config=LoopConfig(simulator=CORE), seed=2)
     loop.step()
     loop.hand_over(Hand(((2.0, 1.5), (4.0, 0.0))))
     for _ in range(4):
@@ -164,7 +166,7 @@ def test_the_agent_goes_on_after_hands_that_drove_both(side_branch) -> None:
 
 
 def test_a_ladder_counts_the_events_that_the_agent_misses(side_branch) -> None:
-    beside = replace(side_branch, target=Target(branch=0, abscissa=16.0), start_inserted_mm=14.0)
+    beside = replace(side_branch, target=Target(branch=0, abscissa=16.0), start_inserted_length_mm=14.0)
     result = attempt("agent", beside, seed=1)
     events, missed = result["events"]
     assert result["success"] and 0 <= missed <= events
@@ -175,4 +177,4 @@ def test_the_agent_drives_one_catheter(side_branch) -> None:
     outer = read_catheter("straight-5f")
     wide = replace(outer, diameter_mm=1.25)
     with pytest.raises(InputError, match="catheter: 2; the search drives one"):
-        navigate(replace(side_branch, catheters=(*side_branch.catheters, wide)), "agent")
+        NavigationLoop(replace(side_branch, catheters=(*side_branch.catheters, wide)), "agent").run()

@@ -1,0 +1,156 @@
+"""A population of wires that draw their motions at random until one passes a place: `Population`.
+
+Every round each candidate draws a constant control for a second. Those nearest to the place, with the cost of what they
+did, are kept and copied over the others: a beam search with random moves.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from endopilot.anatomy.projection import safety_ratio
+from endopilot.control.course import Controls
+from endopilot.control.search_config import SearchConfig
+from endopilot.control.trials import WIRE, Control, Move, Trials
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.route import Route
+
+Each = Float[np.ndarray, "candidates"]
+_LEFT_BEHIND = 0.2
+"""Each further attempt accepts a motion that this much more of the wires, by weight, do not follow."""
+_LEAST_SHARE = 0.5
+"""No attempt accepts a motion that fewer of the wires follow, by weight."""
+_FAILED_MM_S = 1e3
+"""Cost of a wire whose simulation has failed, mm/s."""
+_OFF_ROUTE = 0.5
+"""Cost of each mm that a tip lies off the route, mm."""
+
+
+class Population:
+    """Candidates of a wire alone."""
+
+    def __init__(
+        self,
+        navigation: Navigation,
+        route: Route,
+        trials: Trials,
+        config: SearchConfig,
+        random: np.random.Generator,
+    ) -> None:
+        """Take the candidates.
+
+        Args:
+            navigation: with the wire and the force limit.
+            route: to the target.
+            trials: a candidate each.
+            config: settings of the search.
+            random: what is drawn from.
+        """
+        self._navigation, self._route, self._trials = navigation, route, trials
+        self._config, self._random = config, random
+        self._wire_radius = navigation.device.tip_radius_mm
+
+    def find(self, one: Trials, waypoint: float, *, rounds: int, spare_share: float) -> tuple[Controls, bool]:
+        """Find controls that bring most wires past a place; return the best, and whether they do.
+
+        Every attempt begins from the same state, so that what is found holds no motion of a failed one.
+
+        Args:
+            one: the wires, where all candidates begin.
+            waypoint: that is to be passed, mm.
+            rounds: of each attempt at most.
+            spare_share: share of the force limit that the first attempts stay within; the last leave nothing to spare.
+        """
+        attempts, nearest, best = self._config.attempts, np.inf, np.zeros((0, 1, 2))
+        for attempt in range(attempts):
+            share = spare_share if 2 * attempt < attempts else 1.0
+            score, controls, won = self.attempt(one, waypoint, rounds, attempt, share)
+            if won:
+                return controls, True
+            if score < nearest:
+                nearest, best = score, controls
+        return best, False
+
+    def attempt(
+        self, one: Trials, waypoint: float, rounds: int, attempt: int, force_share: float
+    ) -> tuple[float, Controls, bool]:
+        """Search once; return the least cost so far and to go, its controls, and whether they pass the place."""
+        trials, count = self._trials.copy_of(one), self._trials.count
+        history, spent, peak = np.zeros((0, count, 1, 2)), np.zeros(count), np.zeros(trials.simulator.worlds)
+        most_n = force_share * self._navigation.force_limit_n
+        nearest, best = np.inf, np.zeros((0, 1, 2))
+        for number in range(rounds):
+            before = history[-1] if number else np.zeros((count, 1, 2))
+            drawn = trials.possible(self._draw(before, number, attempt), alike=True)
+            spent += self._run_round(drawn, before, waypoint, peak)
+            history = np.concatenate([history, np.repeat(drawn[None], self._config.round_periods, axis=0)])
+            score, share = self._judge(waypoint, spent, peak <= most_n)
+            won = share >= max(1 - _LEFT_BEHIND * attempt, _LEAST_SHARE) - 1e-9
+            if won.any():
+                return 0.0, history[:, np.argmin(np.where(won, score, np.inf))], True
+            if number == 0:
+                continue  # what has only turned has not shown yet where it leads
+            if score.min() < nearest:
+                nearest, best = float(score.min()), history[:, np.argmin(score)]
+            chosen = self._select(score)
+            trials.copy_trials(chosen)
+            peak = peak.reshape(-1, count)[:, chosen].ravel()
+            history, spent = history[:, chosen], spent[chosen]
+        return nearest, best, False
+
+    def _draw(self, last: Control, number: int, attempt: int) -> Control:
+        """Draw a control for each candidate.
+
+        In the first round they turn the tip to all sides, and pull back, in later attempts farther; in the second most
+        go straight on; then they move at random, and a few go on with what they did.
+        """
+        count, config, random = self._trials.count, self._config, self._random
+        turn = np.where(random.random(count) < 0.25, 0.0, random.uniform(-1.0, 1.0, count)) * config.turn_rad_s
+        if number == 0:
+            sides = (np.arange(count) + random.random(count)) / count
+            turn = (2 * sides - 1) * np.pi / (config.round_periods * DECISION_PERIOD_S)
+            speed = random.uniform(-0.3 * (1 + attempt), 0.3, count)
+        elif number == 1:
+            turn = np.where(random.random(count) < 0.6, 0.0, turn)
+            speed = random.uniform(0.2, 1.0, count)
+        else:
+            back = random.random(count) < 0.45
+            speed = np.where(back, random.uniform(-0.8, 0.0, count), random.uniform(0.1, 0.8, count))
+        drawn = self._trials.control(Move(WIRE, np.clip(speed, -1.0, 1.0) * config.speed_mm_s, turn))
+        same = (random.random(count) < 0.2) & (number > 1)
+        drawn[same] = last[same]
+        return drawn
+
+    def _run_round(self, control: Control, before: Control, waypoint: float, peak: Float[np.ndarray, "worlds"]) -> Each:
+        """Drive all candidates for a round; return what it cost each, and note the largest forces."""
+        trials, cost = self._trials, self._config.cost
+        spent = cost.roughness(before[:, 0], control[:, 0], trials.fastest)
+        for _ in range(self._config.round_periods):
+            step = trials.drive(control)
+            tip = trials.tips[:, 0]
+            running = cost.running(
+                error=self._distance(step.tip_position[:, 0], waypoint),
+                ratio=safety_ratio(tip.offset, tip.radius, self._wire_radius),
+                force_share=step.contact_force_max / self._navigation.force_limit_n,
+            )
+            spent += DECISION_PERIOD_S * trials.mean(np.where(step.valid, running, _FAILED_MM_S))
+            np.maximum(peak, np.where(step.valid, step.contact_force_max, np.inf), out=peak)
+        return spent
+
+    def _distance(self, position: Float[np.ndarray, "n 3"], waypoint: float) -> Float[np.ndarray, "n"]:
+        return np.linalg.norm(position - self._route.position(waypoint), axis=-1)
+
+    def _judge(self, waypoint: float, spent: Each, gentle: Bool[np.ndarray, "worlds"]) -> tuple[Each, Each]:
+        """Return each candidate's cost so far and to go, and the share of its wires that passed gently."""
+        trials, route = self._trials, self._route
+        tip = trials.tips[:, 0]
+        to_go = self._distance(trials.simulator.position[:, 0], waypoint) + _OFF_ROUTE * route.off_route(tip)
+        passed = route.passed(tip, waypoint) & trials.simulator.valid & gentle
+        return trials.mean(to_go) + spent, trials.mean(passed)
+
+    def _select(self, score: Each) -> Int[np.ndarray, "candidates"]:
+        """Return whose copy each candidate becomes: the best stay and are copied over the others."""
+        best = np.argsort(score)[: max(1, round(self._config.keep_share * len(score)))]
+        others = self._random.choice(best, len(score) - len(best))
+        return np.concatenate([best, others])

@@ -1,0 +1,287 @@
+"""Trials of a stack of devices that are driven side by side: `Trials`."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from endopilot.control.course import Course
+from endopilot.devices.device import Wire
+from endopilot.devices.drive_limits import DriveLimits
+from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.state import SimulatorState, Step
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.types import TipProjection
+
+Control = Float[np.ndarray, "trials devices 2"]
+"""Translation (mm/s) and rotation (rad/s) of each device of each trial in a decision period."""
+STALL_PERIODS, STALL_SHARE = 4, 0.25
+"""A tip that comes forward by less than this share of its wire's advance in so many periods has stopped."""
+_LEAST_ADVANCE_MM = 2.0
+"""A wire that advances by less in these periods says nothing."""
+_SHORT_MM = 1.0
+"""A course leaves this much of the travel unused, mm: encoders err."""
+_LOOKS = 5
+"""Times in a period at which forces are read: a tip that is caught presses harder until it snaps, within some tenths
+of a second."""
+_TIP = tuple(TipProjection.__dataclass_fields__)
+
+
+WIRE, CATHETER = 0, 1
+"""Places of devices in a stack: the wire, and the catheter next to it."""
+
+
+class Move(NamedTuple):
+    """What a device of each trial is to do in a decision period.
+
+    Attributes:
+        device: its place in the stack.
+        translation: mm/s; it is advanced, or retracted where this is negative.
+        rotation: rad/s.
+    """
+
+    device: int
+    translation: Float[np.ndarray, "trials"] | float = 0.0
+    rotation: Float[np.ndarray, "trials"] | float = 0.0
+
+
+class Period(NamedTuple):
+    """What trials did in a decision period, and where they were at its end; of worlds as `Trials` has them.
+
+    Attributes:
+        control: of each trial.
+        proximal: inserted length (mm) and rotation (rad) of each world's devices.
+        tip: of each world's wire.
+        force: largest wall force on a node of each world within the period, N.
+    """
+
+    control: Control
+    proximal: Float[np.ndarray, "worlds devices 2"]
+    tip: TipProjection
+    force: Float[np.ndarray, "worlds"]
+
+
+class Kept(NamedTuple):
+    """Where trials were: their state, and how many periods they had done."""
+
+    state: SimulatorState
+    periods: int
+
+
+class Trials:
+    """Trials of a stack that are driven side by side.
+
+    Each is driven alike in several worlds, one for every wire that is held possible: in the first worlds are all trials
+    of the first wire, then those of the next. What is told of a trial is the weighted mean over its wires, or what
+    holds for all that count.
+
+    Attributes:
+        simulator: the worlds.
+        wires, count, devices: numbers of wires, of trials, and of devices in a stack.
+        fastest: translation (mm/s) and rotation (rad/s) of the wire's drive at most.
+        weight: how likely each wire is; one of weight 0 goes along and does not count.
+        still: which trials stand still, whatever they are driven to do.
+        rows: what they have done, period by period.
+    """
+
+    def __init__(self, simulator: Simulator, limits: Sequence[DriveLimits], *, wires: int = 1) -> None:
+        """Take worlds as trials.
+
+        Args:
+            simulator: the worlds.
+            limits: of the drive of each device.
+            wires: number of wires among the worlds, see `Trials`.
+        """
+        self.simulator, self.wires = simulator, wires
+        self.count, self.devices = simulator.worlds // wires, simulator.devices
+        self._limits, self.fastest = list(limits), limits[0].fastest
+        self._seen: tuple[np.ndarray, TipProjection] | None = None
+        self._forget(np.full(wires, 1 / wires))
+
+    @staticmethod
+    def of(navigation: Navigation, wires: Sequence[Wire], count: int, *, like: Simulator) -> Trials:
+        """Return trials of a navigation's devices.
+
+        Args:
+            navigation: vessel and catheters.
+            wires: the wires that are held possible.
+            count: number of trials.
+            like: a simulator of the same anatomy, whose settings are taken.
+        """
+        stacks = [replace(navigation.stack, wire=wire) for wire in wires for _ in range(count)]
+        simulator = Simulator(
+            navigation.anatomy, stacks, motion=navigation.known_motion, config=like.config, sharing=like
+        )
+        limits = [DriveLimits.of(device, navigation.anatomy) for device in stacks[0].devices]
+        first, last = limits[0].travel_mm
+        travel = first, last - _SHORT_MM
+        return Trials(simulator, [replace(each, travel_mm=travel) for each in limits], wires=len(wires))
+
+    def put(self, source: Int[np.ndarray, "wires"], of: Simulator, weight: Float[np.ndarray, "wires"]) -> None:
+        """Put all trials of each wire where a world of a simulator of equal stacks is, and forget what they have done.
+
+        Args:
+            source: the world that is taken for each wire.
+            of: the simulator.
+            weight: of the wires.
+        """
+        self.simulator.copy_worlds(np.repeat(source, self.count), of=of)
+        self._forget(weight)
+
+    def copy_of(self, one: Trials) -> Trials:
+        """Put all trials where those of one trial are; return these."""
+        self.put(np.arange(one.wires), one.simulator, one.weight)
+        return self
+
+    def copy_trials(self, chosen: Int[np.ndarray, "trials"]) -> None:
+        """Put each trial where another one is."""
+        self.simulator.copy_worlds((np.arange(self.wires)[:, None] * self.count + chosen).ravel())
+        self._seen = None
+
+    def _forget(self, weight: Float[np.ndarray, "wires"]) -> None:
+        self.weight, self._seen = weight, None
+        self.rows: list[Period] = []
+        self.still = np.zeros(self.count, dtype=bool)
+
+    @property
+    def counted(self) -> Bool[np.ndarray, "wires"]:
+        """Which wires count."""
+        return self.weight > 0
+
+    def _see(self) -> tuple[Float[np.ndarray, "worlds devices 2"], TipProjection]:
+        """Return where proximal ends and tips are, which is asked of the simulator once."""
+        if self._seen is None:
+            self._seen = self.simulator.proximal, self.simulator.project()
+        return self._seen
+
+    @property
+    def tips(self) -> TipProjection:
+        """Tips of each world's devices."""
+        return self._see()[1]
+
+    @property
+    def lengths(self) -> Float[np.ndarray, "worlds devices"]:
+        """Inserted lengths of each world's devices, mm."""
+        return self._see()[0][..., 0]
+
+    @property
+    def foremost(self) -> TipProjection:
+        """Each world's foremost tip, that of the device which is inserted farthest."""
+        return self.tips[np.arange(self.simulator.worlds), self.lengths.argmax(axis=1)]
+
+    def inserted(self, device: int) -> Float[np.ndarray, "trials"]:
+        """Return the inserted lengths of a device, mm."""
+        return self.mean(self.lengths[:, device])
+
+    def mean(self, values: Float[np.ndarray, "worlds"] | Bool[np.ndarray, "worlds"]) -> Float[np.ndarray, "trials"]:
+        """Return the mean over the wires, by weight."""
+        return self.weight @ values.reshape(self.wires, -1)
+
+    def all(self, holds: Bool[np.ndarray, "worlds"]) -> Bool[np.ndarray, "trials"]:
+        """Return where something holds for all wires that count."""
+        return np.asarray(holds.reshape(self.wires, -1)[self.counted].all(axis=0))
+
+    def control(self, *moves: Move) -> Control:
+        """Return the control that makes some moves; a device that none names rests."""
+        control = np.zeros((self.count, self.devices, 2))
+        for device, translation, rotation in moves:
+            control[:, device, 0], control[:, device, 1] = translation, rotation
+        return control
+
+    def possible(self, control: Control, *, alike: bool = False) -> Control:
+        """Return what the drives can do of a control: no wire of a trial leaves the travel.
+
+        Args:
+            control: of each trial.
+            alike: of no trial.
+        """
+        made = np.array(control)
+        for device, limits in enumerate(self._limits):
+            inserted = self.lengths[:, device].reshape(self.wires, -1)
+            for length in (inserted.min(axis=None if alike else 0), inserted.max(axis=None if alike else 0)):
+                made[:, device] = limits.clip(made[:, device], length, DECISION_PERIOD_S)
+        return made
+
+    def move(self, control: Control, *, force_n: float = np.inf) -> Bool[np.ndarray, "trials"]:
+        """Drive for a decision period, as far as the drives can; return which press too hard, or fail.
+
+        Args:
+            control: of each trial; those that stand still do nothing.
+            force_n: wall force on a node that is too hard beyond it, N.
+        """
+        step = self.drive(self.possible(np.where(self.still[:, None, None], 0.0, control)))
+        return ~self.all(step.valid & (step.contact_force_max <= force_n))
+
+    def drive(self, control: Control) -> Step:
+        """Drive for a decision period; return the worlds at its end, with the largest force within it."""
+        step = drive_period(self.simulator, np.tile(control, (self.wires, 1, 1)))
+        self._seen = None
+        proximal, tips = self._see()
+        self.rows.append(Period(control, proximal, tips[:, WIRE], step.contact_force_max))
+        return step
+
+    def stalled(self, along: Callable[[TipProjection], np.ndarray], gains: int) -> Bool[np.ndarray, "trials"]:
+        """Return which trials have a tip that stayed behind in the last periods while its wire went forward.
+
+        Args:
+            along: how far along the route tips are, mm.
+            gains: number of periods over which tips are compared.
+        """
+        rows = self.rows
+        advance = np.sum([row.control[:, WIRE, 0] for row in rows[-STALL_PERIODS:]], axis=0) * DECISION_PERIOD_S
+        gain = (along(rows[-1].tip) - along(rows[-1 - gains].tip)).reshape(self.wires, -1)[self.counted].min(axis=0)
+        return (advance > _LEAST_ADVANCE_MM) & (gain < STALL_SHARE * advance)
+
+    def kept(self) -> Kept:
+        """Return where they are."""
+        return Kept(self.simulator.state, len(self.rows))
+
+    def restore(self, kept: Kept) -> None:
+        """Put them back to where they were, and forget what they have done since."""
+        self.simulator.set_state(kept.state)
+        self.still[:], self._seen = False, None
+        del self.rows[kept.periods :]
+
+    def as_course(self, *, reached: float, ostium_mm: float, settled: Sequence[int] | None) -> Course:
+        """Return what the first trial has done as a course.
+
+        Args:
+            reached: whether it ends at the target, by weight.
+            ostium_mm: how much deeper the devices of the first wire lie than the encoders say, mm.
+            settled: periods at whose ends a manoeuvre is over: there the course is checked, under X-ray. If None, it is
+                checked at every period without.
+        """
+        ends = np.isin(np.arange(len(self.rows)), settled or ())
+        columns = {name: np.array([getattr(row.tip, name) for row in self.rows]) for name in _TIP}
+        columns["branch"] = columns["branch"].astype(int)
+        proximal = np.array([row.proximal[0] for row in self.rows]).reshape(-1, self.devices, 2)
+        return Course(
+            control=np.array([row.control[0] for row in self.rows]).reshape(-1, self.devices, 2),
+            proximal=proximal - [ostium_mm, 0.0],
+            tip=TipProjection(**{name: column.reshape(-1, self.wires) for name, column in columns.items()}),
+            force=np.array([row.force for row in self.rows]).reshape(-1, self.wires),
+            checked=np.ones_like(ends) if settled is None else ends,
+            exposed=ends,
+            reached=reached,
+        )
+
+
+def drive_period(simulator: Simulator, control: Float[np.ndarray, "worlds *devices 2"]) -> Step:
+    """Drive all worlds for a decision period; a world that fails stays where it was.
+
+    Args:
+        simulator: of the wires.
+        control: mm/s and rad/s of each wire, then of its catheters.
+
+    Returns:
+        The worlds at the end of the period, but with the largest `contact_force_max` within it.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # whoever searches sees in `valid` that a wire has failed
+        steps = [simulator.step(control, DECISION_PERIOD_S / _LOOKS) for _ in range(_LOOKS)]
+    return replace(steps[-1], contact_force_max=np.max([step.contact_force_max for step in steps], axis=0))

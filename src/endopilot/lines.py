@@ -1,0 +1,24 @@
+"""Lines of points: the length along them, and places on them."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+
+def length_along(points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n"]:
+    """Return the length along a line up to each of its points, in their unit."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+
+
+def places_on(
+    points: Float[np.ndarray, "n d"], along: Float[np.ndarray, "n"], at: Float[np.ndarray, "m"]
+) -> Float[np.ndarray, "m d"]:
+    """Return places on a line between its points, linearly.
+
+    Args:
+        points: of the line.
+        along: length along it up to each of them, as `length_along` gives it or from another begin.
+        at: lengths along it of the places.
+    """
+    return np.stack([np.interp(at, along, part) for part in points.T], axis=-1)
