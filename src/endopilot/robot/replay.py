@@ -31,6 +31,8 @@ LEAST_TIPS = 20
 _PERIOD_S = 0.05
 _LEAD_S = 2.0
 """A simulation begins so long before the first tip was seen, or with the first command, s."""
+_FADES = 0.15
+"""Share of what is given over which a tip's weight falls by 1/e, when a world is chosen."""
 _TOGETHER = 8
 """Episodes that are simulated side by side, for as long as the longest of them takes."""
 FAR_MM = 2.0
@@ -264,13 +266,19 @@ def _simulated(
     return _Tried(tip, abscissa, branch, force, _costs(of, tip, of.given))
 
 
-def _costs(of: Prepared, tip: np.ndarray, used: Bool[np.ndarray, "episodes tips"]) -> np.ndarray:
-    """Return how far tips are from the real ones on average, at most `FAR_MM`, as the camera sees them, mm."""
+def _costs(
+    of: Prepared, tip: Float[np.ndarray, "episodes worlds tips 3"], used: Bool[np.ndarray, "episodes tips"]
+) -> Float[np.ndarray, "episodes worlds"]:
+    """Return how far tips are from the real ones on average, at most `FAR_MM`, as the camera sees them, mm.
+
+    The last tips count most: where the wire lies when the prediction begins matters, not how it came there.
+    """
     cost = np.zeros(tip.shape[:2])
     for k, log in enumerate(of.logs):
         count = int(log.seen.sum())
-        far = np.linalg.norm(_in_view(log, tip[k, :, :count]), axis=-1)
-        cost[k] = np.minimum(far, FAR_MM)[:, used[k, :count]].mean(axis=1)
+        far = np.linalg.norm(_in_view(log, tip[k, :, :count]), axis=-1)[:, used[k, :count]]
+        age = np.arange(far.shape[1])[::-1] / far.shape[1]
+        cost[k] = np.average(np.minimum(far, FAR_MM), axis=1, weights=np.exp(-age / _FADES))
     return cost
 
 
