@@ -125,9 +125,9 @@ def replay_log(
     logs: Sequence[RobotLog],
     anatomy: Anatomy,
     device: Stack,
+    *,
     robot: RobotConfig,
     config: ReplayConfig | None = None,
-    *,
     simulator: SimulatorConfig | None = None,
 ) -> list[EpisodeReplay]:
     """Replay logs.
