@@ -12,6 +12,7 @@ from hypothesis import strategies as some
 
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import RobotConfig, read_robot
+from endopilot.devices.transmission import Transmission
 from endopilot.errors import InputError
 from endopilot.navigation.loop import start_world
 from endopilot.robot.remote import RemoteRobot
@@ -125,6 +126,20 @@ def test_encoders_in_front_of_play_and_gain_do_not_see_them(fork, wire, at) -> N
     assert robot.proximal[0] == pytest.approx(true, abs=1e-3)
     lag = 2.0 if at == "motor" else 0.0
     assert robot.proximal_state().devices[0][0] == pytest.approx(read[0] - lag, abs=1e-3)
+
+
+def test_an_encoder_on_the_wire_reads_its_proximal_end_and_not_its_rotation_at_the_ostium(fork, wire) -> None:
+    navigation = Navigation(anatomy=fork, device=wire, target=Target(branch=1, abscissa=30.0))
+    behind = Transmission(length_mm=1000.0, twist_friction_n_mm_mm=3e-4)
+    config = replace(IDEAL, wire=replace(IDEAL.wire, transmission=behind))
+    simulator = start_world(navigation, ModelMismatch(), SimulatorConfig(element_mm=1.5, threads=1), robot=config)
+    assert simulator.set_up.stacks[0].transmissions == (behind,)
+    robot = SimulatedRobot(simulator, [DriveLimits.of(wire, fork)], config)
+    robot.command(((0.0, 2.0),))
+    robot.run(3.0)
+    assert robot.proximal_state().devices[0][1] == pytest.approx(6.0, abs=1e-4)
+    assert 2.0 < robot.proximal[0, 1] < 4.5  # the lag is some 2.5 rad
+    assert robot.proximal_state().load[0][1] > 0.25  # N mm, of the friction
 
 
 def test_a_wire_slips_in_the_grip_at_its_force_and_only_an_encoder_on_the_wire_sees_it(fork, wire) -> None:

@@ -18,6 +18,8 @@ from pydantic import model_validator
 
 from endopilot.devices.device import Device
 from endopilot.devices.device_files import there
+from endopilot.devices.stack import Stack
+from endopilot.devices.transmission import Transmission
 from endopilot.errors import InputError
 from endopilot.files import writing
 from endopilot.settings import NonNegative, Positive, Within, read_settings, settings
@@ -51,6 +53,8 @@ class DriveConfig:
     """Motion that is lost where the rotation reverses, rad."""
     play_sd: Annotated[float, Within(0, 0.5)] = 0.0
     """Standard deviation of both plays from robot to robot, a share of them; a seed draws the robot."""
+    transmission: Transmission = Transmission()
+    """What lies between the drive and the ostium: there the device twists under friction. That of the stack if none."""
     grip_n: Positive | None = None
     """Axial force beyond which the device slips in the drive's grip, N; the device's own limits hold if not given."""
     grip_n_mm: Positive | None = None
@@ -104,6 +108,12 @@ class RobotConfig:
         """Return the drives of the wire and of the catheters around it, of some devices in all."""
         around = [self.catheters[min(k, len(self.catheters) - 1)] for k in range(count - 1)]
         return (self.wire, *around)
+
+    def through_transmissions(self, stack: Stack) -> Stack:
+        """Return devices on which drives act through their transmissions; those without one, through the stack's."""
+        drives = zip(self.drives(len(stack)), stack.transmissions, strict=True)
+        behind = tuple(drive.transmission if drive.transmission.length_mm > 0 else own for drive, own in drives)
+        return replace(stack, transmissions=behind)
 
     def of_drives(self, count: int, *names: str) -> Float[np.ndarray, "devices numbers"]:
         """Return some fields of each drive, of some devices in all."""

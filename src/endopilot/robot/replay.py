@@ -169,6 +169,7 @@ def replay_prepared(
     simulator: SimulatorConfig | None = None,
 ) -> list[EpisodeReplay]:
     """Replay episodes that are prepared, as `replay_log` does."""
+    device = robot.through_transmissions(device)
     times, course = _proximal(of, robot)
     at_tips = _at(times, course[..., 0], of.courses.seen_s)
     depth = np.nanmedian(np.where(of.given, of.abscissa - at_tips, np.nan), axis=1)

@@ -23,7 +23,7 @@ Seed = Sequence[int]
 
 
 def in_grip(stack: Stack, robot: RobotConfig, core: SimulatorConfig) -> tuple[Stack, SimulatorConfig]:
-    """Return devices that slip where a robot's grip yields, and settings by which the wall is as hard as before.
+    """Return devices as a robot drives them, which slip where its grip yields; and settings with the wall as before.
 
     Args:
         stack: the devices.
@@ -32,7 +32,7 @@ def in_grip(stack: Stack, robot: RobotConfig, core: SimulatorConfig) -> tuple[St
     """
     wire, *around = robot.drives(len(stack))
     catheters = tuple(drive.gripped(each) for drive, each in zip(around, stack.catheters, strict=True))
-    held = replace(stack, wire=wire.gripped(stack.wire), catheters=catheters)
+    held = robot.through_transmissions(replace(stack, wire=wire.gripped(stack.wire), catheters=catheters))
     if held == stack:
         return stack, core
     return held, replace(core, wall_stiffness_n_mm=wall_stiffness(core, stack.push_limit_n))
@@ -112,5 +112,5 @@ class Robots:
         return np.concatenate([encoders, load], axis=-1)
 
     def _counted(self, simulator: Simulator) -> Float[np.ndarray, "worlds devices 2"]:
-        """Return where the devices are, counted from where the ostium is assumed."""
-        return simulator.proximal - [self._ostium_mm, 0.0]
+        """Return where the devices are in their drives, counted from where the ostium is assumed."""
+        return np.stack([simulator.inserted_length - self._ostium_mm, simulator.drive_rotation], axis=-1)
