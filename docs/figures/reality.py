@@ -44,7 +44,7 @@ def main() -> None:
     """Replay the sessions with each robot; tell and draw what real and simulated tips have in common."""
     folder = Path(sys.argv[1])
     phantom = endopilot.extract_anatomy(next(folder.glob("phantom2d*.vtp")))
-    wire = endopilot.read_device("workhorse-014")
+    wire = endopilot.read_wire("workhorse-014")
     with tempfile.TemporaryDirectory() as made:
         logs = [convert(path, Path(made)) for path in sorted(folder.glob("2D_phantom_*.csv"))]
     episodes = []

@@ -109,7 +109,7 @@ def test_the_agent_arrives_though_the_wire_is_another_than_believed(side_branch)
 @pytest.fixture(scope="module")
 def with_play() -> RobotConfig:
     """Return a robot whose encoders do not see a play of 2.6 mm and 0.9 turn; a seed draws both, ± 15 %."""
-    wire = DriveConfig(play_mm=2.6, play_rad=2 * np.pi * 0.9, play_sd=0.15)
+    wire = DriveConfig(play_mm=2.6, play_rad=2 * np.pi * 0.9, play_sd_share=0.15)
     return RobotConfig(encoders_at="motor", wire=wire)
 
 
@@ -130,6 +130,14 @@ def test_without_play_what_is_known_of_the_robot_changes_nothing(side_branch) ->
         for known in (RobotConfig(), None)
     )
     assert np.array_equal(told.tip_position, untold.tip_position) and np.array_equal(told.control, untold.control)
+
+
+def test_the_first_decision_goes_by_the_first_reading(side_branch) -> None:
+    policy = AgentPolicy(QUICK)
+    policy.start(side_branch, 0)
+    (velocity,) = policy.decide(Observation(0.0, ((2.3, 0.1),), None)).devices
+    assert policy._course is not None
+    assert velocity == tuple(((policy._course.proximal[0, 0] - [2.3, 0.1]) / 0.5).tolist())
 
 
 def test_an_exposure_says_how_a_wire_is_turned_that_its_encoder_does_not(side_branch, with_play) -> None:

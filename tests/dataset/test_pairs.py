@@ -21,6 +21,7 @@ from endopilot.dataset.info import describe_dataset
 from endopilot.dataset.join import read_joined
 from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.dataset.navigations import STOP_SHORT_MM, simulate_navigations
+from endopilot.dataset.schema import OF_ROBOT
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
@@ -89,7 +90,8 @@ def test_every_number_of_every_device_is_read_back(patient, tmp_path):
     np.testing.assert_array_equal(data.initial, initial)
     np.testing.assert_array_equal(data.friction, made.set_up.friction)
     kept = {field.name for field in fields(data)} - set(OF_EPISODES)
-    assert kept == {*OF_TRAJECTORY, *OF_TIP}
+    assert kept == {*OF_TRAJECTORY, *OF_TIP, *OF_ROBOT}
+    assert all(getattr(data, name) is None for name in OF_ROBOT)  # no robot drove
     ((_, again),) = simulate_again(data, read_anatomy(patient), data.command)
     for name in OF_TRAJECTORY:
         np.testing.assert_array_equal(getattr(again, name), getattr(made, name), err_msg=name)

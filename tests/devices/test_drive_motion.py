@@ -89,7 +89,7 @@ def test_gains_are_drawn_for_each_robot_and_the_same_seed_draws_the_same() -> No
 
 
 def test_plays_are_drawn_for_each_robot_and_begin_anywhere_where_encoders_do_not_see_them() -> None:
-    wire = replace(STIFF, play_mm=2.0, play_sd=0.1)
+    wire = replace(STIFF, play_mm=2.0, play_sd_share=0.1)
     lost, begun = [], []
     for seed in range(60):
         seen, unseen = (drive_of(replace(IDEAL, encoders_at=at, wire=wire), seed=seed) for at in ("wire", "motor"))

@@ -341,7 +341,7 @@ def test_a_robot_drives_and_its_encoders_are_observed(near):
     for push in (1.0, 1.0, 1.0, -1.0):
         observation, *_, infos = env.step(np.tile([[push, 0.0]], (WORLDS, 1)))
     moved = 2 / 15 * 12.0 * (3 - 1)
-    motor = infos["encoder_inserted_length"] - near.start_inserted_mm
+    motor = infos["encoder_inserted_length"] - near.start_inserted_length_mm
     assert (np.abs(motor - moved) < 12.0 * 0.1 * 2 + 0.2).all()  # latency, jitter and ramps
     assert (np.abs(infos["inserted_length"] - infos["encoder_inserted_length"]) > 0.2).all()  # play and gain
     np.testing.assert_allclose(observation[:, 0], infos["encoder_inserted_length"] / 100.0, rtol=1e-5)

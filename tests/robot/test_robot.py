@@ -10,15 +10,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
+from endopilot.devices.catheter import read_catheter
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import RobotConfig, read_robot
+from endopilot.devices.stack import Stack
 from endopilot.devices.transmission import Transmission
 from endopilot.errors import InputError
 from endopilot.navigation.loop import start_world
 from endopilot.robot.remote import RemoteRobot
 from endopilot.robot.robot import CYCLE_S, Robot, SimulatedRobot
-from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.config import SimulatorConfig, wall_stiffness
 from endopilot.simulation.mismatch import ModelMismatch
+from endopilot.simulation.robots import in_grip
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation, Target
 
@@ -128,20 +131,6 @@ def test_encoders_in_front_of_play_and_gain_do_not_see_them(fork, wire, at) -> N
     assert robot.proximal_state().devices[0][0] == pytest.approx(read[0] - lag, abs=1e-3)
 
 
-def test_an_encoder_on_the_wire_reads_its_proximal_end_and_not_its_rotation_at_the_ostium(fork, wire) -> None:
-    navigation = Navigation(anatomy=fork, device=wire, target=Target(branch=1, abscissa=30.0))
-    behind = Transmission(length_mm=1000.0, twist_friction_n_mm_mm=3e-4)
-    config = replace(IDEAL, wire=replace(IDEAL.wire, transmission=behind))
-    simulator = start_world(navigation, ModelMismatch(), SimulatorConfig(element_mm=1.5, threads=1), robot=config)
-    assert simulator.set_up.stacks[0].transmissions == (behind,)
-    robot = SimulatedRobot(simulator, [DriveLimits.of(wire, fork)], config)
-    robot.command(((0.0, 2.0),))
-    robot.run(3.0)
-    assert robot.proximal_state().devices[0][1] == pytest.approx(6.0, abs=1e-4)
-    assert 2.0 < robot.proximal[0, 1] < 4.5  # the lag is some 2.5 rad
-    assert robot.proximal_state().load[0][1] > 0.25  # N mm, of the friction
-
-
 def test_a_wire_slips_in_the_grip_at_its_force_and_only_an_encoder_on_the_wire_sees_it(fork, wire) -> None:
     """Against a wall the drive bears the grip's force, and what is commanded beyond is lost."""
     navigation = Navigation(anatomy=fork, device=wire, target=Target(branch=1, abscissa=30.0))
@@ -200,3 +189,30 @@ def test_what_was_measured_is_kept_beside_what_was_true_and_the_same_seed_repeat
     true = robot.recorder.trajectory()
     assert np.abs(encoders[0, :, 0, 0] - true.inserted_length[0, :, 0]).max() > 0.4  # half the play, and more
     assert (load[0, :, 0, 0] - true.drive_force[0, :, 0]).std() == pytest.approx(0.02, rel=0.4)
+
+
+def test_a_robot_brings_what_lies_between_its_drives_and_the_ostium(wire) -> None:
+    catheter = read_catheter("microcatheter-1.7f")
+    behind = Transmission(length_mm=900.0, twist_friction_n_mm_mm=1e-4)
+    robot = replace(IDEAL, wire=replace(IDEAL.wire, transmission=behind))
+    held, core = in_grip(Stack(wire, (catheter,)), robot, SimulatorConfig())
+    assert held.transmissions == (behind, Transmission()) and held.devices == (wire, catheter)
+    assert core == SimulatorConfig()  # the wall stays as hard as it was, without a weaker grip
+    own = Stack(wire, transmissions=(behind,))
+    assert in_grip(own, IDEAL, core) == (own, core)
+    weak, core = in_grip(own, replace(IDEAL, wire=replace(IDEAL.wire, grip_n=0.1)), SimulatorConfig())
+    assert weak.wire.push_limit_n == 0.1
+    assert core.wall_stiffness_n_mm == wall_stiffness(SimulatorConfig(), wire.push_limit_n)
+
+
+def test_an_encoder_on_the_wire_reads_its_proximal_end_and_not_its_rotation_at_the_ostium(fork, wire) -> None:
+    navigation = Navigation(anatomy=fork, device=wire, target=Target(branch=1, abscissa=30.0))
+    behind = Transmission(length_mm=1000.0, twist_friction_n_mm_mm=3e-4)
+    config = replace(IDEAL, wire=replace(IDEAL.wire, transmission=behind))
+    simulator = start_world(navigation, ModelMismatch(), SimulatorConfig(element_mm=1.5, threads=1), robot=config)
+    robot = SimulatedRobot(simulator, [DriveLimits.of(wire, fork)], config)
+    robot.command(((0.0, 2.0),))
+    robot.run(3.0)
+    assert robot.proximal_state().devices[0][1] == pytest.approx(6.0, abs=1e-4)
+    assert 2.0 < robot.proximal[0, 1] < 4.5  # the lag is some 2.5 rad
+    assert robot.proximal_state().load[0][1] > 0.25  # N mm, of the friction

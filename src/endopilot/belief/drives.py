@@ -85,11 +85,16 @@ class Drives:
             gain = robot.of_drives(count, "gain_translation", "gain_rotation")
             spread = robot.of_drives(count, "gain_sd_translation", "gain_sd_rotation")
             self._gain = gain * (1 + spread * self._random.standard_normal(shape))
-            spread = np.maximum(robot.of_drives(count, "play_sd"), _LEAST_SD)
+            spread = np.maximum(robot.of_drives(count, "play_sd_share"), _LEAST_SD)
             self._gap = self._play * np.maximum(1 + spread * self._random.standard_normal(shape), _LEAST_SHARE)
             self._ahead = self._gap * (self._random.random(shape) - 0.5)
             self._position = np.tile(self._encoder, (_SAMPLES, 1, 1))
             self._estimate()
+
+    def begin(self, encoders: Proximals) -> None:
+        """Take the first reading of the encoders, before anything has moved."""
+        if not self.lose:
+            self.proximal = self.at_rest = self._encoder = np.array(encoders, dtype=float)
 
     def follow(self, encoders: Proximals) -> None:
         """Take a reading of the encoders, a period after the last."""

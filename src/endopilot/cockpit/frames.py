@@ -12,8 +12,9 @@ import struct
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from endopilot.cockpit.world import ShownCatheter, Snapshot
+from endopilot.cockpit.world import Snapshot
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import Anatomy
 
@@ -64,25 +65,24 @@ def device_arrays(snapshot: Snapshot) -> dict[str, np.ndarray]:
     return arrays
 
 
-def motion_values(snapshot: Snapshot, ostium_mm: float = 0.0) -> dict[str, Any]:
+def motion_values(snapshot: Snapshot, counted: Float[np.ndarray, "devices 2"] | None = None) -> dict[str, Any]:
     """Return how far wire and catheters are inserted and turned, and what their drives do, for the page's figures.
 
     Args:
         snapshot: the world.
-        ostium_mm: how much deeper they truly are than the drives' encoders say, mm.
+        counted: inserted length, mm, and rotation, rad, as the drives' encoders have them, which a robot shows; as they
+            truly are if not given.
     """
 
-    def place(device: Snapshot | ShownCatheter) -> dict[str, float]:
-        return {
-            "inserted_length_mm": round(device.inserted_length_mm - ostium_mm, 3),
-            "rotation_deg": round(float(np.rad2deg(device.rotation)), 2),
-        }
-
-    catheters = [place(catheter) for catheter in snapshot.catheters]
+    true = [(device.inserted_length_mm, device.rotation) for device in (snapshot, *snapshot.catheters)]
+    wire, *catheters = (
+        {"inserted_length_mm": round(inserted, 3), "rotation_deg": round(float(np.rad2deg(turned)), 2)}
+        for inserted, turned in (true if counted is None else counted.tolist())
+    )
     return {
         "cycle": snapshot.cycle,
         "time_s": round(snapshot.time_s, 4),
-        **place(snapshot),
+        **wire,
         **({"catheters": catheters} if catheters else {}),
         "velocity": snapshot.velocity,
         "drive_load": snapshot.drive_load,

@@ -165,10 +165,10 @@ class Session:
 
     def values(self, snapshot: Snapshot) -> dict[str, Any]:
         """Return the figures that the page shows."""
-        anatomy, ostium_mm = self.world.navigation.anatomy, self.world.truth.ostium_mm
+        anatomy = self.world.navigation.anatomy
         shown = {
             "mode": "drive",
-            **motion_values(snapshot, ostium_mm),
+            **motion_values(snapshot, self.world.loop.robot.counted),
             "command": tuple(chain.from_iterable(self._command)),
             "stopped": self._stopped,
             "peak_force_n": round(self.world.peak_force_n, 4),

@@ -192,6 +192,8 @@ class _PlanningPolicy:
     def _observe(self, observation: Observation) -> None:
         if self._began:
             self.belief.follow(observation.devices)
+        else:
+            self.belief.drives.begin(observation.devices)
         self._began = True
         if observation.tip is not None:
             self._update(observation.tip)

@@ -211,13 +211,12 @@ class Search:
         beyond, lead, back, push_lead = (
             np.repeat(each, turns) for each in np.array([(*at, at.push_lead_mm) for at in grid], dtype=float).T
         )
+        obstacle, step = self._obstacle(waypoint)
         if not self._alone:
-            obstacle, step = self._obstacle(waypoint)
             wanted = np.maximum(obstacle + beyond * step, 0.0)
             place(many, wanted, lead, config=self.config, force_n=limit_n)
         turn(many, np.tile(sides(turns), len(grid)), periods=left, force_n=limit_n)
-        if back.any():
-            retract(many, back * step, config=self.config, force_n=limit_n)
+        retract(many, back * step, config=self.config, force_n=limit_n)
         return self._push(waypoint).run(many, left - TURN_PERIODS, push_lead)
 
     def _push(self, waypoint: float, *, strict: bool = False) -> Push:

@@ -184,7 +184,7 @@ class Trials:
 
     def all(self, holds: Bool[np.ndarray, "worlds"]) -> Bool[np.ndarray, "trials"]:
         """Return where something holds for all wires that count."""
-        return holds.reshape(self.wires, -1)[self.counted].all(axis=0)
+        return np.asarray(holds.reshape(self.wires, -1)[self.counted].all(axis=0))
 
     def control(self, *moves: Move) -> Control:
         """Return the control that makes some moves; a device that none names rests."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 import yaml
@@ -18,7 +18,6 @@ from pydantic import model_validator
 
 from endopilot.devices.device import Device
 from endopilot.devices.device_files import there
-from endopilot.devices.stack import Stack
 from endopilot.devices.transmission import Transmission
 from endopilot.errors import InputError
 from endopilot.files import writing
@@ -27,13 +26,14 @@ from endopilot.settings import NonNegative, Positive, Within, read_settings, set
 ASSUMED, IDEAL = "assumed", "ideal"
 """Names of the robot whose numbers are assumptions, which is the default, and of the one that does as it is told."""
 _SHIPPED = Path(__file__).parent / "robots"
+Kind = TypeVar("Kind", bound=Device)
 _MOST_SPREADS = 3.0
 """A gain that is drawn lies no farther from its mean than this many standard deviations."""
 
 
 @settings
 class DriveConfig:
-    """The drive of one device: motor, gears and grip."""
+    """The drive of one device: motor, gears and grip, and what lies between it and the ostium."""
 
     max_acceleration_mm_s2: Positive = 200.0
     """Largest change of the translation's speed, mm/s²."""
@@ -51,10 +51,8 @@ class DriveConfig:
     """Motion that is lost where the translation reverses, mm."""
     play_rad: Annotated[float, Within(0, 50, unit="rad", mistaken=(("°", np.pi / 180),))] = 0.035
     """Motion that is lost where the rotation reverses, rad."""
-    play_sd: Annotated[float, Within(0, 0.5)] = 0.0
+    play_sd_share: Annotated[float, Within(0, 0.5)] = 0.0
     """Standard deviation of both plays from robot to robot, a share of them; a seed draws the robot."""
-    transmission: Transmission = Transmission()
-    """What lies between the drive and the ostium: there the device twists under friction. That of the stack if none."""
     grip_n: Positive | None = None
     """Axial force beyond which the device slips in the drive's grip, N; the device's own limits hold if not given."""
     grip_n_mm: Positive | None = None
@@ -67,8 +65,10 @@ class DriveConfig:
     """Standard deviation of a reading of the axial force, N."""
     load_sd_n_mm: NonNegative = 0.01
     """Standard deviation of a reading of the torque, N·mm."""
+    transmission: Transmission = Transmission()
+    """The length of the device in its guiding catheter, which twists there under friction."""
 
-    def gripped(self, device: Device) -> Device:
+    def gripped(self, device: Kind) -> Kind:
         """Return a device with the limits at which it slips in this drive."""
         push, pull, torque = device.push_limit_n, device.pull_limit_n, device.torque_limit_n_mm
         if self.grip_n is not None:
@@ -109,12 +109,6 @@ class RobotConfig:
         around = [self.catheters[min(k, len(self.catheters) - 1)] for k in range(count - 1)]
         return (self.wire, *around)
 
-    def through_transmissions(self, stack: Stack) -> Stack:
-        """Return devices on which drives act through their transmissions; those without one, through the stack's."""
-        drives = zip(self.drives(len(stack)), stack.transmissions, strict=True)
-        behind = tuple(drive.transmission if drive.transmission.length_mm > 0 else own for drive, own in drives)
-        return replace(stack, transmissions=behind)
-
     def of_drives(self, count: int, *names: str) -> Float[np.ndarray, "devices numbers"]:
         """Return some fields of each drive, of some devices in all."""
         return np.array([[getattr(drive, name) for name in names] for drive in self.drives(count)])
@@ -128,7 +122,7 @@ class RobotConfig:
     def plays(self, count: int, random: np.random.Generator) -> Float[np.ndarray, "devices 2"]:
         """Return the plays of one robot's drives, drawn, mm and rad."""
         drawn = np.clip(random.standard_normal((count, 2)), -_MOST_SPREADS, _MOST_SPREADS)
-        spread = self.of_drives(count, "play_sd")
+        spread = self.of_drives(count, "play_sd_share")
         return self.of_drives(count, "play_mm", "play_rad") * np.maximum(1 + spread * drawn, 0.0)
 
     def run_out(self, velocity: Float[np.ndarray, "devices 2"]) -> Float[np.ndarray, "devices 2"]:

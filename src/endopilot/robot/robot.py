@@ -134,6 +134,11 @@ class SimulatedRobot:
         return self._simulator.proximal[0]
 
     @property
+    def counted(self) -> Float[np.ndarray, "devices 2"]:
+        """Inserted length, mm, and rotation, rad, of each device as the encoders count them, without noise."""
+        return self._robots.counted(self._simulator)[0]
+
+    @property
     def measured(self) -> dict[str, Float[np.ndarray, "1 cycles devices 2"]]:
         """What was measured at the end of each cycle, as columns of the recorder's trajectory.
 

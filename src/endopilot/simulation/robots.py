@@ -23,18 +23,25 @@ Seed = Sequence[int]
 
 
 def in_grip(stack: Stack, robot: RobotConfig, core: SimulatorConfig) -> tuple[Stack, SimulatorConfig]:
-    """Return devices as a robot drives them, which slip where its grip yields; and settings with the wall as before.
+    """Return devices as a robot holds them, and settings by which the wall is as hard as before.
+
+    They slip where its grip yields, and lie behind the ostium as its drives say, or else as the stack says.
 
     Args:
         stack: the devices.
         robot: what holds them.
         core: settings of the rod core, whose wall is as hard as the devices' push limits say if nothing else is given.
     """
-    wire, *around = robot.drives(len(stack))
+    drives = robot.drives(len(stack))
+    wire, *around = drives
     catheters = tuple(drive.gripped(each) for drive, each in zip(around, stack.catheters, strict=True))
-    held = robot.through_transmissions(replace(stack, wire=wire.gripped(stack.wire), catheters=catheters))
+    behind = zip(drives, stack.transmissions, strict=True)
+    transmissions = tuple(drive.transmission if drive.transmission.length_mm else given for drive, given in behind)
+    held = replace(stack, wire=wire.gripped(stack.wire), catheters=catheters, transmissions=transmissions)
     if held == stack:
         return stack, core
+    if held.push_limit_n == stack.push_limit_n:
+        return held, core
     return held, replace(core, wall_stiffness_n_mm=wall_stiffness(core, stack.push_limit_n))
 
 
@@ -103,7 +110,7 @@ class Robots:
             encoder_noise: of the encoders' noise, where there is one world; the robots' own streams if not given.
         """
         chosen = list(range(len(self._random)) if worlds is None else worlds)
-        places = (self.motion.motor if self._at_motor else self._counted(simulator))[chosen]
+        places = self.counted(simulator)[chosen]
         own, shape = [self._random[world] for world in chosen], places.shape[1:]
         streams = own if encoder_noise is None else [encoder_noise]
         encoders = places + self._noise * np.stack([random.standard_normal(shape) for random in streams])
@@ -111,6 +118,10 @@ class Robots:
         load = load + self._load_noise * np.stack([random.standard_normal(shape) for random in own])
         return np.concatenate([encoders, load], axis=-1)
 
+    def counted(self, simulator: Simulator) -> Float[np.ndarray, "worlds devices 2"]:
+        """Return what the encoders count, without noise, mm and rad."""
+        return self.motion.motor if self._at_motor else self._counted(simulator)
+
     def _counted(self, simulator: Simulator) -> Float[np.ndarray, "worlds devices 2"]:
-        """Return where the devices are in their drives, counted from where the ostium is assumed."""
+        """Return where the devices are at their drives, counted from where the ostium is assumed."""
         return np.stack([simulator.inserted_length - self._ostium_mm, simulator.drive_rotation], axis=-1)
