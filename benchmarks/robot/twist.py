@@ -27,7 +27,7 @@ from endopilot.devices.stack import Stack
 from endopilot.devices.transmission import Transmission
 from endopilot.errors import InputError
 from endopilot.robot.log import RobotLog, read_log
-from endopilot.robot.replay import EpisodeReplay, ReplayConfig, replay_log, usable_episodes
+from endopilot.robot.replay import EpisodeReplay, replay_log, usable_episodes
 from endopilot.types import Anatomy
 
 MOVES_MM, SNAPS_MM = 0.28, 0.57
@@ -231,7 +231,7 @@ def bench_twist(
     for path in paths:
         log = read_log(path)
         episodes = usable_episodes([log], patient)
-        replays = replay_log([log], patient, stack, robot, ReplayConfig())
+        replays = replay_log([log], patient, stack, robot=robot)
         everything += list(zip(episodes, replays, strict=True))
         rows.append({"log": path.stem, **figures(everything[-len(episodes) :], patient)})
     return [*rows, {"log": "all", **figures(everything, patient)}]

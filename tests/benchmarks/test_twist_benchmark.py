@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from benchmarks.robot.twist import (
     Run,
     Sides,
     at_commands,
+    bench_twist,
     correlation,
     dead_bands,
     drive_of,
@@ -17,6 +20,8 @@ from benchmarks.robot.twist import (
     steps_to,
     tip_in_run,
 )
+from endopilot.anatomy.io import write_anatomy
+from endopilot.errors import InputError
 from endopilot.robot.log import RobotLog
 from endopilot.robot.replay import EpisodeReplay
 from endopilot.types import Anatomy
@@ -129,3 +134,23 @@ def test_where_rotation_is_lost() -> None:
     assert (twist.transmission.length_mm, twist.play_rad) == (900.0, 0.0)
     assert play.transmission.length_mm == 0.0 and play.play_rad > 5
     assert none.transmission.length_mm == none.play_rad == 0.0
+
+
+def test_a_log_is_compared_with_its_replay(fork: Anatomy, tmp_path: Path) -> None:
+    write_anatomy(fork, output=tmp_path / "fork")
+    (tmp_path / "logs").mkdir()
+    at, turn = np.arange(60) * 0.24, np.zeros(60)
+    at[40:], turn[40:50], turn[50:] = at[39], STEP * np.arange(1, 11), STEP * np.arange(9, -1, -1)
+    line = fork.tree.path(1)
+    seen = np.array([[np.interp(5.0 + x, line.abscissa, axis) for axis in line.points.T] for x in at])
+    columns = np.column_stack([0.1 * np.arange(60), at, turn, seen])
+    header = "time_s,translation_mm,rotation_rad,tip_x_mm,tip_y_mm,tip_z_mm"
+    np.savetxt(tmp_path / "logs" / "made-up.csv", columns, delimiter=",", header=header, comments="")
+    rows = bench_twist(logs=tmp_path / "logs", anatomy=tmp_path / "fork", tip_deg=45.0, tip_mm=3.0)
+    assert [row["log"] for row in rows] == ["made-up", "all"]
+    for row in rows:
+        assert (row["episodes"], row["reversals_real"], row["reversals_simulated"]) == (1, 1, 1)
+        assert row["moves_after_real"] == "- (---)"  # the tip seen stays on the centerline
+        assert row["snaps_a_turn_real"] == 0
+    with pytest.raises(InputError, match="no log; convert the public ones"):
+        bench_twist(logs=tmp_path, anatomy=tmp_path / "fork")
