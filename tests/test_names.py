@@ -33,16 +33,16 @@ ASKED = {
 
 
 VERBS = {
-    "check", "climb", "evaluate", "extract", "find", "generate", "list", "load", "make", "navigate", "plan", "read",
-    "segment", "simulate", "take", "train", "write",
+    "calibrate", "check", "climb", "evaluate", "extract", "find", "generate", "list", "load", "make", "navigate",
+    "plan", "read", "replay", "segment", "simulate", "take", "train", "write",
 }  # fmt: skip
 SUBJECTS = {
-    "anatomies", "anatomy", "control", "dataset", "device", "devices", "driven", "folder", "name", "name_or_path",
-    "navigation", "num_envs", "path", "plan", "policy", "run", "session", "source", "target", "version", "volume",
-    "wire", "wire_radius_mm",
+    "anatomies", "anatomy", "control", "dataset", "device", "devices", "driven", "folder", "logs", "name",
+    "name_or_path", "navigation", "num_envs", "path", "plan", "policy", "run", "session", "source", "target", "version",
+    "volume", "wire", "wire_radius_mm",
 }  # fmt: skip
 """What a function does something with, or to. All else goes by keyword."""
-UNITS = re.compile(r"(^|_)(mm2?|s2?|n|hu|rad|deg|ugy|seconds|pixel_sd|along_sd|share|factor|weight|ratio)$")
+UNITS = re.compile(r"(^|_)(mm2?|s2?|n|hu|rad|deg|ugy|seconds|pixel_sd|along_sd|play_sd|share|factor|weight|ratio)$")
 WITHOUT_UNIT = {
     "calcium", "dose", "efficiency", "friction", "gain_rotation", "gain_sd_rotation", "gain_sd_translation",
     "gain_translation", "largest_jump", "learning_rate", "mismatch", "right_heart", "scale",

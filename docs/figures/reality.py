@@ -1,13 +1,13 @@
-"""Write the table of docs/reality.md and draw its pictures: `python docs/figures/reality.py FOLDER`.
+"""Write the table of docs/reality.md and draw its pictures: `python docs/figures/reality.py FOLDER ROBOT DEVICE`.
 
-FOLDER holds the public logs of Kweon et al. (IEEE Access 2021) as CSV files, and the 2-D phantom's lumen as .vtp.
+FOLDER holds the public logs of Kweon et al. (IEEE Access 2021) as CSV files, and the 2-D phantom's lumen as .vtp; ROBOT
+and DEVICE are what `endopilot calibrate` made of all sessions but those of `KEPT_ASIDE`, which are replayed here.
 """
 
 from __future__ import annotations
 
 import sys
 import tempfile
-import warnings
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -31,9 +31,11 @@ import matplotlib.pyplot as plt
 PAGE = Path(__file__).parents[1] / "reality.md"
 IMAGES = Path(__file__).parents[1] / "images"
 BEGIN, END = "<!-- reality:begin -->", "<!-- reality:end -->"
-EPISODES = 8
-"""Of each session, evenly chosen."""
-ROBOTS = ("ideal", "assumed", "kweon-2021-2d")
+EPISODES = 15
+"""Of each session at most, evenly chosen."""
+KEPT_ASIDE = ("log7", "_M2_")
+"""Parts of the names of the sessions that are replayed."""
+CALIBRATED = "calibrated"
 LEAST_RUN_MM, LEAST_TURNS = 3.5, 1.2
 """A reversal counts after so much travel in one direction; a rotation if it goes on for so long without translation."""
 FIRST_MM, SNAP_MM = 0.3, 0.8
@@ -42,31 +44,31 @@ FIRST_MM, SNAP_MM = 0.3, 0.8
 
 def main() -> None:
     """Replay the sessions with each robot; tell and draw what real and simulated tips have in common."""
-    folder = Path(sys.argv[1])
+    folder, robot_file, device = Path(sys.argv[1]), sys.argv[2], sys.argv[3]
     phantom = endopilot.extract_anatomy(next(folder.glob("phantom2d*.vtp")))
-    wire = endopilot.read_device("workhorse-014")
     with tempfile.TemporaryDirectory() as made:
         logs = [convert(path, Path(made)) for path in sorted(folder.glob("2D_phantom_*.csv"))]
+    logs = [log for log in logs if any(part in log.name for part in KEPT_ASIDE)]
     episodes = []
     for log in logs:
         usable = usable_episodes([log], phantom)
         chosen = np.unique(np.linspace(0, len(usable) - 1, EPISODES).round().astype(int))
         episodes += [usable[k] for k in chosen]
-    config, found, drives = ReplayConfig(), {}, None
-    for name in ROBOTS:
-        robot = endopilot.read_robot(name)
+    wire, config = endopilot.read_wire("workhorse-014"), ReplayConfig()
+    worlds = {name: (endopilot.read_robot(name), wire) for name in ("ideal", "assumed")}
+    worlds[CALIBRATED] = (endopilot.read_robot(robot_file), endopilot.read_wire(device))
+    found = {}
+    for name, (robot, driven) in worlds.items():
         of = prepare(episodes, phantom, config.given, robot)
-        drives = _drives(of.courses, robot) if drives is None or name == ROBOTS[-1] else drives
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            found[name] = replay_prepared(of, endopilot.Stack(wire), robot, config)
+        found[name] = replay_prepared(of, endopilot.Stack(driven), robot, config)
         print(name, summary(found[name]))
-    measured = {"real": _measures(drives, found[ROBOTS[-1]], 0)}
+    drives = _drives(of.courses, robot)
+    measured = {"real": _measures(drives, found[CALIBRATED], 0)}
     measured |= {name: _measures(drives, each, 1) for name, each in found.items()}
     head, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
     PAGE.write_text(f"{head}{BEGIN}\n{_table(measured, found)}\n{END}{rest.split(END)[1]}", encoding="utf-8")
     _draw(measured)
-    figure = replay_figure(phantom, [found[ROBOTS[-1]][k] for k in (3, 18, 26, 34)], f"robot {ROBOTS[-1]}")
+    figure = replay_figure(phantom, found[CALIBRATED], "sessions kept aside, robot and wire calibrated on the others")
     figure.savefig(IMAGES / "reality-tracks.png", dpi=80)
 
 
@@ -164,7 +166,7 @@ def _table(measured: dict, found: dict) -> str:
         f"turns before the tip has moved by {FIRST_MM} mm": lambda m: quartiles(m["first"]),
         f"turns before it has moved by {SNAP_MM} mm": lambda m: quartiles(m["snap"]),
     }
-    lines = ["| median (quartiles) | real robot | " + " | ".join(f"ours, `{name}`" for name in found) + " |"]
+    lines = ["| median (quartiles) | real robot | " + " | ".join(f"ours, {name}" for name in found) + " |"]
     lines += ["|---|" + "---|" * (1 + len(found))]
     lines += [f"| {title} | " + " | ".join(show(m) for m in measured.values()) + " |" for title, show in rows.items()]
     figures = {name: summary(each) for name, each in found.items()}
@@ -178,7 +180,7 @@ def _table(measured: dict, found: dict) -> str:
 
 
 def _draw(measured: dict) -> None:
-    colors = {"real": BLACK, "ideal": GREY, "assumed": BLUE, "kweon-2021-2d": VERMILLION}
+    colors = {"real": BLACK, "ideal": GREY, "assumed": BLUE, CALIBRATED: VERMILLION}
     with plt.rc_context(STYLE):
         figure, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.6), layout="constrained")
         for name, each in measured.items():

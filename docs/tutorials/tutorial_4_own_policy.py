@@ -65,7 +65,7 @@ plt.show()
 # The ladder
 # ----------
 # A ladder score counts *safe success*: the target in time, with the wall force below the limit, through a robot with
-# latency, backlash and encoder noise. On the command line:
+# latency, play and encoder noise. On the command line:
 # ``endopilot ladder --policy my_policy:TurnBack --tasks diagonal --patients 4``. All twelve tasks in all twenty
 # patients take some minutes. Several processes drive the navigations: in a script of your own, make the call under
 # ``if __name__ == "__main__":``.

@@ -166,7 +166,7 @@ def test_side_branches_stay_outside_the_heart():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"anatomy": "spleen"}, "'spleen'; choose from .*rca"),
+        ({"vessel": "spleen"}, "'spleen'; choose from .*rca"),
         ({"count": 0}, "count: 0"),
         ({"seed": -1}, "seed: -1"),
         ({"stenosis_share": 1.5}, "stenosis_share: 1.5"),

@@ -90,8 +90,8 @@ def test_the_commands_plan_and_simulate_take_a_catheter(vessel, tmp_path, capsys
         ({"config": replace(CONFIG, method="spin")}, {}, "method: spin; a wire in a catheter is planned by search"),
         ({"target": "tips.csv"}, {}, "desired tips are followed by a wire alone"),
         ({}, {"model": "pretrained"}, "--model pretrained: models are of a wire alone"),
-        ({}, {"catheters": [CATHETER, read_catheter("straight-5f")]}, "catheter: 2; the search drives one"),
-        ({}, {"catheters": []}, "arrives: catheter; there is none"),
+        ({}, {"device": Stack.of("workhorse-014", CATHETER, "straight-5f")}, "catheter: 2; the search drives one"),
+        ({}, {"device": None}, "arrives: catheter; there is none"),
         ({"config": replace(CONFIG, seconds=4.0)}, {}, r"seconds: 4 s are too few .* in microcatheter-1\.7f; give \d"),
         ({"config": replace(CONFIG, force_limit_n=1e-6)}, {}, "no path found to branch"),
     ],
@@ -99,4 +99,9 @@ def test_the_commands_plan_and_simulate_take_a_catheter(vessel, tmp_path, capsys
 def test_what_cannot_be_planned_is_refused(vessel, change, others, line):
     asked = {"target": "0,0,25", "config": CONFIG} | change
     with pytest.raises(InputError, match=line):
-        plan(vessel, asked["target"], config=asked["config"], **({"catheters": [CATHETER]} | others))
+        plan(
+            vessel,
+            asked["target"],
+            config=asked["config"],
+            **({"device": Stack.of("workhorse-014", CATHETER)} | others),
+        )

@@ -166,7 +166,7 @@ def test_it_is_written_beside_the_plan(found, vessel, tmp_path):
     from endopilot.anatomy.io import read_anatomy
 
     xray = plan_xray(found, calibration=calibration(abscissa=(5.0, 0.0, 0.0, 0.0)))
-    figures = write_plan(found, output=tmp_path / "plan", needed=xray)
+    figures = write_plan(found, output=tmp_path / "plan", xray=xray)
     table = pd.read_csv(tmp_path / "plan" / "plan.csv")
     assert (
         figures["xray_due_s"]

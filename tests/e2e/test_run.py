@@ -38,7 +38,7 @@ def case(tmp_path_factory):
     shutil.copy(device_yaml("workhorse-014")[0], folder / "wire.yaml")
     line = [sys.executable, "-m", "endopilot.cli", *map(str, arguments(folder))]
     with subprocess.Popen(line, stderr=subprocess.DEVNULL) as first:
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + 300
         while not masks(folder):
             assert first.poll() is None and time.monotonic() < deadline
             time.sleep(0.05)

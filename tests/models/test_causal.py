@@ -279,17 +279,19 @@ def test_a_simulated_wire_of_the_true_friction_retraces_the_navigation_and_is_si
         assert (read_or_simulate(tmp_path, brief.select(some)) == 7.0).all()  # other episodes are other wires
 
 
-def test_another_end_of_a_navigation_is_simulated_from_where_it_begins(brief):
+@pytest.mark.parametrize("first", [20, 35])
+def test_another_end_of_a_navigation_is_simulated_from_where_it_begins(brief, first):
+    some = brief.select(np.array([0, len(brief) - 1]))
     wires = SimulatedWires()
-    wires.tips(brief)
-    later = brief.control[:, 35:].copy()
+    before = wires.tips(some)
+    later = some.control[:, first:].copy()
     later[..., 0] *= 0.5
-    other = brief.driven(brief.proximal[:, 35:], later)
+    other = some.driven(some.proximal[:, first:], later)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("endopilot.models.simulated_wires.Ensemble", None)  # none is brought to its start again
         tips = wires.tips(other)
     np.testing.assert_array_equal(tips, simulated_tips(other))
-    assert (tips != wires.tips(brief)).any()
+    assert (tips != before).any()
 
 
 def test_a_wire_whose_simulation_fails_is_where_the_guess_is(brief):

@@ -48,4 +48,5 @@ def test_what_the_cost_does_not_depend_on_is_not_identified() -> None:
 
 def test_few_candidates_from_everywhere_find_it_too() -> None:
     told, least_squares = found(1, generations=0, first=64)
-    assert abs(told["slope"].value - least_squares) < 0.05 and told["slope"].low <= 2.0 <= told["slope"].high
+    assert abs(told["slope"].value - least_squares) < 0.05
+    assert told["slope"].low <= 2.0 <= told["slope"].high and told["slope"].identified

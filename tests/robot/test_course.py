@@ -58,7 +58,9 @@ def test_it_is_the_motion_of_the_simulated_robot(fork, wire, seed) -> None:
     courses, late = Courses.of([log], robot.wire), robot.latency_s
     at_s = PERIOD_S * np.arange(1, len(true) + 1)[None]
     gain, play = robot.wire.gain_translation, robot.wire.play_mm
-    motion = followed(courses, at_s, latency_s=late, gain=gain, play=play)
-    error = true[:, 0] - motion
-    assert np.abs(error - np.median(error)).max() < 0.25
+    motions = [  # where in its play a drive begins is drawn
+        followed(courses, at_s, latency_s=late, gain=gain, play=play, start=start) for start in np.linspace(-1, 1, 41)
+    ]
+    errors = [true[:, 0] - motion for motion in motions]
+    assert min(np.abs(error - np.median(error)).max() for error in errors) < 0.25
     assert np.ptp(true[:, 0]) > 5.0

@@ -9,8 +9,9 @@ from tyro.conf import Positional
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cli.arguments import Answer, Existing, OutputFile
-from endopilot.devices.device import read_device, write_device
+from endopilot.devices.device import read_wire
 from endopilot.devices.robot import read_robot
+from endopilot.devices.write import write_device
 from endopilot.files import input_hash, manifest, write_json
 from endopilot.robot.calibrate import CalibrateConfig, RobotCalibration, calibrate
 from endopilot.robot.log import read_log
@@ -42,7 +43,7 @@ def command(
         config: how logs are fitted.
     """
     read, patient = [read_log(path) for path in logs], read_anatomy(anatomy)
-    found = calibrate(read, patient, read_device(device), read_robot(robot), config)
+    found = calibrate(read, patient, read_wire(device), robot=read_robot(robot), config=config)
     names = ", ".join(log.name for log in read)
     _write(found, output, names)
     figures = summary(found.replays)
@@ -78,7 +79,7 @@ def _write(found: RobotCalibration, output: Path, names: str) -> None:
         field: f"by {_BY} from {names}: " + ", ".join(f"{name} {told[name]}" for name in by if name in told)
         for field, by in changed.items()
     }
-    write_device(replace(found.wire, sources=dict(found.wire.sources) | texts), _beside(output))
+    write_device(replace(found.wire, sources=dict(found.wire.sources) | texts), output=_beside(output))
 
 
 def _beside(output: Path) -> Path:

@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cli.arguments import Existing, Figures, OutputFolder
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.devices.robot import read_robot
 from endopilot.devices.stack import Stack
 from endopilot.files import input_hash, manifest, write_json, writing
@@ -45,7 +45,7 @@ def command(
     from endopilot.report.replay_figure import replay_figure  # matplotlib is slow to import
 
     patient, read = read_anatomy(anatomy), read_log(log)
-    found = replay_log([read], patient, Stack(read_device(device)), read_robot(robot), config)
+    found = replay_log([read], patient, Stack(read_wire(device)), robot=read_robot(robot), config=config)
     output.mkdir(parents=True, exist_ok=True)
     figures = summary(found)
     title = f"{read.name} beside {device}, robot {Path(robot).name}"

@@ -62,7 +62,7 @@ class NavigationState:
         safe: worlds whose force has not been too large since their reset.
         ended: worlds whose episode has ended, which the next step resets.
         generators: state of each world's random generator.
-        robots: what drives; None without a robot.
+        robots: what drives, as it is kept within the environment; None without a robot.
         readings: what they measured last; None likewise.
     """
 

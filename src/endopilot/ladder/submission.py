@@ -122,7 +122,7 @@ class SubmissionCheck:
 def task_digest(task: Task) -> str:
     """Return the SHA-256 of what a task's navigations follow from: its definition and its devices."""
     # Older tasks had no such fields, or named them otherwise: their hashes stay.
-    older = {"vessel": "anatomy", "start_inserted_length_mm": "start_inserted_length_mm"}
+    older = {"vessel": "anatomy", "start_inserted_length_mm": "start_inserted_mm"}
     definition = {
         older.get(name, name): value
         for name, value in asdict(task).items()

@@ -28,7 +28,7 @@ def replay_figure(anatomy: Anatomy, found: Sequence[EpisodeReplay], title: str) 
             _draw_plane(panels[row, 0], anatomy, found[k])
             _draw_course(panels[row, 1], found[k])
         figure.suptitle(title, x=0.01, ha="left")
-        panels[0, 1].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4)
+        figure.legend(*panels[0, 1].get_legend_handles_labels(), loc="outside lower right", ncols=4)
         for axes in panels[:-1].ravel():
             axes.set_xlabel("")
     return figure

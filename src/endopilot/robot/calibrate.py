@@ -102,6 +102,7 @@ def calibrate(
     logs: Sequence[RobotLog],
     anatomy: Anatomy,
     device: Wire,
+    *,
     robot: RobotConfig | None = None,
     config: CalibrateConfig | None = None,
 ) -> RobotCalibration:

@@ -24,6 +24,8 @@ _WIDER = 0.5
 """What is drawn from reaches beyond the candidates that are not worse by this share of their range."""
 _LEAST_SPARE = 0.03
 """And by this share of all that was searched in, at least."""
+_LEAST_SHARE = 0.1
+"""Share of the candidates that count as good at least where no optimiser looked for the best."""
 UNKNOWN_SHARE = 0.6
 """A parameter whose interval takes this share of what it was searched in is not identified."""
 LEAST_EPISODES = 5
@@ -68,11 +70,13 @@ class Candidates:
         names: of the parameters.
         values: of each candidate.
         costs: of each candidate in each episode.
+        least: so many count as good at least: where few were tried, none of them is the best that there is.
     """
 
     names: tuple[str, ...]
     values: Float[np.ndarray, "candidates parameters"]
     costs: Float[np.ndarray, "candidates episodes"]
+    least: int = 1
 
     @property
     def best(self) -> int:
@@ -80,12 +84,13 @@ class Candidates:
         return int(np.argmin(self.costs.sum(axis=1)))
 
     @property
-    def not_worse(self) -> Bool[np.ndarray, "candidates"]:
-        """Which are not worse than the best."""
+    def as_good(self) -> Bool[np.ndarray, "candidates"]:
+        """Which are as good as the best, as far as the episodes tell."""
         more = self.costs - self.costs[self.best]
         count = more.shape[1]
         standard_error = np.sqrt(count) * more.std(axis=1, ddof=1)
-        return more.sum(axis=1) <= t.ppf(0.975, count - 1) / 2 * standard_error
+        first = np.argsort(np.argsort(more.sum(axis=1))) < self.least
+        return first | (more.sum(axis=1) <= t.ppf(0.975, count - 1) / 2 * standard_error)
 
 
 def search(
@@ -105,7 +110,7 @@ def search(
         ranges: of each parameter: least and largest value.
         generations: of differential evolution, of about eight candidates a parameter.
         rounds: in which candidates are drawn around those that are not worse.
-        draws: number of them in each round, a power of two.
+        draws: number of them in each round.
         first: number that is drawn from everywhere in place of differential evolution, where each takes long.
         seed: of all.
     """
@@ -119,19 +124,25 @@ def search(
         return cost[-1].sum(axis=1)
 
     def draw(number: int, bottom: np.ndarray, top: np.ndarray, seed: int) -> None:
-        total((bottom + qmc.Sobol(len(low), seed=seed).random(number) * (top - bottom)).T)
+        total((bottom + qmc.Halton(len(low), seed=seed).random(number) * (top - bottom)).T)
 
     if first:
         draw(first, low, high, seed)
     else:
         _evolve(total, list(zip(low, high, strict=True)), generations, seed)
     for number in range(rounds):
-        found = Candidates(tuple(ranges), np.concatenate(tried), np.concatenate(cost))
-        as_good = found.values[found.not_worse]
+        found = _all(tuple(ranges), tried, cost, first)
+        as_good = found.values[found.as_good]
         spare = np.maximum(_WIDER * np.ptp(as_good, axis=0), _LEAST_SPARE * (high - low))
         bottom, top = np.clip([as_good.min(axis=0) - spare, as_good.max(axis=0) + spare], low, high)
         draw(draws, bottom, top, seed + number + 1)
-    return Candidates(tuple(ranges), np.concatenate(tried), np.concatenate(cost))
+    return _all(tuple(ranges), tried, cost, first)
+
+
+def _all(names: tuple[str, ...], tried: list[np.ndarray], cost: list[np.ndarray], first: int) -> Candidates:
+    values = np.concatenate(tried)
+    least = max(2 * len(names) + 2, round(_LEAST_SHARE * len(values))) if first else 1
+    return Candidates(names, values, np.concatenate(cost), least)
 
 
 def _evolve(total: Callable[[np.ndarray], np.ndarray], ranges: list[tuple[float, float]], most: int, seed: int) -> None:
@@ -164,7 +175,7 @@ def estimates(
         units: of the parameters.
         resolution: least half-widths of intervals: what the model itself does not resolve, however long the log.
     """
-    as_good, best = found.values[found.not_worse], found.values[found.best]
+    as_good, best = found.values[found.as_good], found.values[found.best]
     told = {}
     for i, name in enumerate(found.names):
         spare, value = resolution.get(name, 0.0), float(best[i])

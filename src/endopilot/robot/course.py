@@ -1,9 +1,8 @@
 """What a drive makes of the commands of a log: where the device's proximal end is at any time, with lag, gain and play.
 
 A command moves the drive from where it is to the commanded position by the time of the next one, and it begins
-`latency` later. The device follows by `gain`, through the play, which is a play operator (backlash): with the drive
-at x, it lies within [x - play/2, x + play/2], and moves only where it would leave that. Whole sets of candidates are
-computed side by side.
+`latency` later. The device follows by `gain` and through the play, as in the simulated robot (`through_play`).
+Candidates are computed side by side.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from endopilot.devices.play import through_play
 from endopilot.devices.robot import DriveConfig
 from endopilot.robot.log import RobotLog
 
@@ -88,16 +88,19 @@ class Courses:
         """
         drive = gain[:, None, None] * self.command[None, :, :, axis]
         half = play[:, None] / 2
-        device = np.empty_like(drive)
-        device[:, :, 0] = np.clip(start, -1.0, 1.0) * half
+        ahead = np.empty_like(drive)  # of the device
+        ahead[:, :, 0] = -np.clip(start, -1.0, 1.0) * half
         for k in range(1, drive.shape[2]):
-            device[:, :, k] = np.clip(device[:, :, k - 1], drive[:, :, k] - half, drive[:, :, k] + half)
+            ahead[:, :, k], _ = through_play(ahead[:, :, k - 1], drive[:, :, k] - drive[:, :, k - 1], half)
         result = np.empty((len(gain), *at_s.shape))
         for e, knots in enumerate(self.knot_s):
             since = np.clip(at_s[e] - latency_s[:, None], knots[0], knots[-1])
             before = np.minimum(np.searchsorted(knots, since, side="right") - 1, len(knots) - 2)
             share = (since - knots[before]) / (knots[before + 1] - knots[before])
-            left, right = (np.take_along_axis(drive[:, e], before + k, axis=1) for k in (0, 1))
-            now = left + share * (right - left)
-            result[:, e] = np.clip(np.take_along_axis(device[:, e], before, axis=1), now - half, now + half)
+            left, right, led = (
+                np.take_along_axis(each[:, e], at, axis=1)
+                for each, at in ((drive, before), (drive, before + 1), (ahead, before))
+            )
+            driven = share * (right - left)
+            result[:, e] = left + driven - through_play(led, driven, half)[0]
         return result

@@ -23,6 +23,7 @@ from endopilot.robot.course import STARTS, Courses
 from endopilot.robot.log import RobotLog
 from endopilot.settings import OpenShare, Within, settings
 from endopilot.simulation.config import PRESETS, SimulatorConfig
+from endopilot.simulation.robots import in_grip
 from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy
 
@@ -31,6 +32,8 @@ LEAST_TIPS = 20
 _PERIOD_S = 0.05
 _LEAD_S = 2.0
 """A simulation begins so long before the first tip was seen, or with the first command, s."""
+_FADES = 0.15
+"""Share of what is given over which a tip's weight falls by 1/e, when a world is chosen."""
 _TOGETHER = 8
 """Episodes that are simulated side by side, for as long as the longest of them takes."""
 FAR_MM = 2.0
@@ -125,9 +128,9 @@ def replay_log(
     logs: Sequence[RobotLog],
     anatomy: Anatomy,
     device: Stack,
+    *,
     robot: RobotConfig,
     config: ReplayConfig | None = None,
-    *,
     simulator: SimulatorConfig | None = None,
 ) -> list[EpisodeReplay]:
     """Replay logs.
@@ -169,6 +172,7 @@ def replay_prepared(
     simulator: SimulatorConfig | None = None,
 ) -> list[EpisodeReplay]:
     """Replay episodes that are prepared, as `replay_log` does."""
+    device, simulator = in_grip(device, robot, simulator or PRESETS["fast"])
     times, course = _proximal(of, robot)
     at_tips = _at(times, course[..., 0], of.courses.seen_s)
     depth = np.nanmedian(np.where(of.given, of.abscissa - at_tips, np.nan), axis=1)
@@ -231,7 +235,7 @@ def _simulated(
     course: Float[np.ndarray, "episodes times 2"],
     depth: Float[np.ndarray, "episodes"],
     angles: Float[np.ndarray, "episodes worlds"],
-    simulator: SimulatorConfig | None,
+    simulator: SimulatorConfig,
 ) -> _Tried:
     """Simulate worlds that begin at some depth, with some rotations; short episodes together, and long ones."""
     place = course.copy()
@@ -249,8 +253,7 @@ def _simulated(
         initial = np.repeat(place[some, None, 0], angles.shape[1], axis=1)
         initial[..., 1] += angles[some]
         deepest = float(place[..., 0].max())
-        config = simulator or PRESETS["fast"]
-        made = Simulator(of.anatomy, device, worlds=worlds, config=config, sharing=made, reach_mm=deepest)
+        made = Simulator(of.anatomy, device, worlds=worlds, config=simulator, sharing=made, reach_mm=deepest)
         made.reset(inserted_length=initial[..., 0].reshape(-1, 1), rotation=initial[..., 1].reshape(-1, 1))
         driven = np.repeat(control[some, :last], angles.shape[1], axis=0)[:, :, None]
         moved = made.run(driven, period_s=_PERIOD_S)
@@ -264,13 +267,19 @@ def _simulated(
     return _Tried(tip, abscissa, branch, force, _costs(of, tip, of.given))
 
 
-def _costs(of: Prepared, tip: np.ndarray, used: Bool[np.ndarray, "episodes tips"]) -> np.ndarray:
-    """Return how far tips are from the real ones on average, at most `FAR_MM`, as the camera sees them, mm."""
+def _costs(
+    of: Prepared, tip: Float[np.ndarray, "episodes worlds tips 3"], used: Bool[np.ndarray, "episodes tips"]
+) -> Float[np.ndarray, "episodes worlds"]:
+    """Return how far tips are from the real ones on average, at most `FAR_MM`, as the camera sees them, mm.
+
+    The last tips count most: where the wire lies when the prediction begins matters, not how it came there.
+    """
     cost = np.zeros(tip.shape[:2])
     for k, log in enumerate(of.logs):
         count = int(log.seen.sum())
-        far = np.linalg.norm(_in_view(log, tip[k, :, :count]), axis=-1)
-        cost[k] = np.minimum(far, FAR_MM)[:, used[k, :count]].mean(axis=1)
+        far = np.linalg.norm(_in_view(log, tip[k, :, :count]), axis=-1)[:, used[k, :count]]
+        age = np.arange(far.shape[1])[::-1] / far.shape[1]
+        cost[k] = np.average(np.minimum(far, FAR_MM), axis=1, weights=np.exp(-age / _FADES))
     return cost
 
 
