@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from synthetic_robot import drawn, logged
 
 import endopilot
 from endopilot.errors import InputError
-from endopilot.robot.calibrate import CalibrateConfig, calibrate
+from endopilot.robot.calibrate import CalibrateConfig, band, calibrate, left_out_share
 
 sys.path.append(str(Path(__file__).parents[2] / "examples"))
 
@@ -53,3 +54,18 @@ def test_the_public_logs_have_the_play_that_was_measured_on_them(tmp_path) -> No
     assert abs(found.robot.wire.gain_translation - 1.01) < 0.03
     assert abs(found.robot.wire.play_mm - 2.6) < 0.3
     assert np.median([each.errors["along"] for each in found.replays]) < 0.35
+
+
+def test_a_band_holds_throughout_nine_of_ten_episodes() -> None:
+    random = np.random.default_rng(0)
+
+    def replay(size: float) -> SimpleNamespace:
+        error = np.array([9.0, size, size / 2])  # the first tip was given
+        return SimpleNamespace(abscissa=np.column_stack([error, np.zeros(3)]), given=np.array([True, False, False]))
+
+    sizes = random.permutation(np.arange(1.0, 20.0))
+    assert band([replay(size) for size in sizes]) == 18.0  # of 19, the 18th
+    assert band([replay(size) for size in sizes[:8]]) is None  # no band is surer than 8/9
+    others = [replay(size) for size in random.exponential(size=400)]
+    assert 0.87 < left_out_share(others, [f"log {k % 4}" for k in range(400)]) < 0.93
+    assert left_out_share(others, ["log"] * 400) is None
