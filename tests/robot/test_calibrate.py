@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from synthetic_robot import drawn, logged
 import endopilot
 from endopilot.errors import InputError
 from endopilot.robot.calibrate import CalibrateConfig, band, calibrate, left_out_share
+from endopilot.robot.replay import EpisodeReplay
 
 sys.path.append(str(Path(__file__).parents[2] / "examples"))
 
@@ -59,9 +59,22 @@ def test_the_public_logs_have_the_play_that_was_measured_on_them(tmp_path) -> No
 def test_a_band_holds_throughout_nine_of_ten_episodes() -> None:
     random = np.random.default_rng(0)
 
-    def replay(size: float) -> SimpleNamespace:
+    def replay(size: float) -> EpisodeReplay:
         error = np.array([9.0, size, size / 2])  # the first tip was given
-        return SimpleNamespace(abscissa=np.column_stack([error, np.zeros(3)]), given=np.array([True, False, False]))
+        return EpisodeReplay(
+            number=0,
+            time_s=np.arange(3.0),
+            given=np.array([True, False, False]),
+            seen=np.zeros((3, 3)),
+            simulated=np.zeros((3, 3)),
+            abscissa=np.column_stack([error, np.zeros(3)]),
+            driven=np.zeros(3),
+            in_view=np.zeros((3, 3)),
+            along=np.zeros((3, 3)),
+            branch=np.zeros((3, 2)),
+            force=np.zeros((0, 2)),
+            rotation_rad=0.0,
+        )
 
     sizes = random.permutation(np.arange(1.0, 20.0))
     assert band([replay(size) for size in sizes]) == 18.0  # of 19, the 18th
