@@ -16,6 +16,7 @@ from endopilot.control.navigate import NavigateConfig, navigate, set_up_navigati
 from endopilot.control.outcome import tell_outcome
 from endopilot.dataset.loader import read_dataset
 from endopilot.devices.catheter import read_catheter
+from endopilot.devices.device import read_wire
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.files import read_json
@@ -23,6 +24,7 @@ from endopilot.pipeline import navigation
 from endopilot.report.navigation_figure import navigation_figure
 from endopilot.simulation.motion import motion_named
 from endopilot.simulation.trajectory_file import read_trajectory
+from endopilot.simulation.world import World
 
 SHORT = ("--tip", "own", "--seconds", "20")
 FILES = ["episode", "manifest.json", "navigation.csv", "navigation.html", "navigation.png", "run.json",
@@ -137,12 +139,12 @@ def test_the_trajectory_holds_what_was_decided(driven):
 
 
 def test_a_guiding_catheter_that_leans_is_seen_and_written(patient, capsys, tmp_path):
-    folder, drives = tmp_path / "leans", ("--policy", "forward", "--true-axis-deg", "15", "--seed", "3", *SHORT)
+    folder, drives = tmp_path / "leans", ("--policy", "forward", "--world", "leaning-catheter", "--seed", "3", *SHORT)
     run(capsys, "navigate", patient, "--target", "1", "-o", folder, *drives)
     assert sorted(path.name for path in folder.iterdir()) == ["anatomy", *FILES]
     record, page = read_json(folder / "manifest.json"), (folder / "navigation.html").read_text(encoding="utf-8")
     given, real = (read_anatomy(each).insertion.direction for each in (patient, folder / "anatomy"))
-    seen, unseen_deg = np.array(record["catheter_axis"]), record["truth"]["axis_deg"]
+    seen, unseen_deg = np.array(record["catheter_axis"]), record["world"]["axis_deg"]
     off_deg = np.degrees(np.arccos([given @ real, seen @ real]))
     assert off_deg == pytest.approx([15.0, unseen_deg], abs=1e-3) and 0.0 < unseen_deg < 2.0
     assert f"15° off its given axis; X-ray shows it to {unseen_deg:.1f}°" in page
@@ -155,8 +157,11 @@ def test_a_guiding_catheter_that_leans_is_seen_and_written(patient, capsys, tmp_
 
 def test_a_catheter_follows_its_wire_and_both_are_written(patient, capsys, tmp_path):
     folder = tmp_path / "coaxial"
+    World(friction_factor=1.1).write(tmp_path / "rough.yaml")
     command = ("navigate", patient, "--target", "1", "--policy", "in-turn", "--arrives", "catheter", *SHORT)
-    figures = run(capsys, *command, "--true-friction", "1.1", "--catheter", "microcatheter-1.7f", "-o", folder)
+    figures = run(
+        capsys, *command, "--world", tmp_path / "rough.yaml", "--catheter", "microcatheter-1.7f", "-o", folder
+    )
     assert figures["reached"]
     assert sorted(path.name for path in folder.iterdir()) == FILES
     table = pd.read_csv(folder / "navigation.csv")
@@ -168,7 +173,8 @@ def test_a_catheter_follows_its_wire_and_both_are_written(patient, capsys, tmp_p
     true = read_trajectory(folder / "trajectory.npz").set_up
     assert true.stacks[0].catheters == (replace(given, friction=1.1 * given.friction),)
     np.testing.assert_array_equal(episode.friction, true.friction)
-    assert true.friction[0].tolist() == [1.1 * true.stacks[0].wire.friction, 1.1 * given.friction]
+    wire = read_wire("workhorse-014")
+    assert true.friction[0].tolist() == [1.1 * wire.friction, 1.1 * given.friction]
     assert episode.stack.catheters == (given,) and episode.initial[0, 1].tolist() == [0.0, 0.0]
     again = run(capsys, "simulate", patient, "--controls", folder / "trajectory.npz", "-o", tmp_path / "again.csv")
     assert again["valid_worlds"] == 1
@@ -254,7 +260,7 @@ def test_the_episode_of_a_moving_patient_names_the_motion(patient, capsys, tmp_p
 def test_a_finished_folder_is_left_alone_and_another_run_is_refused(driven, patient, capsys):
     folder, figures = driven
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
-    same = ("--seed", "3", "--true-friction", "1.2", "--true-tip-stiffness", "0.8", "--true-ostium-mm", "0.4")
+    same = ("--seed", "3", "--world", folder.with_name("world.yaml"))
     same += ("--robot", folder.with_name("robot.yaml"))
     assert run(capsys, "navigate", patient, "--target", "2", "-o", folder, *SHORT, *same) == figures
     line = refused(capsys, "navigate", patient, "--target", "3", "-o", folder, *SHORT, *same)

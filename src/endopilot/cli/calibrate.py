@@ -47,7 +47,10 @@ def command(
     names = ", ".join(log.name for log in read)
     _write(found, output, names)
     figures = summary(found.replays)
-    about = {"band_of_90_percent_mm": None if found.band_mm is None else round(found.band_mm, 2)}
+    about = {
+        "band_of_90_percent_mm": None if found.band_mm is None else round(found.band_mm, 2),
+        "it_holds_in_logs_left_out": None if found.band_share is None else round(found.band_share, 3),
+    }
     inputs = {name: digest for path in (*logs, anatomy) for name, digest in input_hash(path).items()}
     intervals = {
         name: {

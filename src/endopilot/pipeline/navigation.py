@@ -100,6 +100,7 @@ def _claim(output: Path, set_up: SetUp) -> None:
         device=set_up.navigation.device,
         catheters=set_up.navigation.catheters,
         robot=set_up.robot,
+        world=set_up.world.differences(),
         policy=set_up.policy_name,
         policy_origin=set_up.policy_origin,
         version=__version__,
