@@ -139,7 +139,8 @@ def test_the_trajectory_holds_what_was_decided(driven):
 
 
 def test_a_guiding_catheter_that_leans_is_seen_and_written(patient, capsys, tmp_path):
-    folder, drives = tmp_path / "leans", ("--policy", "forward", "--world", "leaning-catheter", "--seed", "3", *SHORT)
+    folder = tmp_path / "leans"
+    drives = ("--policy", "forward", "--world", "leaning-catheter", "--seed", "3", *SHORT)
     run(capsys, "navigate", patient, "--target", "1", "-o", folder, *drives)
     assert sorted(path.name for path in folder.iterdir()) == ["anatomy", *FILES]
     record, page = read_json(folder / "manifest.json"), (folder / "navigation.html").read_text(encoding="utf-8")

@@ -16,6 +16,7 @@ from endopilot.control.outcome import name_target, slipped_s, tell_outcome, wors
 from endopilot.files import json_text, writing
 from endopilot.report.report import image, template_text
 from endopilot.report.scene import mark_target, navigation_scene
+from endopilot.simulation.world import read_world
 
 
 def write_navigation_page(
@@ -97,8 +98,9 @@ def _facts(found: PatientNavigation) -> list[tuple[str, str]]:
         ("Robot", _robot(set_up)),
         ("A drive slipped for" if navigation.catheters else "Drive slipped for", f"{slipped_s(found):.2f} s"),
     ]
-    if world.axis_deg:
-        facts.append(("Guiding catheter in reality", f"{world.axis_deg:.1f}° off the axis that is given or seen"))
+    if leans_deg := read_world(set_up.config.world).axis_deg:
+        unseen = "" if world.axis_deg == leans_deg else f"; X-ray shows it to {world.axis_deg:.1f}°"
+        facts.append(("Guiding catheter in reality", f"{leans_deg:g}° off its given axis{unseen}"))
     if found.plans is not None:
         facts.append(("Courses searched", str(found.plans)))
     return [*facts, ("Seed", str(set_up.config.seed))]
