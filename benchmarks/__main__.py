@@ -24,6 +24,7 @@ BENCHMARKS = {
     "robustness": "core.robustness:measure_robustness",
     "verification": "verification.verification:bench_verification",
     "published": "published.published:bench_published",
+    "robot-twist": "robot.twist:bench_twist",
     "dataset": "dataset:bench_dataset",
     "cockpit": "cockpit:bench_cockpit",
     "anatomy": "anatomy.extraction:bench_anatomy",

@@ -178,3 +178,11 @@ def test_the_agent_drives_one_catheter(side_branch) -> None:
     wide = replace(outer, diameter_mm=1.25)
     with pytest.raises(InputError, match="catheter: 2; the search drives one"):
         NavigationLoop(replace(side_branch, catheters=(*side_branch.catheters, wide)), "agent").run()
+
+
+def test_of_manoeuvres_that_pass_alike_the_cheapest_is_taken(side_branch, found, monkeypatch) -> None:
+    """Where the hardest is called the cheapest, the course presses harder."""
+    _, course = found
+    monkeypatch.setattr(Search, "manoeuvre_cost", lambda _, pushed: -pushed.force)
+    _, _, harder = search(side_branch)
+    assert harder.reached == 1.0 and harder.force.max() > course.force.max()

@@ -104,15 +104,15 @@ def test_plays_are_drawn_for_each_robot_and_begin_anywhere_where_encoders_do_not
 
 
 def test_jitter_makes_commands_late_and_none_overtakes_another() -> None:
-    config = replace(IDEAL, latency_s=0.02, jitter_s=0.1, wire=STIFF)
-    began = []
+    config, began = replace(IDEAL, latency_s=0.02, jitter_s=0.1, wire=STIFF), []
     for seed in range(200):
-        drive = drive_of(config, seed=seed)
-        drive.command(np.array([[[10.0, 0.0]]]))
-        drive.command(np.array([[[20.0, 0.0]]]))  # at the same time: the newer one holds in the end
-        assert drive.advance(1.0)[0, 0, 0] > 0 and drive.velocity[0, 0, 0] == pytest.approx(20.0)
-        one = drive_of(config, seed=seed)
-        began.append(1.0 - ordered(one, 10.0, 0.0, 1.0)[0] / 10.0)
+        one, alone = drive_of(config, seed=seed), drive_of(config, seed=seed)
+        began.append(1.0 - ordered(alone, 10.0, 0.0, 1.0)[0] / 10.0)
+        late = 2.0 - ordered(alone, 20.0, 0.0, 1.0)[0] / 10.0  # it moves by 10 t + 20 (1 - t)
+        one.command(np.array([[[10.0, 0.0]]]))
+        one.command(np.array([[[20.0, 0.0]]]))  # at the same time
+        first, second = began[-1], max(began[-1], late)
+        assert one.advance(1.0)[0, 0, 0] == pytest.approx(10 * (second - first) + 20 * (1 - second), abs=1e-6)
     assert 0.02 <= min(began) < 0.03 and 0.11 < max(began) <= 0.12 and np.mean(began) == pytest.approx(0.07, abs=0.01)
 
 

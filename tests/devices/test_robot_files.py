@@ -9,6 +9,7 @@ import pytest
 
 from endopilot.devices.device import read_wire
 from endopilot.devices.robot import DriveConfig, RobotConfig, list_robots, read_robot
+from endopilot.devices.transmission import Transmission
 from endopilot.errors import InputError
 
 
@@ -16,7 +17,7 @@ def test_a_robot_is_written_and_read_back(tmp_path) -> None:
     robot = RobotConfig(
         encoders_at="motor",
         jitter_s=0.01,
-        wire=DriveConfig(gain_translation=1.03, play_mm=2.4, grip_n=0.3),
+        wire=DriveConfig(gain_translation=1.03, play_mm=2.4, grip_n=0.3, transmission=Transmission(length_mm=900.0)),
         catheters=(DriveConfig(play_rad=0.2), DriveConfig(grip_n_mm=0.1)),
         sources=("play_mm: measured — 2,4 mm",),
     )
@@ -52,6 +53,10 @@ def test_the_robots_of_the_package() -> None:
         ("wire: {play_mm: -1}", "wire.play_mm: -1; give a number from 0 to 50 mm"),
         ("wire: {play_rad: 324}", r"wire.play_rad: 324; give a number from 0 to 50 rad \(324 ° is 5\.655 rad\)"),
         ("wire: {gain_translation: 101}", "wire.gain_translation: 101; give a number from 0.5 to 2"),
+        (
+            "wire: {transmission: {length_mm: 9000}}",
+            r"wire.transmission.length_mm: 9000; give a number from 0 to 3000 mm",
+        ),
         ("wire: {backlash_mm: 1}", "wire.backlash_mm: no such field"),
         ("catheters: []", r"catheters: \[\]; give at least one drive"),
         ("catheters: [{grip_n: 0}]", r"catheters\[0\].grip_n: 0; give a positive number"),

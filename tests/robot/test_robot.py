@@ -203,3 +203,16 @@ def test_a_robot_brings_what_lies_between_its_drives_and_the_ostium(wire) -> Non
     weak, core = in_grip(own, replace(IDEAL, wire=replace(IDEAL.wire, grip_n=0.1)), SimulatorConfig())
     assert weak.wire.push_limit_n == 0.1
     assert core.wall_stiffness_n_mm == wall_stiffness(SimulatorConfig(), wire.push_limit_n)
+
+
+def test_an_encoder_on_the_wire_reads_its_proximal_end_and_not_its_rotation_at_the_ostium(fork, wire) -> None:
+    navigation = Navigation(anatomy=fork, device=wire, target=Target(branch=1, abscissa=30.0))
+    behind = Transmission(length_mm=1000.0, twist_friction_n_mm_mm=3e-4)
+    config = replace(IDEAL, wire=replace(IDEAL.wire, transmission=behind))
+    simulator = start_world(navigation, ModelMismatch(), SimulatorConfig(element_mm=1.5, threads=1), robot=config)
+    robot = SimulatedRobot(simulator, [DriveLimits.of(wire, fork)], config)
+    robot.command(((0.0, 2.0),))
+    robot.run(3.0)
+    assert robot.proximal_state().devices[0][1] == pytest.approx(6.0, abs=1e-4)
+    assert 2.0 < robot.proximal[0, 1] < 4.5  # the lag is some 2.5 rad
+    assert robot.proximal_state().load[0][1] > 0.25  # N mm, of the friction

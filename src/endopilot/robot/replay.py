@@ -23,6 +23,7 @@ from endopilot.robot.course import STARTS, Courses
 from endopilot.robot.log import RobotLog
 from endopilot.settings import OpenShare, Within, settings
 from endopilot.simulation.config import PRESETS, SimulatorConfig
+from endopilot.simulation.robots import in_grip
 from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy
 
@@ -171,6 +172,7 @@ def replay_prepared(
     simulator: SimulatorConfig | None = None,
 ) -> list[EpisodeReplay]:
     """Replay episodes that are prepared, as `replay_log` does."""
+    device, simulator = in_grip(device, robot, simulator or PRESETS["fast"])
     times, course = _proximal(of, robot)
     at_tips = _at(times, course[..., 0], of.courses.seen_s)
     depth = np.nanmedian(np.where(of.given, of.abscissa - at_tips, np.nan), axis=1)
@@ -233,7 +235,7 @@ def _simulated(
     course: Float[np.ndarray, "episodes times 2"],
     depth: Float[np.ndarray, "episodes"],
     angles: Float[np.ndarray, "episodes worlds"],
-    simulator: SimulatorConfig | None,
+    simulator: SimulatorConfig,
 ) -> _Tried:
     """Simulate worlds that begin at some depth, with some rotations; short episodes together, and long ones."""
     place = course.copy()
@@ -251,8 +253,7 @@ def _simulated(
         initial = np.repeat(place[some, None, 0], angles.shape[1], axis=1)
         initial[..., 1] += angles[some]
         deepest = float(place[..., 0].max())
-        config = simulator or PRESETS["fast"]
-        made = Simulator(of.anatomy, device, worlds=worlds, config=config, sharing=made, reach_mm=deepest)
+        made = Simulator(of.anatomy, device, worlds=worlds, config=simulator, sharing=made, reach_mm=deepest)
         made.reset(inserted_length=initial[..., 0].reshape(-1, 1), rotation=initial[..., 1].reshape(-1, 1))
         driven = np.repeat(control[some, :last], angles.shape[1], axis=0)[:, :, None]
         moved = made.run(driven, period_s=_PERIOD_S)

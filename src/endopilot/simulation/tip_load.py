@@ -15,13 +15,14 @@ ahead of 10 mm is held to its catalogue too.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from endopilot import _core
-from endopilot.devices.device import GRAM_FORCE_N, Wire
+from endopilot.devices.device import GRAM_FORCE_N, Wire, read_wire
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import run_core
 from endopilot.simulation.rod import POISSON_RATIO, SHEAR_CORRECTION, RodLayout
@@ -61,15 +62,16 @@ class TipLoadTest:
     load_n: float
 
 
-def simulate_tip_load(wire: Wire) -> TipLoadTest:
+def simulate_tip_load(wire: Wire | str | Path) -> TipLoadTest:
     """Push the distal 10 mm of a wire, straight, against a smooth plate until it buckles.
 
     Args:
-        wire: the wire; its tip shape is left out.
+        wire: the wire, its name or its YAML file; its tip shape is left out.
 
     Raises:
         RuntimeError: the rod core did not converge.
     """
+    wire = wire if isinstance(wire, Wire) else read_wire(wire)
     rod = _distal_rod(wire)
     nodes = len(rod.abscissa_mm)
     dead, plate, anchor = np.zeros((nodes, 3)), np.zeros((nodes, 3)), np.zeros((nodes, 3))

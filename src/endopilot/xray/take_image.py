@@ -83,12 +83,13 @@ class XrayImage:
     frames: int
     mm_per_pixel: float
 
-    def write(self, path: Path) -> None:
+    def write(self, path: str | Path) -> None:
         """Write the image as PNG.
 
         Raises:
             InputError: the suffix is not .png, or the file cannot be written.
         """
+        path = Path(path)
         if path.suffix != ".png":
             raise InputError(f"{path}: an image is written as PNG; give a name that ends in .png")
         with writing(path) as partial:

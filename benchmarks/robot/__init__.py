@@ -1,0 +1,1 @@
+"""Real robots beside the simulated one."""
