@@ -20,6 +20,7 @@ sys.path.append(str(Path(__file__).parents[2] / "examples"))
 from robot_phantom_logs import convert
 
 import endopilot
+from endopilot.files import read_json
 from endopilot.plotting import BLACK, BLUE, GREY, STYLE, VERMILLION
 from endopilot.report.replay_figure import replay_figure
 from endopilot.robot.course import Courses
@@ -30,7 +31,6 @@ import matplotlib.pyplot as plt
 
 PAGE = Path(__file__).parents[1] / "reality.md"
 IMAGES = Path(__file__).parents[1] / "images"
-BEGIN, END = "<!-- reality:begin -->", "<!-- reality:end -->"
 EPISODES = 8
 """Of each session at most, evenly chosen."""
 KEPT_ASIDE = ("log7", "_M2_")
@@ -66,11 +66,32 @@ def main() -> None:
     apart = {name: [each for each, kept in zip(row, aside, strict=True) if kept] for name, row in found.items()}
     measured = {"real": _measures(drives, found[CALIBRATED], 0)}
     measured |= {name: _measures(drives, each, 1) for name, each in found.items()}
-    head, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-    PAGE.write_text(f"{head}{BEGIN}\n{_table(measured, apart)}\n{END}{rest.split(END)[1]}", encoding="utf-8")
+    _write("reality", _table(measured, apart))
+    _write("calibration", _calibration(Path(robot_file).with_suffix(".json")))
     _draw(measured)
     figure = replay_figure(phantom, apart[CALIBRATED], "sessions kept aside, robot and wire calibrated on the others")
     figure.savefig(IMAGES / "reality-tracks.png", dpi=80)
+
+
+def _write(name: str, table: str) -> None:
+    """Put a table between its markers on the page."""
+    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
+    head, rest = PAGE.read_text(encoding="utf-8").split(begin)
+    PAGE.write_text(f"{head}{begin}\n{table}\n{end}{rest.split(end)[1]}", encoding="utf-8")
+
+
+def _calibration(record: Path) -> str:
+    """Return what `endopilot calibrate` told as a table."""
+    told = read_json(record)
+    lines = ["| constant | best | 95 % |", "|---|---|---|"]
+    for name, each in told["estimates"].items():
+        low, high = each["interval"]
+        said = f"{low:.3g} to {high:.3g}" if each["identified"] else "not identifiable from these logs"
+        lines.append(f"| `{name}` | {each['value']:.3g} | {said} |")
+    band, held = told["band_of_90_percent_mm"], told["it_holds_in_logs_left_out"]
+    said = f"holds in {held:.0%} of the episodes of logs left out"
+    lines.append(f"| band of Δtip throughout 90 % of the episodes | ± {band:.2g} mm | {said} |")
+    return "\n".join(lines)
 
 
 def _drives(courses: Courses, robot: endopilot.RobotConfig) -> list[np.ndarray]:
