@@ -42,7 +42,7 @@ SUBJECTS = {
     "volume", "wire", "wire_radius_mm",
 }  # fmt: skip
 """What a function does something with, or to. All else goes by keyword."""
-UNITS = re.compile(r"(^|_)(mm2?|s2?|n|hu|rad|deg|ugy|seconds|pixel_sd|along_sd|play_sd|share|factor|weight|ratio)$")
+UNITS = re.compile(r"(^|_)(mm2?|s2?|n|hu|rad|deg|ugy|seconds|pixel_sd|along_sd|share|factor|weight|ratio)$")
 WITHOUT_UNIT = {
     "calcium", "dose", "efficiency", "friction", "gain_rotation", "gain_sd_rotation", "gain_sd_translation",
     "gain_translation", "largest_jump", "learning_rate", "mismatch", "right_heart", "scale",

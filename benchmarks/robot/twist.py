@@ -37,6 +37,8 @@ PASSED_MM = 2.0
 """A tip has taken a branch when it is so far beyond the fork, mm."""
 FEW_MM = 0.1
 """Advance that counts as one, mm."""
+FAR_MM = 10.0
+"""Advance after which a wire has unwound, if it twists under friction, mm."""
 _RESAMPLES = 2000
 
 
@@ -48,28 +50,32 @@ class Run:
         first: command that begins it.
         steps: their number.
         reverses: whether the last rotation before it was the other way, and nothing was advanced since.
+        advanced_mm: way that the drive has gone to and fro since the last rotation, mm.
     """
 
     first: int
     steps: int
     reverses: bool
+    advanced_mm: float
 
 
 def rotation_runs(command: Float[np.ndarray, "commands 2"]) -> list[Run]:
     """Return the runs of rotation in the positions that a drive was sent to, mm and rad, one after the other."""
     by = np.diff(command, axis=0, prepend=command[:1])
     way = np.where(np.abs(by[:, 0]) < FEW_MM, np.sign(np.round(by[:, 1], 6)), 0).astype(int)
-    runs, last, advanced, first = [], 0, False, 0
+    runs, last, advanced, first = [], 0, 0.0, 0
     while first < len(way):
         if way[first] == 0:
-            advanced = advanced or abs(by[first, 0]) >= FEW_MM
+            advanced += float(abs(by[first, 0]))
             first += 1
             continue
         end = first + 1
         while end < len(way) and way[end] == way[first]:
             end += 1
-        runs.append(Run(first, end - first, reverses=bool(last == -way[first]) and not advanced))
-        last, advanced, first = way[first], False, end
+        runs.append(
+            Run(first, end - first, reverses=bool(last == -way[first]) and advanced < FEW_MM, advanced_mm=advanced)
+        )
+        last, advanced, first = way[first], 0.0, end
     return runs
 
 
@@ -203,8 +209,8 @@ def bench_twist(
     turns: Literal["twist", "play", "none"] = "twist",
     friction: float = 3.2e-4,
     length_mm: float = 1000.0,
-    tip_deg: float = 70.0,
-    tip_mm: float = 5.0,
+    tip_deg: float = 45.0,
+    tip_mm: float = 8.0,
     sessions: tuple[str, ...] = (),
 ) -> list[dict[str, Any]]:
     """Compare what rotation does to the tip of a real robot's wire with the simulator.
@@ -259,9 +265,11 @@ def figures(of: Sequence[tuple[RobotLog, EpisodeReplay]], anatomy: Anatomy) -> d
     for name, runs in (("real", real), ("simulated", simulated)):
         reversals = [each for each in runs if each[0].reverses]
         moves, snaps, per_step = dead_bands(reversals)
+        unwound = dead_bands([each for each in runs if each[0].advanced_mm >= FAR_MM])[0]
         found[f"reversals_{name}"] = len(reversals)
         found[f"moves_after_{name}"] = _span(moves)
         found[f"snaps_after_{name}"] = _span(snaps)
+        found[f"moves_after_advance_{name}"] = _span(unwound)
         found[f"snaps_a_turn_{name}"] = round(per_step * turn, 2)
     if sides:
         r, low, high = correlation(sides)

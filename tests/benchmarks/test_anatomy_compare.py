@@ -170,7 +170,7 @@ def test_anatomies_are_compared_with_the_atlas_of_their_kind(tmp_path):
     config = AtlasConfig(vessel="lca", seed=3, count=2)
     for index in range(2):
         write_anatomy(make_patient(config, index), output=tmp_path / str(index))
-    rows = compare_with_atlas([tmp_path], replace(config, anatomy="rca"))
+    rows = compare_with_atlas([tmp_path], replace(config, vessel="rca"))
     assert {row["kind"] for row in rows} == {"lca"}
     by_name = {row["quantity"]: row for row in rows}
     # The same patients on both sides, through a file and back.

@@ -35,12 +35,12 @@ def commands(*moves: tuple[float, float]) -> np.ndarray:
 
 
 def test_runs_of_rotation_and_which_of_them_reverse() -> None:
-    command = commands((0, 1), (0, 1), (0, -1), (0, -1), (0, -1), (0.24, 0), (0, 1), (0, 0), (0, -1))
+    command = commands((0, 1), (0, 1), (0, -1), (0, -1), (0, -1), (0.25, 0), (0, 1), (0, 0), (0, -1))
     assert rotation_runs(command) == [
-        Run(1, 2, reverses=False),
-        Run(3, 3, reverses=True),
-        Run(7, 1, reverses=False),  # the wire was advanced before
-        Run(9, 1, reverses=True),  # a rest is no advance
+        Run(1, 2, reverses=False, advanced_mm=0.0),
+        Run(3, 3, reverses=True, advanced_mm=0.0),
+        Run(7, 1, reverses=False, advanced_mm=0.25),  # the wire was advanced before
+        Run(9, 1, reverses=True, advanced_mm=0.0),  # a rest is no advance
     ]
 
 
@@ -57,7 +57,7 @@ def test_dead_bands_of_tips_that_rest_then_creep_and_leap() -> None:
 
     late = tips(0, 0, 0.1, 0.3, 1.5, 2.3, 2.3)  # moves after 3 steps, leaps in 4 and 5: once
     twice = tips(0, 1, 1, 2, 2)
-    runs = [(Run(1, 6, reverses=True), late), (Run(1, 4, reverses=True), twice), (Run(1, 4, reverses=True), tips(0))]
+    runs = [(Run(1, 6, reverses=True, advanced_mm=0.0), each) for each in (late, twice, tips(0))]
     moves, snaps, per_step = dead_bands(runs)
     assert (moves[0], moves[2]) == (1, 3) and (snaps[0], snaps[2]) == (1, 4)
     assert per_step == pytest.approx(3 / 10)
@@ -78,7 +78,7 @@ def test_tips_between_commands_as_long_as_they_are_seen() -> None:
     )
     found = at_commands(log, np.array([0.04, 0.24]), np.array([[1.0, 0, 0], [2.0, 0, 0]]))
     assert np.array_equal(found[:, 0], [1, np.nan, 2, np.nan], equal_nan=True)
-    assert len(tip_in_run(Run(0, 3, reverses=False), found)) == 1
+    assert len(tip_in_run(Run(0, 3, reverses=False, advanced_mm=0.0), found)) == 1
 
 
 def test_sides_of_a_line_change_sign(fork: Anatomy) -> None:

@@ -11,7 +11,8 @@ from synthetic_robot import drawn, logged
 
 import endopilot
 from endopilot.errors import InputError
-from endopilot.robot.calibrate import CalibrateConfig, calibrate
+from endopilot.robot.calibrate import CalibrateConfig, band, calibrate, left_out_share
+from endopilot.robot.replay import EpisodeReplay
 
 sys.path.append(str(Path(__file__).parents[2] / "examples"))
 
@@ -53,3 +54,31 @@ def test_the_public_logs_have_the_play_that_was_measured_on_them(tmp_path) -> No
     assert abs(found.robot.wire.gain_translation - 1.01) < 0.03
     assert abs(found.robot.wire.play_mm - 2.6) < 0.3
     assert np.median([each.errors["along"] for each in found.replays]) < 0.35
+
+
+def test_a_band_holds_throughout_nine_of_ten_episodes() -> None:
+    random = np.random.default_rng(0)
+
+    def replay(size: float) -> EpisodeReplay:
+        error = np.array([9.0, size, size / 2])  # the first tip was given
+        return EpisodeReplay(
+            number=0,
+            time_s=np.arange(3.0),
+            given=np.array([True, False, False]),
+            seen=np.zeros((3, 3)),
+            simulated=np.zeros((3, 3)),
+            abscissa=np.column_stack([error, np.zeros(3)]),
+            driven=np.zeros(3),
+            in_view=np.zeros((3, 3)),
+            along=np.zeros((3, 3)),
+            branch=np.zeros((3, 2)),
+            force=np.zeros((0, 2)),
+            rotation_rad=0.0,
+        )
+
+    sizes = random.permutation(np.arange(1.0, 20.0))
+    assert band([replay(size) for size in sizes]) == 18.0  # of 19, the 18th
+    assert band([replay(size) for size in sizes[:8]]) is None  # no band is surer than 8/9
+    others = [replay(size) for size in random.exponential(size=400)]
+    assert 0.87 < left_out_share(others, [f"log {k % 4}" for k in range(400)]) < 0.93
+    assert left_out_share(others, ["log"] * 400) is None

@@ -131,7 +131,7 @@ class Belief(Ensemble):
     def _move(self) -> None:
         """Move every member's proximal ends to where they are believed to be, in one decision period."""
         simulator = self.simulator
-        now, control = simulator.proximal, np.empty((simulator.worlds, simulator.devices, 2))
+        now, control = simulator.at_drive, np.empty((simulator.worlds, simulator.devices, 2))
         for k, (length, turn) in enumerate(self.drives.proximal.tolist()):
             ahead = self._deeper(np.full(len(now), length)) - now[:, k, 0]
             motion = np.column_stack([ahead, turn - now[:, k, 1]])

@@ -156,7 +156,7 @@ class Trials:
     def _see(self) -> tuple[Float[np.ndarray, "worlds devices 2"], TipProjection]:
         """Return where proximal ends and tips are, which is asked of the simulator once."""
         if self._seen is None:
-            self._seen = self.simulator.proximal, self.simulator.project()
+            self._seen = self.simulator.at_drive, self.simulator.project()
         return self._seen
 
     @property

@@ -69,7 +69,7 @@ class CalibrateConfig:
 
     given: OpenShare = 0.5
     """Share of each episode's tips that say where the wire lies; the rest is predicted."""
-    episodes: Annotated[int, Within(LEAST_EPISODES, 10000)] = 64
+    episodes: Annotated[int, Within(LEAST_EPISODES, 10000)] = 96
     """Episodes that the drive is fitted to at most, evenly chosen from all."""
     wire_episodes: Annotated[int, Within(LEAST_EPISODES, 1000)] = 16
     """Episodes that the wire is fitted to at most, likewise."""
@@ -85,9 +85,11 @@ class RobotCalibration:
 
     Attributes:
         robot: with lag, gain and plays as they were found.
-        wire: with the tip, friction and stiffness that were found where they are identified.
+        wire: with the tip, friction and stiffness of the best candidate, those too that are not identified: they belong
+            together.
         estimates: each constant with its interval.
         band_mm: half-width within which Δtip was predicted throughout 90 % of the episodes, mm; None with too few.
+        band_share: share of the episodes of each log in which the band of the other logs holds; None with one log.
         replays: of the episodes that the drive was fitted to.
     """
 
@@ -95,6 +97,7 @@ class RobotCalibration:
     wire: Wire
     estimates: dict[str, Estimate]
     band_mm: float | None
+    band_share: float | None
     replays: list[EpisodeReplay]
 
 
@@ -134,15 +137,15 @@ def calibrate(
         some = prepare(_evenly(episodes, config.wire_episodes), anatomy, config.given, robot)
         wires = fit_wire(some, device, robot, config)
         told = estimates(wires, WIRE, UNITS, RESOLUTION)
-        known = {name: told[name].value for name in WIRE if told[name].identified}
-        device, robot = with_found(device, robot, known)
+        device, robot = with_found(device, robot, {name: told[name].value for name in WIRE})
     for _ in range(_TIMES):
         slack = _slack(of, replay_prepared(of, Stack(device), robot, replays))
         drives = fit_drive(of, slack, seed=config.seed)
         robot = _driven(robot, drives)
     told = estimates(drives, DRIVE, UNITS, RESOLUTION) | told
     found = replay_prepared(of, Stack(device), robot, replays)
-    return RobotCalibration(robot, device, told, band(found), found)
+    held = left_out_share(found, [log.name for log in of.logs])
+    return RobotCalibration(robot, device, told, band(found), held, found)
 
 
 def _evenly(episodes: list[RobotLog], most: int) -> list[RobotLog]:
@@ -157,11 +160,10 @@ def _driven(robot: RobotConfig, found: Candidates) -> RobotConfig:
 
 
 def _slack(of: Prepared, found: Sequence[EpisodeReplay]) -> Float[np.ndarray, "episodes tips"]:
-    """Return how much farther than its proximal end each tip went in the rod core, mm; NaN in another branch."""
+    """Return how much farther than its proximal end each tip went in the rod core, mm; NaN beyond an episode's tips."""
     slack = np.full(of.abscissa.shape, np.nan)
     for row, each in zip(slack, found, strict=True):
-        same = each.branch[:, 0] == each.branch[:, 1]
-        row[: len(same)] = np.where(same, each.abscissa[:, 1] - each.driven, np.nan)
+        row[: len(each.driven)] = each.abscissa[:, 1] - each.driven
     return slack
 
 
@@ -170,7 +172,7 @@ def fit_drive(of: Prepared, slack: Float[np.ndarray, "episodes tips"] | float = 
 
     Args:
         of: episodes.
-        slack: how much farther than its proximal end the tip went in the rod core, mm; NaN where that is not known.
+        slack: how much farther than its proximal end the tip went in the rod core, mm.
         seed: of the search.
     """
     unit, abscissa = _units(of), of.abscissa - slack
@@ -260,10 +262,28 @@ def band(replays: Sequence[EpisodeReplay], level: float = _LEVEL) -> float | Non
     Args:
         replays: of episodes.
         level: the share.
+
+    Returns:
+        None with too few episodes.
     """
-    worst = np.sort([np.abs(np.diff(each.abscissa, axis=1)[~each.given, 0]).max() for each in replays])
-    rank = math.ceil(level * (len(worst) + 1))
-    return float(worst[rank - 1]) if rank <= len(worst) else None
+    rank = math.ceil(level * (len(replays) + 1))
+    return float(np.sort(_worst(replays))[rank - 1]) if rank <= len(replays) else None
+
+
+def left_out_share(replays: Sequence[EpisodeReplay], logs: Sequence[str]) -> float | None:
+    """Return in which share of the episodes the band holds that is made of all other logs; None where none is."""
+    worst, held = _worst(replays), []
+    for name in dict.fromkeys(logs):
+        others = [each for each, log in zip(replays, logs, strict=True) if log != name]
+        width = band(others)
+        if width is not None:
+            held += [bool(far <= width) for far, log in zip(worst, logs, strict=True) if log == name]
+    return float(np.mean(held)) if held and len(set(logs)) > 1 else None
+
+
+def _worst(replays: Sequence[EpisodeReplay]) -> Float[np.ndarray, "episodes"]:
+    """Return the largest error of Δtip in what was predicted of each episode, mm."""
+    return np.array([np.abs(np.diff(each.abscissa, axis=1)[~each.given, 0]).max() for each in replays])
 
 
 def _units(of: Prepared) -> Int[np.ndarray, "episodes"]:

@@ -96,6 +96,11 @@ class Readout:
         return self._gather("drive_rotation")
 
     @property
+    def at_drive(self) -> Float[np.ndarray, "worlds devices 2"]:
+        """Inserted lengths Δ (mm) and rotations (rad) as the drives make them, see `drive_rotation`."""
+        return np.stack([self.inserted_length, self.drive_rotation], axis=-1)
+
+    @property
     def proximal(self) -> Float[np.ndarray, "worlds devices 2"]:
         """Inserted lengths Δ (mm) and rotations φ (rad).
 

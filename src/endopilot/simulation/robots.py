@@ -124,4 +124,4 @@ class Robots:
 
     def _counted(self, simulator: Simulator) -> Float[np.ndarray, "worlds devices 2"]:
         """Return where the devices are at their drives, counted from where the ostium is assumed."""
-        return np.stack([simulator.inserted_length - self._ostium_mm, simulator.drive_rotation], axis=-1)
+        return simulator.at_drive - [self._ostium_mm, 0.0]

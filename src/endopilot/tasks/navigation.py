@@ -122,8 +122,9 @@ class Navigation:
 
     @property
     def stack(self) -> Stack:
-        """The wire and its catheters."""
-        return Stack(self.device, self.catheters)
+        """The wire and its catheters, and what the robot has between their drives and the ostium."""
+        drives = () if self.robot is None else self.robot.drives(1 + len(self.catheters))
+        return Stack(self.device, self.catheters, tuple(drive.transmission for drive in drives))
 
     @property
     def start(self) -> Float[np.ndarray, "devices 2"]:

@@ -1,0 +1,68 @@
+"""`endopilot calibrate` and `endopilot replay`, one after the other, on what a simulated robot logged."""
+
+from __future__ import annotations
+
+import json
+
+import pandas as pd
+import pytest
+from PIL import Image
+from synthetic_robot import drawn, logged
+
+from endopilot.cli import main
+from endopilot.devices.device import read_wire
+from endopilot.devices.robot import read_robot
+
+
+@pytest.fixture(scope="module")
+def log_file(fork, wire, tmp_path_factory):
+    path = tmp_path_factory.mktemp("log") / "log.csv"
+    logged(fork, wire, drawn(5), episodes=5, seconds=6.0, seed=5).write(path)
+    return path
+
+
+def run(capsys, *arguments):
+    with pytest.raises(SystemExit) as leaving:
+        main([*map(str, arguments), "--json"])
+    assert leaving.value.code == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_robot_is_calibrated_and_its_log_replayed(vessel, log_file, tmp_path, capsys) -> None:
+    options = ("--anatomy", vessel, "-o")
+    found = run(capsys, "calibrate", log_file, *options, tmp_path / "robot.yaml", "--wires", 8)
+    assert set(found["estimates"]) >= {
+        "gain_translation",
+        "play_mm",
+        "latency_s",
+        "tip_bend_deg",
+        "friction",
+        "play_rad",
+    }
+    robot, written = read_robot(tmp_path / "robot.yaml"), json.loads((tmp_path / "robot.json").read_text())
+    assert robot.wire.play_mm == found["estimates"]["play_mm"]["value"] and robot.encoders_at == "motor"
+    assert any(line.startswith("play_mm: ") and "95 %" in line for line in robot.sources)
+    assert written["estimates"] == found["estimates"] and written["inputs"]["log.csv"]
+    for name, each in found["estimates"].items():
+        (line,) = (line for line in robot.sources if line.startswith(f"{name}: "))
+        assert ("not identifiable" in line) != each["identified"]
+    wire = read_wire(tmp_path / "robot.device.yaml")
+    assert wire.friction == found["estimates"]["friction"]["value"]
+    assert "endopilot calibrate" in wire.sources["friction"]
+
+    made = tmp_path / "replay"
+    files = ("--robot", tmp_path / "robot.yaml", "--device", tmp_path / "robot.device.yaml")
+    replayed = run(capsys, "replay", log_file, *options, made, *files)
+    assert replayed["episodes"] == 5 and replayed["error_along_mm"] < 0.5
+    table, errors = pd.read_csv(made / "replay.csv"), pd.read_csv(made / "errors.csv")
+    assert table.groupby("episode")["given"].mean().between(0.4, 0.6).all() and len(errors) == 5
+    assert json.loads((made / "manifest.json").read_text())["figures"] == replayed
+    with Image.open(made / "replay.png") as picture:
+        assert min(picture.size) > 400
+
+
+def test_a_log_that_is_not_there_is_named(vessel, tmp_path, capsys) -> None:
+    with pytest.raises(SystemExit) as leaving:
+        main(["replay", str(tmp_path / "none.csv"), "--anatomy", str(vessel), "-o", str(tmp_path / "replay")])
+    assert leaving.value.code == 2
+    assert "none.csv: no such file" in capsys.readouterr().err and not (tmp_path / "replay").exists()
