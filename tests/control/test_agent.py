@@ -136,8 +136,8 @@ def test_the_first_decision_goes_by_the_first_reading(side_branch) -> None:
     policy = AgentPolicy(QUICK)
     policy.start(side_branch, 0)
     (velocity,) = policy.decide(Observation(0.0, ((2.3, 0.1),), None)).devices
-    assert policy._course is not None
-    assert velocity == tuple(((policy._course.proximal[0, 0] - [2.3, 0.1]) / 0.5).tolist())
+    assert policy._follower.course is not None
+    assert velocity == tuple(((policy._follower.course.proximal[0, 0] - [2.3, 0.1]) / 0.5).tolist())
 
 
 def test_an_exposure_says_how_a_wire_is_turned_that_its_encoder_does_not(side_branch, with_play) -> None:
@@ -310,7 +310,8 @@ def test_whatever_the_model_returns_a_drive_takes_what_is_finite_and_within_limi
             reached=0.0,
         )  # fmt: skip
 
-    started._search.find, started._course, started._failed = find, None, 0
+    started._search.find, started._failed = find, 0
+    started._follower.begin(None)
     for k in range(len(control)):
         (velocity,) = started.decide(Observation(0.5 * k, ((2.0, 0.0),), None)).devices
         taken = DriveLimits.of(shaped).safe(*velocity)

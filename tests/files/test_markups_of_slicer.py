@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from make_meshes import arc, markup
 
+from endopilot.anatomy.extract import extract_anatomy
 from endopilot.anatomy.sources import Polylines, read_source
 from endopilot.errors import InputError
 
@@ -37,6 +38,35 @@ def test_curves_and_lines_of_one_file_are_all_read(tmp_path):
     line = markup(np.array([[0.0, 0, 0], [0, 0, 40]]), np.array([1.0, 1.0]), type="Line")
     source = read_source(written(tmp_path, markup(arc(), RADIUS), markup(arc() + 9, RADIUS), line))
     assert isinstance(source.content, Polylines) and len(source.content.points) == 3 and source.notes == ()
+
+
+def test_the_curves_of_a_folder_are_one_tree_coarse_lines_and_a_loop_are_noted(tmp_path):
+    """Two arteries leave a trunk and meet again; one is coarse: neighbouring spheres do not touch."""
+    folder = tmp_path / "curves"
+    folder.mkdir()
+    turn = np.linspace(0.0, np.pi, 61)[:, None]
+    side = np.hstack([np.sin(turn), np.zeros_like(turn), 1.5 - 1.5 * np.cos(turn)]) * 20
+    trunk = np.linspace([0.0, 0, -40], [0, 0, 0], 41)
+    for name, line, size in (("trunk", trunk, 3.0), ("left", side, 1.0), ("right", side[::6] * [-1, 1, 1], 1.0)):
+        text = json.dumps({"markups": [markup(line, np.full(len(line), size), coordinateSystem="LPS")]})
+        (folder / f"{name}.mrk.json").write_text(text)
+    (folder / "wall.obj").write_text("")
+    anatomy = extract_anatomy(folder)
+    assert anatomy.name == "curves" and len(anatomy.tree.leaves()) == 2
+    np.testing.assert_allclose(anatomy.insertion.position, trunk[0], atol=0.1)
+    notes = anatomy.provenance["notes"]
+    assert notes[:2] == [
+        "3 files of curves in the folder are the lines of one tree",
+        "beside the curves the folder holds wall.obj: left out",
+    ]
+    assert any(note.startswith("line 'right': the spheres of 10 neighbouring points do not touch") for note in notes)
+    (loop,) = [note for note in notes if "close a loop" in note]
+    around = 2 * float(np.linalg.norm(np.diff(side, axis=0), axis=1).sum())
+    assert abs(float(loop.split("loop of ")[1].split(" mm")[0]) - around) < 0.05 * around
+    other = tmp_path / "empty"
+    other.mkdir()
+    with pytest.raises(InputError, match=r"empty: holds no curves \(\.mrk\.json\); give"):
+        read_source(other)
 
 
 @pytest.mark.parametrize("status", ["undefined", "missing", "preview"])

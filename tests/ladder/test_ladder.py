@@ -17,9 +17,11 @@ from endopilot.ladder import ladder, submission
 from endopilot.ladder.attempt import attempt
 from endopilot.ladder.ladder import LadderConfig, climb
 from endopilot.ladder.scores import score
+from endopilot.ladder.submission import check_submission
 from endopilot.report.ladder_page import write_page
 from endopilot.tasks.task import find_task, list_tasks
 from endopilot.types import TipProjection
+from toy_tasks import own_tasks
 
 
 @pytest.fixture(scope="module")
@@ -187,3 +189,18 @@ def test_the_upper_eight_are_summed_only_where_all_were_done():
 def test_bad_settings_are_refused(given, message):
     with pytest.raises(InputError, match=message):
         LadderConfig(**given)
+
+
+def test_tasks_of_ones_own_are_climbed_scored_by_a_second_rule_and_checked(tmp_path):
+    own_tasks(tmp_path / "mine", seconds=5.0)
+    config = LadderConfig(policy="forward", version=str(tmp_path / "mine"))
+    (row,) = climb(output=tmp_path / "run", config=config)
+    # 5 mm/s for 5 s, from 2 to 27 mm: 20 mm is reached, 30 mm is not, but the tip comes within 5 mm of it.
+    assert row["success"] == 0.5 and row["near"] == 1.0
+    assert check_submission(tmp_path / "run" / "submission.json").difference is None
+    page = write_page(tmp_path / "run").read_text(encoding="utf-8")
+    assert "<th>Near, %</th>" in page and "a point for each patient" in page
+    own_tasks(tmp_path / "mine", seconds=5.0, targets_mm=[[0, 0, 21], [0, 0, 30]])
+    list_tasks.cache_clear()
+    with pytest.raises(InputError, match="task 'along' is not the one of endopilot"):
+        check_submission(tmp_path / "run" / "submission.json")

@@ -104,7 +104,7 @@ def test_a_file_of_version_1_is_driven_again_in_the_textbook_s_patients(tmp_path
 
 
 def test_a_version_1_task_has_the_hash_of_its_file_before_there_were_versions():
-    since = ("version", "catheter", "arrives", "start_catheter_mm")
+    since = ("version", "catheter", "arrives", "start_catheter_mm", "anatomies", "targets_mm", "near_mm")
     task = find_task("crux", version=1)
     then = {"vessel": "anatomy", "start_inserted_length_mm": "start_inserted_mm"}
     before = {then.get(name, name): value for name, value in asdict(task).items() if name not in since}

@@ -43,11 +43,12 @@ def test_a_robot_is_calibrated_and_its_log_replayed(vessel, log_file, tmp_path, 
     assert robot.wire.play_mm == found["estimates"]["play_mm"]["value"] and robot.encoders_at == "motor"
     assert any(line.startswith("play_mm: ") and "95 %" in line for line in robot.sources)
     assert written["estimates"] == found["estimates"] and written["inputs"]["log.csv"]
-    unknown = [name for name, each in found["estimates"].items() if not each["identified"]]
-    assert not any(line.startswith(name) for name in unknown for line in robot.sources)
+    for name, each in found["estimates"].items():
+        (line,) = (line for line in robot.sources if line.startswith(f"{name}: "))
+        assert ("not identifiable" in line) != each["identified"]
     wire = read_wire(tmp_path / "robot.device.yaml")
-    if "friction" in unknown:
-        assert wire.friction == read_wire("workhorse-014").friction
+    assert wire.friction == found["estimates"]["friction"]["value"]
+    assert "endopilot calibrate" in wire.sources["friction"]
 
     made = tmp_path / "replay"
     files = ("--robot", tmp_path / "robot.yaml", "--device", tmp_path / "robot.device.yaml")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import gymnasium
@@ -16,6 +17,7 @@ from endopilot.settings import read_settings
 from endopilot.tasks import task
 from endopilot.tasks.targets import find_target, turn_rad
 from endopilot.tasks.task import Task, find_task, list_tasks, without_catheter
+from toy_tasks import own_tasks
 
 FOLDER = Path(task.__file__).parent
 FILES = sorted(FOLDER.glob("ladder_*/*.yaml"))
@@ -119,3 +121,35 @@ def test_a_target_outside_the_tree_is_refused():
         find_target(tree, "4", depth_mm=500.0)
     with pytest.raises(InputError, match="patient: 20"):
         find_task("crux").patient(find_task("crux").ladder, 20)
+
+
+def test_a_folder_of_tasks_has_its_own_anatomies_targets_and_wire(tmp_path):
+    task = own_tasks(tmp_path)
+    assert task.targets_mm is not None
+    navigation = task.ladder_navigation(1)
+    place = navigation.target.position(navigation.anatomy)
+    assert np.linalg.norm(place - task.targets_mm[1]) < 0.5 and place[2] == pytest.approx(30, abs=0.5)
+    assert navigation.device.name == "workhorse-014" and navigation.near_mm == 5.0
+    assert len({task.ladder_navigation(number).start_rotation_rad for number in (0, 1)}) == 2
+    with pytest.raises(InputError, match="no patients to learn on; add training"):
+        task.patient(task.training, 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"targets_mm": [[0, 0, 20]]}, "targets_mm: 1 values; give one for each of ladder.numbers, 2"),
+        ({"anatomies": ["a"]}, "anatomies: 1 values; give one for each of ladder.numbers, 2"),
+        ({"anatomies": None}, "vessel: None; choose from"),
+        ({"section": "G0"}, "section: 'G0'; give either the target's section or targets_mm"),
+        ({"device": "no-such-wire"}, "no-such-wire"),
+    ],
+)
+def test_what_is_wrong_in_a_task_of_ones_own_is_named(tmp_path, change, line):
+    with pytest.raises(InputError, match=re.escape(line)):
+        own_tasks(tmp_path, **change).ladder_navigation(0)
+
+
+def test_a_version_is_shipped_or_a_folder_of_tasks(tmp_path):
+    with pytest.raises(InputError, match="choose from 1, 2, coaxial, or give a folder of tasks"):
+        list_tasks(str(tmp_path))

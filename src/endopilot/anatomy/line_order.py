@@ -37,31 +37,30 @@ def in_order(source: Polylines, label: str) -> tuple[Polylines, list[str]]:
     """
     points, radii, notes = [], [], []
     for number, (line, size) in enumerate(zip(source.points, source.radius, strict=True)):
+        name = source.name(number)
         distinct = np.concatenate([[True], np.linalg.norm(np.diff(line, axis=0), axis=1) > 1e-6])
         line, size = line[distinct], size[distinct]
         if len(line) < 2:
-            notes.append(f"line {number}: all its points coincide at {place_text(line[0])}: left out")
+            notes.append(f"{name}: all its points coincide at {place_text(line[0])}: left out")
             continue
-        order = _order(line, f"{label}: line {number}")
+        order = _order(line, f"{label}: {name}")
         if order is not None:
             before, after = _length(line), _length(line[order])
             line, size = line[order], size[order]
             notes.append(
-                f"line {number}: its points were in another order than along the vessel, and are sorted "
+                f"{name}: its points were in another order than along the vessel, and are sorted "
                 f"({before:.0f} mm became {after:.0f} mm)"
             )
         step = np.linalg.norm(np.diff(line, axis=0), axis=1)
         reach = size[1:] + size[:-1]
         apart = step > reach
         jump = apart & (step > _JUMP_RADII * reach) & (step > _JUMP_STEPS * np.median(step))
-        notes += [
-            f"line {number} jumps by {step[i]:.1f} mm at {place_text(line[i])}: cut there" for i in np.flatnonzero(jump)
-        ]
+        notes += [f"{name} jumps by {step[i]:.1f} mm at {place_text(line[i])}: cut there" for i in np.flatnonzero(jump)]
         coarse = np.flatnonzero(apart & ~jump)
         if len(coarse):
             longest = int(coarse[step[coarse].argmax()])
             notes.append(
-                f"line {number}: the spheres of {len(coarse)} neighbouring points do not touch (the longest step, "
+                f"{name}: the spheres of {len(coarse)} neighbouring points do not touch (the longest step, "
                 f"{step[longest]:.1f} mm, is at {place_text(line[longest])}): joined by straight pieces of "
                 f"{step[coarse].sum():.1f} mm in all"
             )
@@ -70,7 +69,7 @@ def in_order(source: Polylines, label: str) -> tuple[Polylines, list[str]]:
                 points.append(line[part])
                 radii.append(size[part])
             else:
-                notes.append(f"line {number}: the single point at {place_text(line[part[0]])} is left out")
+                notes.append(f"{name}: the single point at {place_text(line[part[0]])} is left out")
     if not points:
         raise InputError(f"{label}: holds no line of at least two distinct points; export the centerline again")
     return Polylines(tuple(points), tuple(radii)), notes

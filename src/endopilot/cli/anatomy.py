@@ -35,7 +35,7 @@ def command(
 
     Args:
         sources: masks (NIfTI, NRRD, MHA, DICOM-SEG), surfaces (STL, OBJ, PLY, VTP), or centerlines with radii (VTP,
-            Slicer .mrk.json).
+            Slicer .mrk.json); a folder of Slicer curves is one tree.
         output: folder of the anatomy; for several files, the folder that takes one of each.
         name: name of the patient in datasets and reports; the folder's name by default.
         label: number or name of the segment to take, where a mask holds several.

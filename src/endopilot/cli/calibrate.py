@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from tyro.conf import Positional
 
 from endopilot.anatomy.io import read_anatomy
@@ -32,7 +33,8 @@ def command(
 ) -> Answer:
     """Find gain, lag, plays, tip shape, friction and stiffness of a robot and its wire, each with an interval.
 
-    What the logs do not tell is said, and stays as it was. `navigate`, `ladder` and `replay` take the files.
+    What the logs do not tell is said; it is then as in the wire that predicts best, for its constants belong together.
+    `navigate`, `ladder` and `replay` take the files.
 
     Args:
         logs: CSV files of commands and tips, driven through one vessel with one wire; docs/reality.md describes them.
@@ -66,21 +68,26 @@ def command(
     write_json(output.with_suffix(".json"), manifest(config=config, seed=config.seed, inputs=inputs) | record)
     told = {name: str(each) for name, each in found.estimates.items()}
     files = {"robot": output, "wire": _beside(output)}
-    return Answer(record | files, shown=[told | {"encoders_at": found.robot.encoders_at} | about | figures | files])
+    read_out = any(np.isfinite(log.encoders).any() for log in read)
+    encoders = {"encoders_at": found.robot.encoders_at if read_out else "not identifiable from this log"}
+    return Answer(record | files, shown=[told | encoders | about | figures | files])
 
 
 def _write(found: RobotCalibration, output: Path, names: str) -> None:
     """Write the robot and the wire, with the source of what was found."""
-    told = {name: each for name, each in found.estimates.items() if each.identified}
-    sources = tuple(f"{name}: {each}, 95 %, by {_BY} from {names}" for name, each in told.items())
+    told = {
+        name: f"{each}, 95 %" if each.identified else f"{each.value:.4g}, {each}"
+        for name, each in found.estimates.items()
+    }
+    sources = tuple(f"{name}: {text}, by {_BY} from {names}" for name, text in told.items())
     kept = tuple(line for line in found.robot.sources if line.partition(":")[0] not in told)
     replace(found.robot, sources=(*kept, *sources)).write(output)
     of_wire = {"tip_bend": ("tip_bend_deg", "tip_bend_length_mm"), "friction": ("friction",)}
     of_wire |= dict.fromkeys(("bend_stiffness_n_mm2", "twist_stiffness_n_mm2"), ("tip_stiffness_factor",))
-    changed = {field: by for field, by in of_wire.items() if any(name in told for name in by)}
     texts = {
-        field: f"by {_BY} from {names}: " + ", ".join(f"{name} {told[name]}" for name in by if name in told)
-        for field, by in changed.items()
+        field: f"by {_BY} from {names}: " + ", ".join(f"{name} {told[name]}" for name in by)
+        for field, by in of_wire.items()
+        if all(name in told for name in by)
     }
     write_device(replace(found.wire, sources=dict(found.wire.sources) | texts), output=_beside(output))
 

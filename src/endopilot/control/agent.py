@@ -4,10 +4,6 @@ Both search a course from the believed state of the wire and its catheter, and f
 exposures the simulated wires alone give the tip. An exposure weights these wires, and shows where none of them is
 right: then the real wire is pulled back, with X-ray on, until one agrees with the image, and another course is searched
 from there.
-
-A course says where the proximal ends are to be, not what encoders read. Where play lies between the two, a device that
-turns back rests until its play is taken up; only then does the course go on. A wire whose rotation is no longer known
-is looked at, and turned to where the course has it, before it is pushed on.
 """
 
 from __future__ import annotations
@@ -24,6 +20,7 @@ from endopilot.belief.adviser import AdviserConfig, XrayAdviser
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.course import Course
+from endopilot.control.follow import Follower
 from endopilot.control.search import Search
 from endopilot.control.search_config import SearchConfig
 from endopilot.devices.stack import Proximals
@@ -90,14 +87,6 @@ _SURE_SDS = 3.0
 """A measured tip is taken for another than the simulated ones beyond this many of its own standard deviations."""
 _WIRE_CREEP_MM_S = 2.0
 """Fastest translation of a wire that should have arrived, and that X-ray shows beside its target, mm/s."""
-_UNSURE_RAD = 0.3
-"""A rotation that is known no better is looked at before a wire is pushed or pulled, rad."""
-_OFF_RAD = 0.25
-"""A wire that is turned otherwise than its course by more than this is turned before it goes on, rad."""
-_LOOKS, _SETTLES = 2, 6
-"""Times that a wire is looked at after it was turned, and periods that it is turned for at one place of a course."""
-_TURNED_RAD_S = 0.1
-"""A wire whose drive turned no faster was not turned, rad/s."""
 _CLEAR_MM = 4.0
 """A wire that is lost is pulled back by this much at least before it is looked at again, mm."""
 _CREEP_MM_S, _CREEP_PERIODS = 1.0, 6
@@ -141,11 +130,12 @@ class _PlanningPolicy:
             check_passable(self.route, device)
         self.belief = Belief(navigation, self._parameters(), self.config.belief)
         self._search = Search(navigation, self.route, self.belief, config=self.config.search, seed=seed)
-        self._fastest = np.array([np.inf, self.config.search.turn_rad_s])
-        self._back_mm, self._looked = np.inf, 0
+        self._follower = Follower(
+            self.belief.drives, devices=len(navigation.devices), turn_rad_s=self.config.search.turn_rad_s
+        )
+        self._back_mm = np.inf
         self._lost = self._began = self._led = self._arrived = self._shows = False
-        self._at, self._crept, self.plans, self._failed, self.planning_s = 0, 0, 0, 0, 0.0
-        self._begin_course(None)
+        self._crept, self.plans, self._failed, self.planning_s = 0, 0, 0, 0.0
 
     def decide(self, observation: Observation) -> Decision:
         """Follow the course, search another one, or pull back, as the module describes."""
@@ -155,13 +145,13 @@ class _PlanningPolicy:
         self._shows = False
         wanted = self._pull_back() if self._lost else self._go_on(observation)
         self.belief.drives.sent(wanted)
-        ends = self._failed >= self.config.tries and self._course is None and not self._lost
+        ends = self._failed >= self.config.tries and self._follower.course is None and not self._lost
         expose = self._back_far_enough() if self._lost else self.wants_xray()
         return Decision(wanted, expose=expose, gives_up=self._search.halt if ends else "")
 
     def watch(self, observation: Observation) -> None:
         """Follow what somebody else does; a new course is searched at the next decision."""
-        self._begin_course(None)
+        self._follower.begin(None)
         self._led, self._failed = True, 0
         self._observe(observation)
         self.wants_xray()
@@ -206,7 +196,7 @@ class _PlanningPolicy:
         explained = np.maximum([config.lost_along_mm, across_mm], _SURE_SDS * np.array(measured.sd_mm))
         lost = bool((self.belief.error[best] > explained).any())
         if lost or self._lost:
-            self._begin_course(None)
+            self._follower.begin(None)
         self._lost = lost
         self._back_mm = self.belief.drives.proximal[0, 0] - self._way_back(measured)
 
@@ -232,108 +222,39 @@ class _PlanningPolicy:
     def _pull_back(self) -> Proximals:
         """Return the velocities that pull the wire back, and each catheter that the wire's tip is in."""
         inserted = self.belief.drives.proximal[:, 0].tolist()
-        return self._moving([-self.config.search.speed_mm_s if inserted[0] <= each else 0.0 for each in inserted])
-
-    def _moving(self, speed_mm_s: list[float]) -> Proximals:
-        """Return the velocities of drives by which devices move at some speeds, once their plays are taken up."""
-        drives = self.belief.drives
-        if not drives.lose:
-            return tuple((speed, 0.0) for speed in speed_mm_s)
-        wanted = drives.at_rest.copy()
-        wanted[: len(speed_mm_s), 0] += DECISION_PERIOD_S * np.array(speed_mm_s)
-        return _pairs(drives.towards(wanted, self._fastest).velocity)
+        return self._follower.move(
+            [-self.config.search.speed_mm_s if inserted[0] <= each else 0.0 for each in inserted]
+        )
 
     def _go_on(self, observation: Observation) -> Proximals:
         """Return the velocities that lead to the next place of the course."""
         arriving = self.navigation.arriving
-        if self._off_course() or (self._ended and not (self._reached and arriving)):
+        if self._off_course() or (self._follower.ended and not (self._follower.reached and arriving)):
             self._plan(observation)
-        self._arrived = self._reached and self._ended
+        self._arrived = self._follower.reached and self._follower.ended
         if self._arrived and arriving:
             return self._creep()
         if self._arrived and observation.tip is not None:  # no wire says what is wrong; the image does
             left = (self.navigation.target.abscissa - observation.tip.abscissa) / DECISION_PERIOD_S
-            return self._moving([float(np.clip(left, -_WIRE_CREEP_MM_S, _WIRE_CREEP_MM_S))])
-        if self._course is None or self._ended:
+            return self._follower.move([float(np.clip(left, -_WIRE_CREEP_MM_S, _WIRE_CREEP_MM_S))])
+        if self._follower.ended:
             self._shows = not self._search.draws  # another look, before another search
             return ((0.0, 0.0),)
-        return self._follow(self._course)
-
-    def _follow(self, course: Course) -> Proximals:
-        """Return the velocities that lead to the next place of a course, or to the last one where the wire is not."""
-        drives, at = self.belief.drives, self._at
-        wanted = course.proximal[at]
-        if drives.lose:
-            held = self._turned(course)
-            if held is not None:
-                return held
-            at = self._turn_ends(course)
-            wanted = course.proximal[at] + self._whole_turns
-            still = np.abs(course.control[at, :, 1]) < 1e-3  # what is off by less than `_OFF_RAD` is left as it is
-            wanted[:, 1] = np.where(still & (at == self._at), drives.at_rest[:, 1], wanted[:, 1])
-        motion = drives.towards(wanted, self._fastest)
-        if motion.done:
-            self._shows, self._at, self._settled = bool(course.exposed[at]), at + 1, 0
-            if np.abs(motion.velocity[0, 1]) > _TURNED_RAD_S:
-                self._looked = 0
-        return _pairs(motion.velocity)
-
-    def _turn_ends(self, course: Course) -> int:
-        """Return the last of the periods in which devices only turn, which they do the shorter way, or the next."""
-        at, drives = self._at, self.belief.drives
-        still = np.abs(course.control[at:, :, 0]).max(axis=1) < 1e-3
-        if not still[0]:
-            return at
-        at += int(np.argmin(still)) - 1 if not still.all() else len(still) - 1
-        turn = course.proximal[at, :, 1] + self._whole_turns[:, 1]
-        self._whole_turns[:, 1] += drives.nearest_turn(turn) - turn
-        return at
-
-    def _turned(self, course: Course) -> Proximals | None:
-        """Return velocities by which the wire rests to be looked at, or is turned; None where it may go on."""
-        at, drives = self._at, self.belief.drives
-        if np.abs(course.control[at, :, 0]).max() < 1e-3:
-            return None
-        if drives.sd[0, 1] > _UNSURE_RAD and self._looked < _LOOKS:
-            self._looked, self._shows = self._looked + 1, True
-            return ((0.0, 0.0),)
-        turn = course.proximal[at, 0, 1] - DECISION_PERIOD_S * course.control[at, 0, 1] + self._whole_turns[0, 1]
-        if abs(turn - drives.at_rest[0, 1]) <= _OFF_RAD or self._settled >= _SETTLES:
-            return None
-        wanted = drives.at_rest.copy()
-        wanted[0, 1] = turn
-        nearest = drives.nearest_turn(wanted[:, 1])
-        self._whole_turns[:, 1] += nearest - wanted[:, 1]
-        wanted[:, 1] = nearest
-        self._settled, self._looked = self._settled + 1, 0
-        return _pairs(drives.towards(wanted, self._fastest).velocity)
+        wanted = self._follower.step()
+        self._shows = self._follower.shows
+        return wanted
 
     def _creep(self) -> Proximals:
         """Return the velocity of a catheter that should have arrived: a little ahead and back; then search again."""
         step, self._crept = self._crept, self._crept + 1
         if step >= 3 * _CREEP_PERIODS:
-            self._begin_course(None)
+            self._follower.begin(None)
         speed = _CREEP_MM_S if step < _CREEP_PERIODS else -_CREEP_MM_S
-        return self._moving([*[0.0] * self.navigation.arriving, speed])
-
-    def _begin_course(self, course: Course | None) -> None:
-        """Follow a course from its begin on, or none."""
-        self._course, self._settled = course, 0
-        self._whole_turns = np.zeros((len(self.navigation.devices), 2))
-
-    @property
-    def _ended(self) -> bool:
-        """Whether there is no course, or no more of it."""
-        return self._course is None or self._at >= len(self._course.control)
-
-    @property
-    def _reached(self) -> bool:
-        """Whether there is a course that ends at the target."""
-        return self._course is not None and self._course.reached > 0.5
+        return self._follower.move([*[0.0] * self.navigation.arriving, speed])
 
     def _off_course(self) -> bool:
         """Return whether the likeliest tip is not where the course has it now."""
-        course, at = self._course, self._at - 1
+        course, at = self._follower.course, self._follower.at - 1
         if course is None or at < 0 or not course.checked[at]:
             return False
         tip, planned = self.belief.likeliest_tip(), course.tip[at]
@@ -347,16 +268,12 @@ class _PlanningPolicy:
         """Search a course, unless too many searches failed or no time is left."""
         seconds = self.navigation.seconds - observation.time_s
         if self._failed >= self.config.tries:
-            self._begin_course(None)
+            self._follower.begin(None)
             return
-        self._at, self._crept, self.plans, worked = 0, 0, self.plans + 1, time.process_time()
-        self._begin_course(self.find_course(seconds) if seconds >= DECISION_PERIOD_S else None)
+        self._crept, self.plans, worked = 0, self.plans + 1, time.process_time()
+        self._follower.begin(self.find_course(seconds) if seconds >= DECISION_PERIOD_S else None)
         self.planning_s += time.process_time() - worked
-        self._failed = self._failed + 1 if self._course is not None and not self._reached else 0
-
-
-def _pairs(velocity: Float[np.ndarray, "devices 2"]) -> Proximals:
-    return tuple((translation, rotation) for translation, rotation in velocity.tolist())
+        self._failed = self._failed + 1 if self._follower.course is not None and not self._follower.reached else 0
 
 
 class OraclePolicy(_PlanningPolicy):

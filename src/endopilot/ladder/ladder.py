@@ -1,4 +1,4 @@
-"""The ladder: twelve tasks, each in twenty patients, that a policy climbs."""
+"""The ladder: twelve tasks, each in twenty patients, or tasks of one's own, that a policy climbs."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class LadderConfig:
     the name of a policy of an installed package, or MODULE:OBJECT of a policy of your own."""
     tasks: tuple[str, ...] = ()
     """Names of the tasks; all if none is given."""
-    patients: Annotated[int, Within(1, MOST_PATIENTS)] = MOST_PATIENTS
-    """Patients of each task, the first of its list: 1 to 20."""
+    patients: Annotated[int, Within(1, MOST_PATIENTS)] | None = None
+    """Patients of each task, the first of its list; all if not given."""
 
     version: LadderVersion = NEWEST
-    """Version of the ladder: 2 in patients that resemble real ones, 1 in the textbook patients of before, or coaxial,
-    four tasks of wire and catheter in patients as of version 2."""
+    """Version of the ladder: 2 in patients that resemble real ones, 1 in the textbook patients of before, coaxial, four
+    tasks of wire and catheter in patients as of version 2, or a folder of tasks of your own (docs/ladder.md)."""
     robot: str = ASSUMED
     """Name of the robot that drives (docs/robot.md), or a YAML file."""
     world: Text = NOMINAL
@@ -46,14 +46,26 @@ class LadderConfig:
     @model_validator(mode="after")
     def _consistent(self) -> LadderConfig:
         POLICIES.check(self.policy)
+        list_tasks(self.version)
         for name in self.tasks:
             find_task(name, version=self.version)
+        most = max(len(task.ladder.numbers) for task in self.chosen)
+        if self.patients is not None and self.patients > most:
+            raise ValueError(f"patients: {self.patients}; the tasks have {most}")
         return self
 
     @property
     def chosen(self) -> list[Task]:
         """The tasks named, or all."""
         return [task for task in list_tasks(self.version) if not self.tasks or task.name in self.tasks]
+
+    def paths(self, folder: Path) -> list[Path]:
+        """Return the result files of the navigations in a folder, TASK/PLACE.json."""
+        return [
+            folder / task.name / f"{place:02d}.json"
+            for task in self.chosen
+            for place in range(len(task.ladder.numbers[: self.patients]))
+        ]
 
 
 def climb(*, output: str | Path, config: LadderConfig | None = None) -> list[dict[str, Any]]:
@@ -78,12 +90,13 @@ def climb(*, output: str | Path, config: LadderConfig | None = None) -> list[dic
     tasks = config.chosen
     robot, world = read_robot(config.robot), read_world(config.world)
     claim(output, "endopilot ladder", **identity(config.policy, config.version, robot, world))
-    paths = [output / task.name / f"{place:02d}.json" for task in tasks for place in range(config.patients)]
+    paths = config.paths(output)
     navigate = partial(_navigate, policy=config.policy, version=config.version, robot=robot, world=world)
     make_missing(f"Ladder, {config.policy}", paths, navigate)
     results = {task.name: [read_json(path) for path in paths if path.parent.name == task.name] for task in tasks}
     rows = score(tasks, results)
-    content = {"policy": config.policy, "ladder": config.version, "robot": config.robot, "patients": config.patients}
+    most = max(map(len, results.values()))
+    content = {"policy": config.policy, "ladder": config.version, "robot": config.robot, "patients": most}
     content |= {"world": {"name": config.world, **world.differences()}, "scores": rows}
     write_json(output / SCORES_FILE, content)
     write_submission(output / SUBMISSION_FILE, config.policy, config.version, results, rows, robot, world)

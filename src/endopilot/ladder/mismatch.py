@@ -49,10 +49,7 @@ def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[d
     tasks = config.chosen
     robot = read_robot(config.robot)
     claim(output, "endopilot ladder --mismatch", **identity(config.policy, config.version, robot), mismatch=share)
-    paths = {
-        case: [output / case / task.name / f"{place:02d}.json" for task in tasks for place in range(config.patients)]
-        for case in CASES
-    }
+    paths = {case: config.paths(output / case) for case in CASES}
     every = [path for of_case in paths.values() for path in of_case]
     navigate = partial(_navigate, policy=config.policy, version=config.version, share=share, robot=robot)
     make_missing(f"Model mismatch, {config.policy}", every, navigate)
@@ -66,7 +63,8 @@ def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[d
         "mismatch": share,
         "tasks": [task.name for task in tasks],
     }
-    write_json(output / MISMATCH_FILE, content | {"patients": config.patients, "cases": rows})
+    most = max(len(task.ladder.numbers[: config.patients]) for task in tasks)
+    write_json(output / MISMATCH_FILE, content | {"patients": most, "cases": rows})
     return rows
 
 

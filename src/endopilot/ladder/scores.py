@@ -24,7 +24,8 @@ def score(tasks: Sequence[Task], results: Mapping[str, Sequence[Mapping[str, Any
     that never exceeded the task's limit; `success`, the share that reached it; of those that did, the medians of
     `seconds` and `path_ratio` (length of the tip's path over that of the centerline); and of all the median of
     `peak_force_n` (N) and the mean of `exposures`. Rows of `agent` have `missed_events`, the share
-    of the events of all their navigations that X-ray did not show (docs/xray.md).
+    of the events of all their navigations that X-ray did not show (docs/xray.md). Rows of tasks with `near_mm` have
+    `near`, the share of navigations in which the tip came so near to the target, whatever the force.
     """
     rows = [{"level": task.level, "task": task.name} | score_navigations(results[task.name]) for task in tasks]
     levels = {task.level: task.name for task in tasks}
@@ -48,6 +49,7 @@ def score_navigations(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {
         "safe_success": round(float(np.mean([result["success"] and result["safe"] for result in results])), 4),
         "success": round(len(reached) / len(results), 4),
+        **({"near": round(float(np.mean([r["near"] for r in results])), 4)} if "near" in results[0] else {}),
         "seconds": median("seconds", reached, 1),
         "path_ratio": median("path_ratio", reached, 3),
         "peak_force_n": median("peak_force_n", results, 4),

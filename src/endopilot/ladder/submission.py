@@ -20,7 +20,7 @@ from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
 from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
-from endopilot.files import json_text, manifest, read_json, write_json
+from endopilot.files import input_hash, json_text, manifest, read_json, write_json
 from endopilot.ladder.attempt import Recording, navigation_seed, repeat
 from endopilot.ladder.scores import score
 from endopilot.navigation.policies import POLICIES
@@ -30,8 +30,8 @@ from endopilot.simulation.world import World
 from endopilot.tasks.task import LadderVersion, Task, find_task, list_tasks
 
 SUBMISSION_FILE = "submission.json"
-MOST_PATIENTS = 20
-"""Patients of each task."""
+MOST_PATIENTS = 100
+"""Patients of each task, at most: their seeds are distinct up to there (`navigation_seed`)."""
 
 
 @settings
@@ -57,14 +57,15 @@ class NavigationEntry:
     path_ratio: float
     peak_force_n: float
     exposures: CountOrZero
+    near: bool | None = None
     events: tuple[CountOrZero, CountOrZero] | None = None
     sha256: str
     recording: PackedRecording
 
     def figures(self) -> dict[str, Any]:
         """Return what driving the recording again must give."""
-        left_out = {"seed", "recording"} if self.events else {"seed", "recording", "events"}
-        return {name: value for name, value in asdict(self).items() if name not in left_out}
+        given = {name: value for name, value in asdict(self).items() if value is not None}
+        return {name: value for name, value in given.items() if name not in ("seed", "recording")}
 
 
 @settings
@@ -131,6 +132,9 @@ def task_digest(task: Task) -> str:
         for name, value in asdict(task).items()
         if (name, value) != ("version", 1) and value is not None
     }
+    if task.anatomies is not None:
+        hashes = [next(iter(input_hash(Path(folder)).values())) for folder in task.anatomies]
+        definition |= {"anatomies": hashes, "device": None}  # what they hold, wherever they lie
     content = json_text(definition) + json_text(read_wire(task.device))
     content += json_text(read_catheter(task.catheter)) if task.catheter else ""
     return hashlib.sha256(content.encode()).hexdigest()
@@ -203,20 +207,25 @@ def _refuse_another_ladder(path: Path, submission: Submission) -> None:
     if set(submission.tasks) != set(submission.navigations):
         raise InputError(f"{path}: tasks and navigations name different tasks; give the file as it was written")
     counts = {name: len(entries) for name, entries in submission.navigations.items()}
-    if not counts or len(set(counts.values())) != 1 or not 1 <= max(counts.values()) <= MOST_PATIENTS:
-        raise InputError(f"{path}: navigations: {counts}; each task needs the same first 1 to {MOST_PATIENTS} patients")
-    for name, entries in submission.navigations.items():
+    tasks = {}
+    for name in counts:
         try:
-            task = find_task(name, version=submission.version)
+            tasks[name] = find_task(name, version=submission.version)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
-        if submission.tasks[name] != task_digest(task):
+    most = max(counts.values(), default=0)
+    known = max((len(task.ladder.numbers) for task in tasks.values()), default=0)
+    whole = all(1 <= counts[name] == min(most, len(task.ladder.numbers)) for name, task in tasks.items())
+    if not counts or not whole:
+        raise InputError(f"{path}: navigations: {counts}; each task needs the same first 1 to {known} patients")
+    for name, entries in submission.navigations.items():
+        if submission.tasks[name] != task_digest(tasks[name]):
             raise InputError(
                 f"{path}: task {name!r} is not the one of endopilot {__version__}; the file was made with endopilot "
                 f"{submission.versions.get('endopilot')}, check it with that"
             )
         for place, entry in enumerate(entries):
-            if entry.seed != (seed := navigation_seed(task, place)):
+            if entry.seed != (seed := navigation_seed(tasks[name], place)):
                 raise InputError(f"{path}: task {name}, patient {place}: seed {entry.seed}; the ladder's is {seed}")
 
 

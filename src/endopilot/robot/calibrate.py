@@ -85,7 +85,8 @@ class RobotCalibration:
 
     Attributes:
         robot: with lag, gain and plays as they were found.
-        wire: with the tip, friction and stiffness that were found where they are identified.
+        wire: with the tip, friction and stiffness of the best candidate, those too that are not identified: they belong
+            together.
         estimates: each constant with its interval.
         band_mm: half-width within which Δtip was predicted throughout 90 % of the episodes, mm; None with too few.
         band_share: share of the episodes of each log in which the band of the other logs holds; None with one log.
@@ -136,8 +137,7 @@ def calibrate(
         some = prepare(_evenly(episodes, config.wire_episodes), anatomy, config.given, robot)
         wires = fit_wire(some, device, robot, config)
         told = estimates(wires, WIRE, UNITS, RESOLUTION)
-        known = {name: told[name].value for name in WIRE if told[name].identified}
-        device, robot = with_found(device, robot, known)
+        device, robot = with_found(device, robot, {name: told[name].value for name in WIRE})
     for _ in range(_TIMES):
         slack = _slack(of, replay_prepared(of, Stack(device), robot, replays))
         drives = fit_drive(of, slack, seed=config.seed)

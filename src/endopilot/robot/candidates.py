@@ -124,7 +124,7 @@ def search(
         return cost[-1].sum(axis=1)
 
     def draw(number: int, bottom: np.ndarray, top: np.ndarray, seed: int) -> None:
-        total((bottom + qmc.Halton(len(low), seed=seed).random(number) * (top - bottom)).T)
+        total((bottom + _halton(len(low), number, seed) * (top - bottom)).T)
 
     if first:
         draw(first, low, high, seed)
@@ -145,6 +145,11 @@ def _all(names: tuple[str, ...], tried: list[np.ndarray], cost: list[np.ndarray]
     return Candidates(names, values, np.concatenate(cost), least)
 
 
+def _halton(size: int, number: int, seed: int) -> Float[np.ndarray, "number size"]:
+    """Return points that fill the unit cube evenly."""
+    return qmc.Halton(size, seed=seed).random(number)  # pyright: ignore[reportCallIssue]
+
+
 def _evolve(total: Callable[[np.ndarray], np.ndarray], ranges: list[tuple[float, float]], most: int, seed: int) -> None:
     """Let differential evolution look for the least total, for a number of generations."""
     differential_evolution(
@@ -157,7 +162,7 @@ def _evolve(total: Callable[[np.ndarray], np.ndarray], ranges: list[tuple[float,
         vectorized=True,
         updating="deferred",
         tol=0.0,
-        seed=seed,
+        seed=seed,  # pyright: ignore[reportCallIssue]  # `rng` from scipy 1.15 on
     )
 
 

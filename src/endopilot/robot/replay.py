@@ -173,6 +173,7 @@ def replay_prepared(
 ) -> list[EpisodeReplay]:
     """Replay episodes that are prepared, as `replay_log` does."""
     device, simulator = in_grip(device, robot, simulator or PRESETS["fast"])
+    device, simulator = in_grip(device, robot, simulator or PRESETS["fast"])
     times, course = _proximal(of, robot)
     at_tips = _at(times, course[..., 0], of.courses.seen_s)
     depth = np.nanmedian(np.where(of.given, of.abscissa - at_tips, np.nan), axis=1)

@@ -81,6 +81,8 @@ class Navigation:
         known_motion: how heart and breath are known to move the vessel, which the C-arm takes off what it measures and
             policies simulate; it is taken to lie still if not given.
         xray: how an exposure finds the tip; `NavigationLoop` says what its C-arm does.
+        near_mm: straight distance from the target, mm, within which another rule counts it as reached. Nothing ends
+            there: it is noted in the scores.
         robot: as it is known, not what a seed draws of it. `NavigationLoop` takes its own if not given; else encoders
             sit at the devices.
     """
@@ -97,6 +99,7 @@ class Navigation:
     force_limit_n: Positive = 0.5
     known_motion: Motion | None = None
     xray: XrayKind = "assumed"
+    near_mm: Positive | None = None
     robot: RobotConfig | None = None
 
     @model_validator(mode="after")

@@ -1,4 +1,5 @@
-"""The tasks of the ladder, from fixed files, in fixed synthetic patients; and the one that environments start with."""
+"""The tasks of the ladder, from fixed files, in fixed synthetic patients or in anatomies of one's own; and the one that
+environments start with."""
 
 from __future__ import annotations
 
@@ -12,12 +13,25 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from endopilot.anatomy.catheter_axis import with_world_zero
+from endopilot.anatomy.io import read_anatomy
 from endopilot.atlas.atlas import VESSELS, AtlasConfig, make_patient
 from endopilot.devices.catheter import list_catheters, read_catheter
 from endopilot.devices.device import read_wire
 from endopilot.devices.device_files import list_wires
 from endopilot.errors import InputError
-from endopilot.settings import CountOrZero, NonNegative, Positive, Seconds, Seed, Share, Within, read_settings, settings
+from endopilot.settings import (
+    CountOrZero,
+    Finite,
+    NonNegative,
+    Positive,
+    Seconds,
+    Seed,
+    Share,
+    Text,
+    Within,
+    read_settings,
+    settings,
+)
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.tasks.navigation import Arrives, Navigation
 from endopilot.tasks.targets import find_target
@@ -26,11 +40,14 @@ from endopilot.types import Anatomy
 CORE = SimulatorConfig(element_mm=1.25, time_step_s=1 / 14, sample_tolerance_mm=1e-4)
 """Settings of the rod core on the ladder and in the environments: longer elements, two time steps a control period,
 and forces that are exact to a micronewton; docs/environment.md states the accuracy that they keep."""
-LadderVersion = Literal[1, 2, "coaxial"]
+ShippedVersion = Literal[1, 2, "coaxial"]
+LadderVersion = ShippedVersion | str
 NEWEST: LadderVersion = 2
 """The ladder's versions: 1 in textbook patients of the atlas, 2 in patients that resemble real ones, coaxial for four
-tasks of wire and catheter in patients of the latter kind."""
-_FOLDERS = {version: Path(__file__).parent / f"ladder_{version}" for version in get_args(LadderVersion)}
+tasks of wire and catheter in patients of the latter kind; or a folder of tasks of one's own, a YAML file each."""
+_FOLDERS: dict[LadderVersion, Path] = {
+    version: Path(__file__).parent / f"ladder_{version}" for version in get_args(ShippedVersion)
+}
 
 
 @settings
@@ -52,90 +69,123 @@ class Task:
 
     Attributes:
         name: short name.
-        level: place on the ladder, 1 to 12, or 13 to 16 of those with a catheter.
+        level: place on the ladder, 1 to 12, or 13 to 16 of those with a catheter; in a folder of one's own, 1 to 16.
         title: what is to be done, in a few words.
-        vessel: kind of vessel tree of the atlas.
-        device: shipped device.
+        vessel: kind of vessel tree of the atlas; none where the task has `anatomies`.
+        device: shipped device, or in a folder of one's own also a device's file, seen from the task's.
         tip_bend_deg: angle to which its tip is shaped for this task, degrees.
         tip_bend_mm: length from the tip over which it is bent, mm.
-        section: section that the target lies in.
-        depth_mm: distance of the target from the section's begin, along the centerline, mm.
+        section: section that the target lies in; none where the task has `targets_mm`.
+        depth_mm: distance of the target from the section's begin, along the centerline, mm; its middle if not given.
         start_inserted_length_mm: inserted length at the start, mm.
         seconds: time limit, s.
         force_limit_n: largest force of the wall on one node that is safe, N.
-        stenosis_share: share of the atlas' patients that have a stenosis.
+        stenosis_share: share of the atlas' patients that have a stenosis; 0 if not given.
         chosen_for: what makes the patients of the atlas eligible; the first eligible ones are taken.
         ladder: the patients that the ladder is scored on.
-        training: patients to learn on.
+        training: patients of the atlas to learn on, if there are any.
         version: of the ladder that the task belongs to; it says which population the patients come from.
         catheter: shipped catheter around the wire, if any.
         arrives: whose tip is to go to the target, "wire" or "catheter"; the wire's if not given.
         start_catheter_mm: inserted length of the catheter at the start, mm; 0 if not given.
+        anatomies: folders of anatomies that are the patients of `ladder`, one for each of its numbers, seen from the
+            task's file. The numbers and the seed then draw the first rotations alone.
+        targets_mm: a point for each of them, LPS mm, nearest to which the target lies on the centerline.
+        near_mm: a straight distance from the target, mm, within which another rule counts it as reached; scored beside
+            the ladder's own.
     """
 
     name: str
     level: Annotated[int, Within(1, 16)]
     title: str
-    vessel: str
+    vessel: str | None = None
     device: str
     tip_bend_deg: Annotated[float, Within(0, 180)]
     tip_bend_mm: Positive
-    section: str
-    depth_mm: Positive
+    section: str | None = None
+    depth_mm: Positive | None = None
     start_inserted_length_mm: NonNegative
     seconds: Seconds
     force_limit_n: Positive
-    stenosis_share: Share
-    chosen_for: str
+    stenosis_share: Share | None = None
+    chosen_for: str | None = None
     ladder: Patients
-    training: Patients
-    version: LadderVersion
+    training: Patients | None = None
+    version: ShippedVersion | None = None
     catheter: str | None = None
     arrives: Arrives | None = None
     start_catheter_mm: NonNegative | None = None
+    anatomies: tuple[Text, ...] | None = None
+    targets_mm: tuple[tuple[Finite, Finite, Finite], ...] | None = None
+    near_mm: Positive | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Task:
         known_catheters = (*list_catheters(), None)
-        for name, known in (("vessel", VESSELS), ("device", list_wires()), ("catheter", known_catheters)):
-            if getattr(self, name) not in known:
-                raise ValueError(f"{name}: {getattr(self, name)!r}; choose from {', '.join(filter(None, known))}")
+        known = {"catheter": known_catheters}
+        if self.anatomies is None:
+            known |= {"vessel": VESSELS, "device": list_wires()}
+        for name, choices in known.items():
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name}: {getattr(self, name)!r}; choose from {', '.join(filter(None, choices))}")
+        count = len(self.ladder.numbers)
+        for name in ("anatomies", "targets_mm"):
+            given = getattr(self, name)
+            if given is not None and len(given) != count:
+                raise ValueError(f"{name}: {len(given)} values; give one for each of ladder.numbers, {count}")
+        if self.targets_mm is not None and self.anatomies is None:
+            raise ValueError("targets_mm: patients of an atlas have no points of their own; give anatomies too")
+        if (self.section is None) == (self.targets_mm is None):
+            raise ValueError(f"section: {self.section!r}; give either the target's section or targets_mm")
         return self
 
-    def patient(self, patients: Patients, place: int) -> Anatomy:
+    def patient(self, patients: Patients | None, place: int) -> Anatomy:
         """Return the anatomy of one of the task's patients, by its place in the list.
 
         φ counts from the world's axes in it, as it always did: recorded submissions stay what they are.
         """
+        if patients is None:
+            raise InputError(f"training: task {self.name} has no patients to learn on; add training to its file")
         if not 0 <= place < len(patients.numbers):
             raise InputError(f"patient: {place}; task {self.name} has patients 0 to {len(patients.numbers) - 1}")
+        if self.anatomies is not None and patients is self.ladder:
+            return read_anatomy(self.anatomies[place])
         return with_world_zero(make_patient(self.atlas(patients.seed), patients.numbers[place]))
 
     def atlas(self, seed: int) -> AtlasConfig:
         """Return the atlas of a seed that the task's patients come from."""
         return AtlasConfig(
-            vessel=self.vessel,
+            vessel=self.vessel or "",
             seed=seed,
-            stenosis_share=self.stenosis_share,
+            stenosis_share=self.stenosis_share or 0.0,
             population="textbook" if self.version == 1 else "patients",
         )
 
     def ladder_navigation(self, place: int) -> Navigation:
         """Return the task in one of the patients that the ladder is scored on, with its own first rotation."""
         turn = np.random.default_rng([self.ladder.seed, self.ladder.numbers[place]]).uniform(0.0, 2 * np.pi)
-        return self.navigation(self.patient(self.ladder, place), start_rotation_rad=turn)
+        point = None if self.targets_mm is None else self.targets_mm[place]
+        return self.navigation(self.patient(self.ladder, place), start_rotation_rad=turn, target_mm=point)
 
-    def navigation(self, anatomy: Anatomy, *, start_rotation_rad: float = 0.0) -> Navigation:
+    def navigation(
+        self, anatomy: Anatomy, *, start_rotation_rad: float = 0.0, target_mm: tuple[float, ...] | None = None
+    ) -> Navigation:
         """Return what is to be done in one of the task's patients.
 
+        Args:
+            anatomy: the patient's.
+            start_rotation_rad: rotation of the wire at the start, rad.
+            target_mm: point nearest to which the target lies on the centerline, LPS mm; the task's section and depth
+                say where it lies if not given.
+
         Raises:
-            InputError: the anatomy lacks the section, or it is too short.
+            InputError: the anatomy lacks the section, it is too short, or the point lies outside the lumen.
         """
         bend = {"tip_bend_rad": float(np.deg2rad(self.tip_bend_deg)), "tip_bend_length_mm": self.tip_bend_mm}
         return Navigation(
             anatomy=anatomy,
             device=replace(read_wire(self.device), **bend),
-            target=find_target(anatomy.tree, self.section, depth_mm=self.depth_mm),
+            target=find_target(anatomy.tree, target_mm or self.section or "", depth_mm=self.depth_mm),
             start_inserted_length_mm=self.start_inserted_length_mm,
             start_rotation_rad=start_rotation_rad,
             seconds=self.seconds,
@@ -143,21 +193,43 @@ class Task:
             catheters=(read_catheter(self.catheter),) if self.catheter else (),
             arrives=self.arrives or "wire",
             start_catheter_mm=self.start_catheter_mm or 0.0,
+            near_mm=self.near_mm,
         )
 
 
 @cache
 def list_tasks(version: LadderVersion = NEWEST) -> tuple[Task, ...]:
-    """Return the tasks of a version of the ladder, the lowest first."""
-    tasks = (read_settings(path, Task) for path in _FOLDERS[version].glob("*.yaml"))
+    """Return the tasks of a version of the ladder, the lowest first.
+
+    Raises:
+        InputError: there is no such version or folder, or a file in the folder is no task.
+    """
+    folder = _FOLDERS.get(version) or Path(str(version))
+    tasks = [_read_task(path) for path in folder.glob("*.yaml")]
+    if not tasks:
+        known = ", ".join(map(str, _FOLDERS))
+        raise InputError(f"version: {version!r}; choose from {known}, or give a folder of tasks (*.yaml)")
     return tuple(sorted(tasks, key=lambda task: task.level))
+
+
+def _read_task(path: Path) -> Task:
+    """Return the task of a file, with the paths of its device and anatomies."""
+    task = read_settings(path, Task)
+    if task.anatomies is None:
+        return task
+    beside = path.parent / task.device
+    return replace(
+        task,
+        device=str(beside) if beside.is_file() else task.device,
+        anatomies=tuple(str(path.parent / folder) for folder in task.anatomies),
+    )
 
 
 def find_task(name: str, *, version: LadderVersion = NEWEST) -> Task:
     """Return a task of a version of the ladder by its name.
 
     Raises:
-        InputError: the ladder has no such task.
+        InputError: the ladder has no such task, or there is no such version or folder.
     """
     return _named(name, list_tasks(version))
 
