@@ -60,7 +60,8 @@ def generate_dataset(
     Raises:
         InputError: too few anatomies for the split, two anatomies of one name, an output folder that holds something
             else or was begun with other settings, catheters that do not fit around the wire or are to be driven by
-            force, or a robot that is, a world that a dataset cannot hold, a scheduler that cannot be reached, or a full disk.
+            force, or a robot that is, a world that a dataset cannot hold, a scheduler that cannot be reached, or a full
+            disk.
     """
     config = config or DatasetConfig()
     folders, stack, world = [Path(folder) for folder in anatomies], Stack.of(device), world or World()

@@ -35,6 +35,7 @@ from endopilot.settings import from_record
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.signals import SIGNALS, Outputs, described
 from endopilot.simulation.world import World
+from endopilot.types import Anatomy
 
 _MEND = "make the dataset again"
 
