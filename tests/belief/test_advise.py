@@ -27,6 +27,7 @@ from endopilot.models.open_loop import OpenLoop, Prediction
 from endopilot.models.twin import TwinPredictor
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
+from endopilot.simulation.world import World
 from toy_navigation import make_toy_dataset
 
 EVENTS = AdviserConfig(wall_ratio=0.7, abscissa_mm=0.8)
@@ -78,6 +79,17 @@ def test_tips_are_given_as_x_ray_measures_them_and_lengths_as_the_encoder_does(s
     assert np.ptp(ostium, axis=1).max() < 1e-4 and 0.1 < np.abs(ostium).max() <= 0.3
     np.testing.assert_allclose(truth.initial[:, 0, 0] - split.episodes.initial[:, 0], ostium[:, 0], atol=1e-4)
     np.testing.assert_array_equal(split.episodes.proximal[..., 1], truth.rotation[..., 0])
+
+
+def test_encoders_and_exposures_err_as_the_world_of_the_dataset_says(split, folder) -> None:
+    data = read_dataset(folder / "dataset").of_split("calibrate")
+    world = World(ostium_mm=0.7, registration_mm=(0.4, 0.0, 0.0))  # along the vessel
+    changed = replace(data, manifest=data.manifest | {"world": world.differences()})
+    found = monitoring.monitor(HoldSlack(), changed, AdviseConfig())
+    np.testing.assert_allclose(found.proximal[..., 0], split.proximal[..., 0] - 0.7, atol=1e-6)
+    assert (found.truth == split.truth).all()
+    along = (found.episodes.tip - split.episodes.tip)[..., 0]
+    assert np.median(along) == pytest.approx(0.4, abs=0.1)
 
 
 def test_imaging_often_enough_shows_every_event_and_none_shows_no_event(split) -> None:

@@ -196,7 +196,7 @@ def test_a_dataset_is_made_in_a_world_and_simulated_again_in_it(patient, tmp_pat
     assert plain.manifest["key"] == nominal.manifest["key"] and plain.manifest["world"] == {}
     anatomy = read_anatomy(patient)
     assert data.manifest["world"] == world.differences() and data.manifest["device"] == plain.manifest["device"]
-    assert data.world(anatomy) == world.drawn(anatomy, config.seed) != world
+    assert data.world == world.leaning(config.seed) == world.drawn(anatomy, config.seed) != world
     np.testing.assert_allclose(data.friction, 2 * plain.friction)
     line = anatomy.tree.branches[data.branch[0, 0, 0]].centerline
     given_mm = np.interp(data.tip_abscissa[0, 0, 0], line.abscissa, line.radius)
@@ -205,15 +205,14 @@ def test_a_dataset_is_made_in_a_world_and_simulated_again_in_it(patient, tmp_pat
     _assert_same(data, again)
     one = episode_set_up(data, 0)
     _assert_same(data.select(np.array([0])), run_set_up(one, data.command[:1], period_s=0.5, record_shape=False))
+    deeper = World(ostium_mm=1.5, robot="ideal")
+    generate_dataset([patient], output=tmp_path / "deeper", device="workhorse-014", config=config, world=deeper)
+    counted = read_dataset(tmp_path / "deeper")
+    np.testing.assert_allclose(counted.encoders[..., 0], counted.inserted_length - 1.5, atol=1e-4)
     both = read_joined([tmp_path / "plain", tmp_path / "world"])
     with pytest.raises(InputError, match="holds episodes of several worlds"):
-        both.world(anatomy)
-    for name, value in (
-        ("share", 0.1),
-        ("ostium_mm", 1.0),
-        ("backs_out_mm", 2.0),
-        ("registration_mm", (1.0, 0.0, 0.0)),
-    ):
+        _ = both.world
+    for name, value in (("share", 0.1), ("backs_out_mm", 2.0)):
         with pytest.raises(InputError, match=f"world: {name} = .*leave it out"):
             generate_dataset([patient], output=tmp_path / "no", device="workhorse-014", world=World(**{name: value}))
     assert not (tmp_path / "no").exists()

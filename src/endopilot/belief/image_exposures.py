@@ -149,6 +149,7 @@ def expose_navigations(data: Dataset, anatomy: Anatomy, settings: ImageSettings)
     """
     seed, name = settings.seed, anatomy.name
     pose_seed = int(np.random.default_rng([seed, 5, *name.encode()]).integers(2**31))
+    world = data.world
     arm = ImageFluoroscope(anatomy, data.stack.wire, config=settings.fluoroscope, seed=pose_seed)
     shape = data.valid.shape
     ostium, samples = np.asarray(anatomy.insertion.position), min(shape[1], settings.samples)
@@ -157,6 +158,7 @@ def expose_navigations(data: Dataset, anatomy: Anatomy, settings: ImageSettings)
         known = arm.measure_motion(motion, np.random.default_rng([seed, 6, *name.encode()]))
     shown = seen_in_episodes(motion, known, ostium, shape[1], data.sample_period_s)
     encoder = data.inserted_length[:, :, 0].astype(float) - deeper_ostium_mm(name, settings.ostium_mm, seed)
+    encoder = encoder - world.ostium_mm
     measured: list[list[TipMeasurement | None]] = [[] for _ in data.sequence]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # forces on the wall are in the dataset
@@ -167,7 +169,8 @@ def expose_navigations(data: Dataset, anatomy: Anatomy, settings: ImageSettings)
             arm.forget_wires()
             sequence = int(data.sequence[index])
             for sample in range(samples):
-                there = nodes[sample] if shown is None else place(shown[sample], nodes[sample])
+                there = nodes[sample] + world.registration_mm if any(world.registration_mm) else nodes[sample]
+                there = there if shown is None else place(shown[sample], there)
                 random = np.random.default_rng([seed, 3, sequence, sample, *name.encode()])
                 depth, given = float(encoder[index, sample]), sample < WINDOW
                 measured[index].append(arm.measure(there, depth, random, refine=given))

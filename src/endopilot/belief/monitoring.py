@@ -130,7 +130,7 @@ def monitor(predictor: Predictor, dataset: Dataset, config: AdviseConfig, *, sam
 
     Args:
         predictor: the model.
-        dataset: the navigations as they truly went.
+        dataset: the navigations as they truly went; encoders and exposures err as its world says.
         config: the C-arm, and the model mismatch.
         samples: exposures of so many samples are needed, from the first on; of all if not given. Images take time.
 
@@ -146,7 +146,8 @@ def monitor(predictor: Predictor, dataset: Dataset, config: AdviseConfig, *, sam
         dataset = dataset.select(~np.isin(dataset.anatomy, unregistered))
     names, owner = np.unique(dataset.anatomy, return_inverse=True)
     wire_radius = from_record(Wire, dataset.manifest["device"]).tip_radius_mm
-    deeper = np.array([deeper_ostium_mm(str(name), config.ostium_mm, config.seed) for name in names])
+    world = dataset.world
+    deeper = np.array([deeper_ostium_mm(str(name), config.ostium_mm, config.seed) for name in names]) + world.ostium_mm
     by_encoder = np.zeros((len(dataset), 2))
     by_encoder[:, 0] = -deeper[owner]
     true = Episodes.of_dataset(dataset)
@@ -165,7 +166,9 @@ def monitor(predictor: Predictor, dataset: Dataset, config: AdviseConfig, *, sam
                 if seen.known_motion is not None:
                     known_motions[str(name)] = seen.known_motion
             else:
-                arm = Fluoroscope(anatomy, wire_radius, config=config.fluoroscope)
+                arm = Fluoroscope(
+                    anatomy, wire_radius, config=config.fluoroscope, registration_mm=world.registration_mm
+                )
                 shown = arm.expose_episodes(dataset.select(mine), proximal[mine, :, 0], config.seed)
                 tip[mine], branch[mine] = np.stack([shown.abscissa, shown.offset], axis=-1), shown.branch
             advance()

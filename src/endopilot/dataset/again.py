@@ -33,7 +33,7 @@ def episode_set_up(data: Dataset, number: int) -> SimulationSetUp:
         raise InputError(f"world: {number}; {data.folder} has episodes 0 to {len(data) - 1}")
     one = data.select(np.array([number]))
     anatomy = read_anatomy(data.anatomy_folder(str(one.anatomy[0])))
-    world = data.world(anatomy)
+    world = data.world
     return SimulationSetUp(
         anatomies=[world.anatomy(anatomy)],
         stacks=[_stack(one, world, float(one.tip_bend[0]), float(one.tip_stiffness_factor[0]))],
@@ -78,7 +78,7 @@ def simulate_again(
         Indices of the episodes whose wires have the same tip, and their simulation: a simulation has one wire.
     """
     friction = data.friction if friction is None else friction
-    world = data.world(anatomy)
+    world = data.world
     tips, tip_of = np.unique(np.stack([data.tip_bend, data.tip_stiffness_factor], axis=-1), axis=0, return_inverse=True)
     for kind, (bend, factor) in enumerate(tips.astype(float)):
         chosen = np.flatnonzero(tip_of.ravel() == kind)

@@ -37,7 +37,7 @@ def write_block(
     """
     config, anatomy, stack = context.config, _read(block.folder, block.identity), context.stack
     draw = draw_navigations(config, stack.wire, anatomy, block.sequences, devices=len(stack))
-    world = context.world.drawn(anatomy, config.seed)
+    world = context.world.leaning(config.seed)
     stacks = draw.stacks(stack)
     true = {id(each): world.stack(each) for each in stacks}
     friction = world.stack(stack).frictions(draw.friction * world.friction_factor)
@@ -53,6 +53,7 @@ def write_block(
             actuation=config.control,
             motion=world.motion or patient_motion(config, anatomy.name),
             robot=context.robot,
+            ostium_mm=world.ostium_mm,
             seeds=draw.seeds,
             advance=advance,
         )

@@ -172,14 +172,14 @@ def make_layout(
 
 
 def _check_world(world: World) -> None:
-    """Refuse what differs between encoders or X-ray and reality: a dataset holds what truly happened.
+    """Refuse what differs from navigation to navigation and within one.
 
     Raises:
         InputError: the world has such fields.
     """
-    for name in ("share", "ostium_mm", "backs_out_mm", "registration_mm"):
+    for name in ("share", "backs_out_mm"):
         if (value := getattr(world, name)) != getattr(World(), name):
-            raise InputError(f"world: {name} = {value}; a dataset holds true lengths and no exposures: leave it out")
+            raise InputError(f"world: {name} = {value}; it is not the same throughout a dataset: leave it out")
 
 
 def version() -> str:

@@ -35,7 +35,6 @@ from endopilot.settings import from_record
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.signals import SIGNALS, Outputs, described
 from endopilot.simulation.world import World
-from endopilot.types import Anatomy
 
 _MEND = "make the dataset again"
 
@@ -147,8 +146,9 @@ class Dataset(Outputs):
         record = self.manifest.get("robot")
         return None if record is None else from_record(RobotConfig, record)
 
-    def world(self, anatomy: Anatomy) -> World:
-        """Return what reality was in the episodes of an anatomy, with what the seed drew.
+    @property
+    def world(self) -> World:
+        """What reality was, with what the seed drew; the wire, the anatomies and tips' radii aside are as given.
 
         Raises:
             InputError: the episodes are of several worlds.
@@ -156,7 +156,7 @@ class Dataset(Outputs):
         record = self.manifest.get("world", {})
         if record is None:
             raise InputError(f"{self.folder}: holds episodes of several worlds; give the dataset of one world")
-        return from_record(World, record, onto=World()).drawn(anatomy, self.manifest["seed"])
+        return from_record(World, record, onto=World()).leaning(self.manifest["seed"])
 
     @property
     def patients(self) -> dict[str, str]:

@@ -50,6 +50,7 @@ def simulate_navigations(
     motion: Motion | None = None,
     robot: RobotConfig | None = None,
     seeds: Sequence[Sequence[int]] = (),
+    ostium_mm: float = 0.0,
     record_shape: bool = False,
     advance: Callable[[int], None] = lambda samples: None,
 ) -> tuple[Trajectory, Bool[np.ndarray, "worlds"]]:
@@ -67,6 +68,7 @@ def simulate_navigations(
         robot: what makes the motions and measures them, its drives' mean over a sample moves the devices; they are made
             as drawn if not given.
         seeds: of each world's robot.
+        ostium_mm: the true inserted lengths are this much more than its encoders', mm.
         record_shape: record the positions of all nodes too.
         advance: called after each sample with the number of worlds.
 
@@ -84,7 +86,7 @@ def simulate_navigations(
     stopped = np.zeros(len(control), dtype=bool)
     inserted = simulator.inserted_length
     last, slip = np.zeros_like(inserted), np.zeros_like(inserted)
-    robots = None if robot is None else _Driven(simulator, robot, anatomy, stacks, seeds)
+    robots = None if robot is None else _Driven(simulator, robot, anatomy, stacks, seeds, ostium_mm)
     for sample in range(control.shape[1]):
         drawn = control[:, sample, :, 0]
         caught = (slip > 0) | (simulator.base_load[..., 0] > watch.caught_n)
@@ -113,9 +115,10 @@ class _Driven:
         anatomy: Anatomy,
         stacks: Sequence[Stack],
         seeds: Sequence[Sequence[int]],
+        ostium_mm: float,
     ) -> None:
         limits = [[DriveLimits.of(device, anatomy) for device in stack.devices] for stack in stacks]
-        self._robots = Robots(simulator, config, limits, seeds=seeds)
+        self._robots = Robots(simulator, config, limits, seeds=seeds, ostium_mm=ostium_mm)
         self._rows: list[Float[np.ndarray, "worlds devices 6"]] = []
 
     def step(self, told: Float[np.ndarray, "worlds devices 2"], recorder: Recorder) -> Step:

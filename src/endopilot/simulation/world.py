@@ -143,14 +143,17 @@ class World:
             anatomy: the vessel as given.
             seed: of the navigation.
         """
+        change = drawn_sides(self.share, np.random.default_rng([seed, 3]))
+        world = replace(_differing(change, anatomy, self), share=0.0) if self.share else self
+        return world.leaning(seed)
+
+    def leaning(self, seed: int) -> World:
+        """Return the world with the side to which its catheter leans, which the seed of the navigation draws."""
+        if not self.axis_deg or self.axis_side_deg is not None:
+            return self
         random = np.random.default_rng([seed, 3])
-        change, side_deg = drawn_sides(self.share, random), float(random.uniform(0.0, 360.0))
-        world = self
-        if self.share:
-            world = replace(_differing(change, anatomy, self), share=0.0)
-        if self.axis_deg and self.axis_side_deg is None:
-            world = replace(world, axis_side_deg=side_deg)
-        return world
+        drawn_sides(0.0, random)  # which are drawn first
+        return replace(self, axis_side_deg=float(random.uniform(0.0, 360.0)))
 
     def wire(self, given: Wire) -> Wire:
         """Return a wire as it is in reality."""

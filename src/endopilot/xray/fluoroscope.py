@@ -244,6 +244,7 @@ class Fluoroscope:
             seed: of the errors; those of a navigation depend on it, the patient and the sequence alone.
         """
         tip, heading = (each[:, :, 0].astype(float) for each in (episodes.tip_position, episodes.tip_direction))
+        tip = tip + self.registration_mm
         position, name = np.zeros_like(tip), self._anatomy.name
         ostium = np.asarray(self._anatomy.insertion.position)
         motion = episodes.motion(name)
