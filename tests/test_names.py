@@ -45,8 +45,8 @@ SUBJECTS = {
 UNITS = re.compile(r"(^|_)(mm2?|s2?|n|hu|rad|deg|ugy|seconds|pixel_sd|along_sd|share|factor|weight|ratio)$")
 WITHOUT_UNIT = {
     "calcium", "dose", "efficiency", "friction", "gain_rotation", "gain_sd_rotation", "gain_sd_translation",
-    "gain_translation", "largest_jump", "learning_rate", "mismatch", "right_heart", "scale",
-    "scatter", "temperature", "true_friction", "true_tip_stiffness", "window", "zoom",
+    "gain_translation", "largest_jump", "learning_rate", "right_heart", "scale",
+    "scatter", "temperature", "window", "zoom",
 }  # fmt: skip
 
 

@@ -28,8 +28,8 @@ from endopilot.ladder.ladder import identity
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Decision, Observation
 from endopilot.runs import claim, make_missing
-from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import Motion, motion_named
+from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.tasks.task import CORE, NEWEST, LadderVersion, Task, find_task, list_tasks
 
@@ -111,13 +111,13 @@ class MonitoredAgent(AgentPolicy):
         return (len(self.kept) + 1) % EXPOSED_EVERY == 0 or self._shows
 
 
-def truth_of(task: Task, place: int, role: str, kind: Kind) -> ModelMismatch:
-    """Return a patient's model mismatch, drawn within the spread of the agent's ensemble."""
+def world_of(task: Task, place: int, role: str, kind: Kind) -> World:
+    """Return a patient's reality, drawn within the spread of the agent's ensemble."""
     belief, roles = kind.config.belief, list(kind.roles)
     off = np.random.default_rng([task.level, place, roles.index(role)]).uniform(-1.0, 1.0, 3)
-    return ModelMismatch(
+    return World(
         friction_factor=1 + belief.friction_spread * off[0],
-        stiffness_factor=1 + belief.stiffness_spread * off[1],
+        tip_stiffness_factor=1 + belief.stiffness_spread * off[1],
         ostium_mm=belief.ostium_spread_mm * off[2],
     )
 
@@ -144,7 +144,7 @@ def measure(path: Path, name: KindName) -> None:
             motion=motion_named("both", seed) if moves else None,
         ),
         seed=seed,
-        truth=truth_of(task, number, role, kind),
+        world=world_of(task, number, role, kind),
     ).run()
     kept, count = np.array(policy.kept), len(policy.kept)
     true = np.column_stack([record.tip.abscissa[:, 0], record.tip.offset[:, 0]])[:count]

@@ -49,7 +49,7 @@ def navigate_coronaries(
     policy: str = "agent",
     device: str = "workhorse-014",
     catheter: tuple[str, ...] = (),
-    config: NavigateConfig = NavigateConfig(mismatch=0.2),
+    config: NavigateConfig = NavigateConfig(world="drawn"),
 ) -> None:
     """Drive a policy into the distal thirds of coronary arteries; print each navigation, and the share that was safe.
 

@@ -14,8 +14,7 @@ import numpy as np
 from tyro.conf import Positional
 
 from endopilot.control.agent import AgentPolicy
-from endopilot.devices.robot import RobotConfig
-from endopilot.ladder.mismatch import CASES, mismatch_of
+from endopilot.ladder.mismatch import CASES, world_of
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.settings import Count
 from endopilot.tasks.task import CORE, find_task
@@ -41,9 +40,9 @@ def drive(name: str, place: int, case: str, rule: type[AgentPolicy]) -> list[flo
     """Return the figures of one navigation, as `COLUMNS` names them."""
     task, policy = find_task(name), rule()
     navigation = task.ladder_navigation(place)
-    mismatch, robot = mismatch_of(case, MISMATCH, navigation, task, place, RobotConfig())
-    config, began = LoopConfig(robot=robot, simulator=replace(CORE, threads=1)), time.process_time()
-    record = NavigationLoop(navigation, policy, config=config, seed=100 * task.level + place, truth=mismatch).run()
+    world = world_of(case, MISMATCH, navigation, task, place)
+    config, began = LoopConfig(simulator=replace(CORE, threads=1)), time.process_time()
+    record = NavigationLoop(navigation, policy, config=config, seed=100 * task.level + place, world=world).run()
     spent = time.process_time() - began
     return [record.success and record.safe, record.exposures, record.seconds, policy.plans, spent]
 

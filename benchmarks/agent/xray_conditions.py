@@ -17,7 +17,6 @@ from tyro.conf import Positional
 
 from benchmarks.figures import DOCS, fill
 from endopilot.control.agent import AgentPolicy
-from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import navigation_events, navigation_seed
@@ -25,8 +24,8 @@ from endopilot.ladder.ladder import identity
 from endopilot.navigation.loop import LoopConfig, NavigationLoop, XrayKind
 from endopilot.runs import claim, make_missing
 from endopilot.settings import Count
-from endopilot.simulation.mismatch import drawn_sides, mismatch_by
 from endopilot.simulation.motion import Motion, motion_named
+from endopilot.simulation.world import World
 from endopilot.tasks.task import CORE, NEWEST, find_task, list_tasks
 
 FOLDER = Path("runs/xray-conditions")
@@ -49,18 +48,15 @@ def measure(path: Path) -> None:
     place, task = int(path.stem), find_task(path.parent.name)
     _, xray, moves, measured = CONDITIONS[path.parent.parent.name]
     navigation, seed = task.ladder_navigation(place), navigation_seed(task, place)
-    change = drawn_sides(MISMATCH, np.random.default_rng([seed, 3]))
     config = LoopConfig(
-        robot=RobotConfig().delayed(1 + change["latency"]),
         simulator=replace(CORE, threads=1),
         xray=xray,
         motion=motion_named("both", seed) if moves else None,
         measure_motion=measured,
     )
-    truth = mismatch_by(change, navigation.anatomy)
     navigation = replace(navigation, known_motion=Motion() if moves else None)
     try:
-        record = NavigationLoop(navigation, AgentPolicy(), config=config, seed=seed, truth=truth).run()
+        record = NavigationLoop(navigation, AgentPolicy(), config=config, seed=seed, world=World(share=MISMATCH)).run()
     except InputError as error:  # the patient is not recognised in the images
         write_json(path, {"reason": str(error), "success": False, "safe": True})
         return

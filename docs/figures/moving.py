@@ -36,7 +36,7 @@ def main() -> None:
             patient = make_patient(AtlasConfig(vessel=kind, seed=70), number)
             path = patient.tree.longest_path()
             place = path.points[np.searchsorted(path.abscissa, DEPTH_SHARE * path.abscissa[-1])]
-            config = NavigateConfig(mismatch=0.2, seed=seed, motion_seed=seed, **case)
+            config = NavigateConfig(world="drawn", seed=seed, motion_seed=seed, **case)
             found = navigate(patient, ",".join(f"{x:.2f}" for x in place), config=config)
             records.append(found.record)
         inside = np.concatenate([record.in_bands for record in records])

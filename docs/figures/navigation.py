@@ -31,7 +31,7 @@ def main() -> None:
     patients = ROOT / "runs" / "patients"
     if not (patients / "lca-41-0000").exists():
         subprocess.run([*command, "atlas", "-o", patients, "--vessel", "lca", "--seed", "41"], check=True)
-    navigate = [*command, "navigate", patients / "lca-41-0000", "--target", "12", "--mismatch", "0.2"]
+    navigate = [*command, "navigate", patients / "lca-41-0000", "--target", "12", "--world", "drawn"]
     pair = ("--catheter", "microcatheter-2.4f", "--arrives", "catheter")
     for options, folder, picture, part in (
         ((), "navigation", "navigation.png", "outcome"),

@@ -18,7 +18,7 @@ from endopilot.devices.device import Wire, read_wire
 from endopilot.navigation.loop import NavigationLoop
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import Policy
-from endopilot.simulation.mismatch import ModelMismatch
+from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import Anatomy
 
@@ -46,11 +46,11 @@ def shaped(angle_deg: float, length_mm: float) -> Wire:
     return replace(wire, tip_bend_length_mm=length_mm)
 
 
-def drive(name: str, navigation: Navigation, truth: ModelMismatch) -> tuple[bool, int, float]:
+def drive(name: str, navigation: Navigation, world: World) -> tuple[bool, int, float]:
     """Return safe success, exposures and processor seconds of one navigation."""
-    kinds: dict[str, Policy] = {"oracle": OraclePolicy(truth), "agent": AgentPolicy()}
+    kinds: dict[str, Policy] = {"oracle": OraclePolicy(world), "agent": AgentPolicy()}
     policy, began = kinds.get(name) or make_policy(name), time.process_time()
-    record = NavigationLoop(navigation, policy, seed=1, truth=truth).run()
+    record = NavigationLoop(navigation, policy, seed=1, world=world).run()
     return record.success and record.safe, record.exposures, time.process_time() - began
 
 
@@ -64,14 +64,16 @@ def measure() -> list[str]:
             for anatomy in patients:
                 for target in side_branches(anatomy):
                     friction, stiffness, side = off.choice([-1.0, 1.0], 3)
-                    truth = ModelMismatch(
-                        friction_factor=1 + 0.2 * friction, stiffness_factor=1 + 0.2 * stiffness, ostium_mm=0.3 * side
+                    world = World(
+                        friction_factor=1 + 0.2 * friction,
+                        tip_stiffness_factor=1 + 0.2 * stiffness,
+                        ostium_mm=0.3 * side,
                     )
                     navigation = Navigation(
                         anatomy=anatomy, device=shaped(angle_deg, length_mm), target=target, seconds=SECONDS,
                         force_limit_n=FORCE_N,
                     )  # fmt: skip
-                    runs.append(drive(name, navigation, truth))
+                    runs.append(drive(name, navigation, world))
             good, exposures, seconds = np.array(runs, dtype=float).T
             rows.append(
                 f"| {angle_deg:g}° over {length_mm:g} mm | `{name}` | {int(good.sum())} of {len(good)} | "

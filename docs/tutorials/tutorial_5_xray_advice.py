@@ -47,9 +47,9 @@ print(f"{int(needed.exposure.sum())} exposures are due in {0.5 * len(route.contr
 # - ``retract-rotate`` keeps X-ray on, retracts from a wrong branch, turns by 180° and advances again.
 
 navigation = replace(route.navigation, seconds=40.0)
-mismatch = endopilot.ModelMismatch(friction_factor=1.2, stiffness_factor=0.85, ostium_mm=0.4)
+world = endopilot.World(friction_factor=1.2, tip_stiffness_factor=0.85, ostium_mm=0.4)
 records = {
-    name: endopilot.NavigationLoop(navigation, endopilot.make_policy(name), seed=3, truth=mismatch).run()
+    name: endopilot.NavigationLoop(navigation, endopilot.make_policy(name), seed=3, world=world).run()
     for name in ("open-loop", "agent", "retract-rotate")
 }
 for name, record in records.items():
@@ -94,7 +94,7 @@ exposures = {"agent": [], "retract-rotate": []}
 for patient in endopilot.make_atlas(config=endopilot.AtlasConfig(vessel="rca", seed=0, count=4, population="textbook")):
     navigation = replace(endopilot.plan(patient, "4", config=config).navigation, seconds=40.0)
     for name, counts in exposures.items():
-        record = endopilot.NavigationLoop(navigation, endopilot.make_policy(name), seed=3, truth=mismatch).run()
+        record = endopilot.NavigationLoop(navigation, endopilot.make_policy(name), seed=3, world=world).run()
         counts.append(record.exposures)
         assert record.safe and (record.success or name == "retract-rotate")
 for name, counts in exposures.items():

@@ -88,7 +88,6 @@ from .robot.replay import ReplayConfig as ReplayConfig
 from .robot.replay import replay_log as replay_log
 from .simulation.config import SimulatorConfig as SimulatorConfig
 from .simulation.controls import ControlConfig as ControlConfig
-from .simulation.mismatch import ModelMismatch as ModelMismatch
 from .simulation.motion import Motion as Motion
 from .simulation.simulate import simulate as simulate
 from .simulation.simulator import Simulator as Simulator
@@ -100,6 +99,10 @@ from .simulation.tip_load import simulate_tip_load as simulate_tip_load
 from .simulation.trajectory import SimulationSetUp as SimulationSetUp
 from .simulation.trajectory import Trajectory as Trajectory
 from .simulation.trajectory_file import read_trajectory as read_trajectory
+from .simulation.world import Stenosis as Stenosis
+from .simulation.world import World as World
+from .simulation.world import list_worlds as list_worlds
+from .simulation.world import read_world as read_world
 from .tasks.navigation import Navigation as Navigation
 from .tasks.navigation import Target as Target
 from .tasks.task import Patients as Patients

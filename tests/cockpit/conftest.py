@@ -16,9 +16,9 @@ def navigation(fork, wire):
 
 @pytest.fixture
 def world(navigation):
-    from endopilot.cockpit.world import World
+    from endopilot.cockpit.world import LiveWorld
 
-    return World(navigation)
+    return LiveWorld(navigation)
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from endopilot.cockpit.messages import Autopilot, Drive, Game, Pedal, Target
 from endopilot.cockpit.open import resume_session
 from endopilot.cockpit.recording import Recorder, Where
 from endopilot.cockpit.session import Session
-from endopilot.cockpit.world import World
+from endopilot.cockpit.world import LiveWorld
 from endopilot.errors import InputError
 from endopilot.tasks.task import find_task
 
@@ -42,7 +42,7 @@ class Rival:
 
 @pytest.fixture
 def played(navigation, xray):
-    world = World(replace(navigation, seconds=6.0, force_limit_n=0.3))
+    world = LiveWorld(replace(navigation, seconds=6.0, force_limit_n=0.3))
     with patch.object(game, "Workers", Rival):
         made = GameSession(Attempt(find_task("straight"), 0), world, xray)
         yield made

@@ -19,7 +19,7 @@ from endopilot.cockpit.messages import Autopilot, Drive, Game, Pedal
 from endopilot.cockpit.open import resume_session
 from endopilot.cockpit.recording import read_recording, replayed
 from endopilot.cockpit.session import SILENCE_S, Session
-from endopilot.cockpit.world import World
+from endopilot.cockpit.world import LiveWorld
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
@@ -181,7 +181,7 @@ def test_a_policy_drives_both(session):
 
 def test_a_curved_catheter_is_turned_back_before_a_policy_begins(navigation, xray):
     curved = replace(navigation.catheters[0], shape=((10.0, 0.5),))
-    session = Session(World(replace(navigation, catheters=(curved,))), xray)
+    session = Session(LiveWorld(replace(navigation, catheters=(curved,))), xray)
     run(session, 0.5, message=both(catheter=(0.0, 3.0)))
     start(session, "in-turn")
     drive_alone(session, lambda: session.autopilot.status == "failed")
@@ -193,7 +193,7 @@ def test_a_task_of_wire_and_catheter_is_scored(navigation, xray):
     """The catheter is to arrive: the wire at the target is not enough. The agent's score stands beside."""
     tried = Attempt(task_by_hand("follow"), 0)
     wanted = replace(navigation.target, abscissa=10.0)
-    world = World(replace(navigation, arrives="catheter", target=wanted, seconds=6.0, force_limit_n=0.3))
+    world = LiveWorld(replace(navigation, arrives="catheter", target=wanted, seconds=6.0, force_limit_n=0.3))
     with patch.object(game, "Workers", Rival):
         played = GameSession(tried, world, xray)
         played.handle(Game(type="game", action="start"), 0.0)

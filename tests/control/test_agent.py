@@ -23,8 +23,8 @@ from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.navigation.loop import LoopConfig, NavigationLoop, start_world
 from endopilot.navigation.policy import Decision, Hand, Observation, Policy
-from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import motion_named
+from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.tasks.route import Route
 from endopilot.types import TipProjection
@@ -65,7 +65,7 @@ def test_the_oracle_gets_into_a_side_branch_that_pushing_misses(side_branch) -> 
 
 
 def test_the_oracle_knows_a_catheter_that_leans(side_branch) -> None:
-    truth = ModelMismatch(axis_deg=20.0, axis_side_deg=90.0)
+    truth = World(axis_deg=20.0, axis_side_deg=90.0)
     policy = OraclePolicy(truth, config=QUICK)
     policy.start(side_branch, seed=1)
     nodes = policy.belief.simulator.position[0]
@@ -92,8 +92,8 @@ def test_a_course_is_what_the_simulator_does_under_its_controls(side_branch, kno
 
 
 def test_the_agent_arrives_though_the_wire_is_another_than_believed(side_branch) -> None:
-    truth = ModelMismatch(friction_factor=1.2, stiffness_factor=0.8, ostium_mm=0.3)
-    record = NavigationLoop(side_branch, AgentPolicy(QUICK), seed=2, truth=truth).run()
+    truth = World(friction_factor=1.2, tip_stiffness_factor=0.8, ostium_mm=0.3)
+    record = NavigationLoop(side_branch, AgentPolicy(QUICK), seed=2, world=truth).run()
     assert record.success and record.safe and record.faults == 0
     assert 1 <= record.exposures < (len(record.time_s) - 1) / 2  # it looks seldom
     held, half = record.in_bands, record.half_width
@@ -187,7 +187,7 @@ def test_measurements_weigh_the_member_that_they_are_of(side_branch) -> None:
 def test_simulated_wires_slide_in_a_vessel_that_beats_as_far_as_that_is_known(side_branch) -> None:
     """One is as the real wire, and driven likewise."""
     beat, same = motion_named("heartbeat"), np.array([[1.0, 1.0, 0.0]])
-    true = start_world(side_branch, ModelMismatch(), QUICK.belief.core, motion=beat)
+    true = start_world(side_branch, World(), QUICK.belief.core, motion=beat)
     knows, knows_not = (Belief(replace(side_branch, known_motion=known), same, QUICK.belief) for known in (beat, None))
     errors = []
     for _ in range(8):

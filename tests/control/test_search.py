@@ -18,8 +18,8 @@ from endopilot.ladder.attempt import Recording, attempt, repeat
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Hand, Observation
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.tasks.route import Route
 from endopilot.xray.fluoroscope import TipMeasurement
@@ -139,9 +139,9 @@ def test_a_wire_that_no_simulated_one_explains_is_pulled_back_until_one_does(sid
 
 
 def test_the_oracle_looks_always_and_a_plan_is_followed_without_a_look(side_branch) -> None:
-    truth, config = ModelMismatch(friction_factor=1.2, ostium_mm=0.5), agent_config(side_branch)
+    truth, config = World(friction_factor=1.2, ostium_mm=0.5), agent_config(side_branch)
     record = NavigationLoop(
-        side_branch, OraclePolicy(truth, config), config=LoopConfig(simulator=CORE), truth=truth
+        side_branch, OraclePolicy(truth, config), config=LoopConfig(simulator=CORE), world=truth
     ).run()
     assert record.reason == "reached" and record.safe and record.exposures == len(record.time_s) - 1
     near = replace(side_branch, target=Target(branch=0, abscissa=16.0))

@@ -16,12 +16,15 @@ from endopilot.control.navigate import NavigateConfig, navigate, set_up_navigati
 from endopilot.control.outcome import tell_outcome
 from endopilot.dataset.loader import read_dataset
 from endopilot.devices.catheter import read_catheter
+from endopilot.devices.device import read_wire
+from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.files import read_json
 from endopilot.pipeline import navigation
 from endopilot.report.navigation_figure import navigation_figure
 from endopilot.simulation.motion import motion_named
 from endopilot.simulation.trajectory_file import read_trajectory
+from endopilot.simulation.world import World
 
 SHORT = ("--tip", "own", "--seconds", "20")
 FILES = ["episode", "manifest.json", "navigation.csv", "navigation.html", "navigation.png", "run.json",
@@ -44,13 +47,13 @@ def driven(patient, tmp_path_factory):
     folder = tmp_path_factory.mktemp("driven") / "navigation"
     robot = folder.with_name("robot.yaml")
     robot.write_text("latency_s: 0.1\njitter_s: 0.02\n", encoding="utf-8")
+    world = folder.with_name("world.yaml")
+    world.write_text("friction_factor: 1.2\ntip_stiffness_factor: 0.8\nostium_mm: 0.4\n", encoding="utf-8")
     config = NavigateConfig(
         tip="own",
         seconds=20.0,
         seed=3,
-        true_friction=1.2,
-        true_tip_stiffness=0.8,
-        true_ostium_mm=0.4,
+        world=str(world),
         robot=str(robot),
     )
     return folder, navigation.navigate_into(patient, "2", output=folder, config=config)
@@ -71,8 +74,9 @@ def test_the_folder_tells_what_happened(driven, patient):
     # every exposure but the first was asked for a decision before, with a reason; the last decision's comes too late
     asked = (table["asks_for_xray"].fillna("") != "").to_numpy()
     np.testing.assert_array_equal(asked[1:-2], (table["xray"] == 1).to_numpy()[2:-1])
-    truth = {"friction_factor": 1.2, "stiffness_factor": 0.8, "ostium_mm": 0.4}
-    assert record["truth"] == truth | {"axis_deg": 0.0, "axis_side_deg": 0.0}
+    differs = {"tip_stiffness_factor": 0.8, "friction_factor": 1.2, "ostium_mm": 0.4}
+    assert record["world"] == differs | {"name": str(folder.with_name("world.yaml"))}
+    assert read_trajectory(folder / "trajectory.npz").about["world"] == record["world"]
     assert record["robot"]["latency_s"] == 0.1 and record["robot"]["encoders_at"] == "wire"
     assert record["anatomy"]["identity"] == read_anatomy(patient).identity
     # it starts deeper than the encoder says
@@ -135,12 +139,13 @@ def test_the_trajectory_holds_what_was_decided(driven):
 
 
 def test_a_guiding_catheter_that_leans_is_seen_and_written(patient, capsys, tmp_path):
-    folder, drives = tmp_path / "leans", ("--policy", "forward", "--true-axis-deg", "15", "--seed", "3", *SHORT)
+    folder = tmp_path / "leans"
+    drives = ("--policy", "forward", "--world", "leaning-catheter", "--seed", "3", *SHORT)
     run(capsys, "navigate", patient, "--target", "1", "-o", folder, *drives)
     assert sorted(path.name for path in folder.iterdir()) == ["anatomy", *FILES]
     record, page = read_json(folder / "manifest.json"), (folder / "navigation.html").read_text(encoding="utf-8")
     given, real = (read_anatomy(each).insertion.direction for each in (patient, folder / "anatomy"))
-    seen, unseen_deg = np.array(record["catheter_axis"]), record["truth"]["axis_deg"]
+    seen, unseen_deg = np.array(record["catheter_axis"]), record["world"]["axis_deg"]
     off_deg = np.degrees(np.arccos([given @ real, seen @ real]))
     assert off_deg == pytest.approx([15.0, unseen_deg], abs=1e-3) and 0.0 < unseen_deg < 2.0
     assert f"15° off its given axis; X-ray shows it to {unseen_deg:.1f}°" in page
@@ -153,8 +158,11 @@ def test_a_guiding_catheter_that_leans_is_seen_and_written(patient, capsys, tmp_
 
 def test_a_catheter_follows_its_wire_and_both_are_written(patient, capsys, tmp_path):
     folder = tmp_path / "coaxial"
+    World(friction_factor=1.1).write(tmp_path / "rough.yaml")
     command = ("navigate", patient, "--target", "1", "--policy", "in-turn", "--arrives", "catheter", *SHORT)
-    figures = run(capsys, *command, "--true-friction", "1.1", "--catheter", "microcatheter-1.7f", "-o", folder)
+    figures = run(
+        capsys, *command, "--world", tmp_path / "rough.yaml", "--catheter", "microcatheter-1.7f", "-o", folder
+    )
     assert figures["reached"]
     assert sorted(path.name for path in folder.iterdir()) == FILES
     table = pd.read_csv(folder / "navigation.csv")
@@ -166,7 +174,8 @@ def test_a_catheter_follows_its_wire_and_both_are_written(patient, capsys, tmp_p
     true = read_trajectory(folder / "trajectory.npz").set_up
     assert true.stacks[0].catheters == (replace(given, friction=1.1 * given.friction),)
     np.testing.assert_array_equal(episode.friction, true.friction)
-    assert true.friction[0].tolist() == [1.1 * true.stacks[0].wire.friction, 1.1 * given.friction]
+    wire = read_wire("workhorse-014")
+    assert true.friction[0].tolist() == [1.1 * wire.friction, 1.1 * given.friction]
     assert episode.stack.catheters == (given,) and episode.initial[0, 1].tolist() == [0.0, 0.0]
     again = run(capsys, "simulate", patient, "--controls", folder / "trajectory.npz", "-o", tmp_path / "again.csv")
     assert again["valid_worlds"] == 1
@@ -252,7 +261,7 @@ def test_the_episode_of_a_moving_patient_names_the_motion(patient, capsys, tmp_p
 def test_a_finished_folder_is_left_alone_and_another_run_is_refused(driven, patient, capsys):
     folder, figures = driven
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
-    same = ("--seed", "3", "--true-friction", "1.2", "--true-tip-stiffness", "0.8", "--true-ostium-mm", "0.4")
+    same = ("--seed", "3", "--world", folder.with_name("world.yaml"))
     same += ("--robot", folder.with_name("robot.yaml"))
     assert run(capsys, "navigate", patient, "--target", "2", "-o", folder, *SHORT, *same) == figures
     line = refused(capsys, "navigate", patient, "--target", "3", "-o", folder, *SHORT, *same)
@@ -283,8 +292,7 @@ def test_an_interrupted_navigation_is_finished_by_the_same_command(patient, caps
         (("--target", ""), "is empty"),
         (("--target", "1", "--policy", "none"), "policy: 'none'"),
         (("--target", "1", "--device", "none"), "device 'none'"),
-        (("--target", "1", "--true-friction", "0"), "true_friction: 0"),
-        (("--target", "1", "--mismatch", "1.5"), "mismatch: 1.5"),
+        (("--target", "1", "--world", "none"), "world 'none'"),
         (("--target", "1", "--tip", "10000/1"), "cannot be given to workhorse-014"),
     ],
 )
@@ -322,19 +330,18 @@ def test_what_does_not_arrive_says_why(vessel, fork, capsys, tmp_path):
     assert "off the route, which it left at the fork at 20.0 mm" in missed and "give more" not in missed
 
 
-def test_mismatch_is_drawn_with_the_seed(patient):
-    def set_up(**changed):
-        return set_up_navigation(patient, "1", config=NavigateConfig(tip="own", mismatch=0.2, **changed))
+def test_a_world_is_drawn_with_the_seed(patient, tmp_path):
+    (tmp_path / "given.yaml").write_text("share: 0.2\nfriction_factor: 1.1\n", encoding="utf-8")
 
-    def truth(**changed):
-        return set_up(**changed).truth
+    def truth(seed, world="drawn"):
+        return set_up_navigation(patient, "1", config=NavigateConfig(tip="own", world=world, seed=seed)).world
 
     drawn = [truth(seed=seed) for seed in range(6)]
-    assert {round(set_up(seed=seed).robot.latency_s, 9) for seed in range(6)} == {0.04, 0.06}
+    assert {round(each.real_robot(RobotConfig()).latency_s, 9) for each in drawn} == {0.04, 0.06}
     assert drawn[0] == truth(seed=0) and len({str(each) for each in drawn}) > 2
     diameter = 2 * float(read_anatomy(patient).tree.branches[0].centerline.radius[0])
     for each in drawn:
         assert round(abs(each.friction_factor - 1), 9) == 0.2
         assert abs(each.ostium_mm) == pytest.approx(0.2 * diameter)
-    assert truth(seed=0, true_friction=1.1).friction_factor == 1.1
-    assert truth(seed=0, true_friction=1.1).ostium_mm == drawn[0].ostium_mm
+    given = truth(seed=0, world=str(tmp_path / "given.yaml"))
+    assert given.friction_factor == 1.1 and given.ostium_mm == drawn[0].ostium_mm

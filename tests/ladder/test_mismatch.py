@@ -7,11 +7,11 @@ import json
 import pytest
 
 from endopilot import runs
-from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
 from endopilot.ladder import mismatch as mismatches
 from endopilot.ladder.ladder import LadderConfig
-from endopilot.ladder.mismatch import CASES, measure_mismatch, mismatch_of, title_of
+from endopilot.ladder.mismatch import CASES, measure_mismatch, title_of, world_of
+from endopilot.simulation.world import World
 from endopilot.tasks.task import find_task
 
 ONE = LadderConfig(policy="forward", tasks=("straight",), patients=1)
@@ -32,21 +32,19 @@ def test_one_quantity_differs_at_a_time_then_all():
     assert len(CASES) == 10
 
     def reality(case, share=0.2, place=0):
-        mismatch, robot = mismatch_of(case, share, navigation, task, place, RobotConfig(latency_s=0.1))
-        return vars(mismatch) | {"latency_s": robot.latency_s}
+        return vars(world_of(case, share, navigation, task, place))
 
     matched = reality("matched")
-    factors = {"friction_factor": 1.0, "stiffness_factor": 1.0, "latency_s": 0.1}
-    assert matched == factors | {"ostium_mm": 0.0, "axis_deg": 0.0, "axis_side_deg": 0.0}
+    assert matched == vars(World())
     for case in CASES[1:-1]:
         now = reality(case)
         assert sum(now[name] != matched[name] for name in matched) == 1
     wide = 2 * navigation.anatomy.tree.branches[0].centerline.radius[0]
     assert reality("ostium-less")["ostium_mm"] == pytest.approx(-0.2 * wide)
-    assert reality("stiffness-more")["stiffness_factor"] == 1.2
+    assert reality("stiffness-more")["tip_stiffness_factor"] == 1.2
     every = [reality("all", 0.1, place) for place in range(6)]
     assert {round(abs(one["friction_factor"] - 1), 9) for one in every} == {0.1}
-    assert {round(one["latency_s"], 9) for one in every} == {0.09, 0.11}
+    assert {round(one["latency_factor"], 9) for one in every} == {0.9, 1.1}
 
 
 def test_a_row_a_case_and_a_deeper_wire_arrives_sooner(measured):

@@ -13,8 +13,8 @@ from endopilot.errors import InputError
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Decision, Hand, Observation, Policy
 from endopilot.robot.robot import CYCLE_S
-from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import Motion, motion_named
+from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.xray.fluoroscope import FluoroscopeConfig
 
@@ -76,9 +76,7 @@ def test_it_ends_in_time_and_the_same_seed_repeats_it(straight) -> None:
 
 def test_encoders_count_from_where_the_ostium_is_believed_to_be(straight) -> None:
     policy = Forward(4.0)
-    record = NavigationLoop(
-        straight, policy, config=LoopConfig(robot=PERFECT), truth=ModelMismatch(ostium_mm=1.5)
-    ).run()
+    record = NavigationLoop(straight, policy, config=LoopConfig(robot=PERFECT), world=World(ostium_mm=1.5)).run()
     encoder = np.array([observation.devices[0][0] for observation in policy.given])
     np.testing.assert_allclose(record.inserted_length[:-1, 0] - encoder, 1.5, atol=1e-9)
     np.testing.assert_allclose(np.diff(record.inserted_length[:, 0]), 2.0, atol=1e-6)
@@ -87,28 +85,30 @@ def test_encoders_count_from_where_the_ostium_is_believed_to_be(straight) -> Non
 def test_friction_and_stiffness_of_the_truth_change_what_happens(straight) -> None:
     config = LoopConfig(robot=PERFECT)
     plain = NavigationLoop(straight, Forward(3.0, rotation=2.0), config=config).run()
-    for truth in (ModelMismatch(friction_factor=2.0), ModelMismatch(stiffness_factor=0.5)):
-        changed = NavigationLoop(straight, Forward(3.0, rotation=2.0), config=config, truth=truth).run()
+    for truth in (World(friction_factor=2.0), World(tip_stiffness_factor=0.5)):
+        changed = NavigationLoop(straight, Forward(3.0, rotation=2.0), config=config, world=truth).run()
         both = min(len(plain.time_s), len(changed.time_s))
         assert np.abs(changed.tip_position[:both] - plain.tip_position[:both]).max() > 1e-3
 
 
 def test_a_catheter_that_leans_in_reality_leads_the_wire_elsewhere(straight) -> None:
-    truth = ModelMismatch(axis_deg=20.0, axis_side_deg=90.0)
+    truth = World(axis_deg=20.0, axis_side_deg=90.0)
     given, real = straight.anatomy.insertion, truth.anatomy(straight.anatomy).insertion
     assert np.degrees(np.arccos(given.direction @ real.direction)) == pytest.approx(20.0, abs=1e-6)
     assert np.linalg.norm(real.direction) == pytest.approx(1.0) and (real.position == given.position).all()
-    other = ModelMismatch(axis_deg=20.0, axis_side_deg=270.0).anatomy(straight.anatomy).insertion
+    other = World(axis_deg=20.0, axis_side_deg=270.0).anatomy(straight.anatomy).insertion
     middle = real.direction + other.direction  # opposite sides: the given axis lies between them
     assert middle / np.linalg.norm(middle) == pytest.approx(given.direction, abs=1e-6)
-    world = NavigationLoop(straight, Forward(6.0), truth=truth).simulator
+    world = NavigationLoop(straight, Forward(6.0), world=truth).simulator
     along = world.position[0, -1] - world.position[0, -2]  # the base lies in the catheter
     assert abs(along @ real.direction) == pytest.approx(np.linalg.norm(along), rel=1e-6)
 
 
 @pytest.mark.parametrize("xray", ["assumed", "images"])
-def test_xray_shows_how_the_guiding_catheter_leans_before_the_wire_is_shaped(fork, xray) -> None:
-    config = NavigateConfig(tip="own", true_axis_deg=20.0, xray=xray)
+def test_xray_shows_how_the_guiding_catheter_leans_before_the_wire_is_shaped(fork, xray, tmp_path) -> None:
+    path = tmp_path / "leaning.yaml"
+    World(axis_deg=20.0).write(path)
+    config = NavigateConfig(tip="own", world=str(path), xray=xray)
     set_up = set_up_navigation(fork, "0,0,33", policy="forward", config=config)
     seen, real = set_up.navigation.anatomy.insertion.direction, set_up.true_anatomy.insertion.direction
     off_deg = [float(np.degrees(np.arccos(axis @ real))) for axis in (fork.insertion.direction, seen)]

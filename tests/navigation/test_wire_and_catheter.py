@@ -17,7 +17,7 @@ from endopilot.navigation.loop import LoopConfig, NavigationLoop, start_world
 from endopilot.navigation.policy import Decision, Hand, Observation
 from endopilot.robot.robot import SimulatedRobot
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.mismatch import ModelMismatch
+from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation, Target
 
 COARSE = LoopConfig(simulator=SimulatorConfig(element_mm=1.5, time_step_s=0.05, threads=1))
@@ -42,7 +42,7 @@ def over_the_wire(fork, wire, catheter) -> Navigation:
 
 
 def test_wire_and_catheter_are_driven_by_drives_of_their_own(over_the_wire) -> None:
-    simulator = start_world(over_the_wire, ModelMismatch(), COARSE.simulator)
+    simulator = start_world(over_the_wire, World(), COARSE.simulator)
     limits = [DriveLimits.of(device, over_the_wire.anatomy) for device in over_the_wire.devices]
     drive = DriveConfig(encoder_sd_mm=0.0, encoder_sd_rad=0.0, play_mm=0.0, play_rad=0.0)
     noiseless = RobotConfig(wire=drive, catheters=(drive,))

@@ -20,9 +20,9 @@ from endopilot.navigation.loop import start_world
 from endopilot.robot.remote import RemoteRobot
 from endopilot.robot.robot import CYCLE_S, Robot, SimulatedRobot
 from endopilot.simulation.config import SimulatorConfig, wall_stiffness
-from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.robots import in_grip
 from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation, Target
 
 LIMITS = DriveLimits(max_velocity_mm_s=40.0, max_rotation_rad_s=12.0, travel_mm=(0.0, 100.0))
@@ -137,7 +137,7 @@ def test_a_wire_slips_in_the_grip_at_its_force_and_only_an_encoder_on_the_wire_s
     read = {}
     for at in ("motor", "wire"):
         config = replace(IDEAL, encoders_at=at, wire=replace(IDEAL.wire, grip_n=0.1))
-        simulator = start_world(navigation, ModelMismatch(), SimulatorConfig(element_mm=1.5, threads=1), robot=config)
+        simulator = start_world(navigation, World(), SimulatorConfig(element_mm=1.5, threads=1), robot=config)
         limits = [DriveLimits.of(navigation.device, navigation.anatomy)]
         robot = SimulatedRobot(simulator, limits, config)
         robot.command(((10.0, 0.0),))
@@ -209,7 +209,7 @@ def test_an_encoder_on_the_wire_reads_its_proximal_end_and_not_its_rotation_at_t
     navigation = Navigation(anatomy=fork, device=wire, target=Target(branch=1, abscissa=30.0))
     behind = Transmission(length_mm=1000.0, twist_friction_n_mm_mm=3e-4)
     config = replace(IDEAL, wire=replace(IDEAL.wire, transmission=behind))
-    simulator = start_world(navigation, ModelMismatch(), SimulatorConfig(element_mm=1.5, threads=1), robot=config)
+    simulator = start_world(navigation, World(), SimulatorConfig(element_mm=1.5, threads=1), robot=config)
     robot = SimulatedRobot(simulator, [DriveLimits.of(wire, fork)], config)
     robot.command(((0.0, 2.0),))
     robot.run(3.0)

@@ -196,8 +196,8 @@ class Belief(Ensemble):
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
         """Return the end of a member's wire, turned by some angles, rad, and its direction there; LPS mm."""
         if fan is None:
-            source = self.simulator
-            return tuple(np.tile(of[best], (len(turn), 1)) for of in (self._end(source), source.tip_direction[:, 0]))
+            end, direction = self._end(self.simulator)[best], self.simulator.tip_direction[best, 0]
+            return np.tile(end, (len(turn), 1)), np.tile(direction, (len(turn), 1))
         ends, directions = self._end(fan), fan.tip_direction[:, 0]
         place = (turn % (2 * np.pi)) * _SIDES / (2 * np.pi)
         low = place.astype(int) % _SIDES

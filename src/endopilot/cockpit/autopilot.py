@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from endopilot.cockpit.frames import encode
-from endopilot.cockpit.world import Snapshot, World
+from endopilot.cockpit.world import LiveWorld, Snapshot
 from endopilot.devices.stack import Proximals, shown_part
 from endopilot.errors import InputError
 from endopilot.navigation.policies import make_policy
@@ -38,7 +38,7 @@ class Autopilot:
         failure: what went wrong or why the policy gave up, in a line.
     """
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: LiveWorld) -> None:
         """Take the world; nobody drives yet."""
         self.status, self.policy_name, self.asks, self.failure = "off", "", "", ""
         self._world, self._pool = world, ThreadPoolExecutor(1)

@@ -32,7 +32,7 @@ def write_session_episode(session: str | Path, *, output: str | Path) -> None:
     if samples == 0:
         raise InputError(f"{session}: lasts less than {DECISION_PERIOD_S:g} s; drive for longer")
     targets = [event["target"] for event in recording.events if "target" in event]
-    navigation, truth = recording.navigation, recording.truth
+    navigation, reality = recording.navigation, recording.reality
     *_, (world, _events) = replayed(recording)
     cycles = world.loop.robot.recorder.trajectory().samples(slice(samples * per_sample))
     folder = recording.where.patient
@@ -46,7 +46,7 @@ def write_session_episode(session: str | Path, *, output: str | Path) -> None:
         output,
         navigation.stack,
         task="navigation by hand",
-        tip_stiffness_factor=truth.stiffness_factor,
+        tip_stiffness_factor=reality.tip_stiffness_factor,
         seed=recording.seed,
         origin={"session": session.name, "target_branch": int(target[0]), "target_mm": float(target[1])},
     )

@@ -17,7 +17,7 @@ from endopilot.cockpit.fluoroscopy import XrayUnit
 from endopilot.cockpit.frames import encode
 from endopilot.cockpit.recording import Recorder
 from endopilot.cockpit.session import Session
-from endopilot.cockpit.world import BY_HAND, Snapshot, World
+from endopilot.cockpit.world import BY_HAND, LiveWorld, Snapshot
 from endopilot.errors import InputError
 from endopilot.ladder.attempt import attempt, navigation_seed, scored
 from endopilot.parallel import Workers
@@ -45,10 +45,10 @@ class Attempt:
         """Of the navigation, the same for policies."""
         return navigation_seed(self.task, self.place)
 
-    def world(self) -> World:
+    def world(self) -> LiveWorld:
         """Return the world at the task's start, with the ladder's rod core."""
         config = replace(BY_HAND, simulator=replace(CORE, threads=1))
-        return World(self.task.ladder_navigation(self.place), config, seed=self.seed)
+        return LiveWorld(self.task.ladder_navigation(self.place), config, seed=self.seed)
 
     def session(self, *parts: Any) -> GameSession:
         """Return the session that plays and scores it, of the parts that every session takes."""
@@ -66,7 +66,7 @@ class GameSession(Session):
     def __init__(
         self,
         tried: Attempt,
-        world: World,
+        world: LiveWorld,
         xray: XrayUnit,
         recorder: Recorder | None = None,
         policies: tuple[str, ...] = (),
@@ -137,7 +137,7 @@ class GameSession(Session):
         if self._pool is not None:
             self._pool.stop()
 
-    def restore(self, history: Iterable[tuple[World, Sequence[dict[str, Any]]]]) -> None:
+    def restore(self, history: Iterable[tuple[LiveWorld, Sequence[dict[str, Any]]]]) -> None:
         """Live through what was played again, and wait for the page to start the clock."""
         super().restore(history)
         if self.phase == "on":

@@ -17,7 +17,7 @@ from endopilot.cockpit.frames import scene
 from endopilot.cockpit.loop import Stage
 from endopilot.cockpit.recording import SUFFIX, Recorder, Where, read_recording, replayed
 from endopilot.cockpit.session import Session
-from endopilot.cockpit.world import World
+from endopilot.cockpit.world import LiveWorld
 from endopilot.devices.stack import Stack
 from endopilot.navigation.policies import POLICIES
 from endopilot.tasks.navigation import Navigation, Target
@@ -71,7 +71,7 @@ def open_session(
     """
     patient = patient or _synthetic(output)
     navigation = _start_of(read_anatomy(patient), Stack.of(device, *catheters))
-    return _driven(World(navigation), Where(patient=patient), output, ct)
+    return _driven(LiveWorld(navigation), Where(patient=patient), output, ct)
 
 
 def open_task(name: str, place: int = 0, *, output: Path = Path("runs/cockpit")) -> Opened:
@@ -148,7 +148,7 @@ def _attempt(task: str, place: int) -> Attempt:
 
 
 def _driven(
-    world: World,
+    world: LiveWorld,
     where: Where,
     output: Path,
     ct: Path | None,

@@ -18,7 +18,7 @@ import numpy as np
 
 from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy
-from endopilot.cockpit.world import World
+from endopilot.cockpit.world import LiveWorld
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire
 from endopilot.devices.stack import Proximals
@@ -26,10 +26,10 @@ from endopilot.errors import InputError
 from endopilot.files import json_text, reading
 from endopilot.navigation.loop import LoopConfig
 from endopilot.settings import from_record
-from endopilot.simulation.mismatch import ModelMismatch
+from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation, Target
 
-FORMAT = "endopilot cockpit 2"
+FORMAT = "endopilot cockpit 3"
 SUFFIX = ".cockpit.jsonl"
 CHECK_S = 0.25
 """Time from one check to the next, s."""
@@ -53,7 +53,7 @@ class Where:
 class Recorder:
     """Writes a session while it goes on."""
 
-    def __init__(self, path: Path, world: World, where: Where, seed: int) -> None:
+    def __init__(self, path: Path, world: LiveWorld, where: Where, seed: int) -> None:
         """Begin a new file, or go on with one that was resumed.
 
         Raises:
@@ -97,7 +97,7 @@ class Recording:
         path: of the file.
         navigation: vessel, wire, target and start.
         config: robot, rod core and length of a cycle.
-        truth: how reality differed from the navigation.
+        reality: what reality was.
         seed: of the encoders' noise.
         where: it took place.
         events: one each, in their order.
@@ -107,7 +107,7 @@ class Recording:
     path: Path
     navigation: Navigation
     config: LoopConfig
-    truth: ModelMismatch
+    reality: World
     seed: int
     where: Where
     events: tuple[dict[str, Any], ...]
@@ -139,13 +139,13 @@ def read_recording(path: Path) -> Recording:
         np.random.default_rng(int(header["seed"]))  # which must not be negative
         for event in events:
             _check(event)
-        config, truth = from_record(LoopConfig, header["config"]), from_record(ModelMismatch, header["truth"])
+        config, reality = from_record(LoopConfig, header["config"]), from_record(World, header["world"])
         at = np.array([0, *(int(event["at"]) for event in events)])
         between = _between_checks(config)
         if (apart := np.diff(np.sort(at)).max(initial=0)) > between:
             raise InputError(f"{apart} cycles without a check, which is due after {between}")
         cycles = int(at.max())
-        return Recording(path, navigation, config, truth, int(header["seed"]), where, events, cycles)
+        return Recording(path, navigation, config, reality, int(header["seed"]), where, events, cycles)
 
 
 def _between_checks(config: LoopConfig) -> int:
@@ -153,13 +153,13 @@ def _between_checks(config: LoopConfig) -> int:
     return max(1, round(CHECK_S / config.cycle_s))
 
 
-def replayed(recording: Recording) -> Iterator[tuple[World, list[dict[str, Any]]]]:
+def replayed(recording: Recording) -> Iterator[tuple[LiveWorld, list[dict[str, Any]]]]:
     """Drive a session again and yield the world before the first cycle and after each, with the events of that cycle.
 
     Raises:
         InputError: the wire is not where it was: another version of endopilot, or another processor.
     """
-    world = World(recording.navigation, recording.config, seed=recording.seed, truth=recording.truth)
+    world = LiveWorld(recording.navigation, recording.config, seed=recording.seed, reality=recording.reality)
     at: dict[int, list[dict[str, Any]]] = {}
     for event in recording.events:
         at.setdefault(int(event["at"]), []).append(event)
@@ -198,7 +198,7 @@ def _check(event: dict[str, Any]) -> None:
         float(event["exposure"] + event["seconds"] + event["kerma_ugy"])
 
 
-def _header(world: World, where: Where, seed: int) -> dict[str, Any]:
+def _header(world: LiveWorld, where: Where, seed: int) -> dict[str, Any]:
     navigation = world.navigation
     values = {
         "format": FORMAT,
@@ -213,7 +213,7 @@ def _header(world: World, where: Where, seed: int) -> dict[str, Any]:
         "seconds": navigation.seconds,
         "force_limit_n": navigation.force_limit_n,
         "config": asdict(world.config),
-        "truth": asdict(world.truth),
+        "world": asdict(world.reality),
         "seed": seed,
     }
     if navigation.catheters:

@@ -16,7 +16,7 @@ from endopilot.cockpit.autopilot import Autopilot, check_policy
 from endopilot.cockpit.fluoroscopy import XrayUnit
 from endopilot.cockpit.frames import device_arrays, encode, motion_values, target_values, tip_values
 from endopilot.cockpit.recording import Recorder
-from endopilot.cockpit.world import Snapshot, World
+from endopilot.cockpit.world import LiveWorld, Snapshot
 from endopilot.devices.stack import Proximals
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import Target
@@ -41,7 +41,7 @@ class Session:
     """
 
     def __init__(
-        self, world: World, xray: XrayUnit, recorder: Recorder | None = None, policies: tuple[str, ...] = ()
+        self, world: LiveWorld, xray: XrayUnit, recorder: Recorder | None = None, policies: tuple[str, ...] = ()
     ) -> None:
         """Take the parts.
 
@@ -97,7 +97,7 @@ class Session:
         else:
             raise InputError(f"{message.type}: not here")
 
-    def restore(self, history: Iterable[tuple[World, Sequence[dict[str, Any]]]]) -> None:
+    def restore(self, history: Iterable[tuple[LiveWorld, Sequence[dict[str, Any]]]]) -> None:
         """Live through a recorded session again: take over what it says of target and exposures, and stop.
 
         Args:

@@ -17,9 +17,9 @@ from endopilot.errors import InputError
 from endopilot.lines import length_along
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Hand, Observation
-from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
+from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation
 from endopilot.types import TipProjection
 
@@ -90,7 +90,7 @@ class Snapshot:
         return max([self.inserted_length_mm, *(catheter.inserted_length_mm for catheter in self.catheters)])
 
 
-class World:
+class LiveWorld:
     """A navigation loop that a hand drives in short cycles, and what pages show of it.
 
     It goes on after the loop's end. The same commands in the same cycles give the same bits.
@@ -99,7 +99,7 @@ class World:
         loop: wire, catheters, robot and C-arm; the hand drives it until it is handed over.
         hand: what the hand holds.
         config: robot, rod core and length of a cycle.
-        truth: how reality differs from the navigation.
+        reality: what reality is.
         cycle: how many cycles have passed.
         force_n: largest wall force on one node in the last cycle, N.
         peak_force_n: the same so far, N.
@@ -111,7 +111,7 @@ class World:
         config: LoopConfig = BY_HAND,
         *,
         seed: int = 0,
-        truth: ModelMismatch | None = None,
+        reality: World | None = None,
     ) -> None:
         """Bring wire and catheters to the navigation's start.
 
@@ -119,13 +119,14 @@ class World:
             navigation: vessel, wire, catheters and start.
             config: robot, rod core and length of a cycle.
             seed: of the encoders' noise and of errors of detection.
-            truth: how reality differs; not at all if not given.
+            reality: what reality is; as the navigation says if not given.
 
         Raises:
             InputError: a device does not fit the vessel, or starts deeper than it is long.
         """
-        self.hand, self.config, self.truth = Hand(), config, truth or ModelMismatch()
-        self.loop = NavigationLoop(navigation, self.hand, config=config, seed=seed, truth=truth)
+        self.hand, self.config = Hand(), config
+        self.loop = NavigationLoop(navigation, self.hand, config=config, seed=seed, world=reality)
+        self.reality = self.loop.world
         self.loop.hand_over(self.hand)
         self.cycle, self.peak_force_n, self.force_n = 0, 0.0, 0.0
         self._taken_s = config.cycle_s / 10

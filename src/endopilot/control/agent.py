@@ -29,7 +29,7 @@ from endopilot.models.ensemble import NOMINAL
 from endopilot.navigation.policy import BelievedTip, Decision, Observation
 from endopilot.progress import Advance
 from endopilot.settings import NonNegative, Positive, Within, settings
-from endopilot.simulation.mismatch import ModelMismatch
+from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, XrayKind
 from endopilot.tasks.route import Route, check_passable
 from endopilot.xray.fluoroscope import TipMeasurement
@@ -279,24 +279,25 @@ class _PlanningPolicy:
 class OraclePolicy(_PlanningPolicy):
     """Plans in the rod core with the true parameters, X-ray always on: the upper bound of what a model can do."""
 
-    def __init__(self, truth: ModelMismatch | None = None, config: AgentConfig | None = None) -> None:
+    def __init__(self, world: World | None = None, config: AgentConfig | None = None) -> None:
         """Take the true parameters.
 
         Args:
-            truth: how reality differs from the navigation; not at all if not given.
+            world: what reality is, of which wire, catheters, vessel and ostium are simulated; as the navigation says
+                if not given.
             config: search and belief; if not given, those for the navigation's devices.
         """
         super().__init__(config)
-        self._truth = truth or ModelMismatch()
+        self._world = world or World()
 
     def start(self, navigation: Navigation, seed: int) -> None:
         """Lay out the simulated devices as they truly are, in the vessel as it truly is, its catheter among it."""
-        anatomy, catheters = self._truth.anatomy(navigation.anatomy), self._truth.catheters(navigation.catheters)
-        super().start(replace(navigation, anatomy=anatomy, catheters=catheters), seed)
+        world = self._world
+        stack, anatomy = world.stack(navigation.stack), world.anatomy(navigation.anatomy)
+        super().start(replace(navigation, anatomy=anatomy, device=stack.wire, catheters=stack.catheters), seed)
 
     def _parameters(self) -> Float[np.ndarray, "members 3"]:
-        truth = self._truth
-        return np.array([[truth.friction_factor, truth.stiffness_factor, truth.ostium_mm]])
+        return np.array([[1.0, 1.0, self._world.ostium_mm]])
 
     def wants_xray(self) -> bool:
         """X-ray is always on."""

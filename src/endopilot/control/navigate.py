@@ -27,11 +27,11 @@ from endopilot.navigation.policies import POLICIES, make_policy
 from endopilot.navigation.policy import Believer, Led, Observation, Policy
 from endopilot.navigation.record import NavigationRecord
 from endopilot.progress import progress
-from endopilot.settings import Finite, Positive, Seconds, Seed, ShareBelowOne, Text, Within, settings
+from endopilot.settings import Finite, Positive, Seconds, Seed, Text, Within, settings
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.mismatch import ModelMismatch, drawn_sides, mismatch_by
-from endopilot.simulation.motion import Motion, MotionName, motion_named
+from endopilot.simulation.motion import Motion, MotionName, motion_named, published_mean
 from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.world import NOMINAL, World, read_world
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Arrives, Navigation
 from endopilot.tasks.route import Route, check_passable
 from endopilot.tasks.targets import find_target
@@ -39,7 +39,6 @@ from endopilot.types import Anatomy
 from endopilot.xray.fluoroscope import Fluoroscope
 
 MotionKnown = Literal["nothing", "published", "measured", "exact"]
-_Factor = Annotated[float, Within(0.2, 5)]
 
 
 @settings
@@ -51,6 +50,9 @@ class NavigateConfig:
     robot: Text = ASSUMED
     """Name of the robot that drives them, such as assumed, ideal or kweon-2021-2d (docs/robot.md), or a YAML file.
     Policies are given it, not what the seed draws of it."""
+    world: Text = NOMINAL
+    """Name of the world that reality is, such as nominal, drawn or wide-lumen (docs/worlds.md), or a YAML file. The
+    policy is not told."""
     tip: Text = "auto"
     """Shape of the wire's tip: auto (chosen for the forks of the route), own (the device's), or angle and length such
     as 75/5, 75 degrees over 5 mm."""
@@ -76,19 +78,7 @@ class NavigateConfig:
     contrast has measured (where exposures are images), or exactly the patient's own. The C-arm takes it off what it
     measures, and agents simulate it."""
     seed: Seed = 0
-    """Seed of encoder noise, detection errors, the policy, and of the sides that `mismatch` draws."""
-    mismatch: ShareBelowOne = 0.0
-    """Friction, tip stiffness, the robot's latency and the ostium differ by this share, each up or down as drawn with
-    the seed; the ostium by this share of the lumen's diameter there. What is given below is not drawn."""
-    true_friction: _Factor | None = None
-    """Factor on the friction coefficient in reality."""
-    true_tip_stiffness: _Factor | None = None
-    """Factor on the stiffness of the wire's distal 10 mm in reality."""
-    true_ostium_mm: Finite | None = None
-    """The wire is this much deeper in reality than the encoder says, mm: the ostium lies elsewhere."""
-    true_axis_deg: Annotated[float, Within(0, 45)] = 0.0
-    """In reality the guiding catheter leans off its given axis by this angle, degrees, to a side drawn by the seed. An
-    exposure shows its axis before the wire is shaped; in X-ray images it lies as given, and is not looked for."""
+    """Seed of encoder noise, detection errors, the policy, and of what the world draws."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,8 +93,8 @@ class SetUp:
             as it was turned.
         navigation: as the policy is given it.
         choice: of the tip's shape and the catheter's axis.
-        truth: how reality differs from the navigation.
-        robot: what drives, as it truly is.
+        world: what reality is, from where the navigation's catheter lies.
+        robot: what drives, as it is given; `World.real_robot` is the true one.
         snapped_mm: distance from a target that was given as a point to the centerline, mm; None for a section.
         policy: what decides.
         policy_name: its name, or that of its class.
@@ -118,7 +108,7 @@ class SetUp:
     anatomy: Anatomy
     navigation: Navigation
     choice: TipChoice
-    truth: ModelMismatch
+    world: World
     robot: RobotConfig
     snapped_mm: float | None
     policy: Policy
@@ -129,12 +119,12 @@ class SetUp:
     @property
     def true_anatomy(self) -> Anatomy:
         """The vessel with its guiding catheter as it truly lies."""
-        return self.truth.anatomy(self.navigation.anatomy)
+        return self.world.anatomy(self.navigation.anatomy)
 
     @property
     def motion(self) -> Motion | None:
         """How the vessel moves; None if it lies still."""
-        return motion_named(self.config.motion, self.config.motion_seed)
+        return self.world.motion or motion_named(self.config.motion, self.config.motion_seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,12 +192,11 @@ def set_up_navigation(
         raise InputError("motion_known: measured; only X-ray images measure it: give xray: images, or published")
     vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
     stack, goal = Stack.of(device), find_target(vessel.tree, target)
-    truth, robot = _truth(config, vessel)
-    seen, truth = _see_catheter(vessel, stack.wire, truth, config)
+    seen, world = _see_catheter(vessel, stack.wire, read_world(config.world).drawn(vessel, config.seed), config)
     name = policy if isinstance(policy, str) else type(policy).__qualname__
     origin = POLICIES.origin(policy) if isinstance(policy, str) else type(policy).__module__
     if isinstance(policy, str):
-        policy = OraclePolicy(truth) if policy == "oracle" else make_policy(policy)
+        policy = OraclePolicy(world) if policy == "oracle" else make_policy(policy)
     given = Navigation(
         anatomy=seen,
         device=stack.wire,
@@ -218,7 +207,7 @@ def set_up_navigation(
         start_rotation_rad=config.start_rotation_rad,
         seconds=config.seconds,
         force_limit_n=config.force_limit_n,
-        known_motion=_known_motion(config),
+        known_motion=_known_motion(config, world),
     )
     check_passable(Route.to(seen, goal), given.devices[given.arriving])
     choice = choose_tip(given, tip=config.tip, catheter_tilt_deg=config.catheter_tilt_deg)
@@ -230,8 +219,8 @@ def set_up_navigation(
         anatomy=vessel,
         navigation=choice.navigation,
         choice=choice,
-        truth=truth,
-        robot=robot,
+        world=world,
+        robot=read_robot(config.robot),
         snapped_mm=float(np.linalg.norm(place - np.array(parts, dtype=float))) if len(parts) == 3 else None,
         policy=policy,
         policy_name=name,
@@ -250,7 +239,7 @@ def drive(set_up: SetUp) -> PatientNavigation:
         motion=set_up.motion,
         measure_motion=set_up.config.motion_known == "measured",
     )
-    loop = NavigationLoop(navigation, policy, config=config, seed=set_up.config.seed, truth=set_up.truth)
+    loop = NavigationLoop(navigation, policy, config=config, seed=set_up.config.seed, world=set_up.world)
     wires: list[Float[np.ndarray, "wires nodes 3"]] = []
     with progress(f"Navigating, {set_up.policy_name}", total=navigation.seconds) as advance:
         while loop.reason is None:
@@ -279,39 +268,24 @@ def drive(set_up: SetUp) -> PatientNavigation:
     )
 
 
-def _known_motion(config: NavigateConfig) -> Motion | None:
+def _known_motion(config: NavigateConfig, world: World) -> Motion | None:
     """Return what is known of how the vessel moves before it is measured."""
     if config.motion_known == "nothing":
         return None
+    if world.motion is not None:
+        return world.motion if config.motion_known == "exact" else published_mean(world.motion)
     return motion_named(config.motion, config.motion_seed if config.motion_known == "exact" else None)
 
 
-def _truth(config: NavigateConfig, vessel: Anatomy) -> tuple[ModelMismatch, RobotConfig]:
-    """Return how reality differs, and the robot as it truly is."""
-    random = np.random.default_rng([config.seed, 3])
-    change = drawn_sides(config.mismatch, random)
-    drawn, robot = mismatch_by(change, vessel), read_robot(config.robot).delayed(1 + change["latency"])
-    side_deg = float(random.uniform(0.0, 360.0)) if config.true_axis_deg else 0.0
-    given = {
-        "friction_factor": config.true_friction,
-        "stiffness_factor": config.true_tip_stiffness,
-        "ostium_mm": config.true_ostium_mm,
-    }
-    given_too = {name: value for name, value in given.items() if value is not None}
-    return replace(drawn, axis_deg=config.true_axis_deg, axis_side_deg=side_deg, **given_too), robot
-
-
-def _see_catheter(
-    vessel: Anatomy, device: Wire, truth: ModelMismatch, config: NavigateConfig
-) -> tuple[Anatomy, ModelMismatch]:
-    """Return the vessel with its guiding catheter as an exposure shows it, and how reality differs from that.
+def _see_catheter(vessel: Anatomy, device: Wire, world: World, config: NavigateConfig) -> tuple[Anatomy, World]:
+    """Return the vessel with its guiding catheter as an exposure shows it, and the world from there.
 
     A catheter that lies as it is given, and one that X-ray does not show, stays as it is given.
     """
-    if truth.axis_deg == 0 or config.xray == "images":
-        return vessel, truth
-    real = truth.anatomy(vessel).insertion.direction
+    if world.axis_deg == 0 or config.xray == "images":
+        return vessel, world
+    real = world.axis(vessel)
     c_arm = Fluoroscope(vessel, device.tip_radius_mm)
     axis = c_arm.catheter_axis(real, np.random.default_rng([config.seed, 4]))
     unseen_deg, side_deg = lean_between(axis, real)
-    return with_axis(vessel, axis), replace(truth, axis_deg=unseen_deg, axis_side_deg=side_deg)
+    return with_axis(vessel, axis), replace(world, axis_deg=unseen_deg, axis_side_deg=side_deg)

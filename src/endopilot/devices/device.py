@@ -158,16 +158,17 @@ class Wire(Device):
             raise ValueError(f"tip_bend: length_mm is {self.tip_bend_length_mm:g}; give a bent tip a positive length")
         return self
 
-    def with_tip(self, *, bend_rad: float, stiffness_factor: float) -> Wire:
+    def with_tip(self, *, bend_rad: float, stiffness_factor: float, shaft_stiffness_factor: float = 1.0) -> Wire:
         """Return the device with another tip.
 
         Args:
             bend_rad: angle by which the unloaded tip is bent, rad.
             stiffness_factor: EI and GJ of the distal `TIP_LENGTH_MM` are multiplied by it, and less and less so as far
                 as the next abscissa of the profiles.
+            shaft_stiffness_factor: EI and GJ from that abscissa on are multiplied by it.
         """
         at = np.asarray(self.abscissa_mm, dtype=float)
-        factor = np.where(at <= TIP_LENGTH_MM, stiffness_factor, 1.0)
+        factor = np.where(at <= TIP_LENGTH_MM, stiffness_factor, shaft_stiffness_factor)
         bend, twist = (
             factor * np.asarray(p, dtype=float) for p in (self.bend_stiffness_n_mm2, self.twist_stiffness_n_mm2)
         )

@@ -21,7 +21,7 @@ from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import Decision, Observation, Policy
 from endopilot.navigation.record import NavigationRecord
-from endopilot.simulation.mismatch import ModelMismatch
+from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import CORE, Task
 from endopilot.types import TipProjection
@@ -39,7 +39,8 @@ class Recording:
         exposed: whether X-ray was on at each decision.
         believed_mm: where the agent believed the tip to be (Δtip) at each decision, mm; None for other policies.
         gave_up: whether the policy ended the navigation with its last decision.
-        robot: what drove; not part of the text.
+        robot: what drove, as it was given; not part of the text.
+        world: what reality was, likewise.
     """
 
     control: Float[np.ndarray, "decisions devices 2"]
@@ -47,6 +48,7 @@ class Recording:
     believed_mm: Float[np.ndarray, "decisions"] | None
     gave_up: bool = False
     robot: RobotConfig = field(default_factory=RobotConfig)
+    world: World = field(default_factory=World)
 
     def packed(self) -> dict[str, Any]:
         """Return the recording as text: little-endian arrays, compressed by zlib, in base64."""
@@ -59,13 +61,16 @@ class Recording:
         }
 
     @staticmethod
-    def unpacked(text: dict[str, Any], devices: int = 1, robot: RobotConfig | None = None) -> Recording:
+    def unpacked(
+        text: dict[str, Any], devices: int = 1, robot: RobotConfig | None = None, world: World | None = None
+    ) -> Recording:
         """Return the recording that `packed` made a text of.
 
         Args:
             text: the arrays.
             devices: number of wire and catheters.
             robot: what drove; the default one if not given.
+            world: what reality was; nominal if not given.
 
         Raises:
             InputError: an array cannot be read, is not finite, or has another length than the others.
@@ -82,7 +87,7 @@ class Recording:
         if not exposed[0]:
             raise InputError("exposed: X-ray is off at the first decision, where it is always on")
         decided, gave_up = control.reshape(count, devices, 2), bool(text.get("gave_up", False))
-        return Recording(decided, exposed, believed, gave_up, robot or RobotConfig())
+        return Recording(decided, exposed, believed, gave_up, robot or RobotConfig(), world or World())
 
 
 def navigation_seed(task: Task, place: int) -> int:
@@ -95,7 +100,7 @@ def attempt(
     navigation: Navigation,
     *,
     seed: int,
-    mismatch: ModelMismatch | None = None,
+    world: World | None = None,
     robot: RobotConfig | None = None,
 ) -> dict[str, Any]:
     """Let a policy drive a navigation, and return its figures, its course and its recording.
@@ -104,14 +109,14 @@ def attempt(
         policy: its name.
         navigation: what is to be done, as the policy is given it.
         seed: of encoder noise, detection errors and the policy.
-        mismatch: how the simulated reality differs from the navigation; not at all if not given.
-        robot: what drives; the default one if not given.
+        world: what reality is; as the navigation says if not given.
+        robot: what drives, as it is given; the default one if not given.
 
     Raises:
         InputError: there is no such policy, or the wire does not fit the vessel.
     """
     driver = make_policy(policy)
-    record = _drive(navigation, driver, seed, mismatch, robot or RobotConfig())
+    record = _drive(navigation, driver, seed, world, robot or RobotConfig())
     return {"seed": seed} | scored(navigation, record, tells=isinstance(driver, AgentPolicy))
 
 
@@ -150,12 +155,13 @@ def driven(recording: Recording, navigation: Navigation, *, seed: int) -> Naviga
     Raises:
         InputError: the recording is shorter than the navigation.
     """
-    return _drive(navigation, Repeated(recording), seed, None, recording.robot)
+    return _drive(navigation, Repeated(recording), seed, recording.world, recording.robot)
 
 
 def begun(recording: Recording, navigation: Navigation, *, seed: int) -> NavigationLoop:
     """Return the loop that drives a navigation as it was recorded, at its start."""
-    return NavigationLoop(navigation, Repeated(recording), config=_config(recording.robot), seed=seed)
+    config = _config(recording.robot)
+    return NavigationLoop(navigation, Repeated(recording), config=config, seed=seed, world=recording.world)
 
 
 def _config(robot: RobotConfig) -> LoopConfig:
@@ -163,9 +169,9 @@ def _config(robot: RobotConfig) -> LoopConfig:
 
 
 def _drive(
-    navigation: Navigation, policy: Policy, seed: int, mismatch: ModelMismatch | None, robot: RobotConfig
+    navigation: Navigation, policy: Policy, seed: int, world: World | None, robot: RobotConfig
 ) -> NavigationRecord:
-    return NavigationLoop(navigation, policy, config=_config(robot), seed=seed, truth=mismatch).run()
+    return NavigationLoop(navigation, policy, config=_config(robot), seed=seed, world=world).run()
 
 
 class Repeated:

@@ -16,7 +16,8 @@ from endopilot.ladder.scores import score
 from endopilot.ladder.submission import MOST_PATIENTS, SUBMISSION_FILE, task_digest, write_submission
 from endopilot.navigation.policies import POLICIES, make_policy
 from endopilot.runs import claim, make_missing
-from endopilot.settings import Within, settings
+from endopilot.settings import Text, Within, settings
+from endopilot.simulation.world import NOMINAL, World, read_world
 from endopilot.tasks.task import NEWEST, LadderVersion, Task, find_task, list_tasks
 
 SCORES_FILE = "ladder.json"
@@ -39,6 +40,8 @@ class LadderConfig:
     tasks of wire and catheter in patients as of version 2, or a folder of tasks of your own (docs/ladder.md)."""
     robot: str = ASSUMED
     """Name of the robot that drives (docs/robot.md), or a YAML file."""
+    world: Text = NOMINAL
+    """Name of the world that reality is (docs/worlds.md), or a YAML file. The policy is not told."""
 
     @model_validator(mode="after")
     def _consistent(self) -> LadderConfig:
@@ -85,32 +88,35 @@ def climb(*, output: str | Path, config: LadderConfig | None = None) -> list[dic
     output = Path(output)
     make_policy(config.policy)
     tasks = config.chosen
-    robot = read_robot(config.robot)
-    claim(output, "endopilot ladder", **identity(config.policy, config.version, robot))
+    robot, world = read_robot(config.robot), read_world(config.world)
+    claim(output, "endopilot ladder", **identity(config.policy, config.version, robot, world))
     paths = config.paths(output)
-    navigate = partial(_navigate, policy=config.policy, version=config.version, robot=robot)
+    navigate = partial(_navigate, policy=config.policy, version=config.version, robot=robot, world=world)
     make_missing(f"Ladder, {config.policy}", paths, navigate)
     results = {task.name: [read_json(path) for path in paths if path.parent.name == task.name] for task in tasks}
     rows = score(tasks, results)
     most = max(map(len, results.values()))
     content = {"policy": config.policy, "ladder": config.version, "robot": config.robot, "patients": most}
-    content["scores"] = rows
+    content |= {"world": {"name": config.world, **world.differences()}, "scores": rows}
     write_json(output / SCORES_FILE, content)
-    write_submission(output / SUBMISSION_FILE, config.policy, config.version, results, rows, robot)
+    write_submission(output / SUBMISSION_FILE, config.policy, config.version, results, rows, robot, world)
     return rows
 
 
-def identity(policy: str, version: LadderVersion, robot: RobotConfig | None = None) -> dict[str, Any]:
-    """Return what a policy's results follow from: its source, its tasks, their devices, the robot, the version."""
+def identity(
+    policy: str, version: LadderVersion, robot: RobotConfig | None = None, world: World | None = None
+) -> dict[str, Any]:
+    """Return what a policy's results follow from: its source, tasks, their devices, robot, world and version."""
     tasks = {task.name: task_digest(task) for task in list_tasks(version)}
     origin = POLICIES.origin(policy)
-    return {"policy": policy, "origin": origin, "tasks": tasks, "robot": robot or RobotConfig(), "version": __version__}
+    found = {"policy": policy, "origin": origin, "tasks": tasks, "robot": robot or RobotConfig()}
+    return found | {"world": (world or World()).differences(), "version": __version__}
 
 
-def _navigate(path: Path, *, policy: str, version: LadderVersion, robot: RobotConfig) -> None:
+def _navigate(path: Path, *, policy: str, version: LadderVersion, robot: RobotConfig, world: World) -> None:
     """Do one navigation and write what came of it."""
     task, place = find_task(path.parent.name, version=version), int(path.stem)
     navigation = task.ladder_navigation(place)
-    result = attempt(policy, navigation, seed=navigation_seed(task, place), robot=robot)
-    about = {"task": task.name, "ladder": version, "robot": robot, "patient": navigation.anatomy.name}
+    result = attempt(policy, navigation, seed=navigation_seed(task, place), robot=robot, world=world)
+    about = {"task": task.name, "ladder": version, "robot": robot, "world": world, "patient": navigation.anatomy.name}
     write_json(path, about | result)

@@ -17,7 +17,7 @@ from endopilot.ladder.ladder import LadderConfig, identity
 from endopilot.ladder.scores import score_navigations
 from endopilot.navigation.policies import make_policy
 from endopilot.runs import claim, make_missing
-from endopilot.simulation.mismatch import QUANTITIES, ModelMismatch, drawn_sides, mismatch_by
+from endopilot.simulation.world import QUANTITIES, World, drawn_sides, world_by
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import LadderVersion, Task, find_task
 
@@ -68,10 +68,8 @@ def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[d
     return rows
 
 
-def mismatch_of(
-    case: str, share: float, navigation: Navigation, task: Task, place: int, robot: RobotConfig
-) -> tuple[ModelMismatch, RobotConfig]:
-    """Return how reality differs from the navigation in one case and one patient, and the robot as it is then."""
+def world_of(case: str, share: float, navigation: Navigation, task: Task, place: int) -> World:
+    """Return what reality is in one case and one patient."""
     change: dict[str, float] = {}
     if case == "all":
         random = np.random.default_rng([task.ladder.seed, task.ladder.numbers[place], 1])
@@ -79,14 +77,14 @@ def mismatch_of(
     elif case != "matched":
         name, side = case.split("-")
         change = {name: share if side == "more" else -share}
-    return mismatch_by(change, navigation.anatomy), robot.delayed(1 + change.get("latency", 0.0))
+    return world_by(change, navigation.anatomy)
 
 
 def _navigate(path: Path, *, policy: str, version: LadderVersion, share: float, robot: RobotConfig) -> None:
     case, task, place = path.parents[1].name, find_task(path.parent.name, version=version), int(path.stem)
     navigation = task.ladder_navigation(place)
-    mismatch, real = mismatch_of(case, share, navigation, task, place, robot)
-    result = attempt(policy, navigation, seed=navigation_seed(task, place), mismatch=mismatch, robot=real)
+    world = world_of(case, share, navigation, task, place)
+    result = attempt(policy, navigation, seed=navigation_seed(task, place), world=world, robot=robot)
     write_json(path, {"task": task.name, "patient": navigation.anatomy.name} | result)
 
 

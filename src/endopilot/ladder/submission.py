@@ -26,6 +26,7 @@ from endopilot.ladder.scores import score
 from endopilot.navigation.policies import POLICIES
 from endopilot.parallel import each
 from endopilot.settings import CountOrZero, Seed, from_record, read_settings, settings
+from endopilot.simulation.world import World
 from endopilot.tasks.task import LadderVersion, Task, find_task, list_tasks
 
 SUBMISSION_FILE = "submission.json"
@@ -82,6 +83,7 @@ class Submission:
         navigations: by the task's name, in the order of the task's patients.
         scores: what `endopilot.ladder.scores.score` makes of them.
         robot: what drove; a file without it has the default one.
+        world: what reality was; a file without it has the nominal one.
     """
 
     format: Literal[1] = 1
@@ -94,6 +96,7 @@ class Submission:
     navigations: dict[str, tuple[NavigationEntry, ...]]
     scores: tuple[dict[str, Any], ...]
     robot: RobotConfig = RobotConfig()
+    world: World = World()
 
     @property
     def version(self) -> LadderVersion:
@@ -144,6 +147,7 @@ def write_submission(
     results: Mapping[str, Sequence[Mapping[str, Any]]],
     scores: Sequence[Mapping[str, Any]],
     robot: RobotConfig,
+    world: World,
 ) -> None:
     """Write the submission file of a policy.
 
@@ -154,6 +158,7 @@ def write_submission(
         results: by the task's name, the results of its navigations (`attempt`) in the order of the task's patients.
         scores: what `score` made of them.
         robot: what drove.
+        world: what reality was.
     """
     known = {each.name for each in fields(NavigationEntry)}
     submission = Submission(
@@ -169,6 +174,7 @@ def write_submission(
         },
         scores=tuple(dict(row) for row in scores),
         robot=robot,
+        world=world,
     )
     write_json(path, submission)
 
@@ -234,7 +240,7 @@ def _first_difference(submission: Submission, folder: Path) -> str | None:
     }
     for path, entry in entries.items():
         write_json(path, entry.recording)
-    again = partial(_repeat, version=submission.version, robot=submission.robot)
+    again = partial(_repeat, version=submission.version, robot=submission.robot, world=submission.world)
     bad = each(f"Checking {submission.policy}", list(entries), again)
     differing = []
     for path, entry in entries.items():
@@ -283,14 +289,15 @@ def recorded_navigation(path: Path, name: str | None, place: int) -> tuple[Task,
         raise InputError(f"{path}: is no file of the ladder; give a submission.json or TASK/NUMBER.json")
     task = find_task(name, version=content.get("ladder") or 1)
     robot = from_record(RobotConfig, content["robot"]) if "robot" in content else None
-    return task, place, Recording.unpacked(entry["recording"], 2 if task.catheter else 1, robot)
+    world = from_record(World, content["world"]) if "world" in content else None
+    return task, place, Recording.unpacked(entry["recording"], 2 if task.catheter else 1, robot, world)
 
 
-def _repeat(path: Path, *, version: LadderVersion, robot: RobotConfig) -> None:
+def _repeat(path: Path, *, version: LadderVersion, robot: RobotConfig, world: World) -> None:
     """Drive the recording in a file again, and put the figures in its place."""
     task, place = find_task(path.parent.name, version=version), int(path.stem)
     navigation = task.ladder_navigation(place)
-    recording = Recording.unpacked(read_json(path), len(navigation.devices), robot)
+    recording = Recording.unpacked(read_json(path), len(navigation.devices), robot, world)
     figures = repeat(recording, navigation, seed=navigation_seed(task, place))
     write_json(path, {"patient": navigation.anatomy.name} | figures)
 

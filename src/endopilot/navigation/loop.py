@@ -13,7 +13,6 @@ from pydantic import model_validator
 
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import RobotConfig
-from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import BelievedTip, Believer, Decision, Led, Observation, Policy
@@ -21,10 +20,10 @@ from endopilot.navigation.record import NavigationRecord, Track
 from endopilot.robot.robot import CYCLE_S, SimulatedRobot
 from endopilot.settings import Within, settings
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.robots import in_grip
 from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM, Navigation, Target, XrayKind
 from endopilot.xray.fluoroscope import FluoroscopeConfig, make_c_arm
 
@@ -92,6 +91,7 @@ class NavigationLoop:
     Attributes:
         navigation: what is to be done, as the policy is given it; `aim` gives it another target.
         config: robot, C-arm and rod core.
+        world: what reality is, with what a seed draws.
         policy: what decides, or watches while somebody else does.
         simulator: the world as it truly is; its one wire is the real one.
         robot: what moves it, and its catheters.
@@ -110,7 +110,7 @@ class NavigationLoop:
         *,
         config: LoopConfig | None = None,
         seed: int = 0,
-        truth: ModelMismatch | None = None,
+        world: World | None = None,
     ) -> None:
         """Bring the wire to the start.
 
@@ -119,25 +119,32 @@ class NavigationLoop:
             policy: what decides, or the name of a policy, such as "agent".
             config: robot, C-arm and rod core.
             seed: of encoder noise, detection errors and the policy.
-            truth: how reality differs from the navigation; not at all if not given.
+            world: what reality is; as the navigation and `config` say if not given.
 
         Raises:
             InputError: there is no such policy, or the wire does not fit the vessel, or starts deeper than it is long,
                 or the vessel is not recognised in X-ray images.
         """
         self.config = config = config or LoopConfig()
-        truth = truth or ModelMismatch()
+        self.world = world = (world or World()).drawn(navigation.anatomy, seed)
         known = navigation.robot or config.robot
         self.navigation = navigation = replace(navigation, xray=config.xray, robot=known)
         self.policy = make_policy(policy) if isinstance(policy, str) else policy
-        self.simulator = start_world(navigation, truth, config.simulator, robot=config.robot, motion=config.motion)
+        real, motion = world.real_robot(config.robot), world.motion or config.motion
+        self.simulator = start_world(navigation, world, config.simulator, robot=real, motion=motion)
         limits = [DriveLimits.of(device, navigation.anatomy) for device in navigation.devices]
         self.robot = SimulatedRobot(
-            self.simulator, limits, config.robot, seed=seed, ostium_mm=truth.ostium_mm, cycle_s=config.cycle_s
+            self.simulator,
+            limits,
+            real,
+            seed=seed,
+            ostium_mm=world.ostium_mm,
+            backs_out=(world.backs_out_after_s, world.backs_out_mm),
+            cycle_s=config.cycle_s,
         )
-        self.c_arm = make_c_arm(navigation, config=config.fluoroscope, seed=seed)
+        self.c_arm = make_c_arm(navigation, config=config.fluoroscope, seed=seed, registration_mm=world.registration_mm)
         if config.measure_motion:
-            measured = self.c_arm.measure_motion(config.motion, np.random.default_rng([seed, 6]))
+            measured = self.c_arm.measure_motion(motion, np.random.default_rng([seed, 6]))
             self.navigation = navigation = replace(navigation, known_motion=measured)
             self.c_arm.known_motion = measured
         self._random = np.random.default_rng([seed, 2])
@@ -290,7 +297,9 @@ class NavigationLoop:
 
     def record(self) -> NavigationRecord:
         """Return what has happened up to the end of the last whole period."""
-        return self._track.record(self.navigation, self.robot, self.reason or "stopped", self.gives_up)
+        return self._track.record(
+            self.navigation, self.world, self.simulator, self.robot, self.reason or "stopped", self.gives_up
+        )
 
     def _end_period(self) -> None:
         self._track.moved(self.simulator, self.robot.proximal, self._peak_n)
@@ -304,7 +313,7 @@ class NavigationLoop:
 
 def start_world(
     navigation: Navigation,
-    truth: ModelMismatch,
+    world: World,
     config: SimulatorConfig,
     *,
     robot: RobotConfig | None = None,
@@ -314,25 +323,23 @@ def start_world(
 
     Args:
         navigation: as a policy is given it.
-        truth: how reality differs.
-        config: settings of the rod core.
+        world: what reality is.
+        config: settings of the rod core, where the world has none.
         robot: in whose grip the devices slip; at their own limits if not given.
         motion: of the vessel; it lies still if not given.
 
     Raises:
         InputError: the wire does not fit the vessel, or starts deeper than it is long.
     """
-    device = navigation.device
-    wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=truth.stiffness_factor)
-    stack = Stack(wire, truth.catheters(navigation.catheters))
+    stack, config = world.stack(navigation.stack), world.core(config)
     if robot is not None:
         stack, config = in_grip(stack, robot, config)
-    simulator = Simulator(truth.anatomy(navigation.anatomy), stack, motion=motion, config=config)
+    simulator = Simulator(world.anatomy(navigation.anatomy), stack, motion=motion, config=config)
     start = navigation.start
     simulator.reset(
-        inserted_length=np.maximum(start[None, :, 0] + truth.ostium_mm, 0.0),
+        inserted_length=np.maximum(start[None, :, 0] + world.ostium_mm, 0.0),
         rotation=start[None, :, 1],
-        friction=stack.frictions(np.array([device.friction * truth.friction_factor])),
+        friction=stack.frictions(np.array([stack.wire.friction])),
     )
     return simulator
 

@@ -13,6 +13,7 @@ from endopilot.navigation.policy import BelievedTip, Observation, Proximals
 from endopilot.robot.robot import SimulatedRobot
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, is_safe
 from endopilot.types import TipProjection
 from endopilot.xray.fluoroscope import TipMeasurement
@@ -152,16 +153,27 @@ class Track:
         self._shape.append(simulator.position[0])
         self._force.append(peak_n)
 
-    def record(self, navigation: Navigation, robot: SimulatedRobot, reason: str, gives_up: str) -> NavigationRecord:
+    def record(
+        self,
+        navigation: Navigation,
+        world: World,
+        simulator: Simulator,
+        robot: SimulatedRobot,
+        reason: str,
+        gives_up: str,
+    ) -> NavigationRecord:
         """Return the record of what was gathered up to the end of the last period.
 
         Args:
             navigation: what was to be done.
+            world: what reality was.
+            simulator: in which it took place; the radii at the tips are those of its vessel.
             robot: what drove.
             reason: why it ended.
             gives_up: where and why the policy gave up, in words.
         """
         anatomy, force = navigation.anatomy, np.array(self._force)
+        tree = simulator.set_up.anatomies[0].tree
         proximal, position = np.array(self._proximal), np.array(self._position)
         samples, devices, _ = proximal.shape
         periods = samples - 1  # a decision whose period is not over does not count
@@ -185,6 +197,7 @@ class Track:
         }
         about = {
             "target": asdict(navigation.target),
+            "world": world.differences(),
             "reason": reason,
             "gives_up": gives_up,
             "exposures_s": (DECISION_PERIOD_S * np.flatnonzero(exposures)).tolist(),
@@ -197,7 +210,7 @@ class Track:
             encoders=encoders,
             load=load,
             tip_position=position,
-            tip=project_tip(anatomy.tree, anatomy.insertion, position),
+            tip=project_tip(tree, anatomy.insertion, position),
             shape=np.array(self._shape),
             contact_force_max=force,
             exposed=exposures > 0,

@@ -100,6 +100,7 @@ def _claim(output: Path, set_up: SetUp) -> None:
         device=set_up.navigation.device,
         catheters=set_up.navigation.catheters,
         robot=set_up.robot,
+        world=set_up.world.differences(),
         policy=set_up.policy_name,
         policy_origin=set_up.policy_origin,
         version=__version__,
@@ -128,8 +129,8 @@ def _write(found: PatientNavigation, output: Path, asked: Mapping[str, Any] | No
         navigation_table(found).to_csv(partial, index=False)
     cycles = found.record.cycles
     assert cycles is not None  # a navigation has a period at least
-    about = {"policy": set_up.policy_name, "seed": set_up.config.seed, "truth": asdict(set_up.truth)}
-    about["robot"] = asdict(set_up.robot)
+    about = {"policy": set_up.policy_name, "seed": set_up.config.seed, "world": _world(set_up)}
+    about["robot"] = asdict(set_up.world.real_robot(set_up.robot))
     replace(cycles, about=cycles.about | about).write(output / TRAJECTORY)
     _write_episode(found, driven_in, output / EPISODE_FOLDER)
     picture = png(navigation_figure(found))
@@ -174,21 +175,22 @@ def _write_episode(found: PatientNavigation, anatomy_folder: Path, output: Path)
     from endopilot.dataset.episode import write_episode  # an extra brings its libraries
 
     set_up = found.set_up
-    truth = set_up.truth
+    world, given = set_up.world, set_up.navigation.stack
+    shaped = replace(world, tip_stiffness_factor=1.0, friction_factor=1.0)  # which the episode holds beside the wire
     write_episode(
         found.episode,
         anatomy_folder,
         output,
-        set_up.navigation.stack,
+        replace(given, wire=shaped.wire(given.wire)),
         task=f"navigate to {name_target(set_up)}",
-        tip_stiffness_factor=truth.stiffness_factor,
+        tip_stiffness_factor=world.tip_stiffness_factor,
         seed=set_up.config.seed,
         origin={
             "target": asdict(set_up.navigation.target),
             "policy": set_up.policy_name,
             "navigation": asdict(set_up.config),
-            "truth": asdict(truth),
-            "robot": asdict(set_up.robot),
+            "world": _world(set_up),
+            "robot": asdict(world.real_robot(set_up.robot)),
         },
     )
 
@@ -228,11 +230,16 @@ def _manifest(found: PatientNavigation, output: Path) -> dict[str, Any]:
         catheters=[asdict(catheter) for catheter in navigation.catheters],
         catheter_axis=None if navigation.anatomy is set_up.anatomy else navigation.anatomy.insertion.direction.tolist(),
         target={"asked": set_up.target, **asdict(navigation.target)},
-        truth=asdict(set_up.truth),
-        robot=asdict(set_up.robot),
-        simulator=asdict(set_up.simulator),
+        world=_world(set_up),
+        robot=asdict(set_up.world.real_robot(set_up.robot)),
+        simulator=asdict(set_up.world.core(set_up.simulator)),
         figures=figures,
     )
+
+
+def _world(set_up: SetUp) -> dict[str, Any]:
+    """Return the world's name and what in it is not as given."""
+    return {"name": set_up.config.world, **set_up.world.differences()}
 
 
 def _commands(

@@ -16,6 +16,7 @@ from endopilot.control.outcome import name_target, slipped_s, tell_outcome, wors
 from endopilot.files import json_text, writing
 from endopilot.report.report import image, template_text
 from endopilot.report.scene import mark_target, navigation_scene
+from endopilot.simulation.world import read_world
 
 
 def write_navigation_page(
@@ -83,22 +84,23 @@ def _tiles(found: PatientNavigation) -> list[tuple[str, str, str]]:
 
 def _facts(found: PatientNavigation) -> list[tuple[str, str]]:
     set_up, navigation = found.set_up, found.set_up.navigation
-    truth, device = set_up.truth, navigation.device
+    world, device = set_up.world, navigation.device
     facts = [
         ("Policy", set_up.policy_name),
         ("Wire", f"{device.name}, {device.diameter_mm:g} mm"),
         *(("Catheter", f"{each.name}, {each.diameter_mm:g} mm") for each in navigation.catheters),
         *((("Arrives", "the catheter's tip"),) if navigation.arriving else ()),
         ("Tip", set_up.choice.why),
-        ("Friction in reality", f"{device.friction * truth.friction_factor:.3g}, given {device.friction:g}"),
-        ("Tip stiffness in reality", f"{truth.stiffness_factor:g} of the given one"),
-        ("Ostium in reality", f"{truth.ostium_mm:+.2f} mm along the catheter"),
+        ("World", ": ".join(filter(None, (set_up.config.world, world.about)))),
+        ("Friction in reality", f"{device.friction * world.friction_factor:.3g}, given {device.friction:g}"),
+        ("Tip stiffness in reality", f"{world.tip_stiffness_factor:g} of the given one"),
+        ("Ostium in reality", f"{world.ostium_mm:+.2f} mm along the catheter"),
         ("Robot", _robot(set_up)),
         ("A drive slipped for" if navigation.catheters else "Drive slipped for", f"{slipped_s(found):.2f} s"),
     ]
-    if set_up.config.true_axis_deg:
-        unseen = "" if truth.axis_deg == set_up.config.true_axis_deg else f"; X-ray shows it to {truth.axis_deg:.1f}°"
-        facts.append(("Guiding catheter in reality", f"{set_up.config.true_axis_deg:g}° off its given axis{unseen}"))
+    if leans_deg := read_world(set_up.config.world).axis_deg:
+        unseen = "" if world.axis_deg == leans_deg else f"; X-ray shows it to {world.axis_deg:.1f}°"
+        facts.append(("Guiding catheter in reality", f"{leans_deg:g}° off its given axis{unseen}"))
     if found.plans is not None:
         facts.append(("Courses searched", str(found.plans)))
     return [*facts, ("Seed", str(set_up.config.seed))]
@@ -106,7 +108,8 @@ def _facts(found: PatientNavigation) -> list[tuple[str, str]]:
 
 def _robot(set_up: SetUp) -> str:
     """Return what drives, in words."""
-    robot, wire = set_up.robot, set_up.robot.wire
+    robot = set_up.world.real_robot(set_up.robot)
+    wire = robot.wire
     where = "motors" if robot.encoders_at == "motor" else "devices"
     play = f"play {wire.play_mm:g} mm and {np.rad2deg(wire.play_rad):.0f}°"
     return f"{set_up.config.robot}: {play}, latency {1e3 * robot.latency_s:.3g} ms, encoders on the {where}"

@@ -20,6 +20,8 @@ from endopilot.simulation.state import Step
 CYCLE_S = 0.05
 """Longest period of a drive's loop, s: in the simulator its motors' mean velocity over it moves the devices. The core's
 time step, a quarter of it, doubles what a navigation costs that plans nothing, and changes none of its figures."""
+_BACKS_OUT_MM_S = 5.0
+"""Speed at which a guiding catheter backs out of the ostium, mm/s: an assumption."""
 _HAIR_MM = 1e-9
 """What rounding may add to an inserted length, mm."""
 
@@ -74,6 +76,7 @@ class SimulatedRobot:
         *,
         seed: int = 0,
         ostium_mm: float = 0.0,
+        backs_out: tuple[float, float] = (0.0, 0.0),
         cycle_s: float = CYCLE_S,
     ) -> None:
         """Grasp the devices where they are.
@@ -84,11 +87,13 @@ class SimulatedRobot:
             config: latency, gains, plays, encoders and noise.
             seed: of the gains, the jitter and the noise.
             ostium_mm: the true inserted lengths are this much more than the encoders', mm.
+            backs_out: after how many seconds the guiding catheter backs out of the ostium, and by how much, mm.
             cycle_s: period of the drives' loop, s.
         """
         self._simulator, self._limits, self._random = simulator, tuple(limits), np.random.default_rng([seed, 1])
         counted = [_by_encoder(limit, ostium_mm) for limit in limits]
         self._robots = Robots(simulator, config or RobotConfig(), [counted], seeds=[[seed]], ostium_mm=ostium_mm)
+        self._backs_out_s, self._backs_out_mm = backs_out
         self._readings: list[Float[np.ndarray, "devices 4"]] = []
         self.recorder = Recorder(simulator, cycle_s)
         self.last_step: Step | None = None
@@ -122,11 +127,25 @@ class SimulatedRobot:
         """Let the robot and its devices run for whole cycles, s, and return the largest wall force on a node, N."""
         period, peak = self.recorder.period_s, 0.0
         for _ in range(max(1, round(duration / period))):
-            self.last_step = step = self.recorder.step(self._robots.advance(period))
+            back_mm = self._backed_out_mm(period)
+            velocity = self._robots.advance(period)
+            if back_mm:
+                velocity[..., 0] -= back_mm / period
+                self._robots.ostium_mm -= back_mm
+            self.last_step = step = self.recorder.step(velocity)
             self._robots.follow(self._simulator)
             self._readings.append(self._robots.read(self._simulator)[0])
             peak = max(peak, float(step.contact_force_max[0]))
         return peak
+
+    def _backed_out_mm(self, period: float) -> float:
+        """Return by how much the guiding catheter backs out in the next cycle, mm."""
+        if not self._backs_out_mm or self._robots.motion.time_s < self._backs_out_s - period / 2:
+            return 0.0
+        room = max(0.0, float(self._simulator.inserted_length.min()))
+        back_mm = min(_BACKS_OUT_MM_S * period, self._backs_out_mm, room)
+        self._backs_out_mm -= back_mm
+        return back_mm
 
     @property
     def proximal(self) -> Float[np.ndarray, "devices 2"]:

@@ -54,6 +54,8 @@ class Robots:
 
     Attributes:
         motion: of the drives.
+        ostium_mm: the true inserted lengths are this much more than the encoders', mm; less where the guiding catheter
+            backs out.
     """
 
     def __init__(
@@ -75,7 +77,7 @@ class Robots:
             ostium_mm: the true inserted lengths are this much more than the encoders', mm.
         """
         devices = len(limits[0])
-        self._at_motor, self._ostium_mm = config.encoders_at == "motor", ostium_mm
+        self._at_motor, self.ostium_mm = config.encoders_at == "motor", ostium_mm
         self._noise = config.of_drives(devices, "encoder_sd_mm", "encoder_sd_rad")
         self._load_noise = config.of_drives(devices, "load_sd_n", "load_sd_n_mm")
         self._random = [np.random.default_rng([*seed, 8]) for seed in seeds]
@@ -124,4 +126,4 @@ class Robots:
 
     def _counted(self, simulator: Simulator) -> Float[np.ndarray, "worlds devices 2"]:
         """Return where the devices are at their drives, counted from where the ostium is assumed."""
-        return simulator.at_drive - [self._ostium_mm, 0.0]
+        return simulator.at_drive - [self.ostium_mm, 0.0]

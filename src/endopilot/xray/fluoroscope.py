@@ -134,6 +134,7 @@ class Fluoroscope:
         *,
         config: FluoroscopeConfig | None = None,
         known_motion: Motion | None = None,
+        registration_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
         """Bring the middle of the vessel to the isocenter.
 
@@ -142,9 +143,10 @@ class Fluoroscope:
             wire_radius_mm: radius of the wire at its tip, mm.
             config: geometry and errors.
             known_motion: what is known of how the patient moves.
+            registration_mm: the wire shows displaced by this, mm LPS.
         """
         self._anatomy, self._config = anatomy, config or FluoroscopeConfig()
-        self.known_motion = known_motion
+        self.known_motion, self.registration_mm = known_motion, registration_mm
         lines = [branch.centerline for branch in anatomy.tree.branches]
         insertion = anatomy.insertion
         behind = np.linspace(-_CATHETER_MM, -0.5, 40)
@@ -164,7 +166,8 @@ class Fluoroscope:
         self, simulator: Simulator, inserted_length: float, random: np.random.Generator, *, time_s: float
     ) -> TipMeasurement:
         """Take one exposure of every view and say where the wire's tip is, as `CArm` says."""
-        _, tip, heading = seen_wire(simulator, self.known_motion, self._anatomy.insertion.position, time_s)
+        ostium = self._anatomy.insertion.position
+        _, tip, heading = seen_wire(simulator, self.known_motion, ostium, time_s, self.registration_mm)
         return self.measure(tip, heading, inserted_length, random)
 
     def measure_motion(self, motion: Motion | None, random: np.random.Generator) -> Motion | None:
@@ -319,20 +322,29 @@ class Fluoroscope:
         return place - max(beyond, 0.0) * lateral, cost, nearest  # a tip does not leave the lumen
 
 
-def make_c_arm(navigation: Navigation, *, config: FluoroscopeConfig | None = None, seed: int = 0) -> CArm:
+def make_c_arm(
+    navigation: Navigation,
+    *,
+    config: FluoroscopeConfig | None = None,
+    seed: int = 0,
+    registration_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> CArm:
     """Return the C-arm of a navigation, whose exposures are what `Navigation.xray` says.
 
     Args:
         navigation: vessel, wire and what is known of its motion.
         config: geometry and errors.
         seed: of the pose that a patient lies in whose images are taken, and of these images' noise.
+        registration_mm: the wire shows displaced by this, mm LPS.
 
     Raises:
         InputError: images of a wire in a catheter, or of a vessel that is not recognised in them.
     """
     anatomy, device, known = navigation.anatomy, navigation.device, navigation.known_motion
     if navigation.xray == "assumed":
-        return Fluoroscope(anatomy, device.tip_radius_mm, config=config, known_motion=known)
+        return Fluoroscope(
+            anatomy, device.tip_radius_mm, config=config, known_motion=known, registration_mm=registration_mm
+        )
     from endopilot.xray.image_fluoroscope import ImageFluoroscope  # slow to import
 
     if navigation.catheters:
@@ -340,4 +352,6 @@ def make_c_arm(navigation: Navigation, *, config: FluoroscopeConfig | None = Non
         raise InputError(
             f"xray: images: the detector takes a wire alone, and there is {names} around it; leave the catheter out"
         )
-    return ImageFluoroscope(anatomy, device, config=config, seed=seed, known_motion=known)
+    return ImageFluoroscope(
+        anatomy, device, config=config, seed=seed, known_motion=known, registration_mm=registration_mm
+    )

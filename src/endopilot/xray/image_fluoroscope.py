@@ -52,6 +52,7 @@ class ImageFluoroscope:
         config: FluoroscopeConfig | None = None,
         seed: int = 0,
         known_motion: Motion | None = None,
+        registration_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
         """Lay the patient on the table, inject contrast and register.
 
@@ -61,6 +62,7 @@ class ImageFluoroscope:
             config: geometry and views; its errors of detection are not used.
             seed: of the pose, up to 5 mm and 3° along and about each axis, and of these images' noise.
             known_motion: what is known of how the patient moves.
+            registration_mm: the wire shows displaced by this, mm LPS, besides what the registration errs.
 
         Raises:
             NotRegistered: the vessel is not recognised in the images.
@@ -69,6 +71,7 @@ class ImageFluoroscope:
         random = np.random.default_rng([seed, 0x706F7365])
         angles = config.view_angles_deg[: 2 if config.biplane else 1]
         self.pose, self._anatomy, self.known_motion = Pose.draw(random), anatomy, known_motion
+        self.registration_mm = registration_mm
         self._imager = XrayImager(
             anatomy, device, ct=surroundings(anatomy), config=ImageConfig(geometry=config.geometry)
         )
@@ -112,7 +115,8 @@ class ImageFluoroscope:
         self, simulator: Simulator, inserted_length: float, random: np.random.Generator, *, time_s: float
     ) -> TipMeasurement | None:
         """Take one exposure of every view and say where the wire's tip is, as `CArm` says."""
-        nodes, _, _ = seen_wire(simulator, self.known_motion, self._anatomy.insertion.position, time_s)
+        ostium = self._anatomy.insertion.position
+        nodes, _, _ = seen_wire(simulator, self.known_motion, ostium, time_s, self.registration_mm)
         return self.measure(nodes, inserted_length, random)
 
     def measure(

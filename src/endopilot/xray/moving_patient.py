@@ -24,7 +24,11 @@ def seen(
 
 
 def seen_wire(
-    simulator: Simulator, known: Motion | None, ostium: Float[np.ndarray, "3"], time_s: float
+    simulator: Simulator,
+    known: Motion | None,
+    ostium: Float[np.ndarray, "3"],
+    time_s: float,
+    registration_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Return where a C-arm sees the wire of one world, in the vessel as CT shows it.
 
@@ -33,11 +37,14 @@ def seen_wire(
         known: motion that the C-arm takes off; none if not given.
         ostium: LPS mm.
         time_s: of this moment, s.
+        registration_mm: the wire shows displaced by this, mm LPS.
 
     Returns:
         The nodes from the foremost tip on, the wire's tip, LPS mm, and the unit vector along the wire there.
     """
     nodes, tip, heading = simulator.position[0], simulator.tip_position[0, 0], simulator.tip_direction[0, 0]
+    if any(registration_mm):
+        nodes, tip = nodes + registration_mm, tip + registration_mm
     if simulator.set_up.motion is None:
         return nodes, tip, heading
     known_core = None if known is None else known.core(ostium)

@@ -1,0 +1,64 @@
+"""A vessel whose lumen is wider or narrower than it is given: `with_radii`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from endopilot.anatomy.distance import CATHETER_LENGTH_MM, add_catheter
+from endopilot.types import Anatomy, DistanceMap
+
+_CHUNK = 1 << 18
+"""Points of the grid that are looked at together."""
+LEAST_MM = 0.02
+"""Radius of a lumen that is closed, mm."""
+
+
+def with_radii(anatomy: Anatomy, radii: Sequence[Float[np.ndarray, "_"]]) -> Anatomy:
+    """Return the anatomy with other radii; branches, their courses and the guiding catheter stay.
+
+    A point of the map belongs to the inscribed sphere, of a centerline or of the catheter, by which it lies deepest: of
+    least d² - r², with d the distance from the sphere's centre and r its radius. The wall moves outwards there by as
+    much as that radius grows; around a tube of radius r that is exact. A closed lumen keeps a radius of `LEAST_MM`.
+
+    Args:
+        anatomy: the vessel.
+        radii: of each branch at each point of its centerline, mm.
+    """
+    branches = anatomy.tree.branches
+    radii = [np.maximum(np.asarray(radius, dtype=float), LEAST_MM) for radius in radii]
+    lines = [replace(branch.centerline, radius=r) for branch, r in zip(branches, radii, strict=True)]
+    new = tuple(replace(branch, centerline=line) for branch, line in zip(branches, lines, strict=True))
+    old = [branch.centerline.radius for branch in branches]
+    insertion, count = anatomy.insertion, max(2, int(np.ceil(CATHETER_LENGTH_MM / anatomy.catheter_radius_mm)))
+    behind = insertion.position - np.linspace(0.0, CATHETER_LENGTH_MM, 2 * count)[:, None] * insertion.direction
+    centres = np.concatenate([*(branch.centerline.points for branch in branches), behind])
+    radius = np.concatenate([*old, np.full(len(behind), anatomy.catheter_radius_mm)])
+    grown = np.concatenate([*(r - before for r, before in zip(radii, old, strict=True)), np.zeros(len(behind))])
+    moved = _moved(anatomy.distance_map, centres, radius, grown)
+    opened = add_catheter(moved, insertion, anatomy.catheter_radius_mm)
+    return replace(anatomy, tree=replace(anatomy.tree, branches=new), distance_map=opened)
+
+
+def _moved(
+    field: DistanceMap,
+    centres: Float[np.ndarray, "n 3"],
+    radius: Float[np.ndarray, "n"],
+    grown: Float[np.ndarray, "n"],
+) -> DistanceMap:
+    """Return a map whose wall moves outwards by what the sphere grows that each point belongs to, mm."""
+    values, floor = field.values.copy(), float(field.values.min())
+    where = np.argwhere(values > floor)
+    # The nearest in one dimension more: sqrt(R² - r²) away, a sphere's squared distance is d² - r² + R².
+    spheres = cKDTree(np.column_stack([centres, np.sqrt(radius.max() ** 2 - radius**2)]))
+    for first in range(0, len(where), _CHUNK):
+        some = where[first : first + _CHUNK]
+        points = field.origin_mm + field.spacing_mm * some[:, ::-1]
+        _, owner = spheres.query(np.column_stack([points, np.zeros(len(points))]))
+        at = tuple(some.T)
+        values[at] = np.maximum(values[at] + grown[owner], floor)
+    return replace(field, values=values)
