@@ -104,7 +104,7 @@ def made_up(path: Path) -> None:
     artery = np.column_stack([0.8 * along, np.zeros(31), 50 + 0.6 * along, np.full(31, 4.0)])
     place = {"insertion_mm": aorta[1, :3], "direction": np.array([0.0, 0, 1]), "target_mm": artery[20, :3]}
     lines = {"branch_aorta": aorta, "branch_artery": artery}
-    np.savez(path, **{f"001_{name}": value for name, value in (lines | place).items()})
+    np.savez(path, allow_pickle=False, **{f"001_{name}": value for name, value in (lines | place).items()})
 
 
 def main() -> None:

@@ -130,6 +130,7 @@ def measure(path: Path, name: KindName) -> None:
     if role == "test":
         navigation = task.ladder_navigation(number)
     else:
+        assert task.training is not None  # as every shipped task has
         turn = np.random.default_rng([task.training.seed, number]).uniform(0.0, 2 * np.pi)
         navigation = task.navigation(task.patient(task.training, number), start_rotation_rad=turn)
     policy = MonitoredAgent(replace(kind.config, tries=2), calibration=NO_BANDS)

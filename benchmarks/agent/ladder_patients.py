@@ -199,7 +199,7 @@ def choose(task: Task, seed: int, *, search: bool) -> tuple[list[int], int, int]
     for number in range(MOST_EXAMINED):
         tree, truth = make_patient_tree(atlas, number)
         try:
-            target = find_target(tree, task.section, depth_mm=task.depth_mm)
+            target = task.target(tree)
         except InputError:
             continue
         if not eligible(tree, truth, target):
@@ -229,6 +229,7 @@ def choose_patients(
             continue
         path = TASKS / f"ladder_{task.version}" / f"{task.name}.yaml"
         text = path.read_text(encoding="utf-8")
+        assert task.training is not None  # as every shipped task has
         search = task.version != 1 or task.level >= 5
         for role, patients, searched in (("ladder", task.ladder, search), ("training", task.training, False)):
             chosen, eligible, examined = choose(task, patients.seed, search=searched)

@@ -48,6 +48,7 @@ def test_pushing_solves_the_straight_run(climbed):
     row = rows[0]
     assert row["safe_success"] == row["success"] == 1.0
     target = find_task("straight")
+    assert target.depth_mm is not None
     assert row["seconds"] == pytest.approx((target.depth_mm - target.start_inserted_length_mm) / 5.0, abs=1.0)
     assert 0.9 < row["path_ratio"] < 1.1 and 0 < row["peak_force_n"] < target.force_limit_n
     assert json.loads((folder / "ladder.json").read_text(encoding="utf-8"))["scores"] == rows

@@ -38,6 +38,7 @@ def test_there_are_twelve_tasks_one_a_level_each_with_its_environment():
 @pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}/{path.stem}")
 def test_a_task_has_twenty_patients_and_others_to_learn_on(path):
     task = read_settings(path, Task)
+    assert task.training is not None
     assert len(set(task.ladder.numbers)) == len(set(task.training.numbers)) == 20
     assert task.ladder.seed != task.training.seed
     seeds = [other.ladder.seed for version in VERSIONS for other in list_tasks(version)]
@@ -49,8 +50,8 @@ def test_coaxial_tasks_are_done_by_the_tip_of_a_catheter():
     assert [each.level for each in tasks] == list(COAXIAL)
     for each in tasks:
         tree, _ = make_patient_tree(each.atlas(each.ladder.seed), each.ladder.numbers[0])
-        target = find_target(tree, each.section, depth_mm=each.depth_mm)
-        assert each.start_catheter_mm < each.start_inserted_length_mm < target.abscissa
+        target = each.target(tree)
+        assert (each.start_catheter_mm or 0.0) < each.start_inserted_length_mm < target.abscissa
     navigation = find_task("follow", version="coaxial").ladder_navigation(0)
     assert navigation.arrives == "catheter" and [c.name for c in navigation.catheters] == ["microcatheter-1.7f"]
     alone = without_catheter(navigation)
@@ -66,14 +67,14 @@ def test_the_side_branch_leaves_at_ninety_degrees_or_more():
     steep = find_task("side-branch", version="coaxial")
     for place in (0, 7):
         tree, _ = make_patient_tree(steep.atlas(steep.ladder.seed), steep.ladder.numbers[place])
-        assert turn_rad(tree, find_target(tree, steep.section, depth_mm=0.5).branch) >= np.pi / 2
+        assert turn_rad(tree, find_target(tree, steep.section or "", depth_mm=0.5).branch) >= np.pi / 2
 
 
 @pytest.mark.parametrize("name", ["straight", "crux", "carotid"])
 def test_the_target_lies_in_its_section(name):
     task = find_task(name)
     tree, _ = make_patient_tree(task.atlas(task.ladder.seed), task.ladder.numbers[0])
-    target = find_target(tree, task.section, depth_mm=task.depth_mm)
+    target = task.target(tree)
     branch = tree.branches[target.branch]
     at = int(np.searchsorted(branch.centerline.abscissa, target.abscissa))
     assert tree.section_names[branch.section[at]] == task.section

@@ -33,9 +33,9 @@ from endopilot.settings import (
     settings,
 )
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.tasks.navigation import Arrives, Navigation
+from endopilot.tasks.navigation import Arrives, Navigation, Target
 from endopilot.tasks.targets import find_target
-from endopilot.types import Anatomy
+from endopilot.types import Anatomy, VesselTree
 
 CORE = SimulatorConfig(element_mm=1.25, time_step_s=1 / 14, sample_tolerance_mm=1e-4)
 """Settings of the rod core on the ladder and in the environments: longer elements, two time steps a control period,
@@ -167,6 +167,14 @@ class Task:
         point = None if self.targets_mm is None else self.targets_mm[place]
         return self.navigation(self.patient(self.ladder, place), start_rotation_rad=turn, target_mm=point)
 
+    def target(self, tree: VesselTree) -> Target:
+        """Return the target in its section of a tree.
+
+        Raises:
+            InputError: the tree lacks the section, or it is too short.
+        """
+        return find_target(tree, self.section or "", depth_mm=self.depth_mm)
+
     def navigation(
         self, anatomy: Anatomy, *, start_rotation_rad: float = 0.0, target_mm: tuple[float, ...] | None = None
     ) -> Navigation:
@@ -185,7 +193,7 @@ class Task:
         return Navigation(
             anatomy=anatomy,
             device=replace(read_wire(self.device), **bend),
-            target=find_target(anatomy.tree, target_mm or self.section or "", depth_mm=self.depth_mm),
+            target=self.target(anatomy.tree) if target_mm is None else find_target(anatomy.tree, target_mm),
             start_inserted_length_mm=self.start_inserted_length_mm,
             start_rotation_rad=start_rotation_rad,
             seconds=self.seconds,

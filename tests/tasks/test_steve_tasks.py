@@ -1,0 +1,42 @@
+"""Episodes of a public benchmark become tasks of the ladder: `examples/steve_tasks.py`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from endopilot.tasks.task import list_tasks
+
+sys.path.append(str(Path(__file__).parents[2] / "examples"))
+EPISODES = Path(__file__).parents[3] / "shared" / "data" / "steve_bench" / "archvariety_dev.npz"
+
+
+def test_a_made_up_arch_becomes_a_task_with_the_benchmarks_wire(tmp_path):
+    from steve_tasks import convert, made_up
+
+    made_up(tmp_path / "episodes.npz")
+    assert convert(tmp_path / "episodes.npz", tmp_path / "steve") == ["001"]
+    (task,) = list_tasks(str(tmp_path / "steve"))
+    navigation = task.ladder_navigation(0)
+    wire, direction = navigation.device, navigation.anatomy.insertion.direction
+    # 17 and 80 MPa on solid round sections of 0.7 and 0.89 mm; an arc of 72° with a radius of 12.1 mm.
+    np.testing.assert_allclose(wire.bend_stiffness_n_mm2[::2], [0.2, 2.46], atol=0.01)
+    np.testing.assert_allclose([np.degrees(wire.tip_bend_rad), wire.tip_bend_length_mm], [72, 15.2], atol=0.01)
+    assert (wire.max_velocity_mm_s, wire.max_rotation_rad_s, wire.friction) == (35.0, 3.14, 0.1)
+    assert navigation.near_mm == 5.0 and navigation.seconds == pytest.approx(1000 / 7.5)
+    np.testing.assert_allclose(direction, [0, 0, 1], atol=1e-9)
+    np.testing.assert_allclose(navigation.target.position(navigation.anatomy), [32, 0, 74], atol=0.5)
+
+
+@pytest.mark.skipif(not EPISODES.exists(), reason="the benchmark's episodes are not at hand")
+def test_every_target_of_the_benchmark_lies_on_a_centerline(tmp_path):
+    from steve_tasks import convert
+
+    assert len(convert(EPISODES, tmp_path / "steve")) == 49
+    (task,) = list_tasks(str(tmp_path / "steve"))
+    for place, point in enumerate(task.targets_mm or ()):
+        navigation = task.ladder_navigation(place)
+        assert np.linalg.norm(navigation.target.position(navigation.anatomy) - point) < 1.0
