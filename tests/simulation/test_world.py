@@ -20,6 +20,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.world import NOMINAL, Stenosis, World, list_worlds, read_world
 from endopilot.tasks.navigation import Navigation, Target
+from toy_fork import make_fork
 
 CORE = SimulatorConfig(element_mm=1.5, time_step_s=0.05, threads=1)
 IDEAL = read_robot("ideal")
@@ -99,7 +100,9 @@ def test_a_lumen_is_scaled_and_offset(fork):
     behind = fork.insertion.position - 10.0 * fork.insertion.direction
     np.testing.assert_allclose(
         sample(real.distance_map, behind[None]), sample(fork.distance_map, behind[None]), atol=1e-6
-    )  # the guiding catheter stays as wide as it is
+    )  # the guiding catheter stays as wide as it is, to its end
+    end = fork.insertion.position - 0.2 * fork.insertion.direction
+    assert sample(World(lumen_mm=-0.4).anatomy(fork).distance_map, end[None])[0] > 0.75
     assert (World(lumen_mm=-0.25, lumen_factor=1.2).anatomy(fork).tree.branches[1].centerline.radius >= 0.02).all()
 
 
@@ -117,7 +120,9 @@ def test_a_stenosis_narrows_one_place(fork):
     assert depth(real, np.array([middle - 4.0])) == pytest.approx(depth(fork, np.array([middle - 4.0])), abs=1e-6)
 
 
-def test_a_missing_branch_is_closed_and_its_parent_stays_open(fork):
+@pytest.mark.parametrize("side_mm", [0.8, 1.0])
+def test_a_missing_branch_is_closed_and_its_parent_stays_open(side_mm):
+    fork = make_fork(radius=(1.0, side_mm))
     tree = fork.tree
     section = np.where(np.arange(len(tree.branches[2].section)) >= 0, len(tree.section_names), 0)
     named = replace(
@@ -132,9 +137,9 @@ def test_a_missing_branch_is_closed_and_its_parent_stays_open(fork):
     side = named.tree.branches[2].centerline
     far = side.abscissa[side.abscissa > side.abscissa[0] + 3.0]
     assert (depth(real, far, 2) < 0.05).all() and (depth(named, far, 2) > 0.5).all()
-    trunk = np.arange(2.0, 19.0)
+    trunk = np.arange(2.0, 20.1)
     assert (depth(real, trunk) > 0.9 * depth(named, trunk)).all()
-    on = np.arange(22.0, 38.0)
+    on = np.arange(20.0, 38.0, 0.5)
     assert (depth(real, on, 1) > 0.9 * depth(named, on, 1)).all()
     for world in (World(occluded=("none",)), World(stenosis=Stenosis(section="none"))):
         with pytest.raises(InputError, match=r"section 'none'; .* has no such section \(it has .*side\)"):

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from endopilot.anatomy.distance import CATHETER_LENGTH_MM, add_catheter
 from endopilot.types import Anatomy, DistanceMap
@@ -54,7 +54,7 @@ def _moved(
     values, floor = field.values.copy(), float(field.values.min())
     where = np.argwhere(values > floor)
     # The nearest in one dimension more: sqrt(R² - r²) away, a sphere's squared distance is d² - r² + R².
-    spheres = cKDTree(np.column_stack([centres, np.sqrt(radius.max() ** 2 - radius**2)]))
+    spheres = KDTree(np.column_stack([centres, np.sqrt(radius.max() ** 2 - radius**2)]))
     for first in range(0, len(where), _CHUNK):
         some = where[first : first + _CHUNK]
         points = field.origin_mm + field.spacing_mm * some[:, ::-1]

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, cast, get_args
 
 import numpy as np
 import yaml
@@ -57,7 +57,7 @@ def _motion(value: Any) -> Any:
         return value
     if value not in get_args(MotionName) or value == "still":
         raise PydanticCustomError("range", "choose from breathing, heartbeat and both, or give amplitudes")
-    return motion_named(value)
+    return motion_named(cast(MotionName, value))
 
 
 @settings
