@@ -12,7 +12,7 @@ from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.cli import main
 from endopilot.dataset import join
-from endopilot.dataset.again import simulate_again
+from endopilot.dataset.again import episode_set_up, simulate_again
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.draw import draw_navigations
 from endopilot.dataset.episode import write_episode
@@ -30,8 +30,9 @@ from endopilot.files import read_json
 from endopilot.models.episodes import Episodes
 from endopilot.models.provenance import check_wire
 from endopilot.simulation.signals import Outputs
-from endopilot.simulation.simulate import simulate
+from endopilot.simulation.simulate import run_set_up, simulate
 from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.world import World
 
 WIRE, CATHETER = read_wire("workhorse-014"), read_catheter("microcatheter-1.7f")
 WEAK = replace(CATHETER, push_limit_n=0.03, pull_limit_n=0.021)
@@ -184,3 +185,35 @@ def test_what_does_not_go_together_is_refused(pairs, patient, tmp_path, monkeypa
     with pytest.raises(InputError, match="too wide for the bore"):
         generate_dataset([patient], output=tmp_path / "w", device=Stack(read_wire("j-035"), (CATHETER,)), config=CONFIG)
     assert not (tmp_path / "f").exists() and not (tmp_path / "w").exists()
+
+
+def test_a_dataset_is_made_in_a_world_and_simulated_again_in_it(patient, tmp_path):
+    world = World(lumen_factor=1.1, friction_factor=2.0, tip_bend_factor=0.5, axis_deg=5.0, compliant_wall_n_mm2=0.05)
+    config = replace(CONFIG, sequences=2)
+    for name, reality in (("plain", None), ("nominal", World()), ("world", world)):
+        generate_dataset([patient], output=tmp_path / name, device="workhorse-014", config=config, world=reality)
+    plain, nominal, data = (read_dataset(tmp_path / name) for name in ("plain", "nominal", "world"))
+    assert plain.manifest["key"] == nominal.manifest["key"] and plain.manifest["world"] == {}
+    anatomy = read_anatomy(patient)
+    assert data.manifest["world"] == world.differences() and data.manifest["device"] == plain.manifest["device"]
+    assert data.world(anatomy) == world.drawn(anatomy, config.seed) != world
+    np.testing.assert_allclose(data.friction, 2 * plain.friction)
+    line = anatomy.tree.branches[data.branch[0, 0, 0]].centerline
+    given_mm = np.interp(data.tip_abscissa[0, 0, 0], line.abscissa, line.radius)
+    assert data.lumen_radius[0, 0, 0] == pytest.approx(1.1 * given_mm, rel=1e-4)
+    ((_, again),) = simulate_again(data, anatomy, data.command)
+    _assert_same(data, again)
+    one = episode_set_up(data, 0)
+    _assert_same(data.select(np.array([0])), run_set_up(one, data.command[:1], period_s=0.5, record_shape=False))
+    both = read_joined([tmp_path / "plain", tmp_path / "world"])
+    with pytest.raises(InputError, match="holds episodes of several worlds"):
+        both.world(anatomy)
+    for name, value in (
+        ("share", 0.1),
+        ("ostium_mm", 1.0),
+        ("backs_out_mm", 2.0),
+        ("registration_mm", (1.0, 0.0, 0.0)),
+    ):
+        with pytest.raises(InputError, match=f"world: {name} = .*leave it out"):
+            generate_dataset([patient], output=tmp_path / "no", device="workhorse-014", world=World(**{name: value}))
+    assert not (tmp_path / "no").exists()

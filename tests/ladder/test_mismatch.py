@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -71,6 +72,8 @@ def test_an_interrupted_run_goes_on_and_another_share_needs_another_folder(measu
 def test_a_share_beyond_its_range_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"mismatch: 1\.5"):
         measure_mismatch(tmp_path / "new", ONE, 1.5)
+    with pytest.raises(InputError, match="world: rough; mismatch makes worlds of its own"):
+        measure_mismatch(tmp_path / "new", replace(ONE, world="rough"), 0.2)
     assert not (tmp_path / "new").exists()
 
 

@@ -246,3 +246,23 @@ def test_a_recording_is_kept_to_the_bit():
     for name in ("control", "exposed", "believed_mm"):
         np.testing.assert_array_equal(getattr(again, name), getattr(recording, name))
     assert len(json.dumps(recording.packed())) < 8000  # 240 of them are less than 2 MB
+
+
+def test_a_ladder_in_another_world_is_confirmed_in_it(written, tmp_path):
+    world = tmp_path / "world.yaml"
+    world.write_text("lumen_factor: 1.1\nostium_mm: 1.0\nbacks_out_mm: 1.0\nbacks_out_after_s: 1.0\n", encoding="utf-8")
+    config = LadderConfig(policy="forward", tasks=("straight",), patients=1, world=str(world))
+    climb(output=tmp_path / "ladder", config=config)
+    path = tmp_path / "ladder" / "submission.json"
+    content, scores = (
+        json.loads((path.with_name(name)).read_text(encoding="utf-8")) for name in (path.name, "ladder.json")
+    )
+    differs = {"lumen_factor": 1.1, "ostium_mm": 1.0, "backs_out_mm": 1.0, "backs_out_after_s": 1.0}
+    assert scores["world"] == {"name": str(world)} | differs
+    assert _first(content)["sha256"] != _first(written)["sha256"]
+    assert check_submission(path).difference is None
+    content["world"]["lumen_factor"] = 1.05
+    path.write_text(json.dumps(content), encoding="utf-8")
+    assert check_submission(path).difference is not None
+    with pytest.raises(InputError, match="was begun with world"):
+        climb(output=tmp_path / "ladder", config=replace(config, world="nominal"))

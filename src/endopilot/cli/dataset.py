@@ -9,6 +9,7 @@ from endopilot.dataset.config import DatasetConfig
 from endopilot.devices.robot import read_robot
 from endopilot.devices.stack import Stack
 from endopilot.files import read_json
+from endopilot.simulation.world import NOMINAL, read_world
 
 
 def command(
@@ -19,6 +20,7 @@ def command(
     device: str = "workhorse-014",
     catheter: tuple[str, ...] = (),
     robot: str | None = None,
+    world: str = NOMINAL,
     scheduler: str | None = None,
     config: DatasetConfig = DatasetConfig(),
 ) -> Figures:
@@ -34,6 +36,7 @@ def command(
             driven at random and independently, by velocity.
         robot: name of a robot (docs/robot.md) or a YAML file that makes the motions, and measures them; if not given,
             they are made as drawn.
+        world: name of the world that reality is (docs/worlds.md), or a YAML file.
         scheduler: address of a Dask scheduler (tcp://host:8786) whose workers simulate and share these folders; the
             cores of this machine if not given.
         config: how many navigations, how long, and how they are split.
@@ -46,6 +49,7 @@ def command(
         device=Stack.of(device, *catheter),
         config=config,
         robot=None if robot is None else read_robot(robot),
+        world=read_world(world),
         scheduler=scheduler,
     )
     info = read_json(output / "meta" / "info.json")

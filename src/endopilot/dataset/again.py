@@ -15,6 +15,7 @@ from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
+from endopilot.simulation.world import World
 from endopilot.types import Anatomy
 
 
@@ -32,20 +33,22 @@ def episode_set_up(data: Dataset, number: int) -> SimulationSetUp:
         raise InputError(f"world: {number}; {data.folder} has episodes 0 to {len(data) - 1}")
     one = data.select(np.array([number]))
     anatomy = read_anatomy(data.anatomy_folder(str(one.anatomy[0])))
+    world = data.world(anatomy)
     return SimulationSetUp(
-        anatomies=[anatomy],
-        stacks=[_stack(one, float(one.tip_bend[0]), float(one.tip_stiffness_factor[0]))],
+        anatomies=[world.anatomy(anatomy)],
+        stacks=[_stack(one, world, float(one.tip_bend[0]), float(one.tip_stiffness_factor[0]))],
         initial=one.initial,
         friction=one.friction,
         actuation=data.manifest["config"]["control"],
         motion=one.motion(anatomy.name),
-        config=_config(one),
+        config=world.core(_config(one)),
     )
 
 
-def _stack(data: Dataset, bend_rad: float, stiffness_factor: float) -> Stack:
+def _stack(data: Dataset, world: World, bend_rad: float, stiffness_factor: float) -> Stack:
     stack = data.stack
-    return replace(stack, wire=stack.wire.with_tip(bend_rad=bend_rad, stiffness_factor=stiffness_factor))
+    drawn = replace(stack, wire=stack.wire.with_tip(bend_rad=bend_rad, stiffness_factor=stiffness_factor))
+    return world.stack(drawn)
 
 
 def _config(data: Dataset) -> SimulatorConfig:
@@ -75,17 +78,18 @@ def simulate_again(
         Indices of the episodes whose wires have the same tip, and their simulation: a simulation has one wire.
     """
     friction = data.friction if friction is None else friction
+    world = data.world(anatomy)
     tips, tip_of = np.unique(np.stack([data.tip_bend, data.tip_stiffness_factor], axis=-1), axis=0, return_inverse=True)
     for kind, (bend, factor) in enumerate(tips.astype(float)):
         chosen = np.flatnonzero(tip_of.ravel() == kind)
         yield (
             chosen,
             simulate(
-                anatomy,
-                _stack(data, float(bend), float(factor)),
+                world.anatomy(anatomy),
+                _stack(data, world, float(bend), float(factor)),
                 control[chosen],
                 initial=data.initial[chosen],
-                config=_config(data),
+                config=world.core(_config(data)),
                 record_shape=record_shape,
                 friction=friction[chosen],
                 motion=data.motion(anatomy.name),

@@ -37,17 +37,21 @@ def write_block(
     """
     config, anatomy, stack = context.config, _read(block.folder, block.identity), context.stack
     draw = draw_navigations(config, stack.wire, anatomy, block.sequences, devices=len(stack))
+    world = context.world.drawn(anatomy, config.seed)
+    stacks = draw.stacks(stack)
+    true = {id(each): world.stack(each) for each in stacks}
+    friction = world.stack(stack).frictions(draw.friction * world.friction_factor)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # invalid worlds are listed in the dataset's manifest
         trajectory, stopped = simulate_navigations(
-            anatomy,
-            draw.stacks(stack),
+            world.anatomy(anatomy),
+            [true[id(each)] for each in stacks],
             draw.initial,
             draw.control,
-            stack.frictions(draw.friction),
-            replace(config.simulator, threads=threads),
+            friction,
+            replace(world.core(config.simulator), threads=threads),
             actuation=config.control,
-            motion=patient_motion(config, anatomy.name),
+            motion=world.motion or patient_motion(config, anatomy.name),
             robot=context.robot,
             seeds=draw.seeds,
             advance=advance,

@@ -27,6 +27,7 @@ from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.progress import progress
 from endopilot.runs import claim, remove_partial_files
 from endopilot.simulation.robots import in_grip
+from endopilot.simulation.world import World
 
 _WORK_PATH = "meta/work.json"
 """What the files written so far have cost; it moves into the manifest when the dataset is complete."""
@@ -39,6 +40,7 @@ def generate_dataset(
     output: str | Path,
     config: DatasetConfig | None = None,
     robot: RobotConfig | None = None,
+    world: World | None = None,
     scheduler: str | None = None,
 ) -> None:
     """Simulate random navigations of every anatomy and store them in the LeRobot v3 layout.
@@ -52,19 +54,23 @@ def generate_dataset(
         output: folder of the dataset.
         config: number, length, distribution and split of the navigations; the defaults if not given.
         robot: what makes the motions and measures them; if not given, they are made as drawn.
+        world: what reality is; its friction, tip and robot come on top of what is drawn and given here.
         scheduler: address of a Dask scheduler whose workers simulate; the cores of this machine if not given.
 
     Raises:
         InputError: too few anatomies for the split, two anatomies of one name, an output folder that holds something
             else or was begun with other settings, catheters that do not fit around the wire or are to be driven by
-            force, or a robot that is, a scheduler that cannot be reached, or a full disk.
+            force, or a robot that is, a world that a dataset cannot hold, a scheduler that cannot be reached, or a full
+            disk.
     """
     config = config or DatasetConfig()
-    folders, stack = [Path(folder) for folder in anatomies], Stack.of(device)
+    folders, stack, world = [Path(folder) for folder in anatomies], Stack.of(device), world or World()
+    if robot is not None or world.robot is not None:
+        robot = world.real_robot(robot or RobotConfig())
     if robot is not None:
         stack, core = in_grip(stack, robot, config.simulator)
         config = replace(config, simulator=core)
-    layout = make_layout(folders, Path(output), stack, config, robot=robot)
+    layout = make_layout(folders, Path(output), stack, config, robot=robot, world=world)
     blocks = layout.blocks()
     claim(layout.context.output, "endopilot dataset", **layout.settings)
     if _is_finished(layout, blocks):
@@ -163,6 +169,7 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
         device=asdict(context.stack.wire),
         catheters=[asdict(catheter) for catheter in context.stack.catheters],
         robot=None if context.robot is None else asdict(context.robot),
+        world=context.world.differences(),
         anatomies=[_anatomy_record(layout, i) for i in range(len(layout.names))],
         splits={name: counts[name] for name in SPLITS if counts[name]},
         manoeuvres=shares,

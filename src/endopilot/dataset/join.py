@@ -53,6 +53,7 @@ def _joined(first: Dataset, other: Dataset) -> Dataset:
     manifest = first.manifest | {
         "key": hashlib.sha256("".join(keys).encode()).hexdigest(),
         "anatomies": list(records.values()),
+        "world": ours if (ours := first.manifest.get("world", {})) == other.manifest.get("world", {}) else None,
     }
     names = [field.name for field in fields(Dataset) if field.name not in ("folder", "manifest", "sample_period_s")]
     pairs = {name: (getattr(first, name), getattr(other, name)) for name in names}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import json_text, read_json
 from endopilot.simulation.motion import Motion
+from endopilot.simulation.world import World
 
 FORMAT_VERSION = 7
 """Counts changes of the columns or of their meaning."""
@@ -63,6 +64,7 @@ class BlockContext:
         key: marks the files of this dataset; it follows from all settings.
         task: what the navigations do, as LeRobot names it.
         robot: what makes the motions; None where they are made as drawn.
+        world: what reality is; the stack and the anatomies are as given.
     """
 
     output: Path
@@ -71,6 +73,7 @@ class BlockContext:
     key: str
     task: str = schema.TASK
     robot: RobotConfig | None = None
+    world: World = field(default_factory=World)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +117,7 @@ def make_layout(
     *,
     task: str = schema.TASK,
     robot: RobotConfig | None = None,
+    world: World | None = None,
     origin: Mapping[str, Any] | None = None,
 ) -> Layout:
     """Read the anatomies' records, and lay out the dataset in blocks.
@@ -125,12 +129,15 @@ def make_layout(
         config: number, length, distribution and split of the navigations.
         task: what they do.
         robot: what makes the motions; they are made as drawn if not given.
+        world: what reality is; as given if not given.
         origin: what else they follow from, where they were not drawn at random.
 
     Raises:
         InputError: no anatomy, or a folder that is none; two of one name; too few for the split; catheters that do not
-            fit around the wire, or are to be driven by force.
+            fit around the wire, or are to be driven by force; a world that a dataset cannot hold.
     """
+    world = world or World()
+    _check_world(world)
     check_nested(stack.wire, stack.catheters)
     if stack.catheters and config.control == "force":
         raise InputError("control: 'force' with catheters; give 'velocity'")
@@ -154,13 +161,25 @@ def make_layout(
         "version": version(),
         **({"catheters": [asdict(catheter) for catheter in stack.catheters]} if stack.catheters else {}),
         **({} if robot is None else {"robot": asdict(robot)}),
+        **({} if world == World() else {"world": world.differences()}),
         **(origin or {}),
     }
     settings = json.loads(json_text(settings))  # as JSON gives them back, so that they compare equal
     key = hashlib.sha256(json_text(settings).encode()).hexdigest()
-    context = BlockContext(Path(output), config, stack, key, task, robot)
-    motions = tuple(patient_motion(config, name) for name in names)
+    context = BlockContext(Path(output), config, stack, key, task, robot, world)
+    motions = tuple(world.motion or patient_motion(config, name) for name in names)
     return Layout(context, tuple(map(Path, folders)), names, identities, splits, motions, settings)
+
+
+def _check_world(world: World) -> None:
+    """Refuse what differs between encoders or X-ray and reality: a dataset holds what truly happened.
+
+    Raises:
+        InputError: the world has such fields.
+    """
+    for name in ("share", "ostium_mm", "backs_out_mm", "registration_mm"):
+        if (value := getattr(world, name)) != getattr(World(), name):
+            raise InputError(f"world: {name} = {value}; a dataset holds true lengths and no exposures: leave it out")
 
 
 def version() -> str:

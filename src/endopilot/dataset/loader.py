@@ -34,6 +34,8 @@ from endopilot.runs import RECORD_FILE
 from endopilot.settings import from_record
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.signals import SIGNALS, Outputs, described
+from endopilot.simulation.world import World
+from endopilot.types import Anatomy
 
 _MEND = "make the dataset again"
 
@@ -144,6 +146,17 @@ class Dataset(Outputs):
         """What made the motions; None where they were made as drawn."""
         record = self.manifest.get("robot")
         return None if record is None else from_record(RobotConfig, record)
+
+    def world(self, anatomy: Anatomy) -> World:
+        """Return what reality was in the episodes of an anatomy, with what the seed drew.
+
+        Raises:
+            InputError: the episodes are of several worlds.
+        """
+        record = self.manifest.get("world", {})
+        if record is None:
+            raise InputError(f"{self.folder}: holds episodes of several worlds; give the dataset of one world")
+        return from_record(World, record, onto=World()).drawn(anatomy, self.manifest["seed"])
 
     @property
     def patients(self) -> dict[str, str]:

@@ -17,7 +17,7 @@ from endopilot.ladder.ladder import LadderConfig, identity
 from endopilot.ladder.scores import score_navigations
 from endopilot.navigation.policies import make_policy
 from endopilot.runs import claim, make_missing
-from endopilot.simulation.world import QUANTITIES, World, drawn_sides, world_by
+from endopilot.simulation.world import NOMINAL, QUANTITIES, World, drawn_sides, world_by
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import LadderVersion, Task, find_task
 
@@ -45,6 +45,8 @@ def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[d
     """
     if not 0 < share < 1:
         raise InputError(f"mismatch: {share} is not in (0, 1); give e.g. 0.2")
+    if config.world != NOMINAL:
+        raise InputError(f"world: {config.world}; mismatch makes worlds of its own: leave one of them out")
     make_policy(config.policy)
     tasks = config.chosen
     robot = read_robot(config.robot)
