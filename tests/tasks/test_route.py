@@ -57,6 +57,17 @@ def test_the_waypoint_of_a_short_branch_lies_before_its_end(fork):
     assert route.next_waypoint(21.9) == 21.0  # its branch is passed with its end
 
 
+@pytest.mark.parametrize(("angle_deg", "beyond_mm"), [(60, 2.0 + 1.5), (150, 2.0 / np.sin(np.deg2rad(30)) + 1.5)])
+def test_the_waypoint_of_a_branch_that_leaves_backwards_lies_outside_its_parent(fork, angle_deg, beyond_mm):
+    axis = np.arange(0.0, 81.0)[:, None] * np.array([0.0, 0.0, 0.5])
+    out = np.array([np.sin(np.deg2rad(angle_deg)), 0.0, np.cos(np.deg2rad(angle_deg))])
+    side = axis[40] + np.arange(0.0, 61.0)[:, None] * 0.5 * out
+    tree = tree_of((axis[:41], 2.0, -1), (axis[40:], 2.0, 0), (side, 1.0, 0))
+    own = tree.branches[2].centerline
+    route = Route.to(replace(fork, tree=tree), Target(branch=2, abscissa=float(own.abscissa[-1]) - 2.0))
+    assert route.waypoints[0] - 20.0 == pytest.approx(beyond_mm, abs=0.6)
+
+
 def named(fork):
     branches = [
         Branch(branch.centerline, branch.parent, np.full(len(branch.section), index))

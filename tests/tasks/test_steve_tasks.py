@@ -15,7 +15,7 @@ EPISODES = Path(__file__).parents[3] / "shared" / "data" / "steve_bench" / "arch
 
 
 def test_a_made_up_arch_becomes_a_task_with_the_benchmarks_wire(tmp_path):
-    from steve_tasks import convert, made_up
+    from steve_tasks import convert, made_up  # pyright: ignore[reportMissingImports]
 
     made_up(tmp_path / "episodes.npz")
     assert convert(tmp_path / "episodes.npz", tmp_path / "steve") == ["001"]
@@ -33,7 +33,7 @@ def test_a_made_up_arch_becomes_a_task_with_the_benchmarks_wire(tmp_path):
 
 @pytest.mark.skipif(not EPISODES.exists(), reason="the benchmark's episodes are not at hand")
 def test_every_target_of_the_benchmark_lies_on_a_centerline(tmp_path):
-    from steve_tasks import convert
+    from steve_tasks import convert  # pyright: ignore[reportMissingImports]
 
     assert len(convert(EPISODES, tmp_path / "steve")) == 49
     (task,) = list_tasks(str(tmp_path / "steve"))

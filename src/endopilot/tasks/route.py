@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from endopilot.devices.device import Device
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import Target
-from endopilot.types import Anatomy, Centerline, TipProjection
+from endopilot.types import Anatomy, Centerline, TipProjection, VesselTree
 
 BEYOND_MM = 1.5
 """A waypoint lies this far beyond the wall of the parent, on the centerline of the branch that leaves it, mm."""
@@ -50,6 +50,8 @@ class Route:
         starts = [tree.branches[b].centerline for b in branches[1:]]
         junctions = np.array([line.abscissa[0] for line in starts if line.abscissa[0] < target.abscissa])
         beyond = np.array([line.abscissa[0] + line.radius[0] + BEYOND_MM for line in starts[: len(junctions)]])
+        left = [_left_backwards(tree, branch) for branch in branches[1 : len(junctions) + 1]]
+        beyond = np.maximum(beyond, np.array(left) + BEYOND_MM)
         ends = np.append(junctions[1:] - ENTERED_MM, target.abscissa)[: len(junctions)]  # of a branch shorter than that
         beyond = np.minimum(beyond, ends)
         return Route(
@@ -97,6 +99,25 @@ class Route:
     def radius(self, abscissa: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Return the lumen radius along the route, mm."""
         return np.interp(abscissa, self.line.abscissa, self.line.radius)
+
+
+def _left_backwards(tree: VesselTree, branch: int) -> float:
+    """Return where a branch that leaves its parent by more than 90° is out of the vessels beside it, mm; else 0.
+
+    The line of such a branch runs back through the parent, farther than the parent's radius: a tip in the mouth of the
+    branch would seem to lie deep in it.
+    """
+    parent, own = tree.branches[branch].parent, tree.branches[branch].centerline
+    beside = [parent, *(other for other in tree.children(parent) if other != branch)]
+    points = np.concatenate([tree.branches[other].centerline.points for other in beside])
+    radius = np.concatenate([tree.branches[other].centerline.radius for other in beside])
+    gap = np.linalg.norm(own.points[:, None] - points, axis=2) - radius
+    out = int(np.argmax(np.append(gap.min(axis=1) > 0, True)))
+    if not 0 < out < len(own.points):
+        return 0.0
+    before = tree.branches[parent].centerline.points
+    into, onto = before[-1] - before[-2], own.points[out] - own.points[out - 1]
+    return float(own.abscissa[out]) if into @ onto < 0 else 0.0
 
 
 def check_passable(route: Route, device: Device) -> None:
