@@ -96,7 +96,7 @@ def test_killed_and_resumed_continues_the_same_curve(short_run, toy_dataset, tmp
         "import torch; torch.set_num_threads(1)\n"
         "from endopilot.models.config import TrainConfig, TransformerConfig\n"
         "from endopilot.models.train import train\n"
-        f"train(Path({str(toy_dataset)!r}), Path({str(run)!r}), TrainConfig(**{SHORT!r}))\n"
+        f"train(Path({str(toy_dataset)!r}), output=Path({str(run)!r}), config=TrainConfig(**{SHORT!r}))\n"
     )
     process = subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.DEVNULL)
     try:

@@ -97,7 +97,12 @@ class Readout:
 
     @property
     def at_drive(self) -> Float[np.ndarray, "worlds devices 2"]:
-        """Inserted lengths Δ (mm) and rotations (rad) as the drives make them, see `drive_rotation`."""
+        """Inserted lengths Δ (mm) and rotations (rad) as the drives make them, see `drive_rotation`.
+
+        Example:
+            >>> simulator.at_drive.shape
+            (4, 1, 2)
+        """
         return np.stack([self.inserted_length, self.drive_rotation], axis=-1)
 
     @property
