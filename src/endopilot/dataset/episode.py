@@ -59,11 +59,12 @@ def write_episode(
     layout = replace(layout, motions=(set_up.motion,))  # it was not drawn with the seed
     (block,) = layout.blocks()
     claim(output, "endopilot navigate", **layout.settings)
-    one = {
-        "friction": set_up.friction[0, 0],
-        "tip_bend_rad": stack.wire.tip_bend_rad,
-        "tip_stiffness_factor": tip_stiffness_factor,
-    }
-    drawn = Draw(set_up.initial, trajectory.command, **{name: np.array([value]) for name, value in one.items()})
+    drawn = Draw(
+        set_up.initial,
+        trajectory.command,
+        friction=set_up.friction[:1, 0],
+        tip_bend_rad=np.array([stack.wire.tip_bend_rad]),
+        tip_stiffness_factor=np.array([tip_stiffness_factor]),
+    )
     store_block(layout.context, block, drawn, trajectory, np.array([False]))
     describe(layout, [block])

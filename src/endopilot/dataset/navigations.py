@@ -81,7 +81,7 @@ def simulate_navigations(
     simulator = Simulator(anatomy, stacks, actuation=actuation, motion=motion, config=config)
     _begin(simulator, watch, initial, friction)
     if record_shape:
-        check_shape_memory(*control.shape[:2], simulator.nodes)
+        check_shape_memory(len(control), control.shape[1], simulator.nodes)
     recorder = Recorder(simulator, SAMPLE_PERIOD_S, record_shape=record_shape)
     stopped = np.zeros(len(control), dtype=bool)
     inserted = simulator.inserted_length
