@@ -12,6 +12,7 @@ from synthetic_robot import drawn, logged
 from endopilot.cli import main
 from endopilot.devices.device import read_wire
 from endopilot.devices.robot import read_robot
+from endopilot.files import read_json
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,7 @@ def test_a_robot_is_calibrated_and_its_log_replayed(vessel, log_file, tmp_path, 
         "friction",
         "play_rad",
     }
-    robot, written = read_robot(tmp_path / "robot.yaml"), json.loads((tmp_path / "robot.json").read_text())
+    robot, written = read_robot(tmp_path / "robot.yaml"), read_json(tmp_path / "robot.json")
     assert robot.wire.play_mm == found["estimates"]["play_mm"]["value"] and robot.encoders_at == "motor"
     assert any(line.startswith("play_mm: ") and "95 %" in line for line in robot.sources)
     assert written["estimates"] == found["estimates"] and written["inputs"]["log.csv"]
@@ -56,7 +57,7 @@ def test_a_robot_is_calibrated_and_its_log_replayed(vessel, log_file, tmp_path, 
     assert replayed["episodes"] == 5 and replayed["error_along_mm"] < 0.5
     table, errors = pd.read_csv(made / "replay.csv"), pd.read_csv(made / "errors.csv")
     assert table.groupby("episode")["given"].mean().between(0.4, 0.6).all() and len(errors) == 5
-    assert json.loads((made / "manifest.json").read_text())["figures"] == replayed
+    assert read_json(made / "manifest.json")["figures"] == replayed
     with Image.open(made / "replay.png") as picture:
         assert min(picture.size) > 400
 
