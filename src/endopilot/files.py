@@ -90,6 +90,19 @@ def write_json(path: Path, content: Any) -> None:
         partial.write_text(json_text(content) + "\n", encoding="utf-8")
 
 
+def write_yaml(path: Path, content: Any) -> None:
+    """Write `content` as YAML in its order, whole or not at all; tuples become lists."""
+    with writing(path) as partial:
+        text = yaml.safe_dump(_lists(content), sort_keys=False, allow_unicode=True)
+        partial.write_text(text, encoding="utf-8")
+
+
+def _lists(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {name: _lists(each) for name, each in content.items()}
+    return [_lists(each) for each in content] if isinstance(content, (list, tuple)) else content
+
+
 def read_text(path: Path, *, what: str = "text file", largest: int = _LARGEST_YAML) -> str:
     """Return what a text file holds, in UTF-8, or in UTF-16 if it begins with that encoding's mark.
 

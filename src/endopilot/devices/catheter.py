@@ -18,7 +18,7 @@ from jaxtyping import Float
 from pydantic import model_validator
 
 from endopilot.devices.device import Device, Sourced, Wire
-from endopilot.devices.device_files import there
+from endopilot.devices.device_files import named_file
 from endopilot.devices.device_ranges import (
     MOST_VALUES,
     Abscissa,
@@ -111,11 +111,7 @@ def read_catheter(name_or_path: str | Path) -> Catheter:
     Raises:
         InputError: no such catheter, or a file that is not one; the line names file, field, value and mend.
     """
-    shipped = _SHIPPED / f"{name_or_path}.yaml"
-    path = shipped if there(shipped) else Path(name_or_path)
-    if not there(path):
-        names = ", ".join(list_catheters())
-        raise InputError(f"catheter '{name_or_path}': no such catheter or file; give a path, or choose from {names}")
+    path = named_file("catheter", name_or_path, (_SHIPPED,), list_catheters)
     content = read_settings(path, CatheterFile)
     entries = {field.name: getattr(content, field.name) for field in fields(content)}
     constants = {name: entry.value for name, entry in entries.items() if isinstance(entry, Sourced)}

@@ -8,6 +8,7 @@ $XDG_CONFIG_HOME, or ~/.config where that is not set.
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from endopilot.errors import InputError
@@ -40,14 +41,25 @@ def device_file(name_or_path: str | Path) -> Path:
         InputError: no such device or file, several folders hold a device of this name, or ENDOPILOT_DEVICES names no
             folder.
     """
-    folders = [_SHIPPED, *_user_folders()]
+    folders = (_SHIPPED, *_user_folders())
+    return named_file("device", name_or_path, folders, lambda: (*list_wires(), *user_devices()))
+
+
+def named_file(
+    kind: str, name_or_path: str | Path, folders: Sequence[Path], names: Callable[[], Sequence[str]]
+) -> Path:
+    """Return a YAML file of some kind, by its name in one of some folders, or by its path.
+
+    Raises:
+        InputError: no such name or file, or several folders hold the name.
+    """
     files = [path for folder in folders if there(path := folder / f"{name_or_path}.yaml")]
     if len(files) > 1:
-        raise InputError(f"device '{name_or_path}': {' and '.join(map(str, files))} both hold it; rename yours")
+        raise InputError(f"{kind} '{name_or_path}': {' and '.join(map(str, files))} both hold it; rename yours")
     path = files[0] if files else Path(name_or_path)
     if not there(path):
-        names = ", ".join((*list_wires(), *user_devices()))
-        raise InputError(f"device '{name_or_path}': no such device or file; give a path, or choose from {names}")
+        choice = ", ".join(names())
+        raise InputError(f"{kind} '{name_or_path}': no such {kind} or file; give a path, or choose from {choice}")
     return path
 
 

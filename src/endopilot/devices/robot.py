@@ -12,15 +12,13 @@ from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
 import numpy as np
-import yaml
 from jaxtyping import Float
 from pydantic import model_validator
 
 from endopilot.devices.device import Device
-from endopilot.devices.device_files import there
+from endopilot.devices.device_files import named_file
 from endopilot.devices.transmission import Transmission
-from endopilot.errors import InputError
-from endopilot.files import writing
+from endopilot.files import write_yaml
 from endopilot.settings import NonNegative, Positive, Within, read_settings, settings
 
 ASSUMED, IDEAL = "assumed", "ideal"
@@ -144,9 +142,7 @@ class RobotConfig:
         Raises:
             InputError: the file cannot be written.
         """
-        content = {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
-        with writing(Path(path)) as partial:
-            partial.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
+        write_yaml(Path(path), asdict(self))
 
 
 def list_robots() -> tuple[str, ...]:
@@ -162,9 +158,5 @@ def read_robot(name_or_path: str | Path) -> RobotConfig:
     """
     if str(name_or_path) == ASSUMED:
         return RobotConfig()
-    named = _SHIPPED / f"{name_or_path}.yaml"
-    path = named if there(named) else Path(name_or_path)
-    if not there(path):
-        names = ", ".join(list_robots())
-        raise InputError(f"robot '{name_or_path}': no such robot or file; give a path, or choose from {names}")
+    path = named_file("robot", name_or_path, (_SHIPPED,), list_robots)
     return read_settings(path, RobotConfig, onto=RobotConfig())

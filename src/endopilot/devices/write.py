@@ -7,11 +7,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from endopilot.devices.catheter import Catheter, CatheterFile
 from endopilot.devices.device import Wire, WireFile
-from endopilot.files import writing
+from endopilot.files import write_yaml
 
 
 def write_device(device: Wire | Catheter, *, output: str | Path) -> None:
@@ -25,8 +23,7 @@ def write_device(device: Wire | Catheter, *, output: str | Path) -> None:
         InputError: the file cannot be written.
     """
     content = _wire(device) if isinstance(device, Wire) else _catheter(device)
-    with writing(Path(output)) as partial:
-        partial.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    write_yaml(Path(output), content)
 
 
 def _wire(wire: Wire) -> dict[str, Any]:

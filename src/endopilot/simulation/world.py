@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any, cast, get_args
 
 import numpy as np
-import yaml
 from jaxtyping import Float
 from pydantic import BeforeValidator, model_validator
 from pydantic_core import PydanticCustomError
@@ -18,11 +17,11 @@ from endopilot.anatomy.catheter_axis import turned_axis, with_axis
 from endopilot.anatomy.other_lumen import with_radii
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire
-from endopilot.devices.device_files import there
+from endopilot.devices.device_files import named_file
 from endopilot.devices.robot import RobotConfig, read_robot
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
-from endopilot.files import writing
+from endopilot.files import write_yaml
 from endopilot.settings import (
     LONGEST_S,
     Finite,
@@ -207,9 +206,7 @@ class World:
         Raises:
             InputError: the file cannot be written.
         """
-        with writing(Path(path)) as partial:
-            text = yaml.safe_dump(_plain(self.differences()), sort_keys=False, allow_unicode=True)
-            partial.write_text(text, encoding="utf-8")
+        write_yaml(Path(path), self.differences())
 
     def differences(self) -> dict[str, Any]:
         """Return the names and values of the fields that are not as given."""
@@ -234,11 +231,7 @@ def read_world(name_or_path: str | Path) -> World:
     """
     if str(name_or_path) == NOMINAL:
         return World()
-    named = _SHIPPED / f"{name_or_path}.yaml"
-    path = named if there(named) else Path(name_or_path)
-    if not there(path):
-        names = ", ".join(list_worlds())
-        raise InputError(f"world '{name_or_path}': no such world or file; give a path, or choose from {names}")
+    path = named_file("world", name_or_path, (_SHIPPED,), list_worlds)
     return read_settings(path, World, onto=World())
 
 
@@ -312,10 +305,3 @@ def _place(anatomy: Anatomy, stenosis: Stenosis) -> tuple[int, float]:
     ]
     index, abscissa = at[len(at) // 2]
     return index, abscissa
-
-
-def _plain(value: Any) -> Any:
-    """Return values as YAML writes them: lists for tuples."""
-    if isinstance(value, dict):
-        return {name: _plain(each) for name, each in value.items()}
-    return [_plain(each) for each in value] if isinstance(value, (list, tuple)) else value
