@@ -46,6 +46,8 @@ _ENTRANCE_MM = 150.0
 _COARSE = 8
 """Scatter is computed for squares of this many pixels a side."""
 _MOST_PULSES = 8
+_WIRE_STEP_MM = 0.1
+"""Distance of the places that a wire is made of, mm; on a coarser detector they are as much farther apart."""
 _ROADMAP_GREY = 90.0
 
 
@@ -248,7 +250,8 @@ class XrayImager:
             nodes: of the wire from its tip on, LPS mm.
         """
         radius = self.stack.wire.tip_radius_mm
-        points, size = wire_points(in_catheter(self.anatomy, nodes), radius, self.config.opaque_tip_mm)
+        step_mm = _WIRE_STEP_MM * max(1.0, self.config.geometry.pixel_mm / CArmGeometry().pixel_mm)
+        points, size = wire_points(in_catheter(self.anatomy, nodes), radius, self.config.opaque_tip_mm, step_mm)
         blur = self._blur_px(plane.zoom)
         points = place(plane.placed, points)
         return splat(plane.view, self.config.pixels, points, size, width_mm=radius / 2, blur_px=blur)
