@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
@@ -21,6 +22,8 @@ from endopilot.xray.moving_patient import seen, turned
 
 _FULL_PIXELS = ImageConfig().pixels
 """Of the house's detector; a coarser one has fewer and larger pixels on the same square."""
+_NOISE = 2**18
+"""Numbers of the table from which images take their noise: drawing it anew would cost as much as all else."""
 _MARGIN = 0.95
 """Share of an image's half width within which all centerlines lie."""
 _TARGET = np.arange(-1, 2)
@@ -182,8 +185,13 @@ class CArms:
             nodes = place(maps[:, None], nodes)
         for world, line in zip(chosen.tolist(), nodes, strict=True):
             devices = lines_from_tips(line[np.isfinite(line[:, 0])], inserted[world])
-            seed = int(exposed.random[world].integers(2**31))
-            exposed.image[world] = self._of[world].image(devices, seed)
+            exposed.image[world] = self._of[world].image(devices, exposed.random[world])
+
+
+@cache
+def _noise() -> Float32[np.ndarray, "n"]:
+    """Return a table of noise of standard deviation 1."""
+    return np.random.default_rng(0).standard_normal(_NOISE, dtype=np.float32)
 
 
 class _Views:
@@ -203,7 +211,7 @@ class _Views:
         given = navigation.anatomy
         roadmaps = self._imager if given is real else XrayImager(given, navigation.stack, config=self._imager.config)
         lines = np.concatenate([branch.centerline.points for branch in given.tree.branches])
-        self._planes, self._roadmaps, self._targets = [], [], []
+        self._planes, self._roadmaps, self._targets, self._size = [], [], [], pixels
         for angles in config.view_angles_deg[: 1 + config.biplane]:
             farthest = np.abs(view_at(angles, isocenter_of(given), geometry).project(lines)).max()
             fits = float(_MARGIN * pixels / 2 / farthest)
@@ -213,15 +221,16 @@ class _Views:
             row, column = np.rint(plane.pixel(navigation.target.position(given))).astype(int)
             self._targets.append(np.ix_(row + _TARGET, column + _TARGET))
 
-    def image(self, devices: Sequence[Float[np.ndarray, "_ 3"]], seed: int) -> UInt8[np.ndarray, "views rows columns"]:
-        """Return the images of devices, each a line from its tip on, LPS mm; the same seed, the same noise."""
-        wire, *catheters = devices
-        shown = []
-        for number, (plane, roadmap, at) in enumerate(zip(self._planes, self._roadmaps, self._targets, strict=True)):
-            signal: Float32[np.ndarray, "rows columns"] = self._imager.signal(
-                plane, wire, seed=2 * seed + number, catheters=catheters
-            )
-            grey = self._imager.grey(signal, roadmap=roadmap)
-            grey[at] = 255
-            shown.append(grey)
-        return np.stack(shown)
+    def image(
+        self, devices: Sequence[Float[np.ndarray, "_ 3"]], random: np.random.Generator
+    ) -> UInt8[np.ndarray, "views rows columns"]:
+        """Return the images of devices, each a line from its tip on, LPS mm; noise is a random part of a table."""
+        (wire, *catheters), size = devices, self._size
+        shown, noise = np.empty((len(self._planes), size, size), dtype=np.uint8), _noise()
+        begins = random.integers(len(noise) - size**2, size=len(shown))
+        for k, plane in enumerate(self._planes):
+            own = noise[begins[k] : begins[k] + size**2].reshape(size, size)
+            signal = self._imager.signal(plane, wire, noise=own, catheters=catheters)
+            shown[k] = self._imager.grey(signal, roadmap=self._roadmaps[k])
+            shown[k][self._targets[k]] = 255
+        return shown
