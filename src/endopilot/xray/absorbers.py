@@ -97,7 +97,9 @@ def catheter_line(anatomy: Anatomy) -> tuple[Float[np.ndarray, "n"], Places, Pla
 
 
 def in_catheter(
-    anatomy: Anatomy, nodes: Places, line: tuple[Float[np.ndarray, "n"], Places, Places] | None = None
+    anatomy: Anatomy,
+    nodes: Places,
+    line: tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None,
 ) -> Places:
     """Return the nodes of a wire, LPS mm, with those behind the ostium laid along the guiding catheter's bend.
 
