@@ -23,6 +23,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from benchmarks.figures import Bar, judged
+from endopilot.cli.arguments import OutputFolder
 from endopilot.control.agent import AgentPolicy
 from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import navigation_events
@@ -238,7 +239,7 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 def drive_in_worlds(
     *,
-    output: Path,
+    output: OutputFolder,
     planned: Annotated[int, Within(0, PLACES)] = 11,
     random: Annotated[int, Within(0, PLACES)] = 6,
     worlds: tuple[str, ...] = (),
@@ -246,8 +247,8 @@ def drive_in_worlds(
 ) -> dict[str, Any]:
     """Drive the agent, and a wire at random under its belief, in worlds that it does not know.
 
-    `output`/WORLD/DRIVE gets one file a navigation; an interrupted run goes on with the others. Worlds begin at
-    different patients of the set, and each goes on with the next.
+    `output`/WORLD/DRIVE gets one file a navigation; an interrupted run goes on with the others. The worlds take
+    turns; each begins at a patient of its own, and goes on with the next of the set.
 
     Args:
         output: folder of the results.
@@ -271,7 +272,8 @@ def drive_in_worlds(
             places = [(first + place) % PLACES for place in range(count)]
             paths[name, drive] = [output / name / drive / f"{place:02d}.json" for place in places]
     make = partial(measure, worlds=chosen, patients=patients)
-    make_missing("The agent in other worlds", [path for some in paths.values() for path in some], make)
+    in_turns = [some[turn] for turn in range(PLACES) for some in paths.values() if turn < len(some)]
+    make_missing("The agent in other worlds", in_turns, make)
     rows = [row(*key, [read_json(path) for path in some]) for key, some in paths.items() if some]
     found = figures(rows)
     return judged(found, {name: bar for name, bar in BARS.items() if name in found}) | {"worlds": rows}
