@@ -26,6 +26,7 @@ KEYPOINTS = {
     "wire": {"tip": 0.0, "10 mm behind": 10.0, "20 mm behind": 20.0, "30 mm behind": 30.0},
 }
 """Keypoints of each device: their names, and their distance behind its tip along it, mm."""
+_MOST_RAYS = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +115,7 @@ class Cine:
     def frames(self) -> Iterator[Frame]:
         """Yield the frames in turn."""
         config, draw, imager = self.config, self.draw, self.imager
-        patient = imager.patient(self.view)
+        patient = imager.patient(self.view, rays=self._rays())
         first = imager.plane_through(patient, self.view, 1.0, self.placed[0])
         self.air_kerma_ugy = imager.air_kerma_ugy(first, draw.dose)
         transit_s = self.flow.transit_of(imager.lumen_points) if draw.injection is not None else None
@@ -122,11 +123,11 @@ class Cine:
         devices = range(len(imager.stack) if self.driven is not None else 0)
         speeds = [self.driven.velocity(device, period_s) for device in devices] if self.driven is not None else []
         for number, placed in enumerate(self.placed):
-            lumen = imager.lumen(self.view, placed)
-            path = np.zeros_like(lumen)
+            parts: list[tuple[Float[np.ndarray, "n"] | float, float]] = [(1.0, 0.0)]
             if transit_s is not None:
-                share = np.interp(transit_s, self._transit, self._shares[number])
-                path = imager.lumen(self.view, placed, share=share, blur_px=blur)
+                parts.append((np.interp(transit_s, self._transit, self._shares[number]), blur))
+            lumen, *filled = imager.lumen(self.view, placed, *parts)
+            path = filled[0] if filled else np.zeros_like(lumen)
             masks = {"vessel": lumen > LUMEN_MM}
             masks["contrast"] = masks["vessel"] & (path > CONTRAST_SHARE * lumen)
             if transit_s is not None:
@@ -164,6 +165,12 @@ class Cine:
             pair = (places_on(points, along, at) for points in (line, frame.lines_px[name]))
             found[name] = tuple(np.where(beyond, np.nan, places) for places in pair)
         return found
+
+    def _rays(self) -> int:
+        """Return how many rays are cast through the CT along each side of the image: two a voxel, and 256 at most."""
+        ct = self.imager.ct
+        field_mm = self.config.image.pixels / self.view.scale * self.config.image.geometry.source_to_isocenter_mm
+        return _MOST_RAYS if ct is None else min(int(np.ceil(2 * field_mm / ct.spacing_mm.min())), _MOST_RAYS)
 
     def _lines(self, lines: list[Float[np.ndarray, "_ 3"]]) -> dict[str, Float[np.ndarray, "_ 3"]]:
         """Return the axes of all devices by name, LPS mm of the CT."""

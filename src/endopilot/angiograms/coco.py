@@ -22,8 +22,8 @@ CATEGORIES: tuple[dict[str, Any], ...] = tuple(
     )
     for number, name in enumerate(CLASSES, 1)
 )
-"""COCO's categories: the masks by name, with the keypoints of the devices. Of several driven catheters, the mask is that
-of all, and the keypoints are those of the inner one."""
+"""COCO's categories: the masks by name, with the keypoints of the devices. Of several driven catheters, the mask is
+that of all, and the keypoints are those of the inner one."""
 _SEEN = 2
 _MOST_FRAMES = 100_000
 """A cine's images are numbered from its own number times this."""

@@ -13,6 +13,7 @@ import SimpleITK as sitk
 from endopilot.angiograms.coco import coco
 from endopilot.angiograms.layout import CARD_FILE, MANIFEST_FILE, SAMPLES_FILE, Layout
 from endopilot.angiograms.masks import CLASSES
+from endopilot.angiograms.views import view_text
 from endopilot.angiograms.write import COCO_FILE, RECORD_FILE
 from endopilot.dataset.splits import SPLITS
 from endopilot.files import manifest, read_json, write_json, writing
@@ -36,8 +37,9 @@ tags: [x-ray, angiography, guidewire, simulated]
 
 # Angiograms with the truth in them
 
-{cines} cines of {frames} frames at {rate} frames a second, {pixels} × {pixels} pixels, of {patients} patients. Simulated by
-endopilot {version}; no patient was exposed. Devices: {devices}. With contrast: {injected} cines; with devices: {driven}.
+{cines} cines of {frames} frames at {rate} frames a second, {pixels} × {pixels} pixels, of {patients} patients.
+Simulated by endopilot {version}; no patient was exposed. Devices: {devices}. With contrast: {injected} cines; with
+devices: {driven}.
 
 ![Frames, and their masks](samples.png)
 
@@ -58,8 +60,8 @@ Splits are by patient. Seed {seed}. `manifest.json` holds all settings; `run.jso
 | `cines/NAME/coco.json` | what `annotations` holds of this cine |
 | `patients/NAME/` | the vessel as `endopilot anatomy` writes it, and the CT that the X-rays pass |
 
-For research and teaching. The images are simulated: what they lack is listed in the documentation of `endopilot angiograms`. Who
-may use them depends on the CTs that they were made of.
+For research and teaching. The images are simulated: the documentation of `endopilot angiograms` lists what they lack.
+Who may use them depends on the CTs that they were made of.
 """
 
 
@@ -128,12 +130,11 @@ def _write_samples(layout: Layout, records: Sequence[dict[str, Any]]) -> None:
     axes = np.atleast_1d(np.asarray(figure.subplots(rows, columns))).ravel()
     for place, index in zip(axes, chosen, strict=False):
         folder, record = layout.cines[index], records[index]
-        injection, last = record["injection"], record["frames"] - 1
-        shown_s = last / record["frames_per_second"] if injection is None else injection["start_s"] + injection["duration_s"]
-        place.imshow(_beside(folder, min(round(shown_s * record["frames_per_second"]), last)))
-        lao, cranial = record["view_angles_deg"]
-        side, tilt = ("LAO" if lao >= 0 else "RAO"), ("CRAN" if cranial >= 0 else "CAUD")
-        place.set_title(f"{folder.name}: {side} {abs(lao):.0f} {tilt} {abs(cranial):.0f}, {record['split']}", fontsize=8)
+        injection, rate, last = record["injection"], record["frames_per_second"], record["frames"] - 1
+        shown = last if injection is None else round((injection["start_s"] + injection["duration_s"]) * rate)
+        place.imshow(_beside(folder, min(shown, last)))
+        view = view_text(record["view_angles_deg"])
+        place.set_title(f"{folder.name}: {view}, {record['split']}", fontsize=8)
     for place in axes:
         place.axis("off")
     with writing(layout.output / SAMPLES_FILE) as partial:

@@ -12,6 +12,7 @@ from pydicom.uid import UID, ExplicitVRLittleEndian, XRayAngiographicImageStorag
 
 from endopilot.angiograms.cine import Cine
 from endopilot.files import writing
+from endopilot.xray.absorbers import is_coronary
 
 _BITS = 12
 _LARGEST = 2**_BITS - 1
@@ -70,12 +71,16 @@ def _header(cine: Cine, number: int, identity: str) -> Dataset:
     header.StudyInstanceUID, header.SeriesInstanceUID = _uid(identity, "study"), _uid(identity, "series", str(number))
     for empty in _EMPTY:
         setattr(header, empty, None)
+    if is_coronary(cine.imager.anatomy):
+        header.BodyPartExamined = "HEART"
+    else:
+        header.Laterality = None
     header.Modality, header.SeriesNumber, header.InstanceNumber = "XA", number + 1, 1
     header.ImageType = ["DERIVED", "SECONDARY", "SINGLE PLANE"]
     header.DerivationDescription = "simulated from a CT angiogram or a synthetic patient"
     header.SamplesPerPixel, header.PhotometricInterpretation = 1, "MONOCHROME2"
     header.BitsAllocated, header.BitsStored, header.HighBit, header.PixelRepresentation = 16, _BITS, _BITS - 1, 0
-    header.PixelIntensityRelationship, header.PixelIntensityRelationshipSign = "LOG", 1
+    header.PixelIntensityRelationship = "LOG"
     header.RescaleSlope, header.RescaleIntercept, header.RescaleType = 1, 0, "US"
     header.WindowCenter, header.WindowWidth = (_LARGEST + 1) / 2, (_LARGEST + 1) / _WIDER
     header.LossyImageCompression, header.BurnedInAnnotation = "00", "NO"

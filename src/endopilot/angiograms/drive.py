@@ -93,7 +93,9 @@ def drive_devices(config: AngiogramsConfig, draw: CineDraw, anatomy: Anatomy, st
                 proximal,
                 attempt,
             )
-    raise InputError(f"{anatomy.name}: {stack.name} could not be simulated in it; give another device, or this patient up")
+    raise InputError(
+        f"{anatomy.name}: {stack.name} could not be simulated in it; give another device, or this patient up"
+    )
 
 
 def _random(

@@ -21,7 +21,7 @@ from endopilot.types import VesselTree
 MIXING_S = 0.03
 """Time in which blood passes one well-mixed volume, s: an assumption. After one second of transit a sharp front is then
 spread by √(1 s · 0.03 s) = 0.17 s, standard deviation."""
-_STEPS = 8
+_STEPS = 24
 """Steps of the balance of contrast in `MIXING_S`."""
 _INLET_MM = 10.0
 """The blood's velocity at the ostium is that of the mean section of this length of vessel, mm."""
@@ -99,14 +99,17 @@ class Flow:
         """
         step = MIXING_S / _STEPS
         longest = min(float(self.transit_s.max()), float(times_s[-1]))
-        tanks = np.zeros(int(np.ceil(longest / MIXING_S)) + 2)
-        at_step = np.arange(int(np.ceil(times_s[-1] / step)) + 1)
-        inlet = np.minimum(injection.rate((at_step + 0.5) * step) / self.inflow_ml_s, 1.0)
-        wanted, shares = np.rint(times_s / step).astype(int), np.zeros((len(times_s), len(tanks) + 1))
-        for number, share in zip(at_step, inlet, strict=True):
-            shares[wanted == number] = np.append(share, tanks)
-            tanks += (np.append(share, tanks[:-1]) - tanks) / _STEPS
-        return np.append(0.0, (np.arange(len(tanks)) + 0.5) * MIXING_S), shares
+        tanks = int(np.ceil(longest / MIXING_S)) + 2
+        share = np.zeros(1 + tanks)  # at the ostium, then in each volume
+        inlet = np.minimum(injection.rate((np.arange(int(times_s[-1] / step) + 2) + 0.5) * step) / self.inflow_ml_s, 1)
+        at_step, shares = np.rint(times_s / step).astype(int), np.zeros((len(times_s), len(share)))
+        frame = 0
+        for number, share[0] in enumerate(inlet):
+            while frame < len(at_step) and at_step[frame] == number:
+                shares[frame] = share
+                frame += 1
+            share[1:] -= np.diff(share) / _STEPS
+        return np.append(0.0, (np.arange(tanks) + 0.5) * MIXING_S), shares
 
     def transit_of(self, places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Return the time, s, that blood takes from the ostium to the centerline nearest to each place, LPS mm."""

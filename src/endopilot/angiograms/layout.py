@@ -59,9 +59,7 @@ class Layout:
     def cines(self) -> list[Path]:
         """The cines' folders, those of one patient after each other."""
         return [
-            self.output / "cines" / f"{name}-{number:04d}"
-            for name in self.names
-            for number in range(self.config.cines)
+            self.output / "cines" / f"{name}-{number:04d}" for name in self.names for number in range(self.config.cines)
         ]
 
     def annotations(self, split: str) -> Path:
@@ -69,9 +67,7 @@ class Layout:
         return self.output / "annotations" / f"{split}.json"
 
 
-def lay_out(
-    sources: Sequence[Path], output: Path, stack: Stack, config: AngiogramsConfig
-) -> Layout:
+def lay_out(sources: Sequence[Path], output: Path, stack: Stack, config: AngiogramsConfig) -> Layout:
     """Read who the patients are, and share them among the splits.
 
     Args:

@@ -35,7 +35,7 @@ def stroke(
     if len(line) < 2:
         return mask
     along = length_along(line)
-    at = np.arange(0.0, along[-1], 1.0)
+    at = np.append(np.arange(0.0, along[-1], 1.0), along[-1])
     places, half = places_on(line, along, at), np.maximum(np.interp(at, along, radius), _THINNEST_PX)
     reach = int(np.ceil(half.max()))
     near = ((places > -reach) & (places < pixels - 1 + reach)).all(axis=1)

@@ -20,7 +20,7 @@ def command(
     scheduler: str | None = None,
     config: AngiogramsConfig = AngiogramsConfig(),
 ) -> Figures:
-    """Make X-ray cines of patients' vessels: contrast that flows, heart and breath, devices, and the truth of each frame.
+    """Make X-ray cines of patients' vessels, with contrast, motion and devices, and the truth of each frame.
 
     An interrupted run goes on where it stopped when the same command is given again.
 

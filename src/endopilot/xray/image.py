@@ -35,7 +35,7 @@ from endopilot.xray.absorbers import (
     without_contrast,
 )
 from endopilot.xray.carm import CArmGeometry, Pose, View, view_at, view_of
-from endopilot.xray.projector import cast, splat
+from endopilot.xray.projector import Shadow, cast, splat
 
 PHOTONS_MM2_UGY = 30174.0
 """Photons a mm² and µGy of a fluoroscopy beam (RQA 5 of IEC 62220-1)."""
@@ -122,6 +122,7 @@ class XrayImager:
         stack: the wire, and the catheters around it.
         config: detector and beam.
         isocenter: the middle of the vessel, about which the C-arm turns, LPS mm.
+        ct: of the patient, HU, without contrast in the vessel's blood; None for 200 mm of water.
         lumen_points: where the small volumes lie that the vessel's lumen is made of, LPS mm.
     """
 
@@ -143,7 +144,7 @@ class XrayImager:
         """
         self.anatomy, self.stack, self.config = anatomy, Stack.of(device), config or ImageConfig()
         self.isocenter = isocenter_of(anatomy)
-        self._ct = None if ct is None else without_contrast(ct, anatomy)
+        self.ct = None if ct is None else without_contrast(ct, anatomy)
         self.lumen_points, self._lumen_size = lumen_points(anatomy)
         self._guide_lumen = catheter_lumen_points(anatomy)
 
@@ -188,7 +189,7 @@ class XrayImager:
             placed: affine map of vessel and catheter, as `plane` takes it.
         """
         background = patient + self.guide(view, zoom_factor, placed)
-        vessel = self.lumen(view, placed, blur_px=self.blur_px(zoom_factor))
+        (vessel,) = self.lumen(view, placed, (1.0, self.blur_px(zoom_factor)))
         vessel += self.guide_lumen(view, zoom_factor, placed)
         primary = np.exp(-background)
         scatter = self._scattered(primary, zoom_factor)
@@ -203,9 +204,9 @@ class XrayImager:
             rays: cast through the CT, along each side of the image; their result is interpolated.
         """
         pixels = self.config.pixels
-        if self._ct is None:
+        if self.ct is None:
             return np.full((pixels, pixels), WATER_MM * _PLAIN_MM, dtype=np.float32)
-        through = cast(self._ct, view, pixels, min(rays, pixels))
+        through = cast(self.ct, view, pixels, min(rays, pixels))
         wide = zoom(through, pixels / through.shape[0], order=1, grid_mode=True, mode="nearest")
         return np.asarray(wide, dtype=np.float32)
 
@@ -229,21 +230,19 @@ class XrayImager:
         self,
         view: View,
         placed: Float[np.ndarray, "3 4"],
-        *,
-        share: Float[np.ndarray, "n"] | float = 1.0,
-        blur_px: float = 0.0,
-    ) -> Float32[np.ndarray, "rows columns"]:
-        """Return the path of each ray through the vessel's lumen, mm.
+        *parts: tuple[Float[np.ndarray, "n"] | float, float],
+    ) -> list[Float32[np.ndarray, "rows columns"]]:
+        """Return the path of each ray through the vessel's lumen, mm, once for each of some parts of it.
 
         Args:
             view: source and detector.
             placed: affine map of the vessel, as `plane_through` takes it.
-            share: by which the path counts at each of `lumen_points`, such as that of contrast in the blood.
-            blur_px: standard deviation of the detector's blur, pixels.
+            parts: the share by which the path counts at each of `lumen_points`, such as that of contrast in the blood,
+                and the standard deviation of the detector's blur, pixels.
         """
-        size, width = share * self._lumen_size, self.anatomy.distance_map.spacing_mm / 2
-        points = place(placed, self.lumen_points)
-        return splat(view, self.config.pixels, points, size, width_mm=width, blur_px=blur_px)
+        width = self.anatomy.distance_map.spacing_mm / 2
+        shadow = Shadow(view, self.config.pixels, place(placed, self.lumen_points))
+        return [shadow.of(share * self._lumen_size, width_mm=width, blur_px=blur) for share, blur in parts]
 
     def signal(
         self,
