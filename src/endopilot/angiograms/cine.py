@@ -97,6 +97,7 @@ class Cine:
             self._transit, self._shares = self.flow.contrast(draw.injection, times)
             self.contrast = np.stack([np.interp(self.flow.transit_s, self._transit, row) for row in self._shares])
         self.air_kerma_ugy = 0.0
+        self._guide = catheter_line(anatomy)
         self.driven: Driven | None = drive_devices(config, draw, anatomy, imager.stack) if draw.devices else None
 
     @cached_property
@@ -175,8 +176,9 @@ class Cine:
     def _lines(self, lines: list[Float[np.ndarray, "_ 3"]]) -> dict[str, Float[np.ndarray, "_ 3"]]:
         """Return the axes of all devices by name, LPS mm of the CT."""
         names = ["wire", "catheter", *(f"catheter_{k}" for k in range(2, len(lines)))]
-        laid = {name: in_catheter(self.imager.anatomy, nodes) for name, nodes in zip(names, lines, strict=False)}
-        return {"guide": catheter_line(self.imager.anatomy)[1]} | laid
+        anatomy, guide = self.imager.anatomy, self._guide
+        laid = {name: in_catheter(anatomy, nodes, guide) for name, nodes in zip(names, lines, strict=False)}
+        return {"guide": guide[1]} | laid
 
     def _device_masks(
         self, lines_mm: dict[str, Float[np.ndarray, "_ 3"]], lines_px: dict[str, Float[np.ndarray, "_ 2"]], number: int
