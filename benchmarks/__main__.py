@@ -38,6 +38,7 @@ BENCHMARKS = {
     "coronary-navigation": "agent.coronary_navigation:navigate_coronaries",
     "ladder-patients": "agent.ladder_patients:choose_patients",
     "xray-conditions": "agent.xray_conditions:drive_under_conditions",
+    "worlds": "agent.worlds:drive_in_worlds",
 }
 """Name of each benchmark, and the function that measures: module and name."""
 EXIT_FAILED, EXIT_BAD_INPUT = 1, 2

@@ -39,6 +39,8 @@ FEW_MM = 0.1
 """Advance that counts as one, mm."""
 FAR_MM = 10.0
 """Advance after which a wire has unwound, if it twists under friction, mm."""
+_PLAY_RAD = 5.65
+"""Play of the rotation that would make the tip wait as long after a reversal, 0.9 turn, rad."""
 _RESAMPLES = 2000
 
 
@@ -195,11 +197,9 @@ def at_commands(log: RobotLog, time_s: Float[np.ndarray, "tips"], tips: Float[np
 
 def drive_of(turns: str, friction: float, length_mm: float) -> RobotConfig:
     """Return the measured robot with its rotation lost in twist, in play, or not at all."""
-    robot = read_robot("kweon-2021-2d")
-    if turns == "play":
-        return robot
+    robot, play = read_robot("kweon-2021-2d"), _PLAY_RAD if turns == "play" else 0.0
     behind = Transmission(length_mm=length_mm, twist_friction_n_mm_mm=friction) if turns == "twist" else Transmission()
-    return replace(robot, wire=replace(robot.wire, play_rad=0.0, transmission=behind))
+    return replace(robot, wire=replace(robot.wire, play_rad=play, transmission=behind))
 
 
 def bench_twist(

@@ -96,15 +96,24 @@ def catheter_line(anatomy: Anatomy) -> tuple[Float[np.ndarray, "n"], Places, Pla
     return distance, places, heading
 
 
-def in_catheter(anatomy: Anatomy, nodes: Places) -> Places:
+def in_catheter(
+    anatomy: Anatomy,
+    nodes: Places,
+    line: tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None,
+) -> Places:
     """Return the nodes of a wire, LPS mm, with those behind the ostium laid along the guiding catheter's bend.
 
     The rod core's catheter is straight; nothing that it computes depends on what lies behind.
+
+    Args:
+        anatomy: the vessel.
+        nodes: of the wire.
+        line: the guiding catheter's axis (`catheter_line`), where it is known already.
     """
     start = anatomy.insertion
     behind = -((nodes - start.position) @ start.direction)
     inside = behind > 0
-    distance, places, _ = catheter_line(anatomy)
+    distance, places, _ = line or catheter_line(anatomy)
     aside = nodes[inside] - start.position + behind[inside, None] * start.direction
     laid = np.stack([np.interp(behind[inside], distance, axis) for axis in places.T], axis=-1)
     past = np.maximum(behind[inside] - distance[-1], 0.0)[:, None]

@@ -26,6 +26,7 @@ from endopilot.types import Anatomy, Volume
 from endopilot.xray.absorbers import (
     CATHETER_MM,
     WATER_MM,
+    catheter_line,
     catheter_lumen_points,
     catheter_points,
     driven_catheter_points,
@@ -35,7 +36,7 @@ from endopilot.xray.absorbers import (
     without_contrast,
 )
 from endopilot.xray.carm import CArmGeometry, Pose, View, view_at, view_of
-from endopilot.xray.projector import cast, splat
+from endopilot.xray.projector import blurred, cast, splat
 
 PHOTONS_MM2_UGY = 30174.0
 """Photons a mm² and µGy of a fluoroscopy beam (RQA 5 of IEC 62220-1)."""
@@ -46,6 +47,8 @@ _ENTRANCE_MM = 150.0
 _COARSE = 8
 """Scatter is computed for squares of this many pixels a side."""
 _MOST_PULSES = 8
+_WIRE_STEP_MM = 0.1
+"""Distance of the places that a wire is made of, mm; on a coarser detector they are as much farther apart."""
 _ROADMAP_GREY = 90.0
 
 
@@ -136,6 +139,7 @@ class XrayImager:
         self.anatomy, self.stack, self.config = anatomy, Stack.of(device), config or ImageConfig()
         self.isocenter = isocenter_of(anatomy)
         self._ct = None if ct is None else without_contrast(ct, anatomy)
+        self._guide = catheter_line(anatomy)
         self._filled = [lumen_points(anatomy), catheter_lumen_points(anatomy)]
 
     def plane(
@@ -187,6 +191,7 @@ class XrayImager:
         contrast: float = 0.0,
         dose: float = 1.0,
         seed: int = 0,
+        noise: Float32[np.ndarray, "rows columns"] | None = None,
         velocity: Float[np.ndarray, "n 3"] | None = None,
         catheters: Sequence[Float[np.ndarray, "_ 3"]] = (),
         catheter_velocities: Sequence[Float[np.ndarray, "_ 3"]] | None = None,
@@ -199,6 +204,7 @@ class XrayImager:
             contrast: share of the full contrast in the vessel's blood.
             dose: multiple of the usual dose.
             seed: of the noise.
+            noise: of standard deviation 1, a number for each pixel; drawn if not given.
             velocity: of the nodes, mm/s, which blurs the wire over the pulse; at rest if not given.
             catheters: nodes of each catheter from its tip on, LPS mm of the CT; none if not given.
             catheter_velocities: of these nodes, mm/s; at rest if not given.
@@ -215,10 +221,11 @@ class XrayImager:
         light = np.exp(-attenuation)
         light += plane.scatter
         light *= np.float32(np.exp(-plane.reference))
-        noise = np.random.default_rng([seed, 0x78726179]).standard_normal(light.shape, dtype=np.float32)
-        noise /= np.sqrt(light * np.float32(self.photons(plane, dose)))
+        if noise is None:
+            noise = np.random.default_rng([seed, 0x78726179]).standard_normal(light.shape, dtype=np.float32)
+        noise = noise / np.sqrt(light * np.float32(self.photons(plane, dose)))
         spread = config.scintillator_mm / config.geometry.pixel_mm * plane.zoom
-        return np.log(light) + gaussian_filter(noise, spread)
+        return np.log(light) + blurred(noise, spread)
 
     def grey(
         self,
@@ -248,7 +255,10 @@ class XrayImager:
             nodes: of the wire from its tip on, LPS mm.
         """
         radius = self.stack.wire.tip_radius_mm
-        points, size = wire_points(in_catheter(self.anatomy, nodes), radius, self.config.opaque_tip_mm)
+        step_mm = _WIRE_STEP_MM * max(1.0, self.config.geometry.pixel_mm / CArmGeometry().pixel_mm)
+        points, size = wire_points(
+            in_catheter(self.anatomy, nodes, self._guide), radius, self.config.opaque_tip_mm, step_mm
+        )
         blur = self._blur_px(plane.zoom)
         points = place(plane.placed, points)
         return splat(plane.view, self.config.pixels, points, size, width_mm=radius / 2, blur_px=blur)
@@ -264,7 +274,7 @@ class XrayImager:
             number: which one, from the inside out.
         """
         catheter = self.stack.catheters[number]
-        points, size = driven_catheter_points(catheter, in_catheter(self.anatomy, nodes))
+        points, size = driven_catheter_points(catheter, in_catheter(self.anatomy, nodes, self._guide))
         wall_mm = catheter.tip_radius_mm - catheter.inner_diameter_mm / 2
         blur = self._blur_px(plane.zoom)
         points = place(plane.placed, points)
