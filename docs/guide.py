@@ -99,7 +99,7 @@ def run(script: str, folder: Path, code: int = 0) -> str:
 
 
 def run_until_ready(script: str, folder: Path) -> str:
-    """Run commands in a folder until the last one prints an address, stop it as Ctrl-C does, and return what it printed."""
+    """Run commands in a folder until the last one prints an address, stop it by Ctrl-C, and return what it printed."""
     line = ["bash", "-e", "-c", re.sub(r"^(endopilot .*)\Z", r"exec \1", script.strip(), flags=re.MULTILINE)]
     with subprocess.Popen(line, cwd=folder, env=_environment(), stdout=subprocess.PIPE, encoding="utf-8") as process:
         printed = []
