@@ -32,6 +32,7 @@ BENCHMARKS = {
     "ostia": "anatomy.ostia:bench_ostia",
     "imaging": "imaging.segmentation:bench_imaging",
     "xray": "imaging.xray:bench_xray",
+    "angiograms": "imaging.angiograms:bench_angiograms",
     "wire-evidence": "imaging.wire_evidence:train_evidence",
     "agent-calibration": "agent.calibration:calibrate_agent",
     "agent-replanning": "agent.replanning:compare_replanning",

@@ -32,6 +32,7 @@ def test_intervals_of_the_drive_hold_the_truth(fork, wire, seed) -> None:
         told = found.estimates[name]
         assert told.identified and told.low <= value <= told.high, f"{name}: {value} not in {told}"
     assert abs(found.robot.wire.gain_translation / robot.wire.gain_translation - 1) < 0.03
+    assert abs(found.robot.wire.play_mm - robot.wire.play_mm) < 0.3
     assert found.robot.encoders_at == "motor"
 
 
@@ -74,6 +75,7 @@ def test_a_band_holds_throughout_nine_of_ten_episodes() -> None:
             branch=np.zeros((3, 2)),
             force=np.zeros((0, 2)),
             rotation_rad=0.0,
+            rotation_known_rad=np.nan,
         )
 
     sizes = random.permutation(np.arange(1.0, 20.0))
