@@ -25,8 +25,6 @@ from endopilot.types import Anatomy
 
 RANDOM = "random"
 """In place of a world or a robot: another one in each episode."""
-WorldGiven = World | str | Path
-RobotGiven = RobotConfig | str | Path
 _OSTIUM_MM, _REGISTERED_MM, _TIMES = 2.5, 1.0, 2.0
 """A random world's ostium and registration lie up to this far off, mm; friction is up to so many times more or less.
 The shipped worlds differ as much."""
@@ -89,8 +87,8 @@ class Reality:
         self,
         navigations: Sequence[Navigation],
         *,
-        world: WorldGiven | Sequence[WorldGiven] | None,
-        robot: RobotGiven | Sequence[RobotGiven] | None,
+        world: World | str | Path | Sequence[World | str | Path] | None,
+        robot: RobotConfig | str | Path | Sequence[RobotConfig | str | Path] | None,
         motion: Motion | None,
         config: SimulatorConfig,
     ) -> None:
@@ -233,7 +231,7 @@ class Reality:
 
     @staticmethod
     def _all_robots(
-        given: RobotGiven | Sequence[RobotGiven] | None, worlds: Sequence[World]
+        given: RobotConfig | str | Path | Sequence[RobotConfig | str | Path] | None, worlds: Sequence[World]
     ) -> list[RobotConfig | None] | None:
         """Return the robot of each world, None for one that is drawn; none at all where devices do as they are told."""
         if given is None and all(each.robot is None for each in worlds):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -11,12 +12,13 @@ from gymnasium.vector import AutoresetMode
 from jaxtyping import Float, UInt8
 from numpy.typing import ArrayLike
 
+from endopilot.devices.robot import RobotConfig
 from endopilot.env.observation import Observed
-from endopilot.env.reality import RobotGiven, WorldGiven
 from endopilot.env.vector import NavigateVectorEnv, NavigationState, Observations
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import CORE, LadderVersion
 from endopilot.xray.fluoroscope import FluoroscopeConfig
@@ -48,8 +50,8 @@ class NavigateEnv(gymnasium.Env):
         observation: Observed = "state",
         pixels: int = 64,
         c_arm: FluoroscopeConfig | None = None,
-        world: WorldGiven | Sequence[WorldGiven] | None = None,
-        robot: RobotGiven | Sequence[RobotGiven] | None = None,
+        world: World | str | Path | Sequence[World | str | Path] | None = None,
+        robot: RobotConfig | str | Path | Sequence[RobotConfig | str | Path] | None = None,
         motion: Motion | None = None,
         config: SimulatorConfig = CORE,
         render_mode: str | None = None,

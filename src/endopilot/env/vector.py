@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
@@ -20,13 +21,14 @@ from endopilot.devices.robot import RobotConfig
 from endopilot.env.exposures import CArms
 from endopilot.env.observation import Measured, Observed, observe, observe_exposed, space
 from endopilot.env.picture import Picture
-from endopilot.env.reality import Reality, RobotGiven, WorldGiven
+from endopilot.env.reality import Reality
 from endopilot.env.route_tables import RouteTables
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState
+from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation, is_safe, reached
 from endopilot.tasks.task import CORE, LadderVersion, in_catheter, reference_navigation, training_navigations
 from endopilot.xray.fluoroscope import FluoroscopeConfig
@@ -261,8 +263,8 @@ class NavigateVectorEnv(VectorEnv):
         observation: Observed = "state",
         pixels: int = 64,
         c_arm: FluoroscopeConfig | None = None,
-        world: WorldGiven | Sequence[WorldGiven] | None = None,
-        robot: RobotGiven | Sequence[RobotGiven] | None = None,
+        world: World | str | Path | Sequence[World | str | Path] | None = None,
+        robot: RobotConfig | str | Path | Sequence[RobotConfig | str | Path] | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         motion: Motion | None = None,
         config: SimulatorConfig = CORE,
