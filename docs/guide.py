@@ -28,7 +28,7 @@ from pathlib import Path
 FOLDER = Path(__file__).with_suffix("")
 BLOCK = re.compile(
     r"^```(?P<kind>bash|text|console)\n(?P<text>.*?)^```$"
-    r"|^<!-- (?P<mark>not run|until Ctrl-C|columns|picture)(?:: (?P<file>.*?))? -->\n(?P<next>(?:\|.*\n)*)",
+    r"|^<!-- (?P<mark>not run|until Ctrl-C|columns|picture)(?:: (?P<file>[^\n]*?))? -->\n(?P<next>(?:\|[^\n]*\n)*)",
     re.MULTILINE | re.DOTALL,
 )
 PICTURE_PIXELS, PICTURE_COLOURS = 1200, 64
@@ -94,12 +94,20 @@ def run(script: str, folder: Path, code: int = 0) -> str:
             printed.append(_in_shell("\n".join(others), folder))
             others.clear()
         if line != "endopilot":
-            printed.append(_in_process(shlex.split(line, comments=True)[1:], folder, code))
+            printed.append(_in_process(_words(line, folder), folder, code))
     return "".join(printed)
 
 
+def _words(line: str, folder: Path) -> list[str]:
+    """Return a command's arguments, with the paths that a pattern stands for."""
+    words = []
+    for word in shlex.split(line, comments=True)[1:]:
+        words += sorted(str(path.relative_to(folder)) for path in folder.glob(word)) if "*" in word else [word]
+    return words
+
+
 def run_until_ready(script: str, folder: Path) -> str:
-    """Run commands in a folder until the last one prints an address, stop it by Ctrl-C, and return what it printed."""
+    """Run commands until the last one prints an address, stop it as Ctrl-C does, and return what they printed."""
     line = ["bash", "-e", "-c", re.sub(r"^(endopilot .*)\Z", r"exec \1", script.strip(), flags=re.MULTILINE)]
     with subprocess.Popen(line, cwd=folder, env=_environment(), stdout=subprocess.PIPE, encoding="utf-8") as process:
         printed = []
@@ -126,7 +134,8 @@ def _in_process(arguments: list[str], folder: Path, code: int) -> str:
         raise RuntimeError(f"endopilot {shlex.join(arguments)}: ended with {ended}, not {code}: {err.getvalue()}")
     if code == 0:
         return out.getvalue()
-    return "".join(f"{line}\n" for line in err.getvalue().splitlines() if not re.search(r": done in [\d.]+ s$", line))
+    lines = [line for line in err.getvalue().splitlines() if not re.search(r": done in [\d.]+ s$", line)]
+    return "\n".join([*lines, ""]).replace(f"{folder}{os.sep}", "")
 
 
 def _in_shell(script: str, folder: Path) -> str:
