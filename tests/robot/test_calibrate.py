@@ -11,8 +11,18 @@ import pytest
 import endopilot
 from benchmarks.robot.synthetic import drawn, logged
 from endopilot.errors import InputError
-from endopilot.robot.calibrate import CalibrateConfig, band, calibrate, left_out_share
-from endopilot.robot.replay import EpisodeReplay
+from endopilot.robot.calibrate import (
+    RESOLUTION,
+    UNITS,
+    WIRE,
+    CalibrateConfig,
+    band,
+    calibrate,
+    fit_wire,
+    left_out_share,
+)
+from endopilot.robot.candidates import estimates
+from endopilot.robot.replay import EpisodeReplay, prepare, usable_episodes
 
 sys.path.append(str(Path(__file__).parents[2] / "examples"))
 
@@ -34,6 +44,23 @@ def test_intervals_of_the_drive_hold_the_truth(fork, wire, seed) -> None:
     assert abs(found.robot.wire.gain_translation / robot.wire.gain_translation - 1) < 0.03
     assert abs(found.robot.wire.play_mm - robot.wire.play_mm) < 0.3
     assert found.robot.encoders_at == "motor"
+
+
+def test_intervals_of_the_wire_hold_the_truth(fork, wire) -> None:
+    robot = drawn(4)
+    log = logged(fork, wire, robot, episodes=5, seconds=5.0, seed=4)
+    prepared = prepare(usable_episodes([log], fork), fork, 0.5, robot)
+    tried = fit_wire(prepared, wire, robot, CalibrateConfig(wires=32, wire_episodes=5))
+    found = estimates(tried, WIRE, UNITS, RESOLUTION)
+    truth = {
+        "tip_bend_deg": np.degrees(wire.tip_bend_rad),
+        "tip_bend_length_mm": wire.tip_bend_length_mm,
+        "friction": wire.friction,
+        "tip_stiffness_factor": 1.0,
+        "play_rad": robot.wire.play_rad,
+    }
+    assert all(found[name].low <= value <= found[name].high for name, value in truth.items()), found
+    assert found["play_rad"].identified and not found["friction"].identified
 
 
 def test_too_few_episodes_are_refused(fork, wire) -> None:
