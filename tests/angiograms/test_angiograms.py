@@ -231,6 +231,7 @@ def test_the_command_drives_devices_by_a_policy(patient, tmp_path, capsys, monke
     ("change", "line"),
     [
         ({"sources": []}, "anatomies: none given"),
+        ({"output": "made", "ct": True}, "was begun with patients.fork"),
         ({"sources": ["nothing"]}, "nothing: is no anatomy and no CT"),
         ({"sources": ["fork", "fork"]}, "2 are named 'fork'"),
         ({"config": {"drive": "nobody"}}, "nobody"),
@@ -238,10 +239,14 @@ def test_the_command_drives_devices_by_a_policy(patient, tmp_path, capsys, monke
     ],
 )
 def test_what_cannot_be_made_is_said_in_one_line(made, patient, tmp_path, change, line):
+    if change.get("ct"):
+        shutil.copytree(patient, tmp_path / "with")
+        (tmp_path / "with" / "ct.nii.gz").write_bytes(b"another")
+        patient = tmp_path / "with"
     sources = [patient if one == "fork" else tmp_path / one for one in change.get("sources", ["fork"])]
     config = replace(CONFIG, cines=1, device_share=1.0, **change.get("config", {}))
     output = made if change.get("output") else tmp_path / "new"
-    config = replace(CONFIG, **change["config"]) if change.get("output") else config
+    config = replace(CONFIG, **change.get("config", {})) if change.get("output") else config
     with pytest.raises(InputError, match=line) as told:
         make_angiograms(sources, output=output, device=STACK, config=config)
     assert "\n" not in str(told.value)
