@@ -217,13 +217,15 @@ def _refined(scene: Scene, registered: Registration, used: Sequence[int]) -> lis
 
 def cases_of(wires: int) -> list[Case]:
     """Return the exposures of some wires: at the usual dose in both views and in each alone; and others in both."""
-    usual = [(wire, 1.0, 0.0, used) for wire in range(wires) for used in SHOWN]
-    other = [
+    usual: list[Case] = [(wire, 1.0, 0.0, used) for wire in range(wires) for used in SHOWN]
+    other: list[Case] = [
         (wire, dose, contrast, (0, 1))
         for wire, dose, contrast in itertools.product(range(0, wires, 2), DOSES, CONTRASTS)
         if (dose, contrast) != (1.0, 0.0)
     ]
-    absent = [(None, dose, contrast, used) for dose in DOSES for contrast in CONTRASTS for used in SHOWN[:2]]
+    absent: list[Case] = [
+        (None, dose, contrast, used) for dose in DOSES for contrast in CONTRASTS for used in SHOWN[:2]
+    ]
     return usual + other + absent * _NO_WIRE
 
 
