@@ -37,8 +37,8 @@ _FORCE_SD_N, _FORCE_SHARE = 0.02, 0.2
 """Standard deviation of the force that a simulated device predicts, N, and as a share of it."""
 _LEAST_LIKELY = 0.02
 """No force makes a sample less likely than this, as a share of the most likely: simulated devices may be elsewhere."""
-_MOVES_MM_S = 0.5
-"""A motor that turns no faster says nothing by its force, mm/s."""
+_MOVES_MM_S, _TURNS_RAD_S = 0.5, 0.1
+"""A motor says something by its force that advances faster than this, mm/s, and turns its device no faster, rad/s."""
 _TAKEN_UP = np.array([0.05, 0.03])
 """What is left of a play that counts as taken up, mm and rad."""
 _WORTH_IT = np.array([0.3, 0.1])
@@ -172,8 +172,8 @@ class Drives:
             pushed_n: what the device ahead of the valve is believed to take of it, N.
             valve: friction of the introducer's valve, N, and its drag, N·s/mm.
         """
-        speed = float(self._sent[device, 0])
-        if not self.lose or abs(speed) < _MOVES_MM_S:
+        speed, turning = self._sent[device].tolist()
+        if not self.lose or abs(speed) < _MOVES_MM_S or abs(turning) > _TURNS_RAD_S:
             return
         left = self._gap[:, device, 0] / 2 - np.sign(speed) * self._ahead[:, device, 0]
         error = force_n - pushed_n - np.where(left < _TAKEN_UP[0], np.sign(speed) * valve[0] + speed * valve[1], 0.0)
