@@ -208,6 +208,18 @@ class World:
         changed = {name: value for name, value in own.items() if value not in (None, ())}
         return replace(given, **changed) if changed else given
 
+    def check_engine(self, what: str) -> None:
+        """Check that the rod core moves the wire.
+
+        Args:
+            what: what it has to move in, as the message names it.
+
+        Raises:
+            InputError: another engine does.
+        """
+        if self.engine != "rod":
+            raise InputError(f"world: engine = {self.engine}; {what} are of the rod core alone: leave it out")
+
     def real_robot(self, given: RobotConfig) -> RobotConfig:
         """Return the robot as it truly is."""
         return (self.robot or given).delayed(self.latency_factor)
