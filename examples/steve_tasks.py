@@ -49,6 +49,9 @@ TASK = {
 """What the benchmark's tasks have in common."""
 OSTIUM_MM, DIRECTION = (-35.0, 65.0, 5.0), (-1.0, -1.0, 0.0)
 """Insertion of DualDeviceNav in the coordinates of its curves: the benchmark takes (x, y, z) as (y, -z, -x)."""
+NARROW_MM = 0.9
+"""Curves with a smaller radius, two branches behind the left carotid artery, are left out: the catheter hardly fits into
+them, and their walls would have to be five times finer than all others."""
 GOALS = ("LCCA", "LVA", "RCCA", "RVA")
 TARGETS = 20
 
@@ -128,8 +131,10 @@ def convert(episodes: Path, folder: Path) -> list[str]:
 def convert_curves(curves: Path, folder: Path, seed: int = 0) -> list[list[float]]:
     """Write anatomy, devices and task of DualDeviceNav's curves into a folder, and return the targets, LPS mm."""
     lines = read_source(curves).content
+    kept = [number for number, radius in enumerate(lines.radius) if radius.min() > NARROW_MM]
+    lines = Polylines(*(tuple(each[number] for number in kept) for each in (lines.points, lines.radius, lines.names)))
     anatomy = endopilot.extract_anatomy(
-        curves, name="dualdevicenav", config=endopilot.AnatomyConfig(ostium_mm=OSTIUM_MM)
+        lines, name="dualdevicenav", config=endopilot.AnatomyConfig(ostium_mm=OSTIUM_MM)
     )
     anatomy = with_axis(anatomy, np.array(DIRECTION) / np.linalg.norm(DIRECTION))
     endopilot.write_anatomy(anatomy, output=folder / "patients" / "dualdevicenav")

@@ -141,6 +141,10 @@ class Push:
         """Whether the place is the target."""
         return self.waypoint >= self.route.target.abscissa
 
+    def spreads(self, trials: Trials) -> bool:
+        """Return whether wires may come to the place one after another: to a target in a wide lumen."""
+        return self.last and trials.devices == 1 and self.route.is_wide(self.waypoint)
+
     def run(self, trials: Trials, periods: int, lead: Each | None = None) -> Pushed:
         """Push trials past the place, and tell which pass.
 
@@ -152,7 +156,7 @@ class Push:
         """
         alone, begun = trials.devices == 1, len(trials.rows)
         took, halt = np.full(trials.count, begun), np.full(trials.count, "late", dtype=object)
-        passed = np.zeros(trials.count, dtype=bool)
+        passed, been = np.zeros(trials.count, dtype=bool), np.zeros(trials.simulator.worlds, dtype=bool)
         progress = farthest = self._progress(trials)
         inserted_there, follower = _deepest(trials), _Follower(self, trials, lead)
         waits = alone and not self.strict and self.route.is_wide(self.waypoint)
@@ -181,7 +185,11 @@ class Push:
             if alone:
                 stalls = self._stalls(trials, begun) & (not waits)
                 stop(stalls & self.strict, "stalled")
-                passed |= ~trials.still & self.arrived(trials)
+                arrived = self.arrived(trials)
+                if self.spreads(trials):
+                    been |= self.route.passed(trials.foremost, self.waypoint)
+                    arrived = trials.mean(been) > 0.5
+                passed |= ~trials.still & arrived
                 trials.still |= passed
                 stop(stalls, "stalled")
                 stop((progress >= self.waypoint + _BEYOND_MM) & (self.last or not self.strict), "off")

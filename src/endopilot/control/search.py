@@ -180,32 +180,26 @@ class Search:
         course, push = self._course, self._push(waypoint, strict=self._alone)
         if push.arrived(course)[0]:
             return None
-        kept = course.kept()
         trials = course if self._alone else self._few.copy_of(course)
         pushed = self._tried[STRAIGHT] = push.run(trials, self._left, np.array(self._repertoire.leads))
         self._hard = float(pushed.farthest.max())
         passes = pushed.passed[0] if self._alone else self._follow(pushed, SPARE_SHARE, waypoint, turns=1)
-        if not passes and push.last and self._alone and self.route.is_wide(waypoint):
-            passes = self._most_arrive(kept)
+        if push.spreads(course):
+            passes = passes and self._arrives(push)
         return None if passes else pushed.halt[int(np.argmax(pushed.farthest))]
 
-    def _most_arrive(self, kept: Kept) -> bool:
-        """Cut a straight push of a wire alone to where most wires are at the target; return whether there is a place.
+    def _arrives(self, push: Push) -> bool:
+        """Return whether the course is past a place; wires that it does not bring to the target are left behind.
 
-        In a wide lumen the wires that are held possible spread by more than what counts as arrived. The others are left
-        behind: an exposure will show which of them is right.
+        That happens in a wide lumen, where the wires that are held possible spread by more than what counts as arrived.
         """
-        course, target = self._course, self.route.target.abscissa
-        there = np.array([self.route.passed(row.tip, target) * course.weight for row in course.rows[kept.periods :]])
-        best = int(np.argmax(there.sum(axis=1)))
-        if there[best].sum() <= 0.5:
-            return False
-        controls = [row.control for row in course.rows[kept.periods : kept.periods + best + 1]]
-        course.restore(kept)
-        for control in controls:
-            course.move(control)
-        course.weight = there[best] / there[best].sum()
-        return True
+        course = self._course
+        if not push.spreads(course):
+            return bool((push.arrived(course) & ~course.still)[0])
+        there = self.route.passed(course.foremost, push.waypoint) * course.weight
+        if there.sum() > 0:
+            course.weight = there / there.sum()
+        return bool(there.sum() > 0)
 
     def _turned(self, grid: Grid, share: float, waypoint: float, kept: Kept) -> bool:
         """Try a grid before a place, and follow the best of it; return whether any passes.
@@ -258,7 +252,7 @@ class Search:
             for control in pushed.controls(trial):
                 if self._alone or control.any():
                     course.still |= course.move(control[None], force_n=limit_n)
-            if (self._push(waypoint).arrived(course) & ~course.still)[0]:
+            if self._arrives(self._push(waypoint)):
                 return True
             course.restore(kept)
         return False
