@@ -47,6 +47,8 @@ _STRETCH_MM = 20.0
 """A wire in a catheter passes the route in stretches of this length at most, mm."""
 _TURNS = (0.0, np.pi)
 """Angles by which a wire alone may be turned before it goes in, rad."""
+_NOTHING_SHARE = 1e-3
+"""Manoeuvres with less than this share of the force limit are as gentle as each other."""
 _REPEATED = 3
 """Trials of a manoeuvre that the course tries, one after another."""
 
@@ -241,13 +243,16 @@ class Search:
     def _follow(self, pushed: Pushed, share: float, waypoint: float, *, turns: int) -> bool:
         """Let the course do what the best trial of a manoeuvre did; return whether any passes within a share of force.
 
-        Of the places that most rotations pass, and among these of the cheapest, it is the rotation in the middle. Where
+        Of the places that most rotations pass, and among these of the cheapest, it is the rotation in the middle; of
+        those that cost next to nothing, the one that uses the least length of its devices. Where
         there is a catheter, trials have waited for each other. The course does not, and so has to pass again.
         """
         course, limit_n, cost = self._course, share * self._navigation.force_limit_n, self.manoeuvre_cost(pushed)
         rows, kept = pushed.within(limit_n).reshape(-1, turns), course.kept()
         trials = [at * turns + middle(row) for at, row in enumerate(rows) if row.any()]
-        trials.sort(key=lambda trial: (-int(rows[trial // turns].sum()), cost[trial]))
+        least = _NOTHING_SHARE * self._navigation.force_limit_n
+        used = pushed.inserted_mm
+        trials.sort(key=lambda trial: (-int(rows[trial // turns].sum()), max(cost[trial], least), used[trial]))
         for trial in trials[:_REPEATED]:
             for control in pushed.controls(trial):
                 if self._alone or control.any():

@@ -20,7 +20,7 @@ _DRAG_N_S_MM2, _SOFT_N_MM2 = 5e-6, 0.1
 """Drag on one mm of wire, N·s/mm²; far below friction. On a wire softer than the latter anywhere, N·mm², it falls with
 the square of that: it would fold as it is pushed."""
 _BLOOD_N_S_MM2 = 1e-8
-"""Drag is no less than that of blood on a slender wire, 2πη / ln(length over diameter) with η = 0.0035 Pa·s, N·s/mm²."""
+"""Drag is no less than that of blood on a slender wire, N·s/mm²: 2πη / ln(length / diameter) with η = 0.0035 Pa·s."""
 _GROWTH_MM = 40.0
 """Distance from the tip at which elements are twice as long as there; they grow in proportion to it, mm."""
 LONGEST_ELEMENTS = 5.0
