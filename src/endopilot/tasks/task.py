@@ -166,6 +166,12 @@ class Task:
         point = None if self.targets_mm is None else self.targets_mm[place]
         return self.navigation(self.patient(self.ladder, place), start_rotation_rad=turn, target_mm=point)
 
+    def learning_navigation(self, place: int) -> Navigation:
+        """Return the task in one of the patients to learn on, or where it has none, in one of the ladder's."""
+        if self.training is None:
+            return self.ladder_navigation(place)
+        return self.navigation(self.patient(self.training, place))
+
     def target(self, tree: VesselTree) -> Target:
         """Return the target in its section of a tree.
 
@@ -262,16 +268,22 @@ def _named(name: str, tasks: Sequence[Task]) -> Task:
     raise InputError(f"task: {name!r}; choose from {', '.join(task.name for task in tasks)}")
 
 
-def training_navigations(name: str, first: int, count: int) -> list[Navigation]:
-    """Return a task of the ladder's version 1 in `count` of its training patients, from number `first` on.
+def training_navigations(name: str | None, first: int, count: int, version: LadderVersion) -> list[Navigation]:
+    """Return a task of the ladder in `count` of its training patients, from number `first` on.
 
-    The learning environments `endopilot/NAME-v0` are made of these and stay as they are.
+    A task of one's own that has no such patients is returned in those that it is scored on.
+
+    Args:
+        name: of the task; all tasks of the version, one after another, if not given.
+        first: number of the first patient.
+        count: of patients of each task.
+        version: of the ladder, or a folder of one's own tasks.
 
     Raises:
         InputError: the ladder has no such task, or the task fewer patients.
     """
-    task = find_task(name, version=1)
-    return [task.navigation(task.patient(task.training, first + place)) for place in range(count)]
+    tasks = list_tasks(version) if name is None else (find_task(name, version=version),)
+    return [task.learning_navigation(first + place) for task in tasks for place in range(count)]
 
 
 def in_catheter(navigations: Sequence[Navigation], name: str) -> list[Navigation]:
