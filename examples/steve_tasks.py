@@ -30,7 +30,8 @@ import yaml
 
 import endopilot
 from endopilot.anatomy.catheter_axis import with_axis
-from endopilot.anatomy.sources import Polylines, read_source
+from endopilot.anatomy.read_source import read_source
+from endopilot.anatomy.sources import Polylines
 from endopilot.tasks.task import list_tasks
 
 POISSON = 0.49
