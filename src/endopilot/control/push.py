@@ -166,6 +166,7 @@ class Push:
         passed, been = np.zeros(trials.count, dtype=bool), np.zeros(trials.simulator.worlds, dtype=bool)
         progress = farthest = self._progress(trials)
         inserted_there, follower = _deepest(trials), _Follower(self, trials, lead)
+        beyond = progress > self.waypoint
         waits = alone and not self.strict and self.route.is_wide(self.waypoint)
         slack_mm = _SLACK_WIDTHS * self.route.width_mm(self.waypoint) if waits else _SLACK_MM
         off_mm, longest, force_n = self._limits(trials, waits)
@@ -195,11 +196,14 @@ class Push:
                 arrived = self.arrived(trials)
                 if self.spreads(trials):
                     been |= self.route.passed(trials.foremost, self.waypoint)
-                    arrived = trials.mean(been) > 0.5
+                    arrived, was_beyond = trials.mean(been) > 0.5, beyond
+                    beyond = progress > self.waypoint
+                    stop(was_beyond & ~beyond & ~arrived, "off")
                 passed |= ~trials.still & arrived
                 trials.still |= passed
                 stop(stalls, "stalled")
-                stop((progress >= self.waypoint + _BEYOND_MM) & (self.last or not self.strict), "off")
+                missed = progress >= self.waypoint + _BEYOND_MM
+                stop(missed & (not self.strict and not self.spreads(trials)), "off")
             stop(self._off(trials, off_mm), "off")
             stop(inserted - inserted_there > slack_mm, "stalled")
         if not alone:
@@ -219,9 +223,13 @@ class Push:
         return trials.all(route.progress(tip) >= self.waypoint)
 
     def _straight(self, trials: Trials, progress: Each) -> Control:
-        """Return what pushes wires alone on, slower as they come near to the target."""
+        """Return what pushes wires alone on, slower as they come near to the target; in a wide lumen also back to it."""
         left = self.waypoint - progress if self.last else np.full(trials.count, np.inf)
-        return trials.control(Move(WIRE, np.clip(left / DECISION_PERIOD_S, _SLOWEST_MM_S, self.config.speed_mm_s)))
+        speed = np.clip(left / DECISION_PERIOD_S, _SLOWEST_MM_S, self.config.speed_mm_s)
+        if self.spreads(trials):
+            back = np.clip(left / DECISION_PERIOD_S, -self.config.speed_mm_s, -_SLOWEST_MM_S)
+            speed = np.where(left < 0, back, speed)
+        return trials.control(Move(WIRE, speed))
 
     def _progress(self, trials: Trials) -> Each:
         return trials.mean(self.route.progress(trials.foremost))
@@ -309,7 +317,7 @@ class _Follower:
 def _slips(trials: Trials, before: Float[np.ndarray, "worlds"]) -> Bool[np.ndarray, "trials"]:
     """Return which drives have slipped in the last period, given the wires' inserted lengths before, mm."""
     commanded = np.tile(trials.rows[-1].control[:, WIRE, 0], trials.wires) * DECISION_PERIOD_S
-    return ~trials.all(trials.lengths[:, WIRE] - before >= _SLIP_SHARE * commanded)
+    return ~trials.all((trials.lengths[:, WIRE] - before >= _SLIP_SHARE * commanded) | (commanded < 0))
 
 
 def _deepest(trials: Trials) -> Each:
