@@ -223,7 +223,7 @@ class Push:
         return trials.all(route.progress(tip) >= self.waypoint)
 
     def _straight(self, trials: Trials, progress: Each) -> Control:
-        """Return what pushes wires alone on, slower as they come near to the target; in a wide lumen also back to it."""
+        """Return what pushes wires alone on, slower near to the target, and in a wide lumen back to it."""
         left = self.waypoint - progress if self.last else np.full(trials.count, np.inf)
         speed = np.clip(left / DECISION_PERIOD_S, _SLOWEST_MM_S, self.config.speed_mm_s)
         if self.spreads(trials):
