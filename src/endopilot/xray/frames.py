@@ -25,7 +25,9 @@ from jaxtyping import Float
 from endopilot.errors import InputError
 from endopilot.files import writing
 from endopilot.simulation.csv_file import read_columns
+from endopilot.xray.carm import View
 from endopilot.xray.tip_filter import TipLocation
+from endopilot.xray.tracker import TipEstimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +42,20 @@ class Frame:
 
     number: int
     lines: tuple[Float[np.ndarray, "_ 2"] | None, ...]
+
+
+def frame_of(number: int, found: TipEstimate | None, views: Sequence[View]) -> Frame:
+    """Return the frame of one exposure's images in which `TipDetector` found a wire, or none.
+
+    Args:
+        number: of the frame.
+        found: in the images.
+        views: that the detector was given; the frame's pixels are those of `View.project`.
+    """
+    if found is None:
+        return Frame(number, (None,) * len(views))
+    wire = np.concatenate([found.position[None], found.wire[::-1]])
+    return Frame(number, tuple(view.project(wire) for view in views))
 
 
 def read_frames(path: str | Path, *, views: int = 1) -> tuple[Frame, ...]:

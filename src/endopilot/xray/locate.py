@@ -8,19 +8,21 @@ from endopilot.errors import InputError
 from endopilot.progress import progress
 from endopilot.types import Anatomy
 from endopilot.xray.camera import Camera
+from endopilot.xray.carm import View
 from endopilot.xray.frames import Frame
 from endopilot.xray.tip_filter import LocateConfig, TipFilter, TipLocation
 
 
 def locate(
-    anatomy: Anatomy, *, frames: Sequence[Frame], cameras: Sequence[Camera], config: LocateConfig | None = None
+    anatomy: Anatomy, *, frames: Sequence[Frame], cameras: Sequence[Camera | View], config: LocateConfig | None = None
 ) -> tuple[TipLocation, ...]:
     """Find the tip of a device in each frame of a sequence.
 
     Args:
         anatomy: the vessel; only its tree is used.
         frames: what the cameras show, in the order of time.
-        cameras: one or two; their coordinates are those of the CT as far as the patient is registered.
+        cameras: one or two, or views, whose pixels count from the image's middle; their coordinates are those of the CT
+            as far as the patient is registered.
         config: what is known of patient and device before the first frame.
 
     Raises:

@@ -24,9 +24,10 @@ from endopilot.lines import length_along, places_on
 from endopilot.settings import Finite, NonNegative, OpenShare, Positive, Within, settings
 from endopilot.types import VesselTree
 from endopilot.xray.camera import Camera
+from endopilot.xray.carm import View
 from endopilot.xray.vessel_grid import VesselGrid, make_grid
 
-Line = Float[np.ndarray, "n 2"]
+Line = Float[np.ndarray, "_ 2"]
 _STEP_MM, _SAMPLE_MM = 1.0, 6.0
 """Distance of the grid's places, and of the compared points of a line, mm."""
 _BREATH_MM = 120.0
@@ -47,6 +48,8 @@ _LANDMARK_SD_MM, _TIP_SD_MM = 6.0, 2.0
 _STRAY, _BEYOND = np.log(1 / 200), -2.5
 """Logarithm of the density, 1/mm, of a point that is not of the device, evenly in 200 mm; and of one in the catheter or
 vessel before the root, where the way is not known."""
+_LEAST_ODDS = 20.0
+"""A line is the device's where it is likelier so, by this logarithm, than if its points were strays."""
 _WINDOW, _SLACK_MM, _SLACK_SHARE = 30, 3.0, 0.25
 """A point of the line belongs to the way within so many places, and this length and share of the line, of where it
 should be by its length."""
@@ -184,7 +187,7 @@ class TipFilter:
         grid: places of the tip.
     """
 
-    def __init__(self, tree: VesselTree, cameras: Sequence[Camera], config: LocateConfig | None = None) -> None:
+    def __init__(self, tree: VesselTree, cameras: Sequence[Camera | View], config: LocateConfig | None = None) -> None:
         """Take the vessel and what sees it; `config` says what is known before the first frame."""
         self.config = config or LocateConfig()
         self._tree, self._cameras = tree, tuple(cameras)
@@ -226,11 +229,14 @@ class TipFilter:
         score = self._log + self._fit(everywhere, tips, base).log_density
         best = np.argsort(-score, kind="stable")[:_MOST]
         places = np.sort(best[score[best] > score[best[0]] - _PRUNE])
-        fit, rows, strays = self._compare(seen, places, base)
-        log = self._log[places] + fit.log_density + strays
-        evidence = float(np.logaddexp.reduce(log))
-        if evidence < _STRAY * rows.value.shape[1]:
+        fit, rows, beyond = self._compare(seen, places, base)
+        # Points that fit no place are strays; so would all be that lie in the vessel, were there no device.
+        odds = fit.log_density - _STRAY * rows.used.sum(axis=1)
+        whole = rows.value.shape[1] > 2 * len(seen)
+        if np.logaddexp.reduce(self._log[places] + odds) < (_LEAST_ODDS if whole else 0.0):
             return self._nowhere(frame)
+        log = self._log[places] + odds + (_BEYOND - _STRAY) * beyond
+        evidence = np.logaddexp.reduce(log)
         self._log = np.full_like(self._log, -np.inf)
         self._log[places] = log - evidence
         self._mean[places], self._covariance[places] = fit.mean, fit.covariance
@@ -274,13 +280,13 @@ class TipFilter:
 
     def _compare(
         self, seen: Sequence[_Seen], places: Int[np.ndarray, "m"], base: Float[np.ndarray, "6"]
-    ) -> tuple[_Fit, _Rows, Float[np.ndarray, "m"]]:
-        """Return what the whole lines say of some places of the tip, and the logarithm of what their strays cost."""
+    ) -> tuple[_Fit, _Rows, Int[np.ndarray, "m"]]:
+        """Return what whole lines say of some places of the tip, and how many of their points lie before the root."""
         tips = _tip_rows(seen, places)
-        fit, rows, strays = self._fit(places, tips, base), tips, np.zeros(len(places))
+        fit, rows, beyond = self._fit(places, tips, base), tips, np.zeros(len(places), dtype=np.int64)
         count = [len(one.at) for one in seen]
         if not any(count):
-            return fit, rows, strays
+            return fit, rows, beyond
         moved = np.repeat(fit.moved[:, :1], sum(count), axis=1)
         bounds = np.cumsum([0, *count])
         for _ in range(_ROUNDS):
@@ -290,7 +296,7 @@ class TipFilter:
                 if high > low
             ]
             rows = _joined([tips, *(part for part, _ in parts)])
-            strays = np.sum([cost for _, cost in parts], axis=0)
+            beyond = np.sum([outside for _, outside in parts], axis=0)
             fit = self._fit(places, rows, base)
             # Each view's rows are those of its points, and one of its length.
             first, kept = tips.value.shape[1], []
@@ -298,7 +304,7 @@ class TipFilter:
                 kept.append(fit.moved[:, first : first + number])
                 first += number + 1
             moved = np.concatenate(kept, axis=1)
-        return fit, rows, strays
+        return fit, rows, beyond
 
     def _fit(self, places: Int[np.ndarray, "m"], rows: _Rows, base: Float[np.ndarray, "6"]) -> _Fit:
         """Return the density of observations, and the posterior of what they depend on."""
@@ -381,14 +387,14 @@ def _alike(apart: np.ndarray, length: float) -> np.ndarray:
 
 
 def _shown(
-    camera: Camera, points: Float[np.ndarray, "n 3"]
+    camera: Camera | View, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
     """Return the pixels of points, and the derivative by the point, pixels/mm."""
     slope = [(camera.project(points + axis) - camera.project(points - axis)) / 2 for axis in np.eye(3)]
     return camera.project(points), np.stack(slope, axis=-1)
 
 
-def _see(grid: VesselGrid, camera: Camera, line: Line, way: Float[np.ndarray, "n 3"]) -> _Seen:
+def _see(grid: VesselGrid, camera: Camera | View, line: Line, way: Float[np.ndarray, "n 3"]) -> _Seen:
     """Return a line's points, evenly apart, and the grid as the camera shows it where the pose has it."""
     shown, slope = _shown(camera, way)
     scale = np.sqrt((slope**2).sum(axis=(1, 2)) / 2)
@@ -424,8 +430,8 @@ def _tip_rows(seen: Sequence[_Seen], places: Int[np.ndarray, "m"]) -> _Rows:
 
 def _line_rows(
     grid: VesselGrid, seen: _Seen, places: Int[np.ndarray, "m"], moved: Float[np.ndarray, "m k 3"]
-) -> tuple[_Rows, Float[np.ndarray, "m"]]:
-    """Return what a line's points say, and its length, and the logarithm of what the points that fit no place cost.
+) -> tuple[_Rows, Int[np.ndarray, "m"]]:
+    """Return what a line's points say, and its length, and how many of them lie before the root.
 
     Args:
         grid: the places.
@@ -450,7 +456,6 @@ def _line_rows(
     place = np.take_along_axis(candidates, chosen, axis=2)[..., 0]
     beyond = seen.at > seen.along[places, None]
     used = np.isfinite(np.take_along_axis(gap, chosen, axis=2)[..., 0]) & (place != 0) & ~beyond
-    strays = _STRAY * (~used & ~beyond).sum(axis=1) + _BEYOND * beyond.sum(axis=1) - _BEYOND * (used & beyond).sum(1)
     scale = seen.scale[place]
     towards = np.einsum("ki,mkij->mkj", seen.across, seen.slope[place]) / scale[..., None]
     value = np.einsum("ki,mki->mk", seen.across, seen.points - seen.shown[place]) / scale
@@ -464,7 +469,7 @@ def _line_rows(
         variance=np.array([*[_POINT_SD_MM**2] * len(seen.at), (_LENGTH_SD_MM + _LENGTH_SHARE * seen.at[-1]) ** 2]),
         used=np.column_stack([used, any_used]),
     )
-    return rows, strays
+    return rows, beyond.sum(axis=1)
 
 
 def _joined(parts: Sequence[_Rows]) -> _Rows:
