@@ -224,3 +224,14 @@ def test_a_coronary_catheter_bends_up_behind_its_straight_end(fork):
     laid = in_catheter(coronary, wire)
     np.testing.assert_allclose(laid[:2], wire[:2], atol=1e-9)
     np.testing.assert_allclose(laid[2] - places[80], [0.0, 0.3, 0.0], atol=1e-9)
+
+
+def test_a_vessel_that_passes_behind_the_ostium_is_not_laid_into_the_catheter(fork):
+    """A right coronary artery comes back below its ostium, behind the plane across the catheter's axis."""
+    coronary = replace(fork, tree=replace(fork.tree, section_names=("1", "2")))
+    turn = np.linspace(1.5 * np.pi, 0.0, 40)
+    nodes = np.stack([12 * np.cos(turn) - 12, 0 * turn, 12 * np.sin(turn)], axis=-1)  # from the tip to the ostium
+    assert nodes[:12, 2].max() < 0  # behind the plane
+    shaft = np.stack([0 * turn, 0 * turn, -np.arange(1.0, 41.0)], axis=-1)
+    laid = in_catheter(coronary, np.concatenate([nodes, shaft]))
+    np.testing.assert_allclose(laid[:39], nodes[:39], atol=1e-9)
