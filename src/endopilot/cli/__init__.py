@@ -34,6 +34,7 @@ COMMANDS = {
     "navigate": "anatomy and target -> a wire driven there by a policy, in closed loop, and its page",
     "xray": "anatomy -> X-ray image of a wire in it: fluoroscopy, contrast, DSA or roadmap",
     "locate": "vessel and a device's lines in X-ray images -> its tip in three dimensions, frame by frame",
+    "angiograms": "anatomies or CTs -> X-ray cines of contrast and devices, with the truth beside each frame",
     "advise": "trained run -> calibrated X-ray adviser: exposures against missed events",
     "drive": "a simulated robotic drive that takes commands over TCP, with a watchdog",
     "replay": "a robot's log -> its commands in the simulator, and both tips side by side",

@@ -15,7 +15,7 @@ from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.cockpit.fluoroscopy import XrayUnit
 from endopilot.cockpit.frames import scene
 from endopilot.cockpit.loop import Stage
-from endopilot.cockpit.recording import SUFFIX, Recorder, Where, read_recording, replayed
+from endopilot.cockpit.recording import SUFFIX, Recorder, Where, read_session, replayed
 from endopilot.cockpit.session import Session
 from endopilot.cockpit.world import BY_HAND, LiveWorld
 from endopilot.devices.robot import RobotConfig
@@ -133,7 +133,7 @@ def resume_session(path: Path, *, ct: Path | None = None) -> Opened:
     Raises:
         InputError: no such session, or one that does not replay to the bit.
     """
-    recording = read_recording(path)
+    recording = read_session(path)
     history = replayed(recording)
     first = next(history)
     _drop_half_line(path)

@@ -18,12 +18,18 @@ SPARE_MM = 20.0
 it takes more wire than centerline to reach the end."""
 _HAIR_MM = 1e-9
 """What rounding may add to an inserted length, mm."""
+WIDE_MM, SPARE_WIDTHS = 16.0, 3.0
+"""In a lumen wider than this, such as an aorta, a wire lies down on the outer walls of bends and in loops, mm; that
+takes up to so many widths of it."""
 Numbers = float | Float[np.ndarray, "..."]
 
 
 def far_end_mm(anatomy: Anatomy) -> float:
-    """Return the largest inserted length in a vessel, mm: its longest path and `SPARE_MM` more."""
-    return float(anatomy.tree.longest_path().abscissa[-1]) + SPARE_MM
+    """Return the largest inserted length in a vessel, mm: its longest path and `SPARE_MM` more, or `SPARE_WIDTHS`."""
+    tree = anatomy.tree
+    width = 2 * max(float(branch.centerline.radius.max()) for branch in tree.branches)
+    spare = SPARE_WIDTHS * width if width > WIDE_MM else SPARE_MM
+    return float(tree.longest_path().abscissa[-1]) + spare
 
 
 def within_travel(

@@ -25,8 +25,6 @@ from endopilot.types import Anatomy
 
 RANDOM = "random"
 """In place of a world or a robot: another one in each episode."""
-WorldGiven = World | str | Path
-RobotGiven = RobotConfig | str | Path
 _OSTIUM_MM, _REGISTERED_MM, _TIMES = 2.5, 1.0, 2.0
 """A random world's ostium and registration lie up to this far off, mm; friction is up to so many times more or less.
 The shipped worlds differ as much."""
@@ -89,8 +87,8 @@ class Reality:
         self,
         navigations: Sequence[Navigation],
         *,
-        world: WorldGiven | Sequence[WorldGiven] | None,
-        robot: RobotGiven | Sequence[RobotGiven] | None,
+        world: World | str | Path | Sequence[World | str | Path] | None,
+        robot: RobotConfig | str | Path | Sequence[RobotConfig | str | Path] | None,
         motion: Motion | None,
         config: SimulatorConfig,
     ) -> None:
@@ -114,7 +112,7 @@ class Reality:
         ]
         fixed = [each or World() for each in self._worlds]
         motion = _common(fixed, "motion", [each.motion or motion for each in fixed])
-        config = _common(fixed, "element_mm, time_step_s, compliant_wall_n_mm2", [each.core(config) for each in fixed])
+        config = _common(fixed, "core or wall", [each.core(config) for each in fixed])
         self._robots = self._all_robots(robot, fixed)
         stacks = [each.stack(navigation.stack) for each, navigation in zip(fixed, navigations, strict=True)]
         if self._robots is not None:
@@ -233,14 +231,14 @@ class Reality:
 
     @staticmethod
     def _all_robots(
-        given: RobotGiven | Sequence[RobotGiven] | None, worlds: Sequence[World]
+        given: RobotConfig | str | Path | Sequence[RobotConfig | str | Path] | None, worlds: Sequence[World]
     ) -> list[RobotConfig | None] | None:
         """Return the robot of each world, None for one that is drawn; none at all where devices do as they are told."""
         if given is None and all(each.robot is None for each in worlds):
             return None
         robots = _spread(IDEAL if given is None else given, len(worlds), read_robot)
         return [
-            world.real_robot(robot) if robot is not None or world.robot is not None else None
+            None if robot is None and world.robot is None else world.real_robot(robot or RobotConfig())
             for world, robot in zip(worlds, robots, strict=True)
         ]
 
@@ -257,7 +255,9 @@ def _spread(given: Any, count: int, read: Any) -> list[Any]:
 def _common(worlds: Sequence[World], names: str, values: Sequence[Any]) -> Any:
     """Return what all worlds have in common."""
     if any(value != values[0] for value in values):
-        raise InputError(f"world: worlds differ in {names}, which all worlds of an environment share; give one for all")
+        raise InputError(
+            f"world: worlds differ in {names}, which all in an environment have in common; give worlds that agree"
+        )
     return values[0]
 
 

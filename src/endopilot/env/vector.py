@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
@@ -20,13 +21,14 @@ from endopilot.devices.robot import RobotConfig
 from endopilot.env.exposures import CArms
 from endopilot.env.observation import Measured, Observed, observe, observe_exposed, space
 from endopilot.env.picture import Picture
-from endopilot.env.reality import Reality, RobotGiven, WorldGiven
+from endopilot.env.reality import Reality
 from endopilot.env.route_tables import RouteTables
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState
+from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation, is_safe, reached
 from endopilot.tasks.task import CORE, LadderVersion, in_catheter, reference_navigation, training_navigations
 from endopilot.xray.fluoroscope import FluoroscopeConfig
@@ -39,7 +41,8 @@ PROGRESS_REWARD, STEP_REWARD, FORCE_REWARD, SUCCESS_REWARD = 0.1, -0.01, -0.1, 5
 """A mm nearer to the target, every step, every step with too large a force, and the target."""
 EXPOSURE_REWARD = -0.05
 """Every exposure, where X-ray shows the tip."""
-Observations = Float[np.ndarray, "worlds features"] | dict[str, np.ndarray]
+Observations = Any
+"""An array with a row a world, or a dictionary of such where images are observed."""
 
 _MASKS = tuple(
     f"_{name}"
@@ -92,10 +95,14 @@ class NavigateVectorEnv(VectorEnv):
     does; which branch it enters at a fork depends on where the bend points. All worlds are stepped by one `Simulator`;
     `NavigateEnv` is this class with one world. A world's course does not depend on the others, to the last bit.
 
-    It is no `NavigationLoop`: there is no C-arm, nobody decides every 0.5 s, and the devices do as they are told unless
-    `robot` names a robot with its latency and play. Then Δ and φ are observed as its encoders have them, and each
-    episode draws a robot anew. It shares with the loop what a navigation is: start, rule of success, time and force
-    limit (`Navigation`, `reached`, `is_safe`), and how fast and how far a drive goes (`DriveLimits`).
+    It is no `NavigationLoop`: nobody decides every 0.5 s, all is observed as it truly is unless `observation` says
+    otherwise, and the devices do as they are told unless `robot` names a robot with its latency and play. Then Δ and φ
+    are observed as its encoders have them, and each episode draws a robot anew. It shares with the loop what a
+    navigation is: start, rule of success, time and force limit (`Navigation`, `reached`, `is_safe`), how fast and how
+    far a drive goes (`DriveLimits`), and what a C-arm shows (`Fluoroscope`, `XrayImager`).
+
+    In `endopilot/NavigateXray-v0` seeing costs: encoders and loads of the drives are observed at every step, the tip
+    only where X-ray is asked for.
 
     ## Action space
 
@@ -111,11 +118,15 @@ class NavigateVectorEnv(VectorEnv):
     With a catheter around the wire it is `Box(-1, 1, (4,), float32)`: 2 and 3 are the same of the catheter's proximal
     end, and so on for a second one. Each is driven by itself.
 
+    With `observation="xray"` or `"image"` there is one number more, the last: above 0, an exposure of every view is
+    taken at the end of the step.
+
     ## Observation space
 
     `Box(-10, 10, (31,), float32)`, a row a world; values beyond are cut off. The route runs along the centerline from
     the ostium to the target; its frame is its tangent and two normals carried along it without twist, at the place
-    that is nearest to the tip along the tree. All values are true ones, as if X-ray were always on.
+    that is nearest to the tip along the tree. All values are true ones, as if X-ray were always on; with a robot,
+    0 to 2 are its encoders'.
 
     | index | observation | unit of 1 |
     |---|---|---|
@@ -145,6 +156,31 @@ class NavigateVectorEnv(VectorEnv):
     | 37 | 1 where its tip is on the route, 0 in a wrong branch | |
     | 38 | its slack | 10 mm |
 
+    With `observation="xray"` it is `Box(-10, 10, (32,), float32)`: what a robot measures, and the last exposure, which
+    has the C-arm's errors of detection (`FluoroscopeConfig`).
+
+    | index | observation | unit of 1 |
+    |---|---|---|
+    | 0 | Δ by the encoder | 100 mm |
+    | 1, 2 | cosine and sine of φ by the encoder | |
+    | 3, 4 | force and torque of the drive | 0.5 N, 0.5 N·mm |
+    | 5 | time that is used up | the time limit |
+    | 6 | time since the last exposure | 10 s |
+    | 7, 8 | what Δ and φ have changed since, by the encoder | 10 mm, π |
+    | 9, 10 | at that exposure: abscissa of the tip, offset from the centerline | 100 mm, the lumen's radius |
+    | 11, 12 | path length to the target, 1 on the route | 100 mm |
+    | 13, 14 | offset of the tip from the route along its normals | the lumen's radius |
+    | 15 to 26 | places of the route 3, 6, 12 and 24 mm ahead of it, in the route's frame | that distance |
+    | 27 to 30 | lumen radius at these places | 2 mm |
+    | 31 | slack: Δ by the encoder less the abscissa | 10 mm |
+
+    For each catheter five more follow, which are as 0 to 4.
+
+    With `observation="image"` it is a dictionary: `measured` is 0 to 8 of these and what follows for catheters, and
+    `image` a `Box(0, 255, (views, pixels, pixels), uint8)`, the X-ray images of the last exposure. The vessel is laid
+    under them as a roadmap, light grey; the target is a white square of 3 × 3 pixels, the wire dark. An image shows the
+    whole vessel. `c_arm=FluoroscopeConfig(biplane=False)` takes one view in place of two.
+
     ## Reward
 
     The sum of
@@ -155,14 +191,15 @@ class NavigateVectorEnv(VectorEnv):
     | every step | −0.01 |
     | every step that ends with a force of the wall beyond the navigation's limit | −0.1 |
     | the target | 5 |
+    | every exposure, except the one at the start | −0.05 |
 
     Where the catheter's tip is to go to the target, every mm counts that the wire's tip or the catheter's comes nearer.
 
     ## Start
 
     Inserted lengths as the navigation says; the wire's rotation is drawn evenly over a full turn, a catheter's is 0.
-    World i of a vector
-    environment that is reset with seed s draws what a single environment that is reset with seed s + i draws.
+    Where seeing costs, an exposure shows the start. World i of a vector environment that is reset with seed s draws
+    what a single environment that is reset with seed s + i draws.
 
     ## End of an episode
 
@@ -180,18 +217,29 @@ class NavigateVectorEnv(VectorEnv):
     one node at the end of the step), `valid`, `success`, `safe` (no force beyond the limit so far), `distance_mm` (path
     length to the target from the tip that is to arrive), `inserted_length` (mm), `rotation` (rad), `tip_abscissa` (mm),
     `tip_offset` (mm), `tip_branch`, `time_s`; and for each catheter `catheter_1_inserted_length`,
-    `catheter_1_rotation`, `catheter_1_tip_abscissa`, `catheter_1_tip_offset`, `catheter_1_tip_branch`. In a single
-    environment they are numbers.
+    `catheter_1_rotation`, `catheter_1_tip_abscissa`, `catheter_1_tip_offset`, `catheter_1_tip_branch`. With a robot
+    also what it measures of the wire, `encoder_inserted_length`, `encoder_rotation`, `load_n`, `load_nmm`. Where seeing
+    costs also `exposed` (whether the observation holds a new exposure) and `exposures` (in the episode so far). In a
+    single environment they are numbers.
 
     ## Arguments
 
     `endopilot/Navigate-v0`: 15 mm into the posterior descending artery of the reference right coronary artery (patient
     0 of the textbook atlas with seed 0). `endopilot/NavigateCoaxial-v0`: the same place, to which the tip of a
-    microcatheter (`microcatheter-1.7f`) is to be brought over the wire. The others are the tasks of the ladder's
-    version 1, as `endopilot/Crux-v0`, in patients of their own, which are not those that the ladder is scored on; world
-    i has patient (`patient` + i) modulo `patients`. With `catheter` a task is to be done by the tip of that catheter.
-    Or give `navigations` of your own. With `motion` the vessels move; positions are those in the vessel as CT shows
-    it, and every episode begins at the phase of the CT.
+    microcatheter (`microcatheter-1.7f`) is to be brought over the wire. `endopilot/NavigateXray-v0`: the first with
+    `observation="xray"`, which any of them takes. The others are the tasks of the ladder, of its version 2 as
+    `endopilot/Crux-v2` (and `endopilot/Follow-v2`, of wire and catheter), of its version 1 as `endopilot/Crux-v0`, in
+    patients of their own, which are not those that the ladder is scored on; world i has patient (`patient` + i) modulo
+    `patients`. `version` takes a folder of tasks of your own as `endopilot ladder --version` does. With `catheter` a
+    task is to be done by the tip of that catheter. Or give `navigations` of your own. With `motion` the vessels move;
+    positions are those in the vessel as CT shows it, and every episode begins at the phase of the CT; an exposure takes
+    off what `Navigation.known_motion` says.
+
+    `world` is what reality is where it differs: a `World`, its name or file, or several, of which world i has number i
+    modulo their number. What these draw by chance they draw by the number i. With "random" each episode draws friction,
+    half to twice what is given, ostium (±2.5 mm) and registration (±1 mm along each axis). `robot` is the same of
+    robots; a random one has plays of up to 2.6 mm and 0.9 turns, gains of 0.95 to 1.05, a latency of up to 0.1 s, and
+    encoders at its motors or on the devices.
 
     ## Version history
 
@@ -216,8 +264,8 @@ class NavigateVectorEnv(VectorEnv):
         observation: Observed = "state",
         pixels: int = 64,
         c_arm: FluoroscopeConfig | None = None,
-        world: WorldGiven | Sequence[WorldGiven] | None = None,
-        robot: RobotGiven | Sequence[RobotGiven] | None = None,
+        world: World | str | Path | Sequence[World | str | Path] | None = None,
+        robot: RobotConfig | str | Path | Sequence[RobotConfig | str | Path] | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         motion: Motion | None = None,
         config: SimulatorConfig = CORE,

@@ -85,7 +85,7 @@ class Task:
         ladder: the patients that the ladder is scored on.
         training: patients of the atlas to learn on, if there are any.
         version: of the ladder that the task belongs to; it says which population the patients come from.
-        catheter: shipped catheter around the wire, if any.
+        catheter: catheter around the wire, if any, named as the device.
         arrives: whose tip is to go to the target, "wire" or "catheter"; the wire's if not given.
         start_catheter_mm: inserted length of the catheter at the start, mm; 0 if not given.
         anatomies: folders of anatomies that are the patients of `ladder`, one for each of its numbers, seen from the
@@ -121,10 +121,9 @@ class Task:
 
     @model_validator(mode="after")
     def _consistent(self) -> Task:
-        known_catheters = (*list_catheters(), None)
-        known = {"catheter": known_catheters}
+        known: dict[str, tuple[str | None, ...]] = {}
         if self.anatomies is None:
-            known |= {"vessel": VESSELS, "device": list_wires()}
+            known = {"vessel": VESSELS, "device": list_wires(), "catheter": (*list_catheters(), None)}
         for name, choices in known.items():
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name}: {getattr(self, name)!r}; choose from {', '.join(filter(None, choices))}")
@@ -227,14 +226,19 @@ def list_tasks(version: LadderVersion = NEWEST) -> tuple[Task, ...]:
 
 
 def _read_task(path: Path) -> Task:
-    """Return the task of a file, with the paths of its device and anatomies."""
+    """Return the task of a file, with the paths of its devices and anatomies."""
     task = read_settings(path, Task)
     if task.anatomies is None:
         return task
-    beside = path.parent / task.device
+
+    def seen(device: str) -> str:
+        beside = path.parent / device
+        return str(beside) if beside.is_file() else device
+
     return replace(
         task,
-        device=str(beside) if beside.is_file() else task.device,
+        device=seen(task.device),
+        catheter=task.catheter and seen(task.catheter),
         anatomies=tuple(str(path.parent / folder) for folder in task.anatomies),
     )
 

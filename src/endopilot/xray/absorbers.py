@@ -18,7 +18,7 @@ WATER_MM = 0.0206
 """Attenuation of water at 60 keV, the mean energy of fluoroscopy's beam, 1/mm (NIST XCOM)."""
 STEEL_MM, COIL_MM = 0.95, 3.0
 """Attenuation of a wire's steel shaft, and of the tungsten or platinum coil over its tip, partly filled, 1/mm."""
-CATHETER_MM, _CATHETER_WALL_MM = 0.23, 0.25
+CATHETER_MM, GUIDE_WALL_MM = 0.23, 0.25
 """Attenuation of a catheter's wall with its barium and its steel braid, 1/mm, and the guiding catheter's thickness,
 mm."""
 MARKER_MM, MARKER_WALL_MM, MARKER_LENGTH_MM = 9.0, 0.03, 1.0
@@ -142,13 +142,13 @@ def catheter_lumen_points(anatomy: Anatomy) -> tuple[Places, Float[np.ndarray, "
 def catheter_points(anatomy: Anatomy) -> tuple[Places, float]:
     """Return the wall of the guiding catheter as small volumes: their places, LPS mm, and the size of each, mm³."""
     distance, places, heading = catheter_line(anatomy)
-    radius = anatomy.catheter_radius_mm + _CATHETER_WALL_MM / 2
+    radius = anatomy.catheter_radius_mm + GUIDE_WALL_MM / 2
     at = np.arange(_STEP_MM / 2, distance[-1], _STEP_MM)
     middle = places_on(places, distance, at)
     first, second = _across(places_on(heading, distance, at))
     turn = np.linspace(0, 2 * np.pi, _RING, endpoint=False)[:, None, None]
     ring = radius * (np.cos(turn) * first + np.sin(turn) * second)
-    size = 2 * np.pi * radius * _CATHETER_WALL_MM * _STEP_MM / _RING
+    size = 2 * np.pi * radius * GUIDE_WALL_MM * _STEP_MM / _RING
     return (middle + ring).reshape(-1, 3), size
 
 
