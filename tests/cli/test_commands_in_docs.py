@@ -18,7 +18,8 @@ from endopilot.errors import InputError
 ROOT = Path(__file__).parents[2]
 CARD = str(Path(endopilot.__file__).parent / "models/pretrained/MODEL_CARD.md")
 PAGES = ["README.md", "Makefile", CARD]
-PAGES += [f"docs/{page.name}" for page in sorted((ROOT / "docs").glob("*.md"))]
+SHELVES = ("docs", "docs/guide", "docs/concepts")
+PAGES += [f"{shelf}/{page.name}" for shelf in SHELVES for page in sorted((ROOT / shelf).glob("*.md"))]
 COMMAND = re.compile(r"endopilot ((?:bench )?[a-z][a-z-]*)((?: [^\n`|&;]*)?)")
 OPTION = re.compile(r"(?<=\s)(--[a-z][a-z0-9-]*|-[a-z](?=\s))")
 
@@ -47,15 +48,15 @@ def test_options_exist(page: str) -> None:
 
 
 def whole_commands(page: str) -> Iterator[list[str]]:
-    """Yield the arguments of the commands that stand in blocks of code, line by line, whole."""
+    """Yield the arguments of the commands that stand in blocks of code, whole; none that is refused."""
     text = re.sub(r"\\\n\s*", " ", (ROOT / page).read_text(encoding="utf-8"))
     fenced = re.findall(r"^```(?:bash|console)\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    fenced = [re.sub(r"^\$ .*\nendopilot[ a-z-]*: .*$", "", block, flags=re.MULTILINE) for block in fenced]
     indented = re.findall(r"^    endopilot .*$", text, re.MULTILINE) if page == "README.md" else []
     for line in "\n".join([*fenced, *indented]).splitlines():
         for command in re.split(r"&&|;|\|| & ", line.removeprefix("$ ")):
-            words = shlex.split(command, comments=True)
-            if words[:1] == ["endopilot"]:
-                yield [word.rstrip("&") for word in words[1:]]
+            if command.strip().startswith("endopilot "):
+                yield [word.rstrip("&") for word in shlex.split(command, comments=True)[1:]]
 
 
 def understood(arguments: list[str]) -> None:
