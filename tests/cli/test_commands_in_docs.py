@@ -54,7 +54,7 @@ def whole_commands(page: str) -> Iterator[list[str]]:
     fenced = [re.sub(r"^\$ .*\nendopilot[ a-z-]*: .*$", "", block, flags=re.MULTILINE) for block in fenced]
     indented = re.findall(r"^    endopilot .*$", text, re.MULTILINE) if page == "README.md" else []
     for line in "\n".join([*fenced, *indented]).splitlines():
-        for command in re.split(r"&&|;|\|| & ", line.removeprefix("$ ")):
+        for command in re.split(r"&&|;|\||>| & ", line.removeprefix("$ ")):
             if command.strip().startswith("endopilot "):
                 yield [word.rstrip("&") for word in shlex.split(command, comments=True)[1:]]
 
