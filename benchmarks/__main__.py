@@ -25,6 +25,7 @@ BENCHMARKS = {
     "verification": "verification.verification:bench_verification",
     "published": "published.published:bench_published",
     "robot-twist": "robot.twist:bench_twist",
+    "robot-blind": "robot.blind:bench_blind",
     "dataset": "dataset:bench_dataset",
     "cockpit": "cockpit:bench_cockpit",
     "anatomy": "anatomy.extraction:bench_anatomy",

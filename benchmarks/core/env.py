@@ -52,12 +52,13 @@ def bench_env() -> dict[str, Any]:
     """
     figures: dict[str, Any] = {}
     valid = []
-    for prefix, given, independent in (
+    kinds: tuple[tuple[str, dict[str, Any], bool], ...] = (
         ("", {}, False),
         ("random_actions_", {}, True),
         ("coaxial_", {"catheter": CATHETER}, False),
         ("xray_", {"observation": "xray"}, False),
-    ):
+    )
+    for prefix, given, independent in kinds:
         for count, episodes in ((MANY, 1), (1, SINGLES)):
             wall, processor, kept = _timed(NavigateVectorEnv(count, **given), episodes, independent=independent)
             steps = count * episodes * round(SECONDS / CONTROL_PERIOD_S)
@@ -92,7 +93,7 @@ def _timed(
     else:
         drives = [_navigations(count * episodes, seconds, first=k * 2**32) for k in range(numbers // 2)]
         actions = np.concatenate(drives, axis=-1).reshape(episodes, count, steps, numbers).swapaxes(1, 2)
-    if env.single_action_space.shape[0] > numbers:
+    if env.action_space.shape != (count, numbers):
         expose = np.where(np.arange(steps) % expose_every, -1.0, 1.0)[None, :, None, None]
         actions = np.concatenate([actions, np.broadcast_to(expose, (*actions.shape[:3], 1))], axis=-1)
     wall = processor = 0.0

@@ -44,7 +44,7 @@ def test_the_robots_of_the_package() -> None:
     assert all(robot.sources and robot.encoders_at == "motor" for robot in measured.values())
     flat, deep = measured["kweon-2021-2d"].wire, measured["kweon-2021-3d"].wire
     assert (flat.play_mm, deep.play_mm) == (2.6, 1.1)
-    assert flat.transmission.length_mm and not flat.play_rad and deep.play_rad and not deep.transmission.length_mm
+    assert all(wire.transmission.length_mm and not wire.play_rad for wire in (flat, deep))
 
 
 @pytest.mark.parametrize(

@@ -92,7 +92,7 @@ def test_robots_take_turns_and_a_world_may_have_its_own(near):
 
 
 def test_what_all_worlds_share_may_not_differ(near):
-    with pytest.raises(InputError, match="world: worlds differ in element_mm"):
+    with pytest.raises(InputError, match="world: worlds differ in core or wall"):
         NavigateVectorEnv(2, navigations=near, world=["nominal", "fine-core"])
     with pytest.raises(InputError, match="world: worlds differ in motion"):
         NavigateVectorEnv(2, navigations=near, world=["moving", "nominal"])

@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from synthetic_robot import drawn, logged
 
+from benchmarks.robot.synthetic import drawn, logged
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError

@@ -51,8 +51,9 @@ class DriveMotion:
         robots, self._devices, _ = position.shape
         self._fastest = np.array([[each.fastest for each in of_robot] for of_robot in limits])
         self._travel = np.moveaxis(np.array([[each.travel_mm for each in of_robot] for of_robot in limits]), -1, 0)
-        self._latency_s, self._jitter_s = np.zeros((2, robots))
-        self._acceleration, self._gain, self._half_play, self._ahead = np.zeros((4, *position.shape))
+        self._latency_s, self._jitter_s = np.zeros(robots), np.zeros(robots)
+        self._acceleration, self._gain = np.zeros(position.shape), np.zeros(position.shape)
+        self._half_play, self._ahead = np.zeros(position.shape), np.zeros(position.shape)
         self._random: list[np.random.Generator] = [np.random.default_rng()] * robots
         self._grasp(range(robots), seeds, [config] * robots if isinstance(config, RobotConfig) else config)
         self._wanted, self._ramp = np.zeros(position.shape), self._acceleration.copy()

@@ -112,7 +112,7 @@ class Reality:
         ]
         fixed = [each or World() for each in self._worlds]
         motion = _common(fixed, "motion", [each.motion or motion for each in fixed])
-        config = _common(fixed, "element_mm, time_step_s, compliant_wall_n_mm2", [each.core(config) for each in fixed])
+        config = _common(fixed, "core or wall", [each.core(config) for each in fixed])
         self._robots = self._all_robots(robot, fixed)
         stacks = [each.stack(navigation.stack) for each, navigation in zip(fixed, navigations, strict=True)]
         if self._robots is not None:
@@ -238,7 +238,7 @@ class Reality:
             return None
         robots = _spread(IDEAL if given is None else given, len(worlds), read_robot)
         return [
-            world.real_robot(robot) if robot is not None or world.robot is not None else None
+            None if robot is None and world.robot is None else world.real_robot(robot or RobotConfig())
             for world, robot in zip(worlds, robots, strict=True)
         ]
 
@@ -255,7 +255,9 @@ def _spread(given: Any, count: int, read: Any) -> list[Any]:
 def _common(worlds: Sequence[World], names: str, values: Sequence[Any]) -> Any:
     """Return what all worlds have in common."""
     if any(value != values[0] for value in values):
-        raise InputError(f"world: worlds differ in {names}, which all worlds of an environment share; give one for all")
+        raise InputError(
+            f"world: worlds differ in {names}, which all in an environment have in common; give worlds that agree"
+        )
     return values[0]
 
 

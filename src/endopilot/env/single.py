@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from numpy.typing import ArrayLike
 
 from endopilot.devices.robot import RobotConfig
@@ -22,8 +22,6 @@ from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import CORE, LadderVersion
 from endopilot.xray.fluoroscope import FluoroscopeConfig
-
-Observation = Float[np.ndarray, "features"] | dict[str, np.ndarray]
 
 
 class NavigateEnv(gymnasium.Env):
@@ -97,14 +95,14 @@ class NavigateEnv(gymnasium.Env):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+    ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode; `options` are not used."""
         super().reset(seed=seed)
         self._worlds.draw_from(self.np_random)
         observations, infos = self._worlds.reset()
         return _of_first(observations), _first(infos)
 
-    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
         """Drive the wire for a control period."""
         row = np.asarray(action, dtype=float)[None]
         observations, rewards, terminations, truncations, infos = self._worlds.step(row)
@@ -132,7 +130,7 @@ class NavigateEnv(gymnasium.Env):
         self._worlds.set_state(state)
 
 
-def _of_first(observations: Observations) -> Observation:
+def _of_first(observations: Observations) -> Observations:
     if isinstance(observations, dict):
         return {name: values[0] for name, values in observations.items()}
     return observations[0]

@@ -41,7 +41,8 @@ PROGRESS_REWARD, STEP_REWARD, FORCE_REWARD, SUCCESS_REWARD = 0.1, -0.01, -0.1, 5
 """A mm nearer to the target, every step, every step with too large a force, and the target."""
 EXPOSURE_REWARD = -0.05
 """Every exposure, where X-ray shows the tip."""
-Observations = Float[np.ndarray, "worlds features"] | dict[str, np.ndarray]
+Observations = Any
+"""An array with a row a world, or a dictionary of such where images are observed."""
 
 _MASKS = tuple(
     f"_{name}"
