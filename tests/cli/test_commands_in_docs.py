@@ -18,8 +18,9 @@ from endopilot.errors import InputError
 ROOT = Path(__file__).parents[2]
 CARD = str(Path(endopilot.__file__).parent / "models/pretrained/MODEL_CARD.md")
 PAGES = ["README.md", "Makefile", CARD]
-SHELVES = ("docs", "docs/guide", "docs/concepts")
-PAGES += [f"{shelf}/{page.name}" for shelf in SHELVES for page in sorted((ROOT / shelf).glob("*.md"))]
+PAGES += [f"{shelf}/{page.name}" for shelf in ("docs", "docs/concepts") for page in sorted((ROOT / shelf).glob("*.md"))]
+GUIDE = [f"docs/guide/{page.name}" for page in sorted((ROOT / "docs/guide").glob("*.md"))]
+"""Pages whose commands `tests/e2e/test_guide.py` runs."""
 COMMAND = re.compile(r"endopilot ((?:bench )?[a-z][a-z-]*)((?: [^\n`|&;]*)?)")
 OPTION = re.compile(r"(?<=\s)(--[a-z][a-z0-9-]*|-[a-z](?=\s))")
 
@@ -35,7 +36,7 @@ def help_of(command: str) -> str:
     return out.getvalue()
 
 
-@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.parametrize("page", PAGES + GUIDE)
 def test_options_exist(page: str) -> None:
     text = re.sub(r"\\\n\s*", " ", (ROOT / page).read_text(encoding="utf-8"))
     wrong = [
@@ -48,15 +49,15 @@ def test_options_exist(page: str) -> None:
 
 
 def whole_commands(page: str) -> Iterator[list[str]]:
-    """Yield the arguments of the commands that stand in blocks of code, whole; none that is refused."""
+    """Yield the arguments of the commands that stand in blocks of code, line by line, whole."""
     text = re.sub(r"\\\n\s*", " ", (ROOT / page).read_text(encoding="utf-8"))
     fenced = re.findall(r"^```(?:bash|console)\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    fenced = [re.sub(r"^\$ .*\nendopilot[ a-z-]*: .*$", "", block, flags=re.MULTILINE) for block in fenced]
     indented = re.findall(r"^    endopilot .*$", text, re.MULTILINE) if page == "README.md" else []
     for line in "\n".join([*fenced, *indented]).splitlines():
-        for command in re.split(r"&&|;|\||>| & ", line.removeprefix("$ ")):
-            if command.strip().startswith("endopilot "):
-                yield [word.rstrip("&") for word in shlex.split(command, comments=True)[1:]]
+        for command in re.split(r"&&|;|\|| & ", line.removeprefix("$ ")):
+            words = shlex.split(command, comments=True)
+            if words[:1] == ["endopilot"]:
+                yield [word.rstrip("&") for word in words[1:]]
 
 
 def understood(arguments: list[str]) -> None:
@@ -78,7 +79,7 @@ def test_whole_commands_are_understood(page: str, capsys, monkeypatch) -> None:
     assert not wrong
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page.endswith(".md")])
+@pytest.mark.parametrize("page", [page for page in PAGES + GUIDE if page.endswith(".md")])
 def test_python_imports_what_is_there(page: str) -> None:
     blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
     for node in ast.walk(ast.Module([line for block in blocks for line in ast.parse(block).body], [])):
