@@ -18,8 +18,9 @@ from endopilot.errors import InputError
 ROOT = Path(__file__).parents[2]
 CARD = str(Path(endopilot.__file__).parent / "models/pretrained/MODEL_CARD.md")
 PAGES = ["README.md", "Makefile", CARD]
-PAGES += [f"{shelf}/{page.name}" for shelf in ("docs", "docs/concepts") for page in sorted((ROOT / shelf).glob("*.md"))]
-GUIDE = [f"docs/guide/{page.name}" for page in sorted((ROOT / "docs/guide").glob("*.md"))]
+PAGES += [str(page.relative_to(ROOT)) for page in sorted((ROOT / "docs").glob("*.md"))]
+PAGES += [str(page.relative_to(ROOT)) for page in sorted((ROOT / "docs/concepts").glob("*.md"))]
+GUIDE = [str(page.relative_to(ROOT)) for page in sorted((ROOT / "docs/guide").glob("*.md"))]
 """Pages whose commands `tests/e2e/test_guide.py` runs."""
 COMMAND = re.compile(r"endopilot ((?:bench )?[a-z][a-z-]*)((?: [^\n`|&;]*)?)")
 OPTION = re.compile(r"(?<=\s)(--[a-z][a-z0-9-]*|-[a-z](?=\s))")
