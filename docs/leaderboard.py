@@ -16,10 +16,7 @@ PAGE = Path(__file__).with_suffix(".md")
 FOLDER = PAGE.parents[1] / "submissions"
 LINKS_FILE = "links.yaml"
 TITLES = {2: "Version 2", "coaxial": "Wire and catheter", 1: "Version 1"}
-HEAD = (
-    "| policy | tasks | navigations | safe success, % | 95 % interval | exposures | peak force, N | time, s | made with |",
-    "|---|---|---|---|---|---|---|---|---|",
-)
+HEAD = ("policy", "tasks", "navigations", "safe success, %", "95 % interval", "exposures", "peak force, N", "time, s")
 
 
 def page() -> str:
@@ -35,7 +32,7 @@ def _tables() -> Iterator[str]:
     for version, title in TITLES.items():
         rows = [_row(path, each, links[path.stem]) for path, each in read.items() if each.version == version]
         if rows:
-            yield from (f"### {title}", "", *HEAD)
+            yield from (f"### {title}", "", _line(*HEAD, "made with"), "|" + "---|" * (len(HEAD) + 1))
             yield from (row for _, row in sorted(rows, reverse=True))
             yield ""
 
@@ -48,7 +45,7 @@ def _row(path: Path, submission: Submission, link: str) -> tuple[tuple[int, floa
     low, high = interval(round(safe * count), count)
     named = f"{tasks} of {len(list_tasks(submission.version))}" if tasks > 2 else ", ".join(submission.tasks)
     made = f"{submission.versions.get('endopilot')}, {submission.core}"
-    cells = [
+    cells = (
         f"[{submission.policy}]({link})",
         named,
         f"[{count}](../submissions/{path.name})",
@@ -58,8 +55,12 @@ def _row(path: Path, submission: Submission, link: str) -> tuple[tuple[int, floa
         scores["peak_force_n"],
         "–" if scores["seconds"] is None else scores["seconds"],
         made,
-    ]
-    return (tasks, safe, count), "| " + " | ".join(map(str, cells)) + " |"
+    )
+    return (tasks, safe, count), _line(*cells)
+
+
+def _line(*cells: object) -> str:
+    return "| " + " | ".join(map(str, cells)) + " |"
 
 
 def interval(reached: int, count: int) -> tuple[float, float]:

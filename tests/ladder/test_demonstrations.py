@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 
 import numpy as np
@@ -74,7 +75,7 @@ def test_images_are_kept_until_the_next_exposure_and_show_a_wire_that_comes_on(m
     for view in ("observation.images.view_1", "observation.images.view_2"):
         shown = [_image(cell) for cell in samples[view]]
         assert shown[0].shape == (PIXELS, PIXELS, 3) and shown[0].dtype == np.uint8
-        changes = [not np.array_equal(a, b) for a, b in zip(shown, shown[1:], strict=False)]
+        changes = [not np.array_equal(a, b) for a, b in itertools.pairwise(shown)]
         np.testing.assert_array_equal(changes, samples["exposed"][1:])
         first, last = shown[0].astype(float), shown[-1].astype(float)
         assert (last < first - 30).sum() > 3 * 10  # pixels that the wire has darkened
