@@ -226,6 +226,19 @@ def test_a_coronary_catheter_bends_up_behind_its_straight_end(fork):
     np.testing.assert_allclose(laid[2] - places[80], [0.0, 0.3, 0.0], atol=1e-9)
 
 
+def test_a_vessel_that_passes_behind_the_ostium_is_not_laid_into_the_catheter(fork):
+    """A right coronary artery comes back below its ostium, behind the plane across the catheter's axis."""
+    tree = replace(fork.tree, section_names=("1", *fork.tree.section_names[1:]))
+    coronary = replace(fork, tree=tree, insertion=Insertion(np.zeros(3), np.array([1.0, 0.0, 0.0])))
+    turn = np.linspace(1.5 * np.pi, 0.0, 40)
+    nodes = np.stack([40 * np.sin(turn), 0 * turn, 40 * np.cos(turn) - 40], axis=-1)  # from the tip to the ostium
+    assert nodes[:12, 0].max() < 0  # behind the plane
+    shaft = np.stack([-np.arange(1.0, 41.0), 0 * turn, 0 * turn], axis=-1)
+    laid = in_catheter(coronary, np.concatenate([nodes, shaft]))
+    np.testing.assert_allclose(laid[:40], nodes, atol=1e-9)
+    assert np.abs(laid[40:] - shaft).max() > 1.0  # the catheter itself bends
+
+
 def noise_of(fork, wire, *, dose=1.0, seed=0, before=None, **changes):
     """Return the noise of a flat image, and how many photons a pixel counts."""
     flat = XrayImager(fork, wire, config=ImageConfig(pixels=256, **changes))
