@@ -33,8 +33,8 @@ ASKED = {
 
 
 VERBS = {
-    "calibrate", "check", "climb", "evaluate", "extract", "find", "generate", "list", "load", "make", "navigate",
-    "plan", "read", "replay", "segment", "simulate", "take", "train", "write",
+    "calibrate", "check", "climb", "evaluate", "extract", "find", "generate", "list", "load", "locate", "make",
+    "navigate", "plan", "read", "replay", "segment", "simulate", "take", "train", "write",
 }  # fmt: skip
 SUBJECTS = {
     "anatomies", "anatomy", "control", "dataset", "device", "devices", "driven", "folder", "logs", "name",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,6 +18,7 @@ from endopilot.settings import Seed, Within, settings
 from endopilot.simulation.motion import draw_motion, published_mean
 from endopilot.xray.carm import Pose
 from endopilot.xray.detector import TipDetector
+from endopilot.xray.image import ImageConfig
 from endopilot.xray.motion_registration import motion_error_mm, register_motion, take_run
 from endopilot.xray.pose_refinement import PoseRefiner
 from endopilot.xray.registration import Registration, register, vessel_error_mm
@@ -60,6 +61,8 @@ class XrayBenchConfig:
     """Seed of patients, poses, wires and noise."""
     given: tuple[Path, ...] = ()
     """Folders of anatomies of your own in place of synthetic patients, as `endopilot anatomy` makes them."""
+    image: ImageConfig = field(default_factory=ImageConfig)
+    """Detector, beam and processing."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,7 @@ def bench_xray(config: XrayBenchConfig = XrayBenchConfig()) -> dict[str, Any]:
     registrations: list[dict[str, Any]] = []
     rates: list[float] = []
     scenes = SceneConfig(patients=config.patients, seed=config.seed, given=config.given)
-    for index, scene in enumerate(draw_scenes(scenes)):
+    for index, scene in enumerate(draw_scenes(scenes, config.image)):
         rates.append(_images_per_second(scene))
         registered, row = _register(scene, int(np.random.SeedSequence([config.seed, index]).generate_state(1)[0]))
         registrations.append(row)
