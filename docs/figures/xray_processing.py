@@ -11,15 +11,17 @@ from pathlib import Path
 
 PAGE = Path(__file__).parents[1] / "xray.md"
 BEGIN, END = "<!-- processing:begin -->", "<!-- processing:end -->"
-HEAD = "| images | along, across, pixels | missed, two views | one view | in own 95 % region | registration |"
+HEAD = "| images | along, across, pixels | missed, two views | one view | in own 95 % region | found where there is none | registration |"
 
 
 def table(rows: list[dict]) -> str:
     """Return the table as Markdown."""
-    lines = [HEAD, "|---|---|---|---|---|---|"]
+    lines = [HEAD, "|---|---|---|---|---|---|---|"]
     for row in rows:
         errors = f"{row['along_px']:.2f}, {row['across_px']:.2f}"
-        shares = (f"{row[name]:.0%}".replace("%", " %") for name in ("missed", "missed_one_view", "in_own_95"))
+        shares = (
+            f"{row[name]:.0%}".replace("%", " %") for name in ("missed", "missed_one_view", "in_own_95", "false_alarms")
+        )
         lines.append(f"| {row['images']} | {errors} | " + " | ".join(shares) + f" | {row['registration_mm']:.2f} mm |")
     return "\n".join(lines)
 
