@@ -11,7 +11,11 @@ from pathlib import Path
 
 PAGE = Path(__file__).parents[1] / "xray.md"
 BEGIN, END = "<!-- processing:begin -->", "<!-- processing:end -->"
-HEAD = "| images | along, across, pixels | missed, two views | one view | in own 95 % region | found where there is none | registration |"
+HEAD = (
+    "| images | along, across, pixels | missed, two views | one view | in own 95 % region | found where there is none "
+    "| registration |"
+)
+SHARES = ("missed", "missed_one_view", "in_own_95", "false_alarms")
 
 
 def table(rows: list[dict]) -> str:
