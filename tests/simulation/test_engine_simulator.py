@@ -40,16 +40,14 @@ def test_two_engines_push_a_wire_around_a_bend_alike(bend):
     engine, core = EngineSimulator(bend, Stack(WIRE), config=CORE), Simulator(bend, WIRE, config=CORE)
     for each in (engine, core):
         each.reset(inserted_length=[28.0], rotation=[0.3], friction=[0.1])
-    forces = []
-    for _ in range(20):
-        theirs, ours = (each.step([[5.0, 0.3]], 0.1) for each in (engine, core))
-        forces.append([theirs.base_force[0, 0], ours.base_force[0, 0]])
+    steps = [[each.step([[5.0, 0.3]], 0.1) for each in (engine, core)] for _ in range(20)]
+    theirs, ours = steps[-1]
     assert theirs.valid.all() and theirs.inserted_length[0, 0] == pytest.approx(38.0)
     assert theirs.rotation[0, 0] == pytest.approx(0.9) and engine.time[0] == pytest.approx(2.0)
     # no body of code is shared: the same wire lies on the same wall, pushed by the same force
     np.testing.assert_allclose(engine.project().abscissa, core.project().abscissa, atol=0.4)
     np.testing.assert_allclose(engine.project().offset, core.project().offset, atol=0.1)
-    mean_n = np.mean(forces, axis=0)
+    mean_n = np.mean([[each.base_force[0, 0] for each in pair] for pair in steps], axis=0)
     assert mean_n[0] == pytest.approx(mean_n[1], rel=0.3)
     np.testing.assert_allclose(theirs.drive_force - theirs.base_force, ours.drive_force - ours.base_force, atol=2e-3)
     ahead = int(engine.active_nodes[0]) - 1

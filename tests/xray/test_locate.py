@@ -78,20 +78,23 @@ def test_the_tip_is_followed_in_a_patient_who_breathes_and_is_not_registered(ana
 
 
 def test_a_landmark_registers_the_first_frame(anatomy) -> None:
-    """A frame that shows the root alone as a line of no length says nothing of the tree: the landmark does."""
-    devices, moved = course(anatomy, anatomy.tree.leaves()[0])
-    frames = frames_of(devices[-1:], moved[-1:], CAMERAS[:1])
-    tip_alone = [Frame(0, (frames[0].lines[0][:1],))]
+    """Of a patient who lies 60 mm off: the tip alone says nothing of that, and the line lies too far off."""
+    device = course(anatomy, anatomy.tree.leaves()[0])[0][-1]
+    away = np.array([60.0, 30.0, -10.0])
+    frames = frames_of([device], away[None], CAMERAS[:1])
+    line = frames[0].lines[0]
+    assert line is not None
+    tip_alone = [Frame(0, (line[:1],))]
     (lost,) = locate(anatomy, frames=tip_alone, cameras=CAMERAS[:1])
-    assert lost.status == "ambiguous"
-    known = LocateConfig(landmark_mm=tuple(devices[-1][0]))
+    assert lost.status != "found"
+    known = LocateConfig(landmark_mm=tuple(device[0]))
     (found,) = locate(anatomy, frames=tip_alone, cameras=CAMERAS[:1], config=known)
-    assert found.status == "found" and np.linalg.norm(found.position - devices[-1][0]) < 2.0
+    assert found.status == "found" and np.linalg.norm(found.position - device[0]) < 2.0
     point = anatomy.tree.branches[0].centerline.points[0]
-    pixel = tuple(CAMERAS[0].project(point[None] + moved[-1])[0])
+    pixel = tuple(CAMERAS[0].project(point[None] + away)[0])
     known = LocateConfig(landmark_mm=tuple(point), landmark_px=pixel, breathing_sd_mm=1.0)
     (found,) = locate(anatomy, frames=frames, cameras=CAMERAS[:1], config=known)
-    assert np.linalg.norm(found.position - devices[-1][0]) < 4.0
+    assert np.linalg.norm(found.position - device[0]) < 4.0
 
 
 def test_a_tip_in_the_wrong_branch_is_found_again(anatomy) -> None:

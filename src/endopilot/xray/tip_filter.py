@@ -213,11 +213,10 @@ class TipFilter:
             lines: for each camera the device's line, pixels (column, row), from its tip backwards; a single point is
                 the tip alone; None where the camera does not see it.
         """
-        if not self._begun:
-            self._begin(lines)
-        else:
+        if self._begun:
             self._predict()
-        self._begun = True
+        else:
+            self._begun = self._begin(lines)
         if all(line is None for line in lines):
             return self._nowhere(frame)
         share = np.exp(self._log)
@@ -242,15 +241,15 @@ class TipFilter:
         self._mean[places], self._covariance[places] = fit.mean, fit.covariance
         return self._answer(frame, places, fit, rows, base)
 
-    def _begin(self, lines: Sequence[Line | None]) -> None:
-        """Register the patient by the landmark, if there is one."""
+    def _begin(self, lines: Sequence[Line | None]) -> bool:
+        """Register the patient by the landmark, if there is one; return whether it was seen or is not needed."""
         if self.config.landmark_mm is None:
-            return
+            return True
         point, line = np.array(self.config.landmark_mm), lines[0]
         pixel = self.config.landmark_px
         if pixel is None:
             if line is None:
-                return
+                return False
             pixel = tuple(line[0])
             nearest = int(np.linalg.norm(self.grid.middle - point, axis=1).argmin())
             log = -self.grid.distance[nearest] / _TIP_SD_MM
@@ -261,6 +260,7 @@ class TipFilter:
             shift = shift + np.linalg.pinv(slope[0]) @ (np.array(pixel) - shown[0])
         self._mean[:, :3] = shift
         self._covariance[:, :3, :3] = _LANDMARK_SD_MM**2 * np.eye(3)
+        return True
 
     def _predict(self) -> None:
         """Let the tip travel and the pose drift; what comes together at a place is one normal distribution there."""
