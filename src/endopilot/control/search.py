@@ -47,8 +47,6 @@ _STRETCH_MM = 20.0
 """A wire in a catheter passes the route in stretches of this length at most, mm."""
 _TURNS = (0.0, np.pi)
 """Angles by which a wire alone may be turned before it goes in, rad."""
-_NOTHING_SHARE = 1e-3
-"""Manoeuvres with less than this share of the force limit are as gentle as each other."""
 _REPEATED = 3
 """Trials of a manoeuvre that the course tries, one after another."""
 
@@ -201,7 +199,7 @@ class Search:
         there = self.route.passed(course.foremost, push.waypoint) * course.weight
         if there.sum() > 0:
             course.weight = there / there.sum()
-        return bool(there.sum() > 0)
+        return bool(there.sum() > 0 and not course.still[0])
 
     def _turned(self, grid: Grid, share: float, waypoint: float, kept: Kept) -> bool:
         """Try a grid before a place, and follow the best of it; return whether any passes.
@@ -243,16 +241,13 @@ class Search:
     def _follow(self, pushed: Pushed, share: float, waypoint: float, *, turns: int) -> bool:
         """Let the course do what the best trial of a manoeuvre did; return whether any passes within a share of force.
 
-        Of the places that most rotations pass, and among these of the cheapest, it is the rotation in the middle; of
-        those that cost next to nothing, the one that uses the least length of its devices. Where
+        Of the places that most rotations pass, and among these of the cheapest, it is the rotation in the middle. Where
         there is a catheter, trials have waited for each other. The course does not, and so has to pass again.
         """
         course, limit_n, cost = self._course, share * self._navigation.force_limit_n, self.manoeuvre_cost(pushed)
         rows, kept = pushed.within(limit_n).reshape(-1, turns), course.kept()
         trials = [at * turns + middle(row) for at, row in enumerate(rows) if row.any()]
-        least = _NOTHING_SHARE * self._navigation.force_limit_n
-        used = pushed.inserted_mm
-        trials.sort(key=lambda trial: (-int(rows[trial // turns].sum()), max(cost[trial], least), used[trial]))
+        trials.sort(key=lambda trial: (-int(rows[trial // turns].sum()), cost[trial]))
         for trial in trials[:_REPEATED]:
             for control in pushed.controls(trial):
                 if self._alone or control.any():
