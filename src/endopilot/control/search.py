@@ -77,7 +77,7 @@ class Search:
             raise InputError(f"catheter: {len(navigation.catheters)}; the search drives one: give one")
         self._navigation, self.route, self.config = navigation, route, config
         self._alone, self._repertoire = not navigation.catheters, Repertoire.of(navigation.catheters, config)
-        trials_of = partial(Trials.of, navigation, list(belief.wires.values()), like=belief.simulator)
+        trials_of = partial(Trials.of, navigation, belief.kinds, like=belief.simulator)
         self._course, self._many = trials_of(count=1), trials_of(count=self._repertoire.trials)
         self._few = self._course if self._alone else trials_of(count=len(self._repertoire.leads))
         self._population = Population(navigation, route, self._many, config, np.random.default_rng([seed, 0x5EA]))
@@ -149,7 +149,7 @@ class Search:
             self._cut_hard()
         return course.as_course(
             reached=reached,
-            ostium_mm=float(belief.parameters[source[0], 2]),
+            ostium_mm=float(belief.ostium_mm[source[0]]),
             settled=None if self._alone else settled,
         )
 

@@ -41,7 +41,8 @@ class NavigationRecord:
         measured: what X-ray showed at this moment; None where it was off, or no wire was found in the images.
         believed: where the policy believed the tip to be when it decided; NaN at the end, and None for a policy that
             does not tell: (Δtip, γtip), mm.
-        half_width: of the adviser's bands around it, mm, likewise; NaN where there is none.
+        half_width: of the adviser's bands around it, mm, likewise; NaN where there is none, infinite where the policy
+            could not explain what X-ray showed.
         asks: why the policy asked at this moment for X-ray at the next one; empty where it did not, or does not tell.
         cycles: what the drives asked for in each of their cycles and what the devices truly did, without shapes;
             replayed it gives the same navigation to the bit. Its columns `encoders` and `load` are what the robot
@@ -100,12 +101,13 @@ class NavigationRecord:
 
     @property
     def in_bands(self) -> Bool[np.ndarray, "decisions"]:
-        """Whether the adviser's bands held Δtip and γtip, at each decision that had bands."""
+        """Whether the adviser's bands held Δtip and γtip, at each decision with bands; infinite ones hold nothing."""
         if self.believed is None or self.half_width is None:
             return np.zeros(0, dtype=bool)
         true = np.stack([self.tip.abscissa[:, 0], self.tip.offset[:, 0]], axis=-1)
-        held = np.less_equal(np.abs(true - self.believed), self.half_width).all(axis=1)
-        return np.asarray(held)[np.isfinite(self.half_width).all(axis=1)]
+        half = self.half_width
+        held = (np.less_equal(np.abs(true - self.believed), half) & np.isfinite(half)).all(axis=1)
+        return np.asarray(held)[~np.isnan(half).any(axis=1)]
 
 
 class Track:

@@ -1,0 +1,138 @@
+"""A wire that is followed by its encoders under a belief: `Monitor`, which whoever drives may ask for X-ray.
+
+An exposure is compared with what was predicted before it weighs the belief (`Innovations`). Where several disagree the
+model is wrong, not the prediction unlucky: the bands widen, and X-ray is due every 1.5 s until two images lie in them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.belief.adviser import AdviserConfig, XrayAdviser
+from endopilot.belief.bands import Calibration
+from endopilot.belief.belief import Belief, BeliefConfig
+from endopilot.belief.innovations import Innovations
+from endopilot.devices.stack import Proximals
+from endopilot.tasks.navigation import Navigation
+from endopilot.xray.fluoroscope import TipMeasurement
+
+MISMATCH = "model mismatch"
+"""Why X-ray is asked for while the model is taken to be wrong."""
+
+
+AdviserInput = tuple[
+    Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1"]
+]
+"""What an adviser is given of a navigation: (Δ, φ), mm and rad; (Δtip, γtip), mm; the spread (standard deviation) of
+these as the model states it, mm; and the lumen's radius at the tip, mm."""
+
+
+@dataclass(frozen=True)
+class BelievedTip:
+    """Where a tip is believed to be.
+
+    Attributes:
+        abscissa: Δtip, mm.
+        offset: γtip, mm.
+        half_width: of the bands around both in which the tip is expected, mm; infinite where no wire explains what
+            X-ray showed, NaN without bands.
+        asks: why X-ray is asked for at the next decision; empty if it is not.
+    """
+
+    abscissa: float
+    offset: float
+    half_width: tuple[float, float] = (np.nan, np.nan)
+    asks: str = ""
+
+
+class Monitor:
+    """Follows a wire that somebody drives, and says where its tip is and when an exposure is due.
+
+    Example:
+        monitor = Monitor(navigation, calibration)
+        believed = monitor.step(encoders, load, exposure)   # every DECISION_PERIOD_S; the exposure that was asked for
+
+    Attributes:
+        belief: about the wire.
+        alarm: whether the model is taken to be wrong.
+        lost: whether no wire explains the last exposure.
+    """
+
+    def __init__(
+        self,
+        navigation: Navigation,
+        calibration: Calibration,
+        *,
+        config: BeliefConfig | None = None,
+        advice: AdviserConfig | None = None,
+    ) -> None:
+        """Lay out the simulated wires at the start of a navigation.
+
+        Args:
+            navigation: as it is given.
+            calibration: of the bands around what the simulated wires predict.
+            config: the simulated wires.
+            advice: which events X-ray must not miss.
+        """
+        self._navigation, self._config = navigation, config or BeliefConfig()
+        self._advice = advice or AdviserConfig()
+        self.belief = Belief(navigation, Belief.around(self._config), self._config)
+        self._adviser = XrayAdviser(calibration, self._advice, navigation.device.tip_radius_mm)
+        self._innovations = Innovations()
+        self._began = self.lost = False
+        proximal, tip, spread, radius = adviser_input(self.belief)
+        self._adviser.start(proximal, tip, radius)
+        self._half = self._adviser.widths(spread)[0]
+
+    @property
+    def alarm(self) -> bool:
+        """Whether the model is taken to be wrong."""
+        return self._innovations.alarm
+
+    def step(self, encoders: Proximals, load: Proximals = (), exposure: TipMeasurement | None = None) -> BelievedTip:
+        """Take what is measured, a period after the last, and return where the tip is believed and what is asked for.
+
+        Args:
+            encoders: inserted length (mm) and rotation (rad) of each device.
+            load: axial force (N) and torque (N·mm) of each drive; empty where it is not measured.
+            exposure: what X-ray shows now; None where it is off.
+        """
+        if self._began:
+            self.belief.follow(encoders)
+        else:
+            self.belief.drives.begin(encoders)
+        self._began = True
+        play = self.belief.play_spread()[None]
+        proximal, tip, spread, radius = adviser_input(self.belief)
+        if exposure is not None:
+            self._innovations.take(np.array([exposure.abscissa, exposure.offset]) - tip[0], self._half, exposure.sd_mm)
+            self.belief.weigh(exposure)
+            self._adviser.exposed()
+            self.lost = not self.belief.explains(exposure)
+            proximal, tip, spread, radius = adviser_input(self.belief)
+        elif self.belief.drives.proximal[0, 0] <= self._navigation.start_inserted_length_mm:
+            self.lost = False  # back where it began, the wire lies as it did, unseen in its catheter
+        factor = self._innovations.factor
+        due = bool(self._adviser.advise(proximal, tip, spread, radius, play, factor=factor, always=self.alarm)[0])
+        self._half = self._adviser.half_width[0] / factor
+        return self._believed(tip[0], due)
+
+    def _believed(self, tip: np.ndarray, due: bool) -> BelievedTip:
+        abscissa, offset = tip.tolist()
+        if self.lost:
+            return BelievedTip(abscissa, offset, (np.inf, np.inf), "no simulated wire explains the last image")
+        along, across = self._adviser.half_width[0].tolist()
+        wide = along >= self._advice.abscissa_mm
+        asks = f"Δtip is known to ±{along:.1f} mm only" if wide else "the tip may be reaching the wall"
+        asks = MISMATCH if self.alarm else asks
+        return BelievedTip(abscissa, offset, (along, across), asks if due else "")
+
+
+def adviser_input(belief: Belief) -> AdviserInput:
+    """Return what the adviser is given: the likeliest wire, and the spread of all wires."""
+    best, tip = int(np.argmax(belief.weight)), belief.likeliest_tip()
+    proximal, ends = belief.simulator.proximal[best, :1], np.array([[tip.abscissa[0], tip.offset[0]]])
+    return proximal, ends, belief.tip_spread()[None], tip.radius
