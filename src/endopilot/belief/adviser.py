@@ -97,6 +97,7 @@ class XrayAdviser:
         *,
         factor: Float[np.ndarray, "2"] | float = 1.0,
         always: bool = False,
+        lumen_share: float = 0.0,
     ) -> Bool[np.ndarray, "n"]:
         """Return for which navigations X-ray is due now, a period after the last call.
 
@@ -109,10 +110,14 @@ class XrayAdviser:
                 not given.
             factor: by which the bands are wider than they are calibrated.
             always: whether an exposure is due whenever the last is 1.5 s ago.
+            lumen_share: by which the lumen's radius may be another than it is given, which the calibration does not
+                know: a tip on the wall is then off by as much.
         """
         self._since, self._travel = self._since + 1, self._travel + np.abs(proximal[:, 0] - self._proximal[:, 0])
         self._proximal = proximal
-        half = self.half_width = factor * self.widths(spread, play)
+        half = factor * self.widths(spread, play)
+        half[:, 1] = np.hypot(half[:, 1], lumen_share * radius_mm)
+        self.half_width = half
         heeded = self._calibration.heeded * half[:, 1]
         edges = [tip[:, 1] + side * heeded for side in (1.0, 0.0, -1.0)]
         beyond = [self._ratio(edge, radius_mm) >= self._config.wall_ratio for edge in edges]

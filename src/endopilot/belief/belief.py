@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Annotated
 
@@ -32,6 +32,8 @@ from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.types import Anatomy, TipProjection
 from endopilot.xray.fluoroscope import TipMeasurement
 
+_OF_VESSEL = "lumen_factor", "lumen_mm", "axis_deg", "axis_side_deg"
+"""What of a `World` makes another vessel."""
 _SIDES = 16
 """Angles that a wire is turned to where its rotation is looked for."""
 _PLACED_MM = 0.5, 0.15
@@ -84,6 +86,49 @@ class BeliefConfig:
         )
 
 
+@dataclass
+class Past:
+    """What became of a navigation so far.
+
+    Attributes:
+        proximal: where the proximal ends of the devices were believed at each decision, mm and rad.
+        load: axial force (N) and torque (N·mm) of each drive then; empty where it is not measured.
+        exposures: what X-ray showed, by the decision.
+    """
+
+    proximal: list[Float[np.ndarray, "devices 2"]] = field(default_factory=list)
+    load: list[Proximals] = field(default_factory=list)
+    exposures: dict[int, TipMeasurement] = field(default_factory=dict)
+
+
+class Vessels:
+    """The vessels of a navigation, with one lumen and another, which beliefs share: preparing one takes a second.
+
+    Attributes:
+        simulators: in which they are prepared.
+    """
+
+    def __init__(self, given: Anatomy) -> None:
+        """Begin with the vessel as it is given."""
+        self._made = {World(): given}
+        self.simulators: list[Simulator] = []
+        self._kept = set[tuple[int, float]]()
+
+    def of(self, member: World) -> Anatomy:
+        """Return the vessel as a member has it."""
+        alone = World(**{name: getattr(member, name) for name in _OF_VESSEL})
+        if alone not in self._made:
+            self._made[alone] = alone.anatomy(self._made[World()])
+        return self._made[alone]
+
+    def prepared(self, simulator: Simulator) -> None:
+        """Keep a simulator if it holds what no other does."""
+        key = {(id(anatomy), simulator.config.wall_reach_mm) for anatomy in simulator.set_up.anatomies}
+        if not key <= self._kept:
+            self._kept |= key
+            self.simulators.append(simulator)
+
+
 class Belief:
     """An ensemble of simulated wires that follow a navigation, and how likely each is.
 
@@ -91,11 +136,13 @@ class Belief:
 
     Attributes:
         members: what each takes reality to be.
+        config: accuracy of measurements, and settings of the rod core.
         kinds: vessel and devices, those that differ; members share them.
         kind: the place among these of each member.
         ostium_mm: how much deeper each member's devices lie than the encoders say, mm.
         tip: of each member's wire.
         drives: where the proximal ends are.
+        vessels: as members have them.
         error: of each member at the last measurement, along and across its wire, mm.
     """
 
@@ -106,6 +153,7 @@ class Belief:
         config: BeliefConfig,
         *,
         drives: Drives | None = None,
+        vessels: Vessels | None = None,
     ) -> None:
         """Bring every member's wire to the start of the navigation.
 
@@ -114,8 +162,9 @@ class Belief:
             members: what each takes reality to be; all have the same kind of wall.
             config: accuracy of measurements, and settings of the rod core.
             drives: of another belief about the same devices; at rest at the start if not given.
+            vessels: that other beliefs have prepared.
         """
-        self.navigation, self.members, self._config = navigation, tuple(members), config
+        self.navigation, self.members, self.config = navigation, tuple(members), config
         self._accuracy_mm = config.along_sd_mm, config.across_sd_mm
         self._core = self.members[0].core(config.core)
         self._limits = [DriveLimits.of(each, navigation.anatomy) for each in navigation.devices]
@@ -123,10 +172,15 @@ class Belief:
         self.drives = drives or Drives(navigation.robot, navigation.start, fastest)
         self._fans = dict[int, Simulator]()
         self.ostium_mm = np.array([each.ostium_mm for each in self.members])
-        self.kinds, self.kind = _kinds(navigation, self.members)
+        self.vessels = vessels or Vessels(navigation.anatomy)
+        self.kinds, self.kind = _kinds(navigation, self.members, self.vessels)
         self.error = np.zeros((len(self.members), 2))
         self._score, self._coaxial = np.zeros(len(self.members)), bool(navigation.catheters)
         self.tip = self.simulator.project()[:, 0]
+
+    def like(self, members: Sequence[World]) -> Belief:
+        """Return a belief of other members about the same devices, at the start of the navigation."""
+        return Belief(self.navigation, members, self.config, drives=self.drives, vessels=self.vessels)
 
     @staticmethod
     def around(config: BeliefConfig) -> tuple[World, ...]:
@@ -148,7 +202,9 @@ class Belief:
         """The worlds of the members."""
         navigation, count = self.navigation, len(self.members)
         anatomies, stacks = zip(*(self.kinds[kind] for kind in self.kind), strict=True)
-        simulator = Simulator(anatomies, stacks, motion=navigation.known_motion, config=self._core)
+        sharing = self.vessels.simulators
+        simulator = Simulator(anatomies, stacks, motion=navigation.known_motion, config=self._core, sharing=sharing)
+        self.vessels.prepared(simulator)
         start = np.tile(navigation.start, (count, 1, 1))
         factor = np.array([each.friction_factor for each in self.members])
         simulator.reset(
@@ -175,13 +231,13 @@ class Belief:
             devices: inserted length (mm) and rotation (rad) of the wire, then of each catheter, as encoders read them.
         """
         self.drives.follow(devices)
-        self._move()
+        self._move(self.drives.proximal)
 
-    def _move(self) -> None:
+    def _move(self, proximal: Float[np.ndarray, "devices 2"]) -> None:
         """Move every member's proximal ends to where they are believed to be, in one decision period."""
         simulator = self.simulator
         now, control = simulator.at_drive, np.empty((simulator.worlds, simulator.devices, 2))
-        for k, (length, turn) in enumerate(self.drives.proximal.tolist()):
+        for k, (length, turn) in enumerate(proximal.tolist()):
             ahead = self._deeper(np.full(len(now), length)) - now[:, k, 0]
             motion = np.column_stack([ahead, turn - now[:, k, 1]])
             control[:, k] = self._limits[k].clip(motion / DECISION_PERIOD_S, now[:, k, 0], DECISION_PERIOD_S)
@@ -208,16 +264,34 @@ class Belief:
         The density is a Cauchy density. Its tails are heavy: a tip that snapped a moment too early says little about
         friction. Its scales are no smaller than the measurement's own standard deviations.
         """
-        position = measured.position - self._relocate(measured) if self.drives.lose else measured.position
+        self._weigh(measured, measured.position - self._relocate(measured) if self.drives.lose else measured.position)
+        if self.drives.lose and self.navigation.known_motion is None:  # else the next period takes them there
+            self._move(self.drives.proximal)
+
+    def _weigh(self, measured: TipMeasurement, position: Float[np.ndarray, "3"]) -> None:
         self.error = self.errors(position)
         scaled = self.error / np.maximum(self._accuracy_mm, measured.sd_mm)
         self._score = self._score - np.log1p((scaled**2).sum(axis=1))
-        if self.drives.lose and self.navigation.known_motion is None:  # else the next period takes them there
-            self._move()
+
+    def replay(self, past: Past) -> Float[np.ndarray, "members exposures 3"]:
+        """Drive the members, at the start of the navigation, as the devices went so far, and weigh them alike.
+
+        Returns:
+            The errors at each exposure along and across each member's wire, and of its γtip, mm.
+        """
+        errors = []
+        for period, proximal in enumerate(past.proximal):
+            if period:
+                self._move(proximal)
+            measured = past.exposures.get(period)
+            if measured is not None:
+                self._weigh(measured, measured.position)
+                errors.append(np.column_stack([self.error, np.abs(measured.offset - self.tip.offset)]))
+        return np.stack(errors, axis=1)
 
     def explains(self, measured: TipMeasurement) -> bool:
         """Return whether the likeliest wire explains the last measurement, which has weighed the members."""
-        best, config = int(np.argmax(self.weight)), self._config
+        best, config = int(np.argmax(self.weight)), self.config
         across_mm = max(config.lost_across_mm, config.lost_across_radii * float(self.tip.radius[best]))
         allowed = np.maximum([config.lost_along_mm, across_mm], _SURE_SDS * np.array(measured.sd_mm))
         return bool((self.error[best] <= allowed).all())
@@ -321,10 +395,10 @@ class Belief:
 
 
 def _kinds(
-    navigation: Navigation, members: Sequence[World]
+    navigation: Navigation, members: Sequence[World], vessels: Vessels
 ) -> tuple[list[tuple[Anatomy, Stack]], Int[np.ndarray, "members"]]:
     """Return vessels and devices of members, those that differ, and which of them each member has."""
     found: dict[World, int] = {}
     alike = [replace(each, friction_factor=1.0, ostium_mm=0.0, about="") for each in members]
     kind = np.array([found.setdefault(each, len(found)) for each in alike])
-    return [(each.anatomy(navigation.anatomy), each.stack(navigation.stack)) for each in found], kind
+    return [(vessels.of(each), each.stack(navigation.stack)) for each in found], kind

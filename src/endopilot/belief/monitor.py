@@ -13,12 +13,17 @@ from jaxtyping import Float
 
 from endopilot.belief.adviser import AdviserConfig, XrayAdviser
 from endopilot.belief.bands import Calibration
-from endopilot.belief.belief import Belief, BeliefConfig
+from endopilot.belief.belief import Belief, BeliefConfig, Past
+from endopilot.belief.identification import Identified, identify
 from endopilot.belief.innovations import Innovations
 from endopilot.devices.stack import Proximals
 from endopilot.tasks.navigation import Navigation
 from endopilot.xray.fluoroscope import TipMeasurement
 
+_LUMEN_SHARE = 0.12
+"""The lumen's radius may be off by this share: CT shows it to a tenth, an assumption."""
+_MOST, _EVERY = 6, 3
+"""The belief is changed as often at most, after as many further exposures at least."""
 MISMATCH = "model mismatch"
 """Why X-ray is asked for while the model is taken to be wrong."""
 
@@ -56,9 +61,10 @@ class Monitor:
         believed = monitor.step(encoders, load, exposure)   # every DECISION_PERIOD_S; the exposure that was asked for
 
     Attributes:
-        belief: about the wire.
-        alarm: whether the model is taken to be wrong.
+        belief: about the wire; another one once the model was taken to be wrong and another was identified.
         lost: whether no wire explains the last exposure.
+        past: what was measured so far.
+        identified: what was found when the belief was last changed; None before.
     """
 
     def __init__(
@@ -81,8 +87,9 @@ class Monitor:
         self._advice = advice or AdviserConfig()
         self.belief = Belief(navigation, Belief.around(self._config), self._config)
         self._adviser = XrayAdviser(calibration, self._advice, navigation.device.tip_radius_mm)
-        self._innovations = Innovations()
-        self._began = self.lost = False
+        self._innovations, self.past, self.lost = Innovations(), Past(), False
+        self.identified: Identified | None = None
+        self._times, self._since = 0, 0
         proximal, tip, spread, radius = adviser_input(self.belief)
         self._adviser.start(proximal, tip, radius)
         self._half = self._adviser.widths(spread)[0]
@@ -100,25 +107,43 @@ class Monitor:
             load: axial force (N) and torque (N·mm) of each drive; empty where it is not measured.
             exposure: what X-ray shows now; None where it is off.
         """
-        if self._began:
+        period = len(self.past.proximal)
+        if period:
             self.belief.follow(encoders)
         else:
             self.belief.drives.begin(encoders)
-        self._began = True
+        self.past.proximal.append(self.belief.drives.proximal.copy())
+        self.past.load.append(load)
         play = self.belief.play_spread()[None]
         proximal, tip, spread, radius = adviser_input(self.belief)
         if exposure is not None:
             self._innovations.take(np.array([exposure.abscissa, exposure.offset]) - tip[0], self._half, exposure.sd_mm)
+            self.past.exposures[period] = exposure
             self.belief.weigh(exposure)
             self._adviser.exposed()
             self.lost = not self.belief.explains(exposure)
+            self._since += 1
+            if self._times < _MOST and (self.alarm or self.lost) and self._since >= (_EVERY if self._times else 0):
+                self._identify(exposure)
             proximal, tip, spread, radius = adviser_input(self.belief)
         elif self.belief.drives.proximal[0, 0] <= self._navigation.start_inserted_length_mm:
             self.lost = False  # back where it began, the wire lies as it did, unseen in its catheter
         factor = self._innovations.factor
-        due = bool(self._adviser.advise(proximal, tip, spread, radius, play, factor=factor, always=self.alarm)[0])
+        due = bool(
+            self._adviser.advise(
+                proximal, tip, spread, radius, play, factor=factor, always=self.alarm, lumen_share=LUMEN
+            )[0]
+        )
         self._half = self._adviser.half_width[0] / factor
         return self._believed(tip[0], due)
+
+    def _identify(self, exposure: TipMeasurement) -> None:
+        """Change the belief to what explains all exposures."""
+        self.belief, self.identified = identify(self.belief, self.past, seed=self._times)
+        self._times, self._since = self._times + 1, 0
+        self._innovations.renew()
+        self._innovations.alarm = True  # until its own predictions were seen
+        self.lost = not self.belief.explains(exposure)
 
     def _believed(self, tip: np.ndarray, due: bool) -> BelievedTip:
         abscissa, offset = tip.tolist()

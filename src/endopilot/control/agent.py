@@ -78,8 +78,10 @@ IN_CATHETER = AgentConfig(
 """Settings of an agent of a wire in a catheter."""
 _WIRE_CREEP_MM_S = 2.0
 """Fastest translation of a wire that should have arrived, and that X-ray shows beside its target, mm/s."""
-_CLEAR_MM = 4.0
+_CLEAR_MM = 8.0
 """A wire that is lost is pulled back by this much at least before it is looked at again, mm."""
+_LOSSES = 4
+"""Times that the wire is lost, after which the agent gives up: each time another belief was sought."""
 _CREEP_MM_S, _CREEP_PERIODS = 1.0, 6
 """A catheter, which X-ray does not show, is moved ahead and back by this where it should have arrived, for as many
 periods and twice."""
@@ -196,12 +198,9 @@ class _PlanningPolicy:
     def _way_back(self, measured: TipMeasurement) -> float:
         """Return how far a wire that is lost is pulled back before it is looked at again, mm.
 
-        That is out of the branch that its tip is in and none of the likeliest wire is, a little at least. Without play
-        it is looked at all the time.
+        That is out of the branch that its tip is in and none of the likeliest wire is, a little at least.
         """
         tree, tip = self.navigation.anatomy.tree, self.belief.likeliest_tip()
-        if not self.belief.drives.lose:
-            return -np.inf
         leaves = min(
             tree.departures(int(tip.branch[0]))[measured.branch], tree.departures(measured.branch)[tip.branch[0]]
         )
@@ -334,14 +333,30 @@ class AgentPolicy(_PlanningPolicy):
         navigation = self.navigation
         self._calibration = self._given or read_agent_calibration(navigation.xray, len(navigation.devices))
         self.monitor = Monitor(navigation, self._calibration, config=self.config.belief, advice=self._advice)
-        self._believed = BelievedTip(np.nan, np.nan)
+        self._believed, self._losses = BelievedTip(np.nan, np.nan), 0
         return self.monitor.belief
 
+    def decide(self, observation: Observation) -> Decision:
+        """Follow the course as the module describes; end where belief after belief was lost."""
+        decision = super().decide(observation)
+        if self._losses < _LOSSES or decision.gives_up:
+            return decision
+        at = "" if observation.tip is None else f" at {observation.tip.abscissa:.0f} mm"
+        return replace(
+            decision, gives_up=f"lost {self._losses} times: no wire, lumen or ostium explains what X-ray shows{at}"
+        )
+
     def _observe(self, observation: Observation) -> None:
-        self._believed = self.monitor.step(observation.devices, observation.load, observation.tip)
+        monitor, before = self.monitor, self.monitor.lost
+        self._believed = monitor.step(observation.devices, observation.load, observation.tip)
+        if self.belief is not monitor.belief:  # another wire, lumen or ostium: another course
+            self.belief, self._failed = monitor.belief, 0
+            self._search = self._new_search()
+            self._follower.begin(None)
         if observation.tip is not None:
-            self._located(observation.tip, lost=self.monitor.lost)
-        self._lost = self.monitor.lost
+            self._located(observation.tip, lost=monitor.lost)
+        self._lost = monitor.lost
+        self._losses += self._lost and not before
 
     def wants_xray(self) -> bool:
         """Ask the monitor; a device that should have arrived, and the end of a manoeuvre, are looked at."""

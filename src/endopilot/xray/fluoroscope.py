@@ -1,9 +1,10 @@
 """What an X-ray exposure says of wire and guiding catheter: measurements with the errors of a C-arm, never the truth.
 
 The tip is projected onto one or two detectors, is found there with an error in pixels, and is located in space as the
-most likely place given the pixels and the vessel: the tip of a wire lies inside the lumen, mostly on its wall, and no
-deeper than the wire is inserted. The second view or, with a single one, the vessel gives the depth. The guiding
-catheter is a line in each view. docs/xray.md says where the numbers come from.
+most likely place given the pixels and the vessel: the tip of a wire lies about as far from the vessel's axis as its
+wall, and no deeper than the wire is inserted. It may be measured outside the lumen, which may be wider than it is
+believed. The second view or, with a single one, the vessel gives the depth. The guiding catheter is a line in each
+view. docs/xray.md says where the numbers come from.
 """
 
 from __future__ import annotations
@@ -31,6 +32,9 @@ _CATHETER_MM = 20.0
 _LEAN_SD = np.sin(np.radians(20.0))
 """Standard deviation of a guiding catheter's axis, a unit vector, across the given one before it is seen."""
 _ITERATIONS, _NEAR_ENOUGH_MM = 8, 1e-2
+_UNCLAMPED = 3.0
+"""Two views need the vessel to tell branches apart, not to place the tip: across it, the prior is this much wider, so
+that a tip outside the lumen as it is believed is measured where it is."""
 _HOPELESS = 30.0
 """Branches whose best vertex is this much less likely than the best of all (twice the log-likelihood) are left out."""
 _NEAR_SHARE = 0.1
@@ -157,7 +161,8 @@ class Fluoroscope:
         self._views = [view_at(angles, isocenter, self._config.geometry) for angles in shown]
         radius = [np.full(len(behind), anatomy.catheter_radius_mm), *(line.radius for line in lines)]
         # A wire that lies on the wall, anywhere around, lies clearance/√2 from it along either axis, root mean square.
-        self._lateral_sd = [np.maximum(r - wire_radius_mm, 0.1) / np.sqrt(2) for r in radius]
+        wider = _UNCLAMPED if len(self._views) > 1 else 1.0
+        self._lateral_sd = [wider * np.maximum(r - wire_radius_mm, 0.1) / np.sqrt(2) for r in radius]
         self._points = [catheter, *points]
         self._tangents = [np.tile(insertion.direction, (len(behind), 1)), *(tangents(p) for p in points)]
         self._abscissa = [behind, *(line.abscissa for line in lines)]
@@ -317,10 +322,7 @@ class Fluoroscope:
             nearest = int(np.argmin(((points - place) ** 2).sum(axis=1)))
             if step @ step < _NEAR_ENOUGH_MM**2:
                 break
-        lateral = place - points[nearest]
-        lateral = lateral - (lateral @ tangent[nearest]) * tangent[nearest]
-        beyond = 1 - np.sqrt(2) * sd[nearest] / max(float(np.linalg.norm(lateral)), 1e-9)
-        return place - max(beyond, 0.0) * lateral, cost, nearest  # a tip does not leave the lumen
+        return place, cost, nearest
 
 
 def make_c_arm(
