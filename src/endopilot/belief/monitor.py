@@ -26,8 +26,6 @@ _MOST, _EVERY = 6, 3
 """The belief is changed as often at most, after as many further exposures at least."""
 MISMATCH = "model mismatch"
 """Why X-ray is asked for while the model is taken to be wrong."""
-
-
 AdviserInput = tuple[
     Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1"]
 ]
@@ -122,6 +120,7 @@ class Monitor:
             self.belief.weigh(exposure)
             self._adviser.exposed()
             self.lost = not self.belief.explains(exposure)
+            self._innovations.alarm |= self.lost
             self._since += 1
             if self._times < _MOST and (self.alarm or self.lost) and self._since >= (_EVERY if self._times else 0):
                 self._identify(exposure)
@@ -129,11 +128,8 @@ class Monitor:
         elif self.belief.drives.proximal[0, 0] <= self._navigation.start_inserted_length_mm:
             self.lost = False  # back where it began, the wire lies as it did, unseen in its catheter
         factor = self._innovations.factor
-        due = bool(
-            self._adviser.advise(
-                proximal, tip, spread, radius, play, factor=factor, always=self.alarm, lumen_share=LUMEN
-            )[0]
-        )
+        shares = {"factor": factor, "always": self.alarm, "lumen_share": _LUMEN_SHARE}
+        due = bool(self._adviser.advise(proximal, tip, spread, radius, play, **shares)[0])
         self._half = self._adviser.half_width[0] / factor
         return self._believed(tip[0], due)
 
@@ -148,7 +144,8 @@ class Monitor:
     def _believed(self, tip: np.ndarray, due: bool) -> BelievedTip:
         abscissa, offset = tip.tolist()
         if self.lost:
-            return BelievedTip(abscissa, offset, (np.inf, np.inf), "no simulated wire explains the last image")
+            asks = "no simulated wire explains the last image" if due else ""
+            return BelievedTip(abscissa, offset, (np.inf, np.inf), asks)
         along, across = self._adviser.half_width[0].tolist()
         wide = along >= self._advice.abscissa_mm
         asks = f"Δtip is known to ±{along:.1f} mm only" if wide else "the tip may be reaching the wall"
