@@ -85,7 +85,7 @@ class XrayAdviser:
         """
         self._proximal, self._travel = proximal, np.zeros(len(proximal))
         self._since = np.zeros(len(proximal), dtype=int)
-        self._beyond = [self._ratio(tip[:, 1], radius_mm) >= self._config.wall_ratio] * 3
+        self._beyond = [self._ratio(tip[:, 1], radius_mm) >= self._config.wall_ratio] * 5
 
     def advise(
         self,
@@ -111,15 +111,15 @@ class XrayAdviser:
             factor: by which the bands are wider than they are calibrated.
             always: whether an exposure is due whenever the last is 1.5 s ago.
             lumen_share: by which the lumen's radius may be another than it is given, which the calibration does not
-                know: a tip on the wall is then off by as much.
+                know: a tip on the wall is then off by as much, and the edges of that band are heeded too.
         """
         self._since, self._travel = self._since + 1, self._travel + np.abs(proximal[:, 0] - self._proximal[:, 0])
         self._proximal = proximal
-        half = factor * self.widths(spread, play)
-        half[:, 1] = np.hypot(half[:, 1], lumen_share * radius_mm)
-        self.half_width = half
+        half, wall = factor * self.widths(spread, play), lumen_share * radius_mm
         heeded = self._calibration.heeded * half[:, 1]
-        edges = [tip[:, 1] + side * heeded for side in (1.0, 0.0, -1.0)]
+        edges = [tip[:, 1] + off for off in (heeded, 0.0, -heeded, wall, -wall)]
+        half[:, 1] = np.hypot(half[:, 1], wall)
+        self.half_width = half
         beyond = [self._ratio(edge, radius_mm) >= self._config.wall_ratio for edge in edges]
         crossed = np.any([now & ~before for now, before in zip(beyond, self._beyond, strict=True)], axis=0)
         due = (crossed | (half[:, 0] >= self._config.abscissa_mm) | always) & (self._since >= _SPACING)

@@ -187,7 +187,7 @@ def _scores(belief: Belief, past: Past, members: Sequence[World]) -> tuple[Float
         except InputError:  # the wire does not fit
             continue
         error = tried.replay(past)
-        scaled = error / np.array(_SCALES_MM)
+        scaled = error / np.maximum(_SCALES_MM, [(0.0, *seen.tip_sd_mm) for seen in past.exposures.values()])
         found = -np.log1p((scaled**2).sum(axis=-1)).sum(axis=1)
         score[chosen] = np.where(tried.simulator.valid, np.nan_to_num(found, nan=-1e6), -1e6)
     return score, bool(score.max() > -count * np.log1p(_UNEXPLAINED**2))

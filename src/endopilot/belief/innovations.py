@@ -16,9 +16,13 @@ _WITHIN = 1.645
 _FORGETS, _PRIOR = 0.8, 0.5
 """What an innovation weighs at the next exposure; and what it weighs that the bands are as wide as calibrated. One that
 an exact measurement shows weighs 1."""
-_FAR, _RECENT = 1.6, 5
+_FAR, _RECENT = 2.0, 6
 """Innovations to the same side add up: one this many times its bound is enough, and so is a mean of n, at most so many,
-this many times its bound over √n."""
+this many times its bound over √n. Bounds are those of bands as calibrated."""
+_OUTSIDE, _OF = 1.3, 3
+"""Two of so many innovations this many times their bounds are enough too. Bounds are those of widened bands."""
+_PROOF = 4
+"""Images in a row that lie within the bands of a belief that was identified before it is trusted."""
 
 
 class Innovations:
@@ -27,20 +31,19 @@ class Innovations:
     Attributes:
         factor: by which the bands of Δtip and γtip are widened, 1 or more.
         alarm: whether the model is taken to be wrong: since two of three innovations lay outside, or one or their mean
-            was far; until two in a row lie inside.
+            was far; until two in a row lie inside, four of a belief that was identified.
     """
 
     def __init__(self) -> None:
         """Begin with the bands as they are calibrated."""
-        self.alarm = False
-        self.shares: list[float] = []
-        self._inside: list[bool] = []
-        self._off: list[Float[np.ndarray, "2"]] = []
+        self._shares, self._off = list[float](), list[Float[np.ndarray, "2"]]()
         self.renew()
+        self.alarm = False
 
     def renew(self) -> None:
-        """Take another belief, of whose predictions nothing was seen yet."""
-        self.factor, self._inside, self._off = np.ones(2), [], []
+        """Take another belief, which has yet to prove itself."""
+        self.factor, self._shares, self._off = np.ones(2), [], []
+        self.alarm, self._inside, self._needed = True, 0, _PROOF
         self._excess, self._weight = np.full(2, _PRIOR), np.full(2, _PRIOR)
 
     def take(
@@ -56,16 +59,19 @@ class Innovations:
         noise = np.where(np.array(sd_mm) > 0, sd_mm, ASSUMED_SD_MM)
         bound = np.hypot(self.factor * half_mm, _WITHIN * noise)
         share = float(np.max(np.abs(innovation) / bound))
-        self._inside.append(share <= 1.0)
-        self.shares.append(share)
+        self._shares.append(share)
         predicted, measured = (np.maximum(half_mm, 1e-3) / _WITHIN) ** 2, noise**2
         information = (predicted / (predicted + measured)) ** 2
         self._excess = _FORGETS * self._excess + information * (innovation**2 - measured) / predicted
         self._weight = _FORGETS * self._weight + information
         self.factor = np.sqrt(np.maximum(self._excess / self._weight, 1.0))
-        self._off.append(innovation / bound)
+        self._off.append(innovation / np.hypot(half_mm, _WITHIN * noise))
         if self.alarm:
-            self.alarm = not (len(self._inside) >= 2 and all(self._inside[-2:]))
+            self._inside = self._inside + 1 if share <= 1.0 else 0
+            self.alarm = self._inside < self._needed
         else:
-            biased = np.abs(np.sum(self._off[-_RECENT:], axis=0)).max() > _FAR * np.sqrt(len(self._off[-_RECENT:]))
-            self.alarm = bool(biased) or self._inside[-3:].count(False) >= 2
+            sums = np.abs(np.cumsum(self._off[: -_RECENT - 1 : -1], axis=0)).max(axis=1)
+            biased = sums > _FAR * np.sqrt(np.arange(1, len(sums) + 1))
+            outside = np.array(self._shares[-_OF:]) > _OUTSIDE
+            self.alarm = bool(biased.any() or outside.sum() >= 2)
+            self._inside, self._needed = 0, 2

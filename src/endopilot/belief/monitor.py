@@ -115,7 +115,9 @@ class Monitor:
         play = self.belief.play_spread()[None]
         proximal, tip, spread, radius = adviser_input(self.belief)
         if exposure is not None:
-            self._innovations.take(np.array([exposure.abscissa, exposure.offset]) - tip[0], self._half, exposure.sd_mm)
+            self._innovations.take(
+                np.array([exposure.abscissa, exposure.offset]) - tip[0], self._half, exposure.tip_sd_mm
+            )
             self.past.exposures[period] = exposure
             self.belief.weigh(exposure)
             self._adviser.exposed()
@@ -138,7 +140,6 @@ class Monitor:
         self.belief, self.identified = identify(self.belief, self.past, seed=self._times)
         self._times, self._since = self._times + 1, 0
         self._innovations.renew()
-        self._innovations.alarm = True  # until its own predictions were seen
         self.lost = not self.belief.explains(exposure)
 
     def _believed(self, tip: np.ndarray, due: bool) -> BelievedTip:
