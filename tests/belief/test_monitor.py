@@ -23,15 +23,21 @@ class ToAndFro:
     """Pushes, turns and pulls, whatever is believed, and asks for X-ray as a monitor does."""
 
     def start(self, navigation: Navigation, seed: int) -> None:
-        self.monitor, self.believed = Monitor(navigation, read_agent_calibration("assumed", 1)), BelievedTip(0.0, 0.0)
+        self.monitor, self.last = Monitor(navigation, read_agent_calibration("assumed", 1)), BelievedTip(0.0, 0.0)
         self.alarmed, self.exposures = 0, 0
+
+    def believed_wires(self) -> np.ndarray:
+        return self.monitor.belief.simulator.position
+
+    def believed(self) -> BelievedTip:
+        return self.last
 
     def decide(self, observation: Observation) -> Decision:
         self.exposures += observation.tip is not None
-        self.believed = self.monitor.step(observation.devices, observation.load, observation.tip)
-        self.alarmed += MISMATCH in self.believed.asks
+        self.last = self.monitor.step(observation.devices, observation.load, observation.tip)
+        self.alarmed += MISMATCH in self.last.asks
         slow = -1 if int(observation.time_s / 4) % 3 == 2 else 1
-        return Decision(((4.0 * slow, 0.6),), expose=bool(self.believed.asks))
+        return Decision(((4.0 * slow, 0.6),), expose=bool(self.last.asks))
 
 
 def driven(navigation: Navigation, world: World, seed: int = 1) -> Iterator[tuple[ToAndFro, NavigationLoop]]:
@@ -57,7 +63,7 @@ def test_a_deeper_ostium_is_noticed_and_identified(along_the_fork) -> None:
             found = monitor.belief.ostium_mm @ monitor.belief.weight
             assert policy.exposures <= 5
         if found is not None:
-            tip, believed = loop.simulator.project(), policy.believed
+            tip, believed = loop.simulator.project(), policy.last
             off = abs(believed.abscissa - tip.abscissa[0, 0]), abs(believed.offset - tip.offset[0, 0])
             held.append(bool(np.less_equal(off, np.add(believed.half_width, 4.0 * 0.5)).all()))
     assert found == pytest.approx(2.5, abs=0.5)

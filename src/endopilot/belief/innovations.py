@@ -46,6 +46,11 @@ class Innovations:
         self.alarm, self._inside, self._needed = True, 0, _PROOF
         self._excess, self._weight = np.full(2, _PRIOR), np.full(2, _PRIOR)
 
+    @property
+    def outside(self) -> bool:
+        """Whether one of the last images lay outside the bands."""
+        return max(self._shares[-_OF:], default=0.0) > 1.0
+
     def take(
         self, innovation: Float[np.ndarray, "2"], half_mm: Float[np.ndarray, "2"], sd_mm: tuple[float, float]
     ) -> None:

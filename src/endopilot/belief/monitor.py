@@ -124,7 +124,7 @@ class Monitor:
             self.lost = not self.belief.explains(exposure)
             self._innovations.alarm |= self.lost
             self._since += 1
-            if self._times < _MOST and (self.alarm or self.lost) and self._since >= (_EVERY if self._times else 0):
+            if self._is_to_change():
                 self._identify(exposure)
             proximal, tip, spread, radius = adviser_input(self.belief)
         elif self.belief.drives.proximal[0, 0] <= self._navigation.start_inserted_length_mm:
@@ -134,6 +134,12 @@ class Monitor:
         due = bool(self._adviser.advise(proximal, tip, spread, radius, play, **shares)[0])
         self._half = self._adviser.half_width[0] / factor
         return self._believed(tip[0], due)
+
+    def _is_to_change(self) -> bool:
+        """Return whether another belief is sought: the first does not explain the images, or no longer the last one."""
+        if self._times == _MOST or not (self.alarm or self.lost):
+            return False
+        return self._times == 0 or (self._since >= _EVERY and (self.lost or self._innovations.outside))
 
     def _identify(self, exposure: TipMeasurement) -> None:
         """Change the belief to what explains all exposures."""
