@@ -8,7 +8,7 @@ simulated side by side; they differ in friction and ostium.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -29,6 +29,14 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "ostium_mm": (-4.0, 4.0),
 }
 """Parameters that are identified, and their ranges; factors are drawn by their logarithms."""
+_NAMES: Mapping[str, str] = {
+    "tip_bend_factor": "tip bend ×{:.2f} to {:.2f}",
+    "tip_bend_length_factor": "bent length ×{:.2f} to {:.2f}",
+    "tip_stiffness_factor": "tip stiffness ×{:.2f} to {:.2f}",
+    "lumen_factor": "lumen ×{:.2f} to {:.2f}",
+    "friction_factor": "friction ×{:.2f} to {:.2f}",
+    "ostium_mm": "wire {:.1f} to {:.1f} mm deeper than by its encoder",
+}
 _OF_KIND = 4
 """The first of them are those of a kind."""
 _LUMENS = 0.9, 1.0, 1.1
@@ -47,6 +55,10 @@ _USUAL_SD: Mapping[str, float] = {
 """Standard deviations of the factors' logarithms before anything was seen: an assumption."""
 _COMPLIANT_SHARE = 0.3
 """How much likelier a rigid wall is before: an assumption."""
+_UNSURE = 0.15
+"""The kind of wall is unknown where either is at least this likely."""
+_KNOWN_SHARE = 0.5
+"""A parameter is unknown where its interval is wider than this share of what was likely before."""
 _OSTIUM_SD_MM = 0.6
 """Standard deviation of the ostium that the first exposure shows, mm."""
 _SHRINKS, _NARROWEST, _LEAST_OF_A_WALL = 0.7, 0.04, 2
@@ -73,14 +85,24 @@ class Identified:
     """What explains the exposures.
 
     Attributes:
-        interval: of each parameter of `RANGES`, the range that holds 80 % of the likelihood.
-        compliant: how likely the wall is compliant.
+        interval: of each parameter of `RANGES`, the range that holds 80 % of the likelihood; None where the exposures
+            hardly tell it.
+        compliant: how likely the wall is compliant; None where nothing tells it.
         explains: whether the likeliest explains the exposures better than no member does.
     """
 
-    interval: Mapping[str, tuple[float, float]]
-    compliant: float
+    interval: Mapping[str, tuple[float, float] | None]
+    compliant: float | None
     explains: bool
+
+    @property
+    def words(self) -> str:
+        """What was found, in words."""
+        known = [_NAMES[name].format(*ends) for name, ends in self.interval.items() if ends is not None]
+        unsure = self.compliant is None or _UNSURE <= self.compliant <= 1 - _UNSURE
+        wall = "unknown wall" if unsure else "compliant wall" if (self.compliant or 0.0) > 0.5 else "rigid wall"
+        found = ", ".join([*known, wall])
+        return found if self.explains else f"nothing explains the images well; likeliest {found}"
 
 
 def identify(
@@ -99,7 +121,10 @@ def identify(
     """
     config = config or IdentificationConfig()
     random = np.random.default_rng([seed, len(past.proximal), 0x1DE])
-    theta, walls = _first(config, _ostium_mm(belief, past), random)
+    deeper_mm = _ostium_mm(belief, past)
+    if len(past.proximal) == 1:  # nothing but the ostium shows before the wire moves
+        return _deeper(belief, past, deeper_mm)
+    theta, walls = _first(config, deeper_mm, random)
     for generation in range(config.generations):
         members = _members(theta, walls)
         score, explains = _scores(belief, past, members)
@@ -113,6 +138,15 @@ def identify(
     found = belief.like(_chosen(members, score, weight, config.each, belief.config))
     found.replay(past)
     return found, Identified(interval, compliant, explains)
+
+
+def _deeper(belief: Belief, past: Past, ostium_mm: float) -> tuple[Belief, Identified]:
+    """Return the same members with their ostia where the first exposure has them."""
+    found = belief.like([replace(each, ostium_mm=each.ostium_mm + ostium_mm) for each in belief.members])
+    found.replay(past)
+    unknown = dict.fromkeys(RANGES)
+    interval = unknown | {"ostium_mm": (ostium_mm - _OSTIUM_SD_MM, ostium_mm + _OSTIUM_SD_MM)}
+    return found, Identified(interval, None, explains=True)
 
 
 Theta = Float[np.ndarray, "kinds each parameters"]
@@ -239,13 +273,15 @@ def _truncated(center: np.ndarray, sd: np.ndarray, random: np.random.Generator) 
     return np.clip(center + sd * norm.ppf(low + (high - low) * random.random(center.shape)), 0.0, 1.0)
 
 
-def _interval(name: str, unit: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
-    """Return the range of a parameter that holds 80 % of the weight."""
+def _interval(name: str, unit: np.ndarray, weight: np.ndarray) -> tuple[float, float] | None:
+    """Return the range of a parameter that holds 80 % of the weight; None where it is hardly narrower than before."""
     order = np.argsort(unit)
     share = np.cumsum(weight[order])
     ends = (unit[order][min(int(np.searchsorted(share, at)), len(unit) - 1)] for at in (0.1, 0.9))
     low, high = (_from_unit(name, float(end)) for end in ends)
-    return low, high
+    before = 2 * 1.28 * _USUAL_SD[name] if name in _USUAL_SD else RANGES[name][1]
+    after = np.log(high / low) if name in _USUAL_SD else high - low
+    return (low, high) if after <= _KNOWN_SHARE * before else None
 
 
 def _chosen(

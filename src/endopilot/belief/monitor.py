@@ -43,12 +43,14 @@ class BelievedTip:
         half_width: of the bands around both in which the tip is expected, mm; infinite where no wire explains what
             X-ray showed, NaN without bands.
         asks: why X-ray is asked for at the next decision; empty if it is not.
+        found: what was identified since the model was taken to be wrong, in words; empty if nothing was.
     """
 
     abscissa: float
     offset: float
     half_width: tuple[float, float] = (np.nan, np.nan)
     asks: str = ""
+    found: str = ""
 
 
 class Monitor:
@@ -150,14 +152,15 @@ class Monitor:
 
     def _believed(self, tip: np.ndarray, due: bool) -> BelievedTip:
         abscissa, offset = tip.tolist()
+        found = "" if self.identified is None else self.identified.words
         if self.lost:
             asks = "no simulated wire explains the last image" if due else ""
-            return BelievedTip(abscissa, offset, (np.inf, np.inf), asks)
+            return BelievedTip(abscissa, offset, (np.inf, np.inf), asks, found)
         along, across = self._adviser.half_width[0].tolist()
         wide = along >= self._advice.abscissa_mm
         asks = f"Δtip is known to ±{along:.1f} mm only" if wide else "the tip may be reaching the wall"
         asks = MISMATCH if self.alarm else asks
-        return BelievedTip(abscissa, offset, (along, across), asks if due else "")
+        return BelievedTip(abscissa, offset, (along, across), asks if due else "", found)
 
 
 def adviser_input(belief: Belief) -> AdviserInput:
