@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig
+from endopilot.belief.monitor import MISMATCH
 from endopilot.control import push
 from endopilot.control.agent import CALIBRATIONS, AgentConfig, AgentPolicy, OpenLoopPolicy, OraclePolicy
 from endopilot.control.course import Course
@@ -230,7 +231,8 @@ def test_a_lost_wire_that_is_back_in_its_catheter_unseen_sets_out_again(side_bra
     assert policy.decide(Observation(0.0, ((6.0, 0.0),), far)).devices[0][0] < 0
     assert policy.decide(Observation(0.5, ((4.0, 0.0),), None)).devices[0][0] < 0  # not there yet
     again = policy.decide(Observation(1.0, ((1.9, 0.0),), None))
-    assert again.devices[0][0] > 0 and not again.expose
+    assert again.devices[0][0] > 0 and not policy.monitor.lost
+    assert again.expose and policy.believed().asks == MISMATCH  # which has yet to be explained
 
 
 def test_a_tip_that_is_measured_badly_is_not_lost(side_branch) -> None:

@@ -6,7 +6,7 @@ model is wrong, not the prediction unlucky: the bands widen, and X-ray is due ev
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -89,7 +89,7 @@ class Monitor:
         self._adviser = XrayAdviser(calibration, self._advice, navigation.device.tip_radius_mm)
         self._innovations, self.past, self.lost = Innovations(), Past(), False
         self.identified: Identified | None = None
-        self._times, self._since = 0, 0
+        self._times, self._since, self._returned = 0, 0, False
         proximal, tip, spread, radius = adviser_input(self.belief)
         self._adviser.start(proximal, tip, radius)
         self._half = self._adviser.widths(spread)[0]
@@ -136,6 +136,19 @@ class Monitor:
         due = bool(self._adviser.advise(proximal, tip, spread, radius, play, **shares)[0])
         self._half = self._adviser.half_width[0] / factor
         return self._believed(tip[0], due)
+
+    @property
+    def may_return(self) -> bool:
+        """Whether what was identified may be given up for what is given, which is done once."""
+        return self.identified is not None and not self._returned
+
+    def return_to_given(self) -> None:
+        """Take wire, lumen and wall as they are given again, with the ostium that was identified, if that may be."""
+        if self.may_return:
+            ostium_mm = float(self.belief.weight @ self.belief.ostium_mm)
+            given = [replace(each, ostium_mm=each.ostium_mm + ostium_mm) for each in Belief.around(self._config)]
+            self.belief, self._returned = self.belief.like(given), True
+            self.belief.replay(self.past)
 
     def _is_to_change(self) -> bool:
         """Return whether another belief is sought: the first does not explain the images, or no longer the last one."""

@@ -78,7 +78,7 @@ IN_CATHETER = AgentConfig(
 """Settings of an agent of a wire in a catheter."""
 _WIRE_CREEP_MM_S = 2.0
 """Fastest translation of a wire that should have arrived, and that X-ray shows beside its target, mm/s."""
-_CLEAR_MM = 8.0
+_CLEAR_MM = 4.0
 """A wire that is lost is pulled back by this much at least before it is looked at again, mm."""
 _LOSSES = 4
 """Times that the wire is lost, after which the agent gives up: each time another belief was sought."""
@@ -139,8 +139,13 @@ class _PlanningPolicy:
         wanted = self._pull_back() if self._lost else self._go_on(observation)
         self.belief.drives.sent(wanted)
         ends = self._failed >= self.config.tries and self._follower.course is None and not self._lost
+        ends = ends and not self._tries_another()
         expose = self._back_far_enough() if self._lost else self.wants_xray()
         return Decision(wanted, expose=expose, gives_up=self._search.halt if ends else "")
+
+    def _tries_another(self) -> bool:
+        """Return whether another belief is left to search in."""
+        return False
 
     def watch(self, observation: Observation) -> None:
         """Follow what somebody else does; a new course is searched at the next decision."""
@@ -198,9 +203,12 @@ class _PlanningPolicy:
     def _way_back(self, measured: TipMeasurement) -> float:
         """Return how far a wire that is lost is pulled back before it is looked at again, mm.
 
-        That is out of the branch that its tip is in and none of the likeliest wire is, a little at least.
+        That is out of the branch that its tip is in and none of the likeliest wire is, a little at least. Without play
+        it is looked at all the time.
         """
         tree, tip = self.navigation.anatomy.tree, self.belief.likeliest_tip()
+        if not self.belief.drives.lose:
+            return -np.inf
         leaves = min(
             tree.departures(int(tip.branch[0]))[measured.branch], tree.departures(measured.branch)[tip.branch[0]]
         )
@@ -349,6 +357,8 @@ class AgentPolicy(_PlanningPolicy):
     def _observe(self, observation: Observation) -> None:
         monitor, before = self.monitor, self.monitor.lost
         self._believed = monitor.step(observation.devices, observation.load, observation.tip)
+        if self._failed >= self.config.tries:  # what was identified leads nowhere
+            monitor.return_to_given()
         if self.belief is not monitor.belief:  # another wire, lumen or ostium: another course
             self.belief, self._failed = monitor.belief, 0
             self._search = self._new_search()
@@ -357,6 +367,9 @@ class AgentPolicy(_PlanningPolicy):
             self._located(observation.tip, lost=monitor.lost)
         self._lost = monitor.lost
         self._losses += self._lost and not before
+
+    def _tries_another(self) -> bool:
+        return self.monitor.may_return
 
     def wants_xray(self) -> bool:
         """Ask the monitor; a device that should have arrived, and the end of a manoeuvre, are looked at."""
