@@ -99,6 +99,7 @@ class MonitoredAgent(AgentPolicy):
         """Begin a navigation without predictions."""
         self.kept: list[np.ndarray] = []
         super().start(navigation, seed)  # pyright: ignore[reportAttributeAccessIssue]
+        self.monitor.changes_left = 0  # the bands are those of the wires as they are given
 
     def decide(self, observation: Observation) -> Decision:
         """Decide as the agent does, and keep the prediction."""

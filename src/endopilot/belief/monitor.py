@@ -65,6 +65,7 @@ class Monitor:
         lost: whether no wire explains the last exposure.
         past: what was measured so far.
         identified: what was found when the belief was last changed; None before.
+        changes_left: how often it may still be changed.
     """
 
     def __init__(
@@ -89,7 +90,7 @@ class Monitor:
         self._adviser = XrayAdviser(calibration, self._advice, navigation.device.tip_radius_mm)
         self._innovations, self.past, self.lost = Innovations(), Past(), False
         self.identified: Identified | None = None
-        self._times, self._since, self._returned = 0, 0, False
+        self.changes_left, self._since, self._returned = _MOST, 0, False
         proximal, tip, spread, radius = adviser_input(self.belief)
         self._adviser.start(proximal, tip, radius)
         self._half = self._adviser.widths(spread)[0]
@@ -152,14 +153,14 @@ class Monitor:
 
     def _is_to_change(self) -> bool:
         """Return whether another belief is sought: the first does not explain the images, or no longer the last one."""
-        if self._times == _MOST or not (self.alarm or self.lost):
+        if self.changes_left == 0 or not (self.alarm or self.lost):
             return False
-        return self._times == 0 or (self._since >= _EVERY and (self.lost or self._innovations.outside))
+        return self.identified is None or (self._since >= _EVERY and (self.lost or self._innovations.outside))
 
     def _identify(self, exposure: TipMeasurement) -> None:
         """Change the belief to what explains all exposures."""
-        self.belief, self.identified = identify(self.belief, self.past, seed=self._times)
-        self._times, self._since = self._times + 1, 0
+        self.belief, self.identified = identify(self.belief, self.past, seed=self.changes_left)
+        self.changes_left, self._since = self.changes_left - 1, 0
         self._innovations.renew()
         self.lost = not self.belief.explains(exposure)
 
