@@ -25,6 +25,7 @@ BENCHMARKS = {
     "verification": "verification.verification:bench_verification",
     "published": "published.published:bench_published",
     "robot-twist": "robot.twist:bench_twist",
+    "robot-blind": "robot.blind:bench_blind",
     "dataset": "dataset:bench_dataset",
     "cockpit": "cockpit:bench_cockpit",
     "anatomy": "anatomy.extraction:bench_anatomy",
@@ -32,12 +33,14 @@ BENCHMARKS = {
     "ostia": "anatomy.ostia:bench_ostia",
     "imaging": "imaging.segmentation:bench_imaging",
     "xray": "imaging.xray:bench_xray",
+    "angiograms": "imaging.angiograms:bench_angiograms",
     "wire-evidence": "imaging.wire_evidence:train_evidence",
     "agent-calibration": "agent.calibration:calibrate_agent",
     "agent-replanning": "agent.replanning:compare_replanning",
     "coronary-navigation": "agent.coronary_navigation:navigate_coronaries",
     "ladder-patients": "agent.ladder_patients:choose_patients",
     "xray-conditions": "agent.xray_conditions:drive_under_conditions",
+    "worlds": "agent.worlds:drive_in_worlds",
 }
 """Name of each benchmark, and the function that measures: module and name."""
 EXIT_FAILED, EXIT_BAD_INPUT = 1, 2

@@ -1,6 +1,7 @@
 """Configuration of the documentation: `make docs` builds it into docs/_build and runs every tutorial and example."""
 
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -40,3 +41,21 @@ sphinx_gallery_conf = {
     "min_reported_time": 1000,
     "write_computation_times": False,
 }
+
+
+def setup(app):
+    """Have docstrings read as they were meant: shapes such as `*each 3`, and the tables of the environments."""
+    app.connect("autodoc-process-docstring", _read_as_meant, priority=900)  # after napoleon
+
+
+def _read_as_meant(app, what, name, obj, options, lines):
+    read, in_table = [], False
+    for line in lines:
+        table = line.startswith("|")
+        if table and not in_table:
+            read += ["::", ""]
+        elif in_table and not table:
+            read.append("")
+        in_table = table
+        read.append(f"    {line}" if table else re.sub(r"(?<=:type: )(.*)", r"``\1``", line))
+    lines[:] = read

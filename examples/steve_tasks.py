@@ -1,13 +1,22 @@
-"""The episodes of stEVE_bench's ArchVariety (Karstensen et al., arXiv 2410.01956; MIT) as a task of the ladder.
+"""Tasks of stEVE_bench (Karstensen et al., arXiv 2410.01956; MIT) as tasks of the ladder.
 
     python examples/steve_tasks.py EPISODES.npz steve
     endopilot ladder --version steve --policy agent
 
-EPISODES.npz holds, for each seed SSS of the benchmark, what its own generator draws, in mm: `SSS_branch_NAME` (a row
-x, y, z, radius for each point), `SSS_insertion_mm`, `SSS_direction` and `SSS_target_mm`. The folder gets an anatomy for
-each seed, the benchmark's wire, and the task. The benchmark counts a target as reached when the tip is within 5 mm of
-it; it gives 1000 steps of 1/7.5 s. It has no limits of force: those are here the ones of the shipped 0.035-inch wire,
-and 0.7 N on a node of the wall. Without arguments, a made-up arch is converted.
+    python examples/steve_tasks.py CURVES dual [SEED]
+    endopilot ladder --version dual --policy agent
+
+EPISODES.npz holds episodes of ArchVariety: for each seed SSS of the benchmark, what its own generator draws, in mm:
+`SSS_branch_NAME` (a row x, y, z, radius for each point), `SSS_insertion_mm`, `SSS_direction` and `SSS_target_mm`. The
+folder gets an anatomy for each seed, the benchmark's wire, and the task.
+
+CURVES is the folder of DualDeviceNav's centerline curves, as 3D Slicer wrote them. The folder gets one anatomy, the
+benchmark's wire and catheter, and a task with twenty targets: points of the carotid and vertebral arteries' curves that
+lie in no other curve's tube, drawn with SEED (0 if not given).
+
+The benchmark counts a target as reached when the tip is within 5 mm of it; it gives 1000 steps of 1/7.5 s. It has no
+limits of force: those are here the ones of shipped devices, and 0.7 N on a node of the wall. Without arguments, a
+made-up arch is converted.
 """
 
 from __future__ import annotations
@@ -21,44 +30,71 @@ import yaml
 
 import endopilot
 from endopilot.anatomy.catheter_axis import with_axis
-from endopilot.anatomy.sources import Polylines
+from endopilot.anatomy.sources import Polylines, read_source
 from endopilot.tasks.task import list_tasks
 
-SHAFT_MPA, TIP_MPA, POISSON = 80.0, 17.0, 0.49
-"""Moduli of the benchmark's wire: its file has 8e4 and 1.7e4 kPa, which follow from its densities (kg, mm, s)."""
-SHAFT_MM, TIP_MM = 0.89, 0.7
-"""Diameters of shaft and tip."""
+POISSON = 0.49
 TIP_RADIUS_MM, TIP_DEG = 12.1, 72.0
-"""The tip's bend."""
-SECONDS = 1000 / 7.5
+"""The tip's bend, of all its devices."""
+TIP_MM = round(float(TIP_RADIUS_MM * np.radians(TIP_DEG)), 2)
+TASK = {
+    "level": 1,
+    "tip_bend_deg": TIP_DEG,
+    "tip_bend_mm": TIP_MM,
+    "start_inserted_length_mm": 2.0,
+    "seconds": 1000 / 7.5,
+    "force_limit_n": 0.7,
+    "near_mm": 5.0,
+}
+"""What the benchmark's tasks have in common."""
+OSTIUM_MM, DIRECTION = (-35.0, 65.0, 5.0), (-1.0, -1.0, 0.0)
+"""Insertion of DualDeviceNav in the coordinates of its curves: the benchmark takes (x, y, z) as (y, -z, -x)."""
+GOALS = ("LCCA", "LVA", "RCCA", "RVA")
+TARGETS = 20
 
 
-def wire() -> dict[str, object]:
-    """Return the benchmark's wire as the content of a device's file."""
-    source = "stEVE_bench, ArchVariety"
-    length = TIP_RADIUS_MM * np.radians(TIP_DEG)
-    bend = [round(float(e * np.pi * d**4 / 64), 4) for e, d in ((TIP_MPA, TIP_MM), (SHAFT_MPA, SHAFT_MM))]
-    bend = [bend[0], bend[0], bend[1]]
+def device(
+    name: str, source: str, diameter_mm: tuple[float, float], modulus_mpa: tuple[float, float], bore_mm: float = 0.0
+) -> dict[str, object]:
+    """Return a device of the benchmark as the content of its file.
+
+    Args:
+        name: of the device.
+        source: where its numbers come from.
+        diameter_mm: outer diameters of tip and shaft, mm.
+        modulus_mpa: Young's moduli of tip and shaft, MPa: the benchmark's files give kPa, which follow from their
+            densities (kg, mm, s).
+        bore_mm: inner diameter of a catheter, mm.
+    """
+    like = "micro-devices" if bore_mm or diameter_mm[1] < 0.5 else "j-035"
+    newtons, torque = (0.5, 0.5) if like == "micro-devices" else (2.0, 10.0)
+    sections = [np.pi * (d**4 - bore_mm**4) / 64 for d in diameter_mm]
+    tip, shaft = (round(float(e * i), 5) for e, i in zip(modulus_mpa, sections, strict=True))
+    bend = [tip, tip, shaft]
+    friction = 0.001 if like == "micro-devices" else 0.1
     values = {
-        "diameter_mm": (SHAFT_MM, f"{source}: of the shaft"),
-        "friction": (0.1, source),
+        "diameter_mm": (diameter_mm[1], f"{source}: of the shaft"),
+        "friction": (friction, source),
         "max_velocity_mm_s": (35.0, source),
         "max_rotation_rad_s": (3.14, source),
-        "push_limit_n": (2.0, "as j-035: the benchmark has no such limit"),
-        "pull_limit_n": (2.0, "as j-035: the benchmark has no such limit"),
-        "torque_limit_n_mm": (10.0, "as j-035: the benchmark has no such limit"),
-        "abscissa_mm": ([0.0, round(float(length), 2), round(float(length), 2) + 0.5], f"{source}: its tip is bent"),
-        "bend_stiffness_n_mm2": (bend, f"{source}: moduli and solid round sections"),
-        "twist_stiffness_n_mm2": ([round(ei / (1 + POISSON), 4) for ei in bend], f"{source}: GJ = EI / (1 + nu)"),
-        "tip_load_n": (None, "not stated"),
+        "push_limit_n": (newtons, f"as shipped {like}: the benchmark has no such limit"),
+        "pull_limit_n": (newtons, f"as shipped {like}: the benchmark has no such limit"),
+        "torque_limit_n_mm": (torque, f"as shipped {like}: the benchmark has no such limit"),
+        "abscissa_mm": ([0.0, TIP_MM, TIP_MM + 0.5], f"{source}: its tip is bent"),
+        "bend_stiffness_n_mm2": (bend, f"{source}: moduli and round sections"),
+        "twist_stiffness_n_mm2": ([round(ei / (1 + POISSON), 5) for ei in bend], f"{source}: GJ = EI / (1 + nu)"),
     }
-    named = {name: {"value": value, "source": text} for name, (value, text) in values.items()}
-    tip = {"angle_deg": TIP_DEG, "length_mm": round(float(length), 2), "source": source}
-    return {"name": "steve-archvariety", **named, "tip_bend": tip}
+    if bore_mm:
+        values |= {"inner_diameter_mm": (bore_mm, source), "bore_friction": (friction, source)}
+        shape: dict[str, object] = {"shape": {"arcs": [[TIP_MM, TIP_DEG]], "source": source}}
+    else:
+        values |= {"tip_load_n": (None, "not stated")}
+        shape = {"tip_bend": {"angle_deg": TIP_DEG, "length_mm": TIP_MM, "source": source}}
+    return {"name": name} | {key: {"value": value, "source": text} for key, (value, text) in values.items()} | shape
 
 
 def convert(episodes: Path, folder: Path) -> list[str]:
-    """Write anatomies, wire and task of a file of episodes into a folder, and return the seeds."""
+    """Write anatomies, wire and task of a file of episodes of ArchVariety into a folder, and return the seeds."""
     with np.load(episodes) as content:
         arrays = {name: np.asarray(content[name], dtype=float) for name in content.files}
     seeds = sorted({name.partition("_")[0] for name in arrays})
@@ -76,29 +112,67 @@ def convert(episodes: Path, folder: Path) -> list[str]:
         direction = arrays[f"{seed}_direction"]
         anatomy = with_axis(anatomy, direction / np.linalg.norm(direction))
         endopilot.write_anatomy(anatomy, output=folder / "patients" / seed)
+    wire = device("steve-archvariety", "stEVE_bench, ArchVariety", (0.7, 0.89), (17.0, 80.0))
     task = {
         "name": "archvariety",
-        "level": 1,
         "title": "Aortic arches of stEVE_bench, to an artery above the arch",
         "device": "devices/steve.yaml",
-        "tip_bend_deg": TIP_DEG,
-        "tip_bend_mm": round(float(TIP_RADIUS_MM * np.radians(TIP_DEG)), 2),
-        "start_inserted_length_mm": 2.0,
-        "seconds": SECONDS,
-        "force_limit_n": 0.7,
         "ladder": {"seed": 0, "numbers": [int(seed) for seed in seeds]},
         "anatomies": [f"patients/{seed}" for seed in seeds],
         "targets_mm": [arrays[f"{seed}_target_mm"].tolist() for seed in seeds],
-        "near_mm": 5.0,
     }
-    (folder / "devices").mkdir(parents=True, exist_ok=True)
-    (folder / "devices" / "steve.yaml").write_text(yaml.safe_dump(wire(), sort_keys=False))
-    (folder / "archvariety.yaml").write_text(yaml.safe_dump(task, sort_keys=False))
+    write(folder, {"steve": wire}, task)
     return seeds
 
 
+def convert_curves(curves: Path, folder: Path, seed: int = 0) -> list[list[float]]:
+    """Write anatomy, devices and task of DualDeviceNav's curves into a folder, and return the targets, LPS mm."""
+    lines = read_source(curves).content
+    anatomy = endopilot.extract_anatomy(
+        curves, name="dualdevicenav", config=endopilot.AnatomyConfig(ostium_mm=OSTIUM_MM)
+    )
+    anatomy = with_axis(anatomy, np.array(DIRECTION) / np.linalg.norm(DIRECTION))
+    endopilot.write_anatomy(anatomy, output=folder / "patients" / "dualdevicenav")
+    free = []
+    for own, points in enumerate(lines.points):
+        if lines.names[own].split()[-1] not in GOALS:
+            continue
+        others = [
+            np.linalg.norm(points[:, None] - line, axis=2) - lines.radius[other]
+            for other, line in enumerate(lines.points)
+            if other != own
+        ]
+        free.append(points[np.min([gap.min(axis=1) for gap in others], axis=0) > 0])
+    chosen = np.concatenate(free)
+    targets = chosen[np.random.default_rng(seed).choice(len(chosen), TARGETS, replace=False)].tolist()
+    source = "stEVE_bench, DualDeviceNav"
+    devices = {
+        "wire": device("steve-microwire", source, (0.36, 0.36), (1.0, 1.0)),
+        "catheter": device("steve-microcatheter", source, (0.6, 0.7), (1.0, 1.0), bore_mm=0.57),
+    }
+    task = {
+        "name": "dualdevicenav",
+        "title": "From the iliac artery to carotid and vertebral arteries of stEVE_bench, by wire and catheter",
+        "device": "devices/wire.yaml",
+        "catheter": "devices/catheter.yaml",
+        "ladder": {"seed": seed, "numbers": list(range(TARGETS))},
+        "anatomies": TARGETS * ["patients/dualdevicenav"],
+        "targets_mm": targets,
+    }
+    write(folder, devices, task)
+    return targets
+
+
+def write(folder: Path, devices: dict[str, dict[str, object]], task: dict[str, object]) -> None:
+    """Write devices and a task into a folder."""
+    (folder / "devices").mkdir(parents=True, exist_ok=True)
+    for name, content in devices.items():
+        (folder / "devices" / f"{name}.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+    (folder / f"{task['name']}.yaml").write_text(yaml.safe_dump(TASK | task, sort_keys=False))
+
+
 def made_up(path: Path) -> None:
-    """Write a file of the benchmark's form: a straight aorta, and an artery that leaves it."""
+    """Write a file of ArchVariety's form: a straight aorta, and an artery that leaves it."""
     aorta = np.column_stack([np.zeros((61, 2)), np.linspace(0, 120, 61), np.full(61, 8.0)])
     along = np.linspace(0, 60, 31)
     artery = np.column_stack([0.8 * along, np.zeros(31), 50 + 0.6 * along, np.full(31, 4.0)])
@@ -108,8 +182,11 @@ def made_up(path: Path) -> None:
 
 
 def main() -> None:
-    if len(sys.argv) == 3:
-        print(f"{len(convert(Path(sys.argv[1]), Path(sys.argv[2])))} episodes")
+    if len(sys.argv) > 2:
+        source, folder = Path(sys.argv[1]), Path(sys.argv[2])
+        curves = source.is_dir()
+        made = convert_curves(source, folder, *map(int, sys.argv[3:])) if curves else convert(source, folder)
+        print(f"{len(made)} {'targets' if curves else 'episodes'}")
         return
     with tempfile.TemporaryDirectory() as folder:
         made_up(Path(folder) / "episodes.npz")

@@ -44,9 +44,9 @@ SUBJECTS = {
 """What a function does something with, or to. All else goes by keyword."""
 UNITS = re.compile(r"(^|_)(mm2?|s2?|n|hu|rad|deg|ugy|seconds|pixel_sd|along_sd|share|factor|weight|ratio)$")
 WITHOUT_UNIT = {
-    "calcium", "dose", "efficiency", "friction", "gain_rotation", "gain_sd_rotation", "gain_sd_translation",
-    "gain_translation", "largest_jump", "learning_rate", "right_heart", "scale",
-    "scatter", "temperature", "window", "zoom",
+    "calcium", "dose", "efficiency", "friction", "friction_along", "gain_rotation", "gain_sd_rotation",
+    "gain_sd_translation", "gain_translation", "largest_jump", "learning_rate", "right_heart", "scale",
+    "scatter", "temperature", "wall_along", "window", "zoom",
 }  # fmt: skip
 
 

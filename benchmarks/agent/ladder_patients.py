@@ -190,8 +190,8 @@ def suits(navigation: Navigation) -> bool:
     return shaped or _Search(alone).reachable()
 
 
-def choose(task: Task, seed: int, *, search: bool) -> tuple[list[int], int, int]:
-    """Return the chosen patients' numbers, how many were eligible and how many were examined."""
+def choose(task: Task, seed: int, *, search: bool, wanted: int = WANTED) -> tuple[list[int], int, int]:
+    """Return the numbers of the patients wanted, how many were eligible and how many were examined."""
     atlas = task.atlas(seed)
     eligible = ELIGIBLE.get(f"{task.name} in version {task.version}", ELIGIBLE.get(task.name, _always))
     chosen: list[int] = []
@@ -209,7 +209,7 @@ def choose(task: Task, seed: int, *, search: bool) -> tuple[list[int], int, int]
         navigation = task.navigation(task.patient(patients, 0)) if search else None
         if navigation is None or suits(navigation):
             chosen.append(number)
-            if len(chosen) == WANTED:
+            if len(chosen) == wanted:
                 return chosen, count, number + 1
     raise InputError(f"{task.name}: only {len(chosen)} of {MOST_EXAMINED} patients qualify; choose another seed")
 

@@ -18,9 +18,10 @@ from benchmarks.anatomy import analytic_lumens as analytic
 from benchmarks.anatomy.compare import compare_with_atlas
 from benchmarks.figures import Bar
 from endopilot.anatomy.distance import BAND_MM, distance_map_from_mask, distance_map_from_spheres, sample
-from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_source
+from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import write_anatomy
 from endopilot.anatomy.projection import project_tip
+from endopilot.anatomy.read_source import read_source
 from endopilot.anatomy.tree import sampled
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.cli.arguments import existing

@@ -12,7 +12,7 @@ from tyro.conf import Positional
 
 from benchmarks.figures import Bar
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
-from endopilot.anatomy.sources import MASK_SUFFIXES
+from endopilot.anatomy.read_source import MASK_SUFFIXES
 from endopilot.anatomy.tree import sampled
 from endopilot.cli.arguments import existing
 from endopilot.errors import InputError

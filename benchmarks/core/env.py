@@ -25,6 +25,10 @@ SINGLES = 4
 """Episodes of a single environment that are timed."""
 CATHETER = "microcatheter-1.7f"
 """Around the wire of the coaxial environments, whose drive is moved like the wire's and independently of it."""
+EXPOSE_EVERY = 15
+"""Steps from one exposure to the next where seeing costs: 2 s."""
+SEEN, SEEN_SECONDS = 64, 8.0
+"""Environments whose images are timed, and for how long, s."""
 COMPARED, COMPARED_SECONDS = 8, 30.0
 """Navigations that the error is measured on, and their length, s."""
 
@@ -39,25 +43,34 @@ def bench_env() -> dict[str, Any]:
     Returns:
         `steps_per_second_256` and `steps_per_second_1`, of 256 environments together and of one, over a minute's
         navigations, on all cores and with all overhead; the same with the prefix `random_actions_` for actions drawn
-        independently, with `coaxial_` for a wire in a catheter, and with `processor_` for steps a second of processor
+        independently, with `coaxial_` for a wire in a catheter, and with `xray_` where seeing costs and an exposure is
+        taken every 2 s; `images_per_second_64` and `images_per_second_128`, X-ray images of so many pixels a side, two
+        at every step of 64 environments, the steps included; all these with `processor_` for a second of processor
         time; the median, the mean, the 95th percentile and the maximum of the tip's distance from that of a core with
-        the settings of the reference
-        (`reference.CONVERGED`), mm, with the environments' settings and with the simulator's default ones; and the
-        share of worlds that stayed valid.
+        the settings of the reference (`reference.CONVERGED`), mm, with the environments' settings and with the
+        simulator's default ones; and the share of worlds that stayed valid.
     """
     figures: dict[str, Any] = {}
     valid = []
-    for prefix, catheter, independent in (
-        ("", None, False),
-        ("random_actions_", None, True),
-        ("coaxial_", CATHETER, False),
-    ):
+    kinds: tuple[tuple[str, dict[str, Any], bool], ...] = (
+        ("", {}, False),
+        ("random_actions_", {}, True),
+        ("coaxial_", {"catheter": CATHETER}, False),
+        ("xray_", {"observation": "xray"}, False),
+    )
+    for prefix, given, independent in kinds:
         for count, episodes in ((MANY, 1), (1, SINGLES)):
-            wall, processor, kept = _timed(count, episodes, catheter=catheter, independent=independent)
+            wall, processor, kept = _timed(NavigateVectorEnv(count, **given), episodes, independent=independent)
             steps = count * episodes * round(SECONDS / CONTROL_PERIOD_S)
             figures[f"{prefix}steps_per_second_{count}"] = round(steps / wall, 1)
             figures[f"{prefix}processor_steps_per_second_{count}"] = round(steps / processor, 1)
             valid.append(kept)
+    for pixels in (64, 128):
+        env = NavigateVectorEnv(SEEN, observation="image", pixels=pixels)
+        wall, processor, _ = _timed(env, 1, independent=False, seconds=SEEN_SECONDS, expose_every=1)
+        images = 2 * SEEN * round(SEEN_SECONDS / CONTROL_PERIOD_S)
+        figures[f"images_per_second_{pixels}"] = round(images / wall, 1)
+        figures[f"processor_images_per_second_{pixels}"] = round(images / processor, 1)
     exact = _tips(CONVERGED)
     for prefix, config in (("", CORE), ("default_", SimulatorConfig())):
         error = np.linalg.norm(_tips(config) - exact, axis=-1)
@@ -65,15 +78,24 @@ def bench_env() -> dict[str, Any]:
     return figures | {"valid_worlds": round(float(np.mean(valid)), 5), "processor": processor_name()}
 
 
-def _timed(count: int, episodes: int, *, catheter: str | None, independent: bool) -> tuple[float, float, float]:
+def _timed(
+    env: NavigateVectorEnv,
+    episodes: int,
+    *,
+    independent: bool,
+    seconds: float = SECONDS,
+    expose_every: int = EXPOSE_EVERY,
+) -> tuple[float, float, float]:
     """Return wall and processor seconds of some episodes, and the share of valid worlds at their end."""
-    env = NavigateVectorEnv(count, catheter=catheter)
-    steps, numbers = round(SECONDS / CONTROL_PERIOD_S), 2 * len(env.navigations[0].devices)
+    count, steps, numbers = env.num_envs, round(seconds / CONTROL_PERIOD_S), 2 * len(env.navigations[0].devices)
     if independent:
         actions = np.random.default_rng(0).uniform(-1.0, 1.0, (episodes, steps, count, numbers))
     else:
-        drives = [_navigations(count * episodes, SECONDS, first=k * 2**32) for k in range(numbers // 2)]
+        drives = [_navigations(count * episodes, seconds, first=k * 2**32) for k in range(numbers // 2)]
         actions = np.concatenate(drives, axis=-1).reshape(episodes, count, steps, numbers).swapaxes(1, 2)
+    if env.action_space.shape != (count, numbers):
+        expose = np.where(np.arange(steps) % expose_every, -1.0, 1.0)[None, :, None, None]
+        actions = np.concatenate([actions, np.broadcast_to(expose, (*actions.shape[:3], 1))], axis=-1)
     wall = processor = 0.0
     valid = np.ones(count, dtype=bool)
     for episode in range(episodes):

@@ -13,6 +13,7 @@ import numpy as np
 
 from benchmarks.figures import Bar, judged
 from endopilot.anatomy.projection import project_tip
+from endopilot.angiograms.views import view_text
 from endopilot.settings import Seed, Within, settings
 from endopilot.simulation.motion import draw_motion, published_mean
 from endopilot.xray.carm import Pose
@@ -228,7 +229,7 @@ def _expose(scene: Scene, registered: Registration, wires: int) -> list[_Exposur
             float(scene.inserted_length[number]),
         )
         angle = scene.angles_deg[used[0]]
-        row = _Exposure(len(used), dose, contrast, _in_words(angle), wire is not None, found is not None)
+        row = _Exposure(len(used), dose, contrast, view_text(angle), wire is not None, found is not None)
         rows.append(row if wire is None else _errors(row, scene, wire, used, found))
     return rows
 
@@ -271,11 +272,6 @@ def _errors(row: _Exposure, scene: Scene, wire: int, used: Sequence[int], found:
         space_mm=float(np.linalg.norm(error)),
         deviations=float(np.sqrt(error @ np.linalg.solve(found.covariance, error))),
     )
-
-
-def _in_words(angle: tuple[float, float]) -> str:
-    side, tilt = ("LAO" if angle[0] >= 0 else "RAO"), ("CRAN" if angle[1] >= 0 else "CAUD")
-    return f"{side} {abs(angle[0]):.0f}" + (f" {tilt} {abs(angle[1]):.0f}" if angle[1] else "")
 
 
 def _figures(exposures: list[_Exposure], registrations: list[dict[str, Any]], rates: list[float]) -> dict[str, Any]:

@@ -39,6 +39,8 @@ FEW_MM = 0.1
 """Advance that counts as one, mm."""
 FAR_MM = 10.0
 """Advance after which a wire has unwound, if it twists under friction, mm."""
+_PLAY_RAD = 5.65
+"""Play of the rotation that would make the tip wait as long after a reversal, 0.9 turn, rad."""
 _RESAMPLES = 2000
 
 
@@ -195,17 +197,15 @@ def at_commands(log: RobotLog, time_s: Float[np.ndarray, "tips"], tips: Float[np
 
 def drive_of(turns: str, friction: float, length_mm: float) -> RobotConfig:
     """Return the measured robot with its rotation lost in twist, in play, or not at all."""
-    robot = read_robot("kweon-2021-2d")
-    if turns == "play":
-        return robot
+    robot, play = read_robot("kweon-2021-2d"), _PLAY_RAD if turns == "play" else 0.0
     behind = Transmission(length_mm=length_mm, twist_friction_n_mm_mm=friction) if turns == "twist" else Transmission()
-    return replace(robot, wire=replace(robot.wire, play_rad=0.0, transmission=behind))
+    return replace(robot, wire=replace(robot.wire, play_rad=play, transmission=behind))
 
 
 def bench_twist(
     *,
     logs: Path,
-    anatomy: Path,
+    anatomy: Path | None = None,
     turns: Literal["twist", "play", "none"] = "twist",
     friction: float = 3.2e-4,
     length_mm: float = 1000.0,
@@ -217,7 +217,8 @@ def bench_twist(
 
     Args:
         logs: folder of logs.
-        anatomy: folder made by `endopilot anatomy` of the phantom.
+        anatomy: folder made by `endopilot anatomy` of the phantom; the real wire alone is told of if not given, and its
+            tip as it moves in the picture.
         turns: where rotation is lost: in a wire that twists under friction, in play of 0.9 turn, or nowhere.
         friction: torque a length of the wire in its guiding catheter, N·mm/mm.
         length_mm: of the wire there, mm.
@@ -228,11 +229,13 @@ def bench_twist(
     Returns:
         A row for each log and one for all: real and simulated.
     """
-    patient, robot = read_anatomy(anatomy), drive_of(turns, friction, length_mm)
-    stack = Stack(read_wire("workhorse-014").shaped(tip_deg, tip_mm))
     paths = [p for p in sorted(logs.glob("*.csv")) if not sessions or any(part in p.name for part in sessions)]
     if not paths:
         raise InputError(f"{logs}: no log; convert the public ones with examples/robot_phantom_logs.py")
+    if anatomy is None:
+        return [{"log": path.stem, **real_figures(read_log(path))} for path in paths]
+    patient, robot = read_anatomy(anatomy), drive_of(turns, friction, length_mm)
+    stack = Stack(read_wire("workhorse-014").shaped(tip_deg, tip_mm))
     rows, everything = [], []
     for path in paths:
         log = read_log(path)
@@ -263,20 +266,44 @@ def figures(of: Sequence[tuple[RobotLog, EpisodeReplay]], anatomy: Anatomy) -> d
     turn = float(np.median(turn_steps)) if turn_steps else np.nan
     found: dict[str, Any] = {"episodes": len(of)}
     for name, runs in (("real", real), ("simulated", simulated)):
-        reversals = [each for each in runs if each[0].reverses]
-        moves, snaps, per_step = dead_bands(reversals)
-        unwound = dead_bands([each for each in runs if each[0].advanced_mm >= FAR_MM])[0]
-        found[f"reversals_{name}"] = len(reversals)
-        found[f"moves_after_{name}"] = _span(moves)
-        found[f"snaps_after_{name}"] = _span(snaps)
-        found[f"moves_after_advance_{name}"] = _span(unwound)
-        found[f"snaps_a_turn_{name}"] = round(per_step * turn, 2)
+        found |= _dead_bands_of(name, runs, turn)
     if sides:
         r, low, high = correlation(sides)
         found["side_r"] = f"{r:.2f} [{low:.2f}, {high:.2f}]"
     found["forks"] = len(forks)
     found["real_branch"] = round(float(np.mean(forks)), 2) if forks else None
     return found
+
+
+def real_figures(log: RobotLog) -> dict[str, Any]:
+    """Return what rotation does to the tip of a real wire in a picture, where the vessel is not known."""
+    runs, steps, episodes = [], [], 0
+    for episode in log.episodes():
+        if not episode.seen.any():
+            continue
+        command, episodes = episode.command[episode.commanded, 0], episodes + 1
+        step = np.abs(np.diff(command[:, 1]))
+        steps += (2 * np.pi / step[step > 1e-6]).tolist()
+        seen = episode.seen
+        tips = episode.tip[seen] if log.camera is None else log.camera.rays(episode.pixel[seen])[0]
+        tips = at_commands(episode, episode.time_s[seen], tips)
+        runs += [(run, tip_in_run(run, tips)) for run in rotation_runs(command)]
+    return {"episodes": episodes} | _dead_bands_of("real", runs, float(np.median(steps)) if steps else np.nan)
+
+
+def _dead_bands_of(
+    name: str, runs: Sequence[tuple[Run, Float[np.ndarray, "seen 3"]]], steps_a_turn: float
+) -> dict[str, Any]:
+    """Return the figures of the runs of one wire."""
+    reversals = [each for each in runs if each[0].reverses]
+    moves, snaps, per_step = dead_bands(reversals)
+    return {
+        f"reversals_{name}": len(reversals),
+        f"moves_after_{name}": _span(moves),
+        f"snaps_after_{name}": _span(snaps),
+        f"moves_after_advance_{name}": _span(dead_bands([r for r in runs if r[0].advanced_mm >= FAR_MM])[0]),
+        f"snaps_a_turn_{name}": round(per_step * steps_a_turn, 2),
+    }
 
 
 def _span(quartiles: tuple[float, float, float]) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import matplotlib as mpl
@@ -24,7 +24,15 @@ from endopilot.files import read_json
 from endopilot.plotting import BLACK, BLUE, GREY, STYLE, VERMILLION
 from endopilot.report.replay_figure import replay_figure
 from endopilot.robot.course import Courses
-from endopilot.robot.replay import EpisodeReplay, ReplayConfig, prepare, replay_prepared, summary, usable_episodes
+from endopilot.robot.replay import (
+    EpisodeReplay,
+    Prepared,
+    ReplayConfig,
+    prepare,
+    replay_prepared,
+    summary,
+    usable_episodes,
+)
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
@@ -38,6 +46,8 @@ KEPT_ASIDE = ("log7", "_M2_")
 CALIBRATED = "calibrated"
 LEAST_RUN_MM, LEAST_TURNS = 3.5, 1.2
 """A reversal counts after so much travel in one direction; a rotation if it goes on for so long without translation."""
+SAME, NEAR_MM = 20, 0.3
+"""Commands of two advances that are compared, and how near to each other they begin."""
 FIRST_MM, SNAP_MM = 0.3, 0.8
 """The tip moves, and has snapped over, where it is so far from where it was."""
 
@@ -48,9 +58,10 @@ def main() -> None:
     phantom = endopilot.extract_anatomy(next(folder.glob("phantom2d*.vtp")))
     with tempfile.TemporaryDirectory() as made:
         logs = [convert(path, Path(made)) for path in sorted(folder.glob("2D_phantom_*.csv"))]
-    episodes = []
+    episodes, repeats = [], []
     for log in logs:
         usable = usable_episodes([log], phantom)
+        repeats.append(_repeats(prepare(usable, phantom, 0.5, endopilot.read_robot("ideal"))))
         chosen = np.unique(np.linspace(0, len(usable) - 1, EPISODES).round().astype(int))
         episodes += [usable[k] for k in chosen]
     wire, config = endopilot.read_wire("workhorse-014"), ReplayConfig()
@@ -66,7 +77,7 @@ def main() -> None:
     apart = {name: [each for each, kept in zip(row, aside, strict=True) if kept] for name, row in found.items()}
     measured = {"real": _measures(drives, found[CALIBRATED], 0)}
     measured |= {name: _measures(drives, each, 1) for name, each in found.items()}
-    _write("reality", _table(measured, apart))
+    _write("reality", _table(measured, apart, repeats))
     _write("calibration", _calibration(Path(robot_file).with_suffix(".json")))
     _draw(measured)
     figure = replay_figure(phantom, apart[CALIBRATED], "sessions kept aside, robot and wire calibrated on the others")
@@ -90,6 +101,11 @@ def _calibration(record: Path) -> str:
         lines.append(f"| `{name}` | {each['value']:.3g} | {said} |")
     band, held = told["band_of_90_percent_mm"], told["it_holds_in_logs_left_out"]
     said = f"holds in {held:.0%} of the episodes of logs left out"
+    share, known = told["start_rotation_told_in"], told["start_rotation_known_rad"]
+    lines.append(
+        f"| rotation at the start of an episode | its own | known to ± {known:.2g} rad (median) in {share:.0%} of the "
+        "episodes, not identifiable in the others |"
+    )
     lines.append(f"| band of Δtip throughout 90 % of the episodes | ± {band:.2g} mm | {said} |")
     return "\n".join(lines)
 
@@ -166,6 +182,31 @@ def _turns(drive: np.ndarray, tip: np.ndarray) -> list[tuple[np.ndarray, np.ndar
     return found
 
 
+def _repeats(of: Prepared) -> np.ndarray:
+    """Return by how much two advances of the tip differ that the same commands made from the same place, mm.
+
+    They are pairs of different episodes of a session, each of `SAME` steps of the drive from where the tip was seen
+    within `NEAR_MM` of the other's, in the same branch.
+    """
+    runs: dict[bytes, list[tuple[int, float, float, float]]] = {}
+    for k, log in enumerate(of.logs):
+        asked, begins = log.command[log.commanded, 0], log.time_s[log.commanded]
+        last = np.searchsorted(log.time_s[log.seen], begins, side="right") - 1  # the tip before each command
+        steps = np.round(np.diff(asked, axis=0), 3)
+        for at in range(int((last < 0).sum()), len(steps) - SAME):
+            begin, end = last[at], last[at + SAME]
+            place = (k, of.branch[k, begin], of.abscissa[k, begin], of.abscissa[k, end])
+            runs.setdefault(steps[at : at + SAME].tobytes(), []).append(place)
+    return np.array(
+        [
+            (a[3] - a[2]) - (b[3] - b[2])
+            for same in runs.values()
+            for a, b in combinations(same, 2)
+            if a[0] != b[0] and a[1] == b[1] and abs(a[2] - b[2]) < NEAR_MM
+        ]
+    )
+
+
 def _reached(moved: np.ndarray, turned: np.ndarray, far: float) -> float:
     return float(np.interp(far, moved, turned)) if moved[-1] > far else np.nan
 
@@ -174,7 +215,7 @@ def _lags(reversals: Sequence[tuple[np.ndarray, np.ndarray]], at_mm: float) -> n
     return np.array([at_mm - np.interp(at_mm, travel, tip) for travel, tip in reversals if travel[-1] >= at_mm])
 
 
-def _table(measured: dict, found: dict) -> str:
+def _table(measured: dict, found: dict, repeats: Sequence[np.ndarray]) -> str:
     def quartiles(values: np.ndarray, digits: int = 2) -> str:
         values = values[np.isfinite(values)]
         if not len(values):
@@ -191,6 +232,11 @@ def _table(measured: dict, found: dict) -> str:
     lines = ["| median (quartiles) | real robot | " + " | ".join(f"ours, {name}" for name in found) + " |"]
     lines += ["|---|" + "---|" * (1 + len(found))]
     lines += [f"| {title} | " + " | ".join(show(m) for m in measured.values()) + " |" for title, show in rows.items()]
+    each, every = [float(np.std(some) / np.sqrt(2)) for some in repeats], np.concatenate(repeats)
+    lines.append(
+        f"| the same {SAME} commands from the same place within {NEAR_MM} mm: SD of the tip's advance, mm (sessions) | "
+        f"{np.std(every) / np.sqrt(2):.2f} ({min(each):.2f} to {max(each):.2f}) |" + " |" * len(found)
+    )
     figures = {name: summary(each) for name, each in found.items()}
     for title, key in (
         ("error of Δtip, predicted second half of an episode of a session kept aside, mm (median)", "error_along_mm"),

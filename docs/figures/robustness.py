@@ -1,4 +1,4 @@
-"""Write the figures of `python -m benchmarks robustness --json > FILE` into docs/simulation.md.
+"""Write the figures of `python -m benchmarks robustness --json > FILE` into docs/robustness.md.
 
 `python docs/figures/robustness.py FILE`, or `... FILE catheters` for a run with `--catheters`. Each run takes half
 an hour on two quiet cores.
@@ -10,7 +10,7 @@ import json
 import sys
 from pathlib import Path
 
-PAGE = Path(__file__).parents[1] / "simulation.md"
+PAGE = Path(__file__).parents[1] / "robustness.md"
 
 
 def text(measured: dict) -> str:

@@ -10,7 +10,7 @@ import gymnasium
 import matplotlib.pyplot as plt
 import numpy as np
 
-worlds = gymnasium.make_vec("endopilot.env:endopilot/Crux-v0", num_envs=64, patients=4)
+worlds = gymnasium.make_vec("endopilot.env:endopilot/Crux-v2", num_envs=64, patients=4)
 worlds.action_space.seed(0)
 observation, info = worlds.reset(seed=0)
 lengths, tips = [info["inserted_length"]], [info["tip_abscissa"]]

@@ -5,6 +5,8 @@ from .anatomy.io import write_anatomy as write_anatomy
 from .anatomy.sources import AnatomySource as AnatomySource
 from .anatomy.sources import Polylines as Polylines
 from .anatomy.surface import Surface as Surface
+from .angiograms.config import AngiogramsConfig as AngiogramsConfig
+from .angiograms.make import make_angiograms as make_angiograms
 from .atlas.atlas import AtlasConfig as AtlasConfig
 from .atlas.atlas import make_atlas as make_atlas
 from .belief.bands import Calibration as Calibration

@@ -79,15 +79,15 @@ def writing(path: Path) -> Iterator[Path]:
                 partial.unlink(missing_ok=True)
 
 
-def json_text(content: Any) -> str:
-    """Return `content` as indented JSON. Dataclasses, paths and numpy values are understood."""
-    return json.dumps(content, indent=2, default=_jsonable, ensure_ascii=False)
+def json_text(content: Any, *, indented: bool = True) -> str:
+    """Return `content` as JSON, indented or in one line. Dataclasses, paths and numpy values are understood."""
+    return json.dumps(content, indent=2 if indented else None, default=_jsonable, ensure_ascii=False)
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write `content` as indented JSON, whole or not at all."""
+def write_json(path: Path, content: Any, *, indented: bool = True) -> None:
+    """Write `content` as JSON, whole or not at all; indented, or in one line where there is much of it."""
     with writing(path) as partial:
-        partial.write_text(json_text(content) + "\n", encoding="utf-8")
+        partial.write_text(json_text(content, indented=indented) + "\n", encoding="utf-8")
 
 
 def write_yaml(path: Path, content: Any) -> None:

@@ -13,8 +13,9 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from endopilot.anatomy.distance import CATHETER_RADIUS_MM, distance_map_from_spheres, sample
-from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_source
+from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.line_ends import to_cut
+from endopilot.anatomy.read_source import read_source
 from endopilot.anatomy.sources import Polylines
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.errors import InputError

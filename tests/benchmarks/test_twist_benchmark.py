@@ -120,6 +120,7 @@ def test_a_fork_is_passed_once_and_the_branch_compared(fork: Anatomy) -> None:
             branch=np.column_stack([real, simulated]).astype(float),
             force=np.zeros((0, 2)),
             rotation_rad=0.0,
+            rotation_known_rad=0.1,
         )
 
     right, wrong, behind = ([0, 0, 0, way, way] for way in (ways[0], ways[1], 0))
@@ -152,5 +153,7 @@ def test_a_log_is_compared_with_its_replay(fork: Anatomy, tmp_path: Path) -> Non
         assert (row["episodes"], row["reversals_real"], row["reversals_simulated"]) == (1, 1, 1)
         assert row["moves_after_real"] == "- (---)"  # the tip seen stays on the centerline
         assert row["snaps_a_turn_real"] == 0
+    (alone,) = bench_twist(logs=tmp_path / "logs")
+    assert {name: rows[0][name] for name in alone} == alone and alone["reversals_real"] == 1
     with pytest.raises(InputError, match="no log; convert the public ones"):
         bench_twist(logs=tmp_path, anatomy=tmp_path / "fork")

@@ -10,7 +10,7 @@ import pytest
 from browser import hold, opened, says, serving, until, value
 
 from benchmarks.cockpit import BROWSER_FLAGS, find_browser
-from endopilot.cockpit.recording import read_recording, replayed
+from endopilot.cockpit.recording import read_session, replayed
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 pytest.importorskip("starlette", reason="the extra `cockpit` is not installed")
@@ -178,7 +178,7 @@ def test_a_killed_server_goes_on_and_a_replay_shows_what_was(context, server):
         assert value(resumed, "cockpit.shown.inserted_length_mm") == pytest.approx(13, abs=3.0)
         hold(resumed, "KeyS", "cockpit.shown.inserted_length_mm < 11")
         resumed.keyboard.up("KeyS")
-    recording = read_recording(Path(server.recording))
+    recording = read_session(Path(server.recording))
     then = next((world.snapshot().nodes for world, _ in replayed(recording) if world.cycle == cycle), None)
     np.testing.assert_array_equal(np.array(nodes, dtype="<f4"), then.astype("<f4").ravel())
     with serving("--replay", server.recording) as shown:

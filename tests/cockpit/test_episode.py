@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("pyarrow", reason="the extra `learn` is not installed")
 
 from endopilot.cockpit.messages import Drive, Target
-from endopilot.cockpit.recording import read_recording, replayed
+from endopilot.cockpit.recording import read_session, replayed
 from endopilot.errors import InputError
 
 
@@ -30,7 +30,7 @@ def test_an_episode_holds_the_wire_as_it_was(session, tmp_path):
     path = tmp_path / "a.cockpit.jsonl"
     write_session_episode(path, output=tmp_path / "episode")
     data = read_dataset(tmp_path / "episode")
-    ends = [world.snapshot() for world, _ in replayed(read_recording(path)) if world.cycle and world.cycle % 40 == 0]
+    ends = [world.snapshot() for world, _ in replayed(read_session(path)) if world.cycle and world.cycle % 40 == 0]
     assert data.inserted_length.shape == (1, 4, 1) == (1, len(ends), 1)
     np.testing.assert_allclose(data.tip_position[0, :, 0], [end.nodes[0] for end in ends], atol=1e-4)
     np.testing.assert_allclose(data.inserted_length[0, :, 0], [end.inserted_length_mm for end in ends], atol=1e-4)

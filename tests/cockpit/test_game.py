@@ -17,6 +17,7 @@ from endopilot.cockpit.open import resume_session
 from endopilot.cockpit.recording import Recorder, Where
 from endopilot.cockpit.session import Session
 from endopilot.cockpit.world import LiveWorld
+from endopilot.devices.robot import RobotConfig, read_robot
 from endopilot.errors import InputError
 from endopilot.tasks.task import find_task
 
@@ -110,7 +111,7 @@ def test_a_task_has_the_ladders_world():
 
 def test_a_killed_game_goes_on_and_is_scored_as_if_it_had_not_been(tmp_path, xray):
     """Half the drive, the server killed, and the other half: the same figures as in one go."""
-    tried = Attempt(find_task("straight"), 0)
+    tried = Attempt(find_task("straight"), 0, read_robot("kweon-2021-3d"))
     scores = {}
     with patch.object(game, "Workers", Rival):
         for name, parts in (("one", (16.0,)), ("two", (1.3, 14.7))):
@@ -122,6 +123,7 @@ def test_a_killed_game_goes_on_and_is_scored_as_if_it_had_not_been(tmp_path, xra
             for seconds in parts:
                 if played.world.cycle:
                     played = resume_session(path).stage
+                    assert played.world.config.robot == played._tried.robot == tried.robot != RobotConfig()
                     until = time.monotonic() + 20
                     while not played.xray.ready and time.monotonic() < until:
                         time.sleep(0.01)

@@ -17,7 +17,7 @@ from endopilot.cockpit.frames import decode, scene
 from endopilot.cockpit.game import Attempt, GameSession
 from endopilot.cockpit.messages import Autopilot, Drive, Game, Pedal
 from endopilot.cockpit.open import resume_session
-from endopilot.cockpit.recording import read_recording, replayed
+from endopilot.cockpit.recording import read_session, replayed
 from endopilot.cockpit.session import SILENCE_S, Session
 from endopilot.cockpit.world import LiveWorld
 from endopilot.devices.catheter import read_catheter
@@ -130,11 +130,11 @@ def test_a_session_replays_to_the_bit_and_goes_on(session, tmp_path):
     assert isinstance(resumed, Session) and resumed.world.digest() == session.world.digest()
     run(resumed, 0.4, message=both(catheter=(-5.0, 0.0)))
     resumed.close()
-    *_, (world, _events) = replayed(read_recording(path))
+    *_, (world, _events) = replayed(read_session(path))
     assert world.digest() == resumed.world.digest() != session.world.digest()
     path.write_text(path.read_text().replace("[12.0, 2.0, 8.0, 1.0]", "[12.0, 2.0, 8.0, 1.1]"))
     with pytest.raises(InputError, match="not where it was"):
-        list(replayed(read_recording(path)))
+        list(replayed(read_session(path)))
 
 
 def test_a_session_becomes_an_episode_of_both(session, tmp_path):

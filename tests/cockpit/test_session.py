@@ -7,7 +7,7 @@ import pytest
 
 from endopilot.cockpit.frames import decode
 from endopilot.cockpit.messages import Contrast, Drive, Pedal, Target
-from endopilot.cockpit.recording import Recorder, read_recording, replayed
+from endopilot.cockpit.recording import Recorder, read_session, replayed
 from endopilot.cockpit.session import HICCUP_S, SILENCE_S, Session
 from endopilot.errors import InputError
 
@@ -136,7 +136,7 @@ def test_a_session_replays_to_the_bit(session, tmp_path):
     run(session, 0.3)
     digest = session.world.digest()
     session.close()
-    recording = read_recording(tmp_path / "a.cockpit.jsonl")
+    recording = read_session(tmp_path / "a.cockpit.jsonl")
     again = {}
     for world, _ in replayed(recording):
         again[world.cycle] = world.snapshot().nodes.astype("<f4").tobytes()
@@ -150,7 +150,7 @@ def test_another_command_is_noticed_by_the_replay(session, tmp_path):
     path = tmp_path / "a.cockpit.jsonl"
     path.write_text(path.read_text().replace('"move": [12.0, 2.0]', '"move": [12.0, 2.1]'))
     with pytest.raises(InputError, match="not where it was"):
-        list(replayed(read_recording(path)))
+        list(replayed(read_session(path)))
 
 
 def test_an_event_that_would_take_days_to_reach_is_refused(session, tmp_path):
@@ -160,7 +160,7 @@ def test_an_event_that_would_take_days_to_reach_is_refused(session, tmp_path):
     with path.open("a") as stream:
         stream.write('{"at": 1000000000, "stop": true}\n')
     with pytest.raises(InputError, match=r"a\.cockpit\.jsonl: 9999999\d\d cycles without a check"):
-        read_recording(path)
+        read_session(path)
 
 
 def test_a_killed_session_goes_on(session, tmp_path):
@@ -179,7 +179,7 @@ def test_a_killed_session_goes_on(session, tmp_path):
     assert resumed.world.snapshot().inserted_length_mm < inserted
     end = resumed.world.digest()
     resumed.close()
-    *_, (world, _events) = replayed(read_recording(path))
+    *_, (world, _events) = replayed(read_session(path))
     assert world.digest() == end
 
 
@@ -195,7 +195,7 @@ def test_a_session_of_an_older_version_says_which(tmp_path):
     path = tmp_path / "x.cockpit.jsonl"
     path.write_text('{"format": "endopilot cockpit 1", "version": "0.0.9"}\n')
     with pytest.raises(InputError, match=r"a session of endopilot 0\.0\.9, whose loop differs; replay it with that"):
-        read_recording(path)
+        read_session(path)
 
 
 @pytest.mark.parametrize("text", ["", "{}\n", "nonsense\n", '{"format": "endopilot cockpit 2"}\n'])
@@ -203,4 +203,4 @@ def test_what_is_no_session_is_told(tmp_path, text):
     path = tmp_path / "x.cockpit.jsonl"
     path.write_text(text)
     with pytest.raises(InputError, match="session"):
-        read_recording(path)
+        read_session(path)

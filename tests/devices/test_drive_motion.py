@@ -126,16 +126,17 @@ def test_each_device_has_a_drive_of_its_own() -> None:
 
 def test_robots_side_by_side_move_as_alone_to_the_bit() -> None:
     wire = DriveConfig(play_mm=1.0, gain_sd_translation=0.05, gain_sd_rotation=0.05)
-    config = RobotConfig(jitter_s=0.07, wire=wire)
+    other = RobotConfig(encoders_at="motor", latency_s=0.2, wire=DriveConfig(play_mm=3.0, max_acceleration_mm_s2=20.0))
+    configs = [RobotConfig(jitter_s=0.07, wire=wire), other, RobotConfig(jitter_s=0.07, wire=wire), other, other]
     random = np.random.default_rng(0)
     control, start = random.uniform(-10, 10, (12, 5, 1, 2)), random.uniform(20, 60, (5, 1, 2))
-    many = DriveMotion(config, [[LIMITS]] * 5, start, seeds=range(5))
-    alone = [DriveMotion(config, [[LIMITS]], start[k : k + 1], seeds=[k]) for k in range(5)]
+    many = DriveMotion(configs, [[LIMITS]] * 5, start, seeds=range(5))
+    alone = [DriveMotion(configs[k], [[LIMITS]], start[k : k + 1], seeds=[k]) for k in range(5)]
     for place, each in enumerate(control):
         if place == 6:
-            many.reset([1, 3], start[[1, 3]], [[11], [13]])
+            many.reset([1, 3], start[[1, 3]], [[11], [13]], configs[:2])
             for k in (1, 3):
-                alone[k].reset([0], start[k : k + 1], [[10 + k]])
+                alone[k].reset([0], start[k : k + 1], [[10 + k]], [configs[k // 2]])
         many.command(each)
         moved = many.advance(0.1)
         for k, one in enumerate(alone):

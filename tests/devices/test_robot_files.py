@@ -42,7 +42,9 @@ def test_the_robots_of_the_package() -> None:
     assert ideal.catheters == (ideal.wire,)
     measured = {name: robot for name, robot in robots.items() if name != "assumed"}
     assert all(robot.sources and robot.encoders_at == "motor" for robot in measured.values())
-    assert (measured["kweon-2021-2d"].wire.play_mm, measured["kweon-2021-3d"].wire.play_mm) == (2.6, 1.1)
+    flat, deep = measured["kweon-2021-2d"].wire, measured["kweon-2021-3d"].wire
+    assert (flat.play_mm, deep.play_mm) == (2.6, 1.1)
+    assert all(wire.transmission.length_mm and not wire.play_rad for wire in (flat, deep))
 
 
 @pytest.mark.parametrize(

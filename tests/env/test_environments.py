@@ -73,7 +73,11 @@ def test_a_process_that_imported_nothing_makes_environments_by_name():
     code = (
         "import gymnasium\n"
         "gymnasium.make('endopilot.env:endopilot/Navigate-v0').reset(seed=0)\n"
-        "gymnasium.make_vec('endopilot.env:endopilot/Straight-v0', num_envs=2).reset(seed=0)\n"
+        "gymnasium.make_vec('endopilot.env:endopilot/Straight-v2', num_envs=2).reset(seed=0)\n"
+        "try:\n    gymnasium.make('endopilot/NavigateXray-v0', observation='sonar')\n"
+        "except Exception as error:\n"
+        "    assert \"observation: 'sonar'; choose from state, xray, image\" in str(error)\n"
+        "else:\n    raise AssertionError\n"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from make_meshes import arc, tube, write_lines, write_surface
 
-from endopilot.anatomy.sources import read_source
+from endopilot.anatomy.read_source import read_source
 from endopilot.anatomy.surface import Surface
 from endopilot.errors import InputError
 

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from make_meshes import arc, markup, tube, write_lines, write_surface
 
 from endopilot.anatomy.polylines import tree_from_polylines
-from endopilot.anatomy.sources import Polylines, read_source
+from endopilot.anatomy.read_source import read_source
+from endopilot.anatomy.sources import Polylines
 from endopilot.errors import InputError
 
 NAMES = ["mesh.bin.stl", "mesh.stl", "mesh.ply", "mesh.obj", "mesh.vtk", "mesh.vtp", "lines.vtp"]

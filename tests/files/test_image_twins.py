@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from make_images import RAMP, metaimage, nifti, nrrd
 
-from endopilot.anatomy.extract import read_source
+from endopilot.anatomy.read_source import read_source
 from endopilot.errors import InputError
 from endopilot.files import sha256
 from endopilot.imaging.volume import read_mask, read_volume

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from endopilot.anatomy.polylines import tree_from_polylines
-from endopilot.anatomy.sources import Polylines, read_source
+from endopilot.anatomy.read_source import read_source
+from endopilot.anatomy.sources import Polylines
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 

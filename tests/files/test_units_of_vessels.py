@@ -9,7 +9,8 @@ import pytest
 from make_meshes import arc, markup, tube, write_surface
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
-from endopilot.anatomy.sources import Polylines, read_source, transformed
+from endopilot.anatomy.read_source import read_source
+from endopilot.anatomy.sources import Polylines, transformed
 from endopilot.anatomy.surface import Surface
 from endopilot.anatomy.units import check_unit
 from endopilot.errors import InputError

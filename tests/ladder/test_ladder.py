@@ -192,6 +192,16 @@ def test_bad_settings_are_refused(given, message):
         LadderConfig(**given)
 
 
+def test_planning_time_is_scored_beside_what_a_submission_confirms(tmp_path):
+    own_tasks(tmp_path / "mine", seconds=5.0)
+    (row,) = climb(output=tmp_path / "run", config=LadderConfig(policy="oracle", version=str(tmp_path / "mine")))
+    each = [json.loads(path.read_text(encoding="utf-8"))["planning_s"] for path in (tmp_path / "run").glob("along/*")]
+    assert len(each) == 2 and min(each) > 0 and row["planning_s"] == pytest.approx(np.mean(each), abs=0.06)
+    assert "<th>Planning, s</th>" in write_page(tmp_path / "run").read_text(encoding="utf-8")
+    assert "planning_s" not in (tmp_path / "run" / "submission.json").read_text(encoding="utf-8")
+    assert check_submission(tmp_path / "run" / "submission.json").difference is None
+
+
 def test_tasks_of_ones_own_are_climbed_scored_by_a_second_rule_and_checked(tmp_path):
     own_tasks(tmp_path / "mine", seconds=5.0)
     config = LadderConfig(policy="forward", version=str(tmp_path / "mine"))

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from synthetic_robot import PERIOD_S, drawn, logged
 
+from benchmarks.robot.synthetic import PERIOD_S, drawn, logged
 from endopilot.devices.robot import DriveConfig
 from endopilot.robot.course import Courses
 from endopilot.robot.log import RobotLog

@@ -7,8 +7,8 @@ import json
 import pandas as pd
 import pytest
 from PIL import Image
-from synthetic_robot import drawn, logged
 
+from benchmarks.robot.synthetic import drawn, logged
 from endopilot.cli import main
 from endopilot.devices.device import read_wire
 from endopilot.devices.robot import read_robot

@@ -4,12 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-from synthetic_robot import drawn, logged
 
+from benchmarks.robot.synthetic import drawn, logged
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
-from endopilot.robot.replay import ReplayConfig, replay_log, summary
+from endopilot.robot.course import Courses
+from endopilot.robot.replay import ReplayConfig, replay_log, summary, usable_episodes
 from endopilot.xray.camera import PlanarCamera
 
 FEW = ReplayConfig(rotations=6)
@@ -21,11 +22,17 @@ def robot() -> RobotConfig:
 
 
 @pytest.fixture(scope="module")
-def log(fork, wire, robot):
-    return logged(fork, wire, robot, episodes=3, seconds=10.0, seed=3)
+def logged_and_true(fork, wire, robot):
+    return logged(fork, wire, robot, episodes=3, seconds=10.0, seed=3, with_truth=True)
 
 
-def test_the_robot_that_logged_is_predicted(fork, wire, robot, log) -> None:
+@pytest.fixture(scope="module")
+def log(logged_and_true):
+    return logged_and_true[0]
+
+
+def test_the_robot_that_logged_is_predicted(fork, wire, robot, logged_and_true) -> None:
+    log, true = logged_and_true
     found = replay_log([log], fork, Stack(wire), robot=robot, config=FEW)
     figures = summary(found)
     assert figures["episodes"] == 3 and figures["error_along_mm"] < 0.2
@@ -35,6 +42,11 @@ def test_the_robot_that_logged_is_predicted(fork, wire, robot, log) -> None:
     for each in found:
         assert each.given.sum() == round(0.5 * len(each.given)) and not each.given[-1]
         assert np.isfinite(each.simulated).all() and len(each.force) >= len(each.time_s)
+    begun = true.reshape(3, -1, 2)[:, 0, 1]
+    for each, turn in zip(found, begun, strict=True):  # nobody knows where in its play a wire begins
+        off = abs((each.rotation_rad - turn + np.pi) % (2 * np.pi) - np.pi)
+        assert off <= each.rotation_known_rad + robot.wire.play_rad / 2
+        assert np.pi / FEW.rotations <= each.rotation_known_rad + 1e-9 < 1.0  # half a step at least
 
 
 def test_what_a_camera_does_not_see_counts_for_nothing(fork, wire, robot, log) -> None:
@@ -45,6 +57,21 @@ def test_what_a_camera_does_not_see_counts_for_nothing(fork, wire, robot, log) -
         np.testing.assert_allclose(each.in_view[:, 1], 0.0, atol=1e-9)
         apart = each.simulated - each.seen
         np.testing.assert_allclose(each.in_view[:, [0, 2]], apart[:, [0, 2]], atol=1e-9)
+
+
+def test_what_a_drive_did_before_the_first_tip_is_left_out(fork, robot, log) -> None:
+    """The first twenty periods of each episode show no tip; the rest moves the wire as it did."""
+    rows = np.concatenate([np.flatnonzero(log.episode == number)[:40] for number in np.unique(log.episode)])
+    unseen = dataclasses.replace(log, used=~np.isin(np.arange(len(log)), rows))
+    whole, cut = usable_episodes([log], fork)[1], usable_episodes([unseen], fork)[1]
+    assert cut.time_s[0] == whole.time_s[40] and cut.commanded.sum() == whole.commanded.sum() - 20
+    moved = []
+    for each in (whole, cut):
+        courses, one = Courses.of([each], robot.wire), np.ones(1)
+        at_s = (cut.time_s[cut.seen] - each.time_s[0])[None]
+        motion = courses.followed(0, at_s=at_s, latency_s=0 * one, gain=one, play=0 * one)[0, 0]
+        moved.append(motion - motion[0])
+    np.testing.assert_allclose(moved[1], moved[0], atol=0.02)  # of ramps
 
 
 def test_a_log_without_tips_is_refused(fork, wire, log) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from endopilot.tasks.targets import find_target
 from endopilot.tasks.task import list_tasks
 
 sys.path.append(str(Path(__file__).parents[2] / "examples"))
@@ -37,6 +38,26 @@ def test_every_target_of_the_benchmark_lies_on_a_centerline(tmp_path):
 
     assert len(convert(EPISODES, tmp_path / "steve")) == 49
     (task,) = list_tasks(str(tmp_path / "steve"))
-    for place, point in enumerate(task.targets_mm or ()):
+    for place, point in list(enumerate(task.targets_mm or ()))[::6]:
         navigation = task.ladder_navigation(place)
         assert np.linalg.norm(navigation.target.position(navigation.anatomy) - point) < 1.0
+
+
+@pytest.mark.skipif(not EPISODES.exists(), reason="the benchmark's curves are not at hand")
+def test_targets_of_two_devices_lie_in_carotid_and_vertebral_arteries_alone(tmp_path):
+    from steve_tasks import convert_curves  # pyright: ignore[reportMissingImports]
+
+    targets = convert_curves(EPISODES.parent / "dualdevicenav", tmp_path / "dual", seed=3)
+    (task,) = list_tasks(str(tmp_path / "dual"))
+    navigation = task.ladder_navigation(0)
+    (catheter,) = navigation.catheters
+    # 1 MPa on a solid section of 0.36 mm, and on rings of 0.57 in 0.6 and in 0.7 mm.
+    np.testing.assert_allclose(navigation.device.bend_stiffness_n_mm2, 8.2e-4, atol=1e-5)
+    np.testing.assert_allclose(catheter.bend_stiffness_n_mm2, [1.18e-3, 1.18e-3, 6.6e-3], atol=1e-5)
+    assert catheter.inner_diameter_mm == 0.57 and np.rad2deg(catheter.turned(np.array([20.0]))[0]) == pytest.approx(72)
+    # The aorta ends at 450 mm; no target lies in the tubes of the arteries behind the four.
+    assert len(targets) == 20 and len({tuple(point) for point in targets}) == 20
+    for point in targets:
+        target = find_target(navigation.anatomy.tree, tuple(point))
+        assert target.abscissa > 450
+        assert np.linalg.norm(target.position(navigation.anatomy) - point) < 1.5

@@ -32,7 +32,21 @@ def test_there_are_twelve_tasks_one_a_level_each_with_its_environment():
         assert {task.version for task in list_tasks(version)} == {version}
         assert {name.lower() for name in endopilot.env.TASKS} == {task.name for task in list_tasks(version)}
     for name in endopilot.env.TASKS:
-        assert f"endopilot/{name}-v0" in gymnasium.registry
+        assert {f"endopilot/{name}-v0", f"endopilot/{name}-v2"} <= set(gymnasium.registry)
+
+
+def test_tasks_of_version_2_and_of_wire_and_catheter_are_environments_in_their_training_patients(monkeypatch):
+    asked = []
+    monkeypatch.setattr(task.Task, "patient", lambda self, patients, place: asked.append((self, patients, place)))
+    monkeypatch.setattr(task.Task, "navigation", lambda self, anatomy: task.reference_navigation())
+    names = [(name, 2) for name in endopilot.env.TASKS]
+    names += [(name, "coaxial") for name in endopilot.env.COAXIAL_TASKS]
+    for name, version in names:
+        given = gymnasium.spec(f"endopilot/{name}-v2").kwargs
+        task.training_navigations(given["task"], 1, 2, given["version"])
+        found = find_task(name.lower(), version=version)
+        assert asked[-2:] == [(found, found.training, 1), (found, found.training, 2)]
+    assert len(asked) == 2 * 16
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}/{path.stem}")

@@ -5,6 +5,7 @@ import pytest
 
 from endopilot.errors import InputError
 from endopilot.xray.camera import CArmCamera, PlanarCamera, points_in_vessel, read_camera
+from endopilot.xray.carm import CArmGeometry
 
 POINTS = np.array([[0.0, 0, 0], [10, 5, -3], [-4, 20, 7]])
 CAMERAS = [
@@ -52,3 +53,15 @@ def test_files(tmp_path) -> None:
     path.write_text("mm_per_pixel: 0.095\norigin_mm: [1, 2, 3]\ncolumns: [1, 0, 0]\nrows: [1, -1, 0]\n")
     with pytest.raises(InputError, match=r"camera.yaml: rows: .* has length 1.414; give a unit vector"):
         read_camera(path)
+
+
+@pytest.mark.parametrize(
+    ("source_to_isocenter_mm", "message"),
+    [
+        (0.72, r"source_to_isocenter_mm: 0\.72; give a number from 100 to 5000 mm \(0\.72 m is 720 mm\)"),
+        (1200.0, r"source_to_detector_mm: 1100; give more than source_to_isocenter_mm, 1200"),
+    ],
+)
+def test_a_geometry_that_no_c_arm_has_is_refused(source_to_isocenter_mm, message):
+    with pytest.raises(InputError, match=message):
+        CArmGeometry(source_to_isocenter_mm=source_to_isocenter_mm)

@@ -9,7 +9,7 @@ from pathlib import Path
 from endopilot import files
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import write_anatomy
-from endopilot.anatomy.sources import MASK_SUFFIXES, SURFACE_SUFFIXES, read_source
+from endopilot.anatomy.read_source import MASK_SUFFIXES, SURFACE_SUFFIXES, read_source
 from endopilot.errors import InputError
 from endopilot.parallel import each
 

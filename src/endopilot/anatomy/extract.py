@@ -27,7 +27,8 @@ from endopilot.anatomy.labels import dominance, label_tree, missing_main_vessel
 from endopilot.anatomy.labels_coronary import SHORT_MM
 from endopilot.anatomy.lumen_graph import lumen_graph, trace_branches
 from endopilot.anatomy.medial_lines import MedialLines, traced_lines
-from endopilot.anatomy.sources import AnatomySource, Polylines, read_source, transformed
+from endopilot.anatomy.read_source import read_source
+from endopilot.anatomy.sources import AnatomySource, Polylines, transformed
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.anatomy.tree import tree_from_lines
 from endopilot.anatomy.units import SMALLEST_RADIUS_MM, check_unit
@@ -36,8 +37,6 @@ from endopilot.imaging.grid import connected_components
 from endopilot.progress import progress
 from endopilot.settings import Finite, Within, settings
 from endopilot.types import Anatomy, DistanceMap, Insertion, LumenMask, VesselTree
-
-__all__ = ["AnatomyConfig", "extract_anatomy", "read_source"]
 
 CORONARY_RADIUS_MM = 1.6
 """Mean radius of a coronary tree at most: what counts for the grid where a lumen holds a piece of the aorta too."""

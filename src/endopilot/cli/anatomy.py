@@ -8,8 +8,9 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from endopilot.anatomy.batch import extract_all
-from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_source
+from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import write_anatomy
+from endopilot.anatomy.read_source import read_source
 from endopilot.cli.arguments import Existing, Figures, OutputFolder, Picture, existing
 from endopilot.errors import InputError
 from endopilot.imaging.volume import read_volume

@@ -49,7 +49,11 @@ def command(
     names = ", ".join(log.name for log in read)
     _write(found, output, names)
     figures = summary(found.replays)
+    known = np.array([each.rotation_known_rad for each in found.replays])
+    told_share = float(np.isfinite(known).mean())
     about = {
+        "start_rotation_told_in": round(told_share, 3),
+        "start_rotation_known_rad": round(float(np.nanmedian(known)), 2) if told_share else None,
         "band_of_90_percent_mm": None if found.band_mm is None else round(found.band_mm, 2),
         "it_holds_in_logs_left_out": None if found.band_share is None else round(found.band_share, 3),
     }

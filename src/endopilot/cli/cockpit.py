@@ -8,6 +8,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from endopilot.cli.arguments import Existing, ListenConfig
+from endopilot.devices.robot import ASSUMED, read_robot
 from endopilot.errors import InputError
 from endopilot.settings import CountOrZero
 
@@ -18,6 +19,7 @@ def command(
     *,
     device: str = "workhorse-014",
     catheter: tuple[str, ...] = (),
+    robot: str | None = None,
     task: str | None = None,
     world: CountOrZero = 0,
     replay: Existing | None = None,
@@ -36,6 +38,7 @@ def command(
         patient: folder made by `endopilot anatomy` or `endopilot atlas`; a synthetic one if nothing is given.
         device: name of a device (`endopilot devices`) or a YAML file.
         catheter: up to two catheters around it, from the inside out: names such as microcatheter-1.7f, or YAML files.
+        robot: name of a robot (docs/robot.md) or a YAML file that drives them; `assumed` if not given.
         task: task of the ladder to drive by hand, with X-ray as the only sight until the end.
         world: which patient of the task, world of the trajectory, or episode of the data set.
         replay: session, trajectory (.npz), folder of a plan, navigation or data set, or file of the ladder to look at
@@ -56,14 +59,17 @@ def command(
 
     if catheter and (replay is not None or task is not None or resume is not None):
         raise InputError("catheter: a replay, a task and a session have theirs; leave it out")
+    if robot is not None and (replay is not None or resume is not None):
+        raise InputError("robot: a replay and a session have theirs; leave it out")
+    drives = read_robot(robot or ASSUMED)
     if replay is not None:
         opened = open_replay(replay, patient, world=world, task=task, ct=ct)
     elif task is not None:
-        opened = open_task(task, world, output=output)
+        opened = open_task(task, world, robot=drives, output=output)
     elif resume is not None:
         opened = resume_session(resume, ct=ct)
     else:
-        opened = open_session(patient, device=device, catheters=catheter, ct=ct, output=output)
+        opened = open_session(patient, device=device, catheters=catheter, robot=drives, ct=ct, output=output)
 
     def listening(address: str) -> None:
         print(f"page       {address}", flush=True)

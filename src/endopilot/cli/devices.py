@@ -7,6 +7,7 @@ from typing import Any
 from tyro.conf import Positional
 
 from endopilot.cli.arguments import Answer
+from endopilot.devices.catheter import catheter_yaml, list_catheters
 from endopilot.devices.device import read_wire
 from endopilot.devices.device_files import device_file, device_yaml, is_shipped, list_wires, user_devices
 from endopilot.errors import InputError
@@ -24,17 +25,23 @@ def command(
     Args:
         devices: names of devices or paths of YAML files; all known devices by default.
         tip_load: simulate the tip-load test instead; exit code 1 if a device's error exceeds the bar.
-        yaml: print the file of one device instead, to start one of your own from.
+        yaml: print the file of one device or catheter instead, to start one of your own from.
     """
     if yaml:
         if len(devices) != 1:
             raise InputError(f"--yaml: {len(devices)} devices; name the one to print")
-        read_wire(devices[0])
-        print(device_yaml(devices[0])[1], end="")
+        print(_yaml(devices[0]), end="")
         return None
     names = devices or (*list_wires(), *user_devices())
     rows = [tip_load_row(read_wire(name)) if tip_load else _row(name) for name in names]
     return Answer(rows, passed=all(row.get("passed") is not False for row in rows))
+
+
+def _yaml(name: str) -> str:
+    if name in list_catheters():
+        return catheter_yaml(name)
+    read_wire(name)
+    return device_yaml(name)[1]
 
 
 def _row(name: str) -> dict[str, Any]:

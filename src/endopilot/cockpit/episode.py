@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from endopilot.anatomy.io import write_anatomy
-from endopilot.cockpit.recording import read_recording, replayed
+from endopilot.cockpit.recording import read_session, replayed
 from endopilot.dataset.episode import write_episode
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import DECISION_PERIOD_S
@@ -26,7 +26,7 @@ def write_session_episode(session: str | Path, *, output: str | Path) -> None:
             something else.
     """
     session, output = Path(session), Path(output)
-    recording = read_recording(session)
+    recording = read_session(session)
     per_sample = round(DECISION_PERIOD_S / recording.config.cycle_s)
     samples = recording.cycles // per_sample
     if samples == 0:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.cockpit.recording import SUFFIX, read_recording, replayed
+from endopilot.cockpit.recording import SUFFIX, read_session, replayed
 from endopilot.cockpit.world import Snapshot, loop_snapshot, take_snapshot
 from endopilot.control.plan_file import read_plan
 from endopilot.dataset.again import episode_set_up
@@ -127,7 +127,7 @@ def open_film(path: Path, patient: Path | None = None, *, world: int = 0, task: 
 
 
 def _session(path: Path) -> Film:
-    recording = read_recording(path)
+    recording = read_session(path)
     every = max(round(FRAME_S / recording.config.cycle_s), 1)
     target = next((event["target"] for event in reversed(recording.events) if "target" in event), None)
     navigation = recording.navigation

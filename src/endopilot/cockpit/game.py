@@ -18,6 +18,7 @@ from endopilot.cockpit.frames import encode
 from endopilot.cockpit.recording import Recorder
 from endopilot.cockpit.session import Session
 from endopilot.cockpit.world import BY_HAND, LiveWorld, Snapshot
+from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
 from endopilot.ladder.attempt import attempt, navigation_seed, scored
 from endopilot.parallel import Workers
@@ -35,10 +36,12 @@ class Attempt:
     Attributes:
         task: of the ladder.
         place: of the patient in the task's list.
+        robot: what drives, for a person and for the agent.
     """
 
     task: Task
     place: int
+    robot: RobotConfig = BY_HAND.robot
 
     @property
     def seed(self) -> int:
@@ -47,7 +50,7 @@ class Attempt:
 
     def world(self) -> LiveWorld:
         """Return the world at the task's start, with the ladder's rod core."""
-        config = replace(BY_HAND, simulator=replace(CORE, threads=1))
+        config = replace(BY_HAND, robot=self.robot, simulator=replace(CORE, threads=1))
         return LiveWorld(self.task.ladder_navigation(self.place), config, seed=self.seed)
 
     def session(self, *parts: Any) -> GameSession:
@@ -178,5 +181,5 @@ class GameSession(Session):
 def _rival(tried: Attempt) -> dict[str, Any]:
     """Let the agent drive the same task in the same patient."""
     navigation = tried.task.ladder_navigation(tried.place)
-    scored = attempt(RIVAL, navigation, seed=tried.seed)
+    scored = attempt(RIVAL, navigation, seed=tried.seed, robot=tried.robot)
     return {name: scored[name] for name in _SHOWN}

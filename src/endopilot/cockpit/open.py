@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,9 +15,10 @@ from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.cockpit.fluoroscopy import XrayUnit
 from endopilot.cockpit.frames import scene
 from endopilot.cockpit.loop import Stage
-from endopilot.cockpit.recording import SUFFIX, Recorder, Where, read_recording, replayed
+from endopilot.cockpit.recording import SUFFIX, Recorder, Where, read_session, replayed
 from endopilot.cockpit.session import Session
-from endopilot.cockpit.world import LiveWorld
+from endopilot.cockpit.world import BY_HAND, LiveWorld
+from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.navigation.policies import POLICIES
 from endopilot.tasks.navigation import Navigation, Target
@@ -54,6 +55,7 @@ def open_session(
     *,
     device: str = "workhorse-014",
     catheters: Sequence[str] = (),
+    robot: RobotConfig = BY_HAND.robot,
     ct: Path | None = None,
     output: Path = Path("runs/cockpit"),
 ) -> Opened:
@@ -63,6 +65,7 @@ def open_session(
         patient: folder of an anatomy; a synthetic one is written into `output` if not given.
         device: name of a wire or a YAML file.
         catheters: names or YAML files of catheters around it, from the inside out.
+        robot: what drives them.
         ct: CT angiogram of the patient, for the X-ray's background.
         output: folder of the recordings.
 
@@ -71,21 +74,24 @@ def open_session(
     """
     patient = patient or _synthetic(output)
     navigation = _start_of(read_anatomy(patient), Stack.of(device, *catheters))
-    return _driven(LiveWorld(navigation), Where(patient=patient), output, ct)
+    return _driven(LiveWorld(navigation, replace(BY_HAND, robot=robot)), Where(patient=patient), output, ct)
 
 
-def open_task(name: str, place: int = 0, *, output: Path = Path("runs/cockpit")) -> Opened:
+def open_task(
+    name: str, place: int = 0, *, robot: RobotConfig = BY_HAND.robot, output: Path = Path("runs/cockpit")
+) -> Opened:
     """Open a task of the ladder, to be driven by hand under X-ray alone.
 
     Args:
         name: of the task.
         place: of the patient in the task's list.
+        robot: what drives; the agent, whose score stands beside a person's, drives the same one.
         output: folder of the recordings.
 
     Raises:
         InputError: the ladder has no such task, or the task no such patient.
     """
-    tried = _attempt(name, place)
+    tried = _attempt(name, place, robot)
     where = Where(task=name, place=place)
     return _driven(tried.world(), where, output, None, seed=tried.seed, make=tried.session)
 
@@ -127,24 +133,24 @@ def resume_session(path: Path, *, ct: Path | None = None) -> Opened:
     Raises:
         InputError: no such session, or one that does not replay to the bit.
     """
-    recording = read_recording(path)
+    recording = read_session(path)
     history = replayed(recording)
     first = next(history)
     _drop_half_line(path)
     where, make = recording.where, Session
     if where.task is not None and not any("score" in event for event in recording.events):
-        make = _attempt(where.task, where.place).session
+        make = _attempt(where.task, where.place, recording.config.robot).session
     opened = _driven(first[0], where, path.parent, ct, path=path, seed=recording.seed, make=make)
     assert isinstance(opened.stage, Session)
     opened.stage.restore(chain([first], history))
     return opened
 
 
-def _attempt(task: str, place: int) -> Attempt:
+def _attempt(task: str, place: int, robot: RobotConfig) -> Attempt:
     from endopilot.cockpit.game import Attempt  # slow to import, and needed for tasks alone
     from endopilot.tasks.task import task_by_hand
 
-    return Attempt(task_by_hand(task), place)
+    return Attempt(task_by_hand(task), place, robot)
 
 
 def _driven(

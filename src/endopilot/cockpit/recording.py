@@ -90,7 +90,7 @@ class Recorder:
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class RecordedSession:
     """A session that was recorded.
 
     Attributes:
@@ -114,7 +114,7 @@ class Recording:
     cycles: int
 
 
-def read_recording(path: Path) -> Recording:
+def read_session(path: Path) -> RecordedSession:
     """Read a session. A last line that a killed server left half-written is ignored.
 
     Raises:
@@ -145,7 +145,7 @@ def read_recording(path: Path) -> Recording:
         if (apart := np.diff(np.sort(at)).max(initial=0)) > between:
             raise InputError(f"{apart} cycles without a check, which is due after {between}")
         cycles = int(at.max())
-        return Recording(path, navigation, config, reality, int(header["seed"]), where, events, cycles)
+        return RecordedSession(path, navigation, config, reality, int(header["seed"]), where, events, cycles)
 
 
 def _between_checks(config: LoopConfig) -> int:
@@ -153,7 +153,7 @@ def _between_checks(config: LoopConfig) -> int:
     return max(1, round(CHECK_S / config.cycle_s))
 
 
-def replayed(recording: Recording) -> Iterator[tuple[LiveWorld, list[dict[str, Any]]]]:
+def replayed(recording: RecordedSession) -> Iterator[tuple[LiveWorld, list[dict[str, Any]]]]:
     """Drive a session again and yield the world before the first cycle and after each, with the events of that cycle.
 
     Raises:

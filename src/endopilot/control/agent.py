@@ -58,10 +58,21 @@ class AgentConfig:
 
     @staticmethod
     def of(navigation: Navigation) -> AgentConfig:
-        """Return the settings for a navigation by a wire alone, or by one in a catheter."""
-        return IN_CATHETER if navigation.catheters else AgentConfig()
+        """Return the settings for a navigation by a wire alone, in a wide lumen or not, or by one in a catheter."""
+        if navigation.catheters:
+            return IN_CATHETER
+        wide = Route.to(navigation.anatomy, navigation.target).is_wide(navigation.target.abscissa)
+        return IN_WIDE_LUMEN if wide else AgentConfig()
 
 
+IN_WIDE_LUMEN = AgentConfig(
+    belief=BeliefConfig(members=24, ostium_spread_mm=3.5, element_mm=1.25, time_step_s=0.1),
+    lost_along_mm=6.0,
+    lost_across_mm=2.5,
+    lost_across_radii=0.3,
+)
+"""Settings of an agent of a wire alone on a route through a wide lumen, such as an aorta. The wire lies more freely in
+it, and the place of the ostium is known less well; bends are wide, so that longer elements and steps do."""
 IN_CATHETER = AgentConfig(
     search=SearchConfig(speed_mm_s=5.0),
     belief=BeliefConfig(

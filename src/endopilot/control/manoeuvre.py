@@ -50,7 +50,8 @@ Grid = tuple[Place, ...]
 STRAIGHT: Grid = ()
 """Devices are pushed on as they are."""
 _ALONE: tuple[Grid, ...] = ((Place(-1.0),), (Place(None),))
-"""Grids of a wire alone."""
+_BACK: tuple[Grid, ...] = ((Place(None, back=1.5),), (Place(None, back=3.0),))
+"""Grids of a wire alone; the latter in a wide lumen, where loops that lie in it come out as it is pulled back."""
 
 
 def _grid(beyond: tuple[float, ...], lead_mm: tuple[float, ...], back: float = 0.0) -> Grid:
@@ -86,11 +87,11 @@ class Repertoire:
     ways: tuple[tuple[float, Grid], ...]
 
     @staticmethod
-    def of(catheters: Sequence[Catheter], config: SearchConfig) -> Repertoire:
-        """Return the manoeuvres of a wire alone, or of one in a catheter."""
+    def of(catheters: Sequence[Catheter], config: SearchConfig, *, wide: bool) -> Repertoire:
+        """Return the manoeuvres of a wire alone, in a wide lumen or not, or of one in a catheter."""
         if not catheters:
-            shares = config.cost.forbidden_share, SPARE_SHARE
-            return Repertoire((ALL_ALONG_MM,), config.candidates, tuple(product(shares, _ALONE)))
+            shares, grids = (config.cost.forbidden_share, SPARE_SHARE), _ALONE + _BACK * wide
+            return Repertoire((ALL_ALONG_MM,), config.candidates, tuple(product(shares, grids)))
         shaped = bool(catheters[0].shape)
         grids = (_GRID, *(_SHAPED if shaped else _UNSHAPED))
         ways = (*product((SPARE_SHARE,), grids), *product((1.0,), (STRAIGHT, _GRID)))

@@ -82,7 +82,8 @@ class Population:
         nearest, best = np.inf, np.zeros((0, 1, 2))
         for number in range(rounds):
             before = history[-1] if number else np.zeros((count, 1, 2))
-            drawn = trials.possible(self._draw(before, number, attempt), alike=True)
+            drawn = self._draw(before, number, attempt)
+            drawn = trials.possible(drawn, alike=True, periods=self._config.round_periods)
             spent += self._run_round(drawn, before, waypoint, peak)
             history = np.concatenate([history, np.repeat(drawn[None], self._config.round_periods, axis=0)])
             score, share = self._judge(waypoint, spent, peak <= most_n)

@@ -35,12 +35,13 @@ _BEYOND_MM = 4.0
 """Wires of which some are this far beyond a waypoint, in the mean, and others before it, will not pass it together."""
 _OFF_MM = 4.0
 """A tip that is this far in a wrong branch does not come back, mm: in a wide fork it may seem to leave the route."""
-_OFF_CATHETER_MM, _OFF_RADII = 5.0, 2.0
-"""The same where there is a catheter: this far, and as many radii of the route's lumen."""
+_OFF_WIDE_MM, _OFF_RADII = 5.0, 2.0
+"""The same where there is a catheter, or a wide lumen: this far, and as many radii of the route's lumen."""
 _MOUTH_RADII = 1.4
 """Half the width of a branch's mouth, lumen radii."""
-_SLACK_MM = 40.0
-"""A wire that was pushed this far and did not come forward folds, mm."""
+_SLACK_MM, _SLACK_WIDTHS = 40.0, 2.0
+"""A wire that was pushed this far and did not come forward folds, mm; in a wide lumen by so many widths of it, since it
+lies down on the outer walls before it comes forward."""
 _AT_MM, REST_MM = 1.0, 0.1
 """A catheter this near to its place is there, mm; what is this near to its goal rests."""
 
@@ -154,7 +155,9 @@ class Push:
         passed = np.zeros(trials.count, dtype=bool)
         progress = farthest = self._progress(trials)
         inserted_there, follower = _deepest(trials), _Follower(self, trials, lead)
-        off_mm, longest, force_n = self._limits(trials)
+        waits = alone and not self.strict and self.route.is_wide(self.waypoint)
+        slack_mm = _SLACK_WIDTHS * self.route.width_mm(self.waypoint) if waits else _SLACK_MM
+        off_mm, longest, force_n = self._limits(trials, waits)
 
         def stop(which: Bool[np.ndarray, "trials"], why: Halt) -> None:
             halt[which & ~trials.still] = why
@@ -176,14 +179,14 @@ class Push:
                 stop(_slips(trials, before), "slipped")
             stop(presses, "pressed")
             if alone:
-                stalls = self._stalls(trials, begun)
+                stalls = self._stalls(trials, begun) & (not waits)
                 stop(stalls & self.strict, "stalled")
                 passed |= ~trials.still & self.arrived(trials)
                 trials.still |= passed
                 stop(stalls, "stalled")
-                stop((progress >= self.waypoint + _BEYOND_MM) & (not self.strict), "off")
+                stop((progress >= self.waypoint + _BEYOND_MM) & (self.last or not self.strict), "off")
             stop(self._off(trials, off_mm), "off")
-            stop(inserted - inserted_there > _SLACK_MM, "stalled")
+            stop(inserted - inserted_there > slack_mm, "stalled")
         if not alone:
             passed = self.arrived(trials) & ~trials.still
         trials.still[:] = False
@@ -211,17 +214,17 @@ class Push:
     def _off(self, trials: Trials, off_mm: float) -> Bool[np.ndarray, "trials"]:
         return ~trials.all(self.route.off_route(trials.foremost) <= off_mm)
 
-    def _limits(self, trials: Trials) -> tuple[float, int, float]:
+    def _limits(self, trials: Trials, waits: bool) -> tuple[float, int, float]:
         """Return how far in a wrong branch (mm), after how many periods, and at what force (N) a trial is given up."""
         limit_n, config = self.navigation.force_limit_n, self.config
+        if self.strict:
+            return 0.0, sys.maxsize, config.cost.forbidden_share * limit_n
         if trials.devices == 1:
-            return (
-                (0.0, sys.maxsize, config.cost.forbidden_share * limit_n)
-                if self.strict
-                else (_OFF_MM, sys.maxsize, limit_n)
-            )
+            before = self.route.junctions[self.route.junctions < self.waypoint]
+            wide_mm = _OFF_WIDE_MM + _OFF_RADII * float(self.route.radius(before[-1:]).max(initial=0.0))
+            return wide_mm if waits else _OFF_MM, sys.maxsize, limit_n
         begun = float(self._progress(trials).min())
-        off_mm = _OFF_CATHETER_MM + _OFF_RADII * float(self.route.radius(np.array([begun, self.waypoint])).max())
+        off_mm = _OFF_WIDE_MM + _OFF_RADII * float(self.route.radius(np.array([begun, self.waypoint])).max())
         seconds = 2 * max(self.waypoint - begun, 0.0) / config.speed_mm_s + config.manoeuvres.longest_s
         return off_mm, round(seconds / DECISION_PERIOD_S), limit_n
 

@@ -76,7 +76,8 @@ class Search:
         if len(navigation.catheters) > 1:
             raise InputError(f"catheter: {len(navigation.catheters)}; the search drives one: give one")
         self._navigation, self.route, self.config = navigation, route, config
-        self._alone, self._repertoire = not navigation.catheters, Repertoire.of(navigation.catheters, config)
+        self._alone, wide = not navigation.catheters, route.is_wide(route.target.abscissa)
+        self._repertoire = Repertoire.of(navigation.catheters, config, wide=wide)
         trials_of = partial(Trials.of, navigation, belief.kinds, like=belief.simulator)
         self._course, self._many = trials_of(count=1), trials_of(count=self._repertoire.trials)
         self._few = self._course if self._alone else trials_of(count=len(self._repertoire.leads))
@@ -179,11 +180,32 @@ class Search:
         course, push = self._course, self._push(waypoint, strict=self._alone)
         if push.arrived(course)[0]:
             return None
+        kept = course.kept()
         trials = course if self._alone else self._few.copy_of(course)
         pushed = self._tried[STRAIGHT] = push.run(trials, self._left, np.array(self._repertoire.leads))
         self._hard = float(pushed.farthest.max())
         passes = pushed.passed[0] if self._alone else self._follow(pushed, SPARE_SHARE, waypoint, turns=1)
+        if not passes and push.last and self._alone and self.route.is_wide(waypoint):
+            passes = self._most_arrive(kept)
         return None if passes else pushed.halt[int(np.argmax(pushed.farthest))]
+
+    def _most_arrive(self, kept: Kept) -> bool:
+        """Cut a straight push of a wire alone to where most wires are at the target; return whether there is a place.
+
+        In a wide lumen the wires that are held possible spread by more than what counts as arrived. The others are left
+        behind: an exposure will show which of them is right.
+        """
+        course, target = self._course, self.route.target.abscissa
+        there = np.array([self.route.passed(row.tip, target) * course.weight for row in course.rows[kept.periods :]])
+        best = int(np.argmax(there.sum(axis=1)))
+        if there[best].sum() <= 0.5:
+            return False
+        controls = [row.control for row in course.rows[kept.periods : kept.periods + best + 1]]
+        course.restore(kept)
+        for control in controls:
+            course.move(control)
+        course.weight = there[best] / there[best].sum()
+        return True
 
     def _turned(self, grid: Grid, share: float, waypoint: float, kept: Kept) -> bool:
         """Try a grid before a place, and follow the best of it; return whether any passes.

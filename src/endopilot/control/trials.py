@@ -191,18 +191,19 @@ class Trials:
             control[:, device, 0], control[:, device, 1] = translation, rotation
         return control
 
-    def possible(self, control: Control, *, alike: bool = False) -> Control:
+    def possible(self, control: Control, *, alike: bool = False, periods: int = 1) -> Control:
         """Return what the drives can do of a control: no wire of a trial leaves the travel.
 
         Args:
             control: of each trial.
             alike: of no trial.
+            periods: decision periods that it holds for.
         """
         made = np.array(control)
         for device, limits in enumerate(self._limits):
             inserted = self.lengths[:, device].reshape(self.wires, -1)
             for length in (inserted.min(axis=None if alike else 0), inserted.max(axis=None if alike else 0)):
-                made[:, device] = limits.clip(made[:, device], length, DECISION_PERIOD_S)
+                made[:, device] = limits.clip(made[:, device], length, periods * DECISION_PERIOD_S)
         return made
 
     def move(self, control: Control, *, force_n: float = np.inf) -> Bool[np.ndarray, "trials"]:

@@ -12,6 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from endopilot.dataset import parquet, schema
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.layout import Block, Layout, make_layout
 from endopilot.dataset.splits import SPLITS
-from endopilot.dataset.workers import run_locally, run_on_cluster
+from endopilot.dataset.workers import run_locally, run_on_cluster, write_timed
 from endopilot.devices.device import Wire
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
@@ -97,7 +98,7 @@ def generate_dataset(
         else:
             remote = [replace(block, folder=block.folder.resolve()) for block in missing]
             context = replace(layout.context, output=layout.context.output.resolve())
-            run_on_cluster(context, remote, done_remotely, scheduler)
+            run_on_cluster(partial(write_timed, context), remote, done_remotely, scheduler)
     describe(layout, blocks)
 
 

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from functools import partial
+from typing import TypeVar
 
 from endopilot.dataset.block import write_block
 from endopilot.dataset.layout import Block, BlockContext, version
@@ -15,6 +15,7 @@ from endopilot.parallel import CORES
 
 Done = Callable[[Block, float], None]
 """Called with each block that has been written and the processor time that it took, s."""
+Item, Result = TypeVar("Item"), TypeVar("Result")
 _CONNECT_TIMEOUT_S = 10
 """Time limit for a scheduler to answer, s."""
 
@@ -59,15 +60,17 @@ def run_locally(context: BlockContext, blocks: Sequence[Block], done: Done, adva
             raise
 
 
-def run_on_cluster(context: BlockContext, blocks: Sequence[Block], done: Done, scheduler: str) -> None:
-    """Write blocks on the workers of a Dask cluster, which must have access to the same folders.
+def run_on_cluster(
+    work: Callable[[Item], Result], items: Sequence[Item], done: Callable[[Item, Result], None], scheduler: str
+) -> None:
+    """Do the same work for every item on the workers of a Dask cluster, which must have access to the same folders.
 
-    If a worker dies, another one does its block.
+    If a worker dies, another one does its item.
 
     Args:
-        context: what all blocks share.
-        blocks: what to write.
-        done: called after each block.
+        work: a function of a module, or a `functools.partial` of one.
+        items: what to work on.
+        done: called with each item and what the work returned for it.
         scheduler: address, such as tcp://host:8786.
 
     Raises:
@@ -86,7 +89,7 @@ def run_on_cluster(context: BlockContext, blocks: Sequence[Block], done: Done, s
         ) from error
     with client:
         _check_versions(client, scheduler)
-        futures = {client.submit(partial(_timed, context), block, pure=False, retries=0): block for block in blocks}
+        futures = {client.submit(work, item, pure=False, retries=0): item for item in items}
         try:
             for future in distributed.as_completed(futures):
                 done(futures[future], future.result())
@@ -111,7 +114,7 @@ def _check_versions(client, scheduler: str) -> None:
             raise InputError(f"scheduler: worker {worker} has {other}, here is {version()}; install the same")
 
 
-def _timed(context: BlockContext, block: Block) -> float:
+def write_timed(context: BlockContext, block: Block) -> float:
     """Write a block and return the processor time that it took, s."""
     started = time.process_time()
     write_block(context, block)

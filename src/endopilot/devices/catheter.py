@@ -33,6 +33,7 @@ from endopilot.devices.device_ranges import (
     check_built,
 )
 from endopilot.errors import InputError
+from endopilot.files import read_text
 from endopilot.settings import NonNegative, Positive, Text, Within, read_settings, settings
 
 _SHIPPED = Path(__file__).parent / "catheters"
@@ -126,6 +127,16 @@ def read_catheter(name_or_path: str | Path) -> Catheter:
         return catheter
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def catheter_yaml(name_or_path: str | Path) -> str:
+    """Return the text of a catheter's YAML file, by its name or its path.
+
+    Raises:
+        InputError: no such catheter, or a file that is no text.
+    """
+    path = named_file("catheter", name_or_path, (_SHIPPED,), list_catheters)
+    return read_text(path, what="catheter's YAML file")
 
 
 def check_nested(wire: Wire, catheters: Sequence[Catheter]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,20 @@ from endopilot.types import Anatomy
 SPARE_MM = 20.0
 """Length that a wire can be driven beyond the end of the vessel's longest path, mm. A wire lies slack along the wall:
 it takes more wire than centerline to reach the end."""
+_HAIR_MM = 1e-9
+"""What rounding may add to an inserted length, mm."""
+WIDE_MM, SPARE_WIDTHS = 16.0, 3.0
+"""In a lumen wider than this, such as an aorta, a wire lies down on the outer walls of bends and in loops, mm; that
+takes up to so many widths of it."""
 Numbers = float | Float[np.ndarray, "..."]
 
 
 def far_end_mm(anatomy: Anatomy) -> float:
-    """Return the largest inserted length in a vessel, mm: its longest path and `SPARE_MM` more."""
-    return float(anatomy.tree.longest_path().abscissa[-1]) + SPARE_MM
+    """Return the largest inserted length in a vessel, mm: its longest path and `SPARE_MM` more, or `SPARE_WIDTHS`."""
+    tree = anatomy.tree
+    width = 2 * max(float(branch.centerline.radius.max()) for branch in tree.branches)
+    spare = SPARE_WIDTHS * width if width > WIDE_MM else SPARE_MM
+    return float(tree.longest_path().abscissa[-1]) + spare
 
 
 def within_travel(
@@ -82,6 +91,15 @@ class DriveLimits:
     def fastest(self) -> Float[np.ndarray, "2"]:
         """Largest translation and rotation, mm/s and rad/s."""
         return np.array([self.max_velocity_mm_s, self.max_rotation_rad_s])
+
+    def by_encoder(self, ostium_mm: float) -> DriveLimits:
+        """Return limits whose far end, by an encoder, is no deeper than where the device truly ends.
+
+        Args:
+            ostium_mm: the true inserted length is at most this much more than the encoder's, mm.
+        """
+        low, high = self.travel_mm
+        return replace(self, travel_mm=(low, high - max(ostium_mm, 0.0) - _HAIR_MM))
 
     def safe(self, translation: Any, rotation: Any) -> tuple[float, float]:
         """Return one command that is finite and within the speed limits, whatever is asked; what is no number stops.

@@ -34,7 +34,7 @@ class DriveMotion:
 
     def __init__(
         self,
-        config: RobotConfig,
+        config: RobotConfig | Sequence[RobotConfig],
         limits: Sequence[Sequence[DriveLimits]],
         position: Float[np.ndarray, "robots devices 2"],
         *,
@@ -43,23 +43,20 @@ class DriveMotion:
         """Begin at rest, in the middle of the play, or somewhere in it if the encoders do not see it.
 
         Args:
-            config: latency, jitter, accelerations, gains and plays.
+            config: latency, jitter, accelerations, gains and plays, of all robots or of each.
             limits: of the drives of each robot.
             position: where the devices are, Δ, mm, and φ, rad.
             seeds: of each robot's gains and jitter.
         """
-        robots, devices, _ = position.shape
-        self._acceleration = config.of_drives(devices, "max_acceleration_mm_s2", "max_acceleration_rad_s2")[None]
+        robots, self._devices, _ = position.shape
         self._fastest = np.array([[each.fastest for each in of_robot] for of_robot in limits])
         self._travel = np.moveaxis(np.array([[each.travel_mm for each in of_robot] for of_robot in limits]), -1, 0)
-        self._latency_s, self._jitter_s = config.latency_s, config.jitter_s
-        self._config, self._devices = config, devices
-        self._random = [np.random.default_rng(seed) for seed in seeds]
-        drawn = [self._drawn(random) for random in self._random]
-        self._gain, self._half_play, ahead = (np.stack(each) for each in zip(*drawn, strict=True))
-        self._top = self._fastest / np.maximum(self._gain, 1.0)  # of the motors: no device goes faster than its limit
-        self._wanted, self._ahead = np.zeros(position.shape), ahead
-        self._ramp = np.broadcast_to(self._acceleration, position.shape).copy()
+        self._latency_s, self._jitter_s = np.zeros(robots), np.zeros(robots)
+        self._acceleration, self._gain = np.zeros(position.shape), np.zeros(position.shape)
+        self._half_play, self._ahead = np.zeros(position.shape), np.zeros(position.shape)
+        self._random: list[np.random.Generator] = [np.random.default_rng()] * robots
+        self._grasp(range(robots), seeds, [config] * robots if isinstance(config, RobotConfig) else config)
+        self._wanted, self._ramp = np.zeros(position.shape), self._acceleration.copy()
         self._orders: deque[tuple[Float[np.ndarray, "robots"], Float[np.ndarray, "robots devices 2"]]] = deque()
         self._clock = np.zeros(robots)
         self.velocity = np.zeros(position.shape)
@@ -85,19 +82,20 @@ class DriveMotion:
         self._ramp = np.maximum(self._acceleration, self._fastest / within_s)
 
     def reset(
-        self, robots: Sequence[int], position: Float[np.ndarray, "chosen devices 2"], seeds: Sequence[Sequence[int]]
+        self,
+        robots: Sequence[int],
+        position: Float[np.ndarray, "chosen devices 2"],
+        seeds: Sequence[Sequence[int]],
+        configs: Sequence[RobotConfig],
     ) -> None:
         """Put other robots, drawn by their seeds, in the place of some, at rest where they are."""
         chosen = np.asarray(robots, dtype=int)
-        for robot, seed in zip(robots, seeds, strict=True):
-            self._random[robot] = np.random.default_rng(seed)
-            self._gain[robot], self._half_play[robot], self._ahead[robot] = self._drawn(self._random[robot])
-        self._top = self._fastest / np.maximum(self._gain, 1.0)
+        self._grasp(robots, seeds, configs)
         for due, velocity in self._orders:
             due[chosen], velocity[chosen] = -np.inf, 0.0
         for array in (self._wanted, self.velocity):
             array[chosen] = 0.0
-        self._ramp[chosen] = self._acceleration
+        self._ramp[chosen], self._clock[chosen] = self._acceleration[chosen], 0.0
         self.motor[chosen], self.position[chosen] = position, position
 
     def advance(self, duration: float) -> Float[np.ndarray, "robots devices 2"]:
@@ -110,17 +108,23 @@ class DriveMotion:
             self._clock = until
         return self.position - before
 
-    def _drawn(self, random: np.random.Generator) -> tuple[Float[np.ndarray, "devices 2"], ...]:
-        """Draw a robot: its gains, half its plays, and how far the motors are ahead of the devices at the start.
+    def _grasp(
+        self, robots: Sequence[int], seeds: Sequence[int | Sequence[int]], configs: Sequence[RobotConfig]
+    ) -> None:
+        """Draw some robots: gains, half the plays, and how far the motors are ahead of the devices at the start.
 
         That is nothing, in the middle of the play, or anywhere in it where encoders at the motors do not see it.
         """
-        config, devices = self._config, self._devices
-        gain = config.gains(devices, random)
-        apart = random.spawn(1)[0]  # what is drawn from the stream stays the same
-        half_play = config.plays(devices, apart) / 2
-        ahead = apart.uniform(-1.0, 1.0, half_play.shape) * half_play
-        return gain, half_play, ahead * (config.encoders_at == "motor")
+        devices = self._devices
+        for robot, seed, config in zip(robots, seeds, configs, strict=True):
+            self._random[robot] = random = np.random.default_rng(seed)
+            self._latency_s[robot], self._jitter_s[robot] = config.latency_s, config.jitter_s
+            self._acceleration[robot] = config.of_drives(devices, "max_acceleration_mm_s2", "max_acceleration_rad_s2")
+            self._gain[robot] = config.gains(devices, random)
+            apart = random.spawn(1)[0]  # what is drawn from the stream stays the same
+            self._half_play[robot] = half_play = config.plays(devices, apart) / 2
+            self._ahead[robot] = apart.uniform(-1.0, 1.0, half_play.shape) * half_play * (config.encoders_at == "motor")
+        self._top = self._fastest / np.maximum(self._gain, 1.0)  # of the motors: no device goes faster than its limit
 
     def _obey(self) -> None:
         """Take what is due of each robot, and forget what all have taken."""

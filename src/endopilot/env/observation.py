@@ -1,13 +1,15 @@
-"""What a learning agent observes of a world: `observe`; the table is in `NavigateVectorEnv`."""
+"""What a learning agent observes of a world: `observe` or `observe_exposed`; the tables are in `NavigateVectorEnv`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict, Space
 from jaxtyping import Bool, Float
 
+from endopilot.env.exposures import Exposed
 from endopilot.env.route_tables import RouteTables
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
@@ -16,11 +18,25 @@ from endopilot.types import TipProjection
 _BOUND = 10.0
 _OF_WIRE, _OF_CATHETER = 31, 8
 """Numbers of an observation: of the wire and its route, and of each catheter."""
+_AT_DRIVES, _OF_TIP, _DRIVE_OF_CATHETER = 9, 23, 5
+"""Numbers where X-ray shows the tip: of the wire's drive and the last exposure's age, of the tip, of each catheter."""
+Observed = Literal["state", "xray", "image"]
+"""What is observed: all as it truly is; or encoders, loads, and the last exposure, as a measured tip or images."""
 
 
-def space(catheters: int) -> Box:
-    """Return the space of one world's observation, of a wire with some catheters; what lies beyond is cut off."""
-    return Box(-_BOUND, _BOUND, (_OF_WIRE + _OF_CATHETER * catheters,), np.float32)
+def space(observed: Observed, catheters: int, images: tuple[int, int, int]) -> Space:
+    """Return the space of one world's observation; what lies beyond is cut off.
+
+    Args:
+        observed: what.
+        catheters: number around the wire.
+        images: their number, rows and columns.
+    """
+    if observed == "state":
+        return Box(-_BOUND, _BOUND, (_OF_WIRE + _OF_CATHETER * catheters,), np.float32)
+    of_tip = _OF_TIP if observed == "xray" else 0
+    measured = Box(-_BOUND, _BOUND, (_AT_DRIVES + of_tip + _DRIVE_OF_CATHETER * catheters,), np.float32)
+    return measured if observed == "xray" else Dict({"image": Box(0, 255, images, np.uint8), "measured": measured})
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +64,8 @@ class Measured:
     valid: Bool[np.ndarray, "worlds"]
 
     @classmethod
-    def after(
-        cls, step: Step, simulator: Simulator, encoders: Float[np.ndarray, "worlds devices 2"] | None
-    ) -> Measured:
-        """Return the worlds at the end of a step, with what encoders say; what is true if not given."""
+    def after(cls, step: Step, simulator: Simulator, encoders: Float[np.ndarray, "worlds devices 2"]) -> Measured:
+        """Return the worlds at the end of a step, with what encoders say."""
         return cls(
             tip=simulator.project(),
             position=step.tip_position,
@@ -59,13 +73,13 @@ class Measured:
             contact_force=step.contact_force_max,
             inserted_length=step.inserted_length,
             rotation=step.rotation,
-            encoders=simulator.proximal if encoders is None else encoders,
+            encoders=encoders,
             valid=step.valid,
         )
 
     @classmethod
-    def current(cls, simulator: Simulator, encoders: Float[np.ndarray, "worlds devices 2"] | None) -> Measured:
-        """Return the worlds as they are now, with what encoders say; what is true if not given."""
+    def current(cls, simulator: Simulator, encoders: Float[np.ndarray, "worlds devices 2"]) -> Measured:
+        """Return the worlds as they are now, with what encoders say."""
         return cls(
             tip=simulator.project(),
             position=simulator.tip_position,
@@ -73,7 +87,7 @@ class Measured:
             contact_force=simulator.contacts.max(axis=1),
             inserted_length=simulator.inserted_length,
             rotation=simulator.rotation,
-            encoders=simulator.proximal if encoders is None else encoders,
+            encoders=encoders,
             valid=simulator.valid,
         )
 
@@ -125,4 +139,51 @@ def observe(
         out[:, begin + 5] = distances_mm[:, device] / 100.0
         out[:, begin + 6] = on_route[:, device]
         out[:, begin + 7] = (inserted - tip.abscissa) / 10.0
-    return np.minimum(np.maximum(out, -_BOUND, out=out), _BOUND, out=out).astype(np.float32)
+    return _bounded(out)
+
+
+def observe_exposed(
+    proximal: Float[np.ndarray, "worlds devices 4"],
+    exposed: Exposed,
+    routes: RouteTables | None,
+    time_s: Float[np.ndarray, "worlds"],
+    time_share: Float[np.ndarray, "worlds"],
+) -> Float[np.ndarray, "worlds features"]:
+    """Return what is measured, as the table at `NavigateVectorEnv` has it.
+
+    Args:
+        proximal: Δ, mm, φ, rad, and the drives' force and torque, N and N·mm, as they are measured.
+        exposed: the last exposures.
+        routes: the paths to the targets; not given where exposures are images.
+        time_s: since the start, s.
+        time_share: share of the time limit that is used up.
+    """
+    around = proximal.shape[1] - 1
+    of_tip = 0 if routes is None else _OF_TIP
+    out = np.empty((len(time_s), _AT_DRIVES + of_tip + _DRIVE_OF_CATHETER * around))
+    begins = (0, *(_AT_DRIVES + of_tip + _DRIVE_OF_CATHETER * k for k in range(around)))
+    for begin, (inserted, turned, force, torque) in zip(begins, proximal.transpose(1, 2, 0), strict=True):
+        out[:, begin] = inserted / 100.0
+        out[:, begin + 1], out[:, begin + 2] = np.cos(turned), np.sin(turned)
+        out[:, begin + 3], out[:, begin + 4] = force / 0.5, torque / 0.5
+    out[:, 5] = time_share
+    out[:, 6] = (time_s - exposed.time_s) / 10.0
+    since = proximal[:, 0, :2] - exposed.encoders
+    out[:, 7], out[:, 8] = since[:, 0] / 10.0, since[:, 1] / np.pi
+    if routes is not None:
+        tip = exposed.tip[:, 0]
+        place, begin = routes.place(tip), _AT_DRIVES
+        out[:, begin] = tip.abscissa / 100.0
+        out[:, begin + 1] = tip.offset / tip.radius
+        out[:, begin + 2] = routes.distance(exposed.tip)[:, 0] / 100.0
+        out[:, begin + 3] = place.on_route
+        away = (exposed.position - place.point) / place.radius[:, None]
+        out[:, begin + 4 : begin + 6] = (place.frame[:, 1:] @ away[..., None])[..., 0]
+        out[:, begin + 6 : begin + 18] = place.ahead
+        out[:, begin + 18 : begin + 22] = place.radius_ahead / 2.0
+        out[:, begin + 22] = (exposed.encoders[:, 0] - tip.abscissa) / 10.0
+    return _bounded(out)
+
+
+def _bounded(values: Float[np.ndarray, "worlds features"]) -> Float[np.ndarray, "worlds features"]:
+    return np.minimum(np.maximum(values, -_BOUND, out=values), _BOUND, out=values).astype(np.float32)

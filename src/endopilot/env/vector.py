@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, get_args
 
 import numpy as np
 from gymnasium.spaces import Box
@@ -15,20 +16,22 @@ from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Float, UInt8
 from numpy.typing import ArrayLike
 
-from endopilot.devices.drive_limits import DriveLimits, within_travel
-from endopilot.devices.robot import RobotConfig, read_robot
-from endopilot.devices.stack import Stack
-from endopilot.env.observation import Measured, observe, space
+from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.robot import RobotConfig
+from endopilot.env.exposures import CArms
+from endopilot.env.observation import Measured, Observed, observe, observe_exposed, space
 from endopilot.env.picture import Picture
+from endopilot.env.reality import Reality
 from endopilot.env.route_tables import RouteTables
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
-from endopilot.simulation.robots import Robots, in_grip
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import SimulatorState, Step
+from endopilot.simulation.state import SimulatorState
+from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation, is_safe, reached
-from endopilot.tasks.task import CORE, in_catheter, reference_navigation, training_navigations
+from endopilot.tasks.task import CORE, LadderVersion, in_catheter, reference_navigation, training_navigations
+from endopilot.xray.fluoroscope import FluoroscopeConfig
 
 CONTROL_PERIOD_S = 2 / 15
 """Time between two actions, s: fluoroscopy's usual 7.5 frames a second."""
@@ -36,6 +39,10 @@ TRANSLATION_MM_S, ROTATION_RAD_S = 12.0, 3.14
 """Velocities of an action of 1: the fastest of the random navigations of `ControlConfig`, and half a turn a second."""
 PROGRESS_REWARD, STEP_REWARD, FORCE_REWARD, SUCCESS_REWARD = 0.1, -0.01, -0.1, 5.0
 """A mm nearer to the target, every step, every step with too large a force, and the target."""
+EXPOSURE_REWARD = -0.05
+"""Every exposure, where X-ray shows the tip."""
+Observations = Any
+"""An array with a row a world, or a dictionary of such where images are observed."""
 
 _MASKS = tuple(
     f"_{name}"
@@ -49,6 +56,8 @@ _OF_CATHETER = ("inserted_length", "rotation", "tip_abscissa", "tip_offset", "ti
 """What the info tells of each catheter."""
 _MEASURED = ("encoder_inserted_length", "encoder_rotation", "load_n", "load_nmm")
 """What the info tells of what a robot measures of the wire."""
+_PIXELS = (64, 128)
+"""Least and most rows of an image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +71,8 @@ class NavigationState:
         safe: worlds whose force has not been too large since their reset.
         ended: worlds whose episode has ended, which the next step resets.
         generators: state of each world's random generator.
-        robots: what drives, as it is kept within the environment; None without a robot.
-        readings: what they measured last; None likewise.
+        drawn: robots and what else differs from episode to episode, as it is kept within the environment.
+        exposed: the last exposures, likewise; None where all is observed as it truly is.
     """
 
     simulator: SimulatorState
@@ -72,8 +81,8 @@ class NavigationState:
     safe: np.ndarray
     ended: np.ndarray
     generators: tuple[dict[str, Any], ...]
-    robots: Any
-    readings: np.ndarray | None
+    drawn: Any
+    exposed: Any
 
 
 class NavigateVectorEnv(VectorEnv):
@@ -86,10 +95,14 @@ class NavigateVectorEnv(VectorEnv):
     does; which branch it enters at a fork depends on where the bend points. All worlds are stepped by one `Simulator`;
     `NavigateEnv` is this class with one world. A world's course does not depend on the others, to the last bit.
 
-    It is no `NavigationLoop`: there is no C-arm, nobody decides every 0.5 s, and the devices do as they are told unless
-    `robot` names a robot with its latency and play. Then Δ and φ are observed as its encoders have them, and each
-    episode draws a robot anew. It shares with the loop what a navigation is: start, rule of success, time and force
-    limit (`Navigation`, `reached`, `is_safe`), and how fast and how far a drive goes (`DriveLimits`).
+    It is no `NavigationLoop`: nobody decides every 0.5 s, all is observed as it truly is unless `observation` says
+    otherwise, and the devices do as they are told unless `robot` names a robot with its latency and play. Then Δ and φ
+    are observed as its encoders have them, and each episode draws a robot anew. It shares with the loop what a
+    navigation is: start, rule of success, time and force limit (`Navigation`, `reached`, `is_safe`), how fast and how
+    far a drive goes (`DriveLimits`), and what a C-arm shows (`Fluoroscope`, `XrayImager`).
+
+    In `endopilot/NavigateXray-v0` seeing costs: encoders and loads of the drives are observed at every step, the tip
+    only where X-ray is asked for.
 
     ## Action space
 
@@ -105,11 +118,15 @@ class NavigateVectorEnv(VectorEnv):
     With a catheter around the wire it is `Box(-1, 1, (4,), float32)`: 2 and 3 are the same of the catheter's proximal
     end, and so on for a second one. Each is driven by itself.
 
+    With `observation="xray"` or `"image"` there is one number more, the last: above 0, an exposure of every view is
+    taken at the end of the step.
+
     ## Observation space
 
     `Box(-10, 10, (31,), float32)`, a row a world; values beyond are cut off. The route runs along the centerline from
     the ostium to the target; its frame is its tangent and two normals carried along it without twist, at the place
-    that is nearest to the tip along the tree. All values are true ones, as if X-ray were always on.
+    that is nearest to the tip along the tree. All values are true ones, as if X-ray were always on; with a robot,
+    0 to 2 are its encoders'.
 
     | index | observation | unit of 1 |
     |---|---|---|
@@ -139,6 +156,31 @@ class NavigateVectorEnv(VectorEnv):
     | 37 | 1 where its tip is on the route, 0 in a wrong branch | |
     | 38 | its slack | 10 mm |
 
+    With `observation="xray"` it is `Box(-10, 10, (32,), float32)`: what a robot measures, and the last exposure, which
+    has the C-arm's errors of detection (`FluoroscopeConfig`).
+
+    | index | observation | unit of 1 |
+    |---|---|---|
+    | 0 | Δ by the encoder | 100 mm |
+    | 1, 2 | cosine and sine of φ by the encoder | |
+    | 3, 4 | force and torque of the drive | 0.5 N, 0.5 N·mm |
+    | 5 | time that is used up | the time limit |
+    | 6 | time since the last exposure | 10 s |
+    | 7, 8 | what Δ and φ have changed since, by the encoder | 10 mm, π |
+    | 9, 10 | at that exposure: abscissa of the tip, offset from the centerline | 100 mm, the lumen's radius |
+    | 11, 12 | path length to the target, 1 on the route | 100 mm |
+    | 13, 14 | offset of the tip from the route along its normals | the lumen's radius |
+    | 15 to 26 | places of the route 3, 6, 12 and 24 mm ahead of it, in the route's frame | that distance |
+    | 27 to 30 | lumen radius at these places | 2 mm |
+    | 31 | slack: Δ by the encoder less the abscissa | 10 mm |
+
+    For each catheter five more follow, which are as 0 to 4.
+
+    With `observation="image"` it is a dictionary: `measured` is 0 to 8 of these and what follows for catheters, and
+    `image` a `Box(0, 255, (views, pixels, pixels), uint8)`, the X-ray images of the last exposure. The vessel is laid
+    under them as a roadmap, light grey; the target is a white square of 3 × 3 pixels, the wire dark. An image shows the
+    whole vessel. `c_arm=FluoroscopeConfig(biplane=False)` takes one view in place of two.
+
     ## Reward
 
     The sum of
@@ -149,14 +191,15 @@ class NavigateVectorEnv(VectorEnv):
     | every step | −0.01 |
     | every step that ends with a force of the wall beyond the navigation's limit | −0.1 |
     | the target | 5 |
+    | every exposure, except the one at the start | −0.05 |
 
     Where the catheter's tip is to go to the target, every mm counts that the wire's tip or the catheter's comes nearer.
 
     ## Start
 
     Inserted lengths as the navigation says; the wire's rotation is drawn evenly over a full turn, a catheter's is 0.
-    World i of a vector
-    environment that is reset with seed s draws what a single environment that is reset with seed s + i draws.
+    Where seeing costs, an exposure shows the start. World i of a vector environment that is reset with seed s draws
+    what a single environment that is reset with seed s + i draws.
 
     ## End of an episode
 
@@ -174,18 +217,29 @@ class NavigateVectorEnv(VectorEnv):
     one node at the end of the step), `valid`, `success`, `safe` (no force beyond the limit so far), `distance_mm` (path
     length to the target from the tip that is to arrive), `inserted_length` (mm), `rotation` (rad), `tip_abscissa` (mm),
     `tip_offset` (mm), `tip_branch`, `time_s`; and for each catheter `catheter_1_inserted_length`,
-    `catheter_1_rotation`, `catheter_1_tip_abscissa`, `catheter_1_tip_offset`, `catheter_1_tip_branch`. In a single
-    environment they are numbers.
+    `catheter_1_rotation`, `catheter_1_tip_abscissa`, `catheter_1_tip_offset`, `catheter_1_tip_branch`. With a robot
+    also what it measures of the wire, `encoder_inserted_length`, `encoder_rotation`, `load_n`, `load_nmm`. Where seeing
+    costs also `exposed` (whether the observation holds a new exposure) and `exposures` (in the episode so far). In a
+    single environment they are numbers.
 
     ## Arguments
 
     `endopilot/Navigate-v0`: 15 mm into the posterior descending artery of the reference right coronary artery (patient
     0 of the textbook atlas with seed 0). `endopilot/NavigateCoaxial-v0`: the same place, to which the tip of a
-    microcatheter (`microcatheter-1.7f`) is to be brought over the wire. The others are the tasks of the ladder's
-    version 1, as `endopilot/Crux-v0`, in patients of their own, which are not those that the ladder is scored on; world
-    i has patient (`patient` + i) modulo `patients`. With `catheter` a task is to be done by the tip of that catheter.
-    Or give `navigations` of your own. With `motion` the vessels move; positions are those in the vessel as CT shows
-    it, and every episode begins at the phase of the CT.
+    microcatheter (`microcatheter-1.7f`) is to be brought over the wire. `endopilot/NavigateXray-v0`: the first with
+    `observation="xray"`, which any of them takes. The others are the tasks of the ladder, of its version 2 as
+    `endopilot/Crux-v2` (and `endopilot/Follow-v2`, of wire and catheter), of its version 1 as `endopilot/Crux-v0`, in
+    patients of their own, which are not those that the ladder is scored on; world i has patient (`patient` + i) modulo
+    `patients`. `version` takes a folder of tasks of your own as `endopilot ladder --version` does. With `catheter` a
+    task is to be done by the tip of that catheter. Or give `navigations` of your own. With `motion` the vessels move;
+    positions are those in the vessel as CT shows it, and every episode begins at the phase of the CT; an exposure takes
+    off what `Navigation.known_motion` says.
+
+    `world` is what reality is where it differs: a `World`, its name or file, or several, of which world i has number i
+    modulo their number. What these draw by chance they draw by the number i. With "random" each episode draws friction,
+    half to twice what is given, ostium (±2.5 mm) and registration (±1 mm along each axis). `robot` is the same of
+    robots; a random one has plays of up to 2.6 mm and 0.9 turns, gains of 0.95 to 1.05, a latency of up to 0.1 s, and
+    encoders at its motors or on the devices.
 
     ## Version history
 
@@ -206,9 +260,14 @@ class NavigateVectorEnv(VectorEnv):
         patient: int = 0,
         patients: int = 1,
         catheter: str | None = None,
+        version: LadderVersion = 1,
+        observation: Observed = "state",
+        pixels: int = 64,
+        c_arm: FluoroscopeConfig | None = None,
+        world: World | str | Path | Sequence[World | str | Path] | None = None,
+        robot: RobotConfig | str | Path | Sequence[RobotConfig | str | Path] | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         motion: Motion | None = None,
-        robot: RobotConfig | str | None = None,
         config: SimulatorConfig = CORE,
         render_mode: str | None = None,
     ) -> None:
@@ -221,15 +280,24 @@ class NavigateVectorEnv(VectorEnv):
             patient: the first of its training patients.
             patients: number of its training patients that the worlds have.
             catheter: name of a catheter around the wire, or a YAML file; its tip is to arrive then.
+            version: of the ladder that the task is of, or a folder of tasks of one's own. Without a task the worlds
+                have those of the folder in turn.
+            observation: what is observed.
+            pixels: rows and columns of an image, 64 to 128.
+            c_arm: its views, one or two, and errors of detection.
+            world: what reality is where it differs from the navigations, or its name or YAML file; or several, of which
+                world i has number i modulo their number; or "random".
+            robot: what drives, likewise; the devices do as they are told if not given, or where X-ray shows the tip,
+                robots are as assumed.
             autoreset_mode: whether an ended world is reset at the next step.
             motion: how heart and breath move all vessels and their guiding catheters; they lie still if not given.
-            robot: what drives, or its name or YAML file; the devices do as they are told if not given.
             config: settings of the rod core.
             render_mode: "rgb_array" lets `render` return pictures.
 
         Raises:
             InputError: no world, no such task or catheter, a catheter for navigations of one's own; a device that is
-                slower than an action of 1 or does not fit; navigations with different catheters; no such robot.
+                slower than an action of 1 or does not fit; navigations with different catheters; no such robot or
+                world, or worlds that cannot be stepped together.
         """
         if num_envs < 1:
             raise InputError(f"num_envs: {num_envs}; give at least 1")
@@ -237,24 +305,38 @@ class NavigateVectorEnv(VectorEnv):
             raise InputError(f"render_mode: {render_mode!r}; give 'rgb_array' or None")
         if autoreset_mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
             raise InputError(f"autoreset_mode: {autoreset_mode}; give AutoresetMode.NEXT_STEP or DISABLED")
+        if observation not in get_args(Observed):
+            raise InputError(f"observation: {observation!r}; choose from {', '.join(get_args(Observed))}")
+        if not _PIXELS[0] <= pixels <= _PIXELS[1]:
+            raise InputError(f"pixels: {pixels}; give {_PIXELS[0]} to {_PIXELS[1]}")
         if navigations is None:
-            navigations = training_navigations(task, patient, patients) if task else [reference_navigation()]
+            ours = task or version != 1
+            navigations = training_navigations(task, patient, patients, version) if ours else [reference_navigation()]
             navigations = in_catheter(navigations, catheter) if catheter else navigations
         elif catheter:
             raise InputError(f"catheter: {catheter}; give it to the navigations")
         given = [navigations] if isinstance(navigations, Navigation) else list(navigations)
-        robot = read_robot(robot) if isinstance(robot, str) else robot
-        worlds = [given[world % len(given)] for world in range(num_envs)]
-        self._prepare(worlds, autoreset_mode, motion, robot, config)
+        if robot is None and observation != "state":
+            robot = RobotConfig()
+        self._given = {
+            "navigations": [given[number % len(given)] for number in range(num_envs)],
+            "observation": observation,
+            "pixels": pixels if observation == "image" else 0,
+            "c_arm": c_arm or FluoroscopeConfig(),
+            "autoreset_mode": autoreset_mode,
+            "reality": {"world": world, "robot": robot, "motion": motion, "config": config},
+        }
+        self._prepare(**self._given)
         self.render_mode = render_mode
 
     def _prepare(
         self,
         navigations: list[Navigation],
+        observation: Observed,
+        pixels: int,
+        c_arm: FluoroscopeConfig,
         autoreset_mode: AutoresetMode,
-        motion: Motion | None,
-        robot: RobotConfig | None,
-        config: SimulatorConfig,
+        reality: dict[str, Any],
     ) -> None:
         first = navigations[0]
         if any((other.catheters, other.arrives) != (first.catheters, first.arrives) for other in navigations):
@@ -267,33 +349,26 @@ class NavigateVectorEnv(VectorEnv):
                     f"an action of 1 is {TRANSLATION_MM_S:g} mm/s and {ROTATION_RAD_S:g} rad/s; give a faster device"
                 )
         count = len(navigations)
-        self.navigations, self._motion, self._config = tuple(navigations), motion, config
-        self._robot, self._robots = robot, None
-        self._readings: np.ndarray | None = None
+        self.navigations = tuple(navigations)
         self.metadata = type(self).metadata | {"autoreset_mode": autoreset_mode}
         self._pictures: dict[int, Picture] = {}
         self.num_envs = count
         self._drives, self._counted = len(first.devices), 1 + first.arriving
         self._fastest = np.tile([TRANSLATION_MM_S, ROTATION_RAD_S], self._drives)
-        self.single_action_space = Box(-1.0, 1.0, (2 * self._drives,), np.float32)
-        self.single_observation_space = space(len(first.catheters))
+        self.single_action_space = Box(-1.0, 1.0, (2 * self._drives + (observation != "state"),), np.float32)
+        self.single_observation_space = space(observation, len(first.catheters), (1 + c_arm.biplane, pixels, pixels))
         self.action_space = batch_space(self.single_action_space, count)
         self.observation_space = batch_space(self.single_observation_space, count)
-        anatomies, stacks = [each.anatomy for each in navigations], [each.stack for each in navigations]
-        if robot is not None:
-            stacks, config = _in_grip(stacks, robot, config)
-        self._simulator = Simulator(anatomies, stacks, motion=motion, config=config)
+        self._reality = Reality(navigations, **reality)
+        self._simulator = self._reality.simulator
         self._routes = RouteTables.of(navigations)
-        limits = [[DriveLimits.of(device, each.anatomy) for device in each.devices] for each in navigations]
-        self._far_ends = np.array([[drive.travel_mm[1] for drive in drives] for drives in limits])
-        if robot is not None:
-            self._robots = Robots(self._simulator, robot, limits, seeds=[(world,) for world in range(count)])
-            self._readings = self._robots.read(self._simulator)
+        self._c_arms: CArms | None = None
+        if observation != "state":
+            self._c_arms = CArms(navigations, self._simulator, config=c_arm, pixels=pixels)
         targets = [navigation.target for navigation in navigations]
         self._target_branch = np.array([target.branch for target in targets])
         self._target_abscissa = np.array([target.abscissa for target in targets])
         self._most_steps = np.array([navigation.periods(CONTROL_PERIOD_S) for navigation in navigations])
-        self._start = np.array([navigation.start for navigation in navigations])
         self._seconds, self._force_limit = (
             np.array([getattr(navigation, name) for navigation in navigations]) for name in ("seconds", "force_limit_n")
         )
@@ -304,7 +379,7 @@ class NavigateVectorEnv(VectorEnv):
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Float[np.ndarray, "worlds features"], dict[str, Any]]:
+    ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode in every world, or in those of `options["reset_mask"]`.
 
         Args:
@@ -322,14 +397,14 @@ class NavigateVectorEnv(VectorEnv):
             for world in np.flatnonzero(mask).tolist():
                 self._generators[world] = seeding.np_random(seeds[world])[0]
         self._begin(mask)
-        now = Measured.current(self._simulator, self._encoders)
+        now = Measured.current(self._simulator, self._reality.encoders)
         distances = self._routes.distance(now.tip)
-        return self._observe(now, distances), self._infos(now)
+        return self._observe(now, distances), self._infos(now, mask)
 
     def step(
         self, actions: ArrayLike
     ) -> tuple[
-        Float[np.ndarray, "worlds features"],
+        Observations,
         Float[np.ndarray, "worlds"],
         Bool[np.ndarray, "worlds"],
         Bool[np.ndarray, "worlds"],
@@ -350,56 +425,53 @@ class NavigateVectorEnv(VectorEnv):
         if control.shape != self.action_space.shape or not np.isfinite(control).all():
             raise InputError(f"actions: shape {control.shape}; give finite numbers of shape {self.action_space.shape}")
         fresh = self._ended & (self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP)
-        control = np.minimum(np.maximum(control, -1.0), 1.0) * self._fastest
+        expose = (control[:, -1] > 0.0) & ~fresh & (self._c_arms is not None)
+        control = np.minimum(np.maximum(control[:, : 2 * self._drives], -1.0), 1.0) * self._fastest
         control[fresh] = 0.0
-        step = self._driven(control.reshape(self.num_envs, self._drives, 2))
-        now = Measured.after(step, self._simulator, self._encoders)
+        control = control.reshape(self.num_envs, self._drives, 2)
+        step = self._reality.drive(control, CONTROL_PERIOD_S, self._steps * CONTROL_PERIOD_S)
+        now = Measured.after(step, self._simulator, self._reality.encoders)
+        self._steps += ~fresh
+        self._expose(expose, self._reality.encoders)
         if fresh.any():
             self._begin(fresh)
-            now = Measured.current(self._simulator, self._encoders)
-        return self._judge(now, fresh)
+            now = Measured.current(self._simulator, self._reality.encoders)
+        return self._judge(now, fresh, expose)
 
-    @property
-    def _encoders(self) -> Float[np.ndarray, "worlds devices 2"] | None:
-        """What the robots' encoders said last."""
-        return None if self._readings is None else self._readings[..., :2]
+    def _expose(self, mask: Bool[np.ndarray, "worlds"], encoders: Float[np.ndarray, "worlds devices 2"]) -> None:
+        """Take exposures in the worlds of a mask."""
+        if self._c_arms is not None:
+            drawn, time_s = self._reality.drawn, self._steps * CONTROL_PERIOD_S
+            self._c_arms.expose(mask, self._simulator, encoders, drawn.registration_mm, time_s)
 
-    def _driven(self, control: Float[np.ndarray, "worlds devices 2"]) -> Step:
-        """Move the devices for a control period, by robots if there are some."""
-        simulator = self._simulator
-        if self._robots is None:
-            travel_mm = (-np.inf, self._far_ends)  # it stops by itself at the ostium
-            inserted = simulator.inserted_length
-            control[..., 0] = within_travel(control[..., 0], inserted, CONTROL_PERIOD_S, travel_mm=travel_mm)
-            return simulator.step(control, CONTROL_PERIOD_S)
-        self._robots.motion.command(control)
-        step = simulator.step(self._robots.advance(CONTROL_PERIOD_S), CONTROL_PERIOD_S)
-        self._robots.follow(simulator)
-        self._readings = self._robots.read(simulator)
-        return step
-
-    def _judge(self, now: Measured, fresh: Bool[np.ndarray, "worlds"]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+    def _judge(
+        self, now: Measured, fresh: Bool[np.ndarray, "worlds"], exposed: Bool[np.ndarray, "worlds"]
+    ) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Score what the worlds did in a step, of which those of `fresh` have only begun."""
         going, before = ~fresh, self._distance
-        self._steps += going
         distances = self._routes.distance(now.tip)
         self._distance = distances[:, : self._counted]
         unsafe = ~is_safe(now.contact_force, self._force_limit) & going
         self._safe &= ~unsafe
-        infos = self._infos(now)
+        infos = self._infos(now, exposed | fresh)
         success = infos["success"] & going
         nearer = (before - self._distance).sum(axis=1)
         rewards = PROGRESS_REWARD * nearer + STEP_REWARD + FORCE_REWARD * unsafe + SUCCESS_REWARD * success
+        rewards = rewards + EXPOSURE_REWARD * exposed
         terminations = (success | ~now.valid) & going
         truncations = (self._steps >= self._most_steps) & ~terminations & going
         self._ended = terminations | truncations
         observations = self._observe(now, distances)
         return observations, np.where(fresh, 0.0, rewards), terminations, truncations, infos
 
-    def _observe(
-        self, now: Measured, distances: Float[np.ndarray, "worlds devices"]
-    ) -> Float[np.ndarray, "worlds features"]:
-        time_share = self._steps * CONTROL_PERIOD_S / self._seconds
+    def _observe(self, now: Measured, distances: Float[np.ndarray, "worlds devices"]) -> Observations:
+        time_s = self._steps * CONTROL_PERIOD_S
+        time_share = time_s / self._seconds
+        if self._c_arms is not None:
+            exposed, images = self._c_arms.exposed, self._given["observation"] == "image"
+            routes = None if images else self._routes
+            measured = observe_exposed(self._reality.proximal, exposed, routes, time_s, time_share)
+            return {"image": exposed.image.copy(), "measured": measured} if images else measured
         return observe(now, self._routes, distances, self._force_limit, time_share)
 
     def draw_from(self, *generators: np.random.Generator) -> None:
@@ -408,19 +480,15 @@ class NavigateVectorEnv(VectorEnv):
 
     def _begin(self, mask: Bool[np.ndarray, "worlds"]) -> None:
         """Start an episode in the worlds of a mask."""
-        turn = self._start[..., 1].copy()
-        worlds = np.flatnonzero(mask)
-        turn[worlds, 0] = [self._generators[world].uniform(0.0, 2 * np.pi) for world in worlds]
-        self._simulator.reset(inserted_length=self._start[..., 0], rotation=turn, worlds=worlds.tolist())
-        if self._robots is not None and self._readings is not None:
-            seeds = [(int(self._generators[world].integers(2**62)),) for world in worlds]
-            self._robots.reset(self._simulator, worlds.tolist(), seeds)
-            self._readings[mask] = self._robots.read(self._simulator, worlds=worlds.tolist())
+        self._reality.begin(mask, self._generators)
         self._steps[mask], self._safe[mask], self._ended[mask] = 0, True, False
         begun = self._routes.distance(self._simulator.project())[:, : self._counted]
         self._distance = np.where(mask[:, None], begun, self._distance)
+        if self._c_arms is not None:
+            self._c_arms.begin(mask, self._generators)
+            self._expose(mask, self._reality.encoders)
 
-    def _infos(self, now: Measured) -> dict[str, Any]:
+    def _infos(self, now: Measured, exposed: Bool[np.ndarray, "worlds"]) -> dict[str, Any]:
         wire = now.tip[:, 0]
         infos: dict[str, Any] = {  # the names of `_MASKS`
             "contact_force_max": now.contact_force,
@@ -436,8 +504,11 @@ class NavigateVectorEnv(VectorEnv):
             "time_s": self._steps * CONTROL_PERIOD_S,
         }
         infos |= dict.fromkeys(_MASKS, self._everyone)
-        if self._readings is not None:
-            for name, values in zip(_MEASURED, np.moveaxis(self._readings[:, 0], -1, 0), strict=True):
+        if (readings := self._reality.drawn.readings) is not None:
+            for name, values in zip(_MEASURED, np.moveaxis(readings[:, 0], -1, 0), strict=True):
+                infos[name], infos[f"_{name}"] = values, self._everyone
+        if self._c_arms is not None:
+            for name, values in (("exposed", exposed), ("exposures", self._c_arms.exposed.count.copy())):
                 infos[name], infos[f"_{name}"] = values, self._everyone
         for k in range(1, self._drives):
             tip = now.tip[:, k]
@@ -453,8 +524,8 @@ class NavigateVectorEnv(VectorEnv):
             self._simulator.state,
             *(array.copy() for array in (self._steps, self._distance, self._safe, self._ended)),
             generators=tuple(dict(copy.deepcopy(generator.bit_generator.state)) for generator in self._generators),
-            robots=copy.deepcopy(self._robots),
-            readings=None if self._readings is None else self._readings.copy(),
+            drawn=copy.deepcopy(self._reality.drawn),
+            exposed=None if self._c_arms is None else copy.deepcopy(self._c_arms.exposed),
         )
 
     def set_state(self, state: NavigationState) -> None:
@@ -467,8 +538,9 @@ class NavigateVectorEnv(VectorEnv):
         self._steps, self._distance, self._safe, self._ended = (
             array.copy() for array in (state.steps, state.distance, state.safe, state.ended)
         )
-        self._robots = copy.deepcopy(state.robots)
-        self._readings = None if state.readings is None else state.readings.copy()
+        self._reality.drawn = copy.deepcopy(state.drawn)
+        if self._c_arms is not None:
+            self._c_arms.exposed = copy.deepcopy(state.exposed)
         for generator, kept in zip(self._generators, state.generators, strict=True):
             generator.bit_generator.state = copy.deepcopy(kept)
 
@@ -489,30 +561,10 @@ class NavigateVectorEnv(VectorEnv):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what `__setstate__` makes the environment of again; the rod core itself cannot be pickled."""
-        return {
-            "navigations": list(self.navigations),
-            "autoreset_mode": self.metadata["autoreset_mode"],
-            "motion": self._motion,
-            "robot": self._robot,
-            "config": self._config,
-            "state": self.state,
-            "spec": self.spec,
-            "render_mode": self.render_mode,
-        }
+        return {"given": self._given, "state": self.state, "spec": self.spec, "render_mode": self.render_mode}
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
-        self._prepare(kept["navigations"], kept["autoreset_mode"], kept["motion"], kept["robot"], kept["config"])
+        self._given = kept["given"]
+        self._prepare(**self._given)
         self.set_state(kept["state"])
         self.spec, self.render_mode = kept["spec"], kept["render_mode"]
-
-
-def _in_grip(
-    stacks: Sequence[Stack], robot: RobotConfig, config: SimulatorConfig
-) -> tuple[list[Stack], SimulatorConfig]:
-    """Return the devices as `in_grip` does, all with one wall."""
-    held = [in_grip(stack, robot, config) for stack in stacks]
-    if any(core != held[0][1] for _, core in held):
-        raise InputError(
-            "robot: its grip is weaker than devices of different push limits; give config a wall stiffness"
-        )
-    return [stack for stack, _ in held], held[0][1]

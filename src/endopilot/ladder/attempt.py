@@ -105,6 +105,9 @@ def attempt(
 ) -> dict[str, Any]:
     """Let a policy drive a navigation, and return its figures, its course and its recording.
 
+    Where the policy searches, `planning_s` is the processor time that its searches took, s. It is no figure: it differs
+    from run to run.
+
     Args:
         policy: its name.
         navigation: what is to be done, as the policy is given it.
@@ -117,7 +120,9 @@ def attempt(
     """
     driver = make_policy(policy)
     record = _drive(navigation, driver, seed, world, robot or RobotConfig())
-    return {"seed": seed} | scored(navigation, record, tells=isinstance(driver, AgentPolicy))
+    result = {"seed": seed} | scored(navigation, record, tells=isinstance(driver, AgentPolicy))
+    planning_s = getattr(driver, "planning_s", None)
+    return result if planning_s is None else result | {"planning_s": round(planning_s, 2)}
 
 
 def scored(navigation: Navigation, record: NavigationRecord, *, tells: bool = False) -> dict[str, Any]:

@@ -25,7 +25,8 @@ def score(tasks: Sequence[Task], results: Mapping[str, Sequence[Mapping[str, Any
     `seconds` and `path_ratio` (length of the tip's path over that of the centerline); and of all the median of
     `peak_force_n` (N) and the mean of `exposures`. Rows of `agent` have `missed_events`, the share
     of the events of all their navigations that X-ray did not show (docs/xray.md). Rows of tasks with `near_mm` have
-    `near`, the share of navigations in which the tip came so near to the target, whatever the force.
+    `near`, the share of navigations in which the tip came so near to the target, whatever the force. Rows of policies
+    that search have `planning_s`, the mean processor time of a navigation's searches, s; `timeless` leaves it out.
     """
     rows = [{"level": task.level, "task": task.name} | score_navigations(results[task.name]) for task in tasks]
     levels = {task.level: task.name for task in tasks}
@@ -44,6 +45,9 @@ def score_navigations(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     def median(name: str, of: Sequence[Mapping[str, Any]], digits: int) -> float | None:
         return round(float(np.median([result[name] for result in of])), digits) if of else None
 
+    def mean(name: str) -> float:
+        return round(float(np.mean([result[name] for result in results])), 1)
+
     events = [result["events"] for result in results if "events" in result]
     missed = round(sum(unseen for _, unseen in events) / max(sum(count for count, _ in events), 1), 4)
     return {
@@ -53,6 +57,12 @@ def score_navigations(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "seconds": median("seconds", reached, 1),
         "path_ratio": median("path_ratio", reached, 3),
         "peak_force_n": median("peak_force_n", results, 4),
-        "exposures": round(float(np.mean([result["exposures"] for result in results])), 1),
+        "exposures": mean("exposures"),
         **({"missed_events": missed} if len(events) == len(results) else {}),
+        **({"planning_s": mean("planning_s")} if all("planning_s" in result for result in results) else {}),
     }
+
+
+def timeless(scores: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the scores of a row that are the same in every run."""
+    return {name: value for name, value in scores.items() if name != "planning_s"}

@@ -22,7 +22,7 @@ from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
 from endopilot.files import input_hash, json_text, manifest, read_json, write_json
 from endopilot.ladder.attempt import Recording, navigation_seed, repeat
-from endopilot.ladder.scores import score
+from endopilot.ladder.scores import score, timeless
 from endopilot.navigation.policies import POLICIES
 from endopilot.parallel import each
 from endopilot.settings import CountOrZero, Seed, from_record, read_settings, settings
@@ -135,6 +135,7 @@ def task_digest(task: Task) -> str:
     if task.anatomies is not None:
         hashes = [next(iter(input_hash(Path(folder)).values())) for folder in task.anatomies]
         definition |= {"anatomies": hashes, "device": None}  # what they hold, wherever they lie
+        definition |= {"catheter": None} if task.catheter else {}
     content = json_text(definition) + json_text(read_wire(task.device))
     content += json_text(read_catheter(task.catheter)) if task.catheter else ""
     return hashlib.sha256(content.encode()).hexdigest()
@@ -172,7 +173,7 @@ def write_submission(
             name: tuple(NavigationEntry(**{key: value for key, value in one.items() if key in known}) for one in done)
             for name, done in results.items()
         },
-        scores=tuple(dict(row) for row in scores),
+        scores=tuple(timeless(row) for row in scores),
         robot=robot,
         world=world,
     )

@@ -20,8 +20,9 @@ import numpy as np
 from pydantic import model_validator
 
 from endopilot import __version__
-from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_source
+from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import read_anatomy, write_anatomy
+from endopilot.anatomy.read_source import read_source
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.control.navigate import NavigateConfig
 from endopilot.dataset.again import episode_set_up

@@ -106,6 +106,12 @@ class RobotLog:
         arrays = {name: value[chosen] for name, value in vars(self).items() if isinstance(value, np.ndarray)}
         return replace(self, **arrays)
 
+    def from_row(self, first: int) -> RobotLog:
+        """Return the log of one episode from a row on; velocities are summed up from there."""
+        before = self.command[:first][self.commanded[:first]]
+        rest = self.rows(np.arange(len(self)) >= first)
+        return replace(rest, command=rest.command - before[-1]) if self.by_velocity and len(before) else rest
+
     def _velocities(self) -> Float[np.ndarray, "rows devices 2"]:
         """Return the velocities that `command` is the sum of; the last one of an episode moves nothing."""
         velocity = np.full_like(self.command, np.nan)

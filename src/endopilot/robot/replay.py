@@ -19,6 +19,7 @@ from endopilot.anatomy.tree import tangents
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
+from endopilot.robot.candidates import LEAST_EPISODES, UNKNOWN_SHARE, Candidates
 from endopilot.robot.course import STARTS, Courses
 from endopilot.robot.log import RobotLog
 from endopilot.settings import OpenShare, Within, settings
@@ -67,6 +68,8 @@ class EpisodeReplay:
         branch: of both tips.
         force: of the drive, N, as the log has it and simulated, at each of its readings after the first tip.
         rotation_rad: φ that the simulated wire began with.
+        rotation_known_rad: rotations no farther from it than this are as good, as what was given tells; NaN where it
+            does not tell.
     """
 
     number: int
@@ -81,6 +84,7 @@ class EpisodeReplay:
     branch: Float[np.ndarray, "tips 2"]
     force: Float[np.ndarray, "readings 2"]
     rotation_rad: float
+    rotation_known_rad: float
 
     @property
     def errors(self) -> dict[str, float]:
@@ -111,17 +115,27 @@ class Prepared:
 
 
 def usable_episodes(logs: Sequence[RobotLog], anatomy: Anatomy) -> list[RobotLog]:
-    """Return the episodes that can be replayed, with tips in space.
+    """Return the episodes that can be replayed, with tips in space, from the last command before the first tip on.
+
+    What a drive did before that, such as a retraction to where an episode begins, tells nothing of where in its play
+    the wire lies: nobody saw whether the wire followed.
 
     Raises:
         InputError: there is none.
     """
     found = [episode for log in logs for episode in log.in_vessel(anatomy.tree).episodes()]
-    found = [each for each in found if each.seen.sum() >= LEAST_TIPS and each.commanded.sum() > 1]
+    found = [each.from_row(_first_row(each)) for each in found if each.seen.sum() >= LEAST_TIPS]
+    found = [each for each in found if each.commanded.sum() > 1]
     if not found:
         names = ", ".join(log.name for log in logs)
         raise InputError(f"{names}: no episode shows the tip {LEAST_TIPS} times; log longer ones, or mark fewer resets")
     return found
+
+
+def _first_row(log: RobotLog) -> int:
+    """Return the row of the last command at or before the first tip, or of the first command."""
+    commands, first = np.flatnonzero(log.commanded), int(np.argmax(log.seen))
+    return int(commands[max(0, np.searchsorted(commands, first, side="right") - 1)]) if len(commands) else 0
 
 
 def replay_log(
@@ -173,7 +187,6 @@ def replay_prepared(
 ) -> list[EpisodeReplay]:
     """Replay episodes that are prepared, as `replay_log` does."""
     device, simulator = in_grip(device, robot, simulator or PRESETS["fast"])
-    device, simulator = in_grip(device, robot, simulator or PRESETS["fast"])
     times, course = _proximal(of, robot)
     at_tips = _at(times, course[..., 0], of.courses.seen_s)
     depth = np.nanmedian(np.where(of.given, of.abscissa - at_tips, np.nan), axis=1)
@@ -181,6 +194,7 @@ def replay_prepared(
     tried = _simulated(of, device, times, course, depth, angles, simulator)
     first = np.argmin(tried.cost, axis=1)
     rows = np.arange(len(of.logs))
+    known = [_known_rotation(_far_from(of, tried.tip, int(k)), angles[k]) for k in rows]
     # Once more where the wire lay deeper, or less deep, than without the vessel, and from around the best rotation.
     behind = np.where(of.given, of.abscissa - tried.abscissa[rows, first], np.nan)
     depth = depth + np.nanmedian(behind, axis=1)
@@ -189,7 +203,7 @@ def replay_prepared(
     tried = _simulated(of, device, times, course, depth, near, simulator)
     best = np.argmin(tried.cost, axis=1)
     return [
-        _episode(of, k, tried, int(best[k]), at_tips[k] + depth[k], float(near[k, best[k]]), times[k, 1:])
+        _episode(of, k, tried, int(best[k]), at_tips[k] + depth[k], (float(near[k, best[k]]), known[k]), times[k, 1:])
         for k in range(len(best))
     ]
 
@@ -265,23 +279,43 @@ def _simulated(
             tip[k, j], abscissa[k, j] = at_tips[:, :3], at_tips[:, 3]
             nearest = np.clip(np.searchsorted(ends, seen_s[k]), 0, last - 1)
             branch[k, j], force[k, j, :last] = moved.tip.branch[row, nearest, 0], moved.drive_force[row, :, 0]
-    return _Tried(tip, abscissa, branch, force, _costs(of, tip, of.given))
+    return _Tried(tip, abscissa, branch, force, _costs(of, tip))
 
 
-def _costs(
-    of: Prepared, tip: Float[np.ndarray, "episodes worlds tips 3"], used: Bool[np.ndarray, "episodes tips"]
-) -> Float[np.ndarray, "episodes worlds"]:
+def _costs(of: Prepared, tip: Float[np.ndarray, "episodes worlds tips 3"]) -> Float[np.ndarray, "episodes worlds"]:
     """Return how far tips are from the real ones on average, at most `FAR_MM`, as the camera sees them, mm.
 
     The last tips count most: where the wire lies when the prediction begins matters, not how it came there.
     """
     cost = np.zeros(tip.shape[:2])
-    for k, log in enumerate(of.logs):
-        count = int(log.seen.sum())
-        far = np.linalg.norm(_in_view(log, tip[k, :, :count]), axis=-1)[:, used[k, :count]]
+    for k in range(len(cost)):
+        far = _far_from(of, tip, k)
         age = np.arange(far.shape[1])[::-1] / far.shape[1]
-        cost[k] = np.average(np.minimum(far, FAR_MM), axis=1, weights=np.exp(-age / _FADES))
+        cost[k] = np.average(far, axis=1, weights=np.exp(-age / _FADES))
     return cost
+
+
+def _far_from(
+    of: Prepared, tip: Float[np.ndarray, "episodes worlds tips 3"], k: int
+) -> Float[np.ndarray, "worlds given"]:
+    """Return how far tips of an episode are from the real ones that are given, at most `FAR_MM`, mm."""
+    log, used = of.logs[k], of.given[k, : int(of.logs[k].seen.sum())]
+    far = np.linalg.norm(_in_view(log, tip[k, :, : len(used)]), axis=-1)[:, used]
+    return np.minimum(far, FAR_MM)
+
+
+def _known_rotation(far: Float[np.ndarray, "worlds given"], angles: Float[np.ndarray, "worlds"]) -> float:
+    """Return half the arc of the rotations that are as good as the best, rad; NaN where that is most of a turn.
+
+    Args:
+        far: how far the tips of worlds are from the real ones, mm.
+        angles: equal ones, that the worlds began with, rad.
+    """
+    parts = [part.sum(axis=1) for part in np.array_split(far, LEAST_EPISODES, axis=1)]
+    good = Candidates(("rotation",), angles[:, None], np.stack(parts, axis=1)).as_good
+    gaps = np.diff(np.flatnonzero(np.tile(good, 2))[: good.sum() + 1])
+    arc = 1 - (gaps.max() - 1) / len(angles)  # of a turn, with half a step to either side
+    return np.pi * arc if arc < UNKNOWN_SHARE else np.nan
 
 
 def _in_view(log: RobotLog, tip: Float[np.ndarray, "*worlds tips 3"]) -> Float[np.ndarray, "*worlds tips 3"]:
@@ -307,7 +341,7 @@ def _episode(
     tried: _Tried,
     world: int,
     driven: Float[np.ndarray, "tips"],
-    rotation: float,
+    rotation: tuple[float, float],
     ends: Float[np.ndarray, "periods"],
 ) -> EpisodeReplay:
     log, count = of.logs[k], int(of.courses.seen[k].sum())
@@ -330,7 +364,8 @@ def _episode(
         along=tangents(line.points)[nearest],
         branch=np.column_stack([of.branch[k, :count], tried.branch[k, world, :count]]),
         force=np.column_stack([log.load[measured, 0, 0], pushed]),
-        rotation_rad=rotation,
+        rotation_rad=rotation[0],
+        rotation_known_rad=rotation[1],
     )
 
 

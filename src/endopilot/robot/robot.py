@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -20,10 +20,8 @@ from endopilot.simulation.state import Step
 CYCLE_S = 0.05
 """Longest period of a drive's loop, s: in the simulator its motors' mean velocity over it moves the devices. The core's
 time step, a quarter of it, doubles what a navigation costs that plans nothing, and changes none of its figures."""
-_BACKS_OUT_MM_S = 5.0
+BACKS_OUT_MM_S = 5.0
 """Speed at which a guiding catheter backs out of the ostium, mm/s: an assumption."""
-_HAIR_MM = 1e-9
-"""What rounding may add to an inserted length, mm."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +89,7 @@ class SimulatedRobot:
             cycle_s: period of the drives' loop, s.
         """
         self._simulator, self._limits, self._random = simulator, tuple(limits), np.random.default_rng([seed, 1])
-        counted = [_by_encoder(limit, ostium_mm) for limit in limits]
+        counted = [limit.by_encoder(ostium_mm) for limit in limits]
         self._robots = Robots(simulator, config or RobotConfig(), [counted], seeds=[[seed]], ostium_mm=ostium_mm)
         self._backs_out_s, self._backs_out_mm = backs_out
         self._readings: list[Float[np.ndarray, "devices 4"]] = []
@@ -143,7 +141,7 @@ class SimulatedRobot:
         if not self._backs_out_mm or self._robots.motion.time_s < self._backs_out_s - period / 2:
             return 0.0
         room = max(0.0, float(self._simulator.inserted_length.min()))
-        back_mm = min(_BACKS_OUT_MM_S * period, self._backs_out_mm, room)
+        back_mm = min(BACKS_OUT_MM_S * period, self._backs_out_mm, room)
         self._backs_out_mm -= back_mm
         return back_mm
 
@@ -165,9 +163,3 @@ class SimulatedRobot:
         """
         read = np.array(self._readings).reshape(1, -1, len(self._limits), 4)
         return {"encoders": read[..., :2], "load": read[..., 2:]}
-
-
-def _by_encoder(limits: DriveLimits, ostium_mm: float) -> DriveLimits:
-    """Return limits whose far end, by the encoder, is no deeper than where the device truly ends."""
-    low, high = limits.travel_mm
-    return replace(limits, travel_mm=(low, high - max(ostium_mm, 0.0) - _HAIR_MM))

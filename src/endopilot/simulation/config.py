@@ -58,6 +58,11 @@ class SimulatorConfig:
     bed of springs (Winkler) that stiffen as the heart's muscle does. It takes the place of `wall_stiffness_n_mm` if
     given. An artery that lies in that muscle has 0.01; docs/physics.md derives it. A softer wall would yield farther
     than distance maps reach."""
+    friction_along: tuple[Annotated[float, Within(0, 100)], ...] = ()
+    """Factors on friction along the vessel: at even distances from the ostium to the end of the longest path, linear
+    between. It is the same everywhere if none is given."""
+    wall_along: tuple[Annotated[float, Within(0.1, 10)], ...] = ()
+    """The same on the stiffness of a compliant wall."""
     stick_velocity_mm_s: Annotated[float, Within(1e-9, 1000)] = 0.05
     """Slip velocity under which smoothed Coulomb friction falls off, mm/s; a wire at rest creeps more slowly."""
     approach_velocity_mm_s: Annotated[float, Within(0.1, 1000)] = 20.0
@@ -80,6 +85,8 @@ class SimulatorConfig:
         steps = SAMPLE_PERIOD_S / self.time_step_s
         if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
             raise ValueError(f"time_step_s: {self.time_step_s} does not divide {SAMPLE_PERIOD_S} s; give e.g. 0.0125")
+        if self.wall_along and self.compliant_wall_n_mm2 is None:
+            raise ValueError("wall_along: the wall is not compliant; give compliant_wall_n_mm2 too, such as 0.01")
         return self
 
     @property

@@ -36,7 +36,7 @@ class Group:
         stack: the wire and its catheters, as the first of them has it.
         rod: its nodes and stiffnesses.
         lumen: the wall, as the core has it.
-        wall_reach_mm: how far outside the wall it goes.
+        wall: how far outside the wall it goes, mm, and how the stiffness of the wall varies along the vessel.
         motion: of the vessel, as the core has it; None if it lies still.
         simulation: the worlds, as the core has them.
         index: their numbers, ascending.
@@ -49,7 +49,7 @@ class Group:
     stack: Stack
     rod: RodLayout
     lumen: Lumen
-    wall_reach_mm: float
+    wall: tuple[float, tuple[float, ...]]
     motion: CoreMotion | None
     simulation: Simulation
     index: Integer[np.ndarray, "members"]
@@ -90,12 +90,8 @@ def make_groups(
         InputError: a device that does not fit its anatomy or the catheter around it; a distance map that is not finite,
             or negative at the ostium; more worlds than the memory holds.
     """
-    core = core_for(config.processor)
-    prepared = [
-        group
-        for group in sharing
-        if isinstance(group.lumen, core.Lumen) and group.wall_reach_mm == config.wall_reach_mm
-    ]
+    core, wall = core_for(config.processor), (config.wall_reach_mm, config.wall_along)
+    prepared = [group for group in sharing if isinstance(group.lumen, core.Lumen) and group.wall == wall]
     lumens = {_wall_key(group.anatomy, group.stack): group.lumen for group in prepared}
     projectors = {group.anatomy.identity: group.project for group in sharing}
     members: dict[GroupKey, list[int]] = {}
@@ -131,5 +127,5 @@ def make_groups(
             transmission=lay_out_transmission(stack, longest_mm=longest_mm + FREE_BEHIND_MM),
         )
         where = (np.array(worlds), path_mm, longest_mm, projectors[anatomy.identity])
-        groups.append(Group(anatomy, stack, rod, lumens[key], config.wall_reach_mm, moving, simulation, *where))
+        groups.append(Group(anatomy, stack, rod, lumens[key], wall, moving, simulation, *where))
     return groups

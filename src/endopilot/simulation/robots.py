@@ -61,27 +61,30 @@ class Robots:
     def __init__(
         self,
         simulator: Simulator,
-        config: RobotConfig,
+        config: RobotConfig | Sequence[RobotConfig],
         limits: Sequence[Sequence[DriveLimits]],
         *,
         seeds: Sequence[Seed],
-        ostium_mm: float = 0.0,
+        ostium_mm: float | Float[np.ndarray, "worlds"] = 0.0,
     ) -> None:
         """Grasp the devices where they are.
 
         Args:
             simulator: whose devices they are.
-            config: latency, gains, plays, encoders and noise.
+            config: latency, gains, plays, encoders and noise, of all robots or of each world's.
             limits: of the drives of each world, by the encoders.
             seeds: of each world's robot.
-            ostium_mm: the true inserted lengths are this much more than the encoders', mm.
+            ostium_mm: the true inserted lengths are this much more than the encoders', mm, in all worlds or in each.
         """
-        devices = len(limits[0])
-        self._at_motor, self.ostium_mm = config.encoders_at == "motor", ostium_mm
-        self._noise = config.of_drives(devices, "encoder_sd_mm", "encoder_sd_rad")
-        self._load_noise = config.of_drives(devices, "load_sd_n", "load_sd_n_mm")
-        self._random = [np.random.default_rng([*seed, 8]) for seed in seeds]
-        self.motion = DriveMotion(config, limits, self._counted(simulator), seeds=[[*seed, 7] for seed in seeds])
+        worlds, devices = len(limits), len(limits[0])
+        configs = [config] * worlds if isinstance(config, RobotConfig) else list(config)
+        self.ostium_mm = np.broadcast_to(ostium_mm, worlds).astype(float)
+        self._configs, self._at_motor = configs, np.zeros((worlds, 1, 1), dtype=bool)
+        self._noise, self._load_noise = np.zeros((2, worlds, devices, 2))
+        self._random = [np.random.default_rng()] * worlds
+        self._grasp(range(worlds), seeds)
+        counted = self._counted(simulator)
+        self.motion = DriveMotion(configs, limits, counted, seeds=[[*seed, 7] for seed in seeds])
 
     def advance(self, duration: float) -> Float[np.ndarray, "worlds devices 2"]:
         """Let some time pass, s, and return the mean velocities with which the drives move the devices in it."""
@@ -91,11 +94,26 @@ class Robots:
         """Take from where the devices have come to that some did not follow."""
         self.motion.position = self._counted(simulator)
 
-    def reset(self, simulator: Simulator, worlds: Sequence[int], seeds: Sequence[Seed]) -> None:
-        """Let other robots grasp the devices of some worlds, at rest."""
-        for world, seed in zip(worlds, seeds, strict=True):
-            self._random[world] = np.random.default_rng([*seed, 8])
-        self.motion.reset(worlds, self._counted(simulator)[list(worlds)], [[*seed, 7] for seed in seeds])
+    def reset(
+        self,
+        simulator: Simulator,
+        worlds: Sequence[int],
+        seeds: Sequence[Seed],
+        configs: Sequence[RobotConfig] | None = None,
+    ) -> None:
+        """Let other robots grasp the devices of some worlds, at rest.
+
+        Args:
+            simulator: whose devices they are.
+            worlds: their numbers.
+            seeds: of their robots.
+            configs: of these; as before if not given.
+        """
+        for world, config in [] if configs is None else zip(worlds, configs, strict=True):
+            self._configs[world] = config
+        self._grasp(worlds, seeds)
+        counted, chosen = self._counted(simulator)[list(worlds)], [self._configs[world] for world in worlds]
+        self.motion.reset(worlds, counted, [[*seed, 7] for seed in seeds], chosen)
 
     def read(
         self,
@@ -115,15 +133,26 @@ class Robots:
         places = self.counted(simulator)[chosen]
         own, shape = [self._random[world] for world in chosen], places.shape[1:]
         streams = own if encoder_noise is None else [encoder_noise]
-        encoders = places + self._noise * np.stack([random.standard_normal(shape) for random in streams])
+        encoders = places + self._noise[chosen] * np.stack([random.standard_normal(shape) for random in streams])
         load = simulator.drive_load[chosen]
-        load = load + self._load_noise * np.stack([random.standard_normal(shape) for random in own])
+        load = load + self._load_noise[chosen] * np.stack([random.standard_normal(shape) for random in own])
         return np.concatenate([encoders, load], axis=-1)
 
     def counted(self, simulator: Simulator) -> Float[np.ndarray, "worlds devices 2"]:
         """Return what the encoders count, without noise, mm and rad."""
-        return self.motion.motor if self._at_motor else self._counted(simulator)
+        return np.where(self._at_motor, self.motion.motor, self._counted(simulator))
+
+    def _grasp(self, worlds: Sequence[int], seeds: Sequence[Seed]) -> None:
+        """Take what the robots of some worlds measure, and how noisily."""
+        devices = self._noise.shape[1]
+        for world, seed in zip(worlds, seeds, strict=True):
+            config, self._random[world] = self._configs[world], np.random.default_rng([*seed, 8])
+            self._at_motor[world] = config.encoders_at == "motor"
+            self._noise[world] = config.of_drives(devices, "encoder_sd_mm", "encoder_sd_rad")
+            self._load_noise[world] = config.of_drives(devices, "load_sd_n", "load_sd_n_mm")
 
     def _counted(self, simulator: Simulator) -> Float[np.ndarray, "worlds devices 2"]:
         """Return where the devices are at their drives, counted from where the ostium is assumed."""
-        return simulator.at_drive - [self.ostium_mm, 0.0]
+        places = simulator.at_drive
+        places[..., 0] -= self.ostium_mm[:, None]
+        return places

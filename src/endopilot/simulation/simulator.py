@@ -10,7 +10,7 @@ import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from endopilot.errors import InputError
 from endopilot.progress import Advance
 from endopilot.simulation.checks import ROUNDING_MM, check_control, check_memory, check_travel, with_device_axis
 from endopilot.simulation.config import FREE_BEHIND_MM, LANES, Actuation, SimulatorConfig
+from endopilot.simulation.friction_along import run_along
 from endopilot.simulation.groups import Group, group_key, make_groups
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.processor import gpu_errors
@@ -464,18 +465,19 @@ class Simulator(Readout):
         shape: bool = False,
         advance: Advance | None = None,
     ) -> dict[str, np.ndarray]:
+        run = partial(
+            group.simulation.run,
+            force_driven=by_force,
+            time_step=time_step,
+            record_shape=shape,
+            record_attitude=False,
+            threads=self.config.threads_for(len(group.index), LANES),
+            lanes=LANES,
+        )
         with gpu_errors(self.config.processor):
-            return group.simulation.run(
-                control=control,
-                force_driven=by_force,
-                time_step=time_step,
-                steps_per_sample=steps,
-                record_shape=shape,
-                record_attitude=False,
-                threads=self.config.threads_for(len(group.index), LANES),
-                lanes=LANES,
-                progress=advance,
-            )
+            if self.config.friction_along and control.shape[1]:
+                return run_along(group, control, steps, self.config.friction_along, run, advance)
+            return run(control=control, steps_per_sample=steps, progress=advance)
 
     def _go_on_their_way(self) -> None:
         """Note that the worlds are no longer at their start: what follows is not replayed from there."""
@@ -498,5 +500,5 @@ class Simulator(Readout):
     def _settings(self) -> tuple[Any, ...]:
         """What a state belongs to besides anatomies and devices: settings, but not where it is stepped."""
         names = (name for name in SimulatorConfig.__dataclass_fields__ if name not in ("processor", "threads"))
-        made = tuple((name, getattr(self.config, name)) for name in names)
+        made = tuple((name, value) for name in names if (value := getattr(self.config, name)) != ())
         return self._set_up.actuation == "force", self._set_up.motion, made

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from endopilot.anatomy.distance import CATHETER_LENGTH_MM
 from endopilot.devices.stack import Stack
 from endopilot.simulation.config import FREE_BEHIND_MM, SimulatorConfig
 from endopilot.simulation.core import make_lumen
 from endopilot.simulation.processor import Lumen
-from endopilot.types import Anatomy
+from endopilot.types import Anatomy, DistanceMap, VesselTree
 
 FINE_MM = 0.2
 """Spacing of a finer grid, mm, at most: a tube's axis then reads at most 0.1 mm too near to the wall."""
@@ -34,7 +37,8 @@ def make_wall(anatomy: Anatomy, stack: Stack, config: SimulatorConfig) -> Lumen:
         stack: the wire, and the catheters around it.
         config: settings of the rod core.
     """
-    field, radius_mm = anatomy.distance_map, stack.outer_radius_mm
+    radius_mm = stack.outer_radius_mm
+    field = _stiffened(anatomy, radius_mm, config.wall_along) if config.wall_along else anatomy.distance_map
     wall = make_lumen(field, radius_mm, config.processor, far_mm=config.wall_reach_mm)
     if not stack.catheters or _leaves_room(wall, anatomy, radius_mm):
         return wall
@@ -46,6 +50,37 @@ def make_wall(anatomy: Anatomy, stack: Stack, config: SimulatorConfig) -> Lumen:
         finer=max(2, math.ceil(field.spacing_mm / FINE_MM)),
         spheres=_inscribed_spheres(wall, anatomy),
     )
+
+
+def factor_at(
+    abscissa_mm: Float[np.ndarray, "*n"], tree: VesselTree, factors: Sequence[float]
+) -> Float[np.ndarray, "*n"]:
+    """Return a factor that varies along a vessel.
+
+    Args:
+        abscissa_mm: where, along the path from the ostium; behind it, in the guiding catheter, the first counts.
+        tree: centerlines.
+        factors: at even distances from the ostium to the end of the longest path, linear between.
+    """
+    ends = np.linspace(0.0, float(tree.longest_path().abscissa[-1]), len(factors)) if len(factors) > 1 else [0.0]
+    return np.interp(abscissa_mm, ends, factors)
+
+
+def _stiffened(anatomy: Anatomy, radius_mm: float, factors: Sequence[float]) -> DistanceMap:
+    """Return a map by which the wall is stiffer by a factor that varies along the vessel, as `factor_at` has it.
+
+    A spring K d²/2 of depth d is c² times as stiff where the map gives c d: distances from where a device touches the
+    wall are multiplied by the root of the factor.
+    """
+    field, tree = anatomy.distance_map, anatomy.tree
+    lines = [branch.centerline for branch in tree.branches]
+    nearest = KDTree(np.concatenate([line.points for line in lines]))
+    abscissa, values = np.concatenate([line.abscissa for line in lines]), field.values.copy()
+    where = np.argwhere(values > values.min())
+    _, at = nearest.query(field.origin_mm + field.spacing_mm * where[:, ::-1])
+    root, place = np.sqrt(factor_at(abscissa[at], tree, factors)), tuple(where.T)
+    values[place] = radius_mm + root * (values[place] - radius_mm)
+    return replace(field, values=values)
 
 
 def _leaves_room(wall: Lumen, anatomy: Anatomy, radius_mm: float) -> bool:

@@ -99,6 +99,11 @@ class World:
     """A narrow place."""
     compliant_wall_n_mm2: Annotated[float, Within(0.01, 1e6)] | None = None
     """Stiffness of a compliant wall, N/mm², as in `SimulatorConfig`; as it is given there if not here."""
+    friction_along: tuple[_Factor, ...] = ()
+    """Further factors on friction along the vessel: at even distances from the ostium to the end of the longest path,
+    linear between. In the guiding catheter the first counts."""
+    wall_along: tuple[Annotated[float, Within(0.1, 10)], ...] = ()
+    """The same on the stiffness of a compliant wall."""
     ostium_mm: Finite = 0.0
     """The wire is inserted this much deeper than the encoder says, mm: the ostium lies elsewhere along the catheter."""
     axis_deg: Annotated[float, Within(0, 45)] = 0.0
@@ -128,11 +133,10 @@ class World:
 
     @model_validator(mode="after")
     def _consistent(self) -> World:
-        if self.time_step_s is not None:
-            try:
-                SimulatorConfig(time_step_s=self.time_step_s)
-            except InputError as error:
-                raise ValueError(str(error)) from None
+        try:
+            self.core(SimulatorConfig())
+        except InputError as error:
+            raise ValueError(str(error)) from None
         return self
 
     def drawn(self, anatomy: Anatomy, seed: int) -> World:
@@ -192,8 +196,9 @@ class World:
 
     def core(self, given: SimulatorConfig) -> SimulatorConfig:
         """Return the settings of the rod core that plays reality."""
-        own = {name: getattr(self, name) for name in ("compliant_wall_n_mm2", "element_mm", "time_step_s")}
-        changed = {name: value for name, value in own.items() if value is not None}
+        names = ("compliant_wall_n_mm2", "friction_along", "wall_along", "element_mm", "time_step_s")
+        own = {name: getattr(self, name) for name in names}
+        changed = {name: value for name, value in own.items() if value not in (None, ())}
         return replace(given, **changed) if changed else given
 
     def real_robot(self, given: RobotConfig) -> RobotConfig:

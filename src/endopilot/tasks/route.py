@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.devices.device import Device
+from endopilot.devices.drive_limits import WIDE_MM
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import Target
 from endopilot.types import Anatomy, Centerline, TipProjection, VesselTree
@@ -95,6 +96,14 @@ class Route:
     def branch(self, abscissa: Float[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
         """Return the index of the branch that the route lies in at some abscissae, mm."""
         return np.array(self.branches)[np.searchsorted(self.junctions, abscissa)]
+
+    def width_mm(self, end: float) -> float:
+        """Return the largest width of the lumen from the ostium up to an abscissa, mm."""
+        return 2 * float(self.line.radius[self.line.abscissa <= end].max())
+
+    def is_wide(self, end: float) -> bool:
+        """Return whether a wire may fold in the lumen up to an abscissa, mm, and yet come forward (`WIDE_MM`)."""
+        return self.width_mm(end) > WIDE_MM
 
     def radius(self, abscissa: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Return the lumen radius along the route, mm."""

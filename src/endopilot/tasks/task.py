@@ -85,7 +85,7 @@ class Task:
         ladder: the patients that the ladder is scored on.
         training: patients of the atlas to learn on, if there are any.
         version: of the ladder that the task belongs to; it says which population the patients come from.
-        catheter: shipped catheter around the wire, if any.
+        catheter: catheter around the wire, if any, named as the device.
         arrives: whose tip is to go to the target, "wire" or "catheter"; the wire's if not given.
         start_catheter_mm: inserted length of the catheter at the start, mm; 0 if not given.
         anatomies: folders of anatomies that are the patients of `ladder`, one for each of its numbers, seen from the
@@ -121,10 +121,9 @@ class Task:
 
     @model_validator(mode="after")
     def _consistent(self) -> Task:
-        known_catheters = (*list_catheters(), None)
-        known = {"catheter": known_catheters}
+        known: dict[str, tuple[str | None, ...]] = {}
         if self.anatomies is None:
-            known |= {"vessel": VESSELS, "device": list_wires()}
+            known = {"vessel": VESSELS, "device": list_wires(), "catheter": (*list_catheters(), None)}
         for name, choices in known.items():
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name}: {getattr(self, name)!r}; choose from {', '.join(filter(None, choices))}")
@@ -166,6 +165,12 @@ class Task:
         turn = np.random.default_rng([self.ladder.seed, self.ladder.numbers[place]]).uniform(0.0, 2 * np.pi)
         point = None if self.targets_mm is None else self.targets_mm[place]
         return self.navigation(self.patient(self.ladder, place), start_rotation_rad=turn, target_mm=point)
+
+    def learning_navigation(self, place: int) -> Navigation:
+        """Return the task in one of the patients to learn on, or where it has none, in one of the ladder's."""
+        if self.training is None:
+            return self.ladder_navigation(place)
+        return self.navigation(self.patient(self.training, place))
 
     def target(self, tree: VesselTree) -> Target:
         """Return the target in its section of a tree.
@@ -221,14 +226,19 @@ def list_tasks(version: LadderVersion = NEWEST) -> tuple[Task, ...]:
 
 
 def _read_task(path: Path) -> Task:
-    """Return the task of a file, with the paths of its device and anatomies."""
+    """Return the task of a file, with the paths of its devices and anatomies."""
     task = read_settings(path, Task)
     if task.anatomies is None:
         return task
-    beside = path.parent / task.device
+
+    def seen(device: str) -> str:
+        beside = path.parent / device
+        return str(beside) if beside.is_file() else device
+
     return replace(
         task,
-        device=str(beside) if beside.is_file() else task.device,
+        device=seen(task.device),
+        catheter=task.catheter and seen(task.catheter),
         anatomies=tuple(str(path.parent / folder) for folder in task.anatomies),
     )
 
@@ -258,16 +268,22 @@ def _named(name: str, tasks: Sequence[Task]) -> Task:
     raise InputError(f"task: {name!r}; choose from {', '.join(task.name for task in tasks)}")
 
 
-def training_navigations(name: str, first: int, count: int) -> list[Navigation]:
-    """Return a task of the ladder's version 1 in `count` of its training patients, from number `first` on.
+def training_navigations(name: str | None, first: int, count: int, version: LadderVersion) -> list[Navigation]:
+    """Return a task of the ladder in `count` of its training patients, from number `first` on.
 
-    The learning environments `endopilot/NAME-v0` are made of these and stay as they are.
+    A task of one's own that has no such patients is returned in those that it is scored on.
+
+    Args:
+        name: of the task; all tasks of the version, one after another, if not given.
+        first: number of the first patient.
+        count: of patients of each task.
+        version: of the ladder, or a folder of one's own tasks.
 
     Raises:
         InputError: the ladder has no such task, or the task fewer patients.
     """
-    task = find_task(name, version=1)
-    return [task.navigation(task.patient(task.training, first + place)) for place in range(count)]
+    tasks = list_tasks(version) if name is None else (find_task(name, version=version),)
+    return [task.learning_navigation(first + place) for task in tasks for place in range(count)]
 
 
 def in_catheter(navigations: Sequence[Navigation], name: str) -> list[Navigation]:

@@ -18,7 +18,7 @@ WATER_MM = 0.0206
 """Attenuation of water at 60 keV, the mean energy of fluoroscopy's beam, 1/mm (NIST XCOM)."""
 STEEL_MM, COIL_MM = 0.95, 3.0
 """Attenuation of a wire's steel shaft, and of the tungsten or platinum coil over its tip, partly filled, 1/mm."""
-CATHETER_MM, _CATHETER_WALL_MM = 0.23, 0.25
+CATHETER_MM, GUIDE_WALL_MM = 0.23, 0.25
 """Attenuation of a catheter's wall with its barium and its steel braid, 1/mm, and the guiding catheter's thickness,
 mm."""
 MARKER_MM, MARKER_WALL_MM, MARKER_LENGTH_MM = 9.0, 0.03, 1.0
@@ -96,15 +96,24 @@ def catheter_line(anatomy: Anatomy) -> tuple[Float[np.ndarray, "n"], Places, Pla
     return distance, places, heading
 
 
-def in_catheter(anatomy: Anatomy, nodes: Places) -> Places:
+def in_catheter(
+    anatomy: Anatomy,
+    nodes: Places,
+    line: tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None,
+) -> Places:
     """Return the nodes of a wire, LPS mm, with those behind the ostium laid along the guiding catheter's bend.
 
     The rod core's catheter is straight; nothing that it computes depends on what lies behind.
+
+    Args:
+        anatomy: the vessel.
+        nodes: of the wire.
+        line: the guiding catheter's axis (`catheter_line`), where it is known already.
     """
     start = anatomy.insertion
     behind = -((nodes - start.position) @ start.direction)
     inside = behind > 0
-    distance, places, _ = catheter_line(anatomy)
+    distance, places, _ = line or catheter_line(anatomy)
     aside = nodes[inside] - start.position + behind[inside, None] * start.direction
     laid = np.stack([np.interp(behind[inside], distance, axis) for axis in places.T], axis=-1)
     past = np.maximum(behind[inside] - distance[-1], 0.0)[:, None]
@@ -132,13 +141,13 @@ def catheter_lumen_points(anatomy: Anatomy) -> tuple[Places, Float[np.ndarray, "
 def catheter_points(anatomy: Anatomy) -> tuple[Places, float]:
     """Return the wall of the guiding catheter as small volumes: their places, LPS mm, and the size of each, mm³."""
     distance, places, heading = catheter_line(anatomy)
-    radius = anatomy.catheter_radius_mm + _CATHETER_WALL_MM / 2
+    radius = anatomy.catheter_radius_mm + GUIDE_WALL_MM / 2
     at = np.arange(_STEP_MM / 2, distance[-1], _STEP_MM)
     middle = places_on(places, distance, at)
     first, second = _across(places_on(heading, distance, at))
     turn = np.linspace(0, 2 * np.pi, _RING, endpoint=False)[:, None, None]
     ring = radius * (np.cos(turn) * first + np.sin(turn) * second)
-    size = 2 * np.pi * radius * _CATHETER_WALL_MM * _STEP_MM / _RING
+    size = 2 * np.pi * radius * GUIDE_WALL_MM * _STEP_MM / _RING
     return (middle + ring).reshape(-1, 3), size
 
 

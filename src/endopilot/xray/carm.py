@@ -7,21 +7,33 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
+from pydantic import model_validator
 from scipy.spatial.transform import Rotation
 
 from endopilot.settings import Within, settings
+
+_Distance = Annotated[float, Within(100, 5000, unit="mm", mistaken=(("m", 1000.0), ("cm", 10.0)))]
 
 
 @settings
 class CArmGeometry:
     """Distances and pixels of a C-arm."""
 
-    source_to_isocenter_mm: Annotated[float, Within(0, 10000, above_low=True)] = 765.0
+    source_to_isocenter_mm: _Distance = 765.0
     """Distance of the X-ray source from the isocenter, mm."""
-    source_to_detector_mm: Annotated[float, Within(0, 10000, above_low=True)] = 1100.0
+    source_to_detector_mm: _Distance = 1100.0
     """Distance of the X-ray source from the detector, mm."""
     pixel_mm: Annotated[float, Within(0.01, 10)] = 0.308
     """Pixel pitch of the detector in fluoroscopy, mm."""
+
+    @model_validator(mode="after")
+    def _in_order(self) -> CArmGeometry:
+        if self.source_to_detector_mm <= self.source_to_isocenter_mm:
+            raise ValueError(
+                f"source_to_detector_mm: {self.source_to_detector_mm:g}; give more than source_to_isocenter_mm, "
+                f"{self.source_to_isocenter_mm:g}: the patient lies between source and detector"
+            )
+        return self
 
 
 @dataclass(frozen=True, eq=False)

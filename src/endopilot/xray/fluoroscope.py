@@ -15,14 +15,13 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.anatomy.projection import project_tip
+from endopilot.anatomy.projection import TipProjector
 from endopilot.anatomy.tree import tangents
 from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
 from endopilot.settings import Finite, Positive, settings
 from endopilot.simulation.motion import Motion, place, published_mean
 from endopilot.simulation.simulator import Simulator
-from endopilot.tasks.navigation import Navigation
 from endopilot.types import Anatomy, TipProjection
 from endopilot.xray.carm import CArmGeometry, View, view_at
 from endopilot.xray.moving_patient import seen_in_episodes, seen_wire, turned
@@ -64,13 +63,14 @@ class TipMeasurement:
 
     @staticmethod
     def at(
+        project: TipProjector,
         anatomy: Anatomy,
         position: Float[np.ndarray, "3"],
         covariance: Float[np.ndarray, "3 3"],
         sd_mm: tuple[float, float] = (0.0, 0.0),
     ) -> TipMeasurement:
-        """Return the measurement of a position, LPS mm, with its covariance, mm²; `sd_mm` as above."""
-        tip = project_tip(anatomy.tree, anatomy.insertion, position[None])
+        """Return the measurement of a position, LPS mm, with its covariance, mm², in an anatomy; `sd_mm` as above."""
+        tip = project(position[None])
         branch, abscissa = int(tip.branch[0]), float(tip.abscissa[0])
         line, tangent = anatomy.tree.branches[branch].centerline, np.asarray(anatomy.insertion.direction)
         centre = anatomy.insertion.position + abscissa * tangent
@@ -190,6 +190,8 @@ class Fluoroscope:
         self._points = [catheter, *points]
         self._tangents = [np.tile(insertion.direction, (len(behind), 1)), *(tangents(p) for p in points)]
         self._abscissa = [behind, *(line.abscissa for line in lines)]
+        self._shown = [[view.project(line) for line in self._points] for view in self._views]
+        self._project = TipProjector(anatomy.tree, anatomy.insertion)
 
     def expose(
         self, simulator: Simulator, inserted_length: float, random: np.random.Generator, *, time_s: float
@@ -216,7 +218,7 @@ class Fluoroscope:
     ) -> TipMeasurement:
         """Take one exposure of every view and say where the tip is. The arguments are those of `locate`."""
         detections = [self._detect(view, tip_position, tip_direction, random) for view in self._views]
-        return TipMeasurement.at(self._anatomy, *self._likeliest(detections, inserted_length))
+        return TipMeasurement.at(self._project, self._anatomy, *self._likeliest(detections, inserted_length))
 
     def catheter_axis(self, axis: Float[np.ndarray, "3"], random: np.random.Generator) -> Float[np.ndarray, "3"]:
         """Take one exposure of every view and return the guiding catheter's axis as it shows, a unit vector.
@@ -285,7 +287,7 @@ class Fluoroscope:
             for sample in range(position.shape[1]):
                 depth = float(inserted_length[index, sample])
                 position[index, sample] = self.locate(tip[index, sample], heading[index, sample], depth, random)
-        return project_tip(self._anatomy.tree, self._anatomy.insertion, position)
+        return self._project(position)
 
     def _detect(
         self,
@@ -311,8 +313,11 @@ class Fluoroscope:
         prior = [((abscissa - inserted_length) / length_sd) ** 2 for abscissa in self._abscissa]
         magnified = self._views[0].scale / self._config.geometry.source_to_isocenter_mm
         first = []
-        for points, sd, unlikely in zip(self._points, self._lateral_sd, prior, strict=True):
-            squared = sum(((one.view.project(points) - one.pixel) ** 2).sum(axis=1) for one in detections)
+        for branch, (sd, unlikely) in enumerate(zip(self._lateral_sd, prior, strict=True)):
+            squared = sum(
+                ((shown[branch] - one.pixel) ** 2).sum(axis=1)
+                for shown, one in zip(self._shown, detections, strict=True)
+            )
             first.append(squared / (self._config.along_sd**2 + (magnified * sd) ** 2) + unlikely)
         least = min(float(cost.min()) for cost in first)
         best, found = np.inf, (self._points[0][-1], np.eye(3))
@@ -354,38 +359,3 @@ class Fluoroscope:
             beyond = 1 - np.sqrt(2) * sd[nearest] / max(float(np.linalg.norm(lateral)), 1e-9)
             place = place - max(beyond, 0.0) * lateral
         return place, cost, nearest, np.linalg.inv(jacobian.T @ jacobian)
-
-
-def make_c_arm(
-    navigation: Navigation,
-    *,
-    config: FluoroscopeConfig | None = None,
-    seed: int = 0,
-    registration_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> CArm:
-    """Return the C-arm of a navigation, whose exposures are what `Navigation.xray` says.
-
-    Args:
-        navigation: vessel, wire and what is known of its motion.
-        config: geometry and errors.
-        seed: of the pose that a patient lies in whose images are taken, and of these images' noise.
-        registration_mm: the wire shows displaced by this, mm LPS.
-
-    Raises:
-        InputError: images of a wire in a catheter, or of a vessel that is not recognised in them.
-    """
-    anatomy, device, known = navigation.anatomy, navigation.device, navigation.known_motion
-    if navigation.xray == "assumed":
-        return Fluoroscope(
-            anatomy, device.tip_radius_mm, config=config, known_motion=known, registration_mm=registration_mm
-        )
-    from endopilot.xray.image_fluoroscope import ImageFluoroscope  # slow to import
-
-    if navigation.catheters:
-        names = ", ".join(catheter.name for catheter in navigation.catheters)
-        raise InputError(
-            f"xray: images: the detector takes a wire alone, and there is {names} around it; leave the catheter out"
-        )
-    return ImageFluoroscope(
-        anatomy, device, config=config, seed=seed, known_motion=known, registration_mm=registration_mm
-    )

@@ -26,6 +26,7 @@ from endopilot.types import Anatomy, Volume
 from endopilot.xray.absorbers import (
     CATHETER_MM,
     WATER_MM,
+    catheter_line,
     catheter_lumen_points,
     catheter_points,
     driven_catheter_points,
@@ -35,7 +36,7 @@ from endopilot.xray.absorbers import (
     without_contrast,
 )
 from endopilot.xray.carm import CArmGeometry, Pose, View, view_at, view_of
-from endopilot.xray.projector import cast, splat
+from endopilot.xray.projector import Shadow, blurred, cast, splat
 
 PHOTONS_MM2_UGY = 30174.0
 """Photons a mm² and µGy of a fluoroscopy beam (RQA 5 of IEC 62220-1)."""
@@ -46,6 +47,8 @@ _ENTRANCE_MM = 150.0
 _COARSE = 8
 """Scatter is computed for squares of this many pixels a side."""
 _MOST_PULSES = 8
+_WIRE_STEP_MM = 0.1
+"""Distance of the places that a wire is made of, mm; on a coarser detector they are as much farther apart."""
 _ROADMAP_GREY = 90.0
 
 
@@ -115,7 +118,16 @@ class Plane:
 
 
 class XrayImager:
-    """Makes the images of one patient and one wire, alone or with catheters around it."""
+    """Makes the images of one patient and one wire, alone or with catheters around it.
+
+    Attributes:
+        anatomy: the vessel.
+        stack: the wire, and the catheters around it.
+        config: detector and beam.
+        isocenter: the middle of the vessel, about which the C-arm turns, LPS mm.
+        ct: of the patient, HU, without contrast in the vessel's blood; None for 200 mm of water.
+        lumen_points: where the small volumes lie that the vessel's lumen is made of, LPS mm.
+    """
 
     def __init__(
         self,
@@ -135,8 +147,10 @@ class XrayImager:
         """
         self.anatomy, self.stack, self.config = anatomy, Stack.of(device), config or ImageConfig()
         self.isocenter = isocenter_of(anatomy)
-        self._ct = None if ct is None else without_contrast(ct, anatomy)
-        self._filled = [lumen_points(anatomy), catheter_lumen_points(anatomy)]
+        self.ct = None if ct is None else without_contrast(ct, anatomy)
+        self._guide = catheter_line(anatomy)
+        self.lumen_points, self._lumen_size = lumen_points(anatomy)
+        self._guide_lumen = catheter_lumen_points(anatomy)
 
     def plane(
         self,
@@ -158,26 +172,81 @@ class XrayImager:
                 them, LPS mm; the chest around stays.
         """
         placed = np.eye(3, 4) if placed is None else placed
-        config, pixels = self.config, self.config.pixels
-        view = view_at(angles_deg, self.isocenter, config.geometry).magnified(zoom_factor)
+        view = view_at(angles_deg, self.isocenter, self.config.geometry).magnified(zoom_factor)
         if pose is not None:
             view = view_of(view, pose, self.isocenter)
-        if self._ct is None:
-            background = np.full((pixels, pixels), WATER_MM * _PLAIN_MM, dtype=np.float32)
-        else:
-            through = cast(self._ct, view, pixels, min(rays, pixels))
-            wide = zoom(through, pixels / through.shape[0], order=1, grid_mode=True, mode="nearest")
-            background = np.asarray(wide, dtype=np.float32)
-        blur = self._blur_px(zoom_factor)
-        points, size = catheter_points(self.anatomy)
-        background += splat(view, pixels, place(placed, points), size * CATHETER_MM, blur_px=blur)
-        vessel = np.zeros((pixels, pixels), dtype=np.float32)
-        for (places, sizes), width in zip(self._filled, (self.anatomy.distance_map.spacing_mm / 2, 0.1), strict=True):
-            vessel += splat(view, pixels, place(placed, places), sizes, width_mm=width, blur_px=blur)
+        return self.plane_through(self.patient(view, rays=rays), view, zoom_factor, placed)
+
+    def plane_through(
+        self,
+        patient: Float32[np.ndarray, "rows columns"],
+        view: View,
+        zoom_factor: float,
+        placed: Float[np.ndarray, "3 4"],
+    ) -> Plane:
+        """Compute what does not move, but for the patient, which is given.
+
+        Args:
+            patient: from `patient`.
+            view: source and detector, in the CT's frame.
+            zoom_factor: magnification of the image.
+            placed: affine map of vessel and catheter, as `plane` takes it.
+        """
+        background = patient + self.guide(view, zoom_factor, placed)
+        (vessel,) = self.lumen(view, placed, (1.0, self.blur_px(zoom_factor)))
+        vessel += self.guide_lumen(view, zoom_factor, placed)
         primary = np.exp(-background)
         scatter = self._scattered(primary, zoom_factor)
         usual = float(np.log(np.median(primary + scatter)))
         return Plane(view, zoom_factor, background, scatter, vessel, usual, placed)
+
+    def patient(self, view: View, *, rays: int = 256) -> Float32[np.ndarray, "rows columns"]:
+        """Return the attenuation of the patient along each ray, without vessel, catheters and wire.
+
+        Args:
+            view: source and detector.
+            rays: cast through the CT, along each side of the image; their result is interpolated.
+        """
+        pixels = self.config.pixels
+        if self.ct is None:
+            return np.full((pixels, pixels), WATER_MM * _PLAIN_MM, dtype=np.float32)
+        through = cast(self.ct, view, pixels, min(rays, pixels))
+        wide = zoom(through, pixels / through.shape[0], order=1, grid_mode=True, mode="nearest")
+        return np.asarray(wide, dtype=np.float32)
+
+    def guide(
+        self, view: View, zoom_factor: float, placed: Float[np.ndarray, "3 4"]
+    ) -> Float32[np.ndarray, "rows columns"]:
+        """Return the attenuation of the guiding catheter's wall along each ray; arguments as `plane_through` has."""
+        points, size = catheter_points(self.anatomy)
+        blur = self.blur_px(zoom_factor)
+        return splat(view, self.config.pixels, place(placed, points), size * CATHETER_MM, blur_px=blur)
+
+    def guide_lumen(
+        self, view: View, zoom_factor: float, placed: Float[np.ndarray, "3 4"]
+    ) -> Float32[np.ndarray, "rows columns"]:
+        """Return the path of each ray inside the guiding catheter, mm; arguments as `plane_through` has."""
+        points, size = self._guide_lumen
+        blur = self.blur_px(zoom_factor)
+        return splat(view, self.config.pixels, place(placed, points), size, width_mm=0.1, blur_px=blur)
+
+    def lumen(
+        self,
+        view: View,
+        placed: Float[np.ndarray, "3 4"],
+        *parts: tuple[Float[np.ndarray, "n"] | float, float],
+    ) -> list[Float32[np.ndarray, "rows columns"]]:
+        """Return the path of each ray through the vessel's lumen, mm, once for each of some parts of it.
+
+        Args:
+            view: source and detector.
+            placed: affine map of the vessel, as `plane_through` takes it.
+            parts: the share by which the path counts at each of `lumen_points`, such as that of contrast in the blood,
+                and the standard deviation of the detector's blur, pixels.
+        """
+        width = self.anatomy.distance_map.spacing_mm / 2
+        shadow = Shadow(view, self.config.pixels, place(placed, self.lumen_points))
+        return [shadow.of(share * self._lumen_size, width_mm=width, blur_px=blur) for share, blur in parts]
 
     def signal(
         self,
@@ -187,6 +256,7 @@ class XrayImager:
         contrast: float = 0.0,
         dose: float = 1.0,
         seed: int = 0,
+        noise: Float32[np.ndarray, "rows columns"] | None = None,
         velocity: Float[np.ndarray, "n 3"] | None = None,
         catheters: Sequence[Float[np.ndarray, "_ 3"]] = (),
         catheter_velocities: Sequence[Float[np.ndarray, "_ 3"]] | None = None,
@@ -199,6 +269,7 @@ class XrayImager:
             contrast: share of the full contrast in the vessel's blood.
             dose: multiple of the usual dose.
             seed: of the noise.
+            noise: of standard deviation 1, a number for each pixel; drawn if not given.
             velocity: of the nodes, mm/s, which blurs the wire over the pulse; at rest if not given.
             catheters: nodes of each catheter from its tip on, LPS mm of the CT; none if not given.
             catheter_velocities: of these nodes, mm/s; at rest if not given.
@@ -215,10 +286,11 @@ class XrayImager:
         light = np.exp(-attenuation)
         light += plane.scatter
         light *= np.float32(np.exp(-plane.reference))
-        noise = np.random.default_rng([seed, 0x78726179]).standard_normal(light.shape, dtype=np.float32)
-        noise /= np.sqrt(light * np.float32(self.photons(plane, dose)))
+        if noise is None:
+            noise = np.random.default_rng([seed, 0x78726179]).standard_normal(light.shape, dtype=np.float32)
+        noise = noise / np.sqrt(light * np.float32(self.photons(plane, dose)))
         spread = config.scintillator_mm / config.geometry.pixel_mm * plane.zoom
-        return np.log(light) + gaussian_filter(noise, spread)
+        return np.log(light) + blurred(noise, spread)
 
     def grey(
         self,
@@ -248,8 +320,11 @@ class XrayImager:
             nodes: of the wire from its tip on, LPS mm.
         """
         radius = self.stack.wire.tip_radius_mm
-        points, size = wire_points(in_catheter(self.anatomy, nodes), radius, self.config.opaque_tip_mm)
-        blur = self._blur_px(plane.zoom)
+        step_mm = _WIRE_STEP_MM * max(1.0, self.config.geometry.pixel_mm / CArmGeometry().pixel_mm)
+        points, size = wire_points(
+            in_catheter(self.anatomy, nodes, self._guide), radius, self.config.opaque_tip_mm, step_mm
+        )
+        blur = self.blur_px(plane.zoom)
         points = place(plane.placed, points)
         return splat(plane.view, self.config.pixels, points, size, width_mm=radius / 2, blur_px=blur)
 
@@ -264,9 +339,9 @@ class XrayImager:
             number: which one, from the inside out.
         """
         catheter = self.stack.catheters[number]
-        points, size = driven_catheter_points(catheter, in_catheter(self.anatomy, nodes))
+        points, size = driven_catheter_points(catheter, in_catheter(self.anatomy, nodes, self._guide))
         wall_mm = catheter.tip_radius_mm - catheter.inner_diameter_mm / 2
-        blur = self._blur_px(plane.zoom)
+        blur = self.blur_px(plane.zoom)
         points = place(plane.placed, points)
         return splat(plane.view, self.config.pixels, points, size, width_mm=wall_mm / np.sqrt(12), blur_px=blur)
 
@@ -298,7 +373,8 @@ class XrayImager:
         drawn = [draw(plane, nodes - time * velocity) for time in times]
         return np.asarray(np.mean(drawn, axis=0), dtype=np.float32)
 
-    def _blur_px(self, zoom_factor: float) -> float:
+    def blur_px(self, zoom_factor: float) -> float:
+        """Return the blur of focal spot and scintillator, standard deviation, pixels of the image."""
         config = self.config
         return float(np.hypot(config.penumbra_mm, config.scintillator_mm) / config.geometry.pixel_mm * zoom_factor)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Float32
 
+from endopilot.anatomy.projection import TipProjector
 from endopilot.devices.device import Wire
 from endopilot.errors import InputError
 from endopilot.simulation.motion import Motion, published_mean
@@ -83,6 +84,7 @@ class ImageFluoroscope:
         if self.registration.failure:
             raise NotRegistered(f"X-ray images: {anatomy.name} cannot be registered: {self.registration.failure}")
         self._detector = TipDetector(anatomy, device)
+        self._project = TipProjector(anatomy.tree, anatomy.insertion)
         self.forget_wires()
         self._slack_mm = self.refiner.slack_mm(self._views, self._detector.config.slack_mm)
 
@@ -150,7 +152,7 @@ class ImageFluoroscope:
         variance = float(along @ found.covariance @ along)
         across = max(float(np.trace(found.covariance)) - variance, 0.0) / 2
         sd_mm = float(np.sqrt(variance)), float(np.sqrt(across))
-        return TipMeasurement.at(self._anatomy, found.position, found.covariance, sd_mm)
+        return TipMeasurement.at(self._project, self._anatomy, found.position, found.covariance, sd_mm)
 
     def _signal(
         self, plane: Plane, nodes: Float[np.ndarray, "n 3"], random: np.random.Generator, contrast: float = 0.0

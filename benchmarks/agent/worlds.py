@@ -1,0 +1,279 @@
+"""Drive the agent in worlds that it does not know: `python -m benchmarks worlds -o FOLDER`.
+
+In every world the agent drives to a target (planned), and a wire is driven at random under the agent's belief, which
+asks for X-ray (random). The targets are those of the seven coronary tasks of the ladder. The patients are new: two sets
+of atlases that neither the ladder nor a training, a calibration or another benchmark has. On `development` an agent may
+be improved; `test` is for what is published. Both are the first four patients of each atlas that
+`benchmarks.agent.ladder_patients.choose` takes, by the ladder's own rules; the atlas of a task has the seed 19000, or
+20000, and the task's level.
+
+Events, and which of them are missed, are counted as in the ladder, by `navigation_events`, and decisions in both bands
+by `NavigationRecord.in_bands`; a decision that has no band, as of a wire that is lost, counts as outside.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+
+from benchmarks.figures import Bar, judged
+from endopilot.cli.arguments import OutputFolder
+from endopilot.control.agent import AgentPolicy
+from endopilot.files import read_json, write_json
+from endopilot.ladder.attempt import navigation_events
+from endopilot.ladder.ladder import identity
+from endopilot.navigation.loop import LoopConfig, NavigationLoop
+from endopilot.navigation.policy import Decision, Observation
+from endopilot.navigation.record import NavigationRecord
+from endopilot.runs import claim, make_missing
+from endopilot.settings import Within
+from endopilot.simulation.controls import ControlConfig, random_controls
+from endopilot.simulation.world import NOMINAL, World, list_worlds, read_world
+from endopilot.tasks.navigation import Navigation
+from endopilot.tasks.task import CORE, NEWEST, Patients, Task, find_task
+from endopilot.types import SAMPLE_PERIOD_S
+
+Set = Literal["development", "test"]
+Drive = Literal["planned", "random"]
+PATIENTS: dict[Set, dict[str, tuple[int, tuple[int, ...]]]] = {
+    "development": {
+        "descending": (19002, (0, 1, 2, 3)),
+        "stenosis": (19003, (5, 14, 15, 23)),
+        "tortuous": (19004, (0, 8, 10, 11)),
+        "crux": (19006, (10, 14, 18, 36)),
+        "diagonal": (19007, (2, 17, 23, 24)),
+        "circumflex": (19008, (0, 1, 2, 5)),
+        "marginal": (19009, (2, 7, 15, 16)),
+    },
+    "test": {
+        "descending": (20002, (0, 1, 2, 3)),
+        "stenosis": (20003, (7, 10, 18, 23)),
+        "tortuous": (20004, (3, 4, 12, 17)),
+        "crux": (20006, (4, 6, 17, 26)),
+        "diagonal": (20007, (5, 8, 13, 14)),
+        "circumflex": (20008, (3, 4, 8, 9)),
+        "marginal": (20009, (0, 3, 8, 11)),
+    },
+}
+"""Of each set and task, the seed of the atlas and the numbers of the patients in it."""
+PLACES = 28
+"""Patients of a set."""
+SECONDS = 60.0
+"""Length of a navigation at random, s."""
+MOST_EXPOSURES = 40
+"""No planned navigation shall take more."""
+ALARM = "model mismatch"
+"""What the agent says where it asks for X-ray since no simulated wire is right."""
+BARS = {
+    "missed_share": Bar(0.05),
+    "missed_share_worst": Bar(0.12),
+    "exposures_per_minute_nominal": Bar(17),
+    "exposures_per_minute_other": Bar(27),
+    "in_bands_share": Bar(0.9, at_least=True),
+    "in_bands_share_worst": Bar(0.75, at_least=True),
+    "safe_share": Bar(0.95, at_least=True),
+    "safe_share_worst": Bar(0.85, at_least=True),
+    "exposures_planned": Bar(7),
+    "exposures_planned_nominal": Bar(4),
+    "navigations_above_40_exposures": Bar(0),
+    "unsafe_by_force_share": Bar(0.01),
+    "false_alarms_share": Bar(0.1),
+}
+
+
+class DrivenAtRandom(AgentPolicy):
+    """The agent's belief and adviser, while random velocities drive the wire."""
+
+    def start(self, navigation: Navigation, seed: int) -> None:
+        """Lay out the simulated wires, and draw the velocities."""
+        super().start(navigation, seed)
+        config = ControlConfig(first_inserted_length_mm=navigation.start_inserted_length_mm, start_spread=0.0)
+        _, control = random_controls(
+            config,
+            n_sequences=1,
+            n_samples=round(SECONDS / SAMPLE_PERIOD_S),
+            seed=seed,
+            max_inserted_length_mm=float(navigation.anatomy.tree.longest_path().abscissa[-1]),
+        )
+        self._velocities = [(v, w) for v, w in control[0, :, 0].tolist()]
+
+    def decide(self, observation: Observation) -> Decision:
+        """Move on at random, and ask for X-ray as the agent does."""
+        self._observe(observation)
+        wanted = (self._velocities[round(observation.time_s / SAMPLE_PERIOD_S)],)
+        self.belief.drives.sent(wanted)
+        return Decision(wanted, expose=self.wants_xray())
+
+
+def navigation_at(patients: Set, place: int) -> tuple[Task, Navigation, int]:
+    """Return the task and the navigation at a place of a set, and its seed; neighbours have other tasks."""
+    names = list(PATIENTS[patients])
+    task = find_task(names[place % len(names)])
+    atlas, numbers = PATIENTS[patients][task.name]
+    number = numbers[place // len(names)]
+    turn = np.random.default_rng([atlas, number]).uniform(0.0, 2 * np.pi)
+    patient = task.patient(Patients(seed=atlas, numbers=(number,)), 0)
+    return task, task.navigation(patient, start_rotation_rad=turn), 1000 * atlas + number
+
+
+def measure(path: Path, worlds: Mapping[str, World], patients: Set) -> None:
+    """Navigate in one patient of one world, and write what came of it."""
+    task, navigation, seed = navigation_at(patients, int(path.stem))
+    at_random = path.parent.name == "random"
+    loop = NavigationLoop(
+        replace(navigation, seconds=SECONDS) if at_random else navigation,
+        DrivenAtRandom() if at_random else AgentPolicy(),
+        config=LoopConfig(simulator=replace(CORE, threads=1)),
+        seed=seed,
+        world=worlds[path.parent.parent.name],
+    )
+    record = driven_on(loop) if at_random else loop.run()
+    write_json(path, {"task": task.name, "patient": navigation.anatomy.name} | counted(record, navigation))
+
+
+def driven_on(loop: NavigationLoop) -> NavigationRecord:
+    """Return the record of a navigation that goes on where it happens to reach its target."""
+    while loop.time_s < SECONDS and loop.reason != "invalid":
+        loop.step()
+        if loop.reason == "reached":
+            loop.go_on()
+    return loop.record()
+
+
+def counted(record: NavigationRecord, navigation: Navigation) -> dict[str, Any]:
+    """Return what is counted of a navigation."""
+    assert record.believed is not None
+    radius_mm = navigation.device.tip_radius_mm
+    return {
+        "reason": record.gives_up or record.reason,
+        "success": record.success,
+        "safe": record.safe,
+        "seconds": record.seconds,
+        "exposures": record.exposures,
+        "peak_force_n": record.peak_force_n,
+        "events": navigation_events(record.tip[:, 0], record.exposed, record.believed[:-1, 0], radius_mm),
+        "decisions": [int(record.in_bands.sum()), len(record.exposed) - 1],
+        "alarms": sum(ALARM in asks for asks in record.asks),
+    }
+
+
+def row(world: str, drive: Drive, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the row of one world and drive."""
+    (happened, missed), (held, decisions) = (
+        np.sum([result[name] for result in results], axis=0).tolist() for name in ("events", "decisions")
+    )
+    seconds, exposures = (sum(result[name] for result in results) for name in ("seconds", "exposures"))
+    return {
+        "world": world,
+        "drive": drive,
+        "navigations": len(results),
+        "safe": sum(result["success"] and result["safe"] for result in results) if drive == "planned" else None,
+        "unsafe_by_force": sum(not result["safe"] for result in results) if drive == "planned" else None,
+        "events": happened,
+        "missed": missed,
+        "decisions": decisions,
+        "in_bands": held,
+        "exposures": exposures,
+        "most_exposures": max(result["exposures"] for result in results),
+        "above_40": sum(result["exposures"] > MOST_EXPOSURES for result in results),
+        "seconds": seconds,
+        "alarmed": sum(result["alarms"] > 0 for result in results),
+    }
+
+
+def share(rows: Sequence[Mapping[str, Any]], part: str, whole: str) -> float | None:
+    """Return a share over several rows; None where there is nothing to share."""
+    total = sum(each[whole] for each in rows)
+    return sum(each[part] for each in rows) / total if total else None
+
+
+def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Return the figures of the rows of all worlds; those without navigations are left out.
+
+    They are of the worlds other than the nominal one where their names do not say so. `in_bands_share` is that of
+    planned or of random navigations, whichever is smaller; `worst` is the world in which a figure is worst.
+    """
+    nominal = [each for each in rows if each["world"] == NOMINAL]
+    other = [each for each in rows if each["world"] != NOMINAL]
+
+    def of(drive: Drive, some: Sequence[Mapping[str, Any]] = other) -> list[Mapping[str, Any]]:
+        return [each for each in some if each["drive"] == drive]
+
+    def worst(rows: Sequence[Mapping[str, Any]], part: str, whole: str, choose: Callable[..., float]) -> float | None:
+        found = [share([each], part, whole) for each in rows]
+        return choose((value for value in found if value is not None), default=None)
+
+    def a_minute(rows: Sequence[Mapping[str, Any]]) -> float | None:
+        a_second = share(rows, "exposures", "seconds")
+        return None if a_second is None else 60 * a_second
+
+    bands = {drive: share(of(drive), "in_bands", "decisions") for drive in ("random", "planned")}
+    found = {
+        "missed_share": share(of("random"), "missed", "events"),
+        "missed_share_worst": worst(of("random"), "missed", "events", max),
+        "exposures_per_minute_nominal": a_minute(of("random", nominal)),
+        "exposures_per_minute_other": a_minute(of("random")),
+        "in_bands_share": min((value for value in bands.values() if value is not None), default=None),
+        "in_bands_share_worst": worst(other, "in_bands", "decisions", min),
+        "in_bands_share_random": bands["random"],
+        "in_bands_share_planned": bands["planned"],
+        "missed_share_planned": share(of("planned"), "missed", "events"),
+        "safe_share": share(of("planned"), "safe", "navigations"),
+        "safe_share_worst": worst(of("planned"), "safe", "navigations", min),
+        "exposures_planned": share(of("planned"), "exposures", "navigations"),
+        "exposures_planned_nominal": share(of("planned", nominal), "exposures", "navigations"),
+        "unsafe_by_force_share": share(of("planned"), "unsafe_by_force", "navigations"),
+        "navigations_above_40_exposures": sum(each["above_40"] for each in rows if each["drive"] == "planned"),
+        "false_alarms_share": share(nominal, "alarmed", "navigations"),
+        "alarms_share": share(other, "alarmed", "navigations"),
+        "events": sum(each["events"] for each in rows),
+    }
+    return {name: round(value, 4) for name, value in found.items() if value is not None}
+
+
+def drive_in_worlds(
+    *,
+    output: OutputFolder,
+    planned: Annotated[int, Within(0, PLACES)] = 11,
+    random: Annotated[int, Within(0, PLACES)] = 6,
+    worlds: tuple[str, ...] = (),
+    patients: Set = "test",
+) -> dict[str, Any]:
+    """Drive the agent, and a wire at random under its belief, in worlds that it does not know.
+
+    `output`/WORLD/DRIVE gets one file a navigation; an interrupted run goes on with the others. The worlds take
+    turns; each begins at a patient of its own, and goes on with the next of the set.
+
+    Args:
+        output: folder of the results.
+        planned: navigations of the agent in each world.
+        random: navigations at random in each world.
+        worlds: names of worlds, or YAML files; all shipped ones, with the nominal one, if not given.
+        patients: set of the patients.
+
+    Returns:
+        The figures with their bars, and a row for each world and drive.
+
+    Raises:
+        InputError: no such world, or the folder belongs to another run.
+    """
+    chosen = {Path(name).stem: read_world(name) for name in worlds or list_worlds()}
+    paths: dict[tuple[str, Drive], list[Path]] = {}
+    for name, world in chosen.items():
+        claim(output / name, "python -m benchmarks worlds", **identity("agent", NEWEST, world=world), patients=patients)
+        first = zlib.crc32(name.encode())
+        for drive, count in (("planned", planned), ("random", random)):
+            places = [(first + place) % PLACES for place in range(count)]
+            paths[name, drive] = [output / name / drive / f"{place:02d}.json" for place in places]
+    make = partial(measure, worlds=chosen, patients=patients)
+    in_turns = [some[turn] for turn in range(PLACES) for some in paths.values() if turn < len(some)]
+    make_missing("The agent in other worlds", in_turns, make)
+    rows = [row(*key, [read_json(path) for path in some]) for key, some in paths.items() if some]
+    found = figures(rows)
+    return judged(found, {name: bar for name, bar in BARS.items() if name in found}) | {"worlds": rows}

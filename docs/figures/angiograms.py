@@ -1,0 +1,71 @@
+"""Draw the picture of docs/angiograms.md, and write its table of transit times: `python docs/figures/angiograms.py`."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT / "src"))
+
+import numpy as np
+
+from endopilot.anatomy.io import write_anatomy
+from endopilot.angiograms.config import AngiogramsConfig
+from endopilot.angiograms.flow import Flow
+from endopilot.angiograms.make import make_angiograms
+from endopilot.atlas.atlas import AtlasConfig, make_patient, make_patient_tree
+
+PAGE, PICTURE = ROOT / "docs" / "angiograms.md", ROOT / "docs" / "images" / "angiograms.png"
+BEGIN, END = "<!-- transit:begin -->", "<!-- transit:end -->"
+ARTERIES = {
+    "right coronary artery": ("rca", "3", (20.4, 3.0)),
+    "left anterior descending artery": ("lca", "8", (36.2, 2.6)),
+}
+"""Kind of patient, section at whose end contrast is awaited, and published frames of 1/30 s (Gibson 1996)."""
+PATIENTS, FRAMES_S = 30, 30
+
+
+def transit_frames(vessel: str, section: str, velocity_mm_s: float) -> list[float]:
+    """Return how many frames of 1/30 s the blood takes to the end of a section, in each patient who has it."""
+    found = []
+    for index in range(PATIENTS):
+        tree, _ = make_patient_tree(AtlasConfig(vessel=vessel, seed=5, stenosis_share=0.0), index)
+        flow = Flow(tree, velocity_mm_s)
+        name = np.concatenate([np.array(tree.section_names)[branch.section] for branch in tree.branches])
+        if (name == section).any():
+            found.append(float(flow.transit_s[name == section].max()) * FRAMES_S)
+    return found
+
+
+def table() -> str:
+    low, high = AngiogramsConfig().blood_mm_s
+    rows = [
+        "| frames of 1/30 s to the end of the | slowest blood | mean | fastest | published |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for name, (vessel, section, (mean, deviation)) in ARTERIES.items():
+        frames = [np.median(transit_frames(vessel, section, speed)) for speed in (low, (low + high) / 2, high)]
+        rows.append(f"| {name} | " + " | ".join(f"{value:.0f}" for value in frames) + f" | {mean} ± {deviation} |")
+    return "\n".join(rows)
+
+
+def draw() -> None:
+    """Make a small data set, and keep its picture of samples."""
+    with tempfile.TemporaryDirectory() as place:
+        folders = []
+        for index in range(4):
+            anatomy = make_patient(AtlasConfig(vessel=("rca", "lca")[index % 2], seed=12), index)
+            folders.append(Path(place) / anatomy.name)
+            write_anatomy(anatomy, output=folders[-1])
+        config = AngiogramsConfig(cines=2, seconds=2.5, injected_share=0.8, seed=1)
+        make_angiograms(folders, output=Path(place) / "angiograms", config=config)
+        shutil.copy(Path(place) / "angiograms" / "samples.png", PICTURE)
+
+
+if __name__ == "__main__":
+    head, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
+    PAGE.write_text(f"{head}{BEGIN}\n{table()}\n{END}{rest.split(END)[1]}", encoding="utf-8")
+    draw()

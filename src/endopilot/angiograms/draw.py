@@ -1,0 +1,93 @@
+"""What a cine shows, drawn at random: `draw_cine`."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.angiograms.config import AngiogramsConfig
+from endopilot.angiograms.flow import Injection
+from endopilot.angiograms.views import draw_view
+from endopilot.simulation.motion import Motion, motion_named
+from endopilot.types import Anatomy
+from endopilot.xray.carm import Pose
+
+_START_S = (0.2, 0.8)
+"""Range of the time at which an injection begins, s: an assumption."""
+_BREATH_S = 4.0
+"""A cine begins anywhere within a breath of this length, s, as `Motion` has it."""
+
+
+@dataclass(frozen=True, eq=False)
+class CineDraw:
+    """What one cine shows.
+
+    Attributes:
+        view: name of the view.
+        angles_deg: LAO (positive) or RAO, and cranial (positive) or caudal, degrees.
+        pose: in which the patient lies.
+        dose: of a frame, as a multiple of fluoroscopy's.
+        lead: frames for which heart, breath and devices move before the first one.
+        injection: of contrast; None where there is none.
+        blood_mm_s: velocity of the blood behind the ostium, mm/s.
+        devices: whether wire and catheters are shown.
+        drive_seed: of the devices' motion.
+        noise_seed: of the first frame's noise; it grows by one a frame.
+    """
+
+    view: str
+    angles_deg: tuple[float, float]
+    pose: Pose
+    dose: float
+    lead: int
+    injection: Injection | None
+    blood_mm_s: float
+    devices: bool
+    drive_seed: int
+    noise_seed: int
+
+    def times_s(self, config: AngiogramsConfig) -> Float[np.ndarray, "frames"]:
+        """Return the times of the frames since heart, breath and devices began to move, s."""
+        return (self.lead + 1 + np.arange(config.frames)) / config.frames_per_second
+
+
+def draw_cine(config: AngiogramsConfig, anatomy: Anatomy, number: int) -> CineDraw:
+    """Draw a cine of a patient; it is the same whatever the others are.
+
+    Args:
+        config: what is drawn from.
+        anatomy: the patient's vessel.
+        number: of the cine among the patient's.
+    """
+    random = np.random.default_rng([config.seed, _name_number(anatomy.name), 1, number])
+    view, angles = draw_view(random, anatomy)
+    if config.view_angles_deg:
+        view, angles = "given", config.view_angles_deg[int(random.integers(len(config.view_angles_deg)))]
+    pose = Pose.draw(random)
+    dose = float(np.exp(random.uniform(*np.log(config.dose))))
+    lead = int(random.integers(round(_BREATH_S * config.frames_per_second)))
+    start, duration, rate = (
+        float(random.uniform(*bounds)) for bounds in (_START_S, config.injection_s, config.injection_ml_s)
+    )
+    blood = float(random.uniform(*config.blood_mm_s))
+    injected, devices = random.random(2) < (config.injected_share, config.device_share)
+    drive_seed, noise_seed = (int(seed) for seed in random.integers(2**48, size=2))
+    injection = Injection(start, duration, rate) if injected else None
+    return CineDraw(view, angles, pose, dose, lead, injection, blood, bool(devices), drive_seed, noise_seed)
+
+
+def motion_of(config: AngiogramsConfig, name: str) -> Motion | None:
+    """Return how a patient's vessel moves; None where it lies still."""
+    return motion_named(config.motion, patient_seed(config, name))
+
+
+def patient_seed(config: AngiogramsConfig, name: str) -> int:
+    """Return the seed of what is drawn once for a patient."""
+    return int(np.random.default_rng([config.seed, _name_number(name), 0]).integers(2**48))
+
+
+def _name_number(name: str) -> int:
+    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "little")

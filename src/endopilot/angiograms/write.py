@@ -1,0 +1,184 @@
+"""A patient and a cine of a data set on disk: `write_patient` and `write_cine`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import SimpleITK as sitk
+from jaxtyping import Float, UInt8
+
+from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
+from endopilot.anatomy.io import read_anatomy, write_anatomy
+from endopilot.angiograms.cine import Cine, Frame
+from endopilot.angiograms.coco import coco, frame_entries
+from endopilot.angiograms.dicom import stored, write_xa
+from endopilot.angiograms.draw import draw_cine, motion_of
+from endopilot.angiograms.layout import CT_FILE, Layout, is_anatomy
+from endopilot.angiograms.masks import CLASSES, laid_together
+from endopilot.files import write_json, writing
+from endopilot.imaging.segment import segment
+from endopilot.imaging.volume import read_volume, write_volume
+from endopilot.types import Volume
+from endopilot.xray.absorbers import surroundings
+from endopilot.xray.image import XrayImager
+
+RECORD_FILE, COCO_FILE = "cine.json", "coco.json"
+"""What a cine shows, and its keypoints and masks."""
+TRUTH_FILE, DICOM_FILE = "truth.npz", "cine.dcm"
+_COMPRESSION = 1
+"""Of PNG files: higher levels take longer and save nearly nothing of a noisy image."""
+_kept: dict[str, XrayImager] = {}
+"""The imager of the last patient in this process: cines of one patient follow each other."""
+
+
+def write_patient(layout: Layout, folder: Path) -> None:
+    """Write a patient's vessel and CT into the data set. The vessel of a CT is segmented.
+
+    Args:
+        layout: of the data set.
+        folder: of the patient in it.
+
+    Raises:
+        InputError: the source cannot be read, the CT shows no such vessel, or the devices do not fit.
+    """
+    source, segmentation = layout.sources[layout.names.index(folder.name)], layout.config.segmentation
+    if is_anatomy(source):
+        anatomy = read_anatomy(source)
+        ct = read_volume(source / CT_FILE) if (source / CT_FILE).exists() else surroundings(anatomy)
+    else:
+        ct = read_volume(source)
+        vessel = segmentation.vessel if segmentation.method == "coronary" else "generic"
+        mask = segment(ct, config=segmentation)
+        anatomy = extract_anatomy(mask, name=folder.name, config=AnatomyConfig(vessel=vessel))
+    layout.stack.check(anatomy)
+    with writing(folder) as partial:
+        write_anatomy(anatomy, output=partial)
+        if ct is not None:
+            whole = np.rint(ct.voxels).astype(np.int16)
+            write_volume(Volume(whole, ct.spacing_mm, ct.origin_mm, ct.direction), partial / CT_FILE)
+
+
+def write_cine(layout: Layout, folder: Path) -> None:
+    """Make a cine, and write its frames, and what is true of them, into its folder.
+
+    Args:
+        layout: of the data set.
+        folder: of the cine.
+
+    Raises:
+        InputError: no motion of the devices can be simulated in the vessel, or there is no such policy.
+    """
+    name, _, number = folder.name.rpartition("-")
+    imager, patient = _imager(layout, name), layout.names.index(name)
+    draw = draw_cine(layout.config, imager.anatomy, int(number))
+    cine = Cine(layout.config, draw, imager)
+    images: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
+    signals, truths = [], []
+    with writing(folder) as partial:
+        for part in ("frames", "masks"):
+            (partial / part).mkdir(parents=True)
+        for index, frame in enumerate(cine.frames()):
+            file = f"{index:04d}.png"
+            _write_png(partial / "frames" / file, frame.grey)
+            _write_png(partial / "masks" / file, laid_together(frame.masks))
+            path = f"cines/{folder.name}/frames/{file}"
+            cine_number = patient * layout.config.cines + int(number)
+            image, entries = frame_entries(cine, frame, path, index, cine_number)
+            images.append(image | {"cine": folder.name, "patient": name})
+            annotations += entries
+            signals.append(stored(frame.signal, layout.config.image.window))
+            truths.append(_truth_of(cine, frame, index))
+        xa, identity = np.stack(signals), f"{layout.key} {name}"
+        write_xa(partial / DICOM_FILE, cine, xa, number=int(number), identity=identity)
+        np.savez(partial / TRUTH_FILE, allow_pickle=False, **_truth(cine, truths))
+        about = f"endopilot angiograms, cine {folder.name}"
+        write_json(partial / COCO_FILE, coco([{"images": images, "annotations": annotations}], about), indented=False)
+        write_json(partial / RECORD_FILE, _record(cine, layout, patient, int(number)))
+
+
+def _imager(layout: Layout, name: str) -> XrayImager:
+    """Return what makes a patient's images."""
+    key = f"{layout.key} {name}"
+    imager = _kept.get(key)
+    if imager is None:
+        folder = layout.output / "patients" / name
+        ct = read_volume(folder / CT_FILE) if (folder / CT_FILE).exists() else None
+        imager = XrayImager(read_anatomy(folder), layout.stack, ct=ct, config=layout.config.image)
+        _kept.clear()
+        _kept[key] = imager
+    return imager
+
+
+def _write_png(path: Path, image: UInt8[np.ndarray, "rows columns"]) -> None:
+    sitk.WriteImage(sitk.GetImageFromArray(image), str(path), useCompression=True, compressionLevel=_COMPRESSION)
+
+
+def _truth_of(cine: Cine, frame: Frame, number: int) -> dict[str, np.ndarray]:
+    """Return what is true of one frame, by the names of the arrays in the cine's file."""
+    truth = {"centerline_px": cine.project(cine.flow.points, number)}
+    for name, line in frame.lines_mm.items():
+        truth |= {f"{name}_mm": line, f"{name}_px": frame.lines_px[name]}
+    for name, (places, pixels) in cine.keypoints(frame).items():
+        truth |= {f"{name}_keypoints_mm": places, f"{name}_keypoints_px": pixels}
+    return truth
+
+
+def _truth(cine: Cine, frames: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Return what is true of a cine: arrays by name. Lines that are shorter than others end in NaN."""
+    lines = [branch.centerline for branch in cine.imager.anatomy.tree.branches]
+    section = np.concatenate([branch.section for branch in cine.imager.anatomy.tree.branches])
+    truth = {
+        "time_s": np.arange(len(frames)) / cine.config.frames_per_second,
+        "projection": cine.projection,
+        "placed": cine.placed,
+        "centerline_mm": cine.flow.points,
+        "centerline_radius_mm": np.concatenate([line.radius for line in lines]),
+        "centerline_branch": cine.flow.branch,
+        "centerline_section": section,
+        "centerline_contrast": cine.contrast.astype(np.float32),
+        **{name: _padded([frame[name] for frame in frames]) for name in frames[0]},
+    }
+    if cine.driven is not None:
+        truth |= {"inserted_length_mm": cine.driven.proximal[..., 0], "rotation_rad": cine.driven.proximal[..., 1]}
+    return truth
+
+
+def _padded(lines: Sequence[Float[np.ndarray, "_ d"]]) -> Float[np.ndarray, "frames n d"]:
+    longest = max(len(line) for line in lines)
+    return np.stack([np.pad(x, ((0, longest - len(x)), (0, 0)), constant_values=np.nan) for x in lines]).astype(
+        np.float32
+    )
+
+
+def _record(cine: Cine, layout: Layout, patient: int, number: int) -> dict[str, Any]:
+    """Return what a cine shows, as JSON has it."""
+    draw, anatomy = cine.draw, cine.imager.anatomy
+    motion = motion_of(cine.config, anatomy.name)
+    return {
+        "patient": anatomy.name,
+        "split": layout.splits[patient],
+        "number": number,
+        "frames": cine.config.frames,
+        "frames_per_second": cine.config.frames_per_second,
+        "view": draw.view,
+        "view_angles_deg": draw.angles_deg,
+        "pose": {"rotation_rad": draw.pose.rotation_rad, "translation_mm": draw.pose.translation_mm},
+        "isocenter_mm": cine.imager.isocenter,
+        "projection": cine.projection,
+        "dose": draw.dose,
+        "air_kerma_ugy": cine.air_kerma_ugy,
+        "injection": None if draw.injection is None else asdict(draw.injection),
+        "blood_mm_s": draw.blood_mm_s,
+        "blood_ml_s": cine.flow.inflow_ml_s,
+        "motion": None if motion is None else asdict(motion),
+        "motion_begins_s": -draw.lead / cine.config.frames_per_second,
+        "devices": [device.name for device in layout.stack.devices] if draw.devices else [],
+        "motions_redrawn": 0 if cine.driven is None else cine.driven.redrawn,
+        "section_names": list(anatomy.tree.section_names),
+        "masks": dict(CLASSES),
+    }

@@ -1,0 +1,236 @@
+"""What C-arms show of an environment's worlds: the last exposure of each world, as a measured tip or as images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+
+from endopilot.anatomy.projection import TipProjector
+from endopilot.devices.stack import lines_from_tips
+from endopilot.simulation.motion import place
+from endopilot.simulation.simulator import Simulator
+from endopilot.tasks.navigation import Navigation
+from endopilot.types import Anatomy, TipProjection
+from endopilot.xray.carm import view_at
+from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig
+from endopilot.xray.image import ImageConfig, XrayImager, isocenter_of
+from endopilot.xray.moving_patient import seen, turned
+
+_FULL_PIXELS = ImageConfig().pixels
+"""Of the house's detector; a coarser one has fewer and larger pixels on the same square."""
+_NOISE = 2**18
+"""Numbers of the table from which images take their noise: drawing it anew would cost as much as all else."""
+_MARGIN = 0.95
+"""Share of an image's half width within which all centerlines lie."""
+_TARGET = np.arange(-1, 2)
+"""Rows and columns about the target's pixel that mark it."""
+
+
+@dataclass(eq=False)
+class Exposed:
+    """The last exposure of each world; a row a world.
+
+    Attributes:
+        count: exposures since the start of the episode.
+        time_s: when the last was taken, since that start.
+        encoders: Δ, mm, and φ, rad, of the wire at that moment, as they were measured.
+        position: where the wire's tip was found, LPS mm.
+        tip: projection of that to the centerline.
+        image: the images, a view each; without rows where exposures are no images.
+        random: where errors and noise are drawn from.
+    """
+
+    count: Int[np.ndarray, "worlds"]
+    time_s: Float[np.ndarray, "worlds"]
+    encoders: Float[np.ndarray, "worlds 2"]
+    position: Float[np.ndarray, "worlds 3"]
+    tip: TipProjection
+    image: UInt8[np.ndarray, "worlds views rows columns"]
+    random: list[np.random.Generator]
+
+
+class CArms:
+    """A C-arm around each patient of an environment.
+
+    Attributes:
+        exposed: what they showed last.
+    """
+
+    def __init__(
+        self,
+        navigations: Sequence[Navigation],
+        simulator: Simulator,
+        *,
+        config: FluoroscopeConfig,
+        pixels: int,
+    ) -> None:
+        """Bring the middle of each vessel to the isocenter.
+
+        Args:
+            navigations: of each world.
+            simulator: the worlds as they truly are.
+            config: views, and errors of detection.
+            pixels: columns and rows of an image; 0 for exposures that say where the tip is.
+        """
+        count, first = len(navigations), navigations[0]
+        self._navigations, self._ostium = navigations, [np.asarray(n.anatomy.insertion.position) for n in navigations]
+        self._tips: dict[int, tuple[Fluoroscope, TipProjector]] = {}
+        self._images: dict[tuple[int, str], _Views] = {}
+        self._of: list[_Views] = []
+        self._pixels = pixels
+        for navigation, real in zip(navigations, simulator.set_up.anatomies, strict=True):
+            anatomy, key = navigation.anatomy, (id(navigation), real.identity)
+            if pixels and key not in self._images:
+                self._images[key] = _Views(navigation, real, config, pixels)
+            elif not pixels and id(navigation) not in self._tips:
+                arm = Fluoroscope(anatomy, navigation.device.tip_radius_mm, config=config)
+                self._tips[id(navigation)] = arm, TipProjector(anatomy.tree, anatomy.insertion)
+            if pixels:
+                self._of.append(self._images[key])
+        views, zeros = 1 + config.biplane, np.zeros((count, 1))
+        self.exposed = Exposed(
+            count=np.zeros(count, dtype=np.int64),
+            time_s=np.zeros(count),
+            encoders=np.zeros((count, 2)),
+            position=np.tile(np.asarray(first.anatomy.insertion.position, dtype=float), (count, 1)),
+            tip=TipProjection(
+                abscissa=zeros.copy(), offset=zeros.copy(), branch=zeros.astype(np.int64), radius=zeros + 1.0
+            ),
+            image=np.zeros((count, views, pixels, pixels), dtype=np.uint8),
+            random=[np.random.default_rng()] * count,
+        )
+
+    def begin(self, mask: Bool[np.ndarray, "worlds"], generators: Sequence[np.random.Generator]) -> None:
+        """Start an episode in the worlds of a mask; errors and noise follow from what generators of the worlds draw."""
+        for world in np.flatnonzero(mask).tolist():
+            self.exposed.random[world] = np.random.default_rng(int(generators[world].integers(2**62)))
+        self.exposed.count[mask] = 0
+
+    def expose(
+        self,
+        mask: Bool[np.ndarray, "worlds"],
+        simulator: Simulator,
+        encoders: Float[np.ndarray, "worlds devices 2"],
+        registration_mm: Float[np.ndarray, "worlds 3"],
+        time_s: Float[np.ndarray, "worlds"],
+    ) -> None:
+        """Take an exposure of every view in the worlds of a mask.
+
+        Args:
+            mask: of the worlds.
+            simulator: the worlds as they truly are.
+            encoders: Δ, mm, and φ, rad, of the devices as they are measured.
+            registration_mm: the wires show displaced by this, mm LPS.
+            time_s: since the start of each episode, s.
+        """
+        chosen = np.flatnonzero(mask & simulator.valid)
+        if not len(chosen):
+            return
+        exposed = self.exposed
+        exposed.count[chosen] += 1
+        exposed.time_s[chosen], exposed.encoders[chosen] = time_s[chosen], encoders[chosen, 0]
+        maps = self._maps(simulator, chosen, time_s)
+        if self._pixels:
+            self._take_images(chosen, simulator, registration_mm, maps)
+        else:
+            self._find_tips(chosen, simulator, registration_mm, maps)
+
+    def _maps(
+        self, simulator: Simulator, chosen: Int[np.ndarray, "chosen"], time_s: Float[np.ndarray, "worlds"]
+    ) -> Float[np.ndarray, "chosen 3 4"] | None:
+        """Return how the C-arms see points of the moving vessels displaced; None where they lie still."""
+        if simulator.set_up.motion is None:
+            return None
+        placed, maps = simulator.vessel_to_laboratory[chosen], []
+        for world, one in zip(chosen.tolist(), placed, strict=True):
+            known = self._navigations[world].known_motion
+            core = None if known is None else known.core(self._ostium[world])
+            maps.append(seen(one[None], core, time_s[world : world + 1])[0])
+        return np.stack(maps)
+
+    def _find_tips(
+        self,
+        chosen: Int[np.ndarray, "chosen"],
+        simulator: Simulator,
+        registration_mm: Float[np.ndarray, "worlds 3"],
+        maps: Float[np.ndarray, "chosen 3 4"] | None,
+    ) -> None:
+        exposed = self.exposed
+        tips, headings = simulator.tip_position[chosen, 0], simulator.tip_direction[chosen, 0]
+        tips = tips + registration_mm[chosen]
+        if maps is not None:
+            tips, headings = place(maps, tips), turned(maps, headings)
+        for world, tip, heading in zip(chosen.tolist(), tips, headings, strict=True):
+            arm, project = self._tips[id(self._navigations[world])]
+            depth = float(exposed.encoders[world, 0])
+            exposed.position[world] = arm.locate(tip, heading, depth, exposed.random[world])
+            found = project(exposed.position[world : world + 1])
+            for name in TipProjection.__dataclass_fields__:
+                getattr(exposed.tip, name)[world] = getattr(found, name)
+
+    def _take_images(
+        self,
+        chosen: Int[np.ndarray, "chosen"],
+        simulator: Simulator,
+        registration_mm: Float[np.ndarray, "worlds 3"],
+        maps: Float[np.ndarray, "chosen 3 4"] | None,
+    ) -> None:
+        exposed, inserted = self.exposed, simulator.inserted_length
+        nodes = simulator.position[chosen] + registration_mm[chosen, None]
+        if maps is not None:
+            nodes = place(maps[:, None], nodes)
+        for world, line in zip(chosen.tolist(), nodes, strict=True):
+            devices = lines_from_tips(line[np.isfinite(line[:, 0])], inserted[world])
+            exposed.image[world] = self._of[world].image(devices, exposed.random[world])
+
+
+@cache
+def _noise() -> Float32[np.ndarray, "n"]:
+    """Return a table of noise of standard deviation 1."""
+    return np.random.default_rng(0).standard_normal(_NOISE, dtype=np.float32)
+
+
+class _Views:
+    """The views of one navigation: what stays the same, and the roadmap with the target that lies under every image."""
+
+    def __init__(self, navigation: Navigation, real: Anatomy, config: FluoroscopeConfig, pixels: int) -> None:
+        """Compute what stays the same.
+
+        Args:
+            navigation: its vessel makes the roadmap.
+            real: the vessel as it truly is.
+            config: the views.
+            pixels: columns and rows.
+        """
+        geometry = replace(config.geometry, pixel_mm=config.geometry.pixel_mm * _FULL_PIXELS / pixels)
+        self._imager = XrayImager(real, navigation.stack, config=ImageConfig(geometry=geometry, pixels=pixels))
+        given = navigation.anatomy
+        roadmaps = self._imager if given is real else XrayImager(given, navigation.stack, config=self._imager.config)
+        lines = np.concatenate([branch.centerline.points for branch in given.tree.branches])
+        self._planes, self._roadmaps, self._targets, self._size = [], [], [], pixels
+        for angles in config.view_angles_deg[: 1 + config.biplane]:
+            farthest = np.abs(view_at(angles, isocenter_of(given), geometry).project(lines)).max()
+            fits = float(_MARGIN * pixels / 2 / farthest)
+            self._planes.append(self._imager.plane(angles, fits))
+            plane = self._planes[-1] if given is real else roadmaps.plane(angles, fits)
+            self._roadmaps.append(plane.vessel_mm)
+            row, column = np.rint(plane.pixel(navigation.target.position(given))).astype(int)
+            self._targets.append(np.ix_(row + _TARGET, column + _TARGET))
+
+    def image(
+        self, devices: Sequence[Float[np.ndarray, "_ 3"]], random: np.random.Generator
+    ) -> UInt8[np.ndarray, "views rows columns"]:
+        """Return the images of devices, each a line from its tip on, LPS mm; noise is a random part of a table."""
+        (wire, *catheters), size = devices, self._size
+        shown, noise = np.empty((len(self._planes), size, size), dtype=np.uint8), _noise()
+        begins = random.integers(len(noise) - size**2, size=len(shown))
+        for k, plane in enumerate(self._planes):
+            own = noise[begins[k] : begins[k] + size**2].reshape(size, size)
+            signal = self._imager.signal(plane, wire, noise=own, catheters=catheters)
+            shown[k] = self._imager.grey(signal, roadmap=self._roadmaps[k])
+            shown[k][self._targets[k]] = 255
+        return shown

@@ -1,0 +1,275 @@
+"""What is real in an environment's worlds: vessels, devices, ostia, robots; some of it drawn in each episode."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from endopilot.devices.drive_limits import DriveLimits, within_travel
+from endopilot.devices.robot import IDEAL, DriveConfig, RobotConfig, read_robot
+from endopilot.errors import InputError
+from endopilot.robot.robot import BACKS_OUT_MM_S
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.motion import Motion
+from endopilot.simulation.robots import Robots, in_grip
+from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.state import Step
+from endopilot.simulation.world import NOMINAL, World, read_world
+from endopilot.tasks.navigation import Navigation
+from endopilot.types import Anatomy
+
+RANDOM = "random"
+"""In place of a world or a robot: another one in each episode."""
+_OSTIUM_MM, _REGISTERED_MM, _TIMES = 2.5, 1.0, 2.0
+"""A random world's ostium and registration lie up to this far off, mm; friction is up to so many times more or less.
+The shipped worlds differ as much."""
+_PLAY_MM, _PLAY_RAD, _GAIN, _LATENCY_S = 2.6, 5.65, 0.05, 0.1
+"""The largest plays of a random robot, mm and rad: the largest that were measured (docs/robot.md); the largest
+difference of its gains from 1, and twice the latency that is assumed, s."""
+
+
+def draw_world(random: np.random.Generator) -> World:
+    """Return a random world, which differs in what may change between two episodes."""
+    return World(
+        friction_factor=float(_TIMES ** random.uniform(-1.0, 1.0)),
+        ostium_mm=float(random.uniform(-_OSTIUM_MM, _OSTIUM_MM)),
+        registration_mm=tuple(random.uniform(-_REGISTERED_MM, _REGISTERED_MM, 3).tolist()),
+    )
+
+
+def draw_robot(random: np.random.Generator) -> RobotConfig:
+    """Return a random robot; its encoders sit at the motors or on the devices, as likely."""
+    drive = DriveConfig(
+        gain_translation=float(1 + random.uniform(-_GAIN, _GAIN)),
+        gain_rotation=float(1 + random.uniform(-_GAIN, _GAIN)),
+        play_mm=float(random.uniform(0.0, _PLAY_MM)),
+        play_rad=float(random.uniform(0.0, _PLAY_RAD)),
+    )
+    at_motors, latency_s = random.random() < 0.5, float(random.uniform(0.0, _LATENCY_S))
+    return RobotConfig(
+        encoders_at="motor" if at_motors else "wire", latency_s=latency_s, wire=drive, catheters=(drive,)
+    )
+
+
+@dataclass(eq=False)
+class Drawn:
+    """What episodes begin with and go on with; a row a world.
+
+    Attributes:
+        ostium_mm: the true inserted lengths are this much more than the encoders', mm.
+        registration_mm: X-ray shows the wire displaced by this, mm LPS.
+        backs_out_mm: the guiding catheter has yet to back out by this, mm.
+        robots: what drives; None where the devices do as they are told.
+        readings: what the robots measured last: Δ, mm, φ, rad, N and N·mm; None likewise.
+    """
+
+    ostium_mm: Float[np.ndarray, "worlds"]
+    registration_mm: Float[np.ndarray, "worlds 3"]
+    backs_out_mm: Float[np.ndarray, "worlds"]
+    robots: Robots | None = None
+    readings: Float[np.ndarray, "worlds devices 4"] | None = None
+
+
+class Reality:
+    """The worlds of an environment as they truly are.
+
+    Attributes:
+        simulator: the worlds.
+        drawn: what differs from episode to episode.
+    """
+
+    def __init__(
+        self,
+        navigations: Sequence[Navigation],
+        *,
+        world: World | str | Path | Sequence[World | str | Path] | None,
+        robot: RobotConfig | str | Path | Sequence[RobotConfig | str | Path] | None,
+        motion: Motion | None,
+        config: SimulatorConfig,
+    ) -> None:
+        """Lay the devices out, each world as it is.
+
+        Args:
+            navigations: of each world, as they are given.
+            world: what differs: of all worlds, or of world i number i modulo their number; "random" draws some.
+            robot: what drives, likewise; the devices do as they are told if not given.
+            motion: of all vessels, where worlds have none.
+            config: of the rod core, where worlds have none.
+
+        Raises:
+            InputError: no such world or robot; worlds that differ in what all must have in common.
+        """
+        count = len(navigations)
+        worlds = _spread(NOMINAL if world is None else world, count, read_world)
+        self._worlds = [
+            None if each is None else each.drawn(navigation.anatomy, number)
+            for number, (each, navigation) in enumerate(zip(worlds, navigations, strict=True))
+        ]
+        fixed = [each or World() for each in self._worlds]
+        motion = _common(fixed, "motion", [each.motion or motion for each in fixed])
+        config = _common(fixed, "core or wall", [each.core(config) for each in fixed])
+        self._robots = self._all_robots(robot, fixed)
+        stacks = [each.stack(navigation.stack) for each, navigation in zip(fixed, navigations, strict=True)]
+        if self._robots is not None:
+            held = [in_grip(s, r or RobotConfig(), config) for s, r in zip(stacks, self._robots, strict=True)]
+            stacks, (config, *others) = [stack for stack, _ in held], [core for _, core in held]
+            if any(other != config for other in others):
+                raise InputError(
+                    "robot: its grip is weaker than devices of different push limits; give config a wall stiffness"
+                )
+        self.simulator = Simulator(_vessels(navigations, fixed), stacks, motion=motion, config=config)
+        self._friction = np.array([[device.friction for device in stack.devices] for stack in stacks])
+        self._start = np.array([navigation.start for navigation in navigations])
+        self._backs_out_s = np.array([each.backs_out_after_s for each in fixed])
+        self.drawn = Drawn(
+            ostium_mm=np.array([each.ostium_mm for each in fixed]),
+            registration_mm=np.array([each.registration_mm for each in fixed], dtype=float),
+            backs_out_mm=np.zeros(count),
+        )
+        limits = [[DriveLimits.of(device, each.anatomy) for device in each.devices] for each in navigations]
+        self._far_ends = np.array([[drive.travel_mm[1] for drive in drives] for drives in limits])
+        if self._robots is not None:
+            random = [_OSTIUM_MM if each is None else each.ostium_mm for each in self._worlds]
+            counted = [
+                [each.by_encoder(deeper) if deeper else each for each in of]
+                for of, deeper in zip(limits, random, strict=True)
+            ]
+            robots, seeds = [each or RobotConfig() for each in self._robots], [(world,) for world in range(count)]
+            self.drawn.robots = Robots(self.simulator, robots, counted, seeds=seeds, ostium_mm=self.drawn.ostium_mm)
+            self.drawn.readings = self.drawn.robots.read(self.simulator)
+
+    @property
+    def encoders(self) -> Float[np.ndarray, "worlds devices 2"]:
+        """Δ, mm, and φ, rad, as the robots' encoders said last; without noise where there are no robots."""
+        if self.drawn.readings is not None:
+            return self.drawn.readings[..., :2]
+        places = self.simulator.proximal
+        places[..., 0] -= self.drawn.ostium_mm[:, None]
+        return places
+
+    @property
+    def proximal(self) -> Float[np.ndarray, "worlds devices 4"]:
+        """What is measured of the devices: `encoders`, and the drives' force, N, and torque, N·mm."""
+        if self.drawn.readings is not None:
+            return self.drawn.readings
+        return np.concatenate([self.encoders, self.simulator.drive_load], axis=-1)
+
+    def begin(self, mask: Bool[np.ndarray, "worlds"], generators: Sequence[np.random.Generator]) -> None:
+        """Start an episode in the worlds of a mask: the wire's rotation is drawn, and what is random in them.
+
+        Args:
+            mask: of the worlds.
+            generators: of each world.
+        """
+        simulator, drawn, chosen = self.simulator, self.drawn, np.flatnonzero(mask).tolist()
+        turn, friction = self._start[..., 1].copy(), self._friction.copy()
+        begun: list[World] = []
+        for world in chosen:
+            turn[world, 0] = generators[world].uniform(0.0, 2 * np.pi)
+            real = self._worlds[world] or draw_world(generators[world])
+            friction[world] *= real.friction_factor if self._worlds[world] is None else 1.0
+            drawn.ostium_mm[world], drawn.registration_mm[world] = real.ostium_mm, real.registration_mm
+            drawn.backs_out_mm[world] = real.backs_out_mm
+            begun.append(real)
+        deep = np.maximum(self._start[..., 0] + drawn.ostium_mm[:, None], 0.0)
+        simulator.reset(inserted_length=deep, rotation=turn, friction=friction, worlds=chosen)
+        if drawn.robots is None or drawn.readings is None or self._robots is None:
+            return
+        seeds = [(int(generators[world].integers(2**62)),) for world in chosen]
+        robots = [
+            self._robots[world] or real.real_robot(draw_robot(generators[world]))
+            for world, real in zip(chosen, begun, strict=True)
+        ]
+        drawn.robots.ostium_mm[chosen] = drawn.ostium_mm[chosen]
+        drawn.robots.reset(simulator, chosen, seeds, robots)
+        drawn.readings[mask] = drawn.robots.read(simulator, worlds=chosen)
+
+    def drive(
+        self, control: Float[np.ndarray, "worlds devices 2"], period_s: float, time_s: Float[np.ndarray, "worlds"]
+    ) -> Step:
+        """Move the devices for a while, by robots if there are some.
+
+        Args:
+            control: what drives are told, mm/s and rad/s.
+            period_s: how long, s.
+            time_s: since each episode's start, s.
+        """
+        simulator, drawn = self.simulator, self.drawn
+        back = self._back_mm(period_s, time_s)
+        if drawn.robots is None:
+            inserted = simulator.inserted_length
+            # it stops by itself at the ostium
+            travel_mm = (-np.inf, self._far_ends)
+            control[..., 0] = within_travel(control[..., 0], inserted, period_s, travel_mm=travel_mm)
+            drawn.ostium_mm -= back
+            control[..., 0] -= back[:, None] / period_s
+            return simulator.step(control, period_s)
+        drawn.robots.motion.command(control)
+        velocity = drawn.robots.advance(period_s)
+        velocity[..., 0] -= back[:, None] / period_s
+        drawn.robots.ostium_mm -= back
+        step = simulator.step(velocity, period_s)
+        drawn.robots.follow(simulator)
+        drawn.readings = drawn.robots.read(simulator)
+        return step
+
+    def _back_mm(self, period_s: float, time_s: Float[np.ndarray, "worlds"]) -> Float[np.ndarray, "worlds"]:
+        """Return by how much each guiding catheter backs out in a while, mm."""
+        left = self.drawn.backs_out_mm
+        if not left.any():
+            return np.zeros(len(left))
+        room = np.maximum(self.simulator.inserted_length.min(axis=1), 0.0)
+        due = time_s >= self._backs_out_s - period_s / 2
+        back = np.where(due, np.minimum(np.minimum(BACKS_OUT_MM_S * period_s, left), room), 0.0)
+        left -= back
+        return back
+
+    @staticmethod
+    def _all_robots(
+        given: RobotConfig | str | Path | Sequence[RobotConfig | str | Path] | None, worlds: Sequence[World]
+    ) -> list[RobotConfig | None] | None:
+        """Return the robot of each world, None for one that is drawn; none at all where devices do as they are told."""
+        if given is None and all(each.robot is None for each in worlds):
+            return None
+        robots = _spread(IDEAL if given is None else given, len(worlds), read_robot)
+        return [
+            None if robot is None and world.robot is None else world.real_robot(robot or RobotConfig())
+            for world, robot in zip(worlds, robots, strict=True)
+        ]
+
+
+def _spread(given: Any, count: int, read: Any) -> list[Any]:
+    """Return of each world what is given for all, or for world i number i modulo how many are; None if it is drawn."""
+    several = [given] if isinstance(given, (str, Path, World, RobotConfig)) else list(given)
+    if not several:
+        raise InputError("world, robot: an empty list; give at least one")
+    made = [None if each == RANDOM else read(each) if isinstance(each, (str, Path)) else each for each in several]
+    return [made[number % len(made)] for number in range(count)]
+
+
+def _common(worlds: Sequence[World], names: str, values: Sequence[Any]) -> Any:
+    """Return what all worlds have in common."""
+    if any(value != values[0] for value in values):
+        raise InputError(
+            f"world: worlds differ in {names}, which all in an environment have in common; give worlds that agree"
+        )
+    return values[0]
+
+
+def _vessels(navigations: Sequence[Navigation], worlds: Sequence[World]) -> list[Anatomy]:
+    """Return the vessel of each world; worlds with the same differences share one."""
+    nominal, made = World(), {}
+    vessels = []
+    for navigation, world in zip(navigations, worlds, strict=True):
+        names = ("lumen_factor", "lumen_mm", "occluded", "stenosis", "axis_deg", "axis_side_deg")
+        lumen = replace(nominal, **{name: getattr(world, name) for name in names})
+        key = (id(navigation.anatomy), lumen)
+        if key not in made:
+            made[key] = lumen.anatomy(navigation.anatomy)
+        vessels.append(made[key])
+    return vessels

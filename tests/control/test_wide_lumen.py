@@ -1,0 +1,61 @@
+"""A wire alone in a wide lumen, such as an aorta: what the agent holds possible, tries and waits for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from endopilot.anatomy.extract import extract_anatomy
+from endopilot.anatomy.sources import Polylines
+from endopilot.control.agent import IN_WIDE_LUMEN, AgentConfig, AgentPolicy
+from endopilot.control.manoeuvre import Repertoire
+from endopilot.control.search_config import SearchConfig
+from endopilot.control.trials import WIRE, Move, Trials
+from endopilot.devices.device import read_wire
+from endopilot.devices.drive_limits import DriveLimits, far_end_mm
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
+
+
+@pytest.fixture(scope="module")
+def aorta() -> Navigation:
+    """Return a navigation along a straight vessel that is 24 mm wide."""
+    line = np.linspace([0.0, 0, 0], [0, 0, 80], 81)
+    anatomy = extract_anatomy(Polylines((line,), (np.full(81, 12.0),)), name="aorta")
+    target, wire = Target(branch=0, abscissa=50.0), read_wire("j-035")
+    return Navigation(anatomy=anatomy, target=target, device=wire, start_inserted_length_mm=20.0)
+
+
+@pytest.fixture(scope="module")
+def started(aorta) -> AgentPolicy:
+    policy = AgentPolicy()
+    policy.start(aorta, 1)
+    return policy
+
+
+def test_a_wire_may_lie_in_loops_of_three_widths(aorta):
+    assert far_end_mm(aorta.anatomy) == pytest.approx(80 + 3 * 24, abs=1.0)
+
+
+def test_an_agent_holds_more_possible_of_the_ostium_and_pulls_loops_out(aorta, started):
+    assert AgentConfig.of(aorta) is IN_WIDE_LUMEN
+    deeper = started.belief.parameters[:, 2]
+    assert deeper.min() < -3.0 and deeper.max() > 3.0
+    grids = [grid for _, grid in Repertoire.of((), SearchConfig(), wide=True).ways]
+    assert {grid[0].back for grid in grids} == {0.0, 1.5, 3.0}
+    assert {grid[0].back for _, grid in Repertoire.of((), SearchConfig(), wide=False).ways} == {0.0}
+
+
+def test_a_course_ends_where_most_wires_are_at_the_target(started, aorta):
+    course = started.find_course(aorta.seconds)
+    at = course.tip.abscissa[-1]
+    assert course.reached > 0.5 and np.ptp(at) > 3.0  # so far apart that they are never all there together
+    assert np.abs(at - 50.0).min() <= 1.5
+    assert (course.control[:, WIRE, 1] == 0).all()  # no other manoeuvre was tried
+
+
+def test_what_holds_for_two_periods_leaves_no_travel_after_them(aorta, started):
+    limits = DriveLimits(max_velocity_mm_s=30.0, max_rotation_rad_s=3.0, travel_mm=(0.0, 6.0))
+    trials = Trials(Trials.of(aorta, [aorta.device], 1, like=started.belief.simulator).simulator, [limits])
+    for periods in (1, 2):
+        control = trials.possible(trials.control(Move(WIRE, 30.0)), periods=periods)
+        assert control[0, WIRE, 0] == pytest.approx(6.0 / (periods * DECISION_PERIOD_S))

@@ -1,0 +1,58 @@
+"""The guide: each command of each page, in order and in one folder; what it prints, refuses and writes is as shown."""
+
+from __future__ import annotations
+
+import re
+import runpy
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+GUIDE = runpy.run_path(str(ROOT / "docs/guide.py"))
+PAGES = GUIDE["pages"]()
+MOST_WORDS = 1000
+
+
+def without_figures(text: str) -> str:
+    """Return a text with its figures blotted out: other processors and libraries change their last digits."""
+    return re.sub(r"\d+(\.\d+)?(e-?\d+)?", "0", text)
+
+
+@pytest.fixture(scope="module")
+def walked(tmp_path_factory):
+    """Return a function that walks a page once, and the pages before it, and returns each block with what was made."""
+    folder = tmp_path_factory.mktemp("guide")
+    done: dict[Path, list] = {}
+
+    def walk(page: Path) -> list:
+        for each in PAGES[: PAGES.index(page) + 1]:
+            if each not in done:
+                done[each] = list(GUIDE["walk"](each, folder))
+        return done[page]
+
+    return walk
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
+def test_a_page_is_as_its_commands_are(walked, page, monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", "120")
+    for block, made in walked(page):
+        if block.kind == "console":
+            assert block.text == made
+        elif block.kind == "text":
+            assert without_figures(block.text) == without_figures(GUIDE["renewed"](block, made))
+        elif block.kind == "columns":
+            named = [name for row in block.text.splitlines() for name in re.findall(r"`([^`]+)`", row.split("|")[1])]
+            assert set(named) - {block.file.rpartition("/")[2]} <= set(made.split(","))
+        else:
+            assert Path(made).stat().st_size > 0
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
+def test_a_page_is_short(page) -> None:
+    assert len(page.read_text(encoding="utf-8").split()) <= MOST_WORDS
+
+
+def test_all_pages_are_walked() -> None:
+    assert {page.name for page in PAGES} | {"index.md"} == {page.name for page in (ROOT / "docs/guide").glob("*.md")}

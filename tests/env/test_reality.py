@@ -1,0 +1,112 @@
+"""Environments in worlds that differ from what is given, with robots that differ, and in tasks of one's own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+
+from endopilot.devices.robot import DriveConfig, RobotConfig, read_robot
+from endopilot.env.single import NavigateEnv
+from endopilot.env.vector import NavigateVectorEnv
+from endopilot.errors import InputError
+from endopilot.simulation.world import World
+from endopilot.tasks.navigation import Navigation, Target
+from toy_tasks import own_tasks
+
+STILL, PUSH = np.zeros((2, 2)), np.tile([0.8, 0.0], (2, 1))
+
+
+@pytest.fixture(scope="module")
+def near(fork, wire) -> Navigation:
+    """Return a target at the end of the vessel."""
+    return Navigation(
+        anatomy=fork, device=wire, target=Target(branch=1, abscissa=38.0), start_inserted_length_mm=6.0, seconds=20.0
+    )
+
+
+def test_worlds_take_turns_with_what_differs_in_them(near):
+    other = World(lumen_factor=1.2, tip_stiffness_factor=2.0, ostium_mm=2.0)
+    env = NavigateVectorEnv(3, navigations=near, world=["nominal", other])
+    _, infos = env.reset(seed=0)
+    np.testing.assert_allclose(infos["inserted_length"], [6.0, 8.0, 6.0], atol=1e-9)
+    set_up = env.simulator.set_up
+    assert [anatomy is near.anatomy for anatomy in set_up.anatomies] == [True, False, True]
+    stiff = [stack.wire.bend_stiffness_n_mm2[0] for stack in set_up.stacks]
+    assert stiff[1] == 2 * stiff[0] == 2 * stiff[2]
+    observed = NavigateVectorEnv(2, navigations=near, world=[World(), World(ostium_mm=2.0)])
+    seen, infos = observed.reset(seed=0)
+    np.testing.assert_allclose(seen[:, 0] * 100, [6.0, 6.0], atol=1e-5)  # as encoders count
+    np.testing.assert_allclose(infos["inserted_length"], [6.0, 8.0], atol=1e-9)
+
+
+def test_a_nominal_world_gives_the_bits_of_none(near):
+    envs = [NavigateVectorEnv(2, navigations=near, world=world, robot="assumed") for world in (None, "nominal")]
+    starts = [env.reset(seed=0)[0] for env in envs]
+    assert np.array_equal(*starts)
+    assert np.array_equal(*[env.step(PUSH)[0] for env in envs])
+
+
+def test_a_guiding_catheter_backs_out_and_encoders_do_not_see_it(near):
+    world = World(backs_out_mm=1.5, backs_out_after_s=0.2)
+    for robot in (None, "ideal"):
+        env = NavigateVectorEnv(2, navigations=near, world=world, robot=robot)
+        env.reset(seed=0)
+        for _ in range(6):
+            seen, *_, infos = env.step(STILL)
+        np.testing.assert_allclose(infos["inserted_length"], 4.5, atol=1e-6)
+        np.testing.assert_allclose(seen[:, 0] * 100, 6.0, atol=1e-5)
+
+
+def test_random_worlds_and_robots_differ_by_episode_and_follow_from_the_seed(near):
+    env = NavigateVectorEnv(2, navigations=near, world="random", robot="random")
+    env.reset(seed=0)
+    drawn = [env._reality.drawn.ostium_mm.copy(), env._reality.drawn.registration_mm[:, 0].copy()]
+    first = np.concatenate([*drawn, env.simulator.set_up.friction[:, 0]])
+    assert len(set(first.tolist())) == 6
+    gains = env._reality.drawn.robots.motion._gain.copy()
+    env.reset()
+    assert not np.isin(env._reality.drawn.ostium_mm, drawn[0]).any()
+    assert not np.isin(env._reality.drawn.robots.motion._gain, gains).any()
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env._reality.drawn.ostium_mm, drawn[0])
+    np.testing.assert_array_equal(env._reality.drawn.robots.motion._gain, gains)
+    np.testing.assert_allclose(env._reality.encoders[:, 0, 0], 6.0, atol=0.2)
+
+
+def test_robots_take_turns_and_a_world_may_have_its_own(near):
+    slow = RobotConfig(latency_s=0.4, wire=DriveConfig(encoder_sd_mm=1e-9))
+    env = NavigateVectorEnv(2, navigations=near, robot=[slow, "ideal"])
+    env.reset(seed=0)
+    moved = [env.step(PUSH)[4]["inserted_length"] - 6.0 for _ in range(2)][-1]
+    assert moved[0] == pytest.approx(0.0, abs=1e-6) and moved[1] == pytest.approx(0.8 * 12 * 4 / 15, abs=0.05)
+    env = NavigateVectorEnv(2, navigations=near, world=[World(robot=slow), "nominal"])
+    env.reset(seed=0)
+    moved = [env.step(PUSH)[4]["inserted_length"] - 6.0 for _ in range(2)][-1]
+    assert moved[0] == pytest.approx(0.0, abs=1e-6) and moved[1] > 2.0
+    slipping = replace(read_robot("ideal"), wire=DriveConfig(grip_n=0.01))
+    held = NavigateVectorEnv(2, navigations=near, world=World(robot=slipping))
+    assert held.simulator.set_up.stacks[0].wire.push_limit_n == 0.01
+
+
+def test_what_all_worlds_share_may_not_differ(near):
+    with pytest.raises(InputError, match="world: worlds differ in core or wall"):
+        NavigateVectorEnv(2, navigations=near, world=["nominal", "fine-core"])
+    with pytest.raises(InputError, match="world: worlds differ in motion"):
+        NavigateVectorEnv(2, navigations=near, world=["moving", "nominal"])
+    with pytest.raises(InputError, match="world 'none': no such world or file"):
+        NavigateEnv(navigation=near, world="none")
+    with pytest.raises(InputError, match="an empty list"):
+        NavigateVectorEnv(2, navigations=near, world=[])
+
+
+def test_a_folder_of_tasks_is_an_environment(tmp_path):
+    own_tasks(tmp_path)
+    env = gymnasium.make_vec("endopilot/Navigate-v0", num_envs=3, version=str(tmp_path), patients=2)
+    assert [navigation.target.abscissa for navigation in env.unwrapped.navigations] == [20.0, 30.0, 20.0]
+    one = NavigateEnv(version=str(tmp_path), task="along", patient=1)
+    assert one.reset(seed=0)[1]["distance_mm"] == pytest.approx(28.0, abs=0.5)
+    with pytest.raises(InputError, match="task: 'across'; choose from along"):
+        NavigateEnv(version=str(tmp_path), task="across")

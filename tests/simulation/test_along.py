@@ -1,0 +1,130 @@
+"""Friction and stiffness of the wall that vary along the vessel."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bend import vessel
+
+from endopilot.anatomy.distance import sample
+from endopilot.devices.device import read_wire
+from endopilot.errors import InputError
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.core_state import CONTACTS, LIMIT, NODE, NORMAL_FORCE, OFFSET, POSITION, nodes_of, with_nodes
+from endopilot.simulation.simulate import simulate
+from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.vessel_wall import factor_at
+
+WIRE = read_wire("workhorse-014")
+CORE = SimulatorConfig(time_step_s=0.05, element_mm=1.5, threads=1, tolerance_mm=1e-6)
+PUSH = np.tile([5.0, 0.3], (1, 16, 1))
+START = np.array([[20.0, 0.0]])
+
+
+@pytest.fixture(scope="module")
+def bend():
+    return vessel()
+
+
+@pytest.fixture(scope="module")
+def pushed(bend):
+    """Return a function that pushes a wire into the bend under some settings and a coefficient of friction."""
+
+    def push(friction=0.1, **changed):
+        return simulate(
+            bend, WIRE, PUSH, initial=START, friction=np.array([[friction]]), config=replace(CORE, **changed)
+        )
+
+    return push
+
+
+def test_a_state_has_its_numbers_where_they_are_said_to_be(bend):
+    simulator = Simulator(bend, WIRE, worlds=2, config=CORE)
+    simulator.reset(inserted_length=[35.0, 40.0], rotation=[0.0, 0.5], friction=[0.1, 0.3])
+    simulator.step(np.tile([5.0, 0.0], (2, 1)), 0.5)
+    numbers = nodes_of(simulator.state.values[0], simulator.nodes, 1)
+    assert numbers.shape == (2, simulator.nodes, NODE)
+    np.testing.assert_array_equal(sum(numbers[..., at + NORMAL_FORCE] for at in CONTACTS), simulator.contacts)
+    active = int(simulator.active_nodes.min())
+    offset = numbers[..., CONTACTS[0] :][..., OFFSET]
+    np.testing.assert_array_equal((numbers[..., POSITION] + offset)[:, :active], simulator.position[:, :active])
+    for at in CONTACTS:  # the limit is the coefficient times the force, extrapolated by half a step
+        touches = numbers[..., at + NORMAL_FORCE] > 1e-3
+        ratio = numbers[..., at + LIMIT] / np.where(touches, numbers[..., at + NORMAL_FORCE], 1.0)
+        np.testing.assert_allclose(ratio[0][touches[0]], 0.1, rtol=0.3)
+        np.testing.assert_allclose(ratio[1][touches[1]], 0.3, rtol=0.3)
+    state = simulator.state.values[0]
+    np.testing.assert_array_equal(with_nodes(state, numbers, 1), state)
+
+
+def test_the_same_factor_everywhere_is_that_friction(pushed):
+    plain, rough, thrice = pushed(), pushed(0.3), pushed(friction_along=(3.0, 3.0))
+    np.testing.assert_allclose(thrice.tip_position, rough.tip_position, atol=0.06)  # brought to its start with 0.1
+    np.testing.assert_allclose(thrice.base_force[0, 4:], rough.base_force[0, 4:], rtol=0.05)
+    assert thrice.base_force[0, -1, 0] > 1.2 * plain.base_force[0, -1, 0]
+    np.testing.assert_allclose(pushed(friction_along=(1.0,)).tip_position, plain.tip_position, atol=0.02)
+
+
+def test_what_is_rough_ahead_holds_the_wire_once_it_is_there(pushed):
+    plain, ahead = pushed(), pushed(friction_along=(1.0, 1.0, 1.0, 5.0, 5.0))
+    force, before = ahead.base_force[0, :, 0], plain.base_force[0, :, 0]
+    there = plain.tip.abscissa[0, :, 0] > 45.0  # the path is 64 mm long
+    assert (force[there] > 1.1 * before[there]).all() and force[-1] > 1.25 * before[-1]
+    np.testing.assert_allclose(force[:3], before[:3], rtol=0.05)
+
+
+def test_a_state_is_gone_on_from_with_the_same_friction(bend):
+    config = replace(CORE, friction_along=(1.0, 4.0))
+    once, again = (Simulator(bend, WIRE, config=config) for _ in range(2))
+    once.reset(inserted_length=[35.0], rotation=[0.0])
+    again.set_state(once.state)
+    for _ in range(4):
+        np.testing.assert_array_equal(
+            once.step([[5.0, 0.3]], 0.5).tip_position, again.step([[5.0, 0.3]], 0.5).tip_position
+        )
+    with pytest.raises(InputError, match="state: made with other"):
+        Simulator(bend, WIRE, config=CORE).set_state(once.state)
+
+
+def test_the_wall_yields_where_it_is_soft(bend):
+    soft = replace(CORE, compliant_wall_n_mm2=0.02)
+
+    def dents(**changed):
+        made = simulate(bend, WIRE, PUSH, initial=START, config=replace(soft, **changed), record_shape=True)
+        assert made.valid.all() and made.shape is not None
+        nodes = made.shape[0, -1]
+        depth = WIRE.tip_radius_mm - sample(bend.distance_map, nodes)
+        along = bend.tree.branches[0].centerline
+        at = along.abscissa[np.argmin(np.linalg.norm(nodes[:, None] - along.points, axis=2), axis=1)]
+        return at, depth, made.base_force[0, -1, 0]
+
+    _, even, _ = dents()
+    _, four, _ = dents(wall_along=(4.0,))
+    _, stiff, _ = dents(compliant_wall_n_mm2=0.08)
+    assert four.max() == pytest.approx(stiff.max(), rel=0.1) and four.max() < 0.5 * even.max()
+    at, graded, _ = dents(wall_along=(0.25, 4.0))
+    _, grew, _ = dents(wall_along=(4.0, 0.25))
+    assert graded[at < 25].max() > 2 * grew[at < 25].max() and graded[at > 40].max() < grew[at > 40].max()
+
+
+def test_walls_that_vary_otherwise_are_not_shared(bend):
+    soft = replace(CORE, compliant_wall_n_mm2=0.02)
+    graded = replace(soft, wall_along=(0.25, 4.0))
+    alone, beside = Simulator(bend, WIRE, config=graded), Simulator(bend, WIRE, config=soft)
+    shared = Simulator(bend, WIRE, config=graded, sharing=beside)
+    for each in (alone, shared):
+        each.reset(inserted_length=[40.0], rotation=[0.0])
+    np.testing.assert_array_equal(alone.position, shared.position)
+    beside.reset(inserted_length=[40.0], rotation=[0.0])
+    assert np.abs(beside.position - alone.position).max() > 5e-3
+
+
+def test_a_factor_is_linear_between_its_places(bend):
+    end = float(bend.tree.longest_path().abscissa[-1])
+    found = factor_at(np.array([-3.0, 0.0, 0.25 * end, end, end + 9.0]), bend.tree, (1.0, 3.0, 2.0))
+    assert found == pytest.approx([1.0, 1.0, 2.0, 2.0, 2.0])
+    assert factor_at(np.array([5.0]), bend.tree, (3.0,)) == pytest.approx([3.0])
+    with pytest.raises(InputError, match="wall_along: the wall is not compliant"):
+        SimulatorConfig(wall_along=(1.0, 2.0))
