@@ -224,6 +224,20 @@ def test_a_tip_that_no_wire_explains_is_pulled_back_under_xray(side_branch) -> N
     assert policy.plans == 2  # found again, it searches another path
 
 
+def test_a_wire_that_is_lost_again_and_again_ends_with_the_cause(side_branch) -> None:
+    policy, said = AgentPolicy(QUICK), ""
+    policy.start(side_branch, 0)
+    policy.monitor.changes_left = 0  # nothing else is sought
+    for k in range(4):
+        shown = measured(policy.belief, int(np.argmax(policy.belief.weight)))
+        far = replace(shown, position=shown.position + np.array([6.0, 0.0, 5.0]))
+        assert not said
+        said = policy.decide(Observation(1.0 * k, ((4.0, 0.0),), far)).gives_up
+        shown = measured(policy.belief, int(np.argmax(policy.belief.weight)))
+        policy.decide(Observation(1.0 * k + 0.5, ((4.0, 0.0),), shown))
+    assert "lost 4 times: no wire, lumen or ostium explains what X-ray shows" in said
+
+
 def test_a_lost_wire_that_is_back_in_its_catheter_unseen_sets_out_again(side_branch) -> None:
     policy = AgentPolicy(QUICK)
     policy.start(side_branch, 0)

@@ -97,7 +97,7 @@ class XrayAdviser:
         *,
         factor: Float[np.ndarray, "2"] | float = 1.0,
         always: bool = False,
-        lumen_share: float = 0.0,
+        wall_mm: Float[np.ndarray, "n"] | float = 0.0,
     ) -> Bool[np.ndarray, "n"]:
         """Return for which navigations X-ray is due now, a period after the last call.
 
@@ -110,15 +110,15 @@ class XrayAdviser:
                 not given.
             factor: by which the bands are wider than they are calibrated.
             always: whether an exposure is due whenever the last is 1.5 s ago.
-            lumen_share: by which the lumen's radius may be another than it is given, which the calibration does not
+            wall_mm: by which the lumen's radius may be another than it is given, mm, which the calibration does not
                 know: a tip on the wall is then off by as much, and the edges of that band are heeded too.
         """
         self._since, self._travel = self._since + 1, self._travel + np.abs(proximal[:, 0] - self._proximal[:, 0])
         self._proximal = proximal
-        half, wall = factor * self.widths(spread, play), lumen_share * radius_mm
+        half = factor * self.widths(spread, play)
         heeded = self._calibration.heeded * half[:, 1]
-        edges = [tip[:, 1] + off for off in (heeded, 0.0, -heeded, wall, -wall)]
-        half[:, 1] = np.hypot(half[:, 1], wall)
+        edges = [tip[:, 1] + off for off in (heeded, 0.0, -heeded, wall_mm, -wall_mm)]
+        half[:, 1] = np.hypot(half[:, 1], wall_mm)
         self.half_width = half
         beyond = [self._ratio(edge, radius_mm) >= self._config.wall_ratio for edge in edges]
         crossed = np.any([now & ~before for now, before in zip(beyond, self._beyond, strict=True)], axis=0)

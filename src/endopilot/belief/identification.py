@@ -17,6 +17,7 @@ from scipy.stats import norm, qmc
 
 from endopilot.belief.belief import Belief, BeliefConfig, Past
 from endopilot.errors import InputError
+from endopilot.models.ensemble import likelihoods
 from endopilot.settings import Within, settings
 from endopilot.simulation.world import World
 
@@ -41,6 +42,8 @@ _OF_KIND = 4
 """The first of them are those of a kind."""
 _LUMENS = 0.9, 1.0, 1.1
 """Lumens that are tried: each is prepared by itself."""
+_LARGEST_MAP = 50_000_000
+"""Points of a distance map beyond which no other lumen is tried: it would take gigabytes."""
 _COMPLIANT_N_MM2 = 0.01
 """Stiffness of a wall that is compliant: that of an artery in the heart's muscle, docs/physics.md."""
 _SCALES_MM = (0.5, 0.3, 0.3)
@@ -59,8 +62,8 @@ _UNSURE = 0.15
 """The kind of wall is unknown where either is at least this likely."""
 _KNOWN_SHARE = 0.5
 """A parameter is unknown where its interval is wider than this share of what was likely before."""
-_OSTIUM_SD_MM = 0.6
-"""Standard deviation of the ostium that the first exposure shows, mm."""
+_OSTIUM_SD_MM = 0.4
+"""Standard deviation of the ostium that the first exposure shows, at least, mm."""
 _SHRINKS, _NARROWEST, _LEAST_OF_A_WALL = 0.7, 0.04, 2
 """Members are drawn around their parents, moved towards the mean; no closer than this share of a parameter's range; and
 so many kinds have each kind of wall at least."""
@@ -121,12 +124,13 @@ def identify(
     """
     config = config or IdentificationConfig()
     random = np.random.default_rng([seed, len(past.proximal), 0x1DE])
-    deeper_mm = _ostium_mm(belief, past)
+    ostium = _ostium(belief, past)
     if len(past.proximal) == 1:  # nothing but the ostium shows before the wire moves
-        return _deeper(belief, past, deeper_mm)
-    theta, walls = _first(config, deeper_mm, random)
+        return _deeper(belief, past, *ostium)
+    theta, walls = _first(config, ostium, random)
+    lumens = _LUMENS if belief.navigation.anatomy.distance_map.values.size <= _LARGEST_MAP else (1.0,)
     for generation in range(config.generations):
-        members = _members(theta, walls)
+        members = _members(theta, walls, lumens)
         score, explains = _scores(belief, past, members)
         score = score + _prior(members)
         weight = _tempered(score, len(members) / 8)
@@ -140,32 +144,44 @@ def identify(
     return found, Identified(interval, compliant, explains)
 
 
-def _deeper(belief: Belief, past: Past, ostium_mm: float) -> tuple[Belief, Identified]:
+def _ostium(belief: Belief, past: Past) -> tuple[float, float]:
+    """Return how much deeper the wire was at the start than the encoder says, by the first exposure, and the standard
+    deviation of that, mm."""
+    low, high = RANGES["ostium_mm"]
+    tried = np.arange(low, high + 0.1, 0.5)
+    if 0 not in past.exposures:
+        return 0.0, high / 2
+    first = Past(past.proximal[:1], past.load[:1], {0: past.exposures[0]})
+    score, _ = _scores(belief, first, [World(ostium_mm=float(each)) for each in tried])
+    weight = likelihoods(score)
+    mean = float(weight @ tried)
+    return mean, max(float(np.sqrt(weight @ (tried - mean) ** 2)), _OSTIUM_SD_MM)
+
+
+def _deeper(belief: Belief, past: Past, ostium_mm: float, sd_mm: float) -> tuple[Belief, Identified]:
     """Return the same members with their ostia where the first exposure has them."""
-    found = belief.like([replace(each, ostium_mm=each.ostium_mm + ostium_mm) for each in belief.members])
+    off = np.array([each.ostium_mm for each in belief.members])
+    wider = sd_mm / max(float(off.std()), 1e-3)
+    members = zip(belief.members, (ostium_mm + wider * (off - off.mean())).tolist(), strict=True)
+    found = belief.like([replace(each, ostium_mm=deeper) for each, deeper in members])
     found.replay(past)
-    unknown = dict.fromkeys(RANGES)
-    interval = unknown | {"ostium_mm": (ostium_mm - _OSTIUM_SD_MM, ostium_mm + _OSTIUM_SD_MM)}
+    interval = dict.fromkeys(RANGES) | {"ostium_mm": (ostium_mm - sd_mm, ostium_mm + sd_mm)}
     return found, Identified(interval, None, explains=True)
 
 
 Theta = Float[np.ndarray, "kinds each parameters"]
 
 
-def _ostium_mm(belief: Belief, past: Past) -> float:
-    """Return how much deeper the wire was at the start than the encoder says, by the first exposure, mm."""
-    seen = past.exposures.get(0)
-    return 0.0 if seen is None else seen.abscissa - float(belief.like([World()]).tip.abscissa[0])
-
-
-def _first(config: IdentificationConfig, ostium_mm: float, random: np.random.Generator) -> tuple[Theta, np.ndarray]:
+def _first(
+    config: IdentificationConfig, ostium: tuple[float, float], random: np.random.Generator
+) -> tuple[Theta, np.ndarray]:
     """Return evenly spread parameters: the first kind is as given, and ostia are about where the first image has it."""
     kinds, each = config.kinds, config.each
     of_kind = qmc.Sobol(_OF_KIND, rng=random).random(kinds)
     of_kind[0] = [_to_unit(name, 1.0) for name in list(RANGES)[:_OF_KIND]]
     rest = qmc.Sobol(len(RANGES) - _OF_KIND, rng=random).random(kinds * each).reshape(kinds, each, -1)
-    off = norm.ppf(np.clip(rest[..., -1], 1e-3, 1 - 1e-3)) * _OSTIUM_SD_MM
-    rest[..., -1] = np.clip(_to_unit("ostium_mm", ostium_mm + off), 0.0, 1.0)
+    off = norm.ppf(np.clip(rest[..., -1], 1e-3, 1 - 1e-3)) * ostium[1]
+    rest[..., -1] = np.clip(_to_unit("ostium_mm", ostium[0] + off), 0.0, 1.0)
     unit = np.concatenate([np.repeat(of_kind[:, None], each, axis=1), rest], axis=-1)
     unit[:, 0, list(RANGES).index("friction_factor")] = _to_unit("friction_factor", 1.0)
     walls = np.arange(kinds) % 3 == 1
@@ -185,19 +201,20 @@ def _to_unit(name: str, value: Any) -> Any:
 def _from_unit(name: str, unit: float) -> float:
     low, high = _bounds(name)
     value = low + unit * (high - low)
-    value = float(np.exp(value)) if name.endswith("factor") else float(value)
-    return float(_LUMENS[np.argmin(np.abs(np.array(_LUMENS) - value))]) if name == "lumen_factor" else value
+    return float(np.exp(value)) if name.endswith("factor") else float(value)
 
 
-def _members(theta: Theta, walls: np.ndarray) -> list[World]:
-    return [
-        World(
-            **{name: _from_unit(name, float(u)) for name, u in zip(RANGES, unit, strict=True)}
-            | ({"compliant_wall_n_mm2": _COMPLIANT_N_MM2, "lumen_factor": 1.0} if wall else {})
-        )
-        for of_kind, wall in zip(theta, walls, strict=True)
-        for unit in of_kind
-    ]
+def _members(theta: Theta, walls: np.ndarray, lumens: Sequence[float]) -> list[World]:
+    """Return members of parameters; each has the nearest of the lumens that are tried, in a compliant vessel the given
+    one."""
+    made = []
+    for of_kind, wall in zip(theta, walls, strict=True):
+        for unit in of_kind:
+            values = {name: _from_unit(name, float(u)) for name, u in zip(RANGES, unit, strict=True)}
+            wanted = 1.0 if wall else values["lumen_factor"]
+            values["lumen_factor"] = min(lumens, key=lambda factor: abs(factor - wanted))
+            made.append(World(**values, compliant_wall_n_mm2=_COMPLIANT_N_MM2 if wall else None))
+    return made
 
 
 def _prior(members: Sequence[World]) -> Float[np.ndarray, "members"]:

@@ -20,8 +20,9 @@ from endopilot.devices.stack import Proximals
 from endopilot.tasks.navigation import Navigation
 from endopilot.xray.fluoroscope import TipMeasurement
 
-_LUMEN_SHARE = 0.12
-"""The lumen's radius may be off by this share: CT shows it to a tenth, an assumption."""
+_LUMEN_SHARE, _LUMEN_MM = 0.12, 0.3
+"""The lumen's radius may be off by this share, and no more than this, mm: CT shows it to a tenth or a voxel, an
+assumption."""
 _MOST, _EVERY = 6, 3
 """The belief is changed as often at most, after as many further exposures at least."""
 MISMATCH = "model mismatch"
@@ -90,6 +91,7 @@ class Monitor:
         self._adviser = XrayAdviser(calibration, self._advice, navigation.device.tip_radius_mm)
         self._innovations, self.past, self.lost = Innovations(), Past(), False
         self.identified: Identified | None = None
+        self._tests = not navigation.catheters
         self.changes_left, self._since, self._returned = _MOST, 0, False
         proximal, tip, spread, radius = adviser_input(self.belief)
         self._adviser.start(proximal, tip, radius)
@@ -125,7 +127,7 @@ class Monitor:
             self.belief.weigh(exposure)
             self._adviser.exposed()
             self.lost = not self.belief.explains(exposure)
-            self._innovations.alarm |= self.lost
+            self._innovations.alarm |= self.lost and self._tests
             self._since += 1
             if self._is_to_change():
                 self._identify(exposure)
@@ -133,8 +135,9 @@ class Monitor:
         elif self.belief.drives.proximal[0, 0] <= self._navigation.start_inserted_length_mm:
             self.lost = False  # back where it began, the wire lies as it did, unseen in its catheter
         factor = self._innovations.factor
-        shares = {"factor": factor, "always": self.alarm, "lumen_share": _LUMEN_SHARE}
-        due = bool(self._adviser.advise(proximal, tip, spread, radius, play, **shares)[0])
+        wall_mm = np.minimum(_LUMEN_SHARE * radius, _LUMEN_MM) if self._tests else 0.0
+        wider = {"factor": factor, "always": self.alarm, "wall_mm": wall_mm}
+        due = bool(self._adviser.advise(proximal, tip, spread, radius, play, **wider)[0])
         self._half = self._adviser.half_width[0] / factor
         return self._believed(tip[0], due)
 
@@ -153,7 +156,7 @@ class Monitor:
 
     def _is_to_change(self) -> bool:
         """Return whether another belief is sought: the first does not explain the images, or no longer the last one."""
-        if self.changes_left == 0 or not (self.alarm or self.lost):
+        if self.changes_left == 0 or not self.alarm:
             return False
         return self.identified is None or (self._since >= _EVERY and (self.lost or self._innovations.outside))
 
@@ -168,7 +171,7 @@ class Monitor:
         abscissa, offset = tip.tolist()
         found = "" if self.identified is None else self.identified.words
         if self.lost:
-            asks = "no simulated wire explains the last image" if due else ""
+            asks = "no simulated wire explains the last image" if due or not self._tests else ""
             return BelievedTip(abscissa, offset, (np.inf, np.inf), asks, found)
         along, across = self._adviser.half_width[0].tolist()
         wide = along >= self._advice.abscissa_mm

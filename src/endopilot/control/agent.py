@@ -66,10 +66,15 @@ class AgentConfig:
 
 
 IN_WIDE_LUMEN = AgentConfig(
-    belief=BeliefConfig(members=24, ostium_spread_mm=3.5, element_mm=1.25, time_step_s=0.1),
-    lost_along_mm=6.0,
-    lost_across_mm=2.5,
-    lost_across_radii=0.3,
+    belief=BeliefConfig(
+        members=24,
+        ostium_spread_mm=3.5,
+        element_mm=1.25,
+        time_step_s=0.1,
+        lost_along_mm=6.0,
+        lost_across_mm=2.5,
+        lost_across_radii=0.3,
+    ),
 )
 """Settings of an agent of a wire alone on a route through a wide lumen, such as an aorta. The wire lies more freely in
 it, and the place of the ostium is known less well; bends are wide, so that longer elements and steps do."""

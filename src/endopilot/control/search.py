@@ -47,6 +47,8 @@ _STRETCH_MM = 20.0
 """A wire in a catheter passes the route in stretches of this length at most, mm."""
 _TURNS = (0.0, np.pi)
 """Angles by which a wire alone may be turned before it goes in, rad."""
+_OFTEN = 6
+"""A course that has passed places this many times as often as there are is at an end."""
 _REPEATED = 3
 """Trials of a manoeuvre that the course tries, one after another."""
 
@@ -138,6 +140,9 @@ class Search:
                     break
                 if len(course.rows) == kept.periods:  # some wire lies beyond the waypoint, others before it
                     course.move(course.control(Move(WIRE, -_BACK_MM_S)))
+                if len(settled) > _OFTEN * len(places):  # it goes to and fro about a place
+                    self._halted("stalled", waypoint)
+                    break
             elif any(self._turned(grid, share, waypoint, kept) for share, grid in self._repertoire.ways):
                 settled.append(len(course.rows) - 1)
             elif not (self._alone and self._drawn(waypoint, kept)):
