@@ -129,19 +129,27 @@ def identify(
         return _deeper(belief, past, *ostium)
     theta, walls = _first(config, ostium, random)
     lumens = _LUMENS if belief.navigation.anatomy.distance_map.values.size <= _LARGEST_MAP else (1.0,)
-    for generation in range(config.generations):
-        members = _members(theta, walls, lumens)
-        score, explains = _scores(belief, past, members)
-        score = score + _prior(members)
-        weight = _tempered(score, len(members) / 8)
-        if generation + 1 < config.generations:
-            theta, walls = _redrawn(theta, walls, weight, config, random)
+    members, score, weight, explains = _weighed(belief, past, theta, walls, lumens)
+    for _ in range(config.generations - 1):
+        theta, walls = _redrawn(theta, walls, weight, config, random)
+        members, score, weight, explains = _weighed(belief, past, theta, walls, lumens)
     flat = theta.reshape(-1, len(RANGES))
     interval = {name: _interval(name, flat[:, k], weight) for k, name in enumerate(RANGES)}
     compliant = float(weight[np.repeat(walls, config.each)].sum())
     found = belief.like(_chosen(members, score, weight, config.each, belief.config))
     found.replay(past)
     return found, Identified(interval, compliant, explains)
+
+
+def _weighed(
+    belief: Belief, past: Past, theta: Theta, walls: np.ndarray, lumens: Sequence[float]
+) -> tuple[list[World], np.ndarray, np.ndarray, bool]:
+    """Return members of parameters, their logarithmic likelihoods, weights by a part of these, and whether the best
+    explains more than none does."""
+    members = _members(theta, walls, lumens)
+    score, explains = _scores(belief, past, members)
+    score = score + _prior(members)
+    return members, score, _tempered(score, len(members) / 8), explains
 
 
 def _ostium(belief: Belief, past: Past) -> tuple[float, float]:
@@ -210,7 +218,7 @@ def _members(theta: Theta, walls: np.ndarray, lumens: Sequence[float]) -> list[W
     made = []
     for of_kind, wall in zip(theta, walls, strict=True):
         for unit in of_kind:
-            values = {name: _from_unit(name, float(u)) for name, u in zip(RANGES, unit, strict=True)}
+            values: dict[str, Any] = {name: _from_unit(name, float(u)) for name, u in zip(RANGES, unit, strict=True)}
             wanted = 1.0 if wall else values["lumen_factor"]
             values["lumen_factor"] = min(lumens, key=lambda factor: abs(factor - wanted))
             made.append(World(**values, compliant_wall_n_mm2=_COMPLIANT_N_MM2 if wall else None))
@@ -234,7 +242,7 @@ def _scores(belief: Belief, past: Past, members: Sequence[World]) -> tuple[Float
         if not len(chosen):
             continue
         try:
-            tried = belief.like([members[k] for k in chosen])
+            tried = belief.like([members[k] for k in chosen.tolist()])
         except InputError:  # the wire does not fit
             continue
         error = tried.replay(past)

@@ -21,8 +21,9 @@ _FAR, _RECENT = 2.0, 6
 this many times its bound over √n. Bounds are those of bands as calibrated."""
 _OUTSIDE, _OF = 1.3, 3
 """Two of so many innovations this many times their bounds are enough too. Bounds are those of widened bands."""
-_PROOF = 4
-"""Images in a row that lie within the bands of a belief that was identified before it is trusted."""
+_PROOF, _WIDER = 3, 1.5
+"""Images in a row that lie within the bands of a belief that was identified before it is trusted; and how much wider
+its bands begin: members that a few images chose are more alike than they are right."""
 
 
 class Innovations:
@@ -31,25 +32,25 @@ class Innovations:
     Attributes:
         factor: by which the bands of Δtip and γtip are widened, 1 or more.
         alarm: whether the model is taken to be wrong: since two of three innovations lay outside, or one or their mean
-            was far; until two in a row lie inside, four of a belief that was identified.
+            was far; until two in a row lie inside, three of a belief that was identified.
     """
 
     def __init__(self) -> None:
         """Begin with the bands as they are calibrated."""
         self._shares, self._off = list[float](), list[Float[np.ndarray, "2"]]()
-        self.renew()
-        self.alarm = False
+        self.factor, self.alarm = np.ones(2), False
+        self._excess, self._weight = np.full(2, _PRIOR), np.full(2, _PRIOR)
 
     def renew(self) -> None:
         """Take another belief, which has yet to prove itself."""
-        self.factor, self._shares, self._off = np.ones(2), [], []
+        self.factor, self._shares, self._off = np.full(2, _WIDER), [], []
         self.alarm, self._inside, self._needed = True, 0, _PROOF
-        self._excess, self._weight = np.full(2, _PRIOR), np.full(2, _PRIOR)
+        self._excess, self._weight = np.full(2, _WIDER**2 * _PRIOR), np.full(2, _PRIOR)
 
     @property
     def outside(self) -> bool:
-        """Whether one of the last images lay outside the bands."""
-        return max(self._shares[-_OF:], default=0.0) > 1.0
+        """Whether one of the last images lay well outside the bands."""
+        return max(self._shares[-_OF:], default=0.0) > _OUTSIDE
 
     def take(
         self, innovation: Float[np.ndarray, "2"], half_mm: Float[np.ndarray, "2"], sd_mm: tuple[float, float]
