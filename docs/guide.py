@@ -163,7 +163,7 @@ def renewed(block: Block, made: str) -> str:
         new = next((line.rstrip() for line in made.splitlines() if line and key(line) == key(shown)), None)
         if new is None:
             raise RuntimeError(f"{shown!r}: the command prints no such line, but\n{made}")
-        lines.append(new[: len(shown) - 1].rstrip() + "…" if shown.endswith("…") and len(new) >= len(shown) else new)
+        lines.append(new[: len(shown) - 1] + "…" if shown.endswith("…") and len(new) >= len(shown) else new)
     return "\n".join([*lines, ""])
 
 

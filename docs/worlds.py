@@ -1,19 +1,53 @@
-"""Write the tables of fields and of shipped worlds in docs/worlds.md: `python docs/worlds.py`."""
+"""Write the tables of docs/worlds.md: `python docs/worlds.py [FILE]`.
+
+Those of fields and of shipped worlds are made of the package. Where the agent was driven in them, FILE holds what
+`python -m benchmarks worlds -o FOLDER --json > FILE` printed.
+"""
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import docstring_parser
 
+from endopilot.files import read_json
 from endopilot.simulation.world import NOMINAL, Stenosis, World, list_worlds, read_world
 
 PAGE = Path(__file__).with_suffix(".md")
+FIGURES = {
+    "missed_share": "events missed, random drive",
+    "missed_share_worst": "the same in the worst world",
+    "exposures_per_minute_nominal": "exposures a minute, random drive, nominal world",
+    "exposures_per_minute_other": "exposures a minute, random drive, other worlds",
+    "in_bands_share_random": "decisions in both bands, random drive",
+    "in_bands_share_planned": "decisions in both bands, planned",
+    "in_bands_share": "the smaller of both",
+    "in_bands_share_worst": "the same in the worst world",
+    "safe_share": "planned navigations that arrived safely",
+    "safe_share_worst": "the same in the worst world",
+    "exposures_planned": "exposures of a planned navigation",
+    "exposures_planned_nominal": "the same in the nominal world",
+    "navigations_above_40_exposures": "planned navigations with more than 40 exposures",
+    "unsafe_by_force_share": "planned navigations beyond the force limit",
+    "missed_share_planned": "events missed, planned",
+    "false_alarms_share": "navigations in the nominal world with a false alarm",
+    "alarms_share": "navigations in other worlds with an alarm",
+}
+"""Figures of the agent in other worlds, in words."""
+LEAST = ("in_bands_share", "in_bands_share_worst", "safe_share", "safe_share_worst")
+"""Figures that are to be at least as large as their bar."""
 
 
-def page() -> str:
-    """Return the page as it is to be: what stands between the markers is made of the record and its files."""
+def page(found: Mapping[str, Any] | None = None) -> str:
+    """Return the page as it is to be: what stands between the markers is made of the record and its files.
+
+    Args:
+        found: what the benchmark of worlds printed; its tables stay as they are if not given.
+    """
     text = PAGE.read_text(encoding="utf-8")
     shipped = [f"| `{name}` | {read_world(name).about} |" for name in list_worlds() if name != NOMINAL]
     tables = {
@@ -21,6 +55,8 @@ def page() -> str:
         "stenosis": _fields(Stenosis()),
         "shipped": ["| world | what it is |", "| --- | --- |", *shipped],
     }
+    if found is not None:
+        tables["measured"] = _measured(found)
     for name, rows in tables.items():
         begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
         head, rest = text.split(begin)
@@ -41,5 +77,53 @@ def _fields(defaults: World | Stenosis) -> list[str]:
     return rows
 
 
+def _measured(found: Mapping[str, Any]) -> list[str]:
+    """Return the figures of the agent in other worlds beside their bars, then the counts of each world."""
+    rows = [f"| {len(found['worlds'])} rows below, {found['events']} events | measured | bar |", "| --- | --- | --- |"]
+    for name, words in FIGURES.items():
+        if name in found:
+            bar = found["bars"].get(name)
+            limit = "" if bar is None else f"{'≥' if name in LEAST else '≤'} {_shown(name, bar)}"
+            rows.append(f"| {words} | {_shown(name, found[name])} | {limit} |")
+    rows += [
+        "",
+        "| world | planned: arrived safely | beyond the force limit | exposures, mean (most) | events missed "
+        "| in both bands | alarms | at random: events missed | exposures a minute | in both bands | alarms |",
+        "| --- |" + " --- |" * 10,
+    ]
+    by_world: dict[str, dict[str, Mapping[str, Any]]] = {}
+    for each in found["worlds"]:
+        by_world.setdefault(each["world"], {})[each["drive"]] = each
+    for world, drives in by_world.items():
+        rows.append(f"| `{world}` | {_planned(drives.get('planned'))} | {_at_random(drives.get('random'))} |")
+    return rows
+
+
+def _planned(row: Mapping[str, Any] | None) -> str:
+    if row is None:
+        return " | | | | | "
+    count = row["navigations"]
+    exposures = f"{row['exposures'] / count:.1f} ({row['most_exposures']})"
+    force = f"{row['unsafe_by_force']} of {count}"
+    return " | ".join([f"{row['safe']} of {count}", force, exposures, *_counts(row), f"{row['alarmed']} of {count}"])
+
+
+def _at_random(row: Mapping[str, Any] | None) -> str:
+    if row is None:
+        return " | | | "
+    missed, held = _counts(row)
+    a_minute = f"{60 * row['exposures'] / row['seconds']:.1f}"
+    return " | ".join([missed, a_minute, held, f"{row['alarmed']} of {row['navigations']}"])
+
+
+def _counts(row: Mapping[str, Any]) -> tuple[str, str]:
+    """Return how many events were missed, and the share of the decisions in both bands."""
+    return f"{row['missed']} of {row['events']}", f"{100 * row['in_bands'] / row['decisions']:.0f} %"
+
+
+def _shown(name: str, value: float) -> str:
+    return f"{100 * value:.1f} %" if "share" in name else f"{value:.1f}" if value % 1 else f"{value:.0f}"
+
+
 if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    PAGE.write_text(page(read_json(Path(sys.argv[1])) if len(sys.argv) > 1 else None), encoding="utf-8")

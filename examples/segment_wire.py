@@ -77,10 +77,8 @@ def train(data: Path, steps: int, batch: int, seed: int) -> UNet:
     optimiser = torch.optim.AdamW(net.parameters(), lr=3e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, total_steps=steps)
     for step in range(steps):
-        images, masks = zip(
-            *(crop(*read(*frames[random.integers(len(frames))]), random) for _ in range(batch)), strict=True
-        )
-        image, mask = torch.from_numpy(np.stack(images))[:, None], torch.from_numpy(np.stack(masks)).float()
+        chosen = [crop(*read(*frames[random.integers(len(frames))]), random) for _ in range(batch)]
+        image, mask = (torch.from_numpy(np.stack(part).astype(np.float32)) for part in zip(*chosen, strict=True))
         logit = net(image[:, None])
         share = logit.sigmoid()
         dice = 1 - (2 * (share * mask).sum() + 1) / (share.sum() + mask.sum() + 1)

@@ -8,7 +8,7 @@
 
 EPISODES.npz holds episodes of ArchVariety: for each seed SSS of the benchmark, what its own generator draws, in mm:
 `SSS_branch_NAME` (a row x, y, z, radius for each point), `SSS_insertion_mm`, `SSS_direction` and `SSS_target_mm`. The
-folder gets an anatomy for each seed, the benchmark's wire, and the task.
+folder gets an anatomy for each seed, the benchmark's wire, the task, and a world in which the ostium lies elsewhere.
 
 CURVES is the folder of DualDeviceNav's centerline curves, as 3D Slicer wrote them. The folder gets one anatomy, the
 benchmark's wire and catheter, and a task with twenty targets: points of the carotid and vertebral arteries' curves that
@@ -30,7 +30,8 @@ import yaml
 
 import endopilot
 from endopilot.anatomy.catheter_axis import with_axis
-from endopilot.anatomy.sources import Polylines, read_source
+from endopilot.anatomy.read_source import read_source
+from endopilot.anatomy.sources import Polylines
 from endopilot.tasks.task import list_tasks
 
 POISSON = 0.49
@@ -49,6 +50,9 @@ TASK = {
 """What the benchmark's tasks have in common."""
 OSTIUM_MM, DIRECTION = (-35.0, 65.0, 5.0), (-1.0, -1.0, 0.0)
 """Insertion of DualDeviceNav in the coordinates of its curves: the benchmark takes (x, y, z) as (y, -z, -x)."""
+NARROW_MM = 0.9
+"""Curves with a smaller radius are left out, two branches behind the left carotid artery: the catheter hardly fits into
+them, and all walls would have to be five times finer for them."""
 GOALS = ("LCCA", "LVA", "RCCA", "RVA")
 TARGETS = 20
 
@@ -122,14 +126,19 @@ def convert(episodes: Path, folder: Path) -> list[str]:
         "targets_mm": [arrays[f"{seed}_target_mm"].tolist() for seed in seeds],
     }
     write(folder, {"steve": wire}, task)
+    world = {"about": "The ostium lies 3 mm deeper; friction, tip stiffness and latency differ by 20 %, as drawn."}
+    (folder / "worlds").mkdir(exist_ok=True)
+    (folder / "worlds" / "ostium-off.yaml").write_text(yaml.safe_dump(world | {"ostium_mm": 3.0, "share": 0.2}))
     return seeds
 
 
 def convert_curves(curves: Path, folder: Path, seed: int = 0) -> list[list[float]]:
     """Write anatomy, devices and task of DualDeviceNav's curves into a folder, and return the targets, LPS mm."""
     lines = read_source(curves).content
+    kept = [number for number, radius in enumerate(lines.radius) if radius.min() > NARROW_MM]
+    lines = Polylines(*(tuple(each[number] for number in kept) for each in (lines.points, lines.radius, lines.names)))
     anatomy = endopilot.extract_anatomy(
-        curves, name="dualdevicenav", config=endopilot.AnatomyConfig(ostium_mm=OSTIUM_MM)
+        lines, name="dualdevicenav", config=endopilot.AnatomyConfig(ostium_mm=OSTIUM_MM)
     )
     anatomy = with_axis(anatomy, np.array(DIRECTION) / np.linalg.norm(DIRECTION))
     endopilot.write_anatomy(anatomy, output=folder / "patients" / "dualdevicenav")

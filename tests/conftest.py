@@ -6,9 +6,42 @@ from unittest.mock import patch
 
 import pytest
 
+from missing_libraries import missing_library
 from shape_checks import check_quickly
 
 check_quickly()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector):
+    """Skip a module that needs a library which is not installed."""
+    report = yield
+    error = report.call.excinfo.value if report.failed and report.call.excinfo else None
+    if reason := missing_library(error):
+        report.outcome, report.longrepr = "skipped", (str(collector.path), 0, f"Skipped: {reason}")
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup():
+    """Skip a test whose fixtures need such a library."""
+    return (yield from skipping())
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call():
+    """Skip a test that needs such a library."""
+    return (yield from skipping())
+
+
+def skipping():
+    """Go on with a hook, and skip the test if it fails for want of a library."""
+    try:
+        return (yield)
+    except Exception as error:
+        if reason := missing_library(error):
+            pytest.skip(reason)
+        raise
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -33,16 +33,16 @@ ASKED = {
 
 
 VERBS = {
-    "calibrate", "check", "climb", "evaluate", "extract", "find", "generate", "list", "load", "make", "navigate",
-    "plan", "read", "replay", "segment", "simulate", "take", "train", "write",
+    "calibrate", "check", "climb", "evaluate", "extract", "find", "generate", "list", "load", "locate", "make",
+    "navigate", "plan", "read", "replay", "segment", "simulate", "take", "train", "write",
 }  # fmt: skip
 SUBJECTS = {
-    "anatomies", "anatomy", "control", "dataset", "device", "devices", "driven", "folder", "logs", "name",
+    "anatomies", "anatomy", "control", "dataset", "device", "devices", "driven", "folder", "locations", "logs", "name",
     "name_or_path", "navigation", "num_envs", "path", "plan", "policy", "run", "session", "source", "target", "version",
     "volume", "wire", "wire_radius_mm",
 }  # fmt: skip
 """What a function does something with, or to. All else goes by keyword."""
-UNITS = re.compile(r"(^|_)(mm2?|s2?|n|hu|rad|deg|ugy|seconds|pixel_sd|along_sd|share|factor|weight|ratio)$")
+UNITS = re.compile(r"(^|_)(mm2?|s2?|n|hu|rad|deg|px|ugy|seconds|pixel_sd|along_sd|share|factor|weight|ratio)$")
 WITHOUT_UNIT = {
     "calcium", "dose", "efficiency", "friction", "friction_along", "gain_rotation", "gain_sd_rotation",
     "gain_sd_translation", "gain_translation", "largest_jump", "learning_rate", "right_heart", "scale",

@@ -268,7 +268,8 @@ def drive_in_worlds(
     for name, world in chosen.items():
         claim(output / name, "python -m benchmarks worlds", **identity("agent", NEWEST, world=world), patients=patients)
         first = zlib.crc32(name.encode())
-        for drive, count in (("planned", planned), ("random", random)):
+        counts: dict[Drive, int] = {"planned": planned, "random": random}
+        for drive, count in counts.items():
             places = [(first + place) % PLACES for place in range(count)]
             paths[name, drive] = [output / name / drive / f"{place:02d}.json" for place in places]
     make = partial(measure, worlds=chosen, patients=patients)

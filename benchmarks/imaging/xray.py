@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,6 +18,7 @@ from endopilot.settings import Seed, Within, settings
 from endopilot.simulation.motion import draw_motion, published_mean
 from endopilot.xray.carm import Pose
 from endopilot.xray.detector import TipDetector
+from endopilot.xray.image import ImageConfig
 from endopilot.xray.motion_registration import motion_error_mm, register_motion, take_run
 from endopilot.xray.pose_refinement import PoseRefiner
 from endopilot.xray.registration import Registration, register, vessel_error_mm
@@ -44,6 +45,10 @@ _OVERLAP_PX = 6.0
 _BONE = 0.25
 """A tip lies before bone or liver where the background takes away this much more than in the middle, in powers of e."""
 _SEEN_SHARE = 0.5
+SHOWN = ((0, 1), (0,), (1,))
+"""Both views, and each alone."""
+Case = tuple[int | None, float, float, tuple[int, ...]]
+"""Of an exposure: the wire, the dose, the contrast, and the views."""
 _OF_95 = 2.795
 """Standard deviations within which 95 % of normally distributed errors in space lie."""
 
@@ -60,10 +65,12 @@ class XrayBenchConfig:
     """Seed of patients, poses, wires and noise."""
     given: tuple[Path, ...] = ()
     """Folders of anatomies of your own in place of synthetic patients, as `endopilot anatomy` makes them."""
+    image: ImageConfig = field(default_factory=ImageConfig)
+    """Detector, beam and processing."""
 
 
 @dataclass(frozen=True)
-class _Exposure:
+class Exposure:
     """One detection, or a miss.
 
     Attributes:
@@ -117,15 +124,15 @@ def bench_xray(config: XrayBenchConfig = XrayBenchConfig()) -> dict[str, Any]:
         `motion_error_mm`: how far a vessel that heart and breath move lies from where a run of contrast has it, and
         `motion_error_of_published_mean_mm`, both medians of the patients.
     """
-    exposures: list[_Exposure] = []
+    exposures: list[Exposure] = []
     registrations: list[dict[str, Any]] = []
     rates: list[float] = []
     scenes = SceneConfig(patients=config.patients, seed=config.seed, given=config.given)
-    for index, scene in enumerate(draw_scenes(scenes)):
+    for index, scene in enumerate(draw_scenes(scenes, config.image)):
         rates.append(_images_per_second(scene))
         registered, row = _register(scene, int(np.random.SeedSequence([config.seed, index]).generate_state(1)[0]))
         registrations.append(row)
-        exposures += _expose(scene, registered, config.wires)
+        exposures += expose(scene, registered, cases_of(config.wires))
     return _figures(exposures, registrations, rates)
 
 
@@ -208,18 +215,31 @@ def _refined(scene: Scene, registered: Registration, used: Sequence[int]) -> lis
     return errors
 
 
-def _expose(scene: Scene, registered: Registration, wires: int) -> list[_Exposure]:
-    detector, rows = TipDetector(scene.anatomy, scene.device), []
-    views = registered.views([scene.view(0), scene.view(1)], scene.imager.isocenter)
-    shown = ((0, 1), (0,), (1,))
-    usual = [(wire, 1.0, 0.0, used) for wire in range(wires) for used in shown]
-    other = [
+def cases_of(wires: int) -> list[Case]:
+    """Return the exposures of some wires: at the usual dose in both views and in each alone; and others in both."""
+    usual: list[Case] = [(wire, 1.0, 0.0, used) for wire in range(wires) for used in SHOWN]
+    other: list[Case] = [
         (wire, dose, contrast, (0, 1))
         for wire, dose, contrast in itertools.product(range(0, wires, 2), DOSES, CONTRASTS)
         if (dose, contrast) != (1.0, 0.0)
     ]
-    absent = [(None, dose, contrast, used) for dose in DOSES for contrast in CONTRASTS for used in shown[:2]]
-    for index, (wire, dose, contrast, used) in enumerate(usual + other + absent * _NO_WIRE):
+    absent: list[Case] = [
+        (None, dose, contrast, used) for dose in DOSES for contrast in CONTRASTS for used in SHOWN[:2]
+    ]
+    return usual + other + absent * _NO_WIRE
+
+
+def expose(scene: Scene, registered: Registration, cases: Sequence[Case]) -> list[Exposure]:
+    """Return what the detector finds in some exposures.
+
+    Args:
+        scene: the patient.
+        registered: of two views.
+        cases: of each exposure the wire, or none, the dose, the contrast and the views.
+    """
+    detector, rows = TipDetector(scene.anatomy, scene.device), []
+    views = registered.views([scene.view(0), scene.view(1)], scene.imager.isocenter)
+    for index, (wire, dose, contrast, used) in enumerate(cases):
         number = index % len(scene.nodes) if wire is None else wire
         signals = scene.signals(wire, contrast=contrast, dose=dose, seed=index)
         found = detector.find(
@@ -229,12 +249,12 @@ def _expose(scene: Scene, registered: Registration, wires: int) -> list[_Exposur
             float(scene.inserted_length[number]),
         )
         angle = scene.angles_deg[used[0]]
-        row = _Exposure(len(used), dose, contrast, view_text(angle), wire is not None, found is not None)
+        row = Exposure(len(used), dose, contrast, view_text(angle), wire is not None, found is not None)
         rows.append(row if wire is None else _errors(row, scene, wire, used, found))
     return rows
 
 
-def _errors(row: _Exposure, scene: Scene, wire: int, used: Sequence[int], found: TipEstimate | None) -> _Exposure:
+def _errors(row: Exposure, scene: Scene, wire: int, used: Sequence[int], found: TipEstimate | None) -> Exposure:
     """Return a row with what is special about the tip, and with its errors."""
     nodes = scene.nodes[wire]
     tip, direction = nodes[0], (nodes[0] - nodes[1]) / np.linalg.norm(nodes[0] - nodes[1])
@@ -274,34 +294,34 @@ def _errors(row: _Exposure, scene: Scene, wire: int, used: Sequence[int], found:
     )
 
 
-def _figures(exposures: list[_Exposure], registrations: list[dict[str, Any]], rates: list[float]) -> dict[str, Any]:
-    def usual(one: _Exposure) -> bool:
+def _figures(exposures: list[Exposure], registrations: list[dict[str, Any]], rates: list[float]) -> dict[str, Any]:
+    def usual(one: Exposure) -> bool:
         return one.wire and one.dose == 1.0 and one.contrast == 0.0
 
     two = [one for one in exposures if usual(one) and one.views == 2]
     single = [one for one in exposures if usual(one) and one.views == 1]
     without = [one for one in exposures if not one.wire]
     by = {
-        f"dose {dose:g}, contrast {contrast:g}": _summary(
+        f"dose {dose:g}, contrast {contrast:g}": summary(
             one for one in exposures if one.wire and one.views == 2 and (one.dose, one.contrast) == (dose, contrast)
         )
         for dose, contrast in itertools.product(DOSES, CONTRASTS)
     }
-    by |= {f"{angle} alone": _summary(one for one in single if one.angle == angle) for angle in _angles(single)}
+    by |= {f"{angle} alone": summary(one for one in single if one.angle == angle) for angle in _angles(single)}
     for name, of in (
         ("over another branch", "overlaps"),
         ("over bone or liver", "bone"),
         ("the end along the beam", "foreshortened"),
     ):
-        by[f"one view, {name}"] = _summary(one for one in single if getattr(one, of))
+        by[f"one view, {name}"] = summary(one for one in single if getattr(one, of))
     figures = {
         "images_per_second": float(np.median(rates)),
-        **_summary(two),
+        **summary(two),
         "registration_error_mm": float(np.median([row["two_views_mm"] for row in registrations])),
         "registration_error_one_view_mm": float(np.median([row["one_view_mm"] for row in registrations])),
         **_motion_summary([row["motion_mm"] for row in registrations]),
         "false_alarms_share": float(np.mean([one.found for one in without])),
-        "one_view": _summary(single),
+        "one_view": summary(single),
         "by": by,
         "registration": registrations,
     }
@@ -319,11 +339,12 @@ def _motion_summary(errors: list[dict[str, float | None]]) -> dict[str, Any]:
     }
 
 
-def _angles(exposures: list[_Exposure]) -> list[str]:
+def _angles(exposures: list[Exposure]) -> list[str]:
     return sorted({one.angle for one in exposures})
 
 
-def _summary(exposures: Iterable[_Exposure]) -> dict[str, Any]:
+def summary(exposures: Iterable[Exposure]) -> dict[str, Any]:
+    """Return errors, misses and calibration of some exposures of a wire."""
     rows = list(exposures)
     found = [one for one in rows if one.found]
 

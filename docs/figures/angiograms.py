@@ -41,6 +41,7 @@ def transit_frames(vessel: str, section: str, velocity_mm_s: float) -> list[floa
 
 
 def table() -> str:
+    """Return the table of transit times as Markdown."""
     low, high = AngiogramsConfig().blood_mm_s
     rows = [
         "| frames of 1/30 s to the end of the | slowest blood | mean | fastest | published |",
@@ -60,7 +61,7 @@ def draw() -> None:
             anatomy = make_patient(AtlasConfig(vessel=("rca", "lca")[index % 2], seed=12), index)
             folders.append(Path(place) / anatomy.name)
             write_anatomy(anatomy, output=folders[-1])
-        config = AngiogramsConfig(cines=2, seconds=2.5, injected_share=0.8, seed=1)
+        config = AngiogramsConfig(cines=2, seconds=1.6, injected_share=0.8, seed=1)
         make_angiograms(folders, output=Path(place) / "angiograms", config=config)
         shutil.copy(Path(place) / "angiograms" / "samples.png", PICTURE)
 

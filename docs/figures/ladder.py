@@ -1,8 +1,9 @@
-"""Write tasks and scores into docs/ladder.md: `python docs/figures/ladder.py [FOLDER [MISMATCH]]`.
+"""Write tasks and scores into docs/ladder.md: `python docs/figures/ladder.py [FOLDER [MISMATCH [STEVE]]]`.
 
 FOLDER, runs/ladder if not given, holds what `endopilot ladder` made of each policy in the newest version and, with
 `--version coaxial`, of those that drive a catheter. MISMATCH, runs/ladder-mismatch if not given, holds what it made
-with `--mismatch 0.2`. A folder that is not there leaves its table as it is.
+with `--mismatch 0.2`. STEVE, runs/steve if not given, holds what it made of the tasks of a public benchmark, a folder
+for each. A folder that is not there leaves its table as it is.
 """
 
 from __future__ import annotations
@@ -18,6 +19,11 @@ ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "ladder.md"
 _MEANS = (("peak force, median, N", "peak_force_n"), ("exposures, mean", "exposures"))
 _MISSED = "events missed, %"
+_PUBLISHED = (
+    ("archvariety", "learned, best", "theirs", "97", "all frames, some 250", "–", "none", "100"),
+    ("dualdevicenav", "learned, best", "theirs", "40", "all frames", "–", "none", "100"),
+)
+"""Success of the controllers that were trained for the benchmark (Karstensen et al., arXiv 2410.01956)."""
 
 
 def fill(name: str, lines: list[str]) -> None:
@@ -101,10 +107,28 @@ def mismatch(folder: Path) -> list[str]:
     return lines
 
 
+def benchmark(folder: Path) -> list[str]:
+    """Return the table of a public benchmark's tasks: what its paper reports, and what each run in a folder reached."""
+    head = ("task", "controller", "world", "within 5 mm, %", "exposures", "force, N", "planning, s", "episodes")
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines += ["| " + " | ".join(row) + " |" for row in _PUBLISHED]
+    for path in sorted(folder.glob("*/ladder.json")):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        (row,) = content["scores"]
+        done = [json.loads(each.read_text(encoding="utf-8")) for each in sorted((path.parent / row["task"]).glob("*"))]
+        planning = [each["planning_s"] for each in done]
+        cells = (row["task"], f"`{content['policy']}`", content["world"]["name"].rpartition("/")[2])
+        cells += (f"{100 * row['near']:.0f}", f"{row['exposures']:g}", f"{row['peak_force_n']:.3g}")
+        cells += (f"{row['planning_s']:.0f}, at most {max(planning):.0f}", str(len(done)))
+        lines.append("| " + " | ".join(cells) + " |")
+    return lines
+
+
 def main() -> None:
     """Fill the page."""
     given = [Path(argument) for argument in sys.argv[1:]]
-    ladder, mismatched = [*given, *[ROOT / "runs" / name for name in ("ladder", "ladder-mismatch")][len(given) :]]
+    names = ("ladder", "ladder-mismatch", "steve")
+    ladder, mismatched, steve = [*given, *[ROOT / "runs" / name for name in names][len(given) :]]
     fill("tasks", tasks())
     fill("coaxial tasks", coaxial_tasks())
     if ladder.is_dir():
@@ -112,6 +136,8 @@ def main() -> None:
         fill("coaxial scores", scores(ladder, "coaxial", "coaxial scores"))
     if mismatched.is_dir():
         fill("mismatch", mismatch(mismatched))
+    if steve.is_dir():
+        fill("benchmark", benchmark(steve))
 
 
 if __name__ == "__main__":

@@ -122,17 +122,24 @@ from .types import VesselTree as VesselTree
 from .types import Volume as Volume
 from .xray.camera import CArmCamera as CArmCamera
 from .xray.camera import PlanarCamera as PlanarCamera
+from .xray.camera import read_camera as read_camera
 from .xray.carm import CArmGeometry as CArmGeometry
 from .xray.carm import Pose as Pose
 from .xray.carm import View as View
 from .xray.fluoroscope import Fluoroscope as Fluoroscope
 from .xray.fluoroscope import FluoroscopeConfig as FluoroscopeConfig
 from .xray.fluoroscope import TipMeasurement as TipMeasurement
+from .xray.frames import Frame as Frame
+from .xray.frames import read_frames as read_frames
+from .xray.frames import write_locations as write_locations
 from .xray.image import ImageConfig as ImageConfig
 from .xray.image import Plane as Plane
 from .xray.image import XrayImager as XrayImager
+from .xray.locate import locate as locate
 from .xray.take_image import TakeImageConfig as TakeImageConfig
 from .xray.take_image import XrayImage as XrayImage
 from .xray.take_image import take_image as take_image
+from .xray.tip_filter import LocateConfig as LocateConfig
+from .xray.tip_filter import TipLocation as TipLocation
 
 __version__: str

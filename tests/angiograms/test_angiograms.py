@@ -6,6 +6,7 @@ import hashlib
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,9 @@ from endopilot.angiograms.masks import CLASSES
 from endopilot.cli import main
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
+from endopilot.imaging.volume import read_volume, write_volume
 from endopilot.simulation.motion import place
+from endopilot.types import Volume
 from endopilot.xray.carm import CArmGeometry
 from endopilot.xray.image import ImageConfig
 
@@ -228,6 +231,7 @@ def test_the_command_drives_devices_by_a_policy(patient, tmp_path, capsys, monke
     ("change", "line"),
     [
         ({"sources": []}, "anatomies: none given"),
+        ({"output": "made", "ct": True}, "was begun with patients.fork"),
         ({"sources": ["nothing"]}, "nothing: is no anatomy and no CT"),
         ({"sources": ["fork", "fork"]}, "2 are named 'fork'"),
         ({"config": {"drive": "nobody"}}, "nobody"),
@@ -235,12 +239,31 @@ def test_the_command_drives_devices_by_a_policy(patient, tmp_path, capsys, monke
     ],
 )
 def test_what_cannot_be_made_is_said_in_one_line(made, patient, tmp_path, change, line):
-    from dataclasses import replace
-
+    if change.get("ct"):
+        shutil.copytree(patient, tmp_path / "with")
+        (tmp_path / "with" / "ct.nii.gz").write_bytes(b"another")
+        patient = tmp_path / "with"
     sources = [patient if one == "fork" else tmp_path / one for one in change.get("sources", ["fork"])]
     config = replace(CONFIG, cines=1, device_share=1.0, **change.get("config", {}))
     output = made if change.get("output") else tmp_path / "new"
-    config = replace(CONFIG, **change["config"]) if change.get("output") else config
+    config = replace(CONFIG, **change.get("config", {})) if change.get("output") else config
     with pytest.raises(InputError, match=line) as told:
         make_angiograms(sources, output=output, device=STACK, config=config)
     assert "\n" not in str(told.value)
+
+
+def test_a_ct_is_segmented_and_the_rays_pass_it(fork, tmp_path, monkeypatch):
+    """A plate of bone in the CT darkens its half of the image."""
+    voxels = np.zeros((40, 40, 40), dtype=np.int16)
+    voxels[:, :, 20:] = 800
+    ct = Volume(voxels, np.full(3, 4.0), np.array([-80.0, -80.0, -60.0]), np.eye(3))
+    write_volume(ct, tmp_path / "heart.nii.gz")
+    monkeypatch.setattr("endopilot.angiograms.write.segment", lambda volume, *, config: volume)
+    monkeypatch.setattr(
+        "endopilot.angiograms.write.extract_anatomy", lambda mask, *, name, config: replace(fork, name=name)
+    )
+    config = replace(CONFIG, cines=1, seconds=0.25, device_share=0.0, view_angles_deg=((0.0, 0.0),))
+    make_angiograms([tmp_path / "heart.nii.gz"], output=tmp_path / "o", config=config)
+    frame = picture(tmp_path / "o" / "cines" / "heart-0000", "frames", 0).astype(float)
+    assert frame[:, :40].mean() > frame[:, -40:].mean() + 50
+    assert read_volume(tmp_path / "o" / "patients" / "heart" / "ct.nii.gz").voxels.max() == 800

@@ -69,6 +69,22 @@ def test_a_play_that_is_not_known_exactly_is_found_and_taken_up(gap, ahead) -> N
     assert np.abs(believed.proximal - real.device).max() < 0.6
 
 
+@pytest.mark.parametrize("ahead", [1.2, -0.3, -1.2])
+def test_a_force_says_when_the_play_is_taken_up(ahead) -> None:
+    """The valve rubs with 0.05 N from when the device moves, 0.02 N of noise on it; nobody looks."""
+    random, found = np.random.default_rng(0), {}
+    for feels in (False, True):
+        real, believed = Real((2.6, 5.65), (ahead, 0.0)), Drives(ROBOT, START, FASTEST)
+        for _ in range(10):
+            before = real.device[0, 0]
+            real.drive(believed, Motion(np.array([[0.8, 0.0]]), done=True))
+            rubs = 0.05 * (real.device[0, 0] > before)
+            if feels:
+                believed.feel(0, rubs + 0.02 * random.standard_normal(), pushed_n=0.0, valve=(0.05, 0.0))
+        found[feels] = believed.sd[0, 0], abs(believed.proximal - real.device)[0, 0]
+    assert found[True][0] < 0.5 * found[False][0] and found[True][1] < 0.35
+
+
 def test_a_device_rests_while_a_play_is_taken_up() -> None:
     real, believed = Real((2.6, 5.65), (0.0, 0.0)), Drives(ROBOT, START, FASTEST)
     real.bring(believed, 10.0, 0.5, looks=3)

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.imaging.xray import BARS, _Exposure, _figures
+from benchmarks.imaging.xray import BARS, Exposure, _figures
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.errors import InputError
 from endopilot.xray.scenes import SceneConfig, draw_scenes
 
 
-def exposure(**changes) -> _Exposure:
+def exposure(**changes) -> Exposure:
     usual = {"views": 2, "dose": 1.0, "contrast": 0.0, "angle": "RAO 30", "wire": True, "found": True}
     errors = {"along_px": 1.0, "across_px": 0.2, "along_mm": 0.3, "space_mm": 0.4, "deviations": 1.0}
-    return _Exposure(**(usual | errors | changes))
+    return Exposure(**(usual | errors | changes))
 
 
 def test_a_tip_found_elsewhere_is_missed_and_one_found_without_a_wire_is_a_false_alarm():
@@ -59,3 +59,15 @@ def test_anatomies_of_ones_own_lie_on_the_table(tmp_path):
     assert scene.anatomy.identity == patient.identity
     with pytest.raises(InputError, match="no such folder"):
         next(draw_scenes(SceneConfig(given=(tmp_path / "absent",))))
+
+
+def test_a_row_of_processed_images_keeps_views_apart():
+    from benchmarks.imaging.processing import _row
+
+    def exposure(views: int, *, wire: bool = True, found: bool = True) -> Exposure:
+        errors = {"along_px": 1.0, "across_px": 0.5, "along_mm": 0.2, "space_mm": 0.3, "deviations": 9.0}
+        return Exposure(views, 1.0, 0.0, "AP", wire, found, **(errors if found else {}))
+
+    row = _row("any", [exposure(2), exposure(2, found=False), exposure(1), exposure(1, wire=False)], 0.1)
+    assert (row["along_px"], row["missed"], row["missed_one_view"], row["false_alarms"]) == (1.0, 0.5, 0.0, 1.0)
+    assert row["in_own_95"] == 0.0

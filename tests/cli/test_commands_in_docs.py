@@ -18,7 +18,10 @@ from endopilot.errors import InputError
 ROOT = Path(__file__).parents[2]
 CARD = str(Path(endopilot.__file__).parent / "models/pretrained/MODEL_CARD.md")
 PAGES = ["README.md", "Makefile", CARD]
-PAGES += [f"docs/{page.name}" for page in sorted((ROOT / "docs").glob("*.md"))]
+PAGES += [str(page.relative_to(ROOT)) for page in sorted((ROOT / "docs").glob("*.md"))]
+PAGES += [str(page.relative_to(ROOT)) for page in sorted((ROOT / "docs/concepts").glob("*.md"))]
+GUIDE = [str(page.relative_to(ROOT)) for page in sorted((ROOT / "docs/guide").glob("*.md"))]
+"""Pages whose commands `tests/e2e/test_guide.py` runs."""
 COMMAND = re.compile(r"endopilot ((?:bench )?[a-z][a-z-]*)((?: [^\n`|&;]*)?)")
 OPTION = re.compile(r"(?<=\s)(--[a-z][a-z0-9-]*|-[a-z](?=\s))")
 
@@ -34,7 +37,7 @@ def help_of(command: str) -> str:
     return out.getvalue()
 
 
-@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.parametrize("page", PAGES + GUIDE)
 def test_options_exist(page: str) -> None:
     text = re.sub(r"\\\n\s*", " ", (ROOT / page).read_text(encoding="utf-8"))
     wrong = [
@@ -77,7 +80,7 @@ def test_whole_commands_are_understood(page: str, capsys, monkeypatch) -> None:
     assert not wrong
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page.endswith(".md")])
+@pytest.mark.parametrize("page", [page for page in PAGES + GUIDE if page.endswith(".md")])
 def test_python_imports_what_is_there(page: str) -> None:
     blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
     for node in ast.walk(ast.Module([line for block in blocks for line in ast.parse(block).body], [])):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -51,6 +53,14 @@ def test_a_course_ends_where_most_wires_are_at_the_target(started, aorta):
     assert course.reached > 0.5 and np.ptp(at) > 3.0  # so far apart that they are never all there together
     assert np.abs(at - 50.0).min() <= 1.5
     assert (course.control[:, WIRE, 1] == 0).all()  # no other manoeuvre was tried
+
+
+def test_wires_beyond_a_target_are_pulled_back_to_it(started, aorta):
+    near = AgentPolicy()
+    near.start(replace(aorta, target=Target(branch=0, abscissa=30.0), start_inserted_length_mm=55.0), 1)
+    course = near.find_course(aorta.seconds)  # their tips begin some 10 mm beyond
+    assert course.reached > 0.5 and (course.control[:, WIRE, 0] < 0).all()
+    assert (course.control[:, WIRE, 1] == 0).all()
 
 
 def test_what_holds_for_two_periods_leaves_no_travel_after_them(aorta, started):

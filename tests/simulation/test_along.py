@@ -89,7 +89,7 @@ def test_a_state_is_gone_on_from_with_the_same_friction(bend):
 
 
 def test_the_wall_yields_where_it_is_soft(bend):
-    soft = replace(CORE, compliant_wall_n_mm2=0.02)
+    soft = replace(CORE, compliant_wall_n_mm2=0.04)
 
     def dents(**changed):
         made = simulate(bend, WIRE, PUSH, initial=START, config=replace(soft, **changed), record_shape=True)
@@ -102,7 +102,7 @@ def test_the_wall_yields_where_it_is_soft(bend):
 
     _, even, _ = dents()
     _, four, _ = dents(wall_along=(4.0,))
-    _, stiff, _ = dents(compliant_wall_n_mm2=0.08)
+    _, stiff, _ = dents(compliant_wall_n_mm2=0.16)
     assert four.max() == pytest.approx(stiff.max(), rel=0.1) and four.max() < 0.5 * even.max()
     at, graded, _ = dents(wall_along=(0.25, 4.0))
     _, grew, _ = dents(wall_along=(4.0, 0.25))
@@ -110,7 +110,7 @@ def test_the_wall_yields_where_it_is_soft(bend):
 
 
 def test_walls_that_vary_otherwise_are_not_shared(bend):
-    soft = replace(CORE, compliant_wall_n_mm2=0.02)
+    soft = replace(CORE, compliant_wall_n_mm2=0.04)
     graded = replace(soft, wall_along=(0.25, 4.0))
     alone, beside = Simulator(bend, WIRE, config=graded), Simulator(bend, WIRE, config=soft)
     shared = Simulator(bend, WIRE, config=graded, sharing=beside)
@@ -128,3 +128,5 @@ def test_a_factor_is_linear_between_its_places(bend):
     assert factor_at(np.array([5.0]), bend.tree, (3.0,)) == pytest.approx([3.0])
     with pytest.raises(InputError, match="wall_along: the wall is not compliant"):
         SimulatorConfig(wall_along=(1.0, 2.0))
+    with pytest.raises(InputError, match=r"wall_along: the wall has 0\.0025 N/mm² at least"):
+        SimulatorConfig(compliant_wall_n_mm2=0.01, wall_along=(1.0, 0.25))

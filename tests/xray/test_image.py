@@ -224,3 +224,70 @@ def test_a_coronary_catheter_bends_up_behind_its_straight_end(fork):
     laid = in_catheter(coronary, wire)
     np.testing.assert_allclose(laid[:2], wire[:2], atol=1e-9)
     np.testing.assert_allclose(laid[2] - places[80], [0.0, 0.3, 0.0], atol=1e-9)
+
+
+def test_a_vessel_that_passes_behind_the_ostium_is_not_laid_into_the_catheter(fork):
+    """A right coronary artery comes back below its ostium, behind the plane across the catheter's axis."""
+    tree = replace(fork.tree, section_names=("1", *fork.tree.section_names[1:]))
+    coronary = replace(fork, tree=tree, insertion=Insertion(np.zeros(3), np.array([1.0, 0.0, 0.0])))
+    turn = np.linspace(1.5 * np.pi, 0.0, 40)
+    nodes = np.stack([40 * np.sin(turn), 0 * turn, 40 * np.cos(turn) - 40], axis=-1)  # from the tip to the ostium
+    assert nodes[:12, 0].max() < 0  # behind the plane
+    shaft = np.stack([-np.arange(1.0, 41.0), 0 * turn, 0 * turn], axis=-1)
+    laid = in_catheter(coronary, np.concatenate([nodes, shaft]))
+    np.testing.assert_allclose(laid[:40], nodes, atol=1e-9)
+    assert np.abs(laid[40:] - shaft).max() > 1.0  # the catheter itself bends
+
+
+def noise_of(fork, wire, *, dose=1.0, seed=0, before=None, **changes):
+    """Return the noise of a flat image, and how many photons a pixel counts."""
+    flat = XrayImager(fork, wire, config=ImageConfig(pixels=256, **changes))
+    plane = flat.plane((0.0, 0.0))
+    plane = replace(plane, background=np.full_like(plane.background, 4.0), scatter=np.zeros_like(plane.scatter))
+    plane = replace(plane, reference=-4.0)
+    return flat.signal(plane, np.zeros((0, 3)), dose=dose, seed=seed, before=before), flat.photons(plane, dose)
+
+
+def test_the_noise_power_spectrum_is_that_of_photons_in_a_scintillator(fork, wire):
+    """NNPS(f) = |H(f)|² / (q η): photons q a mm², of which η count; H is that of the scintillator's blur in pixels."""
+    config, power, impulse = ImageConfig(), 0.0, np.zeros((256, 256))
+    impulse[0, 0] = 1.0
+    blur = gaussian_filter(impulse, config.scintillator_mm / config.geometry.pixel_mm, mode="wrap")
+    known = np.abs(np.fft.fft2(blur)) ** 2 / (PHOTONS_MM2_UGY * config.detector_ugy * config.efficiency)
+    for seed in range(12):
+        noise, _ = noise_of(fork, wire, seed=seed)
+        power = power + np.abs(np.fft.fft2(noise - noise.mean())) ** 2 * config.geometry.pixel_mm**2 / noise.size / 12
+    frequency = np.fft.fftfreq(256, config.geometry.pixel_mm)
+    radial = np.hypot(frequency[:, None], frequency)
+    for low, high in ((0.1, 0.3), (0.5, 0.7), (0.9, 1.1), (1.3, 1.5)):
+        ring = (radial > low) & (radial < high)
+        assert power[ring].mean() == pytest.approx(known[ring].mean(), rel=0.04)
+
+
+def test_noise_of_the_electronics_equals_that_of_photons_at_its_air_kerma(fork, wire):
+    """Variances 1/N of photons and (K_e/K)/N of electronics add up, where the scintillator blurs nothing."""
+    for dose in (1.0, 0.25):
+        noise, photons = noise_of(fork, wire, dose=dose, scintillator_mm=0.0, electronic_noise_ugy=0.03)
+        assert noise.var() * photons == pytest.approx(1 + 1 / dose, rel=0.03)
+
+
+def test_a_temporal_filter_lowers_the_noise_of_what_stands_still(fork, wire):
+    """The variance of y ← w y + (1 - w) x is (1 - w)/(1 + w) times that of x."""
+    plain, before = noise_of(fork, wire)[0], None
+    for seed in range(8):
+        before, _ = noise_of(fork, wire, temporal_weight=0.6, seed=seed, before=before)
+    assert before.var() / plain.var() == pytest.approx(0.4 / 1.6, rel=0.05)
+
+
+def test_edges_are_enhanced_and_the_mean_is_kept(imager, fork, wire):
+    """Unsharp masking multiplies what is finer than its blur by 1 + weight, and leaves the rest."""
+    sharp = XrayImager(fork, wire, config=ImageConfig(edge_weight=2.0, edge_mm=3.0))
+    nodes = imager.isocenter + np.linspace(-20, 20, 9)[:, None] * np.array([0.6, 0.0, 0.8])
+    plane = imager.plane((0.0, 0.0))
+    clear = plane.background.min() - 1
+    plane = replace(plane, background=np.full_like(plane.background, clear))
+    plain, enhanced = (one.signal(plane, nodes, dose=1e8) for one in (imager, sharp))
+    assert enhanced.mean() == pytest.approx(plain.mean(), abs=1e-3)
+    depth, deeper = np.median(plain) - plain.min(), np.median(enhanced) - enhanced.min()
+    assert 2.2 < deeper / depth < 3.0
+    assert enhanced.max() > plain.max() + 0.05  # a bright rim beside the wire

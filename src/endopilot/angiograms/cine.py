@@ -121,6 +121,7 @@ class Cine:
         self.air_kerma_ugy = imager.air_kerma_ugy(first, draw.dose)
         transit_s = self.flow.transit_of(imager.lumen_points) if draw.injection is not None else None
         blur, period_s = imager.blur_px(1.0), 1 / config.frames_per_second
+        signal: Float32[np.ndarray, "rows columns"] | None = None
         devices = range(len(imager.stack) if self.driven is not None else 0)
         speeds = [self.driven.velocity(device, period_s) for device in devices] if self.driven is not None else []
         for number, placed in enumerate(self.placed):
@@ -147,6 +148,7 @@ class Cine:
                 contrast=float(transit_s is not None),
                 dose=draw.dose,
                 seed=draw.noise_seed + number,
+                before=signal,
                 velocity=moving[0] if lines else None,
                 catheters=lines[1:],
                 catheter_velocities=moving[1:],

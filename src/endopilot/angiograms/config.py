@@ -20,7 +20,7 @@ class AngiogramsConfig:
 
     cines: Annotated[int, Within(1, 100000)] = 8
     """Cines of each patient."""
-    seconds: Annotated[float, Within(0.1, 600)] = 4.0
+    seconds: Annotated[float, Within(0.1, 60)] = 4.0
     """Length of a cine, s."""
     frames_per_second: Annotated[int, Within(1, 60)] = 15
     """Frames a second."""

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float32, UInt16
 from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.uid import UID, ExplicitVRLittleEndian, XRayAngiographicImageStorage, generate_uid
+from pydicom.valuerep import format_number_as_ds
 
 from endopilot.angiograms.cine import Cine
 from endopilot.files import writing
@@ -59,6 +60,11 @@ def _uid(*parts: str) -> UID:
     return generate_uid(entropy_srcs=[hashlib.sha256(part.encode()).hexdigest() for part in parts])
 
 
+def _decimal(value: float) -> str:
+    """Return a number as a decimal string of at most 16 characters, DICOM's limit (PS3.5 6.2)."""
+    return format_number_as_ds(float(value))
+
+
 def _header(cine: Cine, number: int, identity: str) -> Dataset:
     """Return all but the pixels."""
     config, draw = cine.config, cine.draw
@@ -85,21 +91,21 @@ def _header(cine: Cine, number: int, identity: str) -> Dataset:
     header.WindowCenter, header.WindowWidth = (_LARGEST + 1) / 2, (_LARGEST + 1) / _WIDER
     header.LossyImageCompression, header.BurnedInAnnotation = "00", "NO"
     header.FrameIncrementPointer = 0x00181063  # frame time
-    header.FrameTime = f"{1000 / config.frames_per_second:.6g}"
+    header.FrameTime = _decimal(1000 / config.frames_per_second)
     header.CineRate = header.RecommendedDisplayFrameRate = config.frames_per_second
     header.StartTrim, header.StopTrim = 1, config.frames
-    header.RadiationSetting, header.AveragePulseWidth = "GR", 1000 * image.pulse_s
+    header.RadiationSetting, header.AveragePulseWidth = "GR", _decimal(1000 * image.pulse_s)
     header.PositionerMotion = "STATIC"
-    header.PositionerPrimaryAngle, header.PositionerSecondaryAngle = (f"{angle:.6g}" for angle in draw.angles_deg)
-    header.DistanceSourceToPatient = geometry.source_to_isocenter_mm
-    header.DistanceSourceToDetector = geometry.source_to_detector_mm
-    header.EstimatedRadiographicMagnificationFactor = (
-        f"{geometry.source_to_detector_mm / geometry.source_to_isocenter_mm:.8g}"
+    header.PositionerPrimaryAngle, header.PositionerSecondaryAngle = map(_decimal, draw.angles_deg)
+    header.DistanceSourceToPatient = _decimal(geometry.source_to_isocenter_mm)
+    header.DistanceSourceToDetector = _decimal(geometry.source_to_detector_mm)
+    header.EstimatedRadiographicMagnificationFactor = _decimal(
+        geometry.source_to_detector_mm / geometry.source_to_isocenter_mm
     )
-    header.ImagerPixelSpacing = [geometry.pixel_mm] * 2
-    header.FocalSpots = image.focal_spot_mm
+    header.ImagerPixelSpacing = [_decimal(geometry.pixel_mm)] * 2
+    header.FocalSpots = _decimal(image.focal_spot_mm)
     if draw.injection is not None:
         header.ContrastBolusAgent = "iodine"
-        header.ContrastFlowRate = f"{draw.injection.rate_ml_s:.6g}"
-        header.ContrastFlowDuration = f"{draw.injection.duration_s:.6g}"
+        header.ContrastFlowRate = _decimal(draw.injection.rate_ml_s)
+        header.ContrastFlowDuration = _decimal(draw.injection.duration_s)
     return header

@@ -15,7 +15,7 @@ from endopilot.dataset.layout import identify
 from endopilot.dataset.splits import assign_splits
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
-from endopilot.files import input_hash, json_text
+from endopilot.files import input_hash, json_text, sha256
 
 FORMAT_VERSION = 1
 """Counts changes of the files or of their meaning."""
@@ -81,7 +81,7 @@ def lay_out(sources: Sequence[Path], output: Path, stack: Stack, config: Angiogr
     """
     if not sources:
         raise InputError("anatomies: none given; name folders made by `endopilot anatomy` or `endopilot atlas`, or CTs")
-    found = [identify(path) if is_anatomy(path) else _identified_ct(path) for path in sources]
+    found = [_identified(path) for path in sources]
     names = tuple(name for name, _ in found)
     for name in names:
         if names.count(name) > 1:
@@ -106,12 +106,16 @@ def is_anatomy(path: Path) -> bool:
     return (path / ANATOMY_FILE).exists()
 
 
-def _identified_ct(path: Path) -> tuple[str, str]:
-    """Return a name for a CT, and the hash of its content.
+def _identified(path: Path) -> tuple[str, str]:
+    """Return a patient's name, and the hash of the vessel and of its CT.
 
     Raises:
-        InputError: there is no such file or folder, or the folder is empty.
+        InputError: there is no such file or folder, or the folder is empty or holds a damaged anatomy.
     """
+    if is_anatomy(path):
+        name, identity = identify(path)
+        ct = path / CT_FILE
+        return name, f"{identity} {sha256(ct)}" if ct.exists() else identity
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         raise InputError(f"{path}: is no anatomy and no CT; give a folder made by `endopilot atlas`, or a CT angiogram")
     name = next((path.name.removesuffix(end) for end in _SUFFIXES if path.name.endswith(end)), path.name)

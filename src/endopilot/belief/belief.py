@@ -224,13 +224,18 @@ class Belief:
         score = np.where(self.simulator.valid, self._score, -1e6)
         return likelihoods(score)
 
-    def follow(self, devices: Proximals) -> None:
+    def follow(self, devices: Proximals, load: Proximals = ()) -> None:
         """Move every member's proximal ends to where they are by the encoders, in one decision period.
 
         Args:
             devices: inserted length (mm) and rotation (rad) of the wire, then of each catheter, as encoders read them.
+            load: force (N) and torque (N·mm) of each drive; empty for a robot that measures none.
         """
         self.drives.follow(devices)
+        if load and self.drives.lose:
+            core, pushed_n = self.simulator.config, self.simulator.base_load[np.argmax(self.weight), 0, 0]
+            valve = core.introducer_friction_n, core.introducer_drag_n_s_mm
+            self.drives.feel(0, load[0][0], pushed_n=float(pushed_n), valve=valve)
         self._move(self.drives.proximal)
 
     def _move(self, proximal: Float[np.ndarray, "devices 2"]) -> None:

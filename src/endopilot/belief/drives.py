@@ -1,8 +1,9 @@
 """Where the proximal ends of devices are, by encoders that may sit in front of the play of their drives: `Drives`.
 
 Encoders at the devices say it. Encoders at the motors do not: how wide each play is, and where in it the device lies at
-the start, is known roughly. Samples of both follow the encoders through the play operator, and what X-ray shows of the
-tip weights them.
+the start, is known roughly. Samples of both follow the encoders through the play operator. What X-ray shows of the tip
+weights them, and so does the force of the drive: the introducer's valve rubs on a device that moves, and not on one
+that rests while its play is taken up.
 """
 
 from __future__ import annotations
@@ -32,6 +33,12 @@ _GAP_JITTER = 0.01
 """The same of their plays, as a share."""
 _STRAY_SHARE, _STRAYS = 0.03, np.array([0.7, 1.0])
 """Share of the samples that may be where none of the others is, and how far from these, mm and rad."""
+_FORCE_SD_N, _FORCE_SHARE = 0.02, 0.2
+"""Standard deviation of the force that a simulated device predicts, N, and as a share of it."""
+_LEAST_LIKELY = 0.02
+"""No force makes a sample less likely than this, as a share of the most likely: simulated devices may be elsewhere."""
+_MOVES_MM_S, _TURNS_RAD_S = 0.5, 0.1
+"""A motor says something by its force that advances faster than this, mm/s, and turns its device no faster, rad/s."""
 _TAKEN_UP = np.array([0.05, 0.03])
 """What is left of a play that counts as taken up, mm and rad."""
 _WORTH_IT = np.array([0.3, 0.1])
@@ -156,24 +163,51 @@ class Drives:
             cost.append(np.abs(each) + slack + unsure)
         return np.take_along_axis(whole, np.argmin(cost, axis=0)[None], axis=0)[0]
 
+    def feel(self, device: int, force_n: float, *, pushed_n: float, valve: tuple[float, float]) -> None:
+        """Weight the samples of a device by the force that its drive reads while the motor turns.
+
+        Args:
+            device: its place in the stack.
+            force_n: as it is read, N.
+            pushed_n: what the device ahead of the valve is believed to take of it, N.
+            valve: friction of the introducer's valve, N, and its drag, N·s/mm.
+        """
+        speed, turning = self._sent[device].tolist()
+        if not self.lose or abs(speed) < _MOVES_MM_S or abs(turning) > _TURNS_RAD_S:
+            return
+        left = self._gap[:, device, 0] / 2 - np.sign(speed) * self._ahead[:, device, 0]
+        error = force_n - pushed_n - np.where(left < _TAKEN_UP[0], np.sign(speed) * valve[0] + speed * valve[1], 0.0)
+        read_sd = self._robot.of_drives(len(self._sent), "load_sd_n")[device, 0]
+        sd = np.hypot(read_sd, _FORCE_SD_N + _FORCE_SHARE * abs(pushed_n))
+        score = np.log(np.exp(-0.5 * (error / sd) ** 2) + _LEAST_LIKELY)
+        if np.ptp(score) > 0:
+            self._draw(device, score)
+            self._estimate()
+
     def samples(self, device: int) -> Float[np.ndarray, "samples 2"]:
         """Return where a device may be, mm and rad."""
         return self._position[:, device]
 
     def weigh(self, device: int, score: Float[np.ndarray, "samples"]) -> None:
         """Weight the samples of a device by their logarithmic likelihoods, up to a constant."""
-        weight, random = np.exp(score - score.max()), self._random
-        at = (np.arange(_SAMPLES) + random.random()) / _SAMPLES
-        chosen = np.searchsorted(np.cumsum(weight) / weight.sum(), at).clip(0, _SAMPLES - 1)
-        moving = self._play[device] > 0
-        gap, ahead, position = (each[chosen, device] for each in (self._gap, self._ahead, self._position))
+        self._draw(device, score)
+        moving, random = self._play[device] > 0, self._random
+        gap, ahead, position = (each[:, device] for each in (self._gap, self._ahead, self._position))
         wider = 1 + _GAP_JITTER * random.standard_normal(gap.shape)
         position = position + moving * _JITTER * random.standard_normal(position.shape)
         stray = random.random(_SAMPLES) < _STRAY_SHARE
         position[stray] += moving * _STRAYS * random.standard_normal((int(stray.sum()), 2))
         self._gap[:, device], self._ahead[:, device] = gap * wider, ahead * wider
-        self._gain[:, device], self._position[:, device] = self._gain[chosen, device], position
+        self._position[:, device] = position
         self._estimate()
+
+    def _draw(self, device: int, score: Float[np.ndarray, "samples"]) -> None:
+        """Draw the samples of a device anew, by their logarithmic likelihoods."""
+        weight = np.exp(score - score.max())
+        at = (np.arange(_SAMPLES) + self._random.random()) / _SAMPLES
+        chosen = np.searchsorted(np.cumsum(weight) / weight.sum(), at).clip(0, _SAMPLES - 1)
+        for each in (self._gap, self._ahead, self._position, self._gain):
+            each[:, device] = each[chosen, device]
 
     def _estimate(self) -> None:
         self.proximal, _ = _estimated(self._position)

@@ -112,7 +112,7 @@ class Monitor:
         """
         period = len(self.past.proximal)
         if period:
-            self.belief.follow(encoders)
+            self.belief.follow(encoders, load)
         else:
             self.belief.drives.begin(encoders)
         self.past.proximal.append(self.belief.drives.proximal.copy())

@@ -33,6 +33,7 @@ COMMANDS = {
     "plan": "anatomy and target -> controls that bring the tip there",
     "navigate": "anatomy and target -> a wire driven there by a policy, in closed loop, and its page",
     "xray": "anatomy -> X-ray image of a wire in it: fluoroscopy, contrast, DSA or roadmap",
+    "locate": "vessel and a device's lines in X-ray images -> its tip in three dimensions, frame by frame",
     "angiograms": "anatomies or CTs -> X-ray cines of contrast and devices, with the truth beside each frame",
     "advise": "trained run -> calibrated X-ray adviser: exposures against missed events",
     "drive": "a simulated robotic drive that takes commands over TCP, with a watchdog",

@@ -6,6 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from endopilot.cli.arguments import Answer, Existing, OutputFolder
+from endopilot.errors import InputError
 from endopilot.ladder.ladder import LadderConfig, climb
 
 
@@ -14,6 +15,7 @@ def command(
     output: OutputFolder | None = None,
     mismatch: float = 0.0,
     check: Existing | None = None,
+    dataset: Path | None = None,
     page: bool = True,
     config: LadderConfig = LadderConfig(),
 ) -> Answer:
@@ -28,12 +30,16 @@ def command(
             differ by it from what the policy is given, one after another and together. The scores of each case are
             printed instead of the ladder's.
         check: a submission.json. Its recorded controls are driven again, without the policy, and its scores confirmed
-            to the bit; exit code 1 if one differs. Nothing else is done.
+            to the bit; exit code 1 if one differs. No policy climbs then.
+        dataset: folder of a LeRobot data set of the navigations, with X-ray images, their recordings being driven again
+            (docs/dataset.md).
         page: write index.html with pictures and replays; --no-page leaves it out.
         config: which policy, tasks and patients.
     """
+    if dataset is not None and mismatch:
+        raise InputError("dataset: with --mismatch, which writes no submission; leave one of them out")
     if check is not None:
-        return _confirmed(check)
+        return _confirmed(check, dataset)
     from endopilot.ladder.mismatch import PICTURE_FILE, measure_mismatch
     from endopilot.ladder.submission import SUBMISSION_FILE
     from endopilot.report.ladder_page import write_page
@@ -41,6 +47,8 @@ def command(
     name = config.policy.replace(":", ".")
     folder = output or Path("runs") / ("ladder-mismatch" if mismatch else "ladder") / name
     rows = measure_mismatch(folder, config, mismatch) if mismatch else climb(output=folder, config=config)
+    if dataset is not None:
+        _write_dataset(folder / SUBMISSION_FILE, dataset)
     if mismatch:
         made = {"picture": folder / PICTURE_FILE}
     else:
@@ -48,9 +56,17 @@ def command(
     return Answer(rows, [rows, made])
 
 
-def _confirmed(file: Path) -> Answer:
+def _confirmed(file: Path, dataset: Path | None) -> Answer:
     from endopilot.ladder.submission import check_submission
 
     checked = check_submission(file)
     confirmed = checked.difference is None
+    if confirmed and dataset is not None:
+        _write_dataset(file, dataset)
     return Answer({"confirmed": confirmed} | asdict(checked), passed=confirmed)
+
+
+def _write_dataset(file: Path, dataset: Path) -> None:
+    from endopilot.ladder.demonstrations import write_demonstrations  # extras bring its libraries
+
+    write_demonstrations(file, output=dataset)

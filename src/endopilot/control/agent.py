@@ -197,7 +197,7 @@ class _PlanningPolicy:
 
     def _observe(self, observation: Observation) -> None:
         if self._began:
-            self.belief.follow(observation.devices)
+            self.belief.follow(observation.devices, observation.load)
         else:
             self.belief.drives.begin(observation.devices)
         self._began = True

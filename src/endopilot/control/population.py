@@ -18,7 +18,7 @@ from endopilot.tasks.route import Route
 
 Each = Float[np.ndarray, "candidates"]
 _LEFT_BEHIND = 0.2
-"""Each further attempt accepts a motion that this much more of the wires, by weight, do not follow."""
+"""Share of the wires, by weight, that may be left behind by a motion: so much more at each further attempt."""
 _LEAST_SHARE = 0.5
 """No attempt accepts a motion that fewer of the wires follow, by weight."""
 _FAILED_MM_S = 1e3

@@ -66,6 +66,13 @@ class Pushed:
     farthest: Each
     halt: list[Halt]
 
+    @property
+    def inserted_mm(self) -> Each:
+        """Inserted length of each trial's devices together, when it was given up or passed, mm."""
+        count = len(self.periods)
+        ends = [self.rows[max(int(end), 1) - 1].proximal[trial, :, 0] for trial, end in enumerate(self.periods)]
+        return np.array(ends).sum(axis=1) if self.rows else np.zeros(count)
+
     def within(self, force_n: float) -> Bool[np.ndarray, "trials"]:
         """Return which pass without pressing on the wall with more than some force, N."""
         return self.passed & (self.force <= force_n)
@@ -141,6 +148,10 @@ class Push:
         """Whether the place is the target."""
         return self.waypoint >= self.route.target.abscissa
 
+    def spreads(self, trials: Trials) -> bool:
+        """Return whether wires may come to the place one after another: to a target in a wide lumen."""
+        return self.last and trials.devices == 1 and self.route.is_wide(self.waypoint)
+
     def run(self, trials: Trials, periods: int, lead: Each | None = None) -> Pushed:
         """Push trials past the place, and tell which pass.
 
@@ -152,9 +163,10 @@ class Push:
         """
         alone, begun = trials.devices == 1, len(trials.rows)
         took, halt = np.full(trials.count, begun), np.full(trials.count, "late", dtype=object)
-        passed = np.zeros(trials.count, dtype=bool)
+        passed, been = np.zeros(trials.count, dtype=bool), np.zeros(trials.simulator.worlds, dtype=bool)
         progress = farthest = self._progress(trials)
         inserted_there, follower = _deepest(trials), _Follower(self, trials, lead)
+        beyond = progress > self.waypoint
         waits = alone and not self.strict and self.route.is_wide(self.waypoint)
         slack_mm = _SLACK_WIDTHS * self.route.width_mm(self.waypoint) if waits else _SLACK_MM
         off_mm, longest, force_n = self._limits(trials, waits)
@@ -181,10 +193,17 @@ class Push:
             if alone:
                 stalls = self._stalls(trials, begun) & (not waits)
                 stop(stalls & self.strict, "stalled")
-                passed |= ~trials.still & self.arrived(trials)
+                arrived = self.arrived(trials)
+                if self.spreads(trials):
+                    been |= self.route.passed(trials.foremost, self.waypoint)
+                    arrived, was_beyond = trials.mean(been) > 0.5, beyond
+                    beyond = progress > self.waypoint
+                    stop(was_beyond & ~beyond & ~arrived, "off")
+                passed |= ~trials.still & arrived
                 trials.still |= passed
                 stop(stalls, "stalled")
-                stop((progress >= self.waypoint + _BEYOND_MM) & (self.last or not self.strict), "off")
+                missed = progress >= self.waypoint + _BEYOND_MM
+                stop(missed & (not self.strict and not self.spreads(trials)), "off")
             stop(self._off(trials, off_mm), "off")
             stop(inserted - inserted_there > slack_mm, "stalled")
         if not alone:
@@ -204,9 +223,13 @@ class Push:
         return trials.all(route.progress(tip) >= self.waypoint)
 
     def _straight(self, trials: Trials, progress: Each) -> Control:
-        """Return what pushes wires alone on, slower as they come near to the target."""
+        """Return what pushes wires alone on, slower near to the target, and in a wide lumen back to it."""
         left = self.waypoint - progress if self.last else np.full(trials.count, np.inf)
-        return trials.control(Move(WIRE, np.clip(left / DECISION_PERIOD_S, _SLOWEST_MM_S, self.config.speed_mm_s)))
+        speed = np.clip(left / DECISION_PERIOD_S, _SLOWEST_MM_S, self.config.speed_mm_s)
+        if self.spreads(trials):
+            back = np.clip(left / DECISION_PERIOD_S, -self.config.speed_mm_s, -_SLOWEST_MM_S)
+            speed = np.where(left < 0, back, speed)
+        return trials.control(Move(WIRE, speed))
 
     def _progress(self, trials: Trials) -> Each:
         return trials.mean(self.route.progress(trials.foremost))
@@ -294,7 +317,7 @@ class _Follower:
 def _slips(trials: Trials, before: Float[np.ndarray, "worlds"]) -> Bool[np.ndarray, "trials"]:
     """Return which drives have slipped in the last period, given the wires' inserted lengths before, mm."""
     commanded = np.tile(trials.rows[-1].control[:, WIRE, 0], trials.wires) * DECISION_PERIOD_S
-    return ~trials.all(trials.lengths[:, WIRE] - before >= _SLIP_SHARE * commanded)
+    return ~trials.all((trials.lengths[:, WIRE] - before >= _SLIP_SHARE * commanded) | (commanded < 0))
 
 
 def _deepest(trials: Trials) -> Each:

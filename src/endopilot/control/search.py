@@ -49,6 +49,8 @@ _TURNS = (0.0, np.pi)
 """Angles by which a wire alone may be turned before it goes in, rad."""
 _OFTEN = 6
 """A course that has passed places this many times as often as there are is at an end."""
+_NOTHING_SHARE = 1e-3
+"""Manoeuvres with less than this share of the force limit are as gentle as each other."""
 _REPEATED = 3
 """Trials of a manoeuvre that the course tries, one after another."""
 
@@ -185,32 +187,26 @@ class Search:
         course, push = self._course, self._push(waypoint, strict=self._alone)
         if push.arrived(course)[0]:
             return None
-        kept = course.kept()
         trials = course if self._alone else self._few.copy_of(course)
         pushed = self._tried[STRAIGHT] = push.run(trials, self._left, np.array(self._repertoire.leads))
         self._hard = float(pushed.farthest.max())
         passes = pushed.passed[0] if self._alone else self._follow(pushed, SPARE_SHARE, waypoint, turns=1)
-        if not passes and push.last and self._alone and self.route.is_wide(waypoint):
-            passes = self._most_arrive(kept)
+        if push.spreads(course):
+            passes = passes and self._arrives(push)
         return None if passes else pushed.halt[int(np.argmax(pushed.farthest))]
 
-    def _most_arrive(self, kept: Kept) -> bool:
-        """Cut a straight push of a wire alone to where most wires are at the target; return whether there is a place.
+    def _arrives(self, push: Push) -> bool:
+        """Return whether the course is past a place; wires that it does not bring to the target are left behind.
 
-        In a wide lumen the wires that are held possible spread by more than what counts as arrived. The others are left
-        behind: an exposure will show which of them is right.
+        That happens in a wide lumen, where the wires that are held possible spread by more than what counts as arrived.
         """
-        course, target = self._course, self.route.target.abscissa
-        there = np.array([self.route.passed(row.tip, target) * course.weight for row in course.rows[kept.periods :]])
-        best = int(np.argmax(there.sum(axis=1)))
-        if there[best].sum() <= 0.5:
-            return False
-        controls = [row.control for row in course.rows[kept.periods : kept.periods + best + 1]]
-        course.restore(kept)
-        for control in controls:
-            course.move(control)
-        course.weight = there[best] / there[best].sum()
-        return True
+        course = self._course
+        if not push.spreads(course):
+            return bool((push.arrived(course) & ~course.still)[0])
+        there = self.route.passed(course.foremost, push.waypoint) * course.weight
+        if there.sum() > 0:
+            course.weight = there / there.sum()
+        return bool(there.sum() > 0)
 
     def _turned(self, grid: Grid, share: float, waypoint: float, kept: Kept) -> bool:
         """Try a grid before a place, and follow the best of it; return whether any passes.
@@ -252,18 +248,21 @@ class Search:
     def _follow(self, pushed: Pushed, share: float, waypoint: float, *, turns: int) -> bool:
         """Let the course do what the best trial of a manoeuvre did; return whether any passes within a share of force.
 
-        Of the places that most rotations pass, and among these of the cheapest, it is the rotation in the middle. Where
+        Of the places that most rotations pass, and among these of the cheapest, it is the rotation in the middle; of
+        those that cost next to nothing, the one that uses the least length of its devices. Where
         there is a catheter, trials have waited for each other. The course does not, and so has to pass again.
         """
         course, limit_n, cost = self._course, share * self._navigation.force_limit_n, self.manoeuvre_cost(pushed)
         rows, kept = pushed.within(limit_n).reshape(-1, turns), course.kept()
         trials = [at * turns + middle(row) for at, row in enumerate(rows) if row.any()]
-        trials.sort(key=lambda trial: (-int(rows[trial // turns].sum()), cost[trial]))
+        least = _NOTHING_SHARE * self._navigation.force_limit_n
+        used = pushed.inserted_mm
+        trials.sort(key=lambda trial: (-int(rows[trial // turns].sum()), max(cost[trial], least), used[trial]))
         for trial in trials[:_REPEATED]:
             for control in pushed.controls(trial):
                 if self._alone or control.any():
                     course.still |= course.move(control[None], force_n=limit_n)
-            if (self._push(waypoint).arrived(course) & ~course.still)[0]:
+            if self._arrives(self._push(waypoint)):
                 return True
             course.restore(kept)
         return False

@@ -75,7 +75,7 @@ def store_block(
     data_path, episodes_path = schema.paths_of_file(context.output, block.number)
     samples = parquet.sample_table(trajectory, block.first_episode, context.key)
     for path, table in (
-        (episodes_path, parquet.episode_table(_episodes(context, block, draw, trajectory, stopped), context.key)),
+        (episodes_path, parquet.marked_table(_episodes(context, block, draw, trajectory, stopped), context.key)),
         (data_path, samples),
     ):
         with writing(path) as partial:

@@ -154,7 +154,8 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
     with writing(context.output / schema.TASKS_PATH) as partial:
         tasks.to_parquet(partial)
     samples = context.config.samples
-    info = schema.info(context.config.control, len(episodes), samples, devices, by_robot=context.robot is not None)
+    described = schema.features(context.config.control, devices, by_robot=context.robot is not None)
+    info = schema.info(described, episodes=len(episodes), samples=len(episodes) * samples)
     write_json(context.output / schema.INFO_PATH, info)
     reported = ("episode_index", "anatomy", "sequence", "invalid_reason")
     invalid = [{name: row[name] for name in reported} for row in episodes if not row["valid"]]

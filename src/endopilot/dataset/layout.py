@@ -177,6 +177,7 @@ def _check_world(world: World) -> None:
     Raises:
         InputError: the world has such fields.
     """
+    world.check_engine("datasets")
     for name in ("share", "backs_out_mm"):
         if (value := getattr(world, name)) != getattr(World(), name):
             raise InputError(f"world: {name} = {value}; it is not the same throughout a dataset: leave it out")

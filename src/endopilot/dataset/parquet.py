@@ -52,18 +52,18 @@ def sample_table(trajectory: Trajectory, first_episode: int, key: str) -> pa.Tab
         "action": trajectory.command,
         "velocity": trajectory.control,
         "observation.state": np.stack([signals[name] for name in STATE], axis=-1),
-        **{column: signals[name] for column, (name, *_) in OWN_COLUMNS.items()},
+        **{own: signals[name] for own, (name, *_) in OWN_COLUMNS.items()},
     }
     kinds = dict.fromkeys(INDEX_COLUMNS, ("int64", None)) | {"timestamp": ("float32", None)}
     columns |= trajectory.columns
     by_robot = set(OF_ROBOT) <= set(trajectory.columns)
     kinds |= signal_columns(trajectory.set_up.actuation, trajectory.devices, by_robot=by_robot)
-    arrays = {name: _column(columns[name], *kinds[name]) for name in columns if name in kinds}
-    return pa.table(arrays).replace_schema_metadata({_KEY: key.encode()})
+    arrays = {name: column(columns[name], *kinds[name]) for name in columns if name in kinds}
+    return marked_table(arrays, key)
 
 
-def episode_table(columns: Mapping[str, Any], key: str) -> pa.Table:
-    """Return rows of the episode table, marked with the dataset's key."""
+def marked_table(columns: Mapping[str, Any], key: str) -> pa.Table:
+    """Return columns as a table that is marked with the dataset's key."""
     return pa.table(dict(columns)).replace_schema_metadata({_KEY: key.encode()})
 
 
@@ -114,10 +114,10 @@ def _is_float(kind: pa.DataType) -> bool:
 
 def column_values(table: pa.Table, name: str) -> np.ndarray:
     """Return a column as an array, (rows,) for scalars and (rows, components) for vectors."""
-    column = table.column(name).combine_chunks()
-    if pa.types.is_fixed_size_list(column.type):
-        return column.flatten().to_numpy(zero_copy_only=False).reshape(len(column), -1)
-    return column.to_numpy(zero_copy_only=False)
+    values = table.column(name).combine_chunks()
+    if pa.types.is_fixed_size_list(values.type):
+        return values.flatten().to_numpy(zero_copy_only=False).reshape(len(values), -1)
+    return values.to_numpy(zero_copy_only=False)
 
 
 def statistics(
@@ -134,8 +134,7 @@ def statistics(
         advance: called once for each file that has been read.
         devices: their number; the manoeuvres are the wire's.
     """
-    sums: dict[str, list[np.ndarray]] = {}
-    count, driven = 0, np.zeros(len(MANOEUVRES))
+    sums, count, driven = Sums(), 0, np.zeros(len(MANOEUVRES))
     for path in paths:
         table = read_table(path, key)
         valid = column_values(table, "valid")
@@ -144,35 +143,44 @@ def statistics(
         driven += np.bincount(manoeuvres(velocity), minlength=len(driven))
         by_robot = set(OF_ROBOT) <= set(table.column_names)
         for name, (dtype, _) in signal_columns(actuation, devices, by_robot=by_robot).items():
-            if dtype == "bool" or not valid.any():
-                continue
-            values = column_values(table, name)[valid].astype(np.float64).reshape(int(valid.sum()), -1)
-            parts = [values.min(axis=0), values.max(axis=0), values.sum(axis=0), (values**2).sum(axis=0)]
-            before = sums.get(name, parts)
-            sums[name] = (
-                parts
-                if before is parts
-                else [
-                    np.minimum(before[0], parts[0]),
-                    np.maximum(before[1], parts[1]),
-                    before[2] + parts[2],
-                    before[3] + parts[3],
-                ]
-            )
+            if dtype != "bool" and valid.any():
+                sums.add(name, column_values(table, name)[valid])
         advance()
-    described = {
-        name: {
-            "min": low.tolist(),
-            "max": high.tolist(),
-            "mean": (total / count).tolist(),
-            "std": np.sqrt(np.maximum(squares / count - (total / count) ** 2, 0)).tolist(),
-            "count": [count],
+    return sums.stats(), dict(zip(MANOEUVRES, (driven / max(count, 1)).tolist(), strict=True))
+
+
+class Sums:
+    """What the statistics of columns are made of, gathered part by part."""
+
+    def __init__(self) -> None:
+        """Begin with nothing."""
+        self._of: dict[str, tuple[int, list[np.ndarray]]] = {}
+
+    def add(self, name: str, values: np.ndarray) -> None:
+        """Take values of a column, a row a sample."""
+        rows = values.astype(np.float64).reshape(len(values), -1)
+        parts = [rows.min(axis=0), rows.max(axis=0), rows.sum(axis=0), (rows**2).sum(axis=0)]
+        count, before = self._of.get(name, (0, None))
+        if before is not None:
+            joined = (np.minimum, np.maximum, np.add, np.add)
+            parts = [join(*pair) for join, *pair in zip(joined, before, parts, strict=True)]
+        self._of[name] = count + len(rows), parts
+
+    def stats(self) -> dict[str, dict[str, list[float]]]:
+        """Return min, max, mean, std and count of each column."""
+        return {
+            name: {
+                "min": low.tolist(),
+                "max": high.tolist(),
+                "mean": (total / count).tolist(),
+                "std": np.sqrt(np.maximum(squares / count - (total / count) ** 2, 0)).tolist(),
+                "count": [count],
+            }
+            for name, (count, (low, high, total, squares)) in self._of.items()
         }
-        for name, (low, high, total, squares) in sums.items()
-    }
-    return described, dict(zip(MANOEUVRES, (driven / max(count, 1)).tolist(), strict=True))
 
 
-def _column(values: np.ndarray, dtype: str, names: list[str] | None) -> pa.Array:
+def column(values: np.ndarray, dtype: str, names: list[str] | None) -> pa.Array:
+    """Return values as a column of a type, with a vector a row if its components have names."""
     flat = pa.array(np.ascontiguousarray(values, dtype=dtype).reshape(-1))
     return pa.FixedSizeListArray.from_arrays(flat, len(names)) if names else flat

@@ -129,23 +129,27 @@ def paths_of_file(folder: Path, number: int) -> tuple[Path, Path]:
     return folder / DATA_PATH.format(**where), folder / EPISODES_PATH.format(**where)
 
 
-def info(
-    actuation: Actuation, episodes: int, samples_per_episode: int, devices: int = 1, *, by_robot: bool = False
-) -> dict[str, Any]:
+def info(described: Mapping[str, Any], *, episodes: int, samples: int, tasks: int = 1) -> dict[str, Any]:
     """Return the content of `meta/info.json`.
 
     LeRobot's `splits` are ranges of episodes, which ours are not: they are in the episode table, column `split`.
+
+    Args:
+        described: its `features`.
+        episodes: their number.
+        samples: number of all samples.
+        tasks: number of tasks.
     """
     return {
         "codebase_version": LEROBOT_VERSION,
         "robot_type": "endovascular guidewire",
         "total_episodes": episodes,
-        "total_frames": episodes * samples_per_episode,
-        "total_tasks": 1,
+        "total_frames": samples,
+        "total_tasks": tasks,
         "chunks_size": FILES_PER_CHUNK,
         "fps": round(1 / SAMPLE_PERIOD_S),
         "splits": {},
         "data_path": DATA_PATH,
         "video_path": None,
-        "features": features(actuation, devices, by_robot=by_robot),
+        "features": dict(described),
     }

@@ -79,13 +79,13 @@ class CArms:
         count, first = len(navigations), navigations[0]
         self._navigations, self._ostium = navigations, [np.asarray(n.anatomy.insertion.position) for n in navigations]
         self._tips: dict[int, tuple[Fluoroscope, TipProjector]] = {}
-        self._images: dict[tuple[int, str], _Views] = {}
-        self._of: list[_Views] = []
+        self._images: dict[tuple[int, str], Views] = {}
+        self._of: list[Views] = []
         self._pixels = pixels
         for navigation, real in zip(navigations, simulator.set_up.anatomies, strict=True):
             anatomy, key = navigation.anatomy, (id(navigation), real.identity)
             if pixels and key not in self._images:
-                self._images[key] = _Views(navigation, real, config, pixels)
+                self._images[key] = Views(navigation, real, config, pixels)
             elif not pixels and id(navigation) not in self._tips:
                 arm = Fluoroscope(anatomy, navigation.device.tip_radius_mm, config=config)
                 self._tips[id(navigation)] = arm, TipProjector(anatomy.tree, anatomy.insertion)
@@ -194,7 +194,7 @@ def _noise() -> Float32[np.ndarray, "n"]:
     return np.random.default_rng(0).standard_normal(_NOISE, dtype=np.float32)
 
 
-class _Views:
+class Views:
     """The views of one navigation: what stays the same, and the roadmap with the target that lies under every image."""
 
     def __init__(self, navigation: Navigation, real: Anatomy, config: FluoroscopeConfig, pixels: int) -> None:

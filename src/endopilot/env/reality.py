@@ -111,6 +111,8 @@ class Reality:
             for number, (each, navigation) in enumerate(zip(worlds, navigations, strict=True))
         ]
         fixed = [each or World() for each in self._worlds]
+        for each in fixed:
+            each.check_engine("environments")
         motion = _common(fixed, "motion", [each.motion or motion for each in fixed])
         config = _common(fixed, "core or wall", [each.core(config) for each in fixed])
         self._robots = self._all_robots(robot, fixed)

@@ -180,6 +180,18 @@ def write_submission(
     write_json(path, submission)
 
 
+def read_submission(path: str | Path) -> Submission:
+    """Read a submission file, whose scores are not checked.
+
+    Raises:
+        InputError: the file is no submission, or its tasks or seeds are not those of this ladder.
+    """
+    path = Path(path)
+    submission = read_settings(path, Submission, remedy="give a submission.json of `endopilot ladder`")
+    _refuse_another_ladder(path, submission)
+    return submission
+
+
 def check_submission(path: str | Path) -> SubmissionCheck:
     """Drive all recordings of a submission file again, without the policy, and compare every figure to the bit.
 
@@ -189,9 +201,7 @@ def check_submission(path: str | Path) -> SubmissionCheck:
     Raises:
         InputError: the file is no submission, or its tasks or seeds are not those of this ladder.
     """
-    path = Path(path)
-    submission = read_settings(path, Submission, remedy="give a submission.json of `endopilot ladder`")
-    _refuse_another_ladder(path, submission)
+    submission = read_submission(path)
     with tempfile.TemporaryDirectory(prefix="endopilot-") as folder:
         difference = _first_difference(submission, Path(folder))
     return SubmissionCheck(

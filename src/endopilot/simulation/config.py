@@ -25,6 +25,8 @@ _HARD_PUSH_N = 2.0
 """Push that stands for the limit of a drive that has none, N."""
 _RIGID_REACH_MM, _COMPLIANT_REACH_MM = 0.5, 2.4
 """How far outside the wall a wire may lie, mm; distance maps reach 2.5 mm."""
+_SOFTEST_N_MM2 = 0.01
+"""A softer wall would yield farther than distance maps reach, N/mm²."""
 _ARTERY_MM = 4.0
 """Width of the artery that displaces the muscle around it, mm."""
 COMPLIANT_WALL_STIFFENING_MM2 = 8.023 / _ARTERY_MM**2
@@ -53,7 +55,7 @@ class SimulatorConfig:
     wall_stiffness_n_mm: Annotated[float, Within(1e-3, 1e6)] | None = None
     """Stiffness of the vessel wall at a node, N/mm. If not given, the push limits of all devices together dent it by
     0.015 mm."""
-    compliant_wall_n_mm2: Annotated[float, Within(0.01, 1e6)] | None = None
+    compliant_wall_n_mm2: Annotated[float, Within(_SOFTEST_N_MM2, 1e6)] | None = None
     """Stiffness of a compliant wall, N/mm of wire and mm of displacement: each place of the wall yields by itself, as a
     bed of springs (Winkler) that stiffen as the heart's muscle does. It takes the place of `wall_stiffness_n_mm` if
     given. An artery that lies in that muscle has 0.01; docs/physics.md derives it. A softer wall would yield farther
@@ -87,6 +89,9 @@ class SimulatorConfig:
             raise ValueError(f"time_step_s: {self.time_step_s} does not divide {SAMPLE_PERIOD_S} s; give e.g. 0.0125")
         if self.wall_along and self.compliant_wall_n_mm2 is None:
             raise ValueError("wall_along: the wall is not compliant; give compliant_wall_n_mm2 too, such as 0.01")
+        softest = (self.compliant_wall_n_mm2 or 0.0) * min(self.wall_along, default=1.0)
+        if self.wall_along and softest < _SOFTEST_N_MM2:
+            raise ValueError(f"wall_along: the wall has {softest:g} N/mm² at least; give factors by which it has 0.01")
         return self
 
     @property

@@ -7,6 +7,13 @@ from jaxtyping import Float
 
 SCALARS, DEVICE, NODE = 10, 27, 35
 """Numbers of a world, then of each device, then of each node."""
+INSERTED, ACTIVE, REASON, TIME = 0, 5, 6, 9
+"""Of a world: inserted length, mm, number of nodes ahead of the catheter, why it is invalid, and time, s."""
+LENGTH, ROTATION, FRICTION, LOADS = SCALARS, SCALARS + 1, SCALARS + 5, slice(SCALARS + 7, SCALARS + 11)
+"""Of the wire: inserted length, mm, rotation, rad, coefficient of friction, and force and torque at the base, then of
+the drive, N and N·mm."""
+DRIVE_ROTATIONS = slice(SCALARS + 18, SCALARS + DEVICE)
+"""Of the wire: rotations of the drive and between it and the ostium, rad."""
 POSITION, ATTITUDE = slice(0, 3), slice(3, 7)
 """Of a node: where it lies, mm, and the quaternion of the element behind it."""
 CONTACTS = (13, 24)

@@ -16,8 +16,11 @@ POISSON_RATIO = 0.3
 """Of steel and nitinol; it ties shear to bending stiffness."""
 SHEAR_CORRECTION = 6 * (1 + POISSON_RATIO) / (7 + 6 * POISSON_RATIO)
 """Cowper's shear coefficient of a round section (J. Appl. Mech. 33, 1966)."""
-_DRAG_N_S_MM2 = 5e-6
-"""Drag of the surrounding blood on one mm of wire, N·s/mm²; far below friction."""
+_DRAG_N_S_MM2, _SOFT_N_MM2 = 5e-6, 0.1
+"""Drag on one mm of wire, N·s/mm²; far below friction. On a wire softer than the latter anywhere, N·mm², it falls with
+the square of that: it would fold as it is pushed."""
+_BLOOD_N_S_MM2 = 1e-8
+"""Drag is no less than that of blood on a slender wire, N·s/mm²: 2πη / ln(length / diameter) with η = 0.0035 Pa·s."""
 _GROWTH_MM = 40.0
 """Distance from the tip at which elements are twice as long as there; they grow in proportion to it, mm."""
 LONGEST_ELEMENTS = 5.0
@@ -90,6 +93,8 @@ def lay_out(device: Wire, *, element_mm: float, length_mm: float) -> RodLayout:
     if device.tip_bend_length_mm > 0:
         bent = device.tip_bend_rad * np.diff(ends) / device.tip_bend_length_mm
         curvature[1:, 0] = bent / np.diff(middle)
+    softness = min(1.0, min(device.bend_stiffness_n_mm2) / _SOFT_N_MM2)
+    drag = max(_DRAG_N_S_MM2 * softness**2, _BLOOD_N_S_MM2)
     return RodLayout(
         abscissa_mm=abscissa,
         shear_n=shear,
@@ -98,8 +103,8 @@ def lay_out(device: Wire, *, element_mm: float, length_mm: float) -> RodLayout:
         twist_n_mm2=device.twist_stiffness(abscissa),
         rest_curvature=curvature,
         radius_mm=np.full(len(abscissa), device.tip_radius_mm),
-        drag_n_s_mm=_DRAG_N_S_MM2 * length,
-        spin_drag_n_mm_s=_DRAG_N_S_MM2 * device.tip_radius_mm**2 * length,  # of the surface, radius times rotation
+        drag_n_s_mm=drag * length,
+        spin_drag_n_mm_s=drag * device.tip_radius_mm**2 * length,  # of the surface, radius times rotation
     )
 
 

@@ -67,10 +67,11 @@ def factor_at(
 
 
 def _stiffened(anatomy: Anatomy, radius_mm: float, factors: Sequence[float]) -> DistanceMap:
-    """Return a map by which the wall is stiffer by a factor that varies along the vessel, as `factor_at` has it.
+    """Return a map by which the wall is softer than where it is stiffest, as `factor_at` has it.
 
     A spring K d²/2 of depth d is c² times as stiff where the map gives c d: distances from where a device touches the
-    wall are multiplied by the root of the factor.
+    wall are multiplied by the root of the factor over the largest one. So none grows, for the core takes a wall to be
+    as far as the map says; the largest factor is the core's own stiffness (`core_options`).
     """
     field, tree = anatomy.distance_map, anatomy.tree
     lines = [branch.centerline for branch in tree.branches]
@@ -78,8 +79,8 @@ def _stiffened(anatomy: Anatomy, radius_mm: float, factors: Sequence[float]) -> 
     abscissa, values = np.concatenate([line.abscissa for line in lines]), field.values.copy()
     where = np.argwhere(values > values.min())
     _, at = nearest.query(field.origin_mm + field.spacing_mm * where[:, ::-1])
-    root, place = np.sqrt(factor_at(abscissa[at], tree, factors)), tuple(where.T)
-    values[place] = radius_mm + root * (values[place] - radius_mm)
+    root, place = np.sqrt(factor_at(abscissa[at], tree, factors) / max(factors)), tuple(where.T)
+    values[place] = np.maximum(radius_mm + root * (values[place] - radius_mm), values.min())
     return replace(field, values=values)
 
 

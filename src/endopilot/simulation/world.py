@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, cast, get_args
+from typing import Annotated, Any, Literal, cast, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -123,6 +123,9 @@ class World:
     """Length of the wire's elements at its tip in reality, mm; as given if not here."""
     time_step_s: Annotated[float, Within(1e-5, SAMPLE_PERIOD_S)] | None = None
     """Time step in reality, s, which divides 0.5 s; as given if not here."""
+    engine: Literal["rod", "mujoco"] = "rod"
+    """What moves the wire in reality: the rod core, which policies simulate too, or MuJoCo, an engine of other people
+    (`pip install 'endopilot[engine]'`). That moves a wire alone in a rigid vessel that lies still."""
     motion: Annotated[Motion | None, BeforeValidator(_motion)] = None
     """How heart and breath truly move the vessel: breathing, heartbeat, both, or amplitudes; as given if not here."""
     registration_mm: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
@@ -137,6 +140,10 @@ class World:
             self.core(SimulatorConfig())
         except InputError as error:
             raise ValueError(str(error)) from None
+        own = ("compliant_wall_n_mm2", "friction_along", "motion")
+        clash = next((name for name in own if getattr(self, name) not in (None, ())), None)
+        if self.engine != "rod" and clash:
+            raise ValueError(f"engine: {self.engine} with {clash}; leave one of them out")
         return self
 
     def drawn(self, anatomy: Anatomy, seed: int) -> World:
@@ -200,6 +207,18 @@ class World:
         own = {name: getattr(self, name) for name in names}
         changed = {name: value for name, value in own.items() if value not in (None, ())}
         return replace(given, **changed) if changed else given
+
+    def check_engine(self, what: str) -> None:
+        """Check that the rod core moves the wire.
+
+        Args:
+            what: what it has to move in, as the message names it.
+
+        Raises:
+            InputError: another engine does.
+        """
+        if self.engine != "rod":
+            raise InputError(f"world: engine = {self.engine}; {what} are of the rod core alone: leave it out")
 
     def real_robot(self, given: RobotConfig) -> RobotConfig:
         """Return the robot as it truly is."""

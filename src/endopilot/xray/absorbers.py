@@ -103,16 +103,17 @@ def in_catheter(
 ) -> Places:
     """Return the nodes of a wire, LPS mm, with those behind the ostium laid along the guiding catheter's bend.
 
-    The rod core's catheter is straight; nothing that it computes depends on what lies behind.
+    The rod core's catheter is straight; nothing that it computes depends on what lies behind. Behind the ostium are the
+    nodes after the last one in front of its plane: vessels pass that plane too, farther on.
 
     Args:
         anatomy: the vessel.
-        nodes: of the wire.
+        nodes: of the wire, from its tip on.
         line: the guiding catheter's axis (`catheter_line`), where it is known already.
     """
     start = anatomy.insertion
     behind = -((nodes - start.position) @ start.direction)
-    inside = behind > 0
+    inside = np.logical_and.accumulate((behind > 0)[::-1])[::-1]
     distance, places, _ = line or catheter_line(anatomy)
     aside = nodes[inside] - start.position + behind[inside, None] * start.direction
     laid = np.stack([np.interp(behind[inside], distance, axis) for axis in places.T], axis=-1)

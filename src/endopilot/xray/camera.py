@@ -21,6 +21,8 @@ from endopilot.xray.carm import CArmGeometry, View, view_at
 CAMERA_FILE = "camera.yaml"
 """Name of the camera's file beside a log."""
 Point = tuple[Finite, Finite, Finite]
+Row = tuple[Finite, Finite, Finite, Finite]
+_SINGULAR = 1e-12
 _UNIT = 1e-3
 """Directions are taken as given if their lengths are 1, and right angles right, to this."""
 
@@ -60,44 +62,85 @@ class PlanarCamera:
 
 @settings
 class CArmCamera:
-    """A C-arm that stands still, and whose images are as large as its detector's pixels make them."""
+    """A C-arm that stands still, and whose images are as large as its detector's pixels make them.
 
-    angles_deg: tuple[Finite, Finite]
+    It is given by angles, isocenter and distances, or by its projection matrix.
+    """
+
+    angles_deg: tuple[Finite, Finite] | None = None
     """LAO (positive) or RAO, and cranial (positive) or caudal angle, degrees."""
-    isocenter_mm: Point
+    isocenter_mm: Point | None = None
     """Point about which the C-arm turns, LPS mm."""
-    centre_px: tuple[Finite, Finite]
+    centre_px: tuple[Finite, Finite] | None = None
     """Column and row, pixels, that show the isocenter."""
     geometry: CArmGeometry = CArmGeometry()
     """Distances and pixels."""
+    matrix: tuple[Row, Row, Row] | None = None
+    """In place of all these: (w·column, w·row, w) is this matrix times (x, y, z, 1), pixels and LPS mm."""
+
+    @model_validator(mode="after")
+    def _is_given_in_one_way(self) -> CArmCamera:
+        angles = {name: getattr(self, name) for name in ("angles_deg", "isocenter_mm", "centre_px")}
+        absent = next((name for name, value in angles.items() if value is None), None)
+        if self.matrix is None:
+            if absent is not None:
+                raise ValueError(f"{absent}: missing; add it, or give a matrix in place of angles")
+        elif extra := [name for name, value in angles.items() if value is not None]:
+            raise ValueError(f"{extra[0]}: is given beside matrix; give one of them")
+        elif abs(np.linalg.det(np.array(self.matrix)[:, :3])) < _SINGULAR * np.linalg.norm(self.matrix) ** 3:
+            raise ValueError("matrix: its first three columns have no inverse; give a projection from a point")
+        return self
 
     @property
     def view(self) -> View:
-        """Source and detector."""
-        return view_at(self.angles_deg, np.array(self.isocenter_mm), self.geometry)
+        """Source and detector; of a matrix, the axes along columns and rows are scaled as its pixels are."""
+        if self.matrix is None:
+            assert self.angles_deg is not None
+            return view_at(self.angles_deg, np.array(self.isocenter_mm), self.geometry)
+        matrix = np.array(self.matrix)
+        matrix = matrix * np.sign(np.linalg.det(matrix[:, :3])) / np.linalg.norm(matrix[2, :3])
+        column, row = self._centre
+        across, down = matrix[0, :3] - column * matrix[2, :3], matrix[1, :3] - row * matrix[2, :3]
+        scale = float(np.linalg.norm(across))
+        return View(
+            source=-np.linalg.solve(matrix[:, :3], matrix[:, 3]),
+            axes=np.stack([across / scale, -down / scale, matrix[2, :3]]),
+            scale=scale,
+        )
+
+    @property
+    def _centre(self) -> Float[np.ndarray, "2"]:
+        """Column and row where the beam meets the detector at a right angle."""
+        if self.matrix is None:
+            return np.array(self.centre_px)
+        first, second, beam = np.array(self.matrix)[:, :3]
+        return np.array([first @ beam, second @ beam]) / (beam @ beam)
 
     def project(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
         """Return column and row, pixels, of points, LPS mm."""
-        return self.view.project(points) * [1.0, -1.0] + self.centre_px
+        return self.view.project(points) * [1.0, -1.0] + self._centre
 
     def rays(self, pixels: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
         """Return a point, LPS mm, on what each pixel shows, and the unit vector along it."""
         view = self.view
-        across = (pixels - self.centre_px) * [1.0, -1.0] / view.scale
-        along = across @ view.axes[:2] + view.axes[2]
+        across = (pixels - self._centre) * [1.0, -1.0] / view.scale
+        along = np.column_stack([across, np.ones(len(across))]) @ np.linalg.inv(view.axes).T
         return np.broadcast_to(view.source, along.shape), along / np.linalg.norm(along, axis=1, keepdims=True)
 
 
 Camera = PlanarCamera | CArmCamera
+_ANY_MATRIX = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 1.0))
 
 
 def read_camera(path: Path) -> Camera:
-    """Read a camera from a YAML file: a `PlanarCamera` where it holds `mm_per_pixel`, else a `CArmCamera`.
+    """Read a camera from a YAML file: a `CArmCamera` where it holds `angles_deg` or `matrix`, else a `PlanarCamera`.
 
     Raises:
         InputError: no such file; the line names file, field, value and mend.
     """
     content = read_yaml(path)
+    if isinstance(content, dict) and "matrix" in content:
+        return read_settings(path, CArmCamera, onto=CArmCamera(matrix=_ANY_MATRIX))
     if isinstance(content, dict) and "angles_deg" in content:
         return read_settings(path, CArmCamera)
     return read_settings(path, PlanarCamera)

@@ -20,7 +20,7 @@ from scipy.ndimage import gaussian_filter, zoom
 
 from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
-from endopilot.settings import Finite, Positive, Share, Within, settings
+from endopilot.settings import Finite, Positive, Share, ShareBelowOne, Within, settings
 from endopilot.simulation.motion import place
 from endopilot.types import Anatomy, Volume
 from endopilot.xray.absorbers import (
@@ -78,6 +78,14 @@ class ImageConfig:
     """Attenuation of the contrasted blood, 1/mm: 185 mg iodine/ml at 7.6 cm²/g."""
     opaque_tip_mm: Annotated[float, Within(0, 5000, above_low=True)] = 30.0
     """Length of the wire's radiopaque coil, mm."""
+    electronic_noise_ugy: Annotated[float, Within(0, 10)] = 0.0
+    """Air kerma at the detector at which the electronics' noise is as large as the quantum noise, µGy; none at 0."""
+    edge_weight: Annotated[float, Within(0, 10)] = 0.0
+    """Weight with which the C-arm adds to an image what its own blur lacks (unsharp mask); none at 0."""
+    edge_mm: Annotated[float, Within(0.05, 20)] = 1.0
+    """Standard deviation of that blur at the detector, mm."""
+    temporal_weight: ShareBelowOne = 0.0
+    """Weight of the image before in an image of a sequence (recursive filter); none at 0."""
     window: Finite = 0.9
     """Half-width of the grey scale, in powers of e about the image's middle."""
 
@@ -257,11 +265,14 @@ class XrayImager:
         dose: float = 1.0,
         seed: int = 0,
         noise: Float32[np.ndarray, "rows columns"] | None = None,
+        before: Float32[np.ndarray, "rows columns"] | None = None,
         velocity: Float[np.ndarray, "n 3"] | None = None,
         catheters: Sequence[Float[np.ndarray, "_ 3"]] = (),
         catheter_velocities: Sequence[Float[np.ndarray, "_ 3"]] | None = None,
     ) -> Float32[np.ndarray, "rows columns"]:
-        """Return what the detector reads: the logarithm of the light over the usual one; the same seed, the same noise.
+        """Return what the C-arm makes of what its detector reads: the logarithm of the light over the usual one.
+
+        The same seed gives the same noise.
 
         Args:
             plane: what does not move.
@@ -270,6 +281,7 @@ class XrayImager:
             dose: multiple of the usual dose.
             seed: of the noise.
             noise: of standard deviation 1, a number for each pixel; drawn if not given.
+            before: the signal before in a sequence, for the temporal filter; this is the first if not given.
             velocity: of the nodes, mm/s, which blurs the wire over the pulse; at rest if not given.
             catheters: nodes of each catheter from its tip on, LPS mm of the CT; none if not given.
             catheter_velocities: of these nodes, mm/s; at rest if not given.
@@ -289,8 +301,17 @@ class XrayImager:
         if noise is None:
             noise = np.random.default_rng([seed, 0x78726179]).standard_normal(light.shape, dtype=np.float32)
         noise = noise / np.sqrt(light * np.float32(self.photons(plane, dose)))
-        spread = config.scintillator_mm / config.geometry.pixel_mm * plane.zoom
-        return np.log(light) + blurred(noise, spread)
+        per_mm = plane.zoom / config.geometry.pixel_mm
+        read = np.log(light) + blurred(noise, config.scintillator_mm * per_mm)
+        if config.electronic_noise_ugy > 0:  # it is white, and grows in dark parts as one over the light
+            random = np.random.default_rng([seed, 0x656C6563])
+            share = config.electronic_noise_ugy / (config.detector_ugy * dose * self.photons(plane, dose))
+            read += random.standard_normal(light.shape, dtype=np.float32) * np.float32(np.sqrt(share)) / light
+        if config.edge_weight > 0:
+            read += np.float32(config.edge_weight) * (read - blurred(read, config.edge_mm * per_mm))
+        if before is None or config.temporal_weight == 0:
+            return read
+        return np.float32(1 - config.temporal_weight) * read + np.float32(config.temporal_weight) * before
 
     def grey(
         self,

@@ -24,6 +24,10 @@ from endopilot.xray.image import ImageConfig, Plane, XrayImager
 
 _SEQUENCES, _SAMPLES, _FIRST_SAMPLE = 6, 40, 4
 _DEEPEST_SHARE = 0.9
+_FRAME_S = 1 / 15
+"""Time between the images that a temporal filter sees, s."""
+_FORGOTTEN = 0.05
+_EARLIER_SEED = 2**40
 Signal = Float32[np.ndarray, "rows columns"]
 
 
@@ -88,11 +92,23 @@ class Scene:
             seed: of the noise.
         """
         nodes = self.nodes[wire] if wire is not None else np.zeros((0, 3))
-        velocity = self.velocity[wire] if wire is not None else None
-        return tuple(
-            self.imager.signal(plane, nodes, contrast=contrast, dose=dose, seed=2 * seed + index, velocity=velocity)
-            for index, plane in enumerate(self.planes)
-        )
+        velocity = self.velocity[wire] if wire is not None else np.zeros((0, 3))
+        weight, earlier = self.imager.config.temporal_weight, 0
+        if weight > 0:  # images before, of a wire on its way, until they count for nothing
+            earlier = int(np.ceil(np.log(_FORGOTTEN) / np.log(weight)))
+        signals: list[Signal | None] = [None] * len(self.planes)
+        for back in reversed(range(earlier + 1)):
+            for index, plane in enumerate(self.planes):
+                signals[index] = self.imager.signal(
+                    plane,
+                    nodes - back * _FRAME_S * velocity,
+                    contrast=contrast,
+                    dose=dose,
+                    seed=2 * seed + index + back * _EARLIER_SEED,
+                    velocity=velocity if wire is not None else None,
+                    before=signals[index],
+                )
+        return tuple(signal for signal in signals if signal is not None)
 
 
 def draw_scenes(config: SceneConfig, image: ImageConfig | None = None) -> Iterator[Scene]:

@@ -1,0 +1,219 @@
+"""Recorded navigations of the ladder as a LeRobot data set with X-ray images: `write_demonstrations`."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+from jaxtyping import UInt8
+from PIL import Image
+
+from endopilot.dataset import parquet, schema
+from endopilot.devices.stack import column_prefixes, lines_from_tips
+from endopilot.env.exposures import Views
+from endopilot.errors import InputError
+from endopilot.files import manifest, sha256, write_json, writing
+from endopilot.ladder.attempt import Recording, begun, navigation_seed
+from endopilot.ladder.submission import Submission, read_submission
+from endopilot.navigation.record import NavigationRecord
+from endopilot.progress import progress
+from endopilot.runs import claim
+from endopilot.tasks.task import Task, find_task
+from endopilot.types import SAMPLE_PERIOD_S
+from endopilot.xray.fluoroscope import FluoroscopeConfig
+
+PIXELS = 128
+"""Columns and rows of an image."""
+_C_ARM = FluoroscopeConfig()
+_VIEWS = tuple(f"observation.images.view_{1 + k}" for k in range(1 + _C_ARM.biplane))
+_AT_DRIVE = ("inserted_length_mm", "rotation_rad", "drive_force_n", "drive_torque_nmm")
+_CHANNELS = 3
+"""Of an image, all alike: networks that were trained on photographs take three."""
+
+Columns = dict[str, Any]
+
+
+def write_demonstrations(submission: str | Path, *, output: str | Path) -> dict[str, Any]:
+    """Drive the navigations of a submission again, and write what was seen and decided as a LeRobot v3 data set.
+
+    An episode is a navigation, a sample a decision, two a second. The columns are
+
+    - `observation.state`: of each device Δ, mm, and φ, rad, by the robot's encoders, force, N, and torque, N·mm, of its
+      drive; and the age of the last exposure, s;
+    - `observation.images.view_1` and `view_2`: the X-ray images of that exposure, with vessel and target, as the
+      environments show them;
+    - `action`: what was decided then: velocities of each device, mm/s and rad/s, and 1 where the next sample was to be
+      an exposure;
+    - `exposed`: whether the images are of this moment;
+    - `contact_force_max_n`: largest wall force on a node over the period that follows.
+
+    Args:
+        submission: the file.
+        output: folder of the data set.
+
+    Returns:
+        `dataset` (the folder), `episodes`, `samples` and `exposures`.
+
+    Raises:
+        InputError: the file is no submission, its tasks have different numbers of devices, or the folder holds
+            something else.
+    """
+    path, output = Path(submission), Path(output)
+    read, key = read_submission(path), sha256(path)
+    tasks = [find_task(name, version=read.version) for name in read.navigations]
+    if len(number := {1 + bool(task.catheter) for task in tasks}) > 1:
+        raise InputError(f"{path}: some tasks are of a wire alone and some have a catheter; give one kind")
+    described = _features(*number)
+    claim(output, "endopilot ladder", submission=key)
+    chosen = [(task, place) for task in tasks for place in range(len(read.navigations[task.name]))]
+    titles = list(dict.fromkeys(task.title for task in tasks))
+    sums, samples, exposures = parquet.Sums(), 0, 0
+    with progress("Writing the data set", total=len(chosen)) as advance:
+        for episode, (task, place) in enumerate(chosen):
+            columns, about = _navigation(read, task, place)
+            count = len(columns["action"])
+            columns |= {
+                "timestamp": np.arange(count) * SAMPLE_PERIOD_S,
+                "index": samples + np.arange(count),
+                "episode_index": np.full(count, episode),
+                "frame_index": np.arange(count),
+                "task_index": np.full(count, titles.index(task.title)),
+            }
+            _write_episode(output, episode, task.title, columns, about, described, key)
+            for name, values in columns.items():
+                sums.add(name, _pixels(values) if name in _VIEWS else np.asarray(values))
+            samples, exposures = samples + count, exposures + int(columns["exposed"].sum())
+            advance()
+    _describe(output, described, titles, sums.stats(), len(chosen), samples)
+    write_json(output / schema.MANIFEST_PATH, manifest(config=None, inputs={path.name: key}, policy=read.policy))
+    return {"dataset": output, "episodes": len(chosen), "samples": samples, "exposures": exposures}
+
+
+def _features(devices: int) -> dict[str, Any]:
+    """Return the `features` entry of `meta/info.json`."""
+    prefixes = column_prefixes(devices)
+    vectors = {
+        "observation.state": [*(p + name for p in prefixes for name in _AT_DRIVE), "exposure_age_s"],
+        "action": [*(p + name for p in prefixes for name in schema.VELOCITY), "expose"],
+    }
+    image = {"dtype": "image", "shape": [PIXELS, PIXELS, _CHANNELS], "names": ["height", "width", "channels"]}
+    scalar = {"shape": [1], "names": None}
+    return {
+        "timestamp": {"dtype": "float32", **scalar},
+        **{name: {"dtype": "int64", **scalar} for name in schema.INDEX_COLUMNS},
+        **{name: {"dtype": "float32", "shape": [len(of)], "names": of} for name, of in vectors.items()},
+        **dict.fromkeys(_VIEWS, image),
+        "exposed": {"dtype": "bool", **scalar},
+        "contact_force_max_n": {"dtype": "float32", **scalar},
+    }
+
+
+def _navigation(submission: Submission, task: Task, place: int) -> tuple[Columns, dict[str, Any]]:
+    """Drive a navigation again, and return its columns and what the episode table says of it."""
+    packed = submission.navigations[task.name][place].recording
+    navigation, seed = task.ladder_navigation(place), navigation_seed(task, place)
+    recording = Recording.unpacked(vars(packed), len(navigation.devices), submission.robot, submission.world)
+    loop = begun(recording, navigation, seed=seed)
+    views = Views(navigation, loop.simulator.set_up.anatomies[0], _C_ARM, PIXELS)
+    record = loop.run()
+    count = len(record.control) - 1
+    images, age_s = _images(record, views, np.asarray(loop.world.registration_mm), seed)
+    drives = np.concatenate([record.encoders[:count], record.load[:count]], axis=-1).reshape(count, -1)
+    asked = np.append(record.exposed[1:count], False)
+    columns = {
+        "observation.state": np.column_stack([drives, age_s]),
+        "action": np.column_stack([record.control[:count].reshape(count, -1), asked]),
+        "exposed": record.exposed[:count],
+        "contact_force_max_n": record.contact_force_max[1:],
+        **{name: [shown[k] for shown in images] for k, name in enumerate(_VIEWS)},
+    }
+    names = ("success", "safe", "reason", "peak_force_n", "exposures")
+    about = {"ladder_task": task.name, "anatomy": navigation.anatomy.name, "seed": seed}
+    return columns, about | {name: getattr(record, name) for name in names}
+
+
+def _images(
+    record: NavigationRecord, views: Views, registration_mm: np.ndarray, seed: int
+) -> tuple[list[UInt8[np.ndarray, "views rows columns"]], list[float]]:
+    """Return the images of the last exposure at each decision, and its age, s; the first decision has one."""
+    random = np.random.default_rng([seed, 7])
+    images, ages, shown, since = [], [], None, 0
+    for at in range(len(record.control) - 1):
+        if record.exposed[at] or shown is None:
+            nodes = record.shape[at] + registration_mm
+            devices = lines_from_tips(nodes[np.isfinite(nodes[:, 0])], record.inserted_length[at])
+            shown, since = views.image(devices, random), at
+        images.append(shown)
+        ages.append((at - since) * SAMPLE_PERIOD_S)
+    return images, ages
+
+
+def _write_episode(
+    output: Path,
+    episode: int,
+    title: str,
+    columns: Columns,
+    about: Mapping[str, Any],
+    described: Mapping[str, Any],
+    key: str,
+) -> None:
+    """Write a navigation: its row of the episode table, then its samples."""
+    data_path, episodes_path = schema.paths_of_file(output, episode)
+    chunk, file = divmod(episode, schema.FILES_PER_CHUNK)
+    begins, count = int(columns["index"][0]), len(columns["index"])
+    row = {
+        "episode_index": episode,
+        "tasks": [title],
+        "length": count,
+        "dataset_from_index": begins,
+        "dataset_to_index": begins + count,
+        "data/chunk_index": chunk,
+        "data/file_index": file,
+        **about,
+        "meta/episodes/chunk_index": chunk,
+        "meta/episodes/file_index": file,
+    }
+    samples = {name: _column(columns[name], each) for name, each in described.items()}
+    for path, table in ((episodes_path, {name: [value] for name, value in row.items()}), (data_path, samples)):
+        with writing(path) as partial:
+            partial.write_bytes(parquet.parquet_bytes(parquet.marked_table(table, key)))
+
+
+def _column(values: Any, feature: Mapping[str, Any]) -> pa.Array:
+    if feature["dtype"] == "image":
+        files = {id(image): _png(image) for image in values}
+        return pa.array([{"bytes": files[id(image)], "path": None} for image in values], _IMAGE)
+    return parquet.column(np.asarray(values), feature["dtype"], feature["names"])
+
+
+_IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+
+
+def _pixels(images: Sequence[UInt8[np.ndarray, "rows columns"]]) -> np.ndarray:
+    """Return the pixels of images, of which white is 1."""
+    return np.concatenate([image.reshape(-1) for image in images]) / 255
+
+
+def _png(image: UInt8[np.ndarray, "rows columns"]) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(image).convert("RGB").save(file, format="PNG")
+    return file.getvalue()
+
+
+def _describe(
+    output: Path, described: Mapping[str, Any], titles: Sequence[str], stats: Mapping[str, Any], episodes: int, n: int
+) -> None:
+    """Write statistics, tasks and the columns."""
+    for name in _VIEWS:  # a row and a column, both of 1, for each channel
+        low_to_std = {key: [[value] for value in values] for key, values in stats[name].items() if key != "count"}
+        stats = {**stats, name: {**stats[name], **{key: [value] * _CHANNELS for key, value in low_to_std.items()}}}
+    write_json(output / schema.STATS_PATH, stats)
+    tasks = pd.DataFrame({"task_index": range(len(titles))}, index=pd.Index(titles, name="task"))
+    with writing(output / schema.TASKS_PATH) as partial:
+        tasks.to_parquet(partial)
+    write_json(output / schema.INFO_PATH, schema.info(described, episodes=episodes, samples=n, tasks=len(titles)))

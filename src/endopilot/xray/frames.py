@@ -1,0 +1,120 @@
+"""Lines of a device in the images of a sequence, and where its tip is in each: their files.
+
+Frames are a CSV file with a row for each point of a line, from the tip backwards; a single row is the tip alone.
+
+==========================  ============================================================================================
+column                      meaning
+==========================  ============================================================================================
+`frame`                     whole number, the same for all points of a frame; frames stand in the order of time
+`view`                      1 or 2: which of the cameras; 1 if not given
+`column_px`, `row_px`       pixel of the point
+==========================  ============================================================================================
+
+Frames whose number is left out show nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.errors import InputError
+from endopilot.files import writing
+from endopilot.simulation.csv_file import read_columns
+from endopilot.xray.carm import View
+from endopilot.xray.tip_filter import TipLocation
+from endopilot.xray.tracker import TipEstimate
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What the cameras show of a device at one time.
+
+    Attributes:
+        number: of the frame.
+        lines: for each camera the device's line, pixels (column, row), from its tip backwards; a single point is the
+            tip alone; None where that camera does not show it.
+    """
+
+    number: int
+    lines: tuple[Float[np.ndarray, "_ 2"] | None, ...]
+
+
+def frame_of(number: int, found: TipEstimate | None, views: Sequence[View]) -> Frame:
+    """Return the frame of one exposure's images in which `TipDetector` found a wire, or none.
+
+    Args:
+        number: of the frame.
+        found: in the images.
+        views: that the detector was given; the frame's pixels are those of `View.project`.
+    """
+    if found is None:
+        return Frame(number, (None,) * len(views))
+    wire = np.concatenate([found.position[None], found.wire[::-1]])
+    return Frame(number, tuple(view.project(wire) for view in views))
+
+
+def read_frames(path: str | Path, *, views: int = 1) -> tuple[Frame, ...]:
+    """Read the lines of a sequence.
+
+    Args:
+        path: CSV file of the columns frame, view (if there are several), column_px and row_px.
+        views: number of cameras.
+
+    Raises:
+        InputError: no such table; the line names file, row, column and mend.
+    """
+    table = read_columns(Path(path), ["frame", "column_px", "row_px"], ["view"])
+    frame, view = table.values["frame"], table.values.get("view", np.ones(len(table.lines)))
+    pixels = np.column_stack([table.values["column_px"], table.values["row_px"]])
+    odd = np.flatnonzero(frame != np.round(frame))
+    if len(odd):
+        raise table.fault(int(odd[0]), "frame", "; give a whole number")
+    back = np.flatnonzero(np.diff(frame) < 0)
+    if len(back):
+        raise table.fault(int(back[0]) + 1, "frame", " is before the row above; sort the rows by frame")
+    odd = np.flatnonzero(~np.isin(view, np.arange(1, views + 1)))
+    if len(odd):
+        raise table.fault(int(odd[0]), "view", f"; give 1 to {views}, or a camera for each view")
+    found = []
+    for number in np.unique(frame):
+        lines: list[Float[np.ndarray, "_ 2"] | None] = []
+        for k in range(1, views + 1):
+            line = pixels[(frame == number) & (view == k)]
+            lines.append(line if len(line) else None)
+        found.append(Frame(int(number), tuple(lines)))
+    return tuple(found)
+
+
+def write_locations(locations: Sequence[TipLocation], *, output: str | Path) -> None:
+    """Write where the tip is in each frame as a CSV file, whole or not at all; empty cells where it is not found.
+
+    Raises:
+        InputError: the suffix is not .csv, or the file cannot be written.
+    """
+    import pandas as pd
+
+    path = Path(output)
+    if path.suffix.lower() != ".csv":
+        raise InputError(f"{path}: tips are written as CSV; give a name that ends in .csv")
+    upper = [(i, j) for i in range(3) for j in range(i, 3)]
+    rows = [
+        {
+            "frame": one.frame,
+            "status": one.status,
+            "section": one.section,
+            "tip_abscissa_mm": one.abscissa,
+            **{f"tip_{axis}_mm": value for axis, value in zip("xyz", one.position, strict=True)},
+            **{f"covariance_{'xyz'[i]}{'xyz'[j]}_mm2": one.covariance[i, j] for i, j in upper},
+            "share": one.share,
+            **{f"moved_{axis}_mm": value for axis, value in zip("xyz", one.moved_mm, strict=True)},
+            "residual_mm": one.residual_mm,
+        }
+        for one in locations
+    ]
+    with writing(path) as partial:
+        pd.DataFrame(rows).to_csv(partial, index=False, float_format="%.4f")

@@ -1,0 +1,482 @@
+"""The tip of a device in a vessel tree, followed through lines in images: a grid filter with a pose for each place.
+
+The state is the place of the tip, one of a grid along all branches, and for each place a normal distribution of the
+patient's pose: three shifts and three rotations. From frame to frame the tip travels a little, or, in a small share of
+the frames, is anywhere: so a tip in the wrong branch is found again. Heart and breath move the way smoothly, and anew
+in each frame.
+
+In a frame the device's line is compared with the projected way to each place. A point of the line belongs to the point
+of the way that is nearest, among those about as far behind the tip; its distance across the line is an observation,
+normally distributed, with what is known of pose, of breathing, and of how far the device lies off its way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
+
+from endopilot.lines import length_along, places_on
+from endopilot.settings import Finite, NonNegative, OpenShare, Positive, Within, settings
+from endopilot.types import VesselTree
+from endopilot.xray.camera import Camera
+from endopilot.xray.carm import View
+from endopilot.xray.vessel_grid import VesselGrid, make_grid
+
+Line = Float[np.ndarray, "_ 2"]
+_STEP_MM, _SAMPLE_MM = 1.0, 6.0
+"""Distance of the grid's places, and of the compared points of a line, mm."""
+_BREATH_MM = 120.0
+"""Length along the vessel over which breathing and heartbeat move it alike, mm."""
+_BEND_SD_MM, _BEND_MM = 2.0, 30.0
+"""How far the device bends the vessel, mm, and over which length of it alike."""
+_ASIDE_SD_MM, _ASIDE_RADII, _ASIDE_MM = 1.5, 0.1, 20.0
+"""How far the device lies off its way: this, and this share of the lumen's radius, mm; and over which length alike."""
+_POINT_SD_MM, _END_SD_MM = 0.4, 1.0
+"""Standard deviations of the points of a line, and more of its end, mm. All lengths above, and the one below, are those
+that made the first half of the frames of a real patient's catheter likeliest; docs/locate.md names them."""
+_LENGTH_SD_MM, _LENGTH_SHARE = 2.0, 0.01
+"""By how much, and by which share of the line, the way to the tip is longer than the line in an image, mm."""
+_DRIFT_MM, _DRIFT_RAD = 0.5, np.deg2rad(0.2)
+"""Standard deviations of how the pose drifts from frame to frame."""
+_LANDMARK_SD_MM, _TIP_SD_MM = 6.0, 2.0
+"""Of the shift that a landmark shows, since the vessel breathes; and of a tip that is a landmark, along the vessel."""
+_STRAY, _BEYOND = np.log(1 / 200), -2.5
+"""Logarithm of the density, 1/mm, of a point that is not of the device, evenly in 200 mm; and of one in the catheter or
+vessel before the root, where the way is not known."""
+_LEAST_ODDS = 20.0
+"""A line is the device's where it is likelier so, by this logarithm, than if its points were strays."""
+_WINDOW, _SLACK_MM, _SLACK_SHARE = 30, 3.0, 0.25
+"""A point of the line belongs to the way within so many places, and this length and share of the line, of where it
+should be by its length."""
+_ROUNDS = 3
+_PRUNE, _MOST = 18.0, 600
+"""Places whose tip alone is less likely than the best one's by this logarithm are not compared further, nor more than
+so many."""
+_NEAR_MM = 12.0
+"""Mean and covariance are those of the posterior within this distance of its mode, mm."""
+_SURE = 0.9
+"""A tip is ambiguous where less of the posterior lies there."""
+
+
+@settings
+class LocateConfig:
+    """What is known of patient and device before the first frame."""
+
+    landmark_mm: tuple[Finite, Finite, Finite] | None = None
+    """A point of the CT, LPS mm, that the first frame shows: the tip, if no pixel is given. Without one the wire itself
+    registers the patient."""
+    landmark_px: tuple[Finite, Finite] | None = None
+    """Column and row of the landmark in the first camera's image, pixels."""
+    registration_sd_mm: Positive = 30.0
+    """How far the patient may lie from where the cameras have the CT, without a landmark: standard deviation, mm."""
+    turn_sd_deg: NonNegative = 4.0
+    """And how far they may be turned about each axis, degrees."""
+    breathing_sd_mm: NonNegative = 4.0
+    """How far heart and breath move the vessel about its mean place: standard deviation, mm."""
+    travel_mm: Positive = 4.0
+    """How far the tip goes along the vessel from frame to frame, in the mean, mm."""
+    stiff_mm: Annotated[float, Within(0, 100)] = 6.0
+    """Length of the vessel over which the device straightens it, mm."""
+    anywhere_share: OpenShare = 0.02
+    """Share of the frames in which the tip may be anywhere, whatever the frames before say."""
+
+
+@dataclass(frozen=True, eq=False)
+class TipLocation:
+    """Where the tip is in one frame; NaN where it is not found.
+
+    Attributes:
+        frame: its number.
+        status: "found"; "ambiguous" where more than a tenth of the posterior lies elsewhere; "not found" where the
+            frame shows no line, or one that no way through the vessel explains.
+        position: of the tip, LPS mm of the CT.
+        covariance: of the position, mm².
+        share: of the posterior that lies near it.
+        abscissa: along the centerline from the tree's root, mm.
+        branch: index in the tree; -1 where it is not found.
+        section: its name; empty where it is not found.
+        moved_mm: how far the vessel lies there from where the cameras have the CT, by pose, heart and breath, LPS mm.
+        residual_mm: mean distance of the line from the moved way, mm; NaN where only the tip is seen.
+    """
+
+    frame: int
+    status: Literal["found", "ambiguous", "not found"]
+    position: Float[np.ndarray, "3"]
+    covariance: Float[np.ndarray, "3 3"]
+    share: float
+    abscissa: float
+    branch: int
+    section: str
+    moved_mm: Float[np.ndarray, "3"]
+    residual_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """One view of a frame: the line's points, and the grid as this camera shows it.
+
+    Attributes:
+        tip: pixel of the line's end.
+        at: length from there to each of its points, mm in the patient.
+        points: of the line behind its end, pixels.
+        across: unit vectors across the line at each.
+        shown: pixels of the grid's places.
+        slope: derivative of these by the place, pixels/mm.
+        scale: pixels in a mm there.
+        along: length from the root to each place in the image, mm in the patient.
+    """
+
+    tip: Float[np.ndarray, "2"]
+    at: Float[np.ndarray, "k"]
+    points: Float[np.ndarray, "k 2"]
+    across: Float[np.ndarray, "k 2"]
+    shown: Float[np.ndarray, "n 2"]
+    slope: Float[np.ndarray, "n 2 3"]
+    scale: Float[np.ndarray, "n"]
+    along: Float[np.ndarray, "n"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Observations, for each of some places of the tip.
+
+    Attributes:
+        place: of the grid that an observation is of.
+        towards: unit vector of the displacement that it observes; 0 where it observes a length.
+        value: observed, mm.
+        variance: of its own noise, mm².
+        used: whether it was made.
+    """
+
+    place: Int[np.ndarray, "m r"]
+    towards: Float[np.ndarray, "m r 3"]
+    value: Float[np.ndarray, "m r"]
+    variance: Float[np.ndarray, "r"]
+    used: Bool[np.ndarray, "m r"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """What observations say, for each of some places of the tip.
+
+    Attributes:
+        log_density: of the observations.
+        mean, covariance: of the pose.
+        moved: how far each observation's place is moved beyond the mean pose, without what lies aside of the way, mm.
+        aside: how far the device lies off its way at the first observation, mm.
+        aside_covariance: of that, mm².
+    """
+
+    log_density: Float[np.ndarray, "m"]
+    mean: Float[np.ndarray, "m 6"]
+    covariance: Float[np.ndarray, "m 6 6"]
+    moved: Float[np.ndarray, "m r 3"]
+    aside: Float[np.ndarray, "m 3"]
+    aside_covariance: Float[np.ndarray, "m 3 3"]
+
+
+class TipFilter:
+    """Follows the tip of one device through the frames of a sequence.
+
+    Attributes:
+        grid: places of the tip.
+    """
+
+    def __init__(self, tree: VesselTree, cameras: Sequence[Camera | View], config: LocateConfig | None = None) -> None:
+        """Take the vessel and what sees it; `config` says what is known before the first frame."""
+        self.config = config or LocateConfig()
+        self._tree, self._cameras = tree, tuple(cameras)
+        self.grid: VesselGrid = make_grid(tree, step_mm=_STEP_MM, stiff_mm=self.config.stiff_mm)
+        count = len(self.grid.middle)
+        stay = np.exp(-self.grid.distance / self.config.travel_mm)
+        rare = self.config.anywhere_share
+        self._goes = (1 - rare) * stay / stay.sum(axis=1, keepdims=True) + rare / count
+        self._centre = self.grid.way.mean(axis=0)
+        self._aside = _ASIDE_SD_MM + _ASIDE_RADII * self.grid.radius
+        turn = np.deg2rad(self.config.turn_sd_deg)
+        spread = np.array([*[self.config.registration_sd_mm] * 3, *[turn] * 3])
+        self._log = np.full(count, -np.log(count))
+        self._mean = np.zeros((count, 6))
+        self._covariance = np.tile(np.diag(spread**2), (count, 1, 1))
+        self._begun = False
+
+    def update(self, frame: int, lines: Sequence[Line | None]) -> TipLocation:
+        """Return where the tip is, by this frame and those before.
+
+        Args:
+            frame: number of the frame.
+            lines: for each camera the device's line, pixels (column, row), from its tip backwards; a single point is
+                the tip alone; None where the camera does not see it.
+        """
+        if self._begun:
+            self._predict()
+        else:
+            self._begun = self._begin(lines)
+        if all(line is None for line in lines):
+            return self._nowhere(frame)
+        share = np.exp(self._log)
+        base = share @ self._mean
+        pairs, way = zip(self._cameras, lines, strict=True), self._moved(base)
+        seen = [_see(self.grid, camera, line, way) for camera, line in pairs if line is not None]
+        everywhere = np.arange(len(self._log))
+        tips = _tip_rows(seen, everywhere)
+        score = self._log + self._fit(everywhere, tips, base).log_density
+        best = np.argsort(-score, kind="stable")[:_MOST]
+        places = np.sort(best[score[best] > score[best[0]] - _PRUNE])
+        fit, rows, beyond = self._compare(seen, places, base)
+        # Points that fit no place are strays; so would all be that lie in the vessel, were there no device.
+        odds = fit.log_density - _STRAY * rows.used.sum(axis=1)
+        whole = rows.value.shape[1] > 2 * len(seen)
+        if np.logaddexp.reduce(self._log[places] + odds) < (_LEAST_ODDS if whole else 0.0):
+            return self._nowhere(frame)
+        log = self._log[places] + odds + (_BEYOND - _STRAY) * beyond
+        evidence = np.logaddexp.reduce(log)
+        self._log = np.full_like(self._log, -np.inf)
+        self._log[places] = log - evidence
+        self._mean[places], self._covariance[places] = fit.mean, fit.covariance
+        return self._answer(frame, places, fit, rows, base)
+
+    def _begin(self, lines: Sequence[Line | None]) -> bool:
+        """Register the patient by the landmark, if there is one; return whether it was seen or is not needed."""
+        if self.config.landmark_mm is None:
+            return True
+        point, line = np.array(self.config.landmark_mm), lines[0]
+        pixel = self.config.landmark_px
+        if pixel is None:
+            if line is None:
+                return False
+            pixel = tuple(line[0])
+            nearest = int(np.linalg.norm(self.grid.middle - point, axis=1).argmin())
+            log = -self.grid.distance[nearest] / _TIP_SD_MM
+            self._log = log - np.logaddexp.reduce(log)
+        shift = np.zeros(3)
+        for _ in range(4):  # the shift across the beam that takes the point to the pixel
+            shown, slope = _shown(self._cameras[0], point[None] + shift)
+            shift = shift + np.linalg.pinv(slope[0]) @ (np.array(pixel) - shown[0])
+        self._mean[:, :3] = shift
+        self._covariance[:, :3, :3] = _LANDMARK_SD_MM**2 * np.eye(3)
+        return True
+
+    def _predict(self) -> None:
+        """Let the tip travel and the pose drift; what comes together at a place is one normal distribution there."""
+        flow = self._goes * np.exp(self._log)[:, None]
+        total = flow.sum(axis=0)
+        flow /= total
+        square = self._covariance + self._mean[:, :, None] * self._mean[:, None]
+        mean = flow.T @ self._mean
+        square = (flow.T @ square.reshape(len(total), -1)).reshape(square.shape)
+        drift = np.array([*[_DRIFT_MM] * 3, *[_DRIFT_RAD] * 3])
+        self._log, self._mean = np.log(total), mean
+        self._covariance = square - mean[:, :, None] * mean[:, None] + np.diag(drift**2)
+
+    def _moved(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "n 3"]:
+        matrix = Rotation.from_rotvec(pose[3:6]).as_matrix()
+        return (self.grid.way - self._centre) @ matrix.T + self._centre + pose[:3]
+
+    def _compare(
+        self, seen: Sequence[_Seen], places: Int[np.ndarray, "m"], base: Float[np.ndarray, "6"]
+    ) -> tuple[_Fit, _Rows, Int[np.ndarray, "m"]]:
+        """Return what whole lines say of some places of the tip, and how many of their points lie before the root."""
+        tips = _tip_rows(seen, places)
+        fit, rows, beyond = self._fit(places, tips, base), tips, np.zeros(len(places), dtype=np.int64)
+        count = [len(one.at) for one in seen]
+        if not any(count):
+            return fit, rows, beyond
+        moved = np.repeat(fit.moved[:, :1], sum(count), axis=1)
+        bounds = np.cumsum([0, *count])
+        for _ in range(_ROUNDS):
+            parts = [
+                _line_rows(self.grid, one, places, moved[:, low:high])
+                for one, low, high in zip(seen, bounds[:-1], bounds[1:], strict=True)
+                if high > low
+            ]
+            rows = _joined([tips, *(part for part, _ in parts)])
+            beyond = np.sum([outside for _, outside in parts], axis=0)
+            fit = self._fit(places, rows, base)
+            # Each view's rows are those of its points, and one of its length.
+            first, kept = tips.value.shape[1], []
+            for number in (n for n in count if n):
+                kept.append(fit.moved[:, first : first + number])
+                first += number + 1
+            moved = np.concatenate(kept, axis=1)
+        return fit, rows, beyond
+
+    def _fit(self, places: Int[np.ndarray, "m"], rows: _Rows, base: Float[np.ndarray, "6"]) -> _Fit:
+        """Return the density of observations, and the posterior of what they depend on."""
+        arm = self._moved(base)[rows.place] - self._centre - base[:3]
+        towards, used = rows.towards, rows.used
+        lever = np.concatenate([towards, np.cross(arm, towards)], axis=-1)
+        prior, covariance = self._mean[places] - base, self._covariance[places]
+        apart = self.grid.abscissa[rows.place]
+        apart = apart[:, :, None] - apart[:, None]
+        smooth = self.config.breathing_sd_mm**2 * _alike(apart, _BREATH_MM) + _BEND_SD_MM**2 * _alike(apart, _BEND_MM)
+        aside = self._aside[rows.place]
+        aside = aside[:, :, None] * aside[:, None] * _alike(apart, _ASIDE_MM)
+        of_pose = lever @ covariance
+        expected = (towards @ towards.swapaxes(1, 2)) * (smooth + aside) + of_pose @ lever.swapaxes(1, 2)
+        one = np.eye(len(rows.variance))
+        both = used[:, :, None] & used[:, None]
+        expected = np.where(both, expected + np.diag(rows.variance), one)
+        error = np.where(used, rows.value - np.einsum("mri,mi->mr", lever, prior), 0.0)
+        gains = np.concatenate([error[..., None], of_pose, aside[:, :1].swapaxes(1, 2) * towards], axis=-1)
+        gains[~used] = 0.0
+        solved = np.linalg.solve(expected, gains)
+        weight = solved[..., 0]
+        _, log_size = np.linalg.slogdet(expected)
+        log_density = -0.5 * ((error * weight).sum(axis=1) + log_size + used.sum(axis=1) * np.log(2 * np.pi))
+        change = np.einsum("mri,mr->mi", of_pose, weight)
+        pose = prior + change
+        across = np.cross(pose[:, None, 3:6], arm)
+        moved = pose[:, None, :3] + across + smooth @ (weight[..., None] * towards)
+        own = gains[..., 7:]
+        return _Fit(
+            log_density=log_density,
+            mean=base + pose,
+            covariance=covariance - gains[..., 1:7].swapaxes(1, 2) @ solved[..., 1:7],
+            moved=moved,
+            aside=np.einsum("mri,mr->mi", own, weight),
+            aside_covariance=aside[:, :1, :1] * np.eye(3) - own.swapaxes(1, 2) @ solved[..., 7:],
+        )
+
+    def _nowhere(self, frame: int) -> TipLocation:
+        nothing = np.full(3, np.nan)
+        return TipLocation(frame, "not found", nothing, np.full((3, 3), np.nan), 0.0, np.nan, -1, "", nothing, np.nan)
+
+    def _answer(
+        self, frame: int, places: Int[np.ndarray, "m"], fit: _Fit, rows: _Rows, base: Float[np.ndarray, "6"]
+    ) -> TipLocation:
+        """Return mean and covariance around the mode of the posterior."""
+        grid, weight = self.grid, np.exp(self._log[places])
+        best = int(weight.argmax())
+        near = np.linalg.norm(grid.middle[places] - grid.middle[places[best]], axis=1) <= _NEAR_MM
+        share = float(weight[near].sum())
+        weight, close = weight[near] / share, places[near]
+        tips = grid.middle[close] + fit.aside[near]
+        mean = weight @ tips
+        off = tips - mean
+        cell = grid.step_mm**2 / 12 * np.eye(3)
+        covariance = (weight[:, None] * off).T @ off + np.einsum("m,mij->ij", weight, fit.aside_covariance[near]) + cell
+        place = int(close[np.linalg.norm(grid.middle[close] - weight @ grid.middle[close], axis=1).argmin()])
+        here = self._tree.branches[grid.branch[place]]
+        section = here.section[np.abs(here.centerline.abscissa - grid.abscissa[place]).argmin()]
+        left = np.abs(rows.value - np.einsum("mri,mri->mr", rows.towards, fit.moved))[best]
+        of_line = rows.used[best] & (rows.variance == _POINT_SD_MM**2)
+        moved = self._moved(base)[places[best]] - grid.way[places[best]] + fit.moved[best, 0]
+        return TipLocation(
+            frame=frame,
+            status="found" if share >= _SURE else "ambiguous",
+            position=mean,
+            covariance=covariance,
+            share=share,
+            abscissa=float(grid.abscissa[place]),
+            branch=int(grid.branch[place]),
+            section=self._tree.section_names[section],
+            moved_mm=moved,
+            residual_mm=float(left[of_line].mean()) if of_line.any() else np.nan,
+        )
+
+
+def _alike(apart: np.ndarray, length: float) -> np.ndarray:
+    """Return the correlation of what lies so far apart along the vessel, mm."""
+    return np.exp(-0.5 * (apart / length) ** 2)
+
+
+def _shown(
+    camera: Camera | View, points: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
+    """Return the pixels of points, and the derivative by the point, pixels/mm."""
+    slope = [(camera.project(points + axis) - camera.project(points - axis)) / 2 for axis in np.eye(3)]
+    return camera.project(points), np.stack(slope, axis=-1)
+
+
+def _see(grid: VesselGrid, camera: Camera | View, line: Line, way: Float[np.ndarray, "n 3"]) -> _Seen:
+    """Return a line's points, evenly apart, and the grid as the camera shows it where the pose has it."""
+    shown, slope = _shown(camera, way)
+    scale = np.sqrt((slope**2).sum(axis=(1, 2)) / 2)
+    usual = float(np.median(scale))
+    length = length_along(line)
+    at = np.arange(_SAMPLE_MM * usual, length[-1], _SAMPLE_MM * usual)
+    around = 0.4 * _SAMPLE_MM * usual
+    ahead = places_on(line, length, at + around) - places_on(line, length, at - around)
+    ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+    return _Seen(
+        tip=line[0],
+        at=at / usual,
+        points=places_on(line, length, at),
+        across=np.stack([-ahead[:, 1], ahead[:, 0]], axis=-1),
+        shown=shown,
+        slope=slope,
+        scale=scale,
+        along=grid.along(shown) / usual,
+    )
+
+
+def _tip_rows(seen: Sequence[_Seen], places: Int[np.ndarray, "m"]) -> _Rows:
+    """Return what the ends of the lines say: two observations a view."""
+    shape = len(places), 2 * len(seen)
+    return _Rows(
+        place=np.repeat(places[:, None], shape[1], axis=1),
+        towards=np.concatenate([one.slope[places] / one.scale[places, None, None] for one in seen], axis=1),
+        value=np.concatenate([(one.tip - one.shown[places]) / one.scale[places, None] for one in seen], axis=1),
+        variance=np.full(shape[1], _POINT_SD_MM**2 + _END_SD_MM**2),
+        used=np.ones(shape, dtype=bool),
+    )
+
+
+def _line_rows(
+    grid: VesselGrid, seen: _Seen, places: Int[np.ndarray, "m"], moved: Float[np.ndarray, "m k 3"]
+) -> tuple[_Rows, Int[np.ndarray, "m"]]:
+    """Return what a line's points say, and its length, and how many of them lie before the root.
+
+    Args:
+        grid: the places.
+        seen: the line.
+        places: of its tip.
+        moved: how far the way is moved at each point, as found so far, mm.
+    """
+    each, behind = np.arange(len(places)), grid.behind[places]
+    arc = seen.along[places, None] - seen.along[behind]
+    within = np.arange(behind.shape[1]) <= grid.depth[places, None]
+    arc[~within] = np.inf
+    first = (arc[:, None, :] < seen.at[:, None]).sum(axis=2)
+    window = np.clip(first[..., None] + np.arange(-_WINDOW, _WINDOW + 1), 0, behind.shape[1] - 1)
+    near = each[:, None, None]
+    candidates = behind[near, window]
+    slack = _SLACK_MM + _SLACK_SHARE * seen.at
+    inside = np.abs(arc[near, window] - seen.at[:, None]) <= slack[:, None]
+    wanted = seen.points - np.einsum("mij,mkj->mki", seen.slope[places], moved)
+    gap = ((seen.shown[candidates] - wanted[:, :, None]) ** 2).sum(axis=3)
+    gap[~inside] = np.inf
+    chosen = gap.argmin(axis=2)[..., None]
+    place = np.take_along_axis(candidates, chosen, axis=2)[..., 0]
+    beyond = seen.at > seen.along[places, None]
+    used = np.isfinite(np.take_along_axis(gap, chosen, axis=2)[..., 0]) & (place != 0) & ~beyond
+    scale = seen.scale[place]
+    towards = np.einsum("ki,mkij->mkj", seen.across, seen.slope[place]) / scale[..., None]
+    value = np.einsum("ki,mki->mk", seen.across, seen.points - seen.shown[place]) / scale
+    any_used = used.any(axis=1)
+    last = np.where(any_used, len(seen.at) - 1 - used[:, ::-1].argmax(axis=1), 0)
+    longer = seen.along[places] - seen.along[place[each, last]] - seen.at[last]
+    rows = _Rows(
+        place=np.column_stack([place, places]),
+        towards=np.concatenate([towards, np.zeros((len(places), 1, 3))], axis=1),
+        value=np.column_stack([value, longer]),
+        variance=np.array([*[_POINT_SD_MM**2] * len(seen.at), (_LENGTH_SD_MM + _LENGTH_SHARE * seen.at[-1]) ** 2]),
+        used=np.column_stack([used, any_used]),
+    )
+    return rows, beyond.sum(axis=1)
+
+
+def _joined(parts: Sequence[_Rows]) -> _Rows:
+    fields = vars(parts[0])
+    return _Rows(
+        **{
+            name: np.concatenate([getattr(part, name) for part in parts], axis=min(1, fields[name].ndim - 1))
+            for name in fields
+        }
+    )

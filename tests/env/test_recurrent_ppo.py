@@ -1,0 +1,72 @@
+"""The single-file learner of `examples/recurrent_ppo.py` plays, remembers and improves where seeing costs."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+from endopilot.tasks.navigation import Navigation, Target
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "recurrent_ppo.py"
+
+
+@pytest.fixture(scope="module")
+def learner() -> dict:
+    pytest.importorskip("torch")
+    return runpy.run_path(str(EXAMPLE))
+
+
+@pytest.fixture
+def worlds(fork, wire):
+    near = Navigation(
+        anatomy=fork, device=wire, target=Target(branch=1, abscissa=38.0), start_inserted_length_mm=6.0, seconds=2.0
+    )
+    return gymnasium.make_vec(
+        "endopilot.env:endopilot/NavigateXray-v0",
+        num_envs=4,
+        navigations=near,
+        autoreset_mode=AutoresetMode.DISABLED,
+    )
+
+
+def test_it_trains(learner, worlds):
+    agent, episodes = learner["train"](worlds, 0.0, 0)
+    assert len(episodes) == 4 * (learner["STEPS"] // 15)  # of 2 s each
+    assert (episodes[:, 3] >= 1).all() and np.isfinite(episodes).all()
+    assert all(parameter.isfinite().all() for parameter in agent.parameters())
+    again, _ = learner["train"](worlds, 0.0, 0)
+    assert all((a == b).all() for a, b in zip(agent.parameters(), again.parameters(), strict=True))
+
+
+def test_what_was_remembered_follows_from_the_rollout_s_begin(learner, worlds):
+    import torch
+
+    torch.manual_seed(0)
+    agent, rollout = learner["Agent"](32, 3), learner["Rollout"](4, 32, 3)
+    player = learner["Player"](worlds, 0)
+    player.play(agent, rollout)
+    player.play(agent, rollout)  # begins with a memory, amid episodes
+    memory = rollout.memory
+    assert memory.abs().max() > 0 and 0 < rollout.begun.sum() < rollout.begun.numel()
+    for observation, begun, value, action, log_prob in zip(
+        rollout.observations, rollout.begun, rollout.values, rollout.actions, rollout.log_prob, strict=True
+    ):
+        memory = agent.remember(observation, memory, begun)
+        chances, again = agent.decide(memory)
+        torch.testing.assert_close(again, value)
+        torch.testing.assert_close(chances.log_prob(action).sum(-1), log_prob)
+
+
+def test_advantages_are_discounted_errors_that_end_with_an_episode(learner):
+    import torch
+
+    gamma, lam, rollout = learner["GAMMA"], learner["LAMBDA"], learner["Rollout"](1, 32, 3)
+    rollout.rewards[-3:, 0] = torch.tensor([1.0, 2.0, 3.0])
+    rollout.ended[-2] = 1.0
+    found = rollout.advantages(torch.tensor([10.0]))[-3:, 0]
+    torch.testing.assert_close(found, torch.tensor([1.0 + gamma * lam * 2.0, 2.0, 3.0 + gamma * 10.0]))

@@ -1,0 +1,116 @@
+"""Recorded navigations become a data set with X-ray images, which holds what was seen and decided."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from endopilot.cli import main
+from endopilot.ladder.attempt import Recording, driven
+from endopilot.ladder.demonstrations import PIXELS, write_demonstrations
+from endopilot.ladder.ladder import LadderConfig, climb
+from endopilot.tasks.task import find_task
+from read_by_lerobot import read_by_lerobot
+from toy_tasks import own_tasks
+
+_POLICY = """
+from endopilot.navigation.policy import Decision
+
+class Looks:
+    def start(self, navigation, seed): pass
+    def decide(self, observation):
+        return Decision(((5.0, 0.3),), expose=observation.time_s % 1.5 == 0.5)
+"""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Return the folder of a data set of two navigations with an exposure every 1.5 s, and the submission's content."""
+    folder = tmp_path_factory.mktemp("demonstrations")
+    own_tasks(folder)
+    (folder / "looks.py").write_text(_POLICY)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(folder))
+        climb(output=folder / "run", config=LadderConfig(policy="looks:Looks", version=str(folder)))
+    found = write_demonstrations(folder / "run/submission.json", output=folder / "set")
+    assert (found["dataset"], found["episodes"]) == (folder / "set", 2)
+    return folder / "set", json.loads((folder / "run/submission.json").read_text(encoding="utf-8")), found
+
+
+def _samples(folder) -> list[pd.DataFrame]:
+    return [pd.read_parquet(path) for path in sorted((folder / "data").rglob("*.parquet"))]
+
+
+def _image(cell) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(cell["bytes"])))
+
+
+def test_samples_are_what_was_measured_and_decided(made):
+    folder, content, found = made
+    task = find_task("along", version=content["ladder"])
+    for place, samples in enumerate(_samples(folder)):
+        entry = content["navigations"]["along"][place]
+        record = driven(Recording.unpacked(entry["recording"]), task.ladder_navigation(place), seed=entry["seed"])
+        state, action = np.stack(samples["observation.state"]), np.stack(samples["action"])
+        np.testing.assert_array_equal(state[:, :2], np.float32(record.encoders[:-1, 0]))
+        np.testing.assert_array_equal(state[:, 2:4], np.float32(record.load[:-1, 0]))
+        np.testing.assert_array_equal(action[:, :2], np.float32(record.control[:-1, 0]))
+        np.testing.assert_array_equal(action[:-1, 2] > 0, samples["exposed"][1:])
+        np.testing.assert_allclose(samples["contact_force_max_n"].max(), record.peak_force_n, rtol=1e-6)
+        assert samples["exposed"].sum() == entry["exposures"]
+        ages = state[:, 4]
+        assert (ages[samples["exposed"]] == 0).all() and ages.max() == 1.0
+    assert found["exposures"] == sum(entry["exposures"] for entry in content["navigations"]["along"])
+
+
+def test_images_are_kept_until_the_next_exposure_and_show_a_wire_that_comes_on(made):
+    folder, *_ = made
+    samples = _samples(folder)[0]
+    for view in ("observation.images.view_1", "observation.images.view_2"):
+        shown = [_image(cell) for cell in samples[view]]
+        assert shown[0].shape == (PIXELS, PIXELS, 3) and shown[0].dtype == np.uint8
+        changes = [not np.array_equal(a, b) for a, b in itertools.pairwise(shown)]
+        np.testing.assert_array_equal(changes, samples["exposed"][1:])
+        first, last = shown[0].astype(float), shown[-1].astype(float)
+        assert (last < first - 30).sum() > 3 * 10  # pixels that the wire has darkened
+
+
+def test_episodes_tasks_and_statistics_are_described(made):
+    folder, content, found = made
+    episodes = pd.read_parquet(folder / "meta/episodes")
+    assert episodes["length"].sum() == found["samples"] == sum(map(len, _samples(folder)))
+    assert episodes["tasks"].map(list).tolist() == [["Along a straight vessel"]] * 2
+    assert episodes["success"].tolist() == [entry["success"] for entry in content["navigations"]["along"]]
+    info = json.loads((folder / "meta/info.json").read_text(encoding="utf-8"))
+    assert (info["total_frames"], info["total_tasks"]) == (found["samples"], 1)
+    stats = json.loads((folder / "meta/stats.json").read_text(encoding="utf-8"))
+    assert stats["action"]["mean"][0] == pytest.approx(5.0)
+    pixels = np.stack([_image(cell) for data in _samples(folder) for cell in data["observation.images.view_2"]]) / 255
+    of_images = stats["observation.images.view_2"]
+    np.testing.assert_allclose(of_images["mean"], np.full((3, 1, 1), pixels.mean()))
+    np.testing.assert_allclose(of_images["std"], np.full((3, 1, 1), pixels.std()))
+
+
+def test_lerobot_reads_navigations_with_images(made):
+    folder, _, found = made
+    read, samples = read_by_lerobot(folder, 3), _samples(folder)[0]
+    assert (read["samples"], read["episodes"], read["fps"]) == (found["samples"], 2, 2)
+    assert read["task"] == "Along a straight vessel"
+    assert read["names"] == ["translation_mm_s", "rotation_rad_s", "expose"]
+    np.testing.assert_array_equal(np.float32(read["state"]), samples["observation.state"][3])
+    brightest = _image(samples["observation.images.view_1"][3]).max() / 255
+    assert read["images"]["observation.images.view_1"] == [[3, PIXELS, PIXELS], pytest.approx(brightest)]
+    assert set(map(tuple, read["of_images"].values())) == {(3, 1, 1)}
+
+
+def test_mismatch_and_a_dataset_exclude_each_other(tmp_path, capsys):
+    with pytest.raises(SystemExit) as left:
+        main(["ladder", "--mismatch", "0.2", "--dataset", str(tmp_path)])
+    assert left.value.code == 2
+    assert "leave one of them out" in capsys.readouterr().err

@@ -1,0 +1,64 @@
+"""Files in `submissions/` are what their scores say, and `docs/leaderboard.md` is made of them."""
+
+from __future__ import annotations
+
+import runpy
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from endopilot.files import read_json, write_json
+from endopilot.ladder.scores import score, timeless
+from endopilot.ladder.submission import NavigationEntry, Submission, check_submission, read_submission
+from endopilot.tasks.task import list_tasks
+
+ROOT = Path(__file__).parents[2]
+FILES = sorted((ROOT / "submissions").glob("*.json"))
+LARGEST = 2 << 20
+
+
+@pytest.fixture(scope="module")
+def script() -> dict:
+    return runpy.run_path(str(ROOT / "docs" / "leaderboard.py"))
+
+
+def _scores(submission: Submission, chosen: dict[str, tuple[NavigationEntry, ...]]) -> list[dict]:
+    tasks = [task for task in list_tasks(submission.version) if task.name in chosen]
+    results = {
+        name: [{key: value for key, value in asdict(one).items() if value is not None} for one in done]
+        for name, done in chosen.items()
+    }
+    return [timeless(row) for row in score(tasks, results)]
+
+
+def test_the_page_is_made_of_the_files(script):
+    page = (ROOT / "docs" / "leaderboard.md").read_text(encoding="utf-8")
+    assert script["page"]() == page  # run `python docs/leaderboard.py`
+    assert all(path.name in page for path in FILES)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_scores_follow_from_the_navigations(path):
+    assert path.stat().st_size < LARGEST
+    submission = read_submission(path)
+    assert [dict(row) for row in submission.scores] == _scores(submission, submission.navigations)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_the_shortest_first_navigation_is_confirmed_to_the_bit(path, tmp_path):
+    submission, content = read_submission(path), read_json(path)
+    name = min(submission.navigations, key=lambda each: submission.navigations[each][0].seconds)
+    content["tasks"] = {name: content["tasks"][name]}
+    content["navigations"] = {name: content["navigations"][name][:1]}
+    content["scores"] = _scores(submission, {name: submission.navigations[name][:1]})
+    write_json(tmp_path / "submission.json", content)
+    found = check_submission(tmp_path / "submission.json")
+    if found.difference and found.remarks:
+        pytest.skip(f"{found.difference}; {', '.join(found.remarks)}")
+    assert (found.difference, found.navigations) == (None, 1)
+
+
+def test_an_interval_is_wilsons(script):
+    assert script["interval"](5, 10) == pytest.approx((0.2366, 0.7634), abs=1e-4)  # his paper's formula by hand
+    assert script["interval"](0, 20)[0] == 0.0 and script["interval"](20, 20)[1] == pytest.approx(1.0)
