@@ -135,8 +135,13 @@ def convert(episodes: Path, folder: Path) -> list[str]:
 def convert_curves(curves: Path, folder: Path, seed: int = 0) -> list[list[float]]:
     """Write anatomy, devices and task of DualDeviceNav's curves into a folder, and return the targets, LPS mm."""
     lines = read_source(curves).content
+    assert isinstance(lines, Polylines)
     kept = [number for number, radius in enumerate(lines.radius) if radius.min() > NARROW_MM]
-    lines = Polylines(*(tuple(each[number] for number in kept) for each in (lines.points, lines.radius, lines.names)))
+    lines = Polylines(
+        tuple(lines.points[number] for number in kept),
+        tuple(lines.radius[number] for number in kept),
+        tuple(lines.names[number] for number in kept),
+    )
     anatomy = endopilot.extract_anatomy(
         lines, name="dualdevicenav", config=endopilot.AnatomyConfig(ostium_mm=OSTIUM_MM)
     )

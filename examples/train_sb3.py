@@ -45,7 +45,7 @@ class WireVecEnv(VecEnv):
         self.actions = actions
 
     def step_wait(self):
-        observations, rewards, terminations, truncations, infos = self.worlds.step(self.actions)
+        observations, rewards, terminations, truncations, info = self.worlds.step(self.actions)
         self.returns += rewards
         ended = terminations | truncations
         infos: list[dict] = [{} for _ in ended]
@@ -54,7 +54,7 @@ class WireVecEnv(VecEnv):
                 "terminal_observation": observations[world],
                 "TimeLimit.truncated": bool(truncations[world]),
                 "return": float(self.returns[world]),
-                "success": bool(infos["success"][world] and infos["safe"][world]),
+                "success": bool(info["success"][world] and info["safe"][world]),
             }
         if ended.any():
             self.returns[ended] = 0.0

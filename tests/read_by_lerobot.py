@@ -1,4 +1,4 @@
-"""What `lerobot` itself reads of a data set, in an environment of its own: its requirements and ours exclude each other."""
+"""What `lerobot` itself reads of a data set, in an environment of its own: both cannot be installed in one."""
 
 from __future__ import annotations
 

@@ -45,6 +45,12 @@ def test_the_mend_names_the_extra(module: str, extra: str) -> None:
     assert missing is not None and missing.endswith(f"pip install 'endopilot[{extra}]'")
 
 
+def test_a_library_that_is_imported_by_another_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.metadata.requires", lambda _: ["mujoco-core>=4; extra == 'engine'"])
+    missing = what_is_missing(ModuleNotFoundError("No module named 'mujoco'", name="mujoco"))
+    assert missing == "needs mujoco; install it with: pip install 'endopilot[engine]'"
+
+
 def test_a_defect_stays_a_defect() -> None:
     error = ModuleNotFoundError("No module named 'nonsense'", name="nonsense")
     assert what_is_missing(error) is None
@@ -76,6 +82,7 @@ def test_all_extras_that_are_missing_are_named_at_once(monkeypatch: pytest.Monke
 
 
 def test_a_run_says_so_before_it_begins(tmp_path: Path) -> None:
+    pytest.importorskip("torch", reason="the extra `learn` is not installed, which the line would name too")
     result = run_without("plotly", f"from endopilot.cli import main; main(['demo', '-o', {str(tmp_path / 'demo')!r}])")
     assert result.returncode == 2
     assert result.stderr == "endopilot demo: needs more libraries; install them with: pip install 'endopilot[report]'\n"

@@ -2,25 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
+from endopilot.devices.device import Wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import RobotConfig
 from endopilot.robot.log import RobotLog
 from endopilot.robot.robot import SimulatedRobot
 from endopilot.simulation.config import PRESETS
 from endopilot.simulation.simulator import Simulator
+from endopilot.types import Anatomy
 
-PERIOD_S = 0.1
+PERIOD_S, TIP_SD_MM = 0.1, 0.05
+"""Time between commands, s, and standard deviation of the tips that are seen, mm."""
 
 
-def logged(anatomy, wire, robot: RobotConfig, *, episodes=6, seconds=12.0, seed=0, tip_sd_mm=0.05, with_truth=False):
-    """Drive a wire to and fro at random, and log commands, loads and tips; each episode begins anew.
+def logged(
+    anatomy: Anatomy, wire: Wire, robot: RobotConfig, *, episodes: int = 6, seconds: float = 12.0, seed: int = 0
+) -> RobotLog:
+    """Drive a wire to and fro at random, and log commands, loads and tips; each episode begins anew."""
+    return logged_and_true(anatomy, wire, robot, episodes=episodes, seconds=seconds, seed=seed)[0]
 
-    With `with_truth`, also return where the wire's proximal end truly was at the end of each period, mm and rad.
-    """
+
+def logged_and_true(
+    anatomy: Anatomy, wire: Wire, robot: RobotConfig, *, episodes: int, seconds: float, seed: int
+) -> tuple[RobotLog, Float[np.ndarray, "periods 2"]]:
+    """Return also where the wire's proximal end truly was at the end of each period, mm and rad."""
     random, rows, truth = np.random.default_rng(seed), [], []
     far = float(anatomy.tree.longest_path().abscissa[-1])
     for episode in range(episodes):
@@ -38,14 +50,14 @@ def logged(anatomy, wire, robot: RobotConfig, *, episodes=6, seconds=12.0, seed=
             at += velocity[0] * PERIOD_S
             drive.command(((velocity[0], velocity[1]),))
             drive.run(PERIOD_S)
-            tip = simulator.tip_position[0, 0] + tip_sd_mm * random.standard_normal(3)
+            tip = simulator.tip_position[0, 0] + TIP_SD_MM * random.standard_normal(3)
             truth.append(drive.proximal[0].copy())
             state = drive.proximal_state()
             rows.append((episode, k * PERIOD_S, velocity.copy(), tip, state.devices[0], state.load[0]))
-    return (_log(rows), np.array(truth)) if with_truth else _log(rows)
+    return _log(rows), np.array(truth)
 
 
-def _log(rows) -> RobotLog:
+def _log(rows: Sequence[tuple[Any, ...]]) -> RobotLog:
     """Return two rows for each period: the command at its start, tip, encoders and load at its end."""
     count = 2 * len(rows)
     nothing = np.full((count, 1, 2), np.nan)

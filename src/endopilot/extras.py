@@ -10,17 +10,19 @@ from endopilot.errors import InputError
 
 FOR_DEVELOPERS = ("dev", "docs")
 """Extras that no command needs."""
+_IMPORTED_AS = {"mujoco-core": "mujoco"}
+"""Libraries that are imported by another name."""
 
 
 def requirements_of_extras() -> dict[str, tuple[str, ...]]:
-    """Return the names of the libraries that each extra brings, as the package's metadata lists them."""
+    """Return the names of the libraries that each extra brings, as they are imported, from the package's metadata."""
     from importlib import metadata  # slow to import, and only needed here
 
     found: dict[str, tuple[str, ...]] = {}
     for line in metadata.requires("endopilot") or ():
         parts = re.match(r"([\w.-]+).*\bextra == ['\"]([\w-]+)['\"]", line)
         if parts and parts[1] != "endopilot":  # `all` only repeats the others
-            found[parts[2]] = (*found.get(parts[2], ()), _normal(parts[1]))
+            found[parts[2]] = (*found.get(parts[2], ()), _IMPORTED_AS.get(_normal(parts[1]), _normal(parts[1])))
     return found
 
 

@@ -98,6 +98,8 @@ def test_what_all_worlds_share_may_not_differ(near):
         NavigateVectorEnv(2, navigations=near, world=["moving", "nominal"])
     with pytest.raises(InputError, match="world 'none': no such world or file"):
         NavigateEnv(navigation=near, world="none")
+    with pytest.raises(InputError, match="world: engine = mujoco; environments are of the rod core alone"):
+        NavigateVectorEnv(2, navigations=near, world=World(engine="mujoco"))
     with pytest.raises(InputError, match="an empty list"):
         NavigateVectorEnv(2, navigations=near, world=[])
 

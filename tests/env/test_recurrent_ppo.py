@@ -60,6 +60,8 @@ def test_what_was_remembered_follows_from_the_rollout_s_begin(learner, worlds):
         chances, again = agent.decide(memory)
         torch.testing.assert_close(again, value)
         torch.testing.assert_close(chances.log_prob(action).sum(-1), log_prob)
+    fresh = agent.remember(observation, memory, torch.ones(4))
+    torch.testing.assert_close(fresh, agent.remember(observation, torch.zeros_like(memory), torch.zeros(4)))
 
 
 def test_advantages_are_discounted_errors_that_end_with_an_episode(learner):

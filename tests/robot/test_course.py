@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.robot.synthetic import PERIOD_S, drawn, logged
+from benchmarks.robot.synthetic import PERIOD_S, drawn, logged_and_true
 from endopilot.devices.robot import DriveConfig
 from endopilot.robot.course import Courses
 from endopilot.robot.log import RobotLog
@@ -54,7 +54,7 @@ def test_play_is_lost_where_the_drive_reverses() -> None:
 def test_it_is_the_motion_of_the_simulated_robot(fork, wire, seed) -> None:
     """The house's drive, which ramps and steps through time, leads the wire to the same places."""
     robot = drawn(seed)
-    log, true = logged(fork, wire, robot, episodes=1, seconds=10.0, seed=seed, with_truth=True)
+    log, true = logged_and_true(fork, wire, robot, episodes=1, seconds=10.0, seed=seed)
     courses, late = Courses.of([log], robot.wire), robot.latency_s
     at_s = PERIOD_S * np.arange(1, len(true) + 1)[None]
     gain, play = robot.wire.gain_translation, robot.wire.play_mm

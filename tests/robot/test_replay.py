@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from benchmarks.robot.synthetic import drawn, logged
+from benchmarks.robot.synthetic import drawn, logged_and_true
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
@@ -22,17 +22,17 @@ def robot() -> RobotConfig:
 
 
 @pytest.fixture(scope="module")
-def logged_and_true(fork, wire, robot):
-    return logged(fork, wire, robot, episodes=3, seconds=10.0, seed=3, with_truth=True)
+def made(fork, wire, robot):
+    return logged_and_true(fork, wire, robot, episodes=3, seconds=10.0, seed=3)
 
 
 @pytest.fixture(scope="module")
-def log(logged_and_true):
-    return logged_and_true[0]
+def log(made):
+    return made[0]
 
 
-def test_the_robot_that_logged_is_predicted(fork, wire, robot, logged_and_true) -> None:
-    log, true = logged_and_true
+def test_the_robot_that_logged_is_predicted(fork, wire, robot, made) -> None:
+    log, true = made
     found = replay_log([log], fork, Stack(wire), robot=robot, config=FEW)
     figures = summary(found)
     assert figures["episodes"] == 3 and figures["error_along_mm"] < 0.2

@@ -120,9 +120,9 @@ class Monitor:
         play = self.belief.play_spread()[None]
         proximal, tip, spread, radius = adviser_input(self.belief)
         if exposure is not None:
-            self._innovations.take(
-                np.array([exposure.abscissa, exposure.offset]) - tip[0], self._half, exposure.tip_sd_mm
-            )
+            seen = np.array([exposure.abscissa, exposure.offset])
+            if self._tests:
+                self._innovations.take(seen - tip[0], self._half, exposure.tip_sd_mm)
             self.past.exposures[period] = exposure
             self.belief.weigh(exposure)
             self._adviser.exposed()

@@ -22,7 +22,7 @@ from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.belief.monitor import BelievedTip, Monitor
 from endopilot.control.course import Course
 from endopilot.control.follow import Follower
-from endopilot.control.search import Search
+from endopilot.control.search import Search, check_devices
 from endopilot.control.search_config import SearchConfig
 from endopilot.devices.stack import Proximals
 from endopilot.errors import InputError
@@ -137,6 +137,7 @@ class _PlanningPolicy:
         self.route = Route.to(navigation.anatomy, navigation.target)
         for device in navigation.devices:
             check_passable(self.route, device)
+        check_devices(navigation)
         self.belief, self._seed = self._believe(), seed
         self._search = self._new_search()
         self._follower = Follower(

@@ -66,13 +66,6 @@ class Pushed:
     farthest: Each
     halt: list[Halt]
 
-    @property
-    def inserted_mm(self) -> Each:
-        """Inserted length of each trial's devices together, when it was given up or passed, mm."""
-        count = len(self.periods)
-        ends = [self.rows[max(int(end), 1) - 1].proximal[trial, :, 0] for trial, end in enumerate(self.periods)]
-        return np.array(ends).sum(axis=1) if self.rows else np.zeros(count)
-
     def within(self, force_n: float) -> Bool[np.ndarray, "trials"]:
         """Return which pass without pressing on the wall with more than some force, N."""
         return self.passed & (self.force <= force_n)

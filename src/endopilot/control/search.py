@@ -49,8 +49,6 @@ _TURNS = (0.0, np.pi)
 """Angles by which a wire alone may be turned before it goes in, rad."""
 _OFTEN = 6
 """A course that has passed places this many times as often as there are is at an end."""
-_NOTHING_SHARE = 1e-3
-"""Manoeuvres with less than this share of the force limit are as gentle as each other."""
 _REPEATED = 3
 """Trials of a manoeuvre that the course tries, one after another."""
 
@@ -77,8 +75,7 @@ class Search:
         Raises:
             InputError: there is more than one catheter.
         """
-        if len(navigation.catheters) > 1:
-            raise InputError(f"catheter: {len(navigation.catheters)}; the search drives one: give one")
+        check_devices(navigation)
         self._navigation, self.route, self.config = navigation, route, config
         self._alone, wide = not navigation.catheters, route.is_wide(route.target.abscissa)
         self._repertoire = Repertoire.of(navigation.catheters, config, wide=wide)
@@ -206,7 +203,7 @@ class Search:
         there = self.route.passed(course.foremost, push.waypoint) * course.weight
         if there.sum() > 0:
             course.weight = there / there.sum()
-        return bool(there.sum() > 0)
+        return bool(there.sum() > 0 and not course.still[0])
 
     def _turned(self, grid: Grid, share: float, waypoint: float, kept: Kept) -> bool:
         """Try a grid before a place, and follow the best of it; return whether any passes.
@@ -248,16 +245,13 @@ class Search:
     def _follow(self, pushed: Pushed, share: float, waypoint: float, *, turns: int) -> bool:
         """Let the course do what the best trial of a manoeuvre did; return whether any passes within a share of force.
 
-        Of the places that most rotations pass, and among these of the cheapest, it is the rotation in the middle; of
-        those that cost next to nothing, the one that uses the least length of its devices. Where
+        Of the places that most rotations pass, and among these of the cheapest, it is the rotation in the middle. Where
         there is a catheter, trials have waited for each other. The course does not, and so has to pass again.
         """
         course, limit_n, cost = self._course, share * self._navigation.force_limit_n, self.manoeuvre_cost(pushed)
         rows, kept = pushed.within(limit_n).reshape(-1, turns), course.kept()
         trials = [at * turns + middle(row) for at, row in enumerate(rows) if row.any()]
-        least = _NOTHING_SHARE * self._navigation.force_limit_n
-        used = pushed.inserted_mm
-        trials.sort(key=lambda trial: (-int(rows[trial // turns].sum()), max(cost[trial], least), used[trial]))
+        trials.sort(key=lambda trial: (-int(rows[trial // turns].sum()), cost[trial]))
         for trial in trials[:_REPEATED]:
             for control in pushed.controls(trial):
                 if self._alone or control.any():
@@ -344,6 +338,16 @@ class Search:
         hard = [bool((row.force[course.counted] > limit_n).any()) for row in course.rows]
         if any(hard):
             del course.rows[hard.index(True) :]
+
+
+def check_devices(navigation: Navigation) -> None:
+    """Refuse a navigation that a search cannot drive.
+
+    Raises:
+        InputError: there is more than one catheter.
+    """
+    if len(navigation.catheters) > 1:
+        raise InputError(f"catheter: {len(navigation.catheters)}; the search drives one: give one")
 
 
 def _merit(course: Course) -> tuple[bool, float]:

@@ -85,6 +85,7 @@ class EngineWire:
         for _ in range(steps):
             self._hold()
             data.qpos[:2] = self.inserted_mm, self.rotation_rad
+            data.qpos[2:][self._held] *= 1 - STEP_S / SETTLE_S
             before, nodes = data.qpos.copy(), self._data.geom_xpos.copy()
             while True:
                 model.dof_armature[2:] = np.where(self._held, _HELD, self._slow * self._inertia[2:])
@@ -173,7 +174,7 @@ def _model(wall: tuple[np.ndarray, np.ndarray], rod: RodLayout, insertion: Inser
         hinges = ""
         if node < count:
             stiffness = np.array([rod.bend_n_mm2[node]] * 2 + [rod.twist_n_mm2[node]]) / width
-            rest = -rod.rest_curvature[node] * width
+            rest = rod.rest_curvature[node] * width
             hinges = "".join(
                 f'<joint type="hinge" axis="{axis}" stiffness="{k}" springref="{np.rad2deg(angle)}" '
                 f'armature="{k * SETTLE_S * STEP_S}"/>'
