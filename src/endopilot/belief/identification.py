@@ -256,15 +256,14 @@ def _tempered(score: Float[np.ndarray, "n"], least: float) -> Float[np.ndarray, 
     """Return weights by as much of the likelihood as leaves some number of members effective."""
     low, high = 0.0, 1.0
     for _ in range(30):
-        weight = np.exp(high * (score - score.max()))
-        weight /= weight.sum()
-        if high == 1.0 and 1 / (weight**2).sum() >= least:
-            return weight
-        middle = 0.5 * (low + high)
-        weight = np.exp(middle * (score - score.max()))
-        weight /= weight.sum()
-        low, high = (middle, high) if 1 / (weight**2).sum() >= least else (low, middle)
-    return weight
+        power = high if high == 1.0 else 0.5 * (low + high)
+        if 1 / (likelihoods(power * score) ** 2).sum() >= least:
+            low = power
+            if power == 1.0:
+                break
+        else:
+            high = power if power < 1.0 else 1.0 - 1e-9
+    return likelihoods(low * score)
 
 
 def _redrawn(

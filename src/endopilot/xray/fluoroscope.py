@@ -61,29 +61,6 @@ class TipMeasurement:
     sd_mm: tuple[float, float] = (0.0, 0.0)
     tip_sd_mm: tuple[float, float] = (0.0, 0.0)
 
-    @staticmethod
-    def at(
-        project: TipProjector,
-        anatomy: Anatomy,
-        position: Float[np.ndarray, "3"],
-        covariance: Float[np.ndarray, "3 3"],
-        sd_mm: tuple[float, float] = (0.0, 0.0),
-    ) -> TipMeasurement:
-        """Return the measurement of a position, LPS mm, with its covariance, mm², in an anatomy; `sd_mm` as above."""
-        tip = project(position[None])
-        branch, abscissa = int(tip.branch[0]), float(tip.abscissa[0])
-        line, tangent = anatomy.tree.branches[branch].centerline, np.asarray(anatomy.insertion.direction)
-        centre = anatomy.insertion.position + abscissa * tangent
-        if abscissa > 0:
-            centre, tangent = (
-                np.array([np.interp(abscissa, line.abscissa, axis) for axis in values.T])
-                for values in (line.points, tangents(line.points))
-            )
-        outwards = position - centre
-        axes = np.array([tangent, outwards / max(float(np.linalg.norm(outwards)), 1e-9)])
-        along, out = np.sqrt(np.einsum("ai,ij,aj->a", axes, covariance, axes)).tolist()
-        return TipMeasurement(position, abscissa, float(tip.offset[0]), branch, sd_mm, (along, out))
-
 
 @runtime_checkable
 class CArm(Protocol):
@@ -152,6 +129,29 @@ class _Detection:
     whiten: Float[np.ndarray, "2 2"]
 
 
+def measurement_at(
+    project: TipProjector,
+    anatomy: Anatomy,
+    position: Float[np.ndarray, "3"],
+    covariance: Float[np.ndarray, "3 3"],
+    sd_mm: tuple[float, float] = (0.0, 0.0),
+) -> TipMeasurement:
+    """Return the measurement of a position, LPS mm, with its covariance, mm², in an anatomy; `sd_mm` as in `TipMeasurement`."""
+    tip = project(position[None])
+    branch, abscissa = int(tip.branch[0]), float(tip.abscissa[0])
+    line, tangent = anatomy.tree.branches[branch].centerline, np.asarray(anatomy.insertion.direction)
+    centre = anatomy.insertion.position + abscissa * tangent
+    if abscissa > 0:
+        centre, tangent = (
+            np.array([np.interp(abscissa, line.abscissa, axis) for axis in values.T])
+            for values in (line.points, tangents(line.points))
+        )
+    outwards = position - centre
+    axes = np.array([tangent, outwards / max(float(np.linalg.norm(outwards)), 1e-9)])
+    along, out = np.sqrt(np.einsum("ai,ij,aj->a", axes, covariance, axes)).tolist()
+    return TipMeasurement(position, abscissa, float(tip.offset[0]), branch, sd_mm, (along, out))
+
+
 class Fluoroscope:
     """A C-arm around one patient, whose vessel is known from the CT and registered to it."""
 
@@ -218,7 +218,7 @@ class Fluoroscope:
     ) -> TipMeasurement:
         """Take one exposure of every view and say where the tip is. The arguments are those of `locate`."""
         detections = [self._detect(view, tip_position, tip_direction, random) for view in self._views]
-        return TipMeasurement.at(self._project, self._anatomy, *self._likeliest(detections, inserted_length))
+        return measurement_at(self._project, self._anatomy, *self._likeliest(detections, inserted_length))
 
     def catheter_axis(self, axis: Float[np.ndarray, "3"], random: np.random.Generator) -> Float[np.ndarray, "3"]:
         """Take one exposure of every view and return the guiding catheter's axis as it shows, a unit vector.

@@ -19,7 +19,7 @@ from endopilot.types import Anatomy
 from endopilot.xray.absorbers import surroundings
 from endopilot.xray.carm import Pose, view_at
 from endopilot.xray.detector import TipDetector
-from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement
+from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement, measurement_at
 from endopilot.xray.image import ImageConfig, Plane, XrayImager
 from endopilot.xray.motion_registration import register_motion, take_run
 from endopilot.xray.moving_patient import seen_wire
@@ -152,7 +152,7 @@ class ImageFluoroscope:
         variance = float(along @ found.covariance @ along)
         across = max(float(np.trace(found.covariance)) - variance, 0.0) / 2
         sd_mm = float(np.sqrt(variance)), float(np.sqrt(across))
-        return TipMeasurement.at(self._project, self._anatomy, found.position, found.covariance, sd_mm)
+        return measurement_at(self._project, self._anatomy, found.position, found.covariance, sd_mm)
 
     def _signal(
         self, plane: Plane, nodes: Float[np.ndarray, "n 3"], random: np.random.Generator, contrast: float = 0.0
