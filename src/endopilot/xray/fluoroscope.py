@@ -136,7 +136,7 @@ def measurement_at(
     covariance: Float[np.ndarray, "3 3"],
     sd_mm: tuple[float, float] = (0.0, 0.0),
 ) -> TipMeasurement:
-    """Return the measurement of a position, LPS mm, with its covariance, mm², in an anatomy; `sd_mm` as in `TipMeasurement`."""
+    """Return the measurement of a position, LPS mm, with its covariance, mm²; `sd_mm` as in `TipMeasurement`."""
     tip = project(position[None])
     branch, abscissa = int(tip.branch[0]), float(tip.abscissa[0])
     line, tangent = anatomy.tree.branches[branch].centerline, np.asarray(anatomy.insertion.direction)
