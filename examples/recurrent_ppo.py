@@ -1,7 +1,7 @@
 """Train a recurrent policy where seeing costs, by PPO in one file: it decides by itself when to take an X-ray image.
 
-    pip install -c constraints.txt -e '.[rl,learn]'
-    python examples/recurrent_ppo.py --minutes 10
+    pip install -c constraints.txt -e '.[env,learn]'
+    python examples/recurrent_ppo.py --minutes 4
     python examples/recurrent_ppo.py --minutes 60 --environment endopilot/Crux-v2 --patients 20
 
 Between two exposures only encoders and loads of the drives are observed, so the policy has a memory, a GRU. The loop is
@@ -155,7 +155,7 @@ def _described(episodes: np.ndarray) -> str:
 def main() -> None:
     """Train, and check that the return has risen."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--minutes", type=float, default=4.0)
     parser.add_argument("--environment", default="endopilot/NavigateXray-v0")
     parser.add_argument("--patients", type=int, default=1)
     parser.add_argument("--worlds", type=int, default=64)

@@ -254,7 +254,7 @@ def drive_in_worlds(
         output: folder of the results.
         planned: navigations of the agent in each world.
         random: navigations at random in each world.
-        worlds: names of worlds, or YAML files; all shipped ones, with the nominal one, if not given.
+        worlds: names of worlds, or YAML files; if not given, the nominal one and all shipped ones of the rod core.
         patients: set of the patients.
 
     Returns:
@@ -263,7 +263,8 @@ def drive_in_worlds(
     Raises:
         InputError: no such world, or the folder belongs to another run.
     """
-    chosen = {Path(name).stem: read_world(name) for name in worlds or list_worlds()}
+    shipped = [name for name in list_worlds() if read_world(name).engine == "rod"]
+    chosen = {Path(name).stem: read_world(name) for name in worlds or shipped}
     paths: dict[tuple[str, Drive], list[Path]] = {}
     for name, world in chosen.items():
         claim(output / name, "python -m benchmarks worlds", **identity("agent", NEWEST, world=world), patients=patients)
