@@ -22,6 +22,7 @@ from tyro.conf import Positional
 
 from benchmarks.figures import fill
 from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of
+from endopilot.belief.monitor import adviser_input
 from endopilot.control.agent import CALIBRATIONS, IN_CATHETER, AgentConfig, AgentPolicy
 from endopilot.files import read_json, write_json
 from endopilot.ladder.ladder import identity
@@ -98,11 +99,12 @@ class MonitoredAgent(AgentPolicy):
         """Begin a navigation without predictions."""
         self.kept: list[np.ndarray] = []
         super().start(navigation, seed)  # pyright: ignore[reportAttributeAccessIssue]
+        self.monitor.changes_left = 0  # the bands are those of the wires as they are given
 
     def decide(self, observation: Observation) -> Decision:
         """Decide as the agent does, and keep the prediction."""
         decision = super().decide(observation)  # pyright: ignore[reportAttributeAccessIssue]
-        proximal, tip, spread, _ = self.adviser_input()
+        proximal, tip, spread, _ = adviser_input(self.belief)
         self.kept.append(np.concatenate([proximal[0], tip[0], spread[0]]))
         return decision
 

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig
+from endopilot.belief.monitor import MISMATCH
 from endopilot.control import push
 from endopilot.control.agent import CALIBRATIONS, AgentConfig, AgentPolicy, OpenLoopPolicy, OraclePolicy
 from endopilot.control.course import Course
@@ -83,7 +84,7 @@ def test_a_course_is_what_the_simulator_does_under_its_controls(side_branch, kno
     assert course.reached == 1.0
     moved = side_branch.start_inserted_length_mm + 0.5 * np.cumsum(course.control[:, 0, 0])
     assert np.allclose(course.proximal[:, 0, 0], moved, atol=1e-9)
-    simulator = Belief(side_branch, np.array([[1.0, 1.0, 0.0]]), QUICK.belief).simulator
+    simulator = Belief(side_branch, [World()], QUICK.belief).simulator
     for k in range(len(course.control)):
         looks = [simulator.step(course.control[k], 0.1) for _ in range(5)]
         assert simulator.project().abscissa[0, 0] == course.tip.abscissa[k, 0]
@@ -142,8 +143,8 @@ def test_the_first_decision_goes_by_the_first_reading(side_branch) -> None:
 
 def test_an_exposure_says_how_a_wire_is_turned_that_its_encoder_does_not(side_branch, with_play) -> None:
     """The real drive had all of its play before it, of which the belief knows nothing."""
-    belief = Belief(replace(side_branch, robot=with_play), np.array([[1.0, 1.0, 0.0]]), QUICK.belief)
-    true = Belief(side_branch, np.array([[1.0, 1.0, 0.0]]), QUICK.belief)
+    belief = Belief(replace(side_branch, robot=with_play), [World()], QUICK.belief)
+    true = Belief(side_branch, [World()], QUICK.belief)
     belief.follow(((12.6, 0.0),))
     true.follow(((10.0, 0.0),))  # the play was ahead
     belief.weigh(measured(true, 0))
@@ -170,13 +171,13 @@ def measured(belief: Belief, member: int) -> TipMeasurement:
 
 def test_measurements_weigh_the_member_that_they_are_of(side_branch) -> None:
     config = BeliefConfig(members=6, time_step_s=0.05, ostium_spread_mm=2.0)
-    belief = Belief(side_branch, Belief.around(np.array([1.0, 1.0, 0.0]), config), config)
-    assert len(np.unique(belief.parameters[:, 1])) == 3 and np.ptp(belief.parameters[:, 2]) > 1.0
+    belief = Belief(side_branch, Belief.around(config), config)
+    assert len(belief.kinds) == 3 and np.ptp(belief.ostium_mm) > 1.0
     assert np.allclose(belief.weight, 1 / 6)
     wide = belief.tip_spread()
     for k in range(4):
         belief.follow(((4.0 + 2.0 * k, 0.0),))
-        assert np.allclose(belief.simulator.inserted_length[:, 0] - belief.parameters[:, 2], 4.0 + 2.0 * k)
+        assert np.allclose(belief.simulator.inserted_length[:, 0] - belief.ostium_mm, 4.0 + 2.0 * k)
         belief.weigh(measured(belief, 4))
     assert belief.weight.argmax() == 4 and belief.weight[4] > 0.5
     assert belief.tip_spread()[0] < 0.8 * wide[0]
@@ -186,7 +187,7 @@ def test_measurements_weigh_the_member_that_they_are_of(side_branch) -> None:
 
 def test_simulated_wires_slide_in_a_vessel_that_beats_as_far_as_that_is_known(side_branch) -> None:
     """One is as the real wire, and driven likewise."""
-    beat, same = motion_named("heartbeat"), np.array([[1.0, 1.0, 0.0]])
+    beat, same = motion_named("heartbeat"), [World()]
     true = start_world(side_branch, World(), QUICK.belief.core, motion=beat)
     knows, knows_not = (Belief(replace(side_branch, known_motion=known), same, QUICK.belief) for known in (beat, None))
     errors = []
@@ -204,7 +205,7 @@ def test_simulated_wires_slide_in_a_vessel_that_beats_as_far_as_that_is_known(si
 def test_an_unsure_measurement_weighs_little(side_branch) -> None:
     """The scales of the weights are no smaller than the standard deviations that the detector states."""
     config = BeliefConfig(members=6, time_step_s=0.05, ostium_spread_mm=2.0)
-    sure, unsure = (Belief(side_branch, Belief.around(np.array([1.0, 1.0, 0.0]), config), config) for _ in range(2))
+    sure, unsure = (Belief(side_branch, Belief.around(config), config) for _ in range(2))
     sure.weigh(replace(measured(sure, 4), sd_mm=(0.01, 0.01)))
     unsure.weigh(replace(measured(unsure, 4), sd_mm=(50.0, 50.0)))
     assert np.ptp(sure.weight) > 0.1 > 0.01 > np.ptp(unsure.weight)
@@ -223,6 +224,20 @@ def test_a_tip_that_no_wire_explains_is_pulled_back_under_xray(side_branch) -> N
     assert policy.plans == 2  # found again, it searches another path
 
 
+def test_a_wire_that_is_lost_again_and_again_ends_with_the_cause(side_branch) -> None:
+    policy, said = AgentPolicy(QUICK), ""
+    policy.start(side_branch, 0)
+    policy.monitor.changes_left = 0  # nothing else is sought
+    for k in range(4):
+        shown = measured(policy.belief, int(np.argmax(policy.belief.weight)))
+        far = replace(shown, position=shown.position + np.array([6.0, 0.0, 5.0]))
+        assert not said
+        said = policy.decide(Observation(1.0 * k, ((4.0, 0.0),), far)).gives_up
+        shown = measured(policy.belief, int(np.argmax(policy.belief.weight)))
+        policy.decide(Observation(1.0 * k + 0.5, ((4.0, 0.0),), shown))
+    assert "lost 4 times: no wire, lumen or ostium explains what X-ray shows" in said
+
+
 def test_a_lost_wire_that_is_back_in_its_catheter_unseen_sets_out_again(side_branch) -> None:
     policy = AgentPolicy(QUICK)
     policy.start(side_branch, 0)
@@ -230,7 +245,8 @@ def test_a_lost_wire_that_is_back_in_its_catheter_unseen_sets_out_again(side_bra
     assert policy.decide(Observation(0.0, ((6.0, 0.0),), far)).devices[0][0] < 0
     assert policy.decide(Observation(0.5, ((4.0, 0.0),), None)).devices[0][0] < 0  # not there yet
     again = policy.decide(Observation(1.0, ((1.9, 0.0),), None))
-    assert again.devices[0][0] > 0 and not again.expose
+    assert again.devices[0][0] > 0 and not policy.monitor.lost
+    assert again.expose and policy.believed().asks == MISMATCH  # which has yet to be explained
 
 
 def test_a_tip_that_is_measured_badly_is_not_lost(side_branch) -> None:

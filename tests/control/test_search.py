@@ -52,7 +52,7 @@ def agent_config(navigation: Navigation, turns: int = 4) -> AgentConfig:
 
 def search(navigation: Navigation, turns: int = 4) -> tuple[Search, Belief, Course]:
     """Return a search, the belief that it began with, and what it found."""
-    belief = Belief(navigation, np.array([[1.0, 1.0, 0.0]]), BELIEF)
+    belief = Belief(navigation, [World()], BELIEF)
     route = Route.to(navigation.anatomy, navigation.target)
     one = Search(navigation, route, belief, config=agent_config(navigation, turns).search, seed=0)
     return one, belief, one.find(belief, seconds=navigation.seconds)
@@ -157,7 +157,7 @@ def test_the_agent_goes_on_after_hands_that_drove_both(side_branch) -> None:
     for _ in range(4):
         loop.step()
     loop.hand_over(None)
-    followed = policy.belief.simulator.inserted_length[:, 1] - policy.belief.parameters[:, 2]
+    followed = policy.belief.simulator.inserted_length[:, 1] - policy.belief.ostium_mm
     assert loop.observation is not None and followed == pytest.approx(loop.observation.devices[1][0])
     while loop.reason is None:
         loop.step()

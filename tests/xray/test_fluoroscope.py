@@ -48,6 +48,16 @@ def test_one_view_knows_the_depth_by_the_vessel_alone(fork) -> None:
     assert np.linalg.norm(found[:, :2], axis=1).max() <= 1.0 - RADIUS + 1e-6  # inside the lumen
 
 
+def test_two_views_show_a_tip_outside_the_lumen_as_it_is_believed_and_say_how_well(fork) -> None:
+    """The wall lies 0.82 mm from the axis for this wire; a wall that yields lets it go to 1.4 mm."""
+    arm, random = Fluoroscope(fork, RADIUS), np.random.default_rng(3)
+    along = np.array([0.0, 0.0, 1.0])
+    seen = [arm.measure(np.array([1.4, 0.0, 12.0]), along, 12.0, random) for _ in range(200)]
+    off = np.array([(tip.abscissa - 12.0, tip.offset - 1.4) for tip in seen])
+    assert np.abs(off.mean(axis=0)).max() < 0.1
+    np.testing.assert_allclose(off.std(axis=0), np.mean([tip.tip_sd_mm for tip in seen], axis=0), rtol=0.2)
+
+
 def test_the_branch_is_observed(fork) -> None:
     arm, random = Fluoroscope(fork, RADIUS), np.random.default_rng(1)
     line = fork.tree.branches[2].centerline

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.distance import CATHETER_LENGTH_MM, add_catheter
@@ -34,31 +35,46 @@ def with_radii(anatomy: Anatomy, radii: Sequence[Float[np.ndarray, "_"]]) -> Ana
     lines = [replace(branch.centerline, radius=r) for branch, r in zip(branches, radii, strict=True)]
     new = tuple(replace(branch, centerline=line) for branch, line in zip(branches, lines, strict=True))
     old = [branch.centerline.radius for branch in branches]
-    insertion, count = anatomy.insertion, max(2, int(np.ceil(CATHETER_LENGTH_MM / anatomy.catheter_radius_mm)))
-    behind = insertion.position - np.linspace(0.0, CATHETER_LENGTH_MM, 2 * count)[:, None] * insertion.direction
-    centres = np.concatenate([*(branch.centerline.points for branch in branches), behind])
-    radius = np.concatenate([*old, np.full(len(behind), anatomy.catheter_radius_mm)])
-    grown = np.concatenate([*(r - before for r, before in zip(radii, old, strict=True)), np.zeros(len(behind))])
-    moved = _moved(anatomy.distance_map, centres, radius, grown)
+    grown = np.concatenate([r - before for r, before in zip(radii, old, strict=True)])
+    insertion = anatomy.insertion
+    moved = _moved(anatomy, np.append(grown, 0.0))
     opened = add_catheter(moved, insertion, anatomy.catheter_radius_mm)
     return replace(anatomy, tree=replace(anatomy.tree, branches=new), distance_map=opened)
 
 
-def _moved(
-    field: DistanceMap,
-    centres: Float[np.ndarray, "n 3"],
-    radius: Float[np.ndarray, "n"],
-    grown: Float[np.ndarray, "n"],
-) -> DistanceMap:
-    """Return a map whose wall moves outwards by what the sphere grows that each point belongs to, mm."""
-    values, floor = field.values.copy(), float(field.values.min())
-    where = np.argwhere(values > floor)
+def _moved(anatomy: Anatomy, grown: Float[np.ndarray, "n"]) -> DistanceMap:
+    """Return the map of an anatomy whose wall moves outwards by what the sphere grows that each point belongs to, mm.
+
+    Args:
+        anatomy: the vessel.
+        grown: of the spheres, and last of the catheter's.
+    """
+    field = anatomy.distance_map
+    values, (where, owner) = field.values.copy(), _owners(anatomy)
+    at = tuple(where.T)
+    values[at] = np.maximum(values[at] + grown[np.minimum(owner, len(grown) - 1)], float(field.values.min()))
+    return replace(field, values=values)
+
+
+@lru_cache(maxsize=1)
+def _owners(anatomy: Anatomy) -> tuple[Int[np.ndarray, "points 3"], Int[np.ndarray, "points"]]:
+    """Return the points of an anatomy's map within its reach, and the inscribed sphere that each belongs to.
+
+    The spheres are those of the branches' centerlines, then the guiding catheter's. The last anatomy's are kept: lumens
+    of several widths are made of one.
+    """
+    insertion, field = anatomy.insertion, anatomy.distance_map
+    lines = [branch.centerline for branch in anatomy.tree.branches]
+    count = max(2, int(np.ceil(CATHETER_LENGTH_MM / anatomy.catheter_radius_mm)))
+    behind = insertion.position - np.linspace(0.0, CATHETER_LENGTH_MM, 2 * count)[:, None] * insertion.direction
+    centres = np.concatenate([*(line.points for line in lines), behind])
+    radius = np.concatenate([*(line.radius for line in lines), np.full(len(behind), anatomy.catheter_radius_mm)])
+    where = np.argwhere(field.values > field.values.min())
     # The nearest in one dimension more: sqrt(R² - r²) away, a sphere's squared distance is d² - r² + R².
     spheres = KDTree(np.column_stack([centres, np.sqrt(radius.max() ** 2 - radius**2)]))
+    owner = np.empty(len(where), dtype=int)
     for first in range(0, len(where), _CHUNK):
         some = where[first : first + _CHUNK]
         points = field.origin_mm + field.spacing_mm * some[:, ::-1]
-        _, owner = spheres.query(np.column_stack([points, np.zeros(len(points))]))
-        at = tuple(some.T)
-        values[at] = np.maximum(values[at] + grown[owner], floor)
-    return replace(field, values=values)
+        _, owner[first : first + _CHUNK] = spheres.query(np.column_stack([points, np.zeros(len(points))]))
+    return where, owner

@@ -85,7 +85,7 @@ class XrayAdviser:
         """
         self._proximal, self._travel = proximal, np.zeros(len(proximal))
         self._since = np.zeros(len(proximal), dtype=int)
-        self._beyond = [self._ratio(tip[:, 1], radius_mm) >= self._config.wall_ratio] * 3
+        self._beyond = [self._ratio(tip[:, 1], radius_mm) >= self._config.wall_ratio] * 5
 
     def advise(
         self,
@@ -94,6 +94,10 @@ class XrayAdviser:
         spread: Tips,
         radius_mm: Float[np.ndarray, "n"],
         play: Tips | None = None,
+        *,
+        factor: Float[np.ndarray, "2"] | float = 1.0,
+        always: bool = False,
+        wall_mm: Float[np.ndarray, "n"] | float = 0.0,
     ) -> Bool[np.ndarray, "n"]:
         """Return for which navigations X-ray is due now, a period after the last call.
 
@@ -104,21 +108,35 @@ class XrayAdviser:
             radius_mm: of the lumen at the predicted Δtip, mm.
             play: standard deviation that the plays of the drives add, which the calibration does not know, mm; none if
                 not given.
+            factor: by which the bands are wider than they are calibrated.
+            always: whether an exposure is due whenever the last is 1.5 s ago.
+            wall_mm: by which the lumen's radius may be another than it is given, mm, which the calibration does not
+                know: a tip on the wall is then off by as much, and the edges of that band are heeded too.
         """
         self._since, self._travel = self._since + 1, self._travel + np.abs(proximal[:, 0] - self._proximal[:, 0])
         self._proximal = proximal
-        half = self._calibration.half_width(self._since * DECISION_PERIOD_S, self._travel, spread)
-        if play is not None and play.any():
-            half = np.hypot(half, norm.ppf(0.5 + 0.5 * self._calibration.level) * play)
-        self.half_width = half
+        half = factor * self.widths(spread, play)
         heeded = self._calibration.heeded * half[:, 1]
-        edges = [tip[:, 1] + side * heeded for side in (1.0, 0.0, -1.0)]
+        edges = [tip[:, 1] + off for off in (heeded, 0.0, -heeded, wall_mm, -wall_mm)]
+        half[:, 1] = np.hypot(half[:, 1], wall_mm)
+        self.half_width = half
         beyond = [self._ratio(edge, radius_mm) >= self._config.wall_ratio for edge in edges]
         crossed = np.any([now & ~before for now, before in zip(beyond, self._beyond, strict=True)], axis=0)
-        due = (crossed | (half[:, 0] >= self._config.abscissa_mm)) & (self._since >= _SPACING)
+        due = (crossed | (half[:, 0] >= self._config.abscissa_mm) | always) & (self._since >= _SPACING)
         self._beyond = [np.where(crossed & ~due, before, now) for now, before in zip(beyond, self._beyond, strict=True)]
         self._since, self._travel = np.where(due, 0, self._since), np.where(due, 0.0, self._travel)
         return due
+
+    def widths(self, spread: Tips, play: Tips | None = None) -> Tips:
+        """Return the half-widths of the bands at the last call of `advise`, mm, for a spread; see there."""
+        half = self._calibration.half_width(self._since * DECISION_PERIOD_S, self._travel, spread)
+        if play is not None and play.any():
+            half = np.hypot(half, norm.ppf(0.5 + 0.5 * self._calibration.level) * play)
+        return half
+
+    def exposed(self) -> None:
+        """Take an exposure that was asked for elsewhere: the bands begin anew."""
+        self._since, self._travel = np.zeros_like(self._since), np.zeros_like(self._travel)
 
     def _ratio(self, offset_mm: Float[np.ndarray, "n"], radius_mm: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         return safety_ratio(offset_mm, radius_mm, self._wire_radius_mm)

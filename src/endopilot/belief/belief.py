@@ -11,6 +11,9 @@ brought to where the device most likely is.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -19,19 +22,24 @@ from scipy.stats import qmc
 
 from endopilot.belief.drives import Drives
 from endopilot.devices.drive_limits import DriveLimits
-from endopilot.devices.stack import Proximals
-from endopilot.models.ensemble import Ensemble, likelihoods
+from endopilot.devices.stack import Proximals, Stack
+from endopilot.models.ensemble import likelihoods
 from endopilot.settings import NonNegative, Positive, ShareBelowOne, Within, settings
 from endopilot.simulation.config import PRESETS, SimulatorConfig
 from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
-from endopilot.types import TipProjection
+from endopilot.types import Anatomy, TipProjection
 from endopilot.xray.fluoroscope import TipMeasurement
 
+_OF_VESSEL = "lumen_factor", "lumen_mm", "axis_deg", "axis_side_deg"
+"""What of a `World` makes another vessel."""
 _SIDES = 16
 """Angles that a wire is turned to where its rotation is looked for."""
 _PLACED_MM = 0.5, 0.15
 """Scales of the errors, along and across the wire, of a tip whose proximal end is where it is believed, mm."""
+_SURE_SDS = 3.0
+"""A measured tip is taken for another than the simulated ones beyond this many of its own standard deviations."""
 _SURE_RAD = 0.08
 """A rotation that is known as well is not looked for, rad."""
 
@@ -54,6 +62,12 @@ class BeliefConfig:
     """Scale of a good member's error along the wire, mm: X-ray shows the end of a tip badly."""
     across_sd_mm: Positive = 0.3
     """The same across the wire, mm."""
+    lost_along_mm: Positive = 4.0
+    """A measured tip this far along the wire from all simulated ones is explained by none, mm."""
+    lost_across_mm: Positive = 1.5
+    """The same across the wire, mm."""
+    lost_across_radii: NonNegative = 0.0
+    """The same in radii of the lumen, where that is more."""
     element_mm: Annotated[float, Within(0.02, 5)] = 0.75
     """Length of the rod core's elements at the wire's tip, mm: longer ones catch in hairpin bends."""
     time_step_s: Annotated[float, Within(1e-5, 0.5)] = 0.05
@@ -72,46 +86,137 @@ class BeliefConfig:
         )
 
 
-class Belief(Ensemble):
-    """An ensemble of simulated wires that follow a navigation, and how likely each is.
+@dataclass
+class Past:
+    """What became of a navigation so far.
 
     Attributes:
+        proximal: where the proximal ends of the devices were believed at each decision, mm and rad.
+        load: axial force (N) and torque (N·mm) of each drive then; empty where it is not measured.
+        exposures: what X-ray showed, by the decision.
+    """
+
+    proximal: list[Float[np.ndarray, "devices 2"]] = field(default_factory=list)
+    load: list[Proximals] = field(default_factory=list)
+    exposures: dict[int, TipMeasurement] = field(default_factory=dict)
+
+
+class Vessels:
+    """The vessels of a navigation, with one lumen and another, which beliefs share: preparing one takes a second.
+
+    Attributes:
+        simulators: in which they are prepared.
+    """
+
+    def __init__(self, given: Anatomy) -> None:
+        """Begin with the vessel as it is given."""
+        self._made = {World(): given}
+        self.simulators: list[Simulator] = []
+        self._kept = set[tuple[int, float]]()
+
+    def of(self, member: World) -> Anatomy:
+        """Return the vessel as a member has it."""
+        alone = World(**{name: getattr(member, name) for name in _OF_VESSEL})
+        if alone not in self._made:
+            self._made[alone] = alone.anatomy(self._made[World()])
+        return self._made[alone]
+
+    def prepared(self, simulator: Simulator) -> None:
+        """Keep a simulator if it holds what no other does."""
+        key = {(id(anatomy), simulator.config.wall_reach_mm) for anatomy in simulator.set_up.anatomies}
+        if not key <= self._kept:
+            self._kept |= key
+            self.simulators.append(simulator)
+
+
+class Belief:
+    """An ensemble of simulated wires that follow a navigation, and how likely each is.
+
+    Each member is a `World` of its own: wire, friction, lumen, wall and ostium as they may truly be.
+
+    Attributes:
+        members: what each takes reality to be.
+        config: accuracy of measurements, and settings of the rod core.
+        kinds: vessel and devices, those that differ; members share them.
+        kind: the place among these of each member.
+        ostium_mm: how much deeper each member's devices lie than the encoders say, mm.
         tip: of each member's wire.
         drives: where the proximal ends are.
+        vessels: as members have them.
         error: of each member at the last measurement, along and across its wire, mm.
     """
 
     def __init__(
-        self, navigation: Navigation, parameters: Float[np.ndarray, "members 3"], config: BeliefConfig
+        self,
+        navigation: Navigation,
+        members: Sequence[World],
+        config: BeliefConfig,
+        *,
+        drives: Drives | None = None,
+        vessels: Vessels | None = None,
     ) -> None:
-        """Bring every member's wire to the start of the navigation."""
-        super().__init__(
-            navigation.anatomy,
-            navigation.stack,
-            parameters,
-            start=np.tile(navigation.start, (len(parameters), 1, 1)),
-            config=config.core,
-            motion=navigation.known_motion,
-        )
+        """Bring every member's wire to the start of the navigation.
+
+        Args:
+            navigation: as it is given.
+            members: what each takes reality to be; all have the same kind of wall.
+            config: accuracy of measurements, and settings of the rod core.
+            drives: of another belief about the same devices; at rest at the start if not given.
+            vessels: that other beliefs have prepared.
+        """
+        self.navigation, self.members, self.config = navigation, tuple(members), config
         self._accuracy_mm = config.along_sd_mm, config.across_sd_mm
+        self._core = self.members[0].core(config.core)
         self._limits = [DriveLimits.of(each, navigation.anatomy) for each in navigation.devices]
         fastest = np.array([limits.fastest for limits in self._limits])
-        self.drives = Drives(navigation.robot, navigation.start, fastest)
-        self._navigation, self._fans = navigation, dict[float, Simulator]()
-        self.error = np.zeros((len(parameters), 2))
-        self._score, self._coaxial = np.zeros(len(parameters)), bool(navigation.catheters)
+        self.drives = drives or Drives(navigation.robot, navigation.start, fastest)
+        self._fans = dict[int, Simulator]()
+        self.ostium_mm = np.array([each.ostium_mm for each in self.members])
+        self.vessels = vessels or Vessels(navigation.anatomy)
+        self.kinds, self.kind = _kinds(navigation, self.members, self.vessels)
+        self.error = np.zeros((len(self.members), 2))
+        self._score, self._coaxial = np.zeros(len(self.members)), bool(navigation.catheters)
         self.tip = self.simulator.project()[:, 0]
 
+    def like(self, members: Sequence[World]) -> Belief:
+        """Return a belief of other members about the same devices, at the start of the navigation."""
+        return Belief(self.navigation, members, self.config, drives=self.drives, vessels=self.vessels)
+
     @staticmethod
-    def around(given: Float[np.ndarray, "3"], config: BeliefConfig) -> Float[np.ndarray, "members 3"]:
-        """Return members evenly around given parameters: friction and ostium from a Sobol sequence, every stiffness."""
+    def around(config: BeliefConfig) -> tuple[World, ...]:
+        """Return members evenly around what is given: friction and ostium from a Sobol sequence, every stiffness."""
         levels = np.linspace(-1.0, 1.0, config.stiffness_levels) if config.stiffness_levels > 1 else np.zeros(1)
         unit = 2 * qmc.Sobol(2, scramble=False).random_base2(config.members.bit_length())[1 : config.members + 1] - 1
-        parameters = np.tile(given, (config.members, 1)).astype(float)
-        parameters[:, 0] *= 1 + config.friction_spread * unit[:, 0]
-        parameters[:, 1] *= 1 + config.stiffness_spread * np.resize(levels, config.members)
-        parameters[:, 2] += config.ostium_spread_mm * unit[:, 1]
-        return parameters
+        stiffness = 1 + config.stiffness_spread * np.resize(levels, config.members)
+        return tuple(
+            World(
+                friction_factor=1 + config.friction_spread * float(friction),
+                tip_stiffness_factor=float(factor),
+                ostium_mm=config.ostium_spread_mm * float(ostium),
+            )
+            for (friction, ostium), factor in zip(unit, stiffness, strict=True)
+        )
+
+    @cached_property
+    def simulator(self) -> Simulator:
+        """The worlds of the members."""
+        navigation, count = self.navigation, len(self.members)
+        anatomies, stacks = zip(*(self.kinds[kind] for kind in self.kind), strict=True)
+        sharing = self.vessels.simulators
+        simulator = Simulator(anatomies, stacks, motion=navigation.known_motion, config=self._core, sharing=sharing)
+        self.vessels.prepared(simulator)
+        start = np.tile(navigation.start, (count, 1, 1))
+        factor = np.array([each.friction_factor for each in self.members])
+        simulator.reset(
+            inserted_length=self._deeper(start[..., 0]),
+            rotation=start[..., 1],
+            friction=navigation.stack.frictions(navigation.device.friction * factor),
+        )
+        return simulator
+
+    def _deeper(self, given_mm: Float[np.ndarray, "members *devices"]) -> Float[np.ndarray, "members *devices"]:
+        """Return inserted lengths from each member's ostium on, mm, of those from the given one on."""
+        return np.maximum(given_mm + self.ostium_mm.reshape(-1, *[1] * (given_mm.ndim - 1)), 0.0)
 
     @property
     def weight(self) -> Float[np.ndarray, "members"]:
@@ -131,13 +236,13 @@ class Belief(Ensemble):
             core, pushed_n = self.simulator.config, self.simulator.base_load[np.argmax(self.weight), 0, 0]
             valve = core.introducer_friction_n, core.introducer_drag_n_s_mm
             self.drives.feel(0, load[0][0], pushed_n=float(pushed_n), valve=valve)
-        self._move()
+        self._move(self.drives.proximal)
 
-    def _move(self) -> None:
+    def _move(self, proximal: Float[np.ndarray, "devices 2"]) -> None:
         """Move every member's proximal ends to where they are believed to be, in one decision period."""
         simulator = self.simulator
         now, control = simulator.at_drive, np.empty((simulator.worlds, simulator.devices, 2))
-        for k, (length, turn) in enumerate(self.drives.proximal.tolist()):
+        for k, (length, turn) in enumerate(proximal.tolist()):
             ahead = self._deeper(np.full(len(now), length)) - now[:, k, 0]
             motion = np.column_stack([ahead, turn - now[:, k, 1]])
             control[:, k] = self._limits[k].clip(motion / DECISION_PERIOD_S, now[:, k, 0], DECISION_PERIOD_S)
@@ -164,17 +269,42 @@ class Belief(Ensemble):
         The density is a Cauchy density. Its tails are heavy: a tip that snapped a moment too early says little about
         friction. Its scales are no smaller than the measurement's own standard deviations.
         """
-        position = measured.position - self._relocate(measured) if self.drives.lose else measured.position
+        self._weigh(measured, measured.position - self._relocate(measured) if self.drives.lose else measured.position)
+        if self.drives.lose and self.navigation.known_motion is None:  # else the next period takes them there
+            self._move(self.drives.proximal)
+
+    def _weigh(self, measured: TipMeasurement, position: Float[np.ndarray, "3"]) -> None:
         self.error = self.errors(position)
         scaled = self.error / np.maximum(self._accuracy_mm, measured.sd_mm)
         self._score = self._score - np.log1p((scaled**2).sum(axis=1))
-        if self.drives.lose and self.set_up.motion is None:  # a vessel that moves takes them there in the next period
-            self._move()
+
+    def replay(self, past: Past) -> Float[np.ndarray, "members exposures 3"]:
+        """Drive the members, at the start of the navigation, as the devices went so far, and weigh them alike.
+
+        Returns:
+            The errors at each exposure along and across each member's wire, and of its γtip, mm.
+        """
+        errors = []
+        for period, proximal in enumerate(past.proximal):
+            if period:
+                self._move(proximal)
+            measured = past.exposures.get(period)
+            if measured is not None:
+                self._weigh(measured, measured.position)
+                errors.append(np.column_stack([self.error, np.abs(measured.offset - self.tip.offset)]))
+        return np.stack(errors, axis=1)
+
+    def explains(self, measured: TipMeasurement) -> bool:
+        """Return whether the likeliest wire explains the last measurement, which has weighed the members."""
+        best, config = int(np.argmax(self.weight)), self.config
+        across_mm = max(config.lost_across_mm, config.lost_across_radii * float(self.tip.radius[best]))
+        allowed = np.maximum([config.lost_along_mm, across_mm], _SURE_SDS * np.array(measured.sd_mm))
+        return bool((self.error[best] <= allowed).all())
 
     def play_spread(self) -> Float[np.ndarray, "2"]:
         """Return the standard deviations of (Δtip, γtip) that the plays of the wire's drive make, mm."""
         along, turn = self.drives.sd[0].tolist()
-        wire = self._navigation.device
+        wire = self.navigation.device
         bend = max(abs(wire.tip_bend_rad), 1e-9)
         reach = wire.tip_bend_length_mm * (1 - np.cos(bend)) / bend
         return np.array([along, reach * min(turn, 1.0)])
@@ -216,18 +346,18 @@ class Belief(Ensemble):
 
     def _fan(self, best: int) -> Simulator:
         """Return copies of a member, each turned by another angle, those to more than half a turn backwards."""
-        factor = float(self.parameters[best, 1])
-        if factor not in self._fans:
-            stack = self.set_up.stacks[best]
-            self._fans[factor] = Simulator(
-                self.set_up.anatomies[best],
+        kind = int(self.kind[best])
+        if kind not in self._fans:
+            anatomy, stack = self.kinds[kind]
+            self._fans[kind] = Simulator(
+                anatomy,
                 stack,
                 worlds=_SIDES,
-                motion=self.set_up.motion,
-                config=self.simulator.config,
+                motion=self.navigation.known_motion,
+                config=self._core,
                 sharing=self.simulator,
             )
-        fan, side = self._fans[factor], 2 * np.pi * np.arange(_SIDES) / _SIDES
+        fan, side = self._fans[kind], 2 * np.pi * np.arange(_SIDES) / _SIDES
         fan.copy_worlds(np.full(_SIDES, best), of=self.simulator)
         control = np.zeros((_SIDES, fan.devices, 2))
         control[:, 0, 1] = np.where(side > np.pi, side - 2 * np.pi, side) / DECISION_PERIOD_S
@@ -238,9 +368,9 @@ class Belief(Ensemble):
 
     def _shifted(self, best: int, along_mm: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
         """Return how far a member's tip moves, mm, that goes some way along the vessel."""
-        line = self._navigation.anatomy.tree.path(int(self.tip.branch[best]))
+        line = self.navigation.anatomy.tree.path(int(self.tip.branch[best]))
         at = float(self.tip.abscissa[best])
-        insertion = self._navigation.anatomy.insertion
+        insertion = self.navigation.anatomy.insertion
         behind = np.array([-20.0, -10.0])
         abscissa = np.concatenate([behind, line.abscissa])
         points = np.concatenate([insertion.position + behind[:, None] * insertion.direction, line.points])
@@ -250,10 +380,10 @@ class Belief(Ensemble):
         )
         return there - here
 
-    def likeliest(self) -> tuple[Int[np.ndarray, "levels"], Float[np.ndarray, "levels"]]:
-        """Return the likeliest member of every stiffness, and how likely each stiffness is."""
+    def likeliest(self) -> tuple[Int[np.ndarray, "kinds"], Float[np.ndarray, "kinds"]]:
+        """Return the likeliest member of every kind, and how likely each kind is."""
         weight = self.weight
-        groups = [np.flatnonzero(self.parameters[:, 1] == factor) for factor in self.wires]
+        groups = [np.flatnonzero(self.kind == kind) for kind in range(len(self.kinds))]
         best = np.array([members[np.argmax(weight[members])] for members in groups])
         share = np.array([weight[members].sum() for members in groups])
         return best, share / share.sum()
@@ -267,3 +397,13 @@ class Belief(Ensemble):
         """Return where the tip of the likeliest member is, as arrays of one."""
         best = [int(np.argmax(self.weight))]
         return self.tip[best]
+
+
+def _kinds(
+    navigation: Navigation, members: Sequence[World], vessels: Vessels
+) -> tuple[list[tuple[Anatomy, Stack]], Int[np.ndarray, "members"]]:
+    """Return vessels and devices of members, those that differ, and which of them each member has."""
+    found: dict[World, int] = {}
+    alike = [replace(each, friction_factor=1.0, ostium_mm=0.0, about="") for each in members]
+    kind = np.array([found.setdefault(each, len(found)) for each in alike])
+    return [(vessels.of(each), each.stack(navigation.stack)) for each in found], kind

@@ -181,8 +181,9 @@ class Autopilot:
         if decision.gives_up:
             return self._end("gave up", f"{self.policy_name} gives up: {decision.gives_up}")
         self.status = "drives"
-        told = "" if self._believed is None else self._believed.asks
-        self.asks = (told or "the policy asks for it") if decision.expose else ""
+        told, found = ("", "") if self._believed is None else (self._believed.asks, self._believed.found)
+        told = f"{told or 'the policy asks for it'}{f'; found: {found}' if found else ''}"
+        self.asks = told if decision.expose else ""
         return self._world.loop.take(decision).devices
 
     def _let_go(self, status: str) -> None:

@@ -16,19 +16,19 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.belief.adviser import AdviserConfig, XrayAdviser
+from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig
+from endopilot.belief.monitor import BelievedTip, Monitor
 from endopilot.control.course import Course
 from endopilot.control.follow import Follower
-from endopilot.control.search import Search
+from endopilot.control.search import Search, check_devices
 from endopilot.control.search_config import SearchConfig
 from endopilot.devices.stack import Proximals
 from endopilot.errors import InputError
-from endopilot.models.ensemble import NOMINAL
-from endopilot.navigation.policy import BelievedTip, Decision, Observation
+from endopilot.navigation.policy import Decision, Observation
 from endopilot.progress import Advance
-from endopilot.settings import NonNegative, Positive, Within, settings
+from endopilot.settings import Positive, Within, settings
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, XrayKind
 from endopilot.tasks.route import Route, check_passable
@@ -40,11 +40,6 @@ CALIBRATIONS: dict[tuple[XrayKind, int], Path] = {
     ("assumed", 2): Path(__file__).parent / "coaxial",
 }
 """Where the calibrations of the agent's ensembles lie, by how exposures find the tip and by the number of devices."""
-AdviserInput = tuple[
-    Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1"]
-]
-"""What an adviser is given of a navigation: (Δ, φ), mm and rad; (Δtip, γtip), mm; the spread (standard deviation) of
-these as the model states it, mm; and the lumen's radius at the tip, mm."""
 
 
 @settings
@@ -60,12 +55,6 @@ class AgentConfig:
     """
     tries: Annotated[int, Within(1, 100)] = 3
     """Failed searches, one after another and each from where the last has led, after which the agent gives up."""
-    lost_along_mm: Positive = 4.0
-    """A measured tip this far along the wire from all simulated ones is explained by none, mm."""
-    lost_across_mm: Positive = 1.5
-    """The same across the wire, mm."""
-    lost_across_radii: NonNegative = 0.0
-    """The same in radii of the lumen, where that is more."""
 
     @staticmethod
     def of(navigation: Navigation) -> AgentConfig:
@@ -77,29 +66,38 @@ class AgentConfig:
 
 
 IN_WIDE_LUMEN = AgentConfig(
-    belief=BeliefConfig(members=24, ostium_spread_mm=3.5, element_mm=1.25, time_step_s=0.1),
-    lost_along_mm=6.0,
-    lost_across_mm=2.5,
-    lost_across_radii=0.3,
+    belief=BeliefConfig(
+        members=24,
+        ostium_spread_mm=3.5,
+        element_mm=1.25,
+        time_step_s=0.1,
+        lost_along_mm=6.0,
+        lost_across_mm=2.5,
+        lost_across_radii=0.3,
+    ),
 )
 """Settings of an agent of a wire alone on a route through a wide lumen, such as an aorta. The wire lies more freely in
 it, and the place of the ostium is known less well; bends are wide, so that longer elements and steps do."""
 IN_CATHETER = AgentConfig(
     search=SearchConfig(speed_mm_s=5.0),
-    belief=BeliefConfig(members=4, stiffness_levels=1, element_mm=1.25),
+    belief=BeliefConfig(
+        members=4,
+        stiffness_levels=1,
+        element_mm=1.25,
+        lost_along_mm=5.0,
+        lost_across_mm=2.5,
+        lost_across_radii=0.5,
+    ),
     off_course_mm=3.0,
     tries=2,
-    lost_along_mm=5.0,
-    lost_across_mm=2.5,
-    lost_across_radii=0.5,
 )
 """Settings of an agent of a wire in a catheter."""
-_SURE_SDS = 3.0
-"""A measured tip is taken for another than the simulated ones beyond this many of its own standard deviations."""
 _WIRE_CREEP_MM_S = 2.0
 """Fastest translation of a wire that should have arrived, and that X-ray shows beside its target, mm/s."""
 _CLEAR_MM = 4.0
 """A wire that is lost is pulled back by this much at least before it is looked at again, mm."""
+_LOSSES = 4
+"""Times that the wire is lost, after which the agent gives up: each time another belief was sought."""
 _CREEP_MM_S, _CREEP_PERIODS = 1.0, 6
 """A catheter, which X-ray does not show, is moved ahead and back by this where it should have arrived, for as many
 periods and twice."""
@@ -121,8 +119,8 @@ class _PlanningPolicy:
         """
         self._given_config = config
 
-    def _parameters(self) -> Float[np.ndarray, "members 3"]:
-        """Return friction factor, tip stiffness factor and depth of the ostium (mm) of the simulated wires."""
+    def _believe(self) -> Belief:
+        """Return the belief at the start of the navigation."""
         raise NotImplementedError
 
     def wants_xray(self) -> bool:
@@ -139,13 +137,14 @@ class _PlanningPolicy:
         self.route = Route.to(navigation.anatomy, navigation.target)
         for device in navigation.devices:
             check_passable(self.route, device)
-        self.belief = Belief(navigation, self._parameters(), self.config.belief)
-        self._search = Search(navigation, self.route, self.belief, config=self.config.search, seed=seed)
+        check_devices(navigation)
+        self.belief, self._seed = self._believe(), seed
+        self._search = self._new_search()
         self._follower = Follower(
             self.belief.drives, devices=len(navigation.devices), turn_rad_s=self.config.search.turn_rad_s
         )
         self._back_mm = np.inf
-        self._lost = self._began = self._led = self._arrived = self._shows = False
+        self._lost = self._began = self._arrived = self._shows = False
         self._crept, self.plans, self._failed, self.planning_s = 0, 0, 0, 0.0
 
     def decide(self, observation: Observation) -> Decision:
@@ -157,15 +156,19 @@ class _PlanningPolicy:
         wanted = self._pull_back() if self._lost else self._go_on(observation)
         self.belief.drives.sent(wanted)
         ends = self._failed >= self.config.tries and self._follower.course is None and not self._lost
+        ends = ends and not self._tries_another()
         expose = self._back_far_enough() if self._lost else self.wants_xray()
         return Decision(wanted, expose=expose, gives_up=self._search.halt if ends else "")
+
+    def _tries_another(self) -> bool:
+        """Return whether another belief is left to search in."""
+        return False
 
     def watch(self, observation: Observation) -> None:
         """Follow what somebody else does; a new course is searched at the next decision."""
         self._follower.begin(None)
-        self._led, self._failed = True, 0
+        self._failed = 0
         self._observe(observation)
-        self.wants_xray()
 
     def believed(self) -> BelievedTip:
         """Return where the likeliest wire has its tip."""
@@ -190,6 +193,9 @@ class _PlanningPolicy:
         """Where and why the last search ended before the target, in words; empty if it arrived."""
         return self._search.halt
 
+    def _new_search(self) -> Search:
+        return Search(self.navigation, self.route, self.belief, config=self.config.search, seed=self._seed)
+
     def _observe(self, observation: Observation) -> None:
         if self._began:
             self.belief.follow(observation.devices, observation.load)
@@ -202,10 +208,10 @@ class _PlanningPolicy:
     def _update(self, measured: TipMeasurement) -> None:
         """Weight the simulated wires by a measurement, and note whether all are wrong."""
         self.belief.weigh(measured)
-        best, config = int(np.argmax(self.belief.weight)), self.config
-        across_mm = max(config.lost_across_mm, config.lost_across_radii * float(self.belief.tip.radius[best]))
-        explained = np.maximum([config.lost_along_mm, across_mm], _SURE_SDS * np.array(measured.sd_mm))
-        lost = bool((self.belief.error[best] > explained).any())
+        self._located(measured, lost=not self.belief.explains(measured))
+
+    def _located(self, measured: TipMeasurement, *, lost: bool) -> None:
+        """Note whether the wire is lost, and how far it is then pulled back."""
         if lost or self._lost:
             self._follower.begin(None)
         self._lost = lost
@@ -307,8 +313,8 @@ class OraclePolicy(_PlanningPolicy):
         stack, anatomy = world.stack(navigation.stack), world.anatomy(navigation.anatomy)
         super().start(replace(navigation, anatomy=anatomy, device=stack.wire, catheters=stack.catheters), seed)
 
-    def _parameters(self) -> Float[np.ndarray, "members 3"]:
-        return np.array([[1.0, 1.0, self._world.ostium_mm]])
+    def _believe(self) -> Belief:
+        return Belief(self.navigation, [World(ostium_mm=self._world.ostium_mm)], self.config.belief)
 
     def wants_xray(self) -> bool:
         """X-ray is always on."""
@@ -348,51 +354,51 @@ class AgentPolicy(_PlanningPolicy):
         super().__init__(config)
         self._given, self._advice = calibration, advice or AdviserConfig()
 
-    def start(self, navigation: Navigation, seed: int) -> None:
-        """Lay out the simulated wires, and start the adviser."""
-        super().start(navigation, seed)
+    def _believe(self) -> Belief:
+        navigation = self.navigation
         self._calibration = self._given or read_agent_calibration(navigation.xray, len(navigation.devices))
-        self._adviser = XrayAdviser(self._calibration, self._advice, navigation.device.tip_radius_mm)
-        self._due = False
-        self._start_adviser()
+        self.monitor = Monitor(navigation, self._calibration, config=self.config.belief, advice=self._advice)
+        self._believed, self._losses = BelievedTip(np.nan, np.nan), 0
+        return self.monitor.belief
 
-    def _start_adviser(self) -> None:
-        proximal, tip, _, radius = self.adviser_input()
-        self._adviser.start(proximal, tip, radius)
+    def decide(self, observation: Observation) -> Decision:
+        """Follow the course as the module describes; end where belief after belief was lost."""
+        decision = super().decide(observation)
+        if self._losses < _LOSSES or decision.gives_up:
+            return decision
+        at = "" if observation.tip is None else f" at {observation.tip.abscissa:.0f} mm"
+        return replace(
+            decision, gives_up=f"lost {self._losses} times: no wire, lumen or ostium explains what X-ray shows{at}"
+        )
 
-    def _update(self, measured: TipMeasurement) -> None:
-        """Weight the wires; an exposure that somebody else made begins the bands anew."""
-        super()._update(measured)
-        if self._led:
-            self._start_adviser()
-            self._led = False
+    def _observe(self, observation: Observation) -> None:
+        monitor, before = self.monitor, self.monitor.lost
+        self._believed = monitor.step(observation.devices, observation.load, observation.tip)
+        if self._failed >= self.config.tries:  # what was identified leads nowhere
+            monitor.return_to_given()
+        if self.belief is not monitor.belief:  # another wire, lumen or ostium: another course
+            self.belief, self._failed = monitor.belief, 0
+            self._search = self._new_search()
+            self._follower.begin(None)
+        if observation.tip is not None:
+            self._located(observation.tip, lost=monitor.lost)
+        self._lost = monitor.lost
+        self._losses += self._lost and not before
 
-    def _parameters(self) -> Float[np.ndarray, "members 3"]:
-        return Belief.around(NOMINAL, self.config.belief)
-
-    def adviser_input(self) -> AdviserInput:
-        """Return what the adviser is given: the likeliest wire, and the spread of all wires."""
-        best, tip = int(np.argmax(self.belief.weight)), self.belief.likeliest_tip()
-        proximal, ends = self.belief.simulator.proximal[best, :1], np.array([[tip.abscissa[0], tip.offset[0]]])
-        return proximal, ends, self.belief.tip_spread()[None], tip.radius
+    def _tries_another(self) -> bool:
+        return self.monitor.may_return
 
     def wants_xray(self) -> bool:
-        """Ask the adviser; a device that should have arrived, and the end of a manoeuvre, are looked at."""
-        play = self.belief.play_spread()[None]
-        self._due = bool(self._adviser.advise(*self.adviser_input(), play)[0]) or self._arrived or self._shows
-        return self._due
+        """Ask the monitor; a device that should have arrived, and the end of a manoeuvre, are looked at."""
+        return bool(self._believed.asks) or self._arrived or self._shows
 
     def believed(self) -> BelievedTip:
         """Return where the likeliest wire has its tip, the adviser's bands around it, and why it asks for X-ray."""
-        tip, half = super().believed(), self._adviser.half_width
-        if self._lost or len(half) == 0:
-            return replace(tip, asks="no simulated wire explains the last image" if self._lost else "")
-        along, across = half[0].tolist()
-        wide = along >= self._advice.abscissa_mm
-        asks = f"Δtip is known to ±{along:.1f} mm only" if wide else "the tip may be reaching the wall"
-        asks = "a manoeuvre is over" if self._shows else asks
-        asks = "the tip should be at the target" if self._arrived else asks
-        return replace(tip, half_width=(along, across), asks=asks if self._due else "")
+        asks = self._believed.asks
+        if not self._lost:
+            asks = "a manoeuvre is over" if self._shows else asks
+            asks = "the tip should be at the target" if self._arrived else asks
+        return replace(self._believed, asks=asks)
 
 
 def read_agent_calibration(xray: XrayKind, devices: int) -> Calibration:

@@ -17,8 +17,10 @@ from jaxtyping import Bool, Float
 
 from endopilot.belief.adviser import AdviserConfig, XrayAdviser
 from endopilot.belief.bands import Calibration
+from endopilot.belief.belief import Belief
+from endopilot.belief.monitor import AdviserInput, adviser_input
 from endopilot.belief.online_predictors import online_predictor
-from endopilot.control.agent import AdviserInput, AgentPolicy, read_agent_calibration
+from endopilot.control.agent import AgentConfig, read_agent_calibration
 from endopilot.control.plan_config import NETWORK_METHODS, Plan
 from endopilot.models.config import WINDOW, run_path
 from endopilot.tasks.route import Route
@@ -98,21 +100,21 @@ class _Model(Protocol):
 
 class _Wires:
     def __init__(self, plan: Plan) -> None:
-        self._plan, self._agent = plan, AgentPolicy()
-        self._agent.start(plan.navigation, seed=0)
+        config = AgentConfig.of(plan.navigation).belief
+        self._plan, self._belief = plan, Belief(plan.navigation, Belief.around(config), config)
 
     def start(self) -> AdviserInput:
-        return self._agent.adviser_input()
+        return adviser_input(self._belief)
 
     def move(self, period: int) -> AdviserInput:
-        self._agent.belief.follow(
+        self._belief.follow(
             tuple((inserted, turn) for inserted, turn in self._plan.trajectory.proximal[0, period].tolist())
         )
-        return self._agent.adviser_input()
+        return adviser_input(self._belief)
 
     def observe(self, period: int) -> None:
         tip = self._plan.tip[:, 0]
-        self._agent.belief.weigh(
+        self._belief.weigh(
             TipMeasurement(
                 position=self._plan.trajectory.tip_position[0, period, 0],
                 abscissa=float(tip.abscissa[period]),

@@ -47,6 +47,8 @@ _STRETCH_MM = 20.0
 """A wire in a catheter passes the route in stretches of this length at most, mm."""
 _TURNS = (0.0, np.pi)
 """Angles by which a wire alone may be turned before it goes in, rad."""
+_OFTEN = 6
+"""A course that has passed places this many times as often as there are is at an end."""
 _REPEATED = 3
 """Trials of a manoeuvre that the course tries, one after another."""
 
@@ -73,12 +75,11 @@ class Search:
         Raises:
             InputError: there is more than one catheter.
         """
-        if len(navigation.catheters) > 1:
-            raise InputError(f"catheter: {len(navigation.catheters)}; the search drives one: give one")
+        check_devices(navigation)
         self._navigation, self.route, self.config = navigation, route, config
         self._alone, wide = not navigation.catheters, route.is_wide(route.target.abscissa)
         self._repertoire = Repertoire.of(navigation.catheters, config, wide=wide)
-        trials_of = partial(Trials.of, navigation, list(belief.wires.values()), like=belief.simulator)
+        trials_of = partial(Trials.of, navigation, belief.kinds, like=belief.simulator)
         self._course, self._many = trials_of(count=1), trials_of(count=self._repertoire.trials)
         self._few = self._course if self._alone else trials_of(count=len(self._repertoire.leads))
         self._population = Population(navigation, route, self._many, config, np.random.default_rng([seed, 0x5EA]))
@@ -138,6 +139,9 @@ class Search:
                     break
                 if len(course.rows) == kept.periods:  # some wire lies beyond the waypoint, others before it
                     course.move(course.control(Move(WIRE, -_BACK_MM_S)))
+                if len(settled) > _OFTEN * len(places):  # it goes to and fro about a place
+                    self._halted("stalled", waypoint)
+                    break
             elif any(self._turned(grid, share, waypoint, kept) for share, grid in self._repertoire.ways):
                 settled.append(len(course.rows) - 1)
             elif not (self._alone and self._drawn(waypoint, kept)):
@@ -150,7 +154,7 @@ class Search:
             self._cut_hard()
         return course.as_course(
             reached=reached,
-            ostium_mm=float(belief.parameters[source[0], 2]),
+            ostium_mm=float(belief.ostium_mm[source[0]]),
             settled=None if self._alone else settled,
         )
 
@@ -334,6 +338,16 @@ class Search:
         hard = [bool((row.force[course.counted] > limit_n).any()) for row in course.rows]
         if any(hard):
             del course.rows[hard.index(True) :]
+
+
+def check_devices(navigation: Navigation) -> None:
+    """Refuse a navigation that a search cannot drive.
+
+    Raises:
+        InputError: there is more than one catheter.
+    """
+    if len(navigation.catheters) > 1:
+        raise InputError(f"catheter: {len(navigation.catheters)}; the search drives one: give one")
 
 
 def _merit(course: Course) -> tuple[bool, float]:

@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.control.course import Course
-from endopilot.devices.device import Wire
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.stack import Stack
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState, Step
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
-from endopilot.types import TipProjection
+from endopilot.types import Anatomy, TipProjection
 
 Control = Float[np.ndarray, "trials devices 2"]
 """Translation (mm/s) and rotation (rad/s) of each device of each trial in a decision period."""
@@ -104,23 +104,21 @@ class Trials:
         self._forget(np.full(wires, 1 / wires))
 
     @staticmethod
-    def of(navigation: Navigation, wires: Sequence[Wire], count: int, *, like: Simulator) -> Trials:
+    def of(navigation: Navigation, kinds: Sequence[tuple[Anatomy, Stack]], count: int, *, like: Simulator) -> Trials:
         """Return trials of a navigation's devices.
 
         Args:
-            navigation: vessel and catheters.
-            wires: the wires that are held possible.
+            navigation: what is to be done.
+            kinds: vessels and devices that are held possible.
             count: number of trials.
-            like: a simulator of the same anatomy, whose settings are taken.
+            like: a simulator of the same anatomies, whose settings are taken.
         """
-        stacks = [replace(navigation.stack, wire=wire) for wire in wires for _ in range(count)]
-        simulator = Simulator(
-            navigation.anatomy, stacks, motion=navigation.known_motion, config=like.config, sharing=like
-        )
+        anatomies, stacks = zip(*(kind for kind in kinds for _ in range(count)), strict=True)
+        simulator = Simulator(anatomies, stacks, motion=navigation.known_motion, config=like.config, sharing=like)
         limits = [DriveLimits.of(device, navigation.anatomy) for device in stacks[0].devices]
         first, last = limits[0].travel_mm
         travel = first, last - _SHORT_MM
-        return Trials(simulator, [replace(each, travel_mm=travel) for each in limits], wires=len(wires))
+        return Trials(simulator, [replace(each, travel_mm=travel) for each in limits], wires=len(kinds))
 
     def put(self, source: Int[np.ndarray, "wires"], of: Simulator, weight: Float[np.ndarray, "wires"]) -> None:
         """Put all trials of each wire where a world of a simulator of equal stacks is, and forget what they have done.

@@ -11,6 +11,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
+from endopilot.belief.monitor import BelievedTip
 from endopilot.devices.stack import Proximals
 from endopilot.tasks.navigation import Navigation
 from endopilot.xray.fluoroscope import TipMeasurement
@@ -80,23 +81,6 @@ class Hand:
     def decide(self, observation: Observation) -> Decision:
         """Go on as the hand holds it."""
         return Decision(self.devices)
-
-
-@dataclass(frozen=True)
-class BelievedTip:
-    """Where a policy believes the tip to be.
-
-    Attributes:
-        abscissa: Δtip, mm.
-        offset: γtip, mm.
-        half_width: of the bands around both in which the tip is expected, mm; NaN without bands.
-        asks: why the policy asks for X-ray at the next decision; empty if it does not.
-    """
-
-    abscissa: float
-    offset: float
-    half_width: tuple[float, float] = (np.nan, np.nan)
-    asks: str = ""
 
 
 @runtime_checkable

@@ -41,14 +41,16 @@ class NavigationRecord:
         measured: what X-ray showed at this moment; None where it was off, or no wire was found in the images.
         believed: where the policy believed the tip to be when it decided; NaN at the end, and None for a policy that
             does not tell: (Δtip, γtip), mm.
-        half_width: of the adviser's bands around it, mm, likewise; NaN where there is none.
+        half_width: of the adviser's bands around it, mm, likewise; NaN where there is none, infinite where the policy
+            could not explain what X-ray showed.
         asks: why the policy asked at this moment for X-ray at the next one; empty where it did not, or does not tell.
+        found: what was identified once the model was taken to be wrong, in words; empty if nothing was.
         cycles: what the drives asked for in each of their cycles and what the devices truly did, without shapes;
             replayed it gives the same navigation to the bit. Its columns `encoders` and `load` are what the robot
             measured at the end of each cycle (`SimulatedRobot.measured`); others repeat over a period's cycles what was
             `decided`, and what X-ray `measured`, what was `believed` and the `half_width` at its begin, NaN where that
-            is nothing. `about` has the target, why it ended, when X-ray was on, s, and why it was asked for. None where
-            no period is over.
+            is nothing. `about` has the target, why it ended, when X-ray was on, s, why it was asked for, and what was
+            found. None where no period is over.
         success: the tip reached the target in time, at the end of a period.
         safe: the wall force never exceeded the navigation's limit.
         seconds: how long it took, s.
@@ -76,6 +78,7 @@ class NavigationRecord:
     believed: Float[np.ndarray, "samples 2"] | None
     half_width: Float[np.ndarray, "samples 2"] | None
     asks: tuple[str, ...]
+    found: str
     cycles: Trajectory | None
     success: bool
     safe: bool
@@ -100,12 +103,13 @@ class NavigationRecord:
 
     @property
     def in_bands(self) -> Bool[np.ndarray, "decisions"]:
-        """Whether the adviser's bands held Δtip and γtip, at each decision that had bands."""
+        """Whether the adviser's bands held Δtip and γtip, at each decision with bands; infinite ones hold nothing."""
         if self.believed is None or self.half_width is None:
             return np.zeros(0, dtype=bool)
         true = np.stack([self.tip.abscissa[:, 0], self.tip.offset[:, 0]], axis=-1)
-        held = np.less_equal(np.abs(true - self.believed), self.half_width).all(axis=1)
-        return np.asarray(held)[np.isfinite(self.half_width).all(axis=1)]
+        half = self.half_width
+        held = (np.less_equal(np.abs(true - self.believed), half) & np.isfinite(half)).all(axis=1)
+        return np.asarray(held)[~np.isnan(half).any(axis=1)]
 
 
 class Track:
@@ -181,6 +185,7 @@ class Track:
         exposures = np.array([*self._exposures[:periods], 0])
         believed = [_NOTHING if tip is None else tip for tip in self._believed[:periods]] + [_NOTHING]
         tells = any(tip is not None for tip in self._believed)
+        found = believed[-2].found if periods else ""
         where = np.array([(tip.abscissa, tip.offset) for tip in believed])
         half_width = np.array([tip.half_width for tip in believed])
         tips = [None if seen is None else seen.tip for seen in self._seen[:periods]]
@@ -202,6 +207,7 @@ class Track:
             "gives_up": gives_up,
             "exposures_s": (DECISION_PERIOD_S * np.flatnonzero(exposures)).tolist(),
             "asks_for_xray": [tip.asks for tip in believed[:-1]],
+            "found": found,
         }
         return NavigationRecord(
             time_s=DECISION_PERIOD_S * np.arange(samples),
@@ -219,6 +225,7 @@ class Track:
             believed=where if tells else None,
             half_width=half_width if tells else None,
             asks=tuple(tip.asks for tip in believed),
+            found=found,
             cycles=_made(robot, cycles, decisions, about) if cycles else None,
             success=reason == "reached",
             safe=bool(is_safe(force.max(), navigation.force_limit_n)),

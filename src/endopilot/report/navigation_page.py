@@ -103,6 +103,8 @@ def _facts(found: PatientNavigation) -> list[tuple[str, str]]:
         facts.append(("Guiding catheter in reality", f"{leans_deg:g}° off its given axis{unseen}"))
     if found.plans is not None:
         facts.append(("Courses searched", str(found.plans)))
+    if found.record.found:
+        facts.append(("Model mismatch: the policy found", found.record.found))
     return [*facts, ("Seed", str(set_up.config.seed))]
 
 

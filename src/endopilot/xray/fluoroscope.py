@@ -1,9 +1,10 @@
 """What an X-ray exposure says of wire and guiding catheter: measurements with the errors of a C-arm, never the truth.
 
 The tip is projected onto one or two detectors, is found there with an error in pixels, and is located in space as the
-most likely place given the pixels and the vessel: the tip of a wire lies inside the lumen, mostly on its wall, and no
-deeper than the wire is inserted. The second view or, with a single one, the vessel gives the depth. The guiding
-catheter is a line in each view. docs/xray.md says where the numbers come from.
+most likely place given the pixels and the vessel: the tip of a wire lies about as far from the vessel's axis as its
+wall, and no deeper than the wire is inserted. It may be measured outside the lumen, which may be wider than it is
+believed. The second view or, with a single one, the vessel gives the depth. The guiding catheter is a line in each
+view. docs/xray.md says where the numbers come from.
 """
 
 from __future__ import annotations
@@ -30,6 +31,9 @@ _CATHETER_MM = 20.0
 _LEAN_SD = np.sin(np.radians(20.0))
 """Standard deviation of a guiding catheter's axis, a unit vector, across the given one before it is seen."""
 _ITERATIONS, _NEAR_ENOUGH_MM = 8, 1e-2
+_UNCLAMPED = 3.0
+"""Two views need the vessel to tell branches apart, not to place the tip: across it, the prior is this much wider, so
+that a tip outside the lumen as it is believed is measured where it is."""
 _HOPELESS = 30.0
 """Branches whose best vertex is this much less likely than the best of all (twice the log-likelihood) are left out."""
 _NEAR_SHARE = 0.1
@@ -47,6 +51,7 @@ class TipMeasurement:
         branch: index of the branch that it is observed in.
         sd_mm: standard deviations of the position along and across the wire as the detector states them, mm; 0 where it
             states none.
+        tip_sd_mm: those of Δtip and γtip, mm, as the views and the errors of detection make them; likewise.
     """
 
     position: Float[np.ndarray, "3"]
@@ -54,6 +59,7 @@ class TipMeasurement:
     offset: float
     branch: int
     sd_mm: tuple[float, float] = (0.0, 0.0)
+    tip_sd_mm: tuple[float, float] = (0.0, 0.0)
 
 
 @runtime_checkable
@@ -123,6 +129,29 @@ class _Detection:
     whiten: Float[np.ndarray, "2 2"]
 
 
+def measurement_at(
+    project: TipProjector,
+    anatomy: Anatomy,
+    position: Float[np.ndarray, "3"],
+    covariance: Float[np.ndarray, "3 3"],
+    sd_mm: tuple[float, float] = (0.0, 0.0),
+) -> TipMeasurement:
+    """Return the measurement of a position, LPS mm, with its covariance, mm²; `sd_mm` as in `TipMeasurement`."""
+    tip = project(position[None])
+    branch, abscissa = int(tip.branch[0]), float(tip.abscissa[0])
+    line, tangent = anatomy.tree.branches[branch].centerline, np.asarray(anatomy.insertion.direction)
+    centre = anatomy.insertion.position + abscissa * tangent
+    if abscissa > 0:
+        centre, tangent = (
+            np.array([np.interp(abscissa, line.abscissa, axis) for axis in values.T])
+            for values in (line.points, tangents(line.points))
+        )
+    outwards = position - centre
+    axes = np.array([tangent, outwards / max(float(np.linalg.norm(outwards)), 1e-9)])
+    along, out = np.sqrt(np.einsum("ai,ij,aj->a", axes, covariance, axes)).tolist()
+    return TipMeasurement(position, abscissa, float(tip.offset[0]), branch, sd_mm, (along, out))
+
+
 class Fluoroscope:
     """A C-arm around one patient, whose vessel is known from the CT and registered to it."""
 
@@ -156,7 +185,8 @@ class Fluoroscope:
         self._views = [view_at(angles, isocenter, self._config.geometry) for angles in shown]
         radius = [np.full(len(behind), anatomy.catheter_radius_mm), *(line.radius for line in lines)]
         # A wire that lies on the wall, anywhere around, lies clearance/√2 from it along either axis, root mean square.
-        self._lateral_sd = [np.maximum(r - wire_radius_mm, 0.1) / np.sqrt(2) for r in radius]
+        wider = _UNCLAMPED if len(self._views) > 1 else 1.0
+        self._lateral_sd = [wider * np.maximum(r - wire_radius_mm, 0.1) / np.sqrt(2) for r in radius]
         self._points = [catheter, *points]
         self._tangents = [np.tile(insertion.direction, (len(behind), 1)), *(tangents(p) for p in points)]
         self._abscissa = [behind, *(line.abscissa for line in lines)]
@@ -187,9 +217,8 @@ class Fluoroscope:
         random: np.random.Generator,
     ) -> TipMeasurement:
         """Take one exposure of every view and say where the tip is. The arguments are those of `locate`."""
-        position = self.locate(tip_position, tip_direction, inserted_length, random)
-        tip = self._project(position[None])
-        return TipMeasurement(position, float(tip.abscissa[0]), float(tip.offset[0]), int(tip.branch[0]))
+        detections = [self._detect(view, tip_position, tip_direction, random) for view in self._views]
+        return measurement_at(self._project, self._anatomy, *self._likeliest(detections, inserted_length))
 
     def catheter_axis(self, axis: Float[np.ndarray, "3"], random: np.random.Generator) -> Float[np.ndarray, "3"]:
         """Take one exposure of every view and return the guiding catheter's axis as it shows, a unit vector.
@@ -230,7 +259,7 @@ class Fluoroscope:
             random: where the errors are drawn from.
         """
         detections = [self._detect(view, tip_position, tip_direction, random) for view in self._views]
-        return self._likeliest(detections, inserted_length)
+        return self._likeliest(detections, inserted_length)[0]
 
     def expose_episodes(
         self, episodes: Dataset, inserted_length: Float[np.ndarray, "episodes samples"], seed: int
@@ -275,8 +304,11 @@ class Fluoroscope:
         error = random.standard_normal(2) * sd
         return _Detection(view, view.project(position) + error @ axes, axes / sd[:, None])
 
-    def _likeliest(self, detections: list[_Detection], inserted_length: float) -> Float[np.ndarray, "3"]:
-        """Return the most likely place of the tip, LPS mm: the best of the likeliest places in every branch."""
+    def _likeliest(
+        self, detections: list[_Detection], inserted_length: float
+    ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+        """Return the most likely place of the tip, LPS mm, the best of the likeliest places in every branch, and its
+        covariance."""
         length_sd = 2.0 + _NEAR_SHARE * max(inserted_length, 0.0)
         prior = [((abscissa - inserted_length) / length_sd) ** 2 for abscissa in self._abscissa]
         magnified = self._views[0].scale / self._config.geometry.source_to_isocenter_mm
@@ -288,26 +320,26 @@ class Fluoroscope:
             )
             first.append(squared / (self._config.along_sd**2 + (magnified * sd) ** 2) + unlikely)
         least = min(float(cost.min()) for cost in first)
-        best, found = np.inf, self._points[0][-1]
+        best, found = np.inf, (self._points[0][-1], np.eye(3))
         for branch, cost in enumerate(first):
             if cost.min() > least + _HOPELESS:
                 continue
-            place, cost_there, nearest = self._refine(detections, branch, int(np.argmin(cost)))
+            place, cost_there, nearest, covariance = self._refine(detections, branch, int(np.argmin(cost)))
             cost_there += float(prior[branch][nearest])
             if cost_there < best:
-                best, found = cost_there, place
+                best, found = cost_there, (place, covariance)
         return found
 
     def _refine(
         self, detections: list[_Detection], branch: int, nearest: int
-    ) -> tuple[Float[np.ndarray, "3"], float, int]:
-        """Return the likeliest place near one branch, LPS mm, twice its negative log-likelihood, and its vertex.
+    ) -> tuple[Float[np.ndarray, "3"], float, int, Float[np.ndarray, "3 3"]]:
+        """Return the likeliest place near one branch, LPS mm, twice its negative log-likelihood, vertex and covariance.
 
         Gauss-Newton on the errors of the pixels, in units of the detection's error, and on the distance from the line,
         in units of what is usual in that lumen.
         """
         points, tangent, sd = self._points[branch], self._tangents[branch], self._lateral_sd[branch]
-        place, cost = points[nearest], np.inf
+        place, cost, jacobian = points[nearest], np.inf, np.eye(3)
         for _ in range(_ITERATIONS):
             across = (np.eye(3) - np.outer(tangent[nearest], tangent[nearest])) / sd[nearest]
             rows, residuals = [across, 1e-3 * np.eye(3)], [across @ (place - points[nearest]), np.zeros(3)]
@@ -321,7 +353,9 @@ class Fluoroscope:
             nearest = int(np.argmin(((points - place) ** 2).sum(axis=1)))
             if step @ step < _NEAR_ENOUGH_MM**2:
                 break
-        lateral = place - points[nearest]
-        lateral = lateral - (lateral @ tangent[nearest]) * tangent[nearest]
-        beyond = 1 - np.sqrt(2) * sd[nearest] / max(float(np.linalg.norm(lateral)), 1e-9)
-        return place - max(beyond, 0.0) * lateral, cost, nearest  # a tip does not leave the lumen
+        if len(detections) == 1:  # the depth is the vessel's, and ends at its wall
+            lateral = place - points[nearest]
+            lateral = lateral - (lateral @ tangent[nearest]) * tangent[nearest]
+            beyond = 1 - np.sqrt(2) * sd[nearest] / max(float(np.linalg.norm(lateral)), 1e-9)
+            place = place - max(beyond, 0.0) * lateral
+        return place, cost, nearest, np.linalg.inv(jacobian.T @ jacobian)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Float32
 
-from endopilot.anatomy.projection import project_tip
+from endopilot.anatomy.projection import TipProjector
 from endopilot.devices.device import Wire
 from endopilot.errors import InputError
 from endopilot.simulation.motion import Motion, published_mean
@@ -19,7 +19,7 @@ from endopilot.types import Anatomy
 from endopilot.xray.absorbers import surroundings
 from endopilot.xray.carm import Pose, view_at
 from endopilot.xray.detector import TipDetector
-from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement
+from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement, measurement_at
 from endopilot.xray.image import ImageConfig, Plane, XrayImager
 from endopilot.xray.motion_registration import register_motion, take_run
 from endopilot.xray.moving_patient import seen_wire
@@ -84,6 +84,7 @@ class ImageFluoroscope:
         if self.registration.failure:
             raise NotRegistered(f"X-ray images: {anatomy.name} cannot be registered: {self.registration.failure}")
         self._detector = TipDetector(anatomy, device)
+        self._project = TipProjector(anatomy.tree, anatomy.insertion)
         self.forget_wires()
         self._slack_mm = self.refiner.slack_mm(self._views, self._detector.config.slack_mm)
 
@@ -146,18 +147,12 @@ class ImageFluoroscope:
             moved_mm = vessel_error_mm(self._anatomy, before, self.refiner.refine(self._views, found, self._slack_mm))
         if moved_mm > _MOVED_MM or self._slack_mm > self._detector.config.slack_mm:
             found = self._detector.find(self.refiner.views(self._views), *image) or found
-        tip = project_tip(self._anatomy.tree, self._anatomy.insertion, found.position[None])
         along = found.wire[-1] - found.wire[max(-5, -len(found.wire))]
         along = along / max(float(np.linalg.norm(along)), 1e-9)
         variance = float(along @ found.covariance @ along)
         across = max(float(np.trace(found.covariance)) - variance, 0.0) / 2
-        return TipMeasurement(
-            position=found.position,
-            abscissa=float(tip.abscissa[0]),
-            offset=float(tip.offset[0]),
-            branch=int(tip.branch[0]),
-            sd_mm=(float(np.sqrt(variance)), float(np.sqrt(across))),
-        )
+        sd_mm = float(np.sqrt(variance)), float(np.sqrt(across))
+        return measurement_at(self._project, self._anatomy, found.position, found.covariance, sd_mm)
 
     def _signal(
         self, plane: Plane, nodes: Float[np.ndarray, "n 3"], random: np.random.Generator, contrast: float = 0.0

@@ -1,0 +1,187 @@
+"""A wire that is followed by its encoders under a belief: `Monitor`, which whoever drives may ask for X-ray.
+
+An exposure is compared with what was predicted before it weighs the belief (`Innovations`). Where several disagree the
+model is wrong, not the prediction unlucky: the bands widen, and X-ray is due every 1.5 s until two images lie in them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.belief.adviser import AdviserConfig, XrayAdviser
+from endopilot.belief.bands import Calibration
+from endopilot.belief.belief import Belief, BeliefConfig, Past
+from endopilot.belief.identification import Identified, identify
+from endopilot.belief.innovations import Innovations
+from endopilot.devices.stack import Proximals
+from endopilot.tasks.navigation import Navigation
+from endopilot.xray.fluoroscope import TipMeasurement
+
+_LUMEN_SHARE, _LUMEN_MM = 0.12, 0.3
+"""The lumen's radius may be off by this share, and no more than this, mm: CT shows it to a tenth or a voxel, an
+assumption."""
+_MOST, _EVERY = 6, 3
+"""The belief is changed as often at most, after as many further exposures at least."""
+MISMATCH = "model mismatch"
+"""Why X-ray is asked for while the model is taken to be wrong."""
+AdviserInput = tuple[
+    Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1"]
+]
+"""What an adviser is given of a navigation: (Δ, φ), mm and rad; (Δtip, γtip), mm; the spread (standard deviation) of
+these as the model states it, mm; and the lumen's radius at the tip, mm."""
+
+
+@dataclass(frozen=True)
+class BelievedTip:
+    """Where a tip is believed to be.
+
+    Attributes:
+        abscissa: Δtip, mm.
+        offset: γtip, mm.
+        half_width: of the bands around both in which the tip is expected, mm; infinite where no wire explains what
+            X-ray showed, NaN without bands.
+        asks: why X-ray is asked for at the next decision; empty if it is not.
+        found: what was identified since the model was taken to be wrong, in words; empty if nothing was.
+    """
+
+    abscissa: float
+    offset: float
+    half_width: tuple[float, float] = (np.nan, np.nan)
+    asks: str = ""
+    found: str = ""
+
+
+class Monitor:
+    """Follows a wire that somebody drives, and says where its tip is and when an exposure is due.
+
+    Example:
+        monitor = Monitor(navigation, calibration)
+        believed = monitor.step(encoders, load, exposure)   # every DECISION_PERIOD_S; the exposure that was asked for
+
+    Attributes:
+        belief: about the wire; another one once the model was taken to be wrong and another was identified.
+        lost: whether no wire explains the last exposure.
+        past: what was measured so far.
+        identified: what was found when the belief was last changed; None before.
+        changes_left: how often it may still be changed.
+    """
+
+    def __init__(
+        self,
+        navigation: Navigation,
+        calibration: Calibration,
+        *,
+        config: BeliefConfig | None = None,
+        advice: AdviserConfig | None = None,
+    ) -> None:
+        """Lay out the simulated wires at the start of a navigation.
+
+        Args:
+            navigation: as it is given.
+            calibration: of the bands around what the simulated wires predict.
+            config: the simulated wires.
+            advice: which events X-ray must not miss.
+        """
+        self._navigation, self._config = navigation, config or BeliefConfig()
+        self._advice = advice or AdviserConfig()
+        self.belief = Belief(navigation, Belief.around(self._config), self._config)
+        self._adviser = XrayAdviser(calibration, self._advice, navigation.device.tip_radius_mm)
+        self._innovations, self.past, self.lost = Innovations(), Past(), False
+        self.identified: Identified | None = None
+        self._tests = not navigation.catheters
+        self.changes_left, self._since, self._returned = _MOST, 0, False
+        proximal, tip, spread, radius = adviser_input(self.belief)
+        self._adviser.start(proximal, tip, radius)
+        self._half = self._adviser.widths(spread)[0]
+
+    @property
+    def alarm(self) -> bool:
+        """Whether the model is taken to be wrong."""
+        return self._innovations.alarm
+
+    def step(self, encoders: Proximals, load: Proximals = (), exposure: TipMeasurement | None = None) -> BelievedTip:
+        """Take what is measured, a period after the last, and return where the tip is believed and what is asked for.
+
+        Args:
+            encoders: inserted length (mm) and rotation (rad) of each device.
+            load: axial force (N) and torque (N·mm) of each drive; empty where it is not measured.
+            exposure: what X-ray shows now; None where it is off.
+        """
+        period = len(self.past.proximal)
+        if period:
+            self.belief.follow(encoders, load)
+        else:
+            self.belief.drives.begin(encoders)
+        self.past.proximal.append(self.belief.drives.proximal.copy())
+        self.past.load.append(load)
+        play = self.belief.play_spread()[None]
+        proximal, tip, spread, radius = adviser_input(self.belief)
+        if exposure is not None:
+            seen = np.array([exposure.abscissa, exposure.offset])
+            if self._tests:
+                self._innovations.take(seen - tip[0], self._half, exposure.tip_sd_mm)
+            self.past.exposures[period] = exposure
+            self.belief.weigh(exposure)
+            self._adviser.exposed()
+            self.lost = not self.belief.explains(exposure)
+            self._innovations.alarm |= self.lost and self._tests
+            self._since += 1
+            if self._is_to_change():
+                self._identify(exposure)
+            proximal, tip, spread, radius = adviser_input(self.belief)
+        elif self.belief.drives.proximal[0, 0] <= self._navigation.start_inserted_length_mm:
+            self.lost = False  # back where it began, the wire lies as it did, unseen in its catheter
+        factor = self._innovations.factor
+        wall_mm = np.minimum(_LUMEN_SHARE * radius, _LUMEN_MM) if self._tests else 0.0
+        wider = {"factor": factor, "always": self.alarm, "wall_mm": wall_mm}
+        due = bool(self._adviser.advise(proximal, tip, spread, radius, play, **wider)[0])
+        self._half = self._adviser.half_width[0] / factor
+        return self._believed(tip[0], due)
+
+    @property
+    def may_return(self) -> bool:
+        """Whether what was identified may be given up for what is given, which is done once."""
+        return self.identified is not None and not self._returned
+
+    def return_to_given(self) -> None:
+        """Take wire, lumen and wall as they are given again, with the ostium that was identified, if that may be."""
+        if self.may_return:
+            ostium_mm = float(self.belief.weight @ self.belief.ostium_mm)
+            given = [replace(each, ostium_mm=each.ostium_mm + ostium_mm) for each in Belief.around(self._config)]
+            self.belief, self._returned = self.belief.like(given), True
+            self.belief.replay(self.past)
+
+    def _is_to_change(self) -> bool:
+        """Return whether another belief is sought: the first does not explain the images, or no longer the last one."""
+        if self.changes_left == 0 or not self.alarm:
+            return False
+        return self.identified is None or (self._since >= _EVERY and (self.lost or self._innovations.outside))
+
+    def _identify(self, exposure: TipMeasurement) -> None:
+        """Change the belief to what explains all exposures."""
+        self.belief, self.identified = identify(self.belief, self.past, seed=self.changes_left)
+        self.changes_left, self._since = self.changes_left - 1, 0
+        self._innovations.renew()
+        self.lost = not self.belief.explains(exposure)
+
+    def _believed(self, tip: np.ndarray, due: bool) -> BelievedTip:
+        abscissa, offset = tip.tolist()
+        found = "" if self.identified is None else self.identified.words
+        if self.lost:
+            asks = "no simulated wire explains the last image" if due or not self._tests else ""
+            return BelievedTip(abscissa, offset, (np.inf, np.inf), asks, found)
+        along, across = self._adviser.half_width[0].tolist()
+        wide = along >= self._advice.abscissa_mm
+        asks = f"Δtip is known to ±{along:.1f} mm only" if wide else "the tip may be reaching the wall"
+        asks = MISMATCH if self.alarm else asks
+        return BelievedTip(abscissa, offset, (along, across), asks if due else "", found)
+
+
+def adviser_input(belief: Belief) -> AdviserInput:
+    """Return what the adviser is given: the likeliest wire, and the spread of all wires."""
+    best, tip = int(np.argmax(belief.weight)), belief.likeliest_tip()
+    proximal, ends = belief.simulator.proximal[best, :1], np.array([[tip.abscissa[0], tip.offset[0]]])
+    return proximal, ends, belief.tip_spread()[None], tip.radius

@@ -1,0 +1,116 @@
+"""A wire followed under a belief: whether a wrong model is noticed, and what is then identified."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from endopilot.belief.innovations import ASSUMED_SD_MM, Innovations
+from endopilot.belief.monitor import MISMATCH, BelievedTip, Monitor
+from endopilot.control.agent import read_agent_calibration
+from endopilot.navigation.loop import NavigationLoop
+from endopilot.navigation.policy import Decision, Observation
+from endopilot.simulation.world import World
+from endopilot.tasks.navigation import Navigation, Target
+
+HALF_MM = np.array([0.8, 0.2])
+
+
+class ToAndFro:
+    """Pushes, turns and pulls, whatever is believed, and asks for X-ray as a monitor does."""
+
+    def start(self, navigation: Navigation, seed: int) -> None:
+        self.monitor, self.last = Monitor(navigation, read_agent_calibration("assumed", 1)), BelievedTip(0.0, 0.0)
+        self.alarmed, self.exposures = 0, 0
+
+    def believed_wires(self) -> np.ndarray:
+        return self.monitor.belief.simulator.position
+
+    def believed(self) -> BelievedTip:
+        return self.last
+
+    def decide(self, observation: Observation) -> Decision:
+        self.exposures += observation.tip is not None
+        self.last = self.monitor.step(observation.devices, observation.load, observation.tip)
+        self.alarmed += MISMATCH in self.last.asks
+        slow = -1 if int(observation.time_s / 4) % 3 == 2 else 1
+        return Decision(((4.0 * slow, 0.6),), expose=bool(self.last.asks))
+
+
+def driven(navigation: Navigation, world: World, seed: int = 1) -> Iterator[tuple[ToAndFro, NavigationLoop]]:
+    policy = ToAndFro()
+    loop = NavigationLoop(navigation, policy, seed=seed, world=world)
+    while loop.reason is None:
+        loop.step()
+        yield policy, loop
+
+
+@pytest.fixture(scope="module")
+def along_the_fork(fork, wire) -> Navigation:
+    shaped = replace(wire.with_tip(bend_rad=np.deg2rad(45.0), stiffness_factor=1.0), tip_bend_length_mm=4.0)
+    return Navigation(anatomy=fork, device=shaped, target=Target(branch=2, abscissa=33.0), seconds=14.0)
+
+
+def test_a_deeper_ostium_is_noticed_and_identified(along_the_fork) -> None:
+    """2.5 mm, to half a millimetre, by at most five images; both bands then hold."""
+    found, held = None, list[bool]()
+    for policy, loop in driven(along_the_fork, World(ostium_mm=2.5)):
+        monitor = policy.monitor
+        if found is None and monitor.identified is not None and policy.exposures >= 2:
+            found = monitor.belief.ostium_mm @ monitor.belief.weight
+            assert policy.exposures <= 5
+        if found is not None:
+            tip, believed = loop.simulator.project(), policy.last
+            off = abs(believed.abscissa - tip.abscissa[0, 0]), abs(believed.offset - tip.offset[0, 0])
+            held.append(bool(np.less_equal(off, np.add(believed.half_width, 4.0 * 0.5)).all()))
+    assert found == pytest.approx(2.5, abs=0.5)
+    assert np.mean(held) > 0.75
+
+
+def test_nothing_is_noticed_where_nothing_is_wrong(along_the_fork) -> None:
+    for policy, _ in driven(along_the_fork, World()):
+        assert not policy.monitor.alarm and policy.monitor.identified is None
+    assert 1 <= policy.exposures <= 6
+
+
+def innovations(random: np.random.Generator, off: np.ndarray, sd: np.ndarray, count: int) -> Innovations:
+    made = Innovations()
+    for _ in range(count):
+        made.take(off + sd * random.standard_normal(2), HALF_MM, (0.0, 0.0))
+    return made
+
+
+def test_bands_are_widened_by_as_much_as_innovations_exceed_them() -> None:
+    """Covariance matching: of a prediction whose error is three times what its band says, the factor is three."""
+    random, noise = np.random.default_rng(0), np.array(ASSUMED_SD_MM)
+    as_calibrated = [innovations(random, np.zeros(2), np.hypot(HALF_MM / 1.645, noise), 12) for _ in range(200)]
+    assert np.median([made.factor[0] for made in as_calibrated]) < 1.1
+    worse = [innovations(random, np.zeros(2), np.hypot(3 * HALF_MM / 1.645, noise), 12) for _ in range(200)]
+    assert np.mean([made.factor[0] ** 2 for made in worse]) == pytest.approx(9.0, rel=0.25)
+    assert min(made.factor.min() for made in as_calibrated + worse) == 1.0
+
+
+def test_small_errors_to_one_side_raise_the_alarm_and_two_good_images_end_it() -> None:
+    made, taken = Innovations(), 0
+    while not made.alarm and taken < 20:
+        made.take(np.array([0.95, 0.0]), HALF_MM, (0.0, 0.0))  # each within its bound of 1.1 mm
+        taken += 1
+    assert 2 <= taken <= 6
+    made.take(np.zeros(2), HALF_MM, (0.0, 0.0))
+    assert made.alarm
+    made.take(np.zeros(2), HALF_MM, (0.0, 0.0))
+    assert not made.alarm
+
+
+def test_where_nothing_explains_the_image_the_band_is_infinite_and_holds_nothing(along_the_fork) -> None:
+    (policy, loop), *_ = driven(replace(along_the_fork, seconds=0.5), World())
+    seen = loop.observation.tip
+    far = replace(seen, position=seen.position + np.array([0.0, 30.0, 0.0]))
+    believed = policy.monitor.step(loop.observation.devices, (), far)
+    assert policy.monitor.lost and np.isinf(believed.half_width).all()
+    record = loop.record()
+    assert record.in_bands.all()
+    assert not replace(record, half_width=np.full_like(record.half_width, np.inf)).in_bands.any()
