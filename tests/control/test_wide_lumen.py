@@ -40,7 +40,7 @@ def test_a_wire_may_lie_in_loops_of_three_widths(aorta):
 
 def test_an_agent_holds_more_possible_of_the_ostium_and_pulls_loops_out(aorta, started):
     assert AgentConfig.of(aorta) is IN_WIDE_LUMEN
-    deeper = started.belief.parameters[:, 2]
+    deeper = np.array([member.ostium_mm for member in started.belief.members])
     assert deeper.min() < -3.0 and deeper.max() > 3.0
     grids = [grid for _, grid in Repertoire.of((), SearchConfig(), wide=True).ways]
     assert {grid[0].back for grid in grids} == {0.0, 1.5, 3.0}
@@ -65,7 +65,9 @@ def test_wires_beyond_a_target_are_pulled_back_to_it(started, aorta):
 
 def test_what_holds_for_two_periods_leaves_no_travel_after_them(aorta, started):
     limits = DriveLimits(max_velocity_mm_s=30.0, max_rotation_rad_s=3.0, travel_mm=(0.0, 6.0))
-    trials = Trials(Trials.of(aorta, [aorta.device], 1, like=started.belief.simulator).simulator, [limits])
+    trials = Trials(
+        Trials.of(aorta, [(aorta.anatomy, aorta.stack)], 1, like=started.belief.simulator).simulator, [limits]
+    )
     for periods in (1, 2):
         control = trials.possible(trials.control(Move(WIRE, 30.0)), periods=periods)
         assert control[0, WIRE, 0] == pytest.approx(6.0 / (periods * DECISION_PERIOD_S))

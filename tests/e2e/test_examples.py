@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 FOLDER = Path(__file__).parents[2] / "examples"
-NEEDS_MORE = {"recurrent_ppo.py", "train_sb3.py"}
-"""Examples that train for minutes, or need a library of their own."""
+NEEDS_MORE = {"recurrent_ppo.py", "segment_wire.py", "train_sb3.py"}
+"""Examples that train for minutes, or need data or a library of their own."""
 EXAMPLES = sorted(path.name for path in FOLDER.glob("*.py") if path.name not in NEEDS_MORE)
 
 

@@ -262,7 +262,7 @@ def _simulated(
     tip = np.empty((*angles.shape, seen_s.shape[1], 3))
     abscissa, branch = np.empty(tip.shape[:-1]), np.empty(tip.shape[:-1])
     force = np.full((*angles.shape, control.shape[1]), np.nan)
-    made: Simulator | None = None
+    made: Simulator | tuple[()] = ()
     for some in np.array_split(np.argsort(samples), max(1, len(samples) // _TOGETHER)):
         last, worlds = int(samples[some].max()), angles[some].size
         initial = np.repeat(place[some, None, 0], angles.shape[1], axis=1)
