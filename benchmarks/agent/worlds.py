@@ -23,6 +23,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from benchmarks.figures import Bar, judged
+from endopilot.belief.monitor import MISMATCH
 from endopilot.cli.arguments import OutputFolder
 from endopilot.control.agent import AgentPolicy
 from endopilot.files import read_json, write_json
@@ -68,8 +69,6 @@ SECONDS = 60.0
 """Length of a navigation at random, s."""
 MOST_EXPOSURES = 40
 """No planned navigation shall take more."""
-ALARM = "model mismatch"
-"""What the agent says where it asks for X-ray since no simulated wire is right."""
 BARS = {
     "missed_share": Bar(0.05),
     "missed_share_worst": Bar(0.12),
@@ -159,7 +158,7 @@ def counted(record: NavigationRecord, navigation: Navigation) -> dict[str, Any]:
         "peak_force_n": record.peak_force_n,
         "events": navigation_events(record.tip[:, 0], record.exposed, record.believed[:-1, 0], radius_mm),
         "decisions": [int(record.in_bands.sum()), len(record.exposed) - 1],
-        "alarms": sum(ALARM in asks for asks in record.asks),
+        "alarms": sum(MISMATCH in asks for asks in record.asks),
     }
 
 

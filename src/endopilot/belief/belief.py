@@ -92,12 +92,10 @@ class Past:
 
     Attributes:
         proximal: where the proximal ends of the devices were believed at each decision, mm and rad.
-        load: axial force (N) and torque (N·mm) of each drive then; empty where it is not measured.
         exposures: what X-ray showed, by the decision.
     """
 
     proximal: list[Float[np.ndarray, "devices 2"]] = field(default_factory=list)
-    load: list[Proximals] = field(default_factory=list)
     exposures: dict[int, TipMeasurement] = field(default_factory=dict)
 
 

@@ -159,7 +159,7 @@ def _ostium(belief: Belief, past: Past) -> tuple[float, float]:
     tried = np.arange(low, high + 0.1, 0.5)
     if 0 not in past.exposures:
         return 0.0, high / 2
-    first = Past(past.proximal[:1], past.load[:1], {0: past.exposures[0]})
+    first = Past(past.proximal[:1], {0: past.exposures[0]})
     score, _ = _scores(belief, first, [World(ostium_mm=float(each)) for each in tried])
     weight = likelihoods(score)
     mean = float(weight @ tried)

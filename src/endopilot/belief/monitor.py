@@ -116,7 +116,6 @@ class Monitor:
         else:
             self.belief.drives.begin(encoders)
         self.past.proximal.append(self.belief.drives.proximal.copy())
-        self.past.load.append(load)
         play = self.belief.play_spread()[None]
         proximal, tip, spread, radius = adviser_input(self.belief)
         if exposure is not None:
