@@ -105,7 +105,7 @@ def bench_wires(
         Figures with bars: shares of missed wires; `said_share`: of the missed wires, and of those found where there is
         none, those that the detector calls ambiguous or does not find; `doubted_share`: of the others;
         `inside_own_95_share`: of the wires called found, those whose tip is within the region that the detector is
-        95 % sure of; `ms_a_view`: median. `by`: the same of some of the exposures.
+        95 % sure of, and the same of two views; `surely_wrong_share`: of all wires, those called found and missed; `ms_a_view`: median. `by`: the same of some of the exposures.
 
     Raises:
         InputError: a folder holds no anatomy, or the output belongs to another run.
@@ -145,6 +145,7 @@ def _searches(scene: Scene, config: WiresConfig) -> Iterator[Search]:
                     [signals[i] for i in used],
                     [scene.imager.photons(planes[i], dose) for i in used],
                     float(scene.inserted_length[at]),
+                    before=[masks[number % 2][i] for i in used],
                 )
                 ms = 1000 * (time.perf_counter() - began) / len(used)
                 row = Search(
