@@ -51,7 +51,7 @@ readme: $(INSTALLED)
 	$(BIN)/python docs/commands.py
 	$(BIN)/python docs/signals.py
 
-# docs/learning.md's figures: two cores and an evening. What is there already is not made again.
+# docs/evidence/learning.md's figures: two cores and an evening. What is there already is not made again.
 LEARNING := runs/causal
 recipe-laptop: $(INSTALLED)
 	$(BIN)/endopilot atlas --count 100 --seed 51 -o $(LEARNING)/patients

@@ -1,4 +1,4 @@
-"""Write the measured parts of README.md and docs/demo.md from what the commands left in `runs/`.
+"""Write the measured parts of README.md and docs/evidence/demo.md from what the commands left in `runs/`.
 
 `make readme` runs it, after `make demo` and `make cta`. A part whose run is not there stays as it is.
 """
@@ -23,7 +23,7 @@ def main() -> None:
         shutil.copyfile(demo / "scene.png", IMAGES / "demo.png")
         metrics, record = read_json(demo / "metrics.json"), read_json(demo / "manifest.json")
         _replace("README.md", "demo", _demo(metrics, record))
-        _replace("docs/demo.md", "demo-table", _demo_table(metrics, record))
+        _replace("docs/evidence/demo.md", "demo-table", _demo_table(metrics, record))
     if (cta / "simulate.json").exists():
         shutil.copyfile(cta / "mask.png", IMAGES / "cta-mask.png")
         shutil.copyfile(cta / "wire.png", IMAGES / "cta-wire.png")
@@ -50,7 +50,7 @@ def _demo(metrics: dict, record: dict) -> str:
             f"10–30 and 30–45 s without X-ray; the best simple baseline errs by {_list(baseline)} mm.",
             f"- **Time**: {record['wall_seconds']:.0f} s on {record['machine']['cores']} cores "
             f"({record['machine']['processor']}). The page is `runs/demo/report.html`; "
-            "[the demo](docs/demo.md) explains every figure.",
+            "[the demo](docs/evidence/demo.md) explains every figure.",
         ]
     )
 
@@ -108,7 +108,7 @@ def _cta(run: Path) -> str:
         "arch, where our lumen shows no membrane, into the ascending aorta: "
         f"{wire['deepest_tip_mm']:.0f} mm in {wire['seconds']:g} s, with "
         f"{wire['exposures']} X-ray exposures and at most {wire['peak_force_n']:.2f} N on the wall "
-        "([navigation](docs/navigation.md#a-dissected-aorta)).\n\n"
+        "([navigation](docs/evidence/navigation.md#a-dissected-aorta)).\n\n"
         "![The CT in three slices, our lumen in green, the network's aorta in red](docs/images/cta-mask.png)\n\n"
         "![The J wire in the true lumen, over the arch](docs/images/cta-wire.png)"
     )

@@ -22,7 +22,7 @@ def bench_blind(*, robots: int = 12, episodes: int = 8, write: bool = False) -> 
     Args:
         robots: their number; gain, play, lag and the play of the rotation are drawn for each.
         episodes: of each log, of 12 s each, in the reference anatomy.
-        write: write the table of docs/reality.md.
+        write: write the table of docs/evidence/reality.md.
     """
     anatomy, wire, rows = reference_navigation().anatomy, read_wire("workhorse-014"), []
     for seed in range(robots):
@@ -42,7 +42,7 @@ def bench_blind(*, robots: int = 12, episodes: int = 8, write: bool = False) -> 
         gain, play = (abs(found.estimates[name].value - truth[name]) for name in ("gain_translation", "play_mm"))
         rows.append(row | {"passed": gain <= GAIN_BAR * truth["gain_translation"] and play <= PLAY_BAR_MM})
     if write:
-        fill("reality.md", "blind", _table(rows))
+        fill("evidence/reality.md", "blind", _table(rows))
     return rows
 
 

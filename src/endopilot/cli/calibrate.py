@@ -37,7 +37,8 @@ def command(
     `navigate`, `ladder` and `replay` take the files.
 
     Args:
-        logs: CSV files of commands and tips, driven through one vessel with one wire; docs/reality.md describes them.
+        logs: CSV files of commands and tips, driven through one vessel with one wire; docs/concepts/calibration.md
+            describes them.
         anatomy: folder made by `endopilot anatomy` of what the wire was driven through.
         output: robot.yaml; beside it robot.device.yaml, the wire, and robot.json, all intervals.
         device: name of a device (`endopilot devices`) or a YAML file, as the wire is known.

@@ -2,7 +2,7 @@
 
     command -> latency, jitter -> motor [encoder] -> gain -> play -> slip -> proximal end of the device [encoder]
 
-docs/robot.md describes the chain, and says where the numbers come from.
+docs/concepts/robot.md describes the chain, and says where the numbers come from.
 """
 
 from __future__ import annotations

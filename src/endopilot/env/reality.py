@@ -29,7 +29,7 @@ _OSTIUM_MM, _REGISTERED_MM, _TIMES = 2.5, 1.0, 2.0
 """A random world's ostium and registration lie up to this far off, mm; friction is up to so many times more or less.
 The shipped worlds differ as much."""
 _PLAY_MM, _PLAY_RAD, _GAIN, _LATENCY_S = 2.6, 5.65, 0.05, 0.1
-"""The largest plays of a random robot, mm and rad: the largest that were measured (docs/robot.md); the largest
+"""The largest plays of a random robot, mm and rad: the largest that were measured (docs/concepts/robot.md); the largest
 difference of its gains from 1, and twice the latency that is assumed, s."""
 
 
