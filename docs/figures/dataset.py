@@ -24,7 +24,7 @@ from endopilot.simulation.trajectory import Trajectory
 
 NAVIGATIONS = 3
 HELD = 0.9
-"""A drive pulls in vain where it feels this share of its pull limit."""
+"""A wire is stuck where its drive feels this share of the pull limit."""
 REFERENCE = PRESETS["accurate"]
 SETTINGS = {
     "0.75 mm, 0.001 mm": SimulatorConfig(),
@@ -32,7 +32,7 @@ SETTINGS = {
     "1 mm, 0.01 mm": SimulatorConfig(element_mm=1.0, tolerance_mm=1e-2),
     "1.25 mm, 0.01 mm": SimulatorConfig(element_mm=1.25, tolerance_mm=1e-2),
 }
-HEAD = ["vessels", "elements, tolerance", "tip error mm: median", "p95", "same branch", "drive pulls in vain", "speed"]
+HEAD = ["vessels", "elements, tolerance", "tip error mm: median", "p95", "same branch", "wire stuck", "speed"]
 
 
 def main(folders: list[str]) -> None:

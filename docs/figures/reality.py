@@ -86,16 +86,16 @@ def main() -> None:
 
 
 def _calibration(record: Path) -> str:
-    """Return what `endopilot calibrate` told as a table."""
-    told = read_json(record)
+    """Return what `endopilot calibrate` found as a table."""
+    found = read_json(record)
     lines = ["| constant | best | 95 % |", "|---|---|---|"]
-    for name, each in told["estimates"].items():
+    for name, each in found["estimates"].items():
         low, high = each["interval"]
         said = f"{low:.3g} to {high:.3g}" if each["identified"] else "not identifiable from these logs"
         lines.append(f"| `{name}` | {each['value']:.3g} | {said} |")
-    band, held = told["band_of_90_percent_mm"], told["it_holds_in_logs_left_out"]
+    band, held = found["band_of_90_percent_mm"], found["it_holds_in_logs_left_out"]
     said = f"holds in {held:.0%} of the episodes of logs left out"
-    share, known = told["start_rotation_told_in"], told["start_rotation_known_rad"]
+    share, known = found["start_rotation_known_in"], found["start_rotation_known_rad"]
     lines.append(
         f"| rotation at the start of an episode | its own | known to ± {known:.2g} rad (median) in {share:.0%} of the "
         "episodes, not identifiable in the others |"

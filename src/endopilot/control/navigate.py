@@ -52,7 +52,7 @@ class NavigateConfig:
     file. Policies are given it, not what the seed draws of it."""
     world: Text = NOMINAL
     """Name of the world that reality is, such as nominal, drawn or wide-lumen (docs/worlds.md), or a YAML file. The
-    policy is not told."""
+    policy does not know it."""
     tip: Text = "auto"
     """Shape of the wire's tip: auto (chosen for the forks of the route), own (the device's), or angle and length such
     as 75/5, 75 degrees over 5 mm."""
