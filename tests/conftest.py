@@ -7,7 +7,7 @@ from unittest.mock import patch
 import pytest
 
 from missing_libraries import missing_library
-from shape_checks import check_quickly
+from shape_checks import begin_test, check_quickly
 
 check_quickly()
 
@@ -25,6 +25,7 @@ def pytest_make_collect_report(collector):
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_setup():
     """Skip a test whose fixtures need such a library."""
+    begin_test()
     return (yield from skipping())
 
 
