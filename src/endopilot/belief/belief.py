@@ -354,7 +354,7 @@ class Belief:
                 worlds=_SIDES,
                 motion=self.navigation.known_motion,
                 config=self._core,
-                sharing=self.simulator,
+                sharing=[self.simulator],
             )
         fan, side = self._fans[kind], 2 * np.pi * np.arange(_SIDES) / _SIDES
         fan.copy_worlds(np.full(_SIDES, best), of=self.simulator)
