@@ -18,7 +18,7 @@ from endopilot.atlas.population import Population, population_of
 from endopilot.atlas.through_ct import rasterised, visible
 from endopilot.atlas.variation import TIGHTEST, Fork, bent, catheter_direction, drawn_from, ectasia, opened_fork
 
-COUNT = 24
+COUNT = 32
 REAL = {
     "rca": {
         "curvature p95, 1/mm": (0.17, 0.10, 0.25),

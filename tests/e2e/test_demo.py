@@ -16,7 +16,7 @@ from endopilot.files import read_json
 from endopilot.pipeline.study import DemoConfig
 from endopilot.runs import claim
 
-SIZE = ("--patients", "2", "--sequences", "4", "--seconds", "25")
+SIZE = ("--patients", "3", "--sequences", "3", "--seconds", "25")
 STAGES = ["atlas", "phantom", "segmentation", "anatomy", "navigation", "dataset", "evaluation", "report"]
 
 
@@ -37,7 +37,7 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path, capsys):
     assert {path: path.stat().st_mtime_ns for path in before} == before  # finished work is not done twice
 
     report = (folder / "report.html").read_text(encoding="utf-8")
-    for part in ("data:image/png;base64,", "Plotly.newPlot", "Kim et al. 2023", "Safety ratio", "patient-2"):
+    for part in ("data:image/png;base64,", "Plotly.newPlot", "Kim et al. 2023", "Safety ratio", "patient-3"):
         assert part in report
     manifest = read_json(folder / "manifest.json")
     assert list(manifest["stages"]) == STAGES and min(manifest["stages"].values()) > 0
@@ -45,7 +45,7 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path, capsys):
     metrics = read_json(folder / "metrics.json")
     unseen = metrics["splits"]["test"]
     assert list(metrics["splits"]) == ["test"]
-    assert len(unseen["anatomies"]) == 2 and unseen["episodes"] == 8
+    assert len(unseen["anatomies"]) == 3 and unseen["episodes"] == 9
     assert unseen["tip"]["P1"]["abscissa"]["all"]["skill"]["hold_slack"] > 0.4  # the packaged networks
     for series in ("P1", "P3", "P4", "hold_slack"):
         assert unseen["tip"][series]["abscissa"]["all"]["count"] > 0
@@ -83,4 +83,4 @@ def test_another_size_in_the_same_folder_is_refused(tmp_path, capsys):
     )
     (tmp_path / "stages.json").write_text("{}")
     line = command.refused(capsys, "demo", "-o", tmp_path, *SIZE)
-    assert "was begun with config.sequences = 60, now it is 6" in line
+    assert "was begun with config.sequences = 60, now it is 3" in line
