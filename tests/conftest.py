@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from unittest.mock import patch
 
 import pytest
@@ -20,6 +21,12 @@ def pytest_make_collect_report(collector):
     if reason := missing_library(error):
         report.outcome, report.longrepr = "skipped", (str(collector.path), 0, f"Skipped: {reason}")
     return report
+
+
+def pytest_collection_finish():
+    """Leave what is imported out of garbage collection, which else goes through all of it again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(wrapper=True)

@@ -7,12 +7,15 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 
 import command
 
 from endopilot import __version__
 from endopilot.devices.device import read_wire
 from endopilot.files import read_json
+from endopilot.phantom.phantom import PhantomConfig
+from endopilot.pipeline import study
 from endopilot.pipeline.study import DemoConfig
 from endopilot.runs import claim
 
@@ -20,7 +23,7 @@ SIZE = ("--patients", "3", "--sequences", "3", "--seconds", "25")
 STAGES = ["atlas", "phantom", "segmentation", "anatomy", "navigation", "dataset", "evaluation", "report"]
 
 
-def test_killed_and_started_again_it_ends_with_a_report(tmp_path, capsys):
+def test_killed_and_started_again_it_ends_with_a_report(tmp_path, capsys, monkeypatch):
     folder = tmp_path / "demo"
     line = [sys.executable, "-m", "endopilot.cli", "demo", "-o", str(folder), *SIZE]
     with subprocess.Popen(line, stderr=subprocess.DEVNULL) as first:
@@ -33,6 +36,8 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path, capsys):
     assert not (folder / "report.html").exists()
     before = {path: path.stat().st_mtime_ns for path in (folder / "truth").rglob("*.json")}
 
+    coarse = partial(PhantomConfig, in_plane_mm=0.6, slice_mm=0.7)  # seen sooner
+    monkeypatch.setattr(study, "PhantomConfig", coarse)
     again = command.run(capsys, "demo", "-o", folder, *SIZE)
     assert {path: path.stat().st_mtime_ns for path in before} == before  # finished work is not done twice
 
@@ -52,8 +57,8 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path, capsys):
     assert min(score["dice"] for score in metrics["anatomy_scores"].values()) > 0.85
     assert 'href="navigation/navigation.html"' in report and (folder / "navigation" / "navigation.html").exists()
     assert read_json(folder / "navigation" / "manifest.json")["figures"]["outcome"] in html.unescape(report)
-    partial = [path for path in folder.rglob("*") if path.name.startswith(".part")]
-    assert partial == []
+    unfinished = [path for path in folder.rglob("*") if path.name.startswith(".part")]
+    assert unfinished == []
 
     finished = (folder / "report.html").stat().st_mtime_ns
     assert command.run(capsys, "demo", "-o", folder, *SIZE) == again
