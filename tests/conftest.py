@@ -1,4 +1,4 @@
-"""Makes the modules in this folder importable from every test, and gives toy data: a dataset, a vessel, predictions."""
+"""Skips what needs a library that is not installed, and gives toy data: a dataset, a vessel, predictions."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ _LUMENS = 0.9, 1.0, 1.1
 _LARGEST_MAP = 50_000_000
 """Points of a distance map beyond which no other lumen is tried: it would take gigabytes."""
 _COMPLIANT_N_MM2 = 0.01
-"""Stiffness of a wall that is compliant: that of an artery in the heart's muscle, docs/physics.md."""
+"""Stiffness of a wall that is compliant: that of an artery in the heart's muscle, docs/concepts/wall.md."""
 _SCALES_MM = (0.5, 0.3, 0.3)
 """Scales of a good member's errors along and across its wire, and of its γtip, mm."""
 _USUAL_SD: Mapping[str, float] = {

@@ -80,7 +80,7 @@ class Film:
             for frame in self.make():
                 peak_n = max(peak_n, frame.snapshot.force_n)
                 self.frames.append(replace(frame, peak_n=peak_n))
-        except Exception as error:  # told in the page
+        except Exception as error:  # shown in the page
             self.failure = " ".join(str(error).split())
         self.done = True
 

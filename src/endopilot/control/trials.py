@@ -77,7 +77,7 @@ class Trials:
     """Trials of a stack that are driven side by side.
 
     Each is driven alike in several worlds, one for every wire that is held possible: in the first worlds are all trials
-    of the first wire, then those of the next. What is told of a trial is the weighted mean over its wires, or what
+    of the first wire, then those of the next. What a trial is judged by is the weighted mean over its wires, or what
     holds for all that count.
 
     Attributes:

@@ -183,10 +183,10 @@ def estimates(
         resolution: least half-widths of intervals: what the model itself does not resolve, however long the log.
     """
     as_good, best = found.values[found.as_good], found.values[found.best]
-    told = {}
+    estimated = {}
     for i, name in enumerate(found.names):
         spare, value = resolution.get(name, 0.0), float(best[i])
         low, high = min(float(as_good[:, i].min()), value - spare), max(float(as_good[:, i].max()), value + spare)
         least, largest = ranges[name]
-        told[name] = Estimate(value, max(low, least), min(high, largest), ranges[name], units.get(name, ""))
-    return told
+        estimated[name] = Estimate(value, max(low, least), min(high, largest), ranges[name], units.get(name, ""))
+    return estimated

@@ -58,7 +58,7 @@ class EpisodeReplay:
     Attributes:
         number: of the episode in its log.
         time_s: at which the tip was seen, by the log's clock, s.
-        given: which of the tips told where the wire lies; the others were predicted.
+        given: which of the tips say where the wire lies; the others were predicted.
         seen: the real tip, LPS mm.
         simulated: the simulated tip at the same times, LPS mm.
         abscissa: Δtip of both, seen and simulated, mm.
