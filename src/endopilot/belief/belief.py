@@ -18,7 +18,6 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.stats import qmc
 
 from endopilot.belief.drives import Drives
 from endopilot.devices.drive_limits import DriveLimits
@@ -183,6 +182,8 @@ class Belief:
     @staticmethod
     def around(config: BeliefConfig) -> tuple[World, ...]:
         """Return members evenly around what is given: friction and ostium from a Sobol sequence, every stiffness."""
+        from scipy.stats import qmc  # slow to import
+
         levels = np.linspace(-1.0, 1.0, config.stiffness_levels) if config.stiffness_levels > 1 else np.zeros(1)
         unit = 2 * qmc.Sobol(2, scramble=False).random_base2(config.members.bit_length())[1 : config.members + 1] - 1
         stiffness = 1 + config.stiffness_spread * np.resize(levels, config.members)
@@ -353,7 +354,7 @@ class Belief:
                 worlds=_SIDES,
                 motion=self.navigation.known_motion,
                 config=self._core,
-                sharing=self.simulator,
+                sharing=[self.simulator],
             )
         fan, side = self._fans[kind], 2 * np.pi * np.arange(_SIDES) / _SIDES
         fan.copy_worlds(np.full(_SIDES, best), of=self.simulator)
