@@ -33,6 +33,7 @@ BENCHMARKS = {
     "ostia": "anatomy.ostia:bench_ostia",
     "imaging": "imaging.segmentation:bench_imaging",
     "xray": "imaging.xray:bench_xray",
+    "xray-wires": "imaging.wires:bench_wires",
     "xray-processing": "imaging.processing:compare_processing",
     "angiograms": "imaging.angiograms:bench_angiograms",
     "wire-evidence": "imaging.wire_evidence:train_evidence",
