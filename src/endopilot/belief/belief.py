@@ -20,12 +20,14 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.stats import qmc
 
+from endopilot.anatomy.projection import TipProjector
 from endopilot.belief.drives import Drives
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Proximals, Stack
 from endopilot.models.ensemble import likelihoods
 from endopilot.settings import NonNegative, Positive, ShareBelowOne, Within, settings
 from endopilot.simulation.config import PRESETS, SimulatorConfig
+from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
@@ -92,7 +94,7 @@ class Past:
 
     Attributes:
         proximal: where the proximal ends of the devices were believed at each decision, mm and rad.
-        exposures: what X-ray showed, by the decision.
+        exposures: what X-ray showed, by the decision, as it was measured.
     """
 
     proximal: list[Float[np.ndarray, "devices 2"]] = field(default_factory=list)
@@ -142,6 +144,9 @@ class Belief:
         drives: where the proximal ends are.
         vessels: as members have them.
         error: of each member at the last measurement, along and across its wire, mm.
+        motion: how the vessel was found to move, which the C-arm does not know; None if it was not.
+        shown: at each measurement that was replayed, every member's tip and the direction of its wire there, in the
+            vessel as CT shows it, LPS mm.
     """
 
     def __init__(
@@ -152,6 +157,7 @@ class Belief:
         *,
         drives: Drives | None = None,
         vessels: Vessels | None = None,
+        motion: Motion | None = None,
     ) -> None:
         """Bring every member's wire to the start of the navigation.
 
@@ -161,8 +167,11 @@ class Belief:
             config: accuracy of measurements, and settings of the rod core.
             drives: of another belief about the same devices; at rest at the start if not given.
             vessels: that other beliefs have prepared.
+            motion: of the vessel, if one was found.
         """
-        self.navigation, self.members, self.config = navigation, tuple(members), config
+        self.motion = motion
+        self.navigation = navigation if motion is None else replace(navigation, known_motion=motion)
+        self.members, self.config = tuple(members), config
         self._accuracy_mm = config.along_sd_mm, config.across_sd_mm
         self._core = self.members[0].core(config.core)
         self._limits = [DriveLimits.of(each, navigation.anatomy) for each in navigation.devices]
@@ -174,11 +183,20 @@ class Belief:
         self.kinds, self.kind = _kinds(navigation, self.members, self.vessels)
         self.error = np.zeros((len(self.members), 2))
         self._score, self._coaxial = np.zeros(len(self.members)), bool(navigation.catheters)
+        self.shown: list[tuple[Float[np.ndarray, "members 3"], Float[np.ndarray, "members 3"]]] = []
         self.tip = self.simulator.project()[:, 0]
 
-    def like(self, members: Sequence[World]) -> Belief:
-        """Return a belief of other members about the same devices, at the start of the navigation."""
-        return Belief(self.navigation, members, self.config, drives=self.drives, vessels=self.vessels)
+    def like(self, members: Sequence[World], motion: Motion | None = None) -> Belief:
+        """Return a belief of other members about the same devices, at the start of the navigation.
+
+        Args:
+            members: what each takes reality to be.
+            motion: of the vessel, if another was found.
+        """
+        motion = motion or self.motion
+        return Belief(
+            self.navigation, members, self.config, drives=self.drives, vessels=self.vessels, motion=motion
+        )
 
     @staticmethod
     def around(config: BeliefConfig) -> tuple[World, ...]:
@@ -215,6 +233,31 @@ class Belief:
     def _deeper(self, given_mm: Float[np.ndarray, "members *devices"]) -> Float[np.ndarray, "members *devices"]:
         """Return inserted lengths from each member's ostium on, mm, of those from the given one on."""
         return np.maximum(given_mm + self.ostium_mm.reshape(-1, *[1] * (given_mm.ndim - 1)), 0.0)
+
+    @property
+    def score(self) -> float:
+        """Logarithm of the likelihood of the likeliest member, up to what all beliefs share."""
+        return float(np.where(self.simulator.valid, self._score, -1e6).max())
+
+    def in_vessel(self, measured: TipMeasurement, period: int) -> TipMeasurement:
+        """Return a measurement less the motion that was found.
+
+        Args:
+            measured: as the C-arm has it.
+            period: the decision at which it was taken.
+        """
+        if self.motion is None:
+            return measured
+        ostium = np.asarray(self.navigation.anatomy.insertion.position)
+        placed = self.motion.core(ostium).placements(np.array([period * DECISION_PERIOD_S]))[0][0]
+        position = np.linalg.solve(placed[:, :3], measured.position - placed[:, 3])
+        tip = self._projector(position[None])
+        at = {"abscissa": float(tip.abscissa[0]), "offset": float(tip.offset[0]), "branch": int(tip.branch[0])}
+        return replace(measured, position=position, **at)
+
+    @cached_property
+    def _projector(self) -> TipProjector:
+        return TipProjector(self.navigation.anatomy.tree, self.navigation.anatomy.insertion)
 
     @property
     def weight(self) -> Float[np.ndarray, "members"]:
@@ -286,8 +329,9 @@ class Belief:
         for period, proximal in enumerate(past.proximal):
             if period:
                 self._move(proximal)
-            measured = past.exposures.get(period)
-            if measured is not None:
+            if period in past.exposures:
+                measured = self.in_vessel(past.exposures[period], period)
+                self.shown.append((self.simulator.tip_position[:, 0].copy(), self.simulator.tip_direction[:, 0].copy()))
                 self._weigh(measured, measured.position)
                 errors.append(np.column_stack([self.error, np.abs(measured.offset - self.tip.offset)]))
         return np.stack(errors, axis=1)
