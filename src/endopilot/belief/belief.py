@@ -95,10 +95,12 @@ class Past:
     Attributes:
         proximal: where the proximal ends of the devices were believed at each decision, mm and rad.
         exposures: what X-ray showed, by the decision, as it was measured.
+        measured: encoders and loads at each decision, and what the drives had been told.
     """
 
     proximal: list[Float[np.ndarray, "devices 2"]] = field(default_factory=list)
     exposures: dict[int, TipMeasurement] = field(default_factory=dict)
+    measured: list[tuple[Proximals, Proximals, Proximals]] = field(default_factory=list)
 
 
 class Vessels:
@@ -145,6 +147,8 @@ class Belief:
         vessels: as members have them.
         error: of each member at the last measurement, along and across its wire, mm.
         motion: how the vessel was found to move, which the C-arm does not know; None if it was not.
+        evidence: logarithm of how likely the measurements so far were, each before it was taken, up to what all beliefs
+            share.
         shown: at each measurement that was replayed, every member's tip and the direction of its wire there, in the
             vessel as CT shows it, LPS mm.
     """
@@ -183,20 +187,20 @@ class Belief:
         self.kinds, self.kind = _kinds(navigation, self.members, self.vessels)
         self.error = np.zeros((len(self.members), 2))
         self._score, self._coaxial = np.zeros(len(self.members)), bool(navigation.catheters)
+        self.evidence = 0.0
         self.shown: list[tuple[Float[np.ndarray, "members 3"], Float[np.ndarray, "members 3"]]] = []
         self.tip = self.simulator.project()[:, 0]
 
-    def like(self, members: Sequence[World], motion: Motion | None = None) -> Belief:
+    def like(self, members: Sequence[World], motion: Motion | None = None, *, drives: Drives | None = None) -> Belief:
         """Return a belief of other members about the same devices, at the start of the navigation.
 
         Args:
             members: what each takes reality to be.
             motion: of the vessel, if another was found.
+            drives: where the devices are, if not where these have them.
         """
-        motion = motion or self.motion
-        return Belief(
-            self.navigation, members, self.config, drives=self.drives, vessels=self.vessels, motion=motion
-        )
+        others = {"drives": drives or self.drives, "vessels": self.vessels, "motion": motion or self.motion}
+        return Belief(self.navigation, members, self.config, **others)
 
     @staticmethod
     def around(config: BeliefConfig) -> tuple[World, ...]:
@@ -310,14 +314,23 @@ class Belief:
         The density is a Cauchy density. Its tails are heavy: a tip that snapped a moment too early says little about
         friction. Its scales are no smaller than the measurement's own standard deviations.
         """
-        self._weigh(measured, measured.position - self._relocate(measured) if self.drives.lose else measured.position)
+        if self.drives.lose:
+            self._weigh(measured, measured.position - self._relocate(measured), None)
+        else:
+            self._weigh(measured, measured.position, self.weight)
         if self.drives.lose and self.navigation.known_motion is None:  # else the next period takes them there
             self._move(self.drives.proximal)
 
-    def _weigh(self, measured: TipMeasurement, position: Float[np.ndarray, "3"]) -> None:
+    def _weigh(
+        self, measured: TipMeasurement, position: Float[np.ndarray, "3"], weight: Float[np.ndarray, "members"] | None
+    ) -> None:
+        """Weigh the members; with their weights before, the measurement counts as evidence."""
         self.error = self.errors(position)
         scaled = self.error / np.maximum(self._accuracy_mm, measured.sd_mm)
-        self._score = self._score - np.log1p((scaled**2).sum(axis=1))
+        density = 1 / (1 + (scaled**2).sum(axis=1))
+        if weight is not None:
+            self.evidence += float(np.log(np.nan_to_num(weight * density).sum() + 1e-9))
+        self._score = self._score + np.log(density)
 
     def replay(self, past: Past) -> Float[np.ndarray, "members exposures 3"]:
         """Drive the members, at the start of the navigation, as the devices went so far, and weigh them alike.
@@ -332,9 +345,27 @@ class Belief:
             if period in past.exposures:
                 measured = self.in_vessel(past.exposures[period], period)
                 self.shown.append((self.simulator.tip_position[:, 0].copy(), self.simulator.tip_direction[:, 0].copy()))
-                self._weigh(measured, measured.position)
+                self._weigh(measured, measured.position, self.weight)
                 errors.append(np.column_stack([self.error, np.abs(measured.offset - self.tip.offset)]))
         return np.stack(errors, axis=1)
+
+    def rerun(self, past: Past) -> list[Float[np.ndarray, "devices 2"]]:
+        """Follow a navigation so far from its start, with drives of its own.
+
+        Returns:
+            Where the proximal ends of the devices were believed at each decision, mm and rad.
+        """
+        proximal = []
+        for period, (encoders, load, told) in enumerate(past.measured):
+            self.drives.sent(told)
+            if period:
+                self.follow(encoders, load)
+            else:
+                self.drives.begin(encoders)
+            proximal.append(self.drives.proximal.copy())
+            if period in past.exposures:
+                self.weigh(self.in_vessel(past.exposures[period], period))
+        return proximal
 
     def explains(self, measured: TipMeasurement) -> bool:
         """Return whether the likeliest wire explains the last measurement, which has weighed the members."""
@@ -361,7 +392,10 @@ class Belief:
         error = measured.position - tip - self._shifted(best, left[:, 0])
         shift = np.einsum("si,si->s", error, along)
         across = np.linalg.norm(error - shift[:, None] * along, axis=1)
-        scaled = np.column_stack([shift, across]) / np.maximum(_PLACED_MM, measured.sd_mm)
+        errors = np.column_stack([shift, across])
+        likely = 1 / (1 + ((errors / np.maximum(self._accuracy_mm, measured.sd_mm)) ** 2).sum(axis=1))
+        self.evidence += float(np.log(likely.mean()))
+        scaled = errors / np.maximum(_PLACED_MM, measured.sd_mm)
         drives.weigh(0, -np.log1p(scaled**2).sum(axis=1))
         moved = (drives.proximal[0] - before)[:, None]
         return (self._turned(best, moved[1], fan)[0] - self._end(self.simulator)[best] + self._shifted(best, moved[0]))[

@@ -97,7 +97,8 @@ class Monitor:
         """
         self._navigation, self._config = navigation, config or BeliefConfig()
         self._advice = advice or AdviserConfig()
-        self.belief = Belief(navigation, Belief.around(self._config), self._config)
+        self._given = Belief.around(self._config)
+        self.belief = Belief(navigation, self._given, self._config)
         self._adviser = XrayAdviser(calibration, self._advice, navigation.device.tip_radius_mm)
         self._innovations, self.past, self.lost = Innovations(), Past(), False
         self.identified: Identified | None = None
@@ -123,6 +124,7 @@ class Monitor:
             exposure: what X-ray shows now; None where it is off.
         """
         period = len(self.past.proximal)
+        self.past.measured.append((encoders, load, self.belief.drives.told))
         if period:
             self.belief.follow(encoders, load)
         else:
@@ -134,9 +136,7 @@ class Monitor:
         if exposure is not None:
             self.seen = seen = self.belief.in_vessel(exposure, period)
             if self._tests:
-                self._innovations.take(
-                    np.array([seen.abscissa, seen.offset]) - tip[0], self._half, exposure.tip_sd_mm
-                )
+                self._innovations.take(np.array([seen.abscissa, seen.offset]) - tip[0], self._half, exposure.tip_sd_mm)
             self.past.exposures[period] = exposure
             self.belief.weigh(seen)
             self._adviser.exposed()
@@ -174,13 +174,21 @@ class Monitor:
         """Return whether another belief is sought: the first does not explain the images, or no longer the last one."""
         if self.changes_left == 0 or not self.alarm:
             return False
-        first = self.identified is None and self.moves is None
+        first = self.identified is None and self.moves is None and not self.belief.drives.unknown
         return first or (self._since >= _EVERY and (self.lost or self._innovations.outside))
 
     def _identify(self) -> None:
         """Change the belief to what explains all exposures."""
-        self.belief, self.identified = identify(self.belief, self.past, seed=self.changes_left)
+        found, identified = identify(self.belief, self.past, seed=self.changes_left)
         self.changes_left -= 1
+        if len(self.past.proximal) == 1:
+            self._given = found.members
+        elif not self.belief.drives.lose:
+            other = self.belief.like(self._given, drives=self.belief.drives.of_unknown_robot())
+            proximal = other.rerun(self.past)
+            if other.evidence > found.evidence:
+                found, identified, self.past.proximal = other, None, proximal
+        self.belief, self.identified = found, identified
         self._renew()
 
     def _renew(self) -> None:
@@ -196,7 +204,7 @@ class Monitor:
         past, given = self.past, self._navigation
         if not self._tests or given.known_motion is not None or len(past.exposures) < _LEAST_EXPOSURES:
             return False
-        members = Belief.around(self._config) if self.moves is None else self.belief.members
+        members = self._given if self.moves is None else self.belief.members
         still, found = self.belief.like(members), None
         still.replay(past)
         for _ in range(2):  # the wire as it lies in a vessel that lies still, and in one that moves
@@ -216,7 +224,8 @@ class Monitor:
 
     def _believed(self, tip: np.ndarray, due: bool) -> BelievedTip:
         abscissa, offset = tip.tolist()
-        found = "; ".join(each.words for each in (self.moves, self.identified) if each is not None)
+        words = [each.words for each in (self.moves, self.belief.drives, self.identified) if each is not None]
+        found = "; ".join(each for each in words if each)
         if self.lost:
             asks = "no simulated wire explains the last image" if due or not self._tests else ""
             return BelievedTip(abscissa, offset, (np.inf, np.inf), asks, found)

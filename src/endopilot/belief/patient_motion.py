@@ -135,9 +135,7 @@ class _Fit:
         evidence, _ = self._evidence(*tried, times_s, weight)
         top = np.unravel_index(np.argmax(evidence), evidence.shape)
         total = float(evidence.max() + np.log(np.exp(evidence - evidence.max()).mean()))
-        near = [
-            hz[k] + step * _FINE if len(hz) > 1 else hz for hz, k in zip(tried, top, strict=True)
-        ]
+        near = [hz[k] + step * _FINE if len(hz) > 1 else hz for hz, k in zip(tried, top, strict=True)]
         evidence, amplitude = self._evidence(*near, times_s, weight)
         k, m = np.unravel_index(np.argmax(evidence), evidence.shape)
         found = np.clip(amplitude[k, m], *np.array([_LIMITS.get(name, (-np.inf, np.inf)) for name in self.names]).T)

@@ -140,9 +140,7 @@ class _PlanningPolicy:
         check_devices(navigation)
         self.belief, self._seed = self._believe(), seed
         self._search = self._new_search()
-        self._follower = Follower(
-            self.belief.drives, devices=len(navigation.devices), turn_rad_s=self.config.search.turn_rad_s
-        )
+        self._follower = self._new_follower()
         self._back_mm, self._measured = np.inf, None
         self._lost = self._began = self._arrived = self._shows = False
         self._crept, self.plans, self._failed, self.planning_s = 0, 0, 0, 0.0
@@ -196,6 +194,10 @@ class _PlanningPolicy:
 
     def _new_search(self) -> Search:
         return Search(self.belief.navigation, self.route, self.belief, config=self.config.search, seed=self._seed)
+
+    def _new_follower(self) -> Follower:
+        devices, turn_rad_s = len(self.navigation.devices), self.config.search.turn_rad_s
+        return Follower(self.belief.drives, devices=devices, turn_rad_s=turn_rad_s)
 
     def _observe(self, observation: Observation) -> None:
         if self._began:
@@ -380,8 +382,7 @@ class AgentPolicy(_PlanningPolicy):
             monitor.return_to_given()
         if self.belief is not monitor.belief:  # another wire, lumen or ostium: another course
             self.belief, self._failed = monitor.belief, 0
-            self._search = self._new_search()
-            self._follower.begin(None)
+            self._search, self._follower = self._new_search(), self._new_follower()
         if monitor.seen is not None:
             self._located(monitor.seen, lost=monitor.lost)
         self._lost = monitor.lost
