@@ -150,6 +150,7 @@ class Belief:
             share.
         shown: at each measurement that was replayed, every member's tip and the direction of its wire there, in the
             vessel as CT shows it, LPS mm.
+        force: largest force of the wall on a node of each member at the end of the last period, N.
     """
 
     def __init__(
@@ -184,7 +185,7 @@ class Belief:
         self.ostium_mm = np.array([each.ostium_mm for each in self.members])
         self.vessels = vessels or Vessels(navigation.anatomy)
         self.kinds, self.kind = _kinds(navigation, self.members, self.vessels)
-        self.error = np.zeros((len(self.members), 2))
+        self.error, self.force = np.zeros((len(self.members), 2)), np.zeros(len(self.members))
         self._score, self._coaxial = np.zeros(len(self.members)), bool(navigation.catheters)
         self.evidence = 0.0
         self.shown: list[tuple[Float[np.ndarray, "members 3"], Float[np.ndarray, "members 3"]]] = []
@@ -294,7 +295,7 @@ class Belief:
             control[:, k] = self._limits[k].clip(motion / DECISION_PERIOD_S, now[:, k, 0], DECISION_PERIOD_S)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a member that fails has no weight
-            simulator.step(control, DECISION_PERIOD_S)
+            self.force = simulator.step(control, DECISION_PERIOD_S).contact_force_max
         self.tip = simulator.project()[:, 0]
 
     def errors(self, position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "members 2"]:
