@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.belief.bands import Calibration, Tips
@@ -131,7 +131,7 @@ class XrayAdviser:
         """Return the half-widths of the bands at the last call of `advise`, mm, for a spread; see there."""
         half = self._calibration.half_width(self._since * DECISION_PERIOD_S, self._travel, spread)
         if play is not None and play.any():
-            half = np.hypot(half, norm.ppf(0.5 + 0.5 * self._calibration.level) * play)
+            half = np.hypot(half, ndtri(0.5 + 0.5 * self._calibration.level) * play)
         return half
 
     def exposed(self) -> None:

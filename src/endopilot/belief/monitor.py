@@ -16,8 +16,9 @@ from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig, Past
 from endopilot.belief.identification import Identified, identify
 from endopilot.belief.innovations import Innovations
+from endopilot.belief.patient_motion import FoundMotion, find_motion
 from endopilot.devices.stack import Proximals
-from endopilot.tasks.navigation import Navigation
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.xray.fluoroscope import TipMeasurement
 
 _LUMEN_SHARE, _LUMEN_MM = 0.12, 0.3
@@ -25,6 +26,13 @@ _LUMEN_SHARE, _LUMEN_MM = 0.12, 0.3
 assumption."""
 _MOST, _EVERY = 6, 3
 """The belief is changed as often at most, after as many further exposures at least."""
+_LEAST_EXPOSURES, _LEAST_GAIN, _MOST_MISFIT = 3, 6.0, 0.8
+"""A motion of the vessel is looked for in as many exposures at least; and believed that makes them likelier by this
+logarithm, and leaves no larger misfit."""
+_MOTION_SD_MM = np.array([0.6, 0.1])
+"""Standard deviations of (Δtip, γtip) that a motion adds which was found, mm: measured in moving vessels."""
+_BETTER = 2.0
+"""What is found must explain all exposures better by this logarithm."""
 MISMATCH = "model mismatch"
 """Why X-ray is asked for while the model is taken to be wrong."""
 AdviserInput = tuple[
@@ -66,6 +74,8 @@ class Monitor:
         lost: whether no wire explains the last exposure.
         past: what was measured so far.
         identified: what was found when the belief was last changed; None before.
+        moves: how the vessel was found to move; None if it was not.
+        seen: the last exposure, less that motion; None where X-ray is off.
         changes_left: how often it may still be changed.
     """
 
@@ -87,10 +97,13 @@ class Monitor:
         """
         self._navigation, self._config = navigation, config or BeliefConfig()
         self._advice = advice or AdviserConfig()
-        self.belief = Belief(navigation, Belief.around(self._config), self._config)
+        self._given = Belief.around(self._config)
+        self.belief = Belief(navigation, self._given, self._config)
         self._adviser = XrayAdviser(calibration, self._advice, navigation.device.tip_radius_mm)
         self._innovations, self.past, self.lost = Innovations(), Past(), False
         self.identified: Identified | None = None
+        self.moves: FoundMotion | None = None
+        self.seen: TipMeasurement | None = None
         self._tests = not navigation.catheters
         self.changes_left, self._since, self._returned = _MOST, 0, False
         proximal, tip, spread, radius = adviser_input(self.belief)
@@ -111,25 +124,29 @@ class Monitor:
             exposure: what X-ray shows now; None where it is off.
         """
         period = len(self.past.proximal)
+        self.past.measured.append((encoders, load, self.belief.drives.told))
         if period:
             self.belief.follow(encoders, load)
         else:
             self.belief.drives.begin(encoders)
         self.past.proximal.append(self.belief.drives.proximal.copy())
-        play = self.belief.play_spread()[None]
+        play = np.hypot(self.belief.play_spread(), 0.0 if self.belief.motion is None else _MOTION_SD_MM)[None]
         proximal, tip, spread, radius = adviser_input(self.belief)
+        self.seen = None
         if exposure is not None:
-            seen = np.array([exposure.abscissa, exposure.offset])
+            self.seen = seen = self.belief.in_vessel(exposure, period)
             if self._tests:
-                self._innovations.take(seen - tip[0], self._half, exposure.tip_sd_mm)
+                self._innovations.take(np.array([seen.abscissa, seen.offset]) - tip[0], self._half, exposure.tip_sd_mm)
             self.past.exposures[period] = exposure
-            self.belief.weigh(exposure)
+            self.belief.weigh(seen)
             self._adviser.exposed()
-            self.lost = not self.belief.explains(exposure)
+            self.lost = not self.belief.explains(seen)
             self._innovations.alarm |= self.lost and self._tests
             self._since += 1
-            if self._is_to_change():
-                self._identify(exposure)
+            if self.alarm and self._finds_motion():
+                self._renew()
+            elif self._is_to_change():
+                self._identify()
             proximal, tip, spread, radius = adviser_input(self.belief)
         elif self.belief.drives.proximal[0, 0] <= self._navigation.start_inserted_length_mm:
             self.lost = False  # back where it began, the wire lies as it did, unseen in its catheter
@@ -157,18 +174,58 @@ class Monitor:
         """Return whether another belief is sought: the first does not explain the images, or no longer the last one."""
         if self.changes_left == 0 or not self.alarm:
             return False
-        return self.identified is None or (self._since >= _EVERY and (self.lost or self._innovations.outside))
+        first = self.identified is None and self.moves is None and not self.belief.drives.unknown
+        return first or (self._since >= _EVERY and (self.lost or self._innovations.outside))
 
-    def _identify(self, exposure: TipMeasurement) -> None:
+    def _identify(self) -> None:
         """Change the belief to what explains all exposures."""
-        self.belief, self.identified = identify(self.belief, self.past, seed=self.changes_left)
-        self.changes_left, self._since = self.changes_left - 1, 0
+        found, identified = identify(self.belief, self.past, seed=self.changes_left)
+        self.changes_left -= 1
+        if len(self.past.proximal) == 1:
+            self._given = found.members
+        elif not self.belief.drives.lose:
+            other = self.belief.like(self._given, drives=self.belief.drives.of_unknown_robot())
+            proximal = other.rerun(self.past)
+            if other.evidence > found.evidence:
+                found, identified, self.past.proximal = other, None, proximal
+        self.belief, self.identified = found, identified
+        self._renew()
+
+    def _renew(self) -> None:
+        """Begin with another belief."""
+        self._since = 0
         self._innovations.renew()
-        self.lost = not self.belief.explains(exposure)
+        period = len(self.past.proximal) - 1
+        self.seen = self.belief.in_vessel(self.past.exposures[period], period)
+        self.lost = not self.belief.explains(self.seen)
+
+    def _finds_motion(self) -> bool:
+        """Return whether a motion of the vessel explains the exposures, and take it into the belief then."""
+        past, given = self.past, self._navigation
+        if not self._tests or given.known_motion is not None or len(past.exposures) < _LEAST_EXPOSURES:
+            return False
+        members = self._given if self.moves is None else self.belief.members
+        still, found = self.belief.like(members), None
+        still.replay(past)
+        for _ in range(2):  # the wire as it lies in a vessel that lies still, and in one that moves
+            best = int(np.argmax(still.weight))
+            tip, direction = (np.array([each[best] for each in some]) for some in zip(*still.shown, strict=True))
+            seen = np.array([each.position for each in past.exposures.values()])
+            times_s = DECISION_PERIOD_S * np.array(list(past.exposures))
+            found = find_motion(tip, direction, seen, times_s, np.asarray(given.anatomy.insertion.position))
+            if found.gain < _LEAST_GAIN or found.misfit > _MOST_MISFIT:
+                return False
+            still = self.belief.like(members, found.motion)
+            still.replay(past)
+        if still.score < self.belief.score + _BETTER:
+            return False
+        self.belief, self.moves, self.identified = still, found, None
+        return True
 
     def _believed(self, tip: np.ndarray, due: bool) -> BelievedTip:
         abscissa, offset = tip.tolist()
-        found = "" if self.identified is None else self.identified.words
+        words = [each.words for each in (self.moves, self.belief.drives, self.identified) if each is not None]
+        found = "; ".join(each for each in words if each)
         if self.lost:
             asks = "no simulated wire explains the last image" if due or not self._tests else ""
             return BelievedTip(abscissa, offset, (np.inf, np.inf), asks, found)

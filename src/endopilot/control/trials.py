@@ -114,7 +114,7 @@ class Trials:
             like: a simulator of the same anatomies, whose settings are taken.
         """
         anatomies, stacks = zip(*(kind for kind in kinds for _ in range(count)), strict=True)
-        simulator = Simulator(anatomies, stacks, motion=navigation.known_motion, config=like.config, sharing=like)
+        simulator = Simulator(anatomies, stacks, motion=navigation.known_motion, config=like.config, sharing=[like])
         limits = [DriveLimits.of(device, navigation.anatomy) for device in stacks[0].devices]
         first, last = limits[0].travel_mm
         travel = first, last - _SHORT_MM
