@@ -42,6 +42,8 @@ def test_links_lead_somewhere(page: Path) -> None:
         target = (page.parent / path).resolve() if path else page
         if "generated" in target.parts:
             continue  # what sphinx-gallery makes
+        if target.suffix in (".png", ".gif") and not (ROOT / "docs/images").exists():
+            continue  # an sdist has no pictures
         if not target.exists() or (anchor and target.suffix == ".md" and anchor not in headings(target)):
             lost.append(f"{path}#{anchor}")
     assert lost == []
