@@ -38,7 +38,7 @@ class TurnNetwork:
     layers: tuple[tuple[np.ndarray, np.ndarray], ...]
 
     def passes(self, view: ForkView) -> Float[np.ndarray, "sides"]:
-        """Return how likely the wire passes with its tip at each of `AZIMUTH`, 0 to 1; mirrored forks count too."""
+        """Return how likely the wire passes with its tip at each of `AZIMUTH`, by a fork and its mirror image."""
         mirrored = self._passes(view.mirrored())
         return 0.5 * (self._passes(view) + np.roll(mirrored[::-1], 1))
 
