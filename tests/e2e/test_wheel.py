@@ -1,4 +1,7 @@
-"""The wheel, built from the sdist and installed into a clean environment, does what the base install promises."""
+"""The wheel, built from the sdist and installed into a clean environment, does what the base install promises.
+
+`make release` runs these tests with what it has built, and with the sdist too.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,13 @@ from pathlib import Path
 
 import pytest
 
+from endopilot import __version__
+
 ROOT = Path(__file__).parents[2]
+RELEASE = os.environ.get("ENDOPILOT_RELEASE")
+"""Folder in which `make release` has put sdist and wheels; without it both are built here."""
+QUICK = ("-C", "cmake.define.CMAKE_CXX_FLAGS_RELEASE=-O1 -DNDEBUG", "-C", "cmake.define.ENDOPILOT_LEVELS=")
+"""The core's baseline alone, with little optimisation: the other tests run what is released."""
 UNREACHABLE = re.compile(
     "NewConnectionError|NameResolutionError|ConnectTimeout|ReadTimeout|Network is unreachable|Connection refused"
 )
@@ -22,32 +31,38 @@ UNREACHABLE = re.compile(
 def install(*arguments: str | Path) -> None:
     """Run pip, and skip the test where no package index can be reached."""
     result = subprocess.run([*map(str, arguments)], capture_output=True, encoding="utf-8")
-    if result.returncode and UNREACHABLE.search(result.stdout + result.stderr):
+    if result.returncode and not RELEASE and UNREACHABLE.search(result.stdout + result.stderr):
         pytest.skip("no package index can be reached, and the wheel needs one for its build and its libraries")
     assert result.returncode == 0, result.stdout + result.stderr
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a wheel that was built from an sdist, in little time: the other tests run what is released.
-
-    It holds the core's baseline alone, with little optimisation.
-    """
+def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with an sdist and the wheel built from it: those of the release, or quick ones."""
+    if RELEASE:
+        return Path(RELEASE)
     folder = tmp_path_factory.mktemp("dist")
-    quick = ("-C", "cmake.define.CMAKE_CXX_FLAGS_RELEASE=-O1 -DNDEBUG", "-C", "cmake.define.ENDOPILOT_LEVELS=")
-    install(sys.executable, "-m", "build", *quick, "--outdir", folder, ROOT)
-    assert len(list(folder.glob("*.tar.gz"))) == 1
-    (made,) = folder.glob("*.whl")
-    return made
+    install(sys.executable, "-m", "build", *QUICK, "--outdir", folder, ROOT)
+    return folder
 
 
 @pytest.fixture(scope="module")
-def clean(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the `bin` folder of an environment that holds the wheel and its base libraries alone."""
+def wheel(dist: Path) -> Path:
+    """Return the wheel for this Python."""
+    (made,) = dist.glob(f"endopilot-{__version__}-cp{sys.version_info[0]}{sys.version_info[1]}-*.whl")
+    return made
+
+
+@pytest.fixture(scope="module", params=["wheel", "sdist"] if RELEASE else ["wheel"])
+def clean(request: pytest.FixtureRequest, dist: Path, wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the `bin` folder of an environment that holds the wheel, or the sdist, and its base libraries alone."""
     folder = tmp_path_factory.mktemp("clean")
     venv.create(folder, with_pip=True)
     pip = (folder / "bin" / "python", "-m", "pip", "install", "-q", "--no-compile", "-c", ROOT / "constraints.txt")
-    install(*pip, wheel)
+    if request.param == "wheel":
+        install(*pip, wheel)
+    else:
+        install(*pip, *QUICK, dist / f"endopilot-{__version__}.tar.gz")
     return folder / "bin"
 
 
@@ -82,6 +97,7 @@ def test_it_simulates_and_plans(clean: Path) -> None:
 
 
 def test_the_command_line_answers(clean: Path) -> None:
+    assert run(clean, "endopilot", "--version").stdout == f"endopilot {__version__}\n"
     assert "endopilot COMMAND" in run(clean, "endopilot", "--help").stdout
     extras = json.loads(run(clean, "endopilot", "info", "--json").stdout)["extras"]
     assert not any(extras.values())

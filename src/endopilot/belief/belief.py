@@ -18,7 +18,6 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.stats import qmc
 
 from endopilot.anatomy.projection import TipProjector
 from endopilot.belief.drives import Drives
@@ -155,6 +154,7 @@ class Belief:
             share.
         shown: at each measurement that was replayed, every member's tip and the direction of its wire there, in the
             vessel as CT shows it, LPS mm.
+        force: largest force of the wall on a node of each member at the end of the last period, N.
     """
 
     def __init__(
@@ -189,7 +189,7 @@ class Belief:
         self.ostium_mm = np.array([each.ostium_mm for each in self.members])
         self.vessels = vessels or Vessels(navigation.anatomy)
         self.kinds, self.kind = _kinds(navigation, self.members, self.vessels)
-        self.error = np.zeros((len(self.members), 2))
+        self.error, self.force = np.zeros((len(self.members), 2)), np.zeros(len(self.members))
         self._score, self._coaxial = np.zeros(len(self.members)), bool(navigation.catheters)
         self.evidence = 0.0
         self.shown: list[tuple[Float[np.ndarray, "members 3"], Float[np.ndarray, "members 3"]]] = []
@@ -209,6 +209,8 @@ class Belief:
     @staticmethod
     def around(config: BeliefConfig) -> tuple[World, ...]:
         """Return members evenly around what is given: friction and ostium from a Sobol sequence, every stiffness."""
+        from scipy.stats import qmc  # slow to import
+
         levels = np.linspace(-1.0, 1.0, config.stiffness_levels) if config.stiffness_levels > 1 else np.zeros(1)
         unit = 2 * qmc.Sobol(2, scramble=False).random_base2(config.members.bit_length())[1 : config.members + 1] - 1
         stiffness = 1 + config.stiffness_spread * np.resize(levels, config.members)
@@ -297,7 +299,7 @@ class Belief:
             control[:, k] = self._limits[k].clip(motion / DECISION_PERIOD_S, now[:, k, 0], DECISION_PERIOD_S)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a member that fails has no weight
-            simulator.step(control, DECISION_PERIOD_S)
+            self.force = simulator.step(control, DECISION_PERIOD_S).contact_force_max
         self.tip = simulator.project()[:, 0]
 
     def errors(self, position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "members 2"]:
@@ -435,7 +437,7 @@ class Belief:
                 worlds=_SIDES,
                 motion=self.navigation.known_motion,
                 config=self._core,
-                sharing=self.simulator,
+                sharing=[self.simulator],
             )
         fan, side = self._fans[kind], 2 * np.pi * np.arange(_SIDES) / _SIDES
         fan.copy_worlds(np.full(_SIDES, best), of=self.simulator)

@@ -107,7 +107,7 @@ class TipDetector:
             The tip; None where there is no wire.
         """
         found = self.estimate(views, signals, photons, inserted_length, slack_mm)
-        return found if found.log_odds >= self.config.least_log_odds else None
+        return None if found.status == "not found" else found
 
     def estimate(
         self,
@@ -123,7 +123,8 @@ class TipDetector:
         deepest = _AHEAD_SHARE * max(inserted_length, 0.0) + _AHEAD_MM
         slack_mm = self.config.slack_mm if slack_mm is None else slack_mm
         corridor = make_corridor(self._anatomy, self._radius_mm, slack_mm, deepest)
-        return _refined(track(corridor, views, evidence, inserted_length), views, plain, self._radius_mm)
+        found = _refined(track(corridor, views, evidence, inserted_length), views, plain, self._radius_mm)
+        return replace(found, status="found" if found.log_odds >= self.config.least_log_odds else "not found")
 
     def _saturated(self, log_ratio: Signal) -> Signal:
         """Return evidence that no single pixel can overrule all others with."""

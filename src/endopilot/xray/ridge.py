@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 from scipy.ndimage import gaussian_filter
-from skimage.feature import hessian_matrix, hessian_matrix_eigvals
 
 from endopilot.files import read_json
 
@@ -59,7 +58,10 @@ class RidgeEvidence:
 
 def features(signal: Float32[np.ndarray, "rows columns"], photons: float) -> Float32[np.ndarray, "rows columns f"]:
     """Return the features of every pixel: ridges and darkness over the noise, and the noise itself."""
+    from skimage.feature import hessian_matrix, hessian_matrix_eigvals  # slow to import
+
     noise = np.exp(-0.5 * gaussian_filter(signal, _AROUND_PX)) / np.float32(np.sqrt(photons))
+
     found = []
     for scale in SCALES_PX:
         sigma: Any = scale  # its annotation says int; it takes floats

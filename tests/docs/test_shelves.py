@@ -1,0 +1,34 @@
+"""The documentation's shelves: pages are short, and pages that code and messages name are there."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+WORDS = runpy.run_path(str(ROOT / "docs/words.py"))
+
+
+def test_pages_are_within_the_bound_of_their_shelf() -> None:
+    assert [str(page) for page, count, bound in WORDS["pages"]() if count > bound] == []
+
+
+def test_what_is_generated_is_not_counted() -> None:
+    assert WORDS["words"]("# One\n<!-- a:begin -->\n| two | three |\n<!-- a:end -->\n| four | – |\n") == 2
+
+
+def test_pages_that_code_and_messages_name_exist() -> None:
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("no git checkout")
+    named = set()
+    for name in listed.stdout.splitlines():
+        path = ROOT / name
+        if path.suffix in {".py", ".md", ".yaml", ".toml", ".hpp", ".cpp", ".js"} and path.is_file():
+            named |= set(re.findall(r"(?<![\w/])docs/[\w/-]+\.md", path.read_text(encoding="utf-8")))
+    assert len(named) > 10
+    assert sorted(page for page in named if not (ROOT / page).exists()) == []
