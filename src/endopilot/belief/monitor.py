@@ -223,6 +223,8 @@ class Monitor:
         if not self._tests or given.known_motion is not None or len(self.past.exposures) < _LEAST_EXPOSURES:
             return False
         members, past = self.belief.members, self.past
+        if self.moves is not None and not (self.lost or self._innovations.outside or self._since >= _EVERY):
+            return False
         if self.moves is None:
             members = self._given
             if drives.unknown:  # its encoder may be right, and the image was wrong
