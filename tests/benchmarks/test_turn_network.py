@@ -30,7 +30,8 @@ def test_trials_before_a_fork_pass_on_some_sides_and_not_on_others(fork, wire) -
 
 def test_the_network_learns_which_sides_pass(monkeypatch) -> None:
     """Sides within 1 rad of what the features say pass: the network finds them at forks it has not seen."""
-    monkeypatch.setattr(turn_network, "EPOCHS", 30)
+    for name, few in (("EPOCHS", 25), ("NETWORKS", 1), ("WIDTH", 48)):
+        monkeypatch.setattr(turn_network, name, few)
     random = np.random.default_rng(0)
     angle = random.uniform(-np.pi, np.pi, 400)
     view = 0.1 * random.standard_normal((400, FEATURES))
