@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test test-wheel check cta readme docs roofline recipe-laptop recipe-gpu gpu-figures clean
+.PHONY: demo test test-wheel release check cta readme docs roofline recipe-laptop recipe-gpu gpu-figures clean
 
 demo: $(INSTALLED)
 	$(BIN)/endopilot demo
@@ -27,6 +27,24 @@ test-wheel: $(INSTALLED)
 	rm -r $(CLEAN)/source/src/endopilot
 	cd $(CLEAN)/source && OMP_NUM_THREADS=1 ../venv/bin/python -m pytest -n auto --dist loadfile --no-loadscope-reorder \
 	  --ignore tests/e2e/test_wheel.py
+
+# The version of src/endopilot/__init__.py in dist/: notes from CHANGELOG.md, sdist and wheels, tried where no source is.
+# manylinux wheels need Docker; without it the wheel is one of this machine's Linux, which no package index takes.
+TOOLS := build/release
+release: $(INSTALLED)
+	rm -rf dist $(TOOLS)
+	$(PYTHON) -m venv $(TOOLS)
+	$(TOOLS)/bin/pip install -q build cibuildwheel twine
+	mkdir dist && $(BIN)/python docs/release.py > $(TOOLS)/notes.md
+	if docker info >/dev/null 2>&1; then \
+	  $(TOOLS)/bin/python -m build --sdist && $(TOOLS)/bin/cibuildwheel --platform linux --output-dir dist dist/*.tar.gz; \
+	else \
+	  echo "manylinux wheels: skipped, Docker does not run here" && $(TOOLS)/bin/python -m build; \
+	fi
+	$(TOOLS)/bin/twine check --strict dist/*
+	OMP_NUM_THREADS=1 ENDOPILOT_RELEASE=$(CURDIR)/dist $(BIN)/python -m pytest -v tests/e2e/test_wheel.py
+	mv $(TOOLS)/notes.md dist/notes.md
+	ls -l dist
 
 check: $(INSTALLED)
 	$(BIN)/ruff check .
@@ -51,7 +69,7 @@ readme: $(INSTALLED)
 	$(BIN)/python docs/commands.py
 	$(BIN)/python docs/signals.py
 
-# docs/learning.md's figures: two cores and an evening. What is there already is not made again.
+# docs/evidence/learning.md's figures: two cores and an evening. What is there already is not made again.
 LEARNING := runs/causal
 recipe-laptop: $(INSTALLED)
 	$(BIN)/endopilot atlas --count 100 --seed 51 -o $(LEARNING)/patients
@@ -98,9 +116,13 @@ roofline:
 	  -I src/core benchmarks/core/roofline.cpp -o build/roofline
 	build/roofline
 
+# The site with its tutorials run, and its links checked; those to other sites where they can be reached.
 docs: $(INSTALLED)
-	$(BIN)/pip install -q -c constraints.txt -e '.[docs]'
+	$(BIN)/pip install -q -c constraints.txt 'endopilot[docs]'
 	$(BIN)/sphinx-build -W -q docs docs/_build
+	ignored=; $(BIN)/python -c 'from urllib.request import urlopen; urlopen("https://arxiv.org", timeout=10)' 2>/dev/null || \
+	  { echo "links to other sites: skipped, no network"; ignored=https?://; }; \
+	$(BIN)/sphinx-build -W -q -b linkcheck -D plot_gallery=0 -D linkcheck_ignore="$$ignored" docs docs/_build/linkcheck
 
 $(INSTALLED): pyproject.toml constraints.txt CMakeLists.txt $(wildcard src/core/*)
 	$(PYTHON) -c 'import sys; sys.exit("endopilot needs Python 3.11 or newer; name one: make PYTHON=python3.12 demo" if sys.version_info < (3, 11) else 0)'

@@ -43,6 +43,7 @@ BENCHMARKS = {
     "ladder-patients": "agent.ladder_patients:choose_patients",
     "xray-conditions": "agent.xray_conditions:drive_under_conditions",
     "worlds": "agent.worlds:drive_in_worlds",
+    "turn-network": "agent.turn_network:train_turns",
 }
 """Name of each benchmark, and the function that measures: module and name."""
 EXIT_FAILED, EXIT_BAD_INPUT = 1, 2

@@ -89,7 +89,7 @@ def bench_cockpit(*, catheter: str | None = None) -> dict[str, Any]:
         InputError: there is no browser, or playwright is not installed; no such catheter.
     """
     if catheter is not None:
-        read_catheter(catheter)  # or the server's error would be all that is told
+        read_catheter(catheter)  # or the server's error would be all that is shown
     browser_path = find_browser()
     if browser_path is None:
         raise InputError("browser: none found; install Chromium or Chrome")

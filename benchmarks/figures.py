@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from endopilot.cli.arguments import show, show_rows
+from endopilot.files import processor_name
 
 T = TypeVar("T")
 Number = float | int
@@ -124,9 +126,23 @@ def spread(name: str, values_mm: np.ndarray, *, digits: int = 5) -> dict[str, fl
     return {f"{name}_{what}_mm": round(float(value), digits) for what, value in found.items()}
 
 
-def fill(page: str, mark: str, lines: Iterable[str]) -> None:
-    """Write lines between the marks of some name in a page of the documentation."""
+def made_on() -> str:
+    """Return the line that ends a table of measured figures in the documentation: the day and the processor."""
+    return f"Made on {date.today()}, {processor_name()}."
+
+
+def fill(page: str, mark: str, lines: str | Iterable[str], *, dated: bool = True) -> None:
+    """Write lines between the marks of some name in a page of the documentation.
+
+    Args:
+        page: the page's path in `docs`.
+        mark: name of the marks.
+        lines: what is to stand there.
+        dated: end it with the day and the processor, as measured figures need.
+    """
     begin, end = f"<!-- {mark}:begin -->\n", f"<!-- {mark}:end -->"
-    text = (DOCS / page).read_text(encoding="utf-8")
-    head, rest = text.split(begin)[0], text.split(end)[1]
-    (DOCS / page).write_text(head + begin + "\n".join(lines) + f"\n{end}{rest}", encoding="utf-8")
+    text = (lines if isinstance(lines, str) else "\n".join(lines)).rstrip("\n")
+    whole = f"{text}\n\n{made_on()}" if dated else text
+    path = DOCS / page
+    head, rest = path.read_text(encoding="utf-8").split(begin)
+    path.write_text(f"{head}{begin}{whole}\n{end}{rest.split(end)[1]}", encoding="utf-8")

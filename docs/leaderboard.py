@@ -1,4 +1,4 @@
-"""Write the tables of docs/leaderboard.md from the files in submissions/: `python docs/leaderboard.py`."""
+"""Write the tables of docs/evidence/leaderboard.md from the files in submissions/: `python docs/leaderboard.py`."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from endopilot.ladder.scores import score_navigations
 from endopilot.ladder.submission import Submission, read_submission
 from endopilot.tasks.task import list_tasks
 
-PAGE = Path(__file__).with_suffix(".md")
-FOLDER = PAGE.parents[1] / "submissions"
+PAGE = Path(__file__).parent / "evidence" / "leaderboard.md"
+FOLDER = PAGE.parents[2] / "submissions"
 LINKS_FILE = "links.yaml"
 TITLES = {2: "Version 2", "coaxial": "Wire and catheter", 1: "Version 1"}
 HEAD = ("policy", "tasks", "navigations", "safe success, %", "95 % interval", "exposures", "peak force, N", "time, s")
@@ -48,7 +48,7 @@ def _row(path: Path, submission: Submission, link: str) -> tuple[tuple[int, floa
     cells = (
         f"[{submission.policy}]({link})",
         named,
-        f"[{count}](../submissions/{path.name})",
+        f"[{count}](../../submissions/{path.name})",
         f"{100 * safe:.0f}",
         f"{100 * low:.0f}–{100 * high:.0f}",
         scores["exposures"],

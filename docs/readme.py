@@ -1,4 +1,4 @@
-"""Write the measured parts of README.md and docs/demo.md from what the commands left in `runs/`.
+"""Write the measured parts of README.md and docs/evidence/demo.md, from `runs/` and from other pages.
 
 `make readme` runs it, after `make demo` and `make cta`. A part whose run is not there stays as it is.
 """
@@ -14,6 +14,7 @@ from endopilot.report.report_text import tip_rows
 ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "images"
 SPLIT = "test"
+SPEED = ("simulation", "realtime_factor_per_core"), ("errors", "true_tip_error_median_mm")
 
 
 def main() -> None:
@@ -23,11 +24,12 @@ def main() -> None:
         shutil.copyfile(demo / "scene.png", IMAGES / "demo.png")
         metrics, record = read_json(demo / "metrics.json"), read_json(demo / "manifest.json")
         _replace("README.md", "demo", _demo(metrics, record))
-        _replace("docs/demo.md", "demo-table", _demo_table(metrics, record))
+        _replace("docs/evidence/demo.md", "demo-table", _demo_table(metrics, record))
     if (cta / "simulate.json").exists():
         shutil.copyfile(cta / "mask.png", IMAGES / "cta-mask.png")
         shutil.copyfile(cta / "wire.png", IMAGES / "cta-wire.png")
         _replace("README.md", "cta", _cta(cta))
+    _replace("README.md", "stands", stands())
 
 
 def _replace(page: str, name: str, content: str) -> None:
@@ -50,7 +52,7 @@ def _demo(metrics: dict, record: dict) -> str:
             f"10–30 and 30–45 s without X-ray; the best simple baseline errs by {_list(baseline)} mm.",
             f"- **Time**: {record['wall_seconds']:.0f} s on {record['machine']['cores']} cores "
             f"({record['machine']['processor']}). The page is `runs/demo/report.html`; "
-            "[the demo](docs/demo.md) explains every figure.",
+            "[the demo](docs/evidence/demo.md) explains every figure.",
         ]
     )
 
@@ -100,18 +102,106 @@ def _cta(run: Path) -> str:
     """Return agreement and navigation in the real CT angiogram."""
     mask, wire = read_json(run / "segment.json"), read_json(run / "navigation" / "manifest.json")["figures"]
     return (
-        f"Dice {mask['dice']:.2f} against the aorta of a segmentation network (not a human reader): "
-        f"{100 * mask['share_inside_reference']:.0f} % of our lumen lies inside theirs, {mask['cut_off_ml']:.0f} ml of "
-        "theirs are outside ours (mostly false lumen without contrast), "
-        f"{mask['beyond_ml']:.0f} ml of ours are outside theirs (stumps of arch branches). The entry "
-        "lies in the false lumen. The agent takes the 0.035″ J wire through a tear into the true lumen, and over the "
-        "arch, where our lumen shows no membrane, into the ascending aorta: "
-        f"{wire['deepest_tip_mm']:.0f} mm in {wire['seconds']:g} s, with "
-        f"{wire['exposures']} X-ray exposures and at most {wire['peak_force_n']:.2f} N on the wall "
-        "([navigation](docs/navigation.md#a-dissected-aorta)).\n\n"
+        f"Dice {mask['dice']:.2f} against the aorta of a segmentation network (not a human reader). The agent takes "
+        "the 0.035″ J wire from the false lumen through a tear into the true one and over the arch: "
+        f"{wire['deepest_tip_mm']:.0f} mm in {wire['seconds']:g} s, with {wire['exposures']} X-ray exposures and at "
+        f"most {wire['peak_force_n']:.2f} N on the wall "
+        "([navigation](docs/evidence/navigation.md#a-dissected-aorta)).\n\n"
         "![The CT in three slices, our lumen in green, the network's aorta in red](docs/images/cta-mask.png)\n\n"
         "![The J wire in the true lumen, over the arch](docs/images/cta-wire.png)"
     )
+
+
+def stands() -> str:
+    """Return the table of where endopilot stands beside others, with the figures that the pages of evidence hold."""
+    speed, error = (_row("performance", block, row)[0] for block, row in SPEED)
+    (agent, *_) = _row("ladder", "scores", "all twelve")
+    theirs = {task: _row("ladder", "benchmark", task.lower()) for task in ("ArchVariety", "DualDeviceNav")}
+    ours = {task: _row("ladder", "benchmark", task.lower(), "agent") for task in theirs}
+    plane = _row("reality", "reality", "error in the camera")[-1]
+    share, forks = _row("reality", None, "the real branch, of forks in two")[1].split(" of ")
+    band, kept = _row("reality", "calibration", "band of Δtip")
+    straight, leaning, play = (
+        _row("planning", None, row)[0] for row in ("as it is believed", "leans by", "as believed;")
+    )
+    rows = [
+        (
+            "speed",
+            f"{float(speed):.0f} times real time on one core, tips err by {float(error):.3f} mm (median); the same "
+            "wire in MuJoCo takes some 3 s of a core for a second",
+            "beside simulators made for guidewires",
+            [("performance", ""), ("worlds", "#another-engine")],
+        ),
+        (
+            "own tasks",
+            f"ladder, version 2: {agent.split()[0]} % of 240 navigations are safe",
+            "in others' simulators",
+            [("ladder", "#version-2")],
+        ),
+        (
+            "tasks of others",
+            "stEVE_bench, within 5 mm: "
+            + "; ".join(
+                f"{task} {_of_ours(row)}, its learned controller {theirs[task][2]} %" for task, row in ours.items()
+            ),
+            "with devices as stiff as a hospital's",
+            [("ladder", "#tasks-of-a-public-benchmark")],
+        ),
+        (
+            "a real robot",
+            f"public log of a phantom, sessions kept aside: tips err by {plane} mm (median), "
+            f"{100 * float(share):.0f} % of {forks} forks are taken as the real wire took them; "
+            f"a band of {band} for Δtip holds throughout "
+            f"{kept.split('%')[0].split()[-1]} % of the episodes",
+            "forces; a robot driven by the agent",
+            [("reality", "")],
+        ),
+        (
+            "real patients",
+            f"simulated wires in coronary arteries of seven CTs: {straight} distal targets safely, {leaning} where the "
+            f"guiding catheter leans by 20°, {play} with play in the drive",
+            "wires in patients; real fluoroscopy",
+            [("planning", "#real-arteries")],
+        ),
+    ]
+    lines = ["| beside | measured | not measured | page |", "| --- | --- | --- | --- |"]
+    for beside, measured, missing, pages in rows:
+        links = ", ".join(f"[{name}]({_path(name).relative_to(ROOT)}{anchor})" for name, anchor in pages)
+        lines.append(f"| {beside} | {measured} | {missing} | {links} |")
+    return "\n".join(lines)
+
+
+def _of_ours(row: list[str]) -> str:
+    """Return the agent's share of a benchmark's row, in words."""
+    return f"{row[2]} %" if row else "not measured yet"
+
+
+def _path(name: str) -> Path:
+    """Return the file of a page of the documentation."""
+    evidence = ROOT / "docs" / "evidence" / f"{name}.md"
+    return evidence if evidence.exists() else ROOT / "docs" / f"{name}.md"
+
+
+def _row(page: str, block: str | None, begin: str, also: str = "") -> list[str]:
+    """Return the cells after the first of a table's row.
+
+    Args:
+        page: name of the page.
+        block: between whose marks the table stands; None for the whole page.
+        begin: of the row's first cell.
+        also: what another cell holds.
+
+    Returns:
+        The cells, none if there is no such row.
+    """
+    text = _path(page).read_text(encoding="utf-8")
+    if block is not None:
+        text = text.split(f"<!-- {block}:begin -->")[1].split(f"<!-- {block}:end -->")[0]
+    for line in text.splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if cells[0].startswith(begin) and (not also or also in cells):
+            return cells[1:]
+    return []
 
 
 if __name__ == "__main__":

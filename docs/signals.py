@@ -1,4 +1,4 @@
-"""Write the table of a trajectory's signals in docs/simulation.md: `python docs/signals.py`."""
+"""Write the table of a trajectory's signals in docs/concepts/trajectory.md: `python docs/signals.py`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from endopilot.simulation.signals import SIGNALS
 
-PAGE = Path(__file__).with_name("simulation.md")
+PAGE = Path(__file__).parent / "concepts" / "trajectory.md"
 BEGIN, END = "<!-- signals:begin -->", "<!-- signals:end -->"
 
 

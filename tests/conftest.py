@@ -1,13 +1,14 @@
-"""Makes the modules in this folder importable from every test, and gives toy data: a dataset, a vessel, predictions."""
+"""Skips what needs a library that is not installed, and gives toy data: a dataset, a vessel, predictions."""
 
 from __future__ import annotations
 
+import gc
 from unittest.mock import patch
 
 import pytest
 
 from missing_libraries import missing_library
-from shape_checks import check_quickly
+from shape_checks import begin_test, check_quickly
 
 check_quickly()
 
@@ -22,9 +23,16 @@ def pytest_make_collect_report(collector):
     return report
 
 
+def pytest_collection_finish():
+    """Leave what is imported out of garbage collection, which else goes through all of it again and again."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_setup():
     """Skip a test whose fixtures need such a library."""
+    begin_test()
     return (yield from skipping())
 
 

@@ -30,7 +30,7 @@ def read_by_lerobot(folder: Path, row: int) -> dict[str, Any]:
     """Return figures of a data set and of one of its rows; skip the test where no Python has `lerobot`."""
     python = os.environ.get("LEROBOT_PYTHON")
     if not python:
-        pytest.skip("LEROBOT_PYTHON names no Python that has lerobot (see docs/dataset.md)")
+        pytest.skip("LEROBOT_PYTHON names no Python that has lerobot (see docs/concepts/dataset.md)")
     environment = os.environ | {"HF_HUB_OFFLINE": "1", "PYTHONPATH": os.environ.get("LEROBOT_PYTHONPATH", "")}
     result = subprocess.run(
         [python, "-c", READER, str(folder), str(row)], capture_output=True, text=True, env=environment, check=False

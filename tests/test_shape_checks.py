@@ -14,7 +14,7 @@ from beartype.roar import BeartypeCallHintViolation
 from jaxtyping import Float
 
 from endopilot.anatomy.distance import sample
-from shape_checks import checked
+from shape_checks import EVERY, FIRST, begin_test, checked
 
 if TYPE_CHECKING:
     from nowhere import Unknown
@@ -98,3 +98,16 @@ def test_what_does_not_fit_is_refused(call) -> None:
 
 def test_the_package_is_checked_in_this_way() -> None:
     assert sample._is_checked and sample.__module__ == "endopilot.anatomy.distance"
+
+
+def test_what_is_called_again_and_again_is_checked_at_first_and_now_and_then() -> None:
+    wrong = []
+    for call in range(1, FIRST + 2 * EVERY + 1):
+        try:
+            unknown(0, "many")
+        except BeartypeCallHintViolation:
+            wrong.append(call)
+    assert wrong == [*range(1, FIRST + 1), FIRST + EVERY, FIRST + 2 * EVERY]
+    begin_test()
+    with pytest.raises(BeartypeCallHintViolation):
+        unknown(0, "many")

@@ -41,7 +41,7 @@ def bench_ostia(folder: Positional[Path], /) -> dict[str, Any]:
 
     Returns:
         `arteries`, a row for each: distance of the ostium from where it is known to be (mm), confidence, share of the
-        artery's voxels that the tree covers, longest path (mm), seconds, and what was told where it was refused; and
+        artery's voxels that the tree covers, longest path (mm), seconds, and the `refusal`, if it was refused; and
         `figures`, those of `judged`.
 
     Raises:
@@ -63,7 +63,7 @@ def bench_ostia(folder: Positional[Path], /) -> dict[str, Any]:
 
 def judged(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return figures beside their bars: found, wrong without a word, least covered, slowest."""
-    made = [row for row in rows if row["told"] is None]
+    made = [row for row in rows if row["refusal"] is None]
     right = int(sum(row["ostium_error_mm"] <= OSTIUM_BAR_MM for row in made))
     coverage = min((row["coverage"] for row in made), default=0.0)
     slowest = max((row["seconds"] for row in rows), default=0.0)
@@ -72,7 +72,7 @@ def judged(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         Bar(enough, at_least=True).row(
             f"arteries of {len(rows)} whose ostium lies within {OSTIUM_BAR_MM:g} mm, at least", right
         ),
-        Bar(0).row("wrong and not told", len(made) - right),
+        Bar(0).row("wrong and not refused", len(made) - right),
         COVERAGE_BAR.row("covered, at least", coverage),
         SECONDS_BAR.row("slowest, s", slowest),
     ]
@@ -94,14 +94,14 @@ def _measured(file: Path, vessel: str, known: np.ndarray) -> dict[str, Any]:
     try:
         anatomy = extract_anatomy(LumenMask(volume), name=file.name, config=config)
     except InputError as error:
-        return row | {"seconds": round(time.perf_counter() - started, 1), "told": str(error)}
+        return row | {"seconds": round(time.perf_counter() - started, 1), "refusal": str(error)}
     return {
         "ostium_error_mm": round(float(np.linalg.norm(anatomy.insertion.position - known)), 1),
         "confidence": anatomy.provenance.get("ostium_confidence"),
         "coverage": round(_coverage(anatomy, volume), 4),
         "longest_mm": round(float(anatomy.tree.longest_path().abscissa[-1]), 1),
         "seconds": round(time.perf_counter() - started, 1),
-        "told": None,
+        "refusal": None,
     }
 
 

@@ -72,7 +72,7 @@ def bench_imaging(config: ImagingBenchConfig = ImagingBenchConfig()) -> dict[str
         result, `bar`, `counts` (mean or worst) and whether it `passed`; `seconds`
         and `processor_seconds` of the segmentation a case; `cases`, and `failed`: cases without any result, each with
         the reason. A failed case counts 0 in the shares, and no bar in mm is met then. `wrong` counts results that
-        are wrong or absent, `told` those of them that were refused or come with warnings, `silent` the others;
+        are wrong or absent, `reported` those of them that were refused or come with warnings, `silent` the others;
         `false_alarms` counts right results with warnings.
 
     Raises:
@@ -89,9 +89,9 @@ def bench_imaging(config: ImagingBenchConfig = ImagingBenchConfig()) -> dict[str
         values = np.array([row[name] for row in rows])
         figures[name] = {"mean": round(float(values.mean()), 2), "worst": round(float(values.max()), 2)}
     wrong = [row for row in rows if is_wrong(row)]
-    told = sum(1 for row in wrong if row["failed"] or row["warnings"])
+    reported = sum(1 for row in wrong if row["failed"] or row["warnings"])
     alarms = sum(1 for row in rows if not is_wrong(row) and row["warnings"])
-    counts = {"wrong": len(wrong), "told": told, "silent": len(wrong) - told, "false_alarms": alarms}
+    counts = {"wrong": len(wrong), "reported": reported, "silent": len(wrong) - reported, "false_alarms": alarms}
     return figures | {"cases": len(rows)} | counts | {"failed": failed}
 
 

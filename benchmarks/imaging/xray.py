@@ -167,7 +167,7 @@ def _register(scene: Scene, seed: int) -> tuple[Registration, dict[str, Any]]:
         "one_view_mm": [vessel_error_mm(scene.anatomy, scene.pose, one.pose) for one in alone],
         "refined_mm": refined,
         "failures": sum(bool(one.failure) for one in (both, *alone)),
-        "told_without_contrast": bool(empty.failure),
+        "refused_without_contrast": bool(empty.failure),
         "motion_mm": _motion_errors(scene, both, before, seed),
     }
 

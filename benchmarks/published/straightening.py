@@ -49,7 +49,7 @@ APART_DEG = (35.0, 11.1)
 parameters of human aortic bifurcations", Arteriosclerosis 1986)."""
 TISSUE_MPA = (0.0023, 0.012)
 """Least and largest modulus of the tissue around, MPa: three times the shear modulus of fat in living people, 752 Pa
-(J Mech Behav Biomed Mater 2023), and that of the heart's muscle in docs/physics.md."""
+(J Mech Behav Biomed Mater 2023), and that of the heart's muscle in docs/concepts/wall.md."""
 STIFFENS_OVER_MM = (20.0, 40.0)
 """Least and largest width of the tissue that shears, mm, assumed: what may lie between the artery and the bone."""
 FRICTION = (0.02, 0.1)
@@ -96,7 +96,7 @@ class AortoIliac:
         return self.stiffens_over_mm / _CORE_STIFFENS_OVER_MM
 
     def foundation_n_mm2(self, bend_n_mm2: float) -> float:
-        """Return the stiffness of the bed for a wire of some EI (N·mm²), N/mm², as docs/physics.md computes it."""
+        """Return the stiffness of the bed for a wire of some EI (N·mm²), N/mm², by docs/concepts/wall.md."""
         width = 2 * float(self.radius_mm[-1])
         stiffening = (self.tissue_mpa * width**4 / bend_n_mm2) ** (1 / 12)
         return 0.65 * stiffening * self.tissue_mpa / (1 - 0.5**2)

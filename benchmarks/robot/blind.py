@@ -22,7 +22,7 @@ def bench_blind(*, robots: int = 12, episodes: int = 8, write: bool = False) -> 
     Args:
         robots: their number; gain, play, lag and the play of the rotation are drawn for each.
         episodes: of each log, of 12 s each, in the reference anatomy.
-        write: write the table of docs/reality.md.
+        write: write the table of docs/evidence/reality.md.
     """
     anatomy, wire, rows = reference_navigation().anatomy, read_wire("workhorse-014"), []
     for seed in range(robots):
@@ -36,13 +36,13 @@ def bench_blind(*, robots: int = 12, episodes: int = 8, write: bool = False) -> 
         }
         row: dict[str, Any] = {"robot": seed}
         for name, true in truth.items():
-            told = found.estimates[name]
-            row |= {name: round(true, 3), f"{name}_found": round(told.value, 3)}
-            row[f"{name}_held"] = told.low <= true <= told.high
+            estimate = found.estimates[name]
+            row |= {name: round(true, 3), f"{name}_found": round(estimate.value, 3)}
+            row[f"{name}_held"] = estimate.low <= true <= estimate.high
         gain, play = (abs(found.estimates[name].value - truth[name]) for name in ("gain_translation", "play_mm"))
         rows.append(row | {"passed": gain <= GAIN_BAR * truth["gain_translation"] and play <= PLAY_BAR_MM})
     if write:
-        fill("reality.md", "blind", _table(rows))
+        fill("evidence/reality.md", "blind", _table(rows))
     return rows
 
 

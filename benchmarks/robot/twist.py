@@ -217,8 +217,8 @@ def bench_twist(
 
     Args:
         logs: folder of logs.
-        anatomy: folder made by `endopilot anatomy` of the phantom; the real wire alone is told of if not given, and its
-            tip as it moves in the picture.
+        anatomy: folder made by `endopilot anatomy` of the phantom; if not given, the real wire alone is described, and
+            its tip as it moves in the picture.
         turns: where rotation is lost: in a wire that twists under friction, in play of 0.9 turn, or nowhere.
         friction: torque a length of the wire in its guiding catheter, N·mm/mm.
         length_mm: of the wire there, mm.

@@ -1,6 +1,6 @@
 """Scenes in analytic vessels, each of which shows one thing that guidewires do: drag, stick-slip, torque lag, buckling.
 
-docs/physics.md shows them in pictures, and the tests hold each against its physics.
+docs/evidence/physics.md shows them in pictures, and the tests hold each against its physics.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Measure extraction, write the figures into docs/anatomy.md and draw its picture.
+"""Measure extraction, write the figures into docs/evidence/anatomy.md and draw its picture.
 
 `python docs/figures/anatomy.py [FOLDER]`, where the folder holds rca_cl.vtp and lca_cl.vtp of a real patient; takes
 some five minutes. With `--from FILE` it takes the figures from what `python -m benchmarks anatomy --json` printed.
@@ -13,11 +13,9 @@ from pathlib import Path
 sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
 
 from benchmarks.anatomy.extraction import extraction_errors
+from benchmarks.figures import DOCS, fill
 from endopilot.anatomy.anatomy_picture import draw_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-
-DOCS = Path(__file__).parents[1]
-PAGE = DOCS / "anatomy.md"
 
 
 def tables(rows: list[dict]) -> str:
@@ -49,9 +47,7 @@ def main(arguments: list[str]) -> None:
         rows = json.loads(Path(arguments[1]).read_text(encoding="utf-8"))
     else:
         rows = extraction_errors(Path(arguments[0]) if arguments else None)
-    begin, end = "<!-- bench:begin -->", "<!-- bench:end -->"
-    page = PAGE.read_text(encoding="utf-8")
-    PAGE.write_text(f"{page.split(begin)[0]}{begin}\n{tables(rows)}\n{end}{page.split(end)[1]}", encoding="utf-8")
+    fill("evidence/anatomy.md", "bench", tables(rows))
     draw_anatomy(make_patient(AtlasConfig(seed=1), 0), DOCS / "images" / "anatomy.png")
 
 

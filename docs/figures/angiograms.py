@@ -1,4 +1,4 @@
-"""Draw the picture of docs/angiograms.md, and write its table of transit times: `python docs/figures/angiograms.py`."""
+"""Draw the picture of docs/concepts/angiograms.md, and write the transit times into docs/evidence/angiograms.md."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "src"))
+sys.path[:0] = [str(ROOT), str(ROOT / "src")]  # where `benchmarks` is
 
 import numpy as np
 
+from benchmarks.figures import fill
 from endopilot.anatomy.io import write_anatomy
 from endopilot.angiograms.config import AngiogramsConfig
 from endopilot.angiograms.flow import Flow
 from endopilot.angiograms.make import make_angiograms
 from endopilot.atlas.atlas import AtlasConfig, make_patient, make_patient_tree
 
-PAGE, PICTURE = ROOT / "docs" / "angiograms.md", ROOT / "docs" / "images" / "angiograms.png"
-BEGIN, END = "<!-- transit:begin -->", "<!-- transit:end -->"
+PICTURE = ROOT / "docs" / "images" / "angiograms.png"
 ARTERIES = {
     "right coronary artery": ("rca", "3", (20.4, 3.0)),
     "left anterior descending artery": ("lca", "8", (36.2, 2.6)),
@@ -67,6 +67,5 @@ def draw() -> None:
 
 
 if __name__ == "__main__":
-    head, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-    PAGE.write_text(f"{head}{BEGIN}\n{table()}\n{END}{rest.split(END)[1]}", encoding="utf-8")
+    fill("evidence/angiograms.md", "transit", table())
     draw()

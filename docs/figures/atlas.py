@@ -1,4 +1,4 @@
-"""Write the tables of docs/atlas.md and draw its pictures: `python docs/figures/atlas.py`."""
+"""Write the tables of docs/evidence/atlas.md and draw its pictures: `python docs/figures/atlas.py`."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import numpy as np
 sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
 
 from benchmarks.anatomy.labels import measure_labels
+from benchmarks.figures import fill
 from endopilot.atlas import curves as shape
 from endopilot.atlas.atlas import VESSELS, AtlasConfig, make_patient, make_patient_tree
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
@@ -22,7 +23,6 @@ from endopilot.types import VesselTree
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
-PAGE = Path(__file__).parents[1] / "atlas.md"
 PICTURES = Path(__file__).parents[1] / "images"
 Patients = list[tuple[VesselTree, dict[str, Any]]]
 SHOWN = {"rca": (0, 2), "lca": (0, 2), "cerebral": (0, 2), "portal": (0, 2), "arch": (0, 2)}
@@ -219,14 +219,10 @@ def cost_table(count: int = 5) -> str:
 
 
 def write_tables() -> None:
-    """Put every table between its two marks in docs/atlas.md."""
-    text = PAGE.read_text(encoding="utf-8")
+    """Put every table between its two marks in docs/evidence/atlas.md."""
     for name in ("rca", "lca", "arch", "cerebral", "portal", "label", "cost"):
-        begin, end = f"<!-- {name} table -->\n", f"<!-- end of {name} table -->"
-        (head, _), (_, tail) = text.split(begin), text.split(end)
-        text = head + begin + globals()[f"{name}_table"]().rstrip() + "\n" + end + tail
+        fill("evidence/atlas.md", name, globals()[f"{name}_table"]())
         print(name, flush=True)
-    PAGE.write_text(text, encoding="utf-8")
 
 
 def draw_tree(axes: Any, tree: VesselTree, anatomy: str) -> None:

@@ -1,4 +1,4 @@
-"""Write docs/atlas.md's table of real patients beside the atlas: `python docs/figures/atlas_real.py FOLDER`.
+"""Write docs/evidence/atlas.md's table of real patients beside the atlas: `python docs/figures/atlas_real.py FOLDER`.
 
 The folder holds the anatomies that `endopilot anatomy` made of the seven real patients' masks (`../shared/data`).
 """
@@ -15,10 +15,10 @@ sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
 
 from benchmarks.anatomy.compare import KINDS, Values, anatomy_folders, scaled_distance, together
 from benchmarks.anatomy.vessel_shape import vessel_shape
+from benchmarks.figures import fill
 from endopilot.anatomy.io import read_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_atlas
 
-PAGE = Path(__file__).parents[1] / "atlas.md"
 ATLAS = {
     "patients": AtlasConfig(count=30),
     "seen through a CT": AtlasConfig(count=8, seen_through_ct=True),
@@ -66,9 +66,7 @@ def main() -> None:
     for kind in NINETEEN:
         given = together(vessel_shape(one) for one in anatomies if one.tree.section_names == KINDS[kind])
         lines += rows(kind, given)
-    begin, end = "<!-- real table -->\n", "<!-- end of real table -->"
-    text = PAGE.read_text(encoding="utf-8")
-    PAGE.write_text(text.split(begin)[0] + begin + "\n".join(lines) + "\n" + end + text.split(end)[1], encoding="utf-8")
+    fill("evidence/atlas.md", "real", lines)
 
 
 if __name__ == "__main__":

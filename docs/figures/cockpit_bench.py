@@ -1,4 +1,4 @@
-"""Measure the cockpit's speed and write it into docs/cockpit.md: `python docs/figures/cockpit_bench.py [alone] [pair]`.
+"""Write the cockpit's speed into docs/evidence/cockpit.md: `python docs/figures/cockpit_bench.py [alone] [pair]`.
 
 Runs `python -m benchmarks cockpit` five times, then three times in turn with a catheter, which takes ten minutes;
 nothing else should run meanwhile. `alone` and `pair` make one of the two tables.
@@ -17,10 +17,9 @@ from typing import Any
 sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
 
 from benchmarks.cockpit import BARS
-from endopilot.files import processor_name
+from benchmarks.figures import fill
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "cockpit.md"
 COMMAND = (sys.executable, "-m", "benchmarks", "cockpit", "--json")
 RUNS, PAIR_RUNS = 5, 3
 CATHETER = "microcatheter-1.7f"
@@ -74,10 +73,7 @@ def write(mark: str, runs: int, rows: list[str]) -> None:
     """Write a table between the page's marks."""
     load = os.getloadavg()[1]
     others = "nothing else running" if load < QUIET else f"other work running beside (load {load:.0f})"
-    begin, end = f"<!-- {mark}:begin -->", f"<!-- {mark}:end -->"
-    lines = [begin, f"{processor_name()}, two cores, {others}, {runs} runs:", "", *rows, end]
-    page = PAGE.read_text(encoding="utf-8")
-    PAGE.write_text(page.split(begin)[0] + "\n".join(lines) + page.split(end)[1], encoding="utf-8")
+    fill("evidence/cockpit.md", mark, [f"Two cores, {others}, {runs} runs:", "", *rows])
 
 
 if __name__ == "__main__":

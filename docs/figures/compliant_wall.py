@@ -1,13 +1,17 @@
-"""Measures how far wires displace a compliant wall, beside a rigid one, and writes the table of docs/physics.md."""
+"""Measures how far wires displace a compliant wall, for the table of docs/evidence/physics.md."""
 
 from __future__ import annotations
 
+import sys
 import warnings
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.figures import fill
 from endopilot.anatomy.distance import sample
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.device import Wire, read_wire
@@ -18,8 +22,10 @@ from endopilot.simulation.simulate import simulate
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import Anatomy
 
-PAGE = Path(__file__).parents[1] / "physics.md"
-HEAD = "| patient, wire | wall |"
+HEAD = (
+    "| patient, wire | wall | displacement, 99th percentile, mm | largest, mm | "
+    "wall's force, median of the largest, N | largest push, N | valid |"
+)
 PATIENTS, SEQUENCES = (0, 1, 2, 3), 8
 STIFFNESS_N_MM2 = (None, 0.05, 0.01)
 
@@ -36,8 +42,8 @@ def displaced_mm(
 
 
 def main() -> None:
-    """Write the table in place of the one that is there."""
-    rows = []
+    """Write the table."""
+    rows = [HEAD, "|---|---|---|---|---|---|---|"]
     for number in PATIENTS:
         patient = make_patient(AtlasConfig(), number)
         longest = float(patient.tree.longest_path().abscissa[-1])
@@ -61,10 +67,7 @@ def main() -> None:
                     f"| {valid[:, -1].sum()} of {len(valid)} |"
                 )
                 print(rows[-1], flush=True)
-    lines = PAGE.read_text(encoding="utf-8").split("\n")
-    first = next(place for place, line in enumerate(lines) if line.startswith(HEAD)) + 2
-    last = next(place for place in range(first, len(lines)) if not lines[place].startswith("|"))
-    PAGE.write_text("\n".join([*lines[:first], *rows, *lines[last:]]), encoding="utf-8")
+    fill("evidence/physics.md", "yielding", rows)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Measure what the simulator's settings cost a data set, and write the table of docs/dataset.md.
+"""Measure what the simulator's settings cost a data set, and write the table of docs/evidence/dataset.md.
 
 `python docs/figures/dataset.py FOLDER...`: data sets, one for each kind of vessel, named by their folders. The first
 navigations of each patient are simulated again with every setting, and compared with the finest.
@@ -13,17 +13,18 @@ from pathlib import Path
 
 import numpy as np
 
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.figures import fill
 from endopilot.dataset.loader import read_dataset
 from endopilot.models.episodes import Episodes
 from endopilot.simulation.config import PRESETS, SimulatorConfig
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.trajectory import Trajectory
 
-PAGE = Path(__file__).parents[1] / "dataset.md"
-BEGIN, END = "<!-- settings:begin -->", "<!-- settings:end -->"
 NAVIGATIONS = 3
 HELD = 0.9
-"""A drive pulls in vain where it feels this share of its pull limit."""
+"""A wire is stuck where its drive feels this share of the pull limit."""
 REFERENCE = PRESETS["accurate"]
 SETTINGS = {
     "0.75 mm, 0.001 mm": SimulatorConfig(),
@@ -31,7 +32,7 @@ SETTINGS = {
     "1 mm, 0.01 mm": SimulatorConfig(element_mm=1.0, tolerance_mm=1e-2),
     "1.25 mm, 0.01 mm": SimulatorConfig(element_mm=1.25, tolerance_mm=1e-2),
 }
-HEAD = ["vessels", "elements, tolerance", "tip error mm: median", "p95", "same branch", "drive pulls in vain", "speed"]
+HEAD = ["vessels", "elements, tolerance", "tip error mm: median", "p95", "same branch", "wire stuck", "speed"]
 
 
 def main(folders: list[str]) -> None:
@@ -43,9 +44,7 @@ def main(folders: list[str]) -> None:
         truth, _ = _simulated(episodes, REFERENCE)
         rows += [[folder.name, name, *_compared(episodes, truth, config)] for name, config in SETTINGS.items()]
         rows.append([folder.name, "reference: 0.3 mm, 0.001 mm", "", "", "", _held(episodes, truth), ""])
-    table = "\n".join(f"| {' | '.join(row)} |" for row in rows)
-    page = PAGE.read_text(encoding="utf-8")
-    PAGE.write_text(f"{page.split(BEGIN)[0]}{BEGIN}\n{table}\n{END}{page.split(END)[1]}", encoding="utf-8")
+    fill("evidence/dataset.md", "settings", [f"| {' | '.join(row)} |" for row in rows])
 
 
 def _simulated(episodes: Episodes, config: SimulatorConfig) -> tuple[list[Trajectory], float]:

@@ -14,18 +14,13 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.figures import fill
 from endopilot.env.single import NavigateEnv
 from endopilot.env.vector import NavigateVectorEnv
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "environment.md"
-
-
-def fill(name: str, text: str) -> None:
-    """Replace what stands between the page's marks of some name."""
-    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
-    page = PAGE.read_text(encoding="utf-8")
-    PAGE.write_text(f"{page.split(begin)[0]}{begin}\n{text}\n{end}{page.split(end)[1]}", encoding="utf-8")
 
 
 def draw() -> None:
@@ -48,13 +43,14 @@ def draw() -> None:
 def main() -> None:
     """Fill the page."""
     draw()
-    fill("specification", (inspect.getdoc(NavigateVectorEnv) or "").replace("\n## ", "\n### "))
+    said = inspect.getdoc(NavigateVectorEnv) or ""
+    fill("concepts/environment-specification.md", "specification", said, dated=False)
     if "--specification" in sys.argv:
         return
     command = [sys.executable, "-m", "benchmarks", "env", "--json"]
     figures = json.loads(subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout)
     rows = [f"| {name} | {value} |" for name, value in figures.items() if name != "processor"]
-    fill("bench", "\n".join([f"{figures['processor']}:\n", "| figure | value |", "|---|---|", *rows]))
+    fill("evidence/environments.md", "bench", ["| figure | value |", "|---|---|", *rows])
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Measure what a GPU does and write the figures into docs/performance.md: `make gpu-figures`, at most 30 minutes.
+"""Write what a GPU does into docs/evidence/performance.md: `make gpu-figures`, at most 30 minutes.
 
 First the rod core, with a test of its agreement; then a slice of `make recipe-gpu`: a hundredth of its navigations,
 and two minutes of each network's training.
@@ -13,8 +13,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from performance import ROOT, fill, output, table
+from performance import ROOT, output, table
 
+from benchmarks.figures import fill
 from endopilot.models.config import WINDOW
 
 PATIENTS, SEQUENCES = 10, 100
@@ -69,14 +70,15 @@ def main() -> None:
     agreement = output(sys.executable, "-m", "pytest", *test)
     if "1 passed" not in agreement:
         sys.exit(agreement)
-    fill("gpu", f"{gpu}:\n\n{table(kernel_rows())}")
+    fill("evidence/performance.md", "gpu", f"{gpu}:\n\n{table(kernel_rows())}")
     started = time.perf_counter()
     size = [f"FULL={SLICE}", f"FULL_PATIENTS={PATIENTS}", f"FULL_SEQUENCES={SEQUENCES}"]
     training = f"FULL_TRAINING=--max-seconds {TRAINING_SECONDS}"
     subprocess.run(["make", "recipe-gpu", *size, training], cwd=ROOT, check=True)
     minutes = (time.perf_counter() - started) / 60
     rows = table(recipe_rows(ROOT / SLICE))
-    fill("gpu-recipe", f"{rows}\n\nThe slice took {minutes:.0f} minutes, with its evaluations.")
+    text = f"{rows}\n\nThe slice took {minutes:.0f} minutes, with its evaluations."
+    fill("evidence/performance.md", "gpu-recipe", text)
 
 
 if __name__ == "__main__":

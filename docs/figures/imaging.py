@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/imaging.md and prints the agreement with the network's mask of the real aorta."""
+"""Draws the pictures of docs/evidence/imaging.md and prints the agreement with the network's mask of the real aorta."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs `python -m benchmarks imaging` and writes what it measured into docs/imaging.md.
+"""Runs `python -m benchmarks imaging` and writes what it measured into docs/evidence/imaging.md.
 
 Give the number of clean cases, or 50, and that of each difficulty, or 10.
 """
@@ -11,10 +11,10 @@ from typing import Any
 
 sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
 
+from benchmarks.figures import fill
 from benchmarks.imaging.cases import DIFFICULTIES
 from benchmarks.imaging.segmentation import BARS, ImagingBenchConfig, bench_imaging
 
-PAGE = Path(__file__).parents[1] / "imaging.md"
 TITLES = {
     "dice": "Dice",
     "cldice": "clDice",
@@ -55,22 +55,21 @@ def _difficulties(cases: int) -> list[str]:
     lines = [
         f"`python -m benchmarks imaging --cases {cases} --seed 0 --difficulty NAME`, means of the cases with a result:",
         "",
-        "| difficulty | Dice | clDice | overlap OV | ostium error, mm | wrong or none | told | silent | false alarms |",
+        "| difficulty | Dice | clDice | overlap OV | ostium error, mm "
+        "| wrong or none | reported | silent | false alarms |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for name in DIFFICULTIES:
         found: dict[str, Any] = bench_imaging(ImagingBenchConfig(cases=cases, difficulty=name))
         means = [_number(found[figure]["mean_found"]) for figure in ("dice", "cldice", "overlap", "ostium_error_mm")]
-        counts = [str(found[count]) for count in ("wrong", "told", "silent", "false_alarms")]
+        counts = [str(found[count]) for count in ("wrong", "reported", "silent", "false_alarms")]
         lines.append(f"| {' | '.join([name, *means, *counts])} |")
     return lines
 
 
 def _replace(mark: str, lines: list[str]) -> None:
     """Put the lines between the page's marks of that name, and print them."""
-    begin, end = f"<!-- {mark}:begin -->", f"<!-- {mark}:end -->"
-    head, rest = PAGE.read_text(encoding="utf-8").split(begin)
-    PAGE.write_text("\n".join([f"{head}{begin}", *lines, end]) + rest.split(end)[1], encoding="utf-8")
+    fill("evidence/imaging.md", mark, lines)
     print("\n".join(lines))
 
 

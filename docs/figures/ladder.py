@@ -1,4 +1,4 @@
-"""Write tasks and scores into docs/ladder.md: `python docs/figures/ladder.py [FOLDER [MISMATCH [STEVE]]]`.
+"""Write tasks and scores into docs/evidence/ladder.md: `python docs/figures/ladder.py [FOLDER [MISMATCH [STEVE]]]`.
 
 FOLDER, runs/ladder if not given, holds what `endopilot ladder` made of each policy in the newest version and, with
 `--version coaxial`, of those that drive a catheter. MISMATCH, runs/ladder-mismatch if not given, holds what it made
@@ -12,11 +12,14 @@ import json
 import sys
 from pathlib import Path
 
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.figures import DOCS, fill
 from endopilot.ladder.mismatch import title_of
 from endopilot.tasks.task import NEWEST, LadderVersion, list_tasks
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "ladder.md"
+PAGE = "evidence/ladder.md"
 _MEANS = (("peak force, median, N", "peak_force_n"), ("exposures, mean", "exposures"))
 _MISSED = "events missed, %"
 _PUBLISHED = (
@@ -24,13 +27,6 @@ _PUBLISHED = (
     ("dualdevicenav", "learned, best", "theirs", "40", "all frames", "–", "none", "100"),
 )
 """Success of the controllers that were trained for the benchmark (Karstensen et al., arXiv 2410.01956)."""
-
-
-def fill(name: str, lines: list[str]) -> None:
-    """Replace what stands between the page's marks of some name."""
-    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
-    page, text = PAGE.read_text(encoding="utf-8"), "\n".join(lines)
-    PAGE.write_text(f"{page.split(begin)[0]}{begin}\n{text}\n{end}{page.split(end)[1]}", encoding="utf-8")
 
 
 def tasks() -> list[str]:
@@ -86,8 +82,8 @@ def scores(folder: Path, version: LadderVersion, mark: str) -> list[str]:
 
 def _kept(mark: str) -> dict[str, dict[str, str]]:
     """Return the columns that stand in the page between marks of some name."""
-    text = PAGE.read_text(encoding="utf-8").split(f"<!-- {mark}:begin -->")[1].split(f"<!-- {mark}:end -->")[0]
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.strip().splitlines()]
+    text = (DOCS / PAGE).read_text(encoding="utf-8").split(f"<!-- {mark}:begin -->")[1].split(f"<!-- {mark}:end -->")[0]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
     if not rows:
         return {}
     head, body = rows[0][1:], rows[2:]
@@ -129,15 +125,15 @@ def main() -> None:
     given = [Path(argument) for argument in sys.argv[1:]]
     names = ("ladder", "ladder-mismatch", "steve")
     ladder, mismatched, steve = [*given, *[ROOT / "runs" / name for name in names][len(given) :]]
-    fill("tasks", tasks())
-    fill("coaxial tasks", coaxial_tasks())
+    fill(PAGE, "tasks", tasks(), dated=False)
+    fill(PAGE, "coaxial tasks", coaxial_tasks(), dated=False)
     if ladder.is_dir():
-        fill("scores", scores(ladder, NEWEST, "scores"))
-        fill("coaxial scores", scores(ladder, "coaxial", "coaxial scores"))
+        fill(PAGE, "scores", scores(ladder, NEWEST, "scores"))
+        fill(PAGE, "coaxial scores", scores(ladder, "coaxial", "coaxial scores"))
     if mismatched.is_dir():
-        fill("mismatch", mismatch(mismatched))
+        fill(PAGE, "mismatch", mismatch(mismatched))
     if steve.is_dir():
-        fill("benchmark", benchmark(steve))
+        fill(PAGE, "benchmark", benchmark(steve))
 
 
 if __name__ == "__main__":

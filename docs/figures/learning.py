@@ -1,4 +1,4 @@
-"""Write what the models reach into the tables of docs/learning.md.
+"""Write what the models reach into the tables of docs/evidence/learning.md.
 
 `python docs/figures/learning.py FOLDER`: FOLDER holds the dataset, the runs and the evaluations that the page's
 commands make; what is not there is left out. The table of what was tried is that of `learning_tried.py`.
@@ -15,6 +15,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.figures import made_on
 from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.devices.device import read_wire
 from endopilot.evaluation.metrics import OFF_WALL_MM
@@ -27,7 +30,7 @@ from endopilot.models.rollout import load_model
 from endopilot.models.sequences import prepare_vessels, unfold
 from endopilot.models.simulated_wires import FRICTION_FACTORS, read_or_simulate
 
-PAGE = Path(__file__).parents[1] / "learning.md"
+PAGE = Path(__file__).parents[1] / "evidence" / "learning.md"
 RUNS = {"`pretrained`": "seed-0", "seed 1": "seed-1", "seed 2": "seed-2", "`paper`": "paper"}
 """Runs of `make recipe-laptop`, by the name of the row; those that are not there are left out."""
 OURS = next(iter(RUNS))
@@ -174,8 +177,9 @@ def control_rows(folder: Path) -> Iterator[str]:
 
 def written(text: str, mark: str, rows: list[str]) -> str:
     """Return a page with the rows of one table replaced."""
-    pattern = rf"(<!-- {mark}:begin -->\n(?:\|.*\n){{2}})(?:\|.*\n)*(<!-- {mark}:end -->)"
-    return re.sub(pattern, lambda found: found[1] + "".join(f"{line}\n" for line in rows) + found[2], text)
+    pattern = rf"(<!-- {mark}:begin -->\n(?:\|.*\n){{2}})[^<]*(<!-- {mark}:end -->)"
+    table = "".join(f"{line}\n" for line in [*rows, "", made_on()])
+    return re.sub(pattern, lambda found: found[1] + table + found[2], text)
 
 
 if __name__ == "__main__":

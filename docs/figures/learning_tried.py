@@ -1,4 +1,4 @@
-"""Measure what was tried for the causal model, and write the table of it into docs/learning.md.
+"""Measure what was tried for the causal model, and write the table of it into docs/evidence/learning.md.
 
 `python docs/figures/learning_tried.py FOLDER`: FOLDER holds the dataset that the page's commands make. Every network is
 trained for a minute or two on one core, and measured on patients that it was not trained on.

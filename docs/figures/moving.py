@@ -1,17 +1,19 @@
-"""Lets the agent navigate in patients that move, and writes the table of docs/navigation.md."""
+"""Lets the agent navigate in patients that move, and writes the table of docs/evidence/navigation.md."""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.figures import fill
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.control.navigate import NavigateConfig, navigate
 
-PAGE = Path(__file__).parents[1] / "navigation.md"
-BEGIN, END = "<!-- moving:begin -->\n", "<!-- moving:end -->"
 PATIENTS = (("rca", 0), ("lca", 0), ("rca", 1), ("lca", 1))
 DEPTH_SHARE = 0.6
 """The target lies at this share of the longest path."""
@@ -49,16 +51,13 @@ def main() -> None:
             f"| {max(record.peak_force_n for record in records):.2f} |"
         )
         print(rows[-1], flush=True)
-    head, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-    table = "\n".join(
-        [
-            "| motion | known | reached safely | median time, s | exposures a minute "
-            "| decisions in both bands | largest wall force, N |",
-            "|---|---|---|---|---|---|---|",
-            *rows,
-        ]
-    )
-    PAGE.write_text(f"{head}{BEGIN}{table}\n{END}{rest.split(END)[1]}", encoding="utf-8")
+    table = [
+        "| motion | known | reached safely | median time, s | exposures a minute "
+        "| decisions in both bands | largest wall force, N |",
+        "|---|---|---|---|---|---|---|",
+        *rows,
+    ]
+    fill("evidence/navigation.md", "moving", table)
 
 
 if __name__ == "__main__":

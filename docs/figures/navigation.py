@@ -1,4 +1,4 @@
-"""Write the pictures and tables of docs/navigation.md.
+"""Write the pictures and tables of docs/evidence/navigation.md.
 
 The first part drives the agent in a synthetic patient, with a catheter too. The second needs what
 `make cta` leaves in `runs/cta-thorax`; it pushes the J wire without a policy, at first rotations all around, to see
@@ -14,12 +14,15 @@ from pathlib import Path
 
 import numpy as np
 
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
 import endopilot
+from benchmarks.figures import fill
 from endopilot.files import read_json
 from endopilot.imaging.sample import fetch_sample
 
 ROOT = Path(__file__).parents[2]
-PAGE, IMAGES, CTA = ROOT / "docs" / "navigation.md", ROOT / "docs" / "images", ROOT / "runs" / "cta-thorax"
+IMAGES, CTA = ROOT / "docs" / "images", ROOT / "runs" / "cta-thorax"
 ROTATIONS, SPEED_MM_S, SECONDS = 24, 9.0, 40.0
 BLIND_END_MM = 80.0
 """A wire that comes no deeper has gone into the blind end of the false lumen."""
@@ -40,9 +43,9 @@ def main() -> None:
         output = ROOT / "runs" / folder
         subprocess.run([*navigate, *options, "-o", output], check=True)
         shutil.copyfile(output / "navigation.png", IMAGES / picture)
-        _replace(part, f"    {read_json(output / 'manifest.json')['figures']['outcome']}")
+        fill("evidence/navigation.md", part, f"    {read_json(output / 'manifest.json')['figures']['outcome']}")
     if (CTA / "navigation" / "manifest.json").exists():
-        _replace("dissection", _dissection())
+        fill("evidence/navigation.md", "dissection", _dissection())
 
 
 def _dissection() -> str:
@@ -80,12 +83,6 @@ def _share(mask: endopilot.Volume, points: np.ndarray) -> float:
     i, j, k = np.round(mask.world_to_index(points)).astype(int).T
     inside = (k < mask.voxels.shape[0]) & (j < mask.voxels.shape[1]) & (i < mask.voxels.shape[2])
     return float((mask.voxels[k[inside], j[inside], i[inside]] > 0).mean())
-
-
-def _replace(name: str, content: str) -> None:
-    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
-    head, rest = PAGE.read_text(encoding="utf-8").split(begin)
-    PAGE.write_text(f"{head}{begin}\n{content}\n{end}{rest.split(end)[1]}", encoding="utf-8")
 
 
 if __name__ == "__main__":

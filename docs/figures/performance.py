@@ -1,4 +1,4 @@
-"""Measure the rod core and write the figures into docs/performance.md: `python docs/figures/performance.py`.
+"""Measure the rod core and write the figures into docs/evidence/performance.md: `python docs/figures/performance.py`.
 
 Takes some ten minutes; nothing else should run meanwhile.
 """
@@ -11,11 +11,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from endopilot.files import processor_name
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.figures import fill
 from endopilot.simulation.config import PRESETS
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "performance.md"
+PAGE = "evidence/performance.md"
 COMPARED = (
     "realtime_factor_per_core",
     "node_iterations_per_second",
@@ -52,14 +54,6 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def fill(name: str, text: str) -> None:
-    """Replace what stands between the page's marks of some name."""
-    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
-    page = PAGE.read_text(encoding="utf-8")
-    head, tail = page.split(begin)[0], page.split(end)[1]
-    PAGE.write_text(f"{head}{begin}\n{text}\n{end}{tail}", encoding="utf-8")
-
-
 def main() -> None:
     """Run the measurements."""
     presets = {name: bench("simulation", "--preset", name) for name in PRESETS}
@@ -67,22 +61,24 @@ def main() -> None:
     errors = figures["intervals"]
     nested = ("preset", "intervals", "by_anatomy", "reference_own_error", *errors)
     rows = [{"figure": name, "value": value} for name, value in figures.items() if name not in nested]
-    fill("simulation", f"{processor_name()}:\n\n{table(rows)}")
+    fill(PAGE, "simulation", table(rows))
     rows = [
         {"error": name, "all": figures[name], "90 % interval": " to ".join(map(str, interval))}
         | {anatomy: found[name] for anatomy, found in figures["by_anatomy"].items()}
         | {"of the reference": figures["reference_own_error"][name]}
         for name, interval in errors.items()
     ]
-    fill("errors", table(rows))
+    fill(PAGE, "errors", table(rows))
     fill(
-        "presets", table([{"preset": name} | {key: found[key] for key in COMPARED} for name, found in presets.items()])
+        PAGE,
+        "presets",
+        table([{"preset": name} | {key: found[key] for key in COMPARED} for name, found in presets.items()]),
     )
     for name, options in BESIDE.items():
         found = bench("simulation", *options)
-        fill(name, table([{"figure": figure, "value": value} for figure, value in found.items()]))
-    fill("scaling", table(bench("scaling")))
-    fill("roofline", "```\n" + output("make", "-s", "roofline").rstrip() + "\n```")
+        fill(PAGE, name, table([{"figure": figure, "value": value} for figure, value in found.items()]))
+    fill(PAGE, "scaling", table(bench("scaling")))
+    fill(PAGE, "roofline", "```\n" + output("make", "-s", "roofline").rstrip() + "\n```")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/physics.md and print its figures: `python docs/figures/physics.py`."""
+"""Draw the pictures of docs/evidence/physics.md and print its figures: `python docs/figures/physics.py`."""
 
 from __future__ import annotations
 

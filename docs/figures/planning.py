@@ -1,10 +1,11 @@
-"""Measure the policies on side branches of patients of the atlas, and write the table into docs/planning.md.
+"""Measure the policies on side branches of patients of the atlas, and write the table into docs/evidence/planning.md.
 
 `python docs/figures/planning.py` takes some minutes on one core.
 """
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -12,6 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.figures import fill
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.control.agent import AgentPolicy, OraclePolicy
 from endopilot.devices.device import Wire, read_wire
@@ -22,7 +26,6 @@ from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import Anatomy
 
-PAGE = Path(__file__).parents[1] / "planning.md"
 SEED, PATIENTS, DEEP_MM, SECONDS, FORCE_N = 900, (("rca", 0), ("lca", 0)), 15.0, 60.0, 0.3
 TIPS = ((90.0, 8.0), (45.0, 3.0))
 POLICIES = ("forward", "spin", "oracle", "agent")
@@ -84,8 +87,4 @@ def measure() -> list[str]:
 
 
 if __name__ == "__main__":
-    table = "\n".join(measure())
-    before, after = PAGE.read_text(encoding="utf-8").split("<!-- planning:begin -->")
-    after = after.split("<!-- planning:end -->")[1]
-    text = f"{before}<!-- planning:begin -->\n{table}\n<!-- planning:end -->{after}"
-    PAGE.write_text(text, encoding="utf-8")
+    fill("evidence/planning.md", "planning", measure())

@@ -1,4 +1,4 @@
-"""Write the figures of `python -m benchmarks published --json > FILE` into docs/bench.md.
+"""Write the figures of `python -m benchmarks published --json > FILE` into docs/evidence/bench.md.
 
 `python docs/figures/published.py FILE`. The run itself takes ten minutes.
 """
@@ -10,14 +10,16 @@ import sys
 from pathlib import Path
 from typing import Any
 
-PAGE = Path(__file__).parents[1] / "bench.md"
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.figures import fill
+
 TITLES = {
     "prediction": "Predictions",
     "unpublished": "Predictions that no published figure can judge",
     "sensitivity": "The same with one assumption changed: what the figures depend on",
     "calibration": "Calibrations and what was drawn, which are no predictions",
 }
-BEGIN, END = "<!-- published:begin -->", "<!-- published:end -->"
 
 
 def text(rows: list[dict[str, Any]]) -> str:
@@ -51,9 +53,7 @@ def _line(row: dict[str, Any]) -> str:
 
 def main(file: str) -> None:
     """Replace what stands between the page's marks."""
-    page = PAGE.read_text(encoding="utf-8")
-    table = text(json.loads(Path(file).read_text(encoding="utf-8")))
-    PAGE.write_text(f"{page.split(BEGIN)[0]}{BEGIN}\n{table}\n{END}{page.split(END)[1]}", encoding="utf-8")
+    fill("evidence/bench.md", "published", text(json.loads(Path(file).read_text(encoding="utf-8"))))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Write the table of docs/reality.md and draw its pictures: `python docs/figures/reality.py FOLDER ROBOT DEVICE`.
+"""Write tables and pictures of docs/evidence/reality.md: `python docs/figures/reality.py FOLDER ROBOT DEVICE`.
 
 FOLDER holds the public logs of Kweon et al. (IEEE Access 2021) as CSV files, and the 2-D phantom's lumen as .vtp; ROBOT
 and DEVICE are what `endopilot calibrate` made of all sessions but those of `KEPT_ASIDE`.
@@ -15,11 +15,13 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
 sys.path.append(str(Path(__file__).parents[2] / "examples"))
 
 from robot_phantom_logs import convert
 
 import endopilot
+from benchmarks.figures import fill
 from endopilot.files import read_json
 from endopilot.plotting import BLACK, BLUE, GREY, STYLE, VERMILLION
 from endopilot.report.replay_figure import replay_figure
@@ -37,7 +39,6 @@ from endopilot.robot.replay import (
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
-PAGE = Path(__file__).parents[1] / "reality.md"
 IMAGES = Path(__file__).parents[1] / "images"
 EPISODES = 8
 """Of each session at most, evenly chosen."""
@@ -77,31 +78,24 @@ def main() -> None:
     apart = {name: [each for each, kept in zip(row, aside, strict=True) if kept] for name, row in found.items()}
     measured = {"real": _measures(drives, found[CALIBRATED], 0)}
     measured |= {name: _measures(drives, each, 1) for name, each in found.items()}
-    _write("reality", _table(measured, apart, repeats))
-    _write("calibration", _calibration(Path(robot_file).with_suffix(".json")))
+    fill("evidence/reality.md", "reality", _table(measured, apart, repeats))
+    fill("evidence/reality.md", "calibration", _calibration(Path(robot_file).with_suffix(".json")))
     _draw(measured)
     figure = replay_figure(phantom, apart[CALIBRATED], "sessions kept aside, robot and wire calibrated on the others")
     figure.savefig(IMAGES / "reality-tracks.png", dpi=80)
 
 
-def _write(name: str, table: str) -> None:
-    """Put a table between its markers on the page."""
-    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
-    head, rest = PAGE.read_text(encoding="utf-8").split(begin)
-    PAGE.write_text(f"{head}{begin}\n{table}\n{end}{rest.split(end)[1]}", encoding="utf-8")
-
-
 def _calibration(record: Path) -> str:
-    """Return what `endopilot calibrate` told as a table."""
-    told = read_json(record)
+    """Return what `endopilot calibrate` found as a table."""
+    found = read_json(record)
     lines = ["| constant | best | 95 % |", "|---|---|---|"]
-    for name, each in told["estimates"].items():
+    for name, each in found["estimates"].items():
         low, high = each["interval"]
         said = f"{low:.3g} to {high:.3g}" if each["identified"] else "not identifiable from these logs"
         lines.append(f"| `{name}` | {each['value']:.3g} | {said} |")
-    band, held = told["band_of_90_percent_mm"], told["it_holds_in_logs_left_out"]
+    band, held = found["band_of_90_percent_mm"], found["it_holds_in_logs_left_out"]
     said = f"holds in {held:.0%} of the episodes of logs left out"
-    share, known = told["start_rotation_told_in"], told["start_rotation_known_rad"]
+    share, known = found["start_rotation_known_in"], found["start_rotation_known_rad"]
     lines.append(
         f"| rotation at the start of an episode | its own | known to ± {known:.2g} rad (median) in {share:.0%} of the "
         "episodes, not identifiable in the others |"

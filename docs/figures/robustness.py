@@ -1,4 +1,4 @@
-"""Write the figures of `python -m benchmarks robustness --json > FILE` into docs/robustness.md.
+"""Write the figures of `python -m benchmarks robustness --json > FILE` into docs/evidence/robustness.md.
 
 `python docs/figures/robustness.py FILE`, or `... FILE catheters` for a run with `--catheters`. Each run takes half
 an hour on two quiet cores.
@@ -10,7 +10,9 @@ import json
 import sys
 from pathlib import Path
 
-PAGE = Path(__file__).parents[1] / "robustness.md"
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.figures import fill
 
 
 def text(measured: dict) -> str:
@@ -42,10 +44,7 @@ def text(measured: dict) -> str:
 
 def main(file: str, kind: str = "robustness") -> None:
     """Replace what stands between the page's marks of one kind."""
-    begin, end = f"<!-- {kind}:begin -->", f"<!-- {kind}:end -->"
-    page = PAGE.read_text(encoding="utf-8")
-    figures = text(json.loads(Path(file).read_text(encoding="utf-8")))
-    PAGE.write_text(f"{page.split(begin)[0]}{begin}\n{figures}\n{end}{page.split(end)[1]}", encoding="utf-8")
+    fill("evidence/robustness.md", kind, text(json.loads(Path(file).read_text(encoding="utf-8"))))
 
 
 if __name__ == "__main__":

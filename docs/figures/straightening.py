@@ -1,4 +1,4 @@
-"""Draw the picture of docs/bench.md: an aorto-iliac path before and after stiff wires."""
+"""Draw the picture of docs/evidence/bench.md: an aorto-iliac path before and after stiff wires."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measure the twin on the new patients of docs/learning.md and write its table into docs/models.md.
+"""Measure the twin on the new patients of docs/evidence/learning.md and write its table there.
 
 `python docs/figures/twin.py FOLDER`: FOLDER holds `dataset`, made by the commands of the packaged model's card. The
 twin gets a friction and a tip stiffness from which the truth differs by up to 20 %, other ones for each patient.
@@ -13,6 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.figures import fill
 from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.devices.device import Wire
 from endopilot.models.config import WINDOW, TwinConfig
@@ -21,7 +24,6 @@ from endopilot.models.twin import TwinPredictor
 from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
 
-PAGE = Path(__file__).parents[1] / "models.md"
 SEED, OFF, DEEPER_MM = 600, 0.2, 0.3
 SPANS = (("0-10 s", 30, 50), ("10-30 s", 50, 90), ("30-45 s", 90, 120))
 
@@ -69,7 +71,4 @@ def measure(folder: Path) -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    table = "\n".join(measure(Path(sys.argv[1])))
-    head, rest = PAGE.read_text(encoding="utf-8").split("<!-- twin:begin -->\n")
-    tail = rest.split("<!-- twin:end -->")[1]
-    PAGE.write_text(f"{head}<!-- twin:begin -->\n{table}\n<!-- twin:end -->{tail}", encoding="utf-8")
+    fill("evidence/learning.md", "twin", measure(Path(sys.argv[1])))

@@ -1,4 +1,4 @@
-"""Runs every case of the verification, draws the picture of docs/verification.md and writes its table."""
+"""Runs every case of the verification, draws the picture of docs/evidence/verification.md and writes its table."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ from PIL import Image
 
 sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
 
+from benchmarks.figures import DOCS, fill
 from benchmarks.verification.plots import file_name
 from benchmarks.verification.verification import bench_verification
 
-DOCS = Path(__file__).parents[1]
-BEGIN, END = "<!-- table:begin -->", "<!-- table:end -->"
 SHOWN = (
     "elastica α=10 w/L",
     "Greenhill twist buckling M",
@@ -29,18 +28,15 @@ COLUMNS = 3
 
 
 def main() -> None:
-    """Write docs/images/verification.png and the table between its markers in docs/verification.md."""
+    """Write docs/images/verification.png and the table between its markers in docs/evidence/verification.md."""
     with tempfile.TemporaryDirectory() as folder:
         rows = bench_verification(plots=Path(folder))
         pictures = [np.asarray(Image.open(Path(folder) / f"{file_name(name)}.png").convert("RGB")) for name in SHOWN]
     lines = [np.hstack(pictures[start : start + COLUMNS]) for start in range(0, len(pictures), COLUMNS)]
     whole = Image.fromarray(np.vstack(lines)).quantize(64)
     whole.save(DOCS / "images" / "verification.png", optimize=True)
-    page = DOCS / "verification.md"
-    head, rest = page.read_text(encoding="utf-8").split(BEGIN)
-    table = "\n".join([BEGIN, "| case | reference | value | error | bar | passed |", "|---|---|---|---|---|---|"])
-    table += "\n" + "\n".join(_line(row) for row in rows) + "\n" + END
-    page.write_text(head + table + rest.split(END)[1], encoding="utf-8")
+    head = ["| case | reference | value | error | bar | passed |", "|---|---|---|---|---|---|"]
+    fill("evidence/verification.md", "table", [*head, *map(_line, rows)])
 
 
 def _line(row: dict[str, Any]) -> str:

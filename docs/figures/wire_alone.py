@@ -1,4 +1,4 @@
-"""Measures how far a wire alone comes in the tasks of wire and catheter, for a table of docs/ladder.md.
+"""Measures how far a wire alone comes in the tasks of wire and catheter, for a table of docs/evidence/ladder.md.
 
 `python docs/figures/wire_alone.py FOLDER [PATIENTS]`: FOLDER gets a file for each navigation; those that are there are
 kept. The simple policies drive in all patients of a task, the agent in the first PATIENTS of them, 5 if not given.
@@ -10,14 +10,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.figures import fill
 from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import attempt, navigation_seed
 from endopilot.ladder.scores import score_navigations
 from endopilot.runs import make_missing
 from endopilot.tasks.task import Task, find_task, list_tasks, without_catheter
 
-PAGE = Path(__file__).parents[1] / "ladder.md"
-BEGIN, END = "<!-- wire alone:begin -->\n", "<!-- wire alone:end -->"
 SIMPLE, PLANS = ("forward", "spin"), "agent"
 
 
@@ -64,10 +65,7 @@ def main() -> None:
     for policy in (*SIMPLE, PLANS):
         paths = [path for task in list_tasks("coaxial") for path in paths_of(folder, policy, task, patients)]
         make_missing(f"Wire alone, {policy}", paths, navigate)
-    page = PAGE.read_text(encoding="utf-8")
-    head, tail = page.split(BEGIN)[0], page.split(END)[1]
-    text = "\n".join([*table(folder, patients), ""])
-    PAGE.write_text(f"{head}{BEGIN}{text}{END}{tail}", encoding="utf-8")
+    fill("evidence/ladder.md", "wire alone", table(folder, patients))
 
 
 if __name__ == "__main__":

@@ -50,7 +50,7 @@ def tables(found: dict[str, Any]) -> str:
         "",
         f"A wire is found in {100 * found['false_alarms_share']:.0f} % of the exposures without one, over all doses, "
         f"with and without contrast. An image without contrast is refused by registration in "
-        f"{sum(row['told_without_contrast'] for row in poses)} of {len(poses)} patients. "
+        f"{sum(row['refused_without_contrast'] for row in poses)} of {len(poses)} patients. "
         f"{motion_sentence(found)} "
         f"{found['images_per_second']:.0f} images a second of 512 × 512 pixels were made on one core, while others "
         "were busy.",

@@ -18,7 +18,7 @@ namespace endopilot {
 using TimePoint = std::chrono::steady_clock::time_point;
 
 // Calls `work(thread, until)` on `threads` threads, this one being number 0, until it returns true. On this thread it gets
-// a time to return at, so that `progress` is told of the samples that are `done`; if that throws, `stop` is set.
+// a time to return at, so that `progress` learns of the samples that are `done`; if that throws, `stop` is set.
 template <class Work>
 void run_threads(int threads, const Progress& progress, const std::atomic<long>& done, std::atomic<bool>& stop, const Work& work) {
     std::exception_ptr failure;

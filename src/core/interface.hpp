@@ -162,7 +162,7 @@ struct Inputs {
     ENDOPILOT_DEVICE double sample_period() const { return time_step * steps_per_sample; }
 };
 
-// Is told while a run goes on how many samples have ended since it was last called. Where it throws, the run ends.
+// Called while a run goes on, with how many samples have ended since the last call. Where it throws, the run ends.
 using Progress = std::function<void(long)>;
 
 enum Reason : std::uint8_t { kFine = 0, kNotFinite = 1, kNotConverged = 2, kThroughWall = 3 };

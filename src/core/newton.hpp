@@ -14,7 +14,7 @@ constexpr int kMaxRejections = 12;
 constexpr int kSlow = 20;                // iterations after which a step of several devices counts as slow; of a wire alone, max_iterations
 constexpr int kTurnabout = 10;           // iterations after which friction's tangent and its secant take turns
 constexpr int kSnapIterations = 25;      // times max_iterations that the shortest step may take: a snap takes many at any step
-constexpr double kAllowedRise = 0.85;    // of what the energy has fallen lately: by so much it may rise in a slow step
+constexpr double kAllowedRise = 0.85;    // share of its latest fall by which the energy may rise in a slow step
 constexpr double kBackInside = 0.02;     // of a move that left the map, that is tried next
 constexpr double kLeastOfMove = 1e-4, kMostOfMove = 0.7;   // of a move that raised the energy, that is tried next
 constexpr double kMostPower = 8;         // of the share, that the energy is taken to grow with beyond its slope

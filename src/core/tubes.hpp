@@ -63,8 +63,8 @@ ENDOPILOT_DEVICE inline Integrals integrals(const Tubes& tubes, int tube, double
 }
 
 // A joint that T further tubes share with tube 0. The stretch of a joint consists of pieces, each covered by some tubes; the moment is the
-// same in all. With E the sum of EI over the tubes of a piece and f the piece's share of the length, 1 / bend is the sum of f / E;
-// c of a tube that of f EI / E over its pieces, and d of two tubes that of f EI EI' / E over their common ones.
+// same in all. A piece has the share f of the length and the stiffness E, the sum of EI over its tubes. Then, with sums over pieces:
+// 1 / bend = sum of f / E; c of a tube = sum of f EI / E over its pieces; d of two tubes = sum of f EI EI' / E over those of both.
 template <class V, int T>
 struct TubeJoint {
     static constexpr int kPairs = T * (T + 1) / 2;

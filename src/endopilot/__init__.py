@@ -17,7 +17,7 @@ import lazy_loader
 
 from endopilot.extras import extra_named
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _import_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)  # the names stand in __init__.pyi
 

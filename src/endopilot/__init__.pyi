@@ -129,7 +129,7 @@ from .xray.carm import View as View
 from .xray.fluoroscope import Fluoroscope as Fluoroscope
 from .xray.fluoroscope import FluoroscopeConfig as FluoroscopeConfig
 from .xray.fluoroscope import TipMeasurement as TipMeasurement
-from .xray.frames import Frame as Frame
+from .xray.frames import DeviceFrame as DeviceFrame
 from .xray.frames import read_frames as read_frames
 from .xray.frames import write_locations as write_locations
 from .xray.image import ImageConfig as ImageConfig

@@ -1,4 +1,4 @@
-"""The atlas' patients against what was measured in real ones (docs/atlas.md), and what bends, forks and sections do."""
+"""The atlas' patients against what was measured in real ones (docs/evidence/atlas.md), and what bends do."""
 
 from __future__ import annotations
 

@@ -114,11 +114,11 @@ def test_a_difficulty_changes_the_scan_and_nothing_else():
     assert set(DISTURBANCES) == set(DIFFICULTIES[1:])
 
 
-def test_wrong_results_are_counted_and_those_that_are_told(tmp_path):
+def test_wrong_results_are_counted_and_those_that_are_reported(tmp_path):
     few, far, unsure = {"overlap": 0.79}, {"ostium_error_mm": 5.1}, {"warnings": ["a vessel ends"]}
     rows = [GOOD, GOOD | few, GOOD | far, GOOD | far | unsure, GOOD | unsure, {"failed": "no aorta"}]
     found = figures(tmp_path, rows)
-    assert [found[name] for name in ("wrong", "told", "silent", "false_alarms")] == [4, 2, 2, 1]
+    assert [found[name] for name in ("wrong", "reported", "silent", "false_alarms")] == [4, 2, 2, 1]
 
 
 def test_one_case_from_the_volume_to_its_scores(tmp_path, monkeypatch):

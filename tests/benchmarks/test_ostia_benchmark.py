@@ -24,15 +24,15 @@ def test_a_folder_of_masks_is_judged_by_its_truth(tmp_path):
         bench_ostia(tmp_path)
     write_volume(right.volume, tmp_path / "two.nii.gz")
     found, absent = bench_ostia(tmp_path)["arteries"]
-    assert found["ostium_error_mm"] < 3.0 and found["confidence"] > 0.8 and found["told"] is None
+    assert found["ostium_error_mm"] < 3.0 and found["confidence"] > 0.8 and found["refusal"] is None
     assert 0.99 < found["coverage"] <= 1.0
-    assert absent["ostium_error_mm"] is None and "holds no left coronary artery" in absent["told"]
+    assert absent["ostium_error_mm"] is None and "holds no left coronary artery" in absent["refusal"]
 
 
 def test_figures_count_what_is_right_what_is_wrong_and_what_is_told():
-    made = {"told": None, "coverage": 0.995, "seconds": 4.0}
+    made = {"refusal": None, "coverage": 0.995, "seconds": 4.0}
     rows = [made | {"ostium_error_mm": error} for error in np.linspace(0.0, 4.9, 23)]
-    told = {"told": "not certain", "ostium_error_mm": None, "coverage": None, "seconds": 3.0}
+    told = {"refusal": "not certain", "ostium_error_mm": None, "coverage": None, "seconds": 3.0}
     assert [figure["passed"] for figure in judged([*rows, told])] == [True, True, True, True]
     assert [figure["passed"] for figure in judged([*rows[1:], told, told])] == [False, True, True, True]
     wrong = made | {"ostium_error_mm": 5.1, "coverage": 0.98, "seconds": 16.0}

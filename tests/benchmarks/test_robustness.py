@@ -28,7 +28,7 @@ DEVICE = read_wire("workhorse-014")
 
 
 def small(folder: Path) -> RobustnessConfig:
-    return RobustnessConfig(rollouts=20, anatomies=1, seconds=12.0, seed=3, threads=1, folder=folder)
+    return RobustnessConfig(rollouts=20, anatomies=1, seconds=6.0, seed=3, threads=1, folder=folder)
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ void expect(bool fine, const char* what) {
 }
 
 constexpr double kPeriod = 0.5;  // s
-constexpr int kWorlds = 37, kSamples = 6, kSteps = 10;
+constexpr int kWorlds = 13, kSamples = 4, kSteps = 10;
 
 // Worlds at rest and what is recorded of them.
 struct Recorded {

@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 import re
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-
 from make_vessels import hairpin, length_of, line, lumen, tubes, with_voxels
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from scipy.spatial import KDTree
-
-sys.path.insert(0, str(Path(__file__).parent))
-
 from make_vessels import length_of, line, lumen, thinned_at, tubes, with_voxels
+from scipy.spatial import KDTree
 
 from endopilot.anatomy.coverage import NOTED_MM
 from endopilot.anatomy.extract import extract_anatomy

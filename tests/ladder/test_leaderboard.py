@@ -1,4 +1,4 @@
-"""Files in `submissions/` are what their scores say, and `docs/leaderboard.md` is made of them."""
+"""Files in `submissions/` are what their scores say, and `docs/evidence/leaderboard.md` is made of them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _scores(submission: Submission, chosen: dict[str, tuple[NavigationEntry, ...
 
 
 def test_the_page_is_made_of_the_files(script):
-    page = (ROOT / "docs" / "leaderboard.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "evidence" / "leaderboard.md").read_text(encoding="utf-8")
     assert script["page"]() == page  # run `python docs/leaderboard.py`
     assert all(path.name in page for path in FILES)
 

@@ -110,4 +110,5 @@ def test_a_table_that_is_no_log_is_refused(tmp_path, text, line) -> None:
 
 
 def test_pixels_need_a_camera(tmp_path) -> None:
-    assert refused(tmp_path, LOG, camera=False) == "camera.yaml: no such file; check the path"
+    line = refused(tmp_path, LOG, camera=False)
+    assert line.startswith("log.csv: tip_column_px: pixels need camera.yaml beside the log; write mm_per_pixel")

@@ -167,7 +167,7 @@ np.save("after.npy", simulator.state.values[0])
 
 def test_worlds_go_over_into_another_simulator_of_the_same_kind(anatomy: Anatomy, wider: Anatomy) -> None:
     first = begun(Simulator(anatomy, [DEVICE, STIFF, DEVICE]), 3)
-    second = Simulator(anatomy, [STIFF, DEVICE], sharing=first)
+    second = Simulator(anatomy, [STIFF, DEVICE], sharing=[first])
     second.copy_worlds([1, 2], of=first)
     moved = second.step(controls(1, 2)[0], PERIOD)
     wanted = first.step(controls(1, 2)[0][[0, 0, 1]], PERIOD)  # world 1 and world 2 get the controls of their copies
@@ -190,7 +190,7 @@ def test_equal_anatomies_and_devices_are_stepped_together(anatomy: Anatomy) -> N
     for control in controls(2, 4):
         step, wanted = simulator.step(control, PERIOD), shared.step(control, PERIOD)
         assert np.array_equal(step.tip_position, wanted.tip_position)
-    elsewhere = Simulator(again, read_wire("workhorse-014"), worlds=2, sharing=simulator)
+    elsewhere = Simulator(again, read_wire("workhorse-014"), worlds=2, sharing=[simulator])
     assert elsewhere._groups[0].lumen is simulator._groups[0].lumen
     elsewhere.copy_worlds([2, 1], of=simulator)
     assert np.array_equal(elsewhere.position, simulator.position[[2, 1]])

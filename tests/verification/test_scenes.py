@@ -1,4 +1,4 @@
-"""Drag, stick-slip, torque lag and whip, tip buckling: what docs/physics.md shows."""
+"""Drag, stick-slip, torque lag and whip, tip buckling: what docs/evidence/physics.md shows."""
 
 from __future__ import annotations
 

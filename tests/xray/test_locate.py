@@ -13,7 +13,7 @@ from endopilot.errors import InputError
 from endopilot.types import Anatomy, DistanceMap, Insertion
 from endopilot.xray.camera import CArmCamera, PlanarCamera, read_camera
 from endopilot.xray.detector import TipDetector
-from endopilot.xray.frames import Frame, frame_of, read_frames, write_locations
+from endopilot.xray.frames import DeviceFrame, frame_of, read_frames, write_locations
 from endopilot.xray.image import XrayImager
 from endopilot.xray.locate import locate
 from endopilot.xray.tip_filter import LocateConfig, TipFilter
@@ -55,11 +55,11 @@ def course(anatomy: Anatomy, leaf: int, frames: int = 12) -> tuple[list[np.ndarr
     return devices, moved
 
 
-def frames_of(devices, moved, cameras) -> list[Frame]:
+def frames_of(devices, moved, cameras) -> list[DeviceFrame]:
     random, frames = np.random.default_rng(0), []
     for number, (device, shift) in enumerate(zip(devices, moved, strict=True)):
         lines = [camera.project(device + shift) for camera in cameras]
-        frames.append(Frame(number, tuple(line + 0.5 * random.standard_normal(line.shape) for line in lines)))
+        frames.append(DeviceFrame(number, tuple(line + 0.5 * random.standard_normal(line.shape) for line in lines)))
     return frames
 
 
@@ -84,7 +84,7 @@ def test_a_landmark_registers_the_first_frame(anatomy) -> None:
     frames = frames_of([device], away[None], CAMERAS[:1])
     line = frames[0].lines[0]
     assert line is not None
-    tip_alone = [Frame(0, (line[:1],))]
+    tip_alone = [DeviceFrame(0, (line[:1],))]
     (lost,) = locate(anatomy, frames=tip_alone, cameras=CAMERAS[:1])
     assert lost.status != "found"
     known = LocateConfig(landmark_mm=tuple(device[0]))
@@ -116,7 +116,7 @@ def test_what_is_no_device_is_not_found(anatomy) -> None:
     devices, moved = course(anatomy, anatomy.tree.leaves()[0])
     frames = frames_of(devices, moved, CAMERAS[:1])
     loop = 512 + 150 * np.stack([np.cos(np.arange(0, 6, 0.05)), np.sin(np.arange(0, 6, 0.05))], axis=-1)
-    shown = [*frames[:3], Frame(3, (loop,)), Frame(4, (None,)), *frames[5:]]
+    shown = [*frames[:3], DeviceFrame(3, (loop,)), DeviceFrame(4, (None,)), *frames[5:]]
     found = locate(anatomy, frames=shown, cameras=CAMERAS[:1])
     assert [one.status for one in found[3:5]] == ["not found"] * 2 and np.isnan(found[3].position).all()
     assert np.linalg.norm(found[-1].position - devices[-1][0]) < 3.0

@@ -11,7 +11,6 @@ from jaxtyping import Float, Int
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
-from scipy.stats import rankdata
 
 from endopilot.anatomy.lumen_graph import lumen_graph, trace_branches
 
@@ -112,6 +111,16 @@ def open_ends(skeleton: Skeleton) -> list[OpenEnd]:
     return [_described(skeleton, int(tip), own, back) for tip, own, back in trees]
 
 
+def rank_correlation(one: Float[np.ndarray, "n"], other: Float[np.ndarray, "n"]) -> float:
+    """Return Spearman's rank correlation of two series; equal values share their mean rank."""
+    return float(np.corrcoef([_ranks(one), _ranks(other)])[0, 1])
+
+
+def _ranks(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    _, place, count = np.unique(values, return_inverse=True, return_counts=True)  # scipy.stats is slow to import
+    return (np.cumsum(count) - (count - 1) / 2)[place]
+
+
 def _described(skeleton: Skeleton, tip: int, length: Float[np.ndarray, "n"], before: Int[np.ndarray, "n"]) -> OpenEnd:
     points, radius, position = skeleton.points, skeleton.radius, skeleton.points[tip]
     near = (length > _NEAR_MM[0]) & (length < _NEAR_MM[1])
@@ -122,11 +131,10 @@ def _described(skeleton: Skeleton, tip: int, length: Float[np.ndarray, "n"], bef
     for node in np.argsort(length):
         if begun[node]:
             narrowest[node] = min(radius[node], narrowest[before[node]] if before[node] >= 0 else np.inf)
-    ranks = np.stack([rankdata(length), rankdata(radius)])
     return OpenEnd(
         position=position,
         calibre=width / skeleton.calibre_mm,
-        taper=-float(np.corrcoef(ranks)[0, 1]) if np.ptp(radius) > 0 else 0.0,
+        taper=-rank_correlation(length, radius) if np.ptp(radius) > 0 else 0.0,
         widening=float(np.mean(np.log(radius[begun] / narrowest[begun]))) if begun.any() else 0.0,
         heading=_unit((points[first] if first.any() else points).mean(axis=0) - position),
         course=_unit(points.mean(axis=0) - position),

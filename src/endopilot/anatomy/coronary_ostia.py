@@ -3,9 +3,9 @@
 Every open end of every piece is scored as the ostium of the right and of the left artery by what anatomy demands:
 calibre, taper, course, first heading and first fork, the place of the two ostia relative to each other, and that no
 vessel runs through the aorta between them. Each score is a logarithmic likelihood with heavy tails (Student's t), so no
-single quantity decides; its weight was fitted to perturbed masks of real patients (docs/anatomy.md). The probability of
-an ostium is the share of all hypotheses that agree with it within `SAME_MM`; among them are an absent artery, arteries
-that touch, other axes, and none of these.
+single quantity decides; its weight was fitted to perturbed masks of real patients (docs/concepts/ostium.md). The
+probability of an ostium is the share of all hypotheses that agree with it within `SAME_MM`; among them are an absent
+artery, arteries that touch, other axes, and none of these.
 """
 
 from __future__ import annotations

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer
-from scipy.stats import rankdata
 
 from endopilot.anatomy import parent_vessel
-from endopilot.anatomy.coronary_ends import open_ends, skeleton_of
+from endopilot.anatomy.coronary_ends import open_ends, rank_correlation, skeleton_of
 from endopilot.anatomy.coronary_ostia import Side, end_score, shape_score
 from endopilot.anatomy.distance import distance_map_from_surface
 from endopilot.anatomy.line_ends import end_score as inlet_score
@@ -189,5 +188,4 @@ def widest_open_end(
 def _tapering(points: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, "n"], tip: Float[np.ndarray, "3"]) -> float:
     """Return how steadily a tree narrows away from an end: its rank correlation, −1 where it widens throughout."""
     distance = np.linalg.norm(points - tip, axis=1)
-    ranks = np.stack([rankdata(distance), rankdata(radius)])
-    return -float(np.corrcoef(ranks)[0, 1]) if len(points) > 3 else 0.0
+    return -rank_correlation(distance, radius) if len(points) > 3 else 0.0

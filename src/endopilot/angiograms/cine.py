@@ -30,7 +30,7 @@ _MOST_RAYS = 256
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class CineFrame:
     """One frame and its truth. Pixels are (column, row), from 0 at the middle of the first one.
 
     Attributes:
@@ -113,7 +113,7 @@ class Cine:
         homogeneous = place(self.projection, place(self.placed[frame], points))
         return homogeneous[..., :2] / homogeneous[..., 2:]
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(self) -> Iterator[CineFrame]:
         """Yield the frames in turn."""
         config, draw, imager = self.config, self.draw, self.imager
         patient = imager.patient(self.view, rays=self._rays())
@@ -156,9 +156,9 @@ class Cine:
             lines_mm = self._lines(lines)
             lines_px = {name: self.project(line, number) for name, line in lines_mm.items()}
             masks |= self._device_masks(lines_mm, lines_px, number)
-            yield Frame(signal, imager.grey(signal), masks, lines_mm, lines_px)
+            yield CineFrame(signal, imager.grey(signal), masks, lines_mm, lines_px)
 
-    def keypoints(self, frame: Frame) -> dict[str, tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 2"]]]:
+    def keypoints(self, frame: CineFrame) -> dict[str, tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 2"]]]:
         """Return the keypoints of each device in a frame, LPS mm of the CT and pixels; NaN beyond a device's end."""
         found = {}
         for name, line in frame.lines_mm.items():

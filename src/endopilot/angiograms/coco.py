@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from endopilot.angiograms.cine import KEYPOINTS, Cine, Frame
+from endopilot.angiograms.cine import KEYPOINTS, Cine, CineFrame
 from endopilot.angiograms.masks import CLASSES, box_of, encoded
 
 CATEGORIES: tuple[dict[str, Any], ...] = tuple(
@@ -30,7 +30,7 @@ _MOST_FRAMES = 100_000
 
 
 def frame_entries(
-    cine: Cine, frame: Frame, image: str, number: int, cine_number: int
+    cine: Cine, frame: CineFrame, image: str, number: int, cine_number: int
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Return a frame's entry in `images`, and its entries in `annotations`; what does not show has none.
 

@@ -38,7 +38,7 @@ class AngiogramsConfig:
     """Range of the time for which contrast is injected, s."""
     blood_mm_s: Annotated[tuple[Positive, Positive], Ascending] = (80.0, 220.0)
     """Range of the blood's velocity behind the ostium, mean over the section, mm/s: such that contrast reaches the ends
-    of coronary arteries as fast as published (docs/angiograms.md)."""
+    of coronary arteries as fast as published (docs/evidence/angiograms.md)."""
     motion: MotionName = "both"
     """How heart and breath move vessel, catheter and wire: still, breathing, heartbeat or both. The amplitudes of each
     patient are drawn from the published distributions."""

@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import read_anatomy, write_anatomy
-from endopilot.angiograms.cine import Cine, Frame
+from endopilot.angiograms.cine import Cine, CineFrame
 from endopilot.angiograms.coco import coco, frame_entries
 from endopilot.angiograms.dicom import stored, write_xa
 from endopilot.angiograms.draw import draw_cine, motion_of
@@ -118,7 +118,7 @@ def _write_png(path: Path, image: UInt8[np.ndarray, "rows columns"]) -> None:
     sitk.WriteImage(sitk.GetImageFromArray(image), str(path), useCompression=True, compressionLevel=_COMPRESSION)
 
 
-def _truth_of(cine: Cine, frame: Frame, number: int) -> dict[str, np.ndarray]:
+def _truth_of(cine: Cine, frame: CineFrame, number: int) -> dict[str, np.ndarray]:
     """Return what is true of one frame, by the names of the arrays in the cine's file."""
     truth = {"centerline_px": cine.project(cine.flow.points, number)}
     for name, line in frame.lines_mm.items():

@@ -4,8 +4,8 @@ Facts and their sources: mean courses and origins of branches, Dodge JT et al., 
 `heart_left`); lumen diameters and the influence of dominance and sex, Dodge JT et al., Circulation 1992;86:232-46 (left
 main 4.5 ± 0.5 mm, anterior descending 3.7 ± 0.4 to 1.9 ± 0.4 mm, circumflex 3.4 ± 0.5 mm, 4.2 ± 0.6 mm where it is
 dominant); left main 13.1 mm long and the circumflex most often 65 to 80 mm, a cadaver study of 80 hearts from Gujarat
-(docs/atlas.md), where the SD of the left main's length, 2.4 mm, is smaller than the 5.2 mm of Reig J, Petit M, Clin
-Anat 2004;17:6-13: drawn with 3.5 mm.
+(docs/evidence/atlas.md), where the SD of the left main's length, 2.4 mm, is smaller than the 5.2 mm of Reig J, Petit M,
+Clin Anat 2004;17:6-13: drawn with 3.5 mm.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """How the patients of an atlas differ from each other: the textbook's mean courses, or those and what patients show.
 
 `textbook` patients follow published mean courses with smooth wiggles. `patients` have, on top of these, what was
-measured on 19 patients' coronary CT angiograms (docs/atlas.md) and what is published for the other vessels: sharp bends
-up to the tightest a lumen can make (curvature times radius 1), parents that give way at forks, side branches of any
-angle and calibre, missing branches, lumens that are not round, and catheters that meet the vessel at an angle.
+measured on 19 patients' coronary CT angiograms (docs/evidence/atlas.md) and what is published for the other vessels:
+sharp bends up to the tightest a lumen can make (curvature times radius 1), parents that give way at forks, side
+branches of any angle and calibre, missing branches, lumens that are not round, and catheters that meet the vessel at an
+angle.
 """
 
 from __future__ import annotations

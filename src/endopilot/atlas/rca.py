@@ -2,7 +2,8 @@
 
 Facts and their sources: the course, see `heart_reference`; lumen diameters by dominance, Dodge JT et al., "Lumen
 diameter of normal human coronary arteries", Circulation 1992;86:232-46; length, tortuosity, curvature, diameter along
-the artery and the origins of branches, measured on sixteen manually segmented right coronary arteries (docs/atlas.md).
+the artery and the origins of branches, measured on sixteen manually segmented right coronary arteries
+(docs/evidence/atlas.md).
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import norm, qmc
+from scipy.special import ndtr, ndtri
 
 from endopilot.belief.belief import Belief, BeliefConfig, Past
 from endopilot.errors import InputError
@@ -45,7 +45,7 @@ _LUMENS = 0.9, 1.0, 1.1
 _LARGEST_MAP = 50_000_000
 """Points of a distance map beyond which no other lumen is tried: it would take gigabytes."""
 _COMPLIANT_N_MM2 = 0.01
-"""Stiffness of a wall that is compliant: that of an artery in the heart's muscle, docs/physics.md."""
+"""Stiffness of a wall that is compliant: that of an artery in the heart's muscle, docs/concepts/wall.md."""
 _SCALES_MM = (0.5, 0.3, 0.3)
 """Scales of a good member's errors along and across its wire, and of its γtip, mm."""
 _USUAL_SD: Mapping[str, float] = {
@@ -184,11 +184,13 @@ def _first(
     config: IdentificationConfig, ostium: tuple[float, float], random: np.random.Generator
 ) -> tuple[Theta, np.ndarray]:
     """Return evenly spread parameters: the first kind is as given, and ostia are about where the first image has it."""
+    from scipy.stats import qmc  # slow to import
+
     kinds, each = config.kinds, config.each
     of_kind = qmc.Sobol(_OF_KIND, rng=random).random(kinds)
     of_kind[0] = [_to_unit(name, 1.0) for name in list(RANGES)[:_OF_KIND]]
     rest = qmc.Sobol(len(RANGES) - _OF_KIND, rng=random).random(kinds * each).reshape(kinds, each, -1)
-    off = norm.ppf(np.clip(rest[..., -1], 1e-3, 1 - 1e-3)) * ostium[1]
+    off = ndtri(np.clip(rest[..., -1], 1e-3, 1 - 1e-3)) * ostium[1]
     rest[..., -1] = np.clip(_to_unit("ostium_mm", ostium[0] + off), 0.0, 1.0)
     unit = np.concatenate([np.repeat(of_kind[:, None], each, axis=1), rest], axis=-1)
     unit[:, 0, list(RANGES).index("friction_factor")] = _to_unit("friction_factor", 1.0)
@@ -293,8 +295,8 @@ def _redrawn(
 
 def _truncated(center: np.ndarray, sd: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """Return normal deviates between 0 and 1."""
-    low, high = norm.cdf((0.0 - center) / sd), norm.cdf((1.0 - center) / sd)
-    return np.clip(center + sd * norm.ppf(low + (high - low) * random.random(center.shape)), 0.0, 1.0)
+    low, high = ndtr((0.0 - center) / sd), ndtr((1.0 - center) / sd)
+    return np.clip(center + sd * ndtri(low + (high - low) * random.random(center.shape)), 0.0, 1.0)
 
 
 def _interval(name: str, unit: np.ndarray, weight: np.ndarray) -> tuple[float, float] | None:

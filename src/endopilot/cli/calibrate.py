@@ -37,7 +37,8 @@ def command(
     `navigate`, `ladder` and `replay` take the files.
 
     Args:
-        logs: CSV files of commands and tips, driven through one vessel with one wire; docs/reality.md describes them.
+        logs: CSV files of commands and tips, driven through one vessel with one wire; docs/concepts/calibration.md
+            describes them.
         anatomy: folder made by `endopilot anatomy` of what the wire was driven through.
         output: robot.yaml; beside it robot.device.yaml, the wire, and robot.json, all intervals.
         device: name of a device (`endopilot devices`) or a YAML file, as the wire is known.
@@ -50,10 +51,10 @@ def command(
     _write(found, output, names)
     figures = summary(found.replays)
     known = np.array([each.rotation_known_rad for each in found.replays])
-    told_share = float(np.isfinite(known).mean())
+    known_share = float(np.isfinite(known).mean())
     about = {
-        "start_rotation_told_in": round(told_share, 3),
-        "start_rotation_known_rad": round(float(np.nanmedian(known)), 2) if told_share else None,
+        "start_rotation_known_in": round(known_share, 3),
+        "start_rotation_known_rad": round(float(np.nanmedian(known)), 2) if known_share else None,
         "band_of_90_percent_mm": None if found.band_mm is None else round(found.band_mm, 2),
         "it_holds_in_logs_left_out": None if found.band_share is None else round(found.band_share, 3),
     }
@@ -70,28 +71,28 @@ def command(
     }
     record = {"estimates": intervals} | about | figures
     write_json(output.with_suffix(".json"), manifest(config=config, seed=config.seed, inputs=inputs) | record)
-    told = {name: str(each) for name, each in found.estimates.items()}
+    estimated = {name: str(each) for name, each in found.estimates.items()}
     files = {"robot": output, "wire": _beside(output)}
     read_out = any(np.isfinite(log.encoders).any() for log in read)
     encoders = {"encoders_at": found.robot.encoders_at if read_out else "not identifiable from this log"}
-    return Answer(record | files, shown=[told | encoders | about | figures | files])
+    return Answer(record | files, shown=[estimated | encoders | about | figures | files])
 
 
 def _write(found: RobotCalibration, output: Path, names: str) -> None:
     """Write the robot and the wire, with the source of what was found."""
-    told = {
+    by_name = {
         name: f"{each}, 95 %" if each.identified else f"{each.value:.4g}, {each}"
         for name, each in found.estimates.items()
     }
-    sources = tuple(f"{name}: {text}, by {_BY} from {names}" for name, text in told.items())
-    kept = tuple(line for line in found.robot.sources if line.partition(":")[0] not in told)
+    sources = tuple(f"{name}: {text}, by {_BY} from {names}" for name, text in by_name.items())
+    kept = tuple(line for line in found.robot.sources if line.partition(":")[0] not in by_name)
     replace(found.robot, sources=(*kept, *sources)).write(output)
     of_wire = {"tip_bend": ("tip_bend_deg", "tip_bend_length_mm"), "friction": ("friction",)}
     of_wire |= dict.fromkeys(("bend_stiffness_n_mm2", "twist_stiffness_n_mm2"), ("tip_stiffness_factor",))
     texts = {
-        field: f"by {_BY} from {names}: " + ", ".join(f"{name} {told[name]}" for name in by)
+        field: f"by {_BY} from {names}: " + ", ".join(f"{name} {by_name[name]}" for name in by)
         for field, by in of_wire.items()
-        if all(name in told for name in by)
+        if all(name in by_name for name in by)
     }
     write_device(replace(found.wire, sources=dict(found.wire.sources) | texts), output=_beside(output))
 

@@ -26,14 +26,14 @@ def command(
     listen: ListenConfig = ListenConfig(port=7345),
     robot: str = ASSUMED,
 ) -> None:
-    """Run a simulated robotic drive until Ctrl-C; one client commands it over TLS (docs/robot.md). No medical device.
+    """Run a simulated robotic drive until Ctrl-C, over TLS (docs/concepts/drive-protocol.md). No medical device.
 
     Args:
-        certificates: folder with drive.key, drive.crt and client.crt; docs/robot.md makes them.
+        certificates: folder with drive.key, drive.crt and client.crt; docs/concepts/drive-protocol.md makes them.
         device: name of a device (`endopilot devices`) or a YAML file; it sets the speed limits.
         travel_mm: least and largest inserted length, mm.
         listen: the drive's address.
-        robot: name of a robot (docs/robot.md) or a YAML file: latency, accelerations and noise.
+        robot: name of a robot (docs/concepts/robot.md) or a YAML file: latency, accelerations and noise.
     """
     wire = read_wire(device)
     limits = DriveLimits(

@@ -32,7 +32,7 @@ def command(
         check: a submission.json. Its recorded controls are driven again, without the policy, and its scores confirmed
             to the bit; exit code 1 if one differs. No policy climbs then.
         dataset: folder of a LeRobot data set of the navigations, with X-ray images, their recordings being driven again
-            (docs/dataset.md).
+            (docs/concepts/dataset.md).
         page: write index.html with pictures and replays; --no-page leaves it out.
         config: which policy, tasks and patients.
     """

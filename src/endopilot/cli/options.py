@@ -214,7 +214,7 @@ class Command:
                 shape = make_dataclass("Arguments", parts, kw_only=True)
                 given = tyro.cli(shape, prog=self.name, args=rest, add_help=False)
         except SystemExit:
-            raise InputError(f"{_told(said.getvalue())}; `{self.name} --help` lists the options") from None
+            raise InputError(f"{_first_line(said.getvalue())}; `{self.name} --help` lists the options") from None
         return _with(start, given)
 
     def help(self, *, everything: bool) -> str:
@@ -322,7 +322,7 @@ def _taken(words: list[str], flag: str) -> str | None:
     return None
 
 
-def _told(box: str) -> str:
+def _first_line(box: str) -> str:
     """Return what tyro's box of several lines says of bad arguments, in one line: its first part, without the help."""
     lines = [line.strip("│╭╮╰╯─\n") for line in box.splitlines()[1:]]
     first = list(itertools.takewhile(lambda line: line.strip(" ─"), lines))

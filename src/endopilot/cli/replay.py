@@ -34,7 +34,7 @@ def command(
     The first part of each episode says how deep the wire lies and to which side it is turned; the rest is predicted.
 
     Args:
-        log: CSV file of commands and tips; docs/reality.md describes its columns.
+        log: CSV file of commands and tips; docs/concepts/calibration.md describes its columns.
         anatomy: folder made by `endopilot anatomy` of what the wire was driven through.
         output: folder of replay.png, replay.csv (both tips at each time), errors.csv (each episode's) and
             manifest.json.

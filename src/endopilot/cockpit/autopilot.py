@@ -47,7 +47,7 @@ class Autopilot:
         self._pending: Future[Decision | None] | None = None
         self._believed: BelievedTip | None = None
         self._began_s, self._started = 0.0, False
-        self._turned: tuple[float, ...] = ()  # each device as the policy began; the wire's turns are told
+        self._turned: tuple[float, ...] = ()  # each device as the policy began; the wire's turns are known
 
     @property
     def drives(self) -> bool:
@@ -171,7 +171,7 @@ class Autopilot:
         self._pending = None
         try:
             decision = pending.result()
-        except Exception as error:  # a policy may be anybody's: whatever it raises is told in the page
+        except Exception as error:  # a policy may be anybody's: whatever it raises is shown in the page
             self._policy = None
             return self._end("failed", f"{self.policy_name}: {' '.join(str(error).split())}")
         if isinstance(self._policy, Believer):
@@ -181,9 +181,9 @@ class Autopilot:
         if decision.gives_up:
             return self._end("gave up", f"{self.policy_name} gives up: {decision.gives_up}")
         self.status = "drives"
-        told, found = ("", "") if self._believed is None else (self._believed.asks, self._believed.found)
-        told = f"{told or 'the policy asks for it'}{f'; found: {found}' if found else ''}"
-        self.asks = told if decision.expose else ""
+        asks, found = ("", "") if self._believed is None else (self._believed.asks, self._believed.found)
+        asks = f"{asks or 'the policy asks for it'}{f'; found: {found}' if found else ''}"
+        self.asks = asks if decision.expose else ""
         return self._world.loop.take(decision).devices
 
     def _let_go(self, status: str) -> None:

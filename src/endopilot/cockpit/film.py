@@ -35,7 +35,7 @@ FRAME_S = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class FilmFrame:
     """The world at one moment of a film.
 
     Attributes:
@@ -65,8 +65,8 @@ class Film:
     navigation: Navigation
     seconds: float
     title: str
-    make: Callable[[], Iterator[Frame]]
-    frames: list[Frame] = field(default_factory=list)
+    make: Callable[[], Iterator[FilmFrame]]
+    frames: list[FilmFrame] = field(default_factory=list)
     done: bool = False
     failure: str = ""
 
@@ -80,7 +80,7 @@ class Film:
             for frame in self.make():
                 peak_n = max(peak_n, frame.snapshot.force_n)
                 self.frames.append(replace(frame, peak_n=peak_n))
-        except Exception as error:  # told in the page
+        except Exception as error:  # shown in the page
             self.failure = " ".join(str(error).split())
         self.done = True
 
@@ -134,12 +134,12 @@ def _session(path: Path) -> Film:
     if target is not None:
         navigation = replace(navigation, target=Target(branch=target[0], abscissa=target[1]))
 
-    def make() -> Iterator[Frame]:
+    def make() -> Iterator[FilmFrame]:
         exposed = False
         for world, events in replayed(recording):
             exposed |= any("exposure" in event for event in events)
             if world.cycle % every == 0:
-                yield Frame(world.snapshot(), exposed)
+                yield FilmFrame(world.snapshot(), exposed)
                 exposed = False
 
     return Film(navigation, recording.cycles * recording.config.cycle_s, f"session {path.name}", make)
@@ -149,17 +149,17 @@ def _of_the_ladder(task: Task, place: int, recording: Recording) -> Film:
     """Return a film of a navigation of the ladder, of which its decisions were recorded."""
     navigation, periods = task.ladder_navigation(place), len(recording.control)
 
-    def make() -> Iterator[Frame]:
+    def make() -> Iterator[FilmFrame]:
         loop = begun(recording, navigation, seed=navigation_seed(task, place))
         cycle_s, cycles = loop.config.cycle_s, loop.config.cycles
-        yield Frame(loop_snapshot(loop, cycle=0, force_n=float(loop.simulator.contacts.max())), True)
+        yield FilmFrame(loop_snapshot(loop, cycle=0, force_n=float(loop.simulator.contacts.max())), True)
         for number in range(1, periods * cycles + 1):
             if loop.between_periods:
                 loop.begin()
             force_n = loop.advance(cycle_s)
             period, within = divmod(number, cycles)
             exposed = within == 0 and period < periods and bool(recording.exposed[period])
-            yield Frame(loop_snapshot(loop, cycle=number, force_n=force_n), exposed)
+            yield FilmFrame(loop_snapshot(loop, cycle=number, force_n=force_n), exposed)
 
     return Film(navigation, DECISION_PERIOD_S * periods, f"{task.title}, patient {place}", make)
 
@@ -203,13 +203,13 @@ def _film(
     parts, every = max(round(period_s / FRAME_S), 1), max(round(FRAME_S / period_s), 1)
     exposed = {round(time_s / FRAME_S) for time_s in about.get("exposures_s", ())}
 
-    def make() -> Iterator[Frame]:
+    def make() -> Iterator[FilmFrame]:
         simulator = Simulator(
             anatomy, stack, actuation=set_up.actuation, motion=set_up.motion, config=replace(set_up.config, threads=1)
         )
         simulator.reset(inserted_length=start[None, :, 0], rotation=start[None, :, 1], friction=set_up.friction)
         frame = {"cycle": 0, "time_s": 0.0, "force_n": 0.0, "velocity": (0.0,) * start.size}
-        yield Frame(take_snapshot(simulator, None, **frame), 0 in exposed)
+        yield FilmFrame(take_snapshot(simulator, None, **frame), 0 in exposed)
         force_n = 0.0
         for number, command in enumerate(np.repeat(commands, parts, axis=0), start=1):
             before = simulator.proximal[0]
@@ -222,7 +222,7 @@ def _film(
                     "force_n": force_n,
                     "velocity": tuple(((simulator.proximal[0] - before) * parts / period_s).ravel().tolist()),
                 }
-                yield Frame(take_snapshot(simulator, step, **frame), number // every in exposed)
+                yield FilmFrame(take_snapshot(simulator, step, **frame), number // every in exposed)
                 force_n = 0.0
 
     return Film(navigation, len(commands) * period_s, title, make)

@@ -236,5 +236,5 @@ class XrayUnit:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         try:
             task()
-        except Exception as error:  # told in the page by the next pulse, not lost in a thread
+        except Exception as error:  # shown in the page by the next pulse, not lost in a thread
             self._failed = error

@@ -77,7 +77,7 @@ class Trials:
     """Trials of a stack that are driven side by side.
 
     Each is driven alike in several worlds, one for every wire that is held possible: in the first worlds are all trials
-    of the first wire, then those of the next. What is told of a trial is the weighted mean over its wires, or what
+    of the first wire, then those of the next. What a trial is judged by is the weighted mean over its wires, or what
     holds for all that count.
 
     Attributes:
@@ -114,7 +114,7 @@ class Trials:
             like: a simulator of the same anatomies, whose settings are taken.
         """
         anatomies, stacks = zip(*(kind for kind in kinds for _ in range(count)), strict=True)
-        simulator = Simulator(anatomies, stacks, motion=navigation.known_motion, config=like.config, sharing=like)
+        simulator = Simulator(anatomies, stacks, motion=navigation.known_motion, config=like.config, sharing=[like])
         limits = [DriveLimits.of(device, navigation.anatomy) for device in stacks[0].devices]
         first, last = limits[0].travel_mm
         travel = first, last - _SHORT_MM

@@ -17,8 +17,8 @@ from endopilot.types import SAMPLE_PERIOD_S
 def dataset_simulator() -> SimulatorConfig:
     """Return the settings that datasets are simulated with: the default's elements and a coarser Newton.
 
-    What they cost in accuracy stands in docs/dataset.md. Longer elements would be cheaper, but they catch in the
-    hairpins of real vessels.
+    What they cost in accuracy stands in docs/evidence/dataset.md. Longer elements would be cheaper, but they catch in
+    the hairpins of real vessels.
     """
     return SimulatorConfig(tolerance_mm=1e-2)
 

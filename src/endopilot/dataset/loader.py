@@ -64,8 +64,8 @@ class Dataset(Outputs):
         control: π = (dΔ/dt mm/s, dφ/dt rad/s), what was made of it.
         tip_abscissa: Δtip, mm.
         tip_offset: γtip, mm.
-        decided: what the robot was told, mm/s and rad/s; None where no robot made the motions, and `command` is what
-            its drives made of that, as the mean over a sample.
+        decided: what the robot was commanded, mm/s and rad/s; None where no robot made the motions, and `command` is
+            what its drives made of that, as the mean over a sample.
         encoders: inserted length, mm, and rotation, rad, as the robot measured them, likewise.
         load: force, N, and torque, N·mm, of the drives as the robot measured them, likewise.
         branch: index of the branch that the tip lies in.

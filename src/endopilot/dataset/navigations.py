@@ -74,8 +74,8 @@ def simulate_navigations(
 
     Returns:
         What was driven, and which worlds were stopped short. Commands are float32 numbers. With a robot, its columns
-        are what the robot was told (`decided`), and what it measured (`encoders`, `load`); commands are then what its
-        drives made of that.
+        are what the robot was commanded (`decided`), and what it measured (`encoders`, `load`); commands are then what
+        its drives made of that.
     """
     watch = _PushRoom(anatomy.tree, stacks)
     simulator = Simulator(anatomy, stacks, actuation=actuation, motion=motion, config=config)
@@ -97,8 +97,8 @@ def simulate_navigations(
         if actuation == "velocity":
             held = within_travel(np.minimum(held, room / SAMPLE_PERIOD_S), inserted, SAMPLE_PERIOD_S)
         stopped |= ((drawn > 0) & (held < drawn)).any(axis=1)
-        told = np.stack([held, control[:, sample, :, 1]], axis=-1).astype(np.float32)
-        step = recorder.step(told) if robots is None else robots.step(told, recorder)
+        commanded = np.stack([held, control[:, sample, :, 1]], axis=-1).astype(np.float32)
+        step = recorder.step(commanded) if robots is None else robots.step(commanded, recorder)
         slip, last, inserted = step.slip, step.inserted_length - inserted, step.inserted_length
         advance(len(control))
     trajectory = recorder.trajectory()
@@ -106,7 +106,7 @@ def simulate_navigations(
 
 
 class _Driven:
-    """The robots of the worlds, and what they were told and have measured at each sample."""
+    """The robots of the worlds, and what they were commanded and have measured at each sample."""
 
     def __init__(
         self,
@@ -121,11 +121,11 @@ class _Driven:
         self._robots = Robots(simulator, config, limits, seeds=seeds, ostium_mm=ostium_mm)
         self._rows: list[Float[np.ndarray, "worlds devices 6"]] = []
 
-    def step(self, told: Float[np.ndarray, "worlds devices 2"], recorder: Recorder) -> Step:
-        self._robots.motion.command(told.astype(float))
+    def step(self, commanded: Float[np.ndarray, "worlds devices 2"], recorder: Recorder) -> Step:
+        self._robots.motion.command(commanded.astype(float))
         step = recorder.step(self._robots.advance(recorder.period_s))
         self._robots.follow(recorder.simulator)
-        self._rows.append(np.concatenate([told, self._robots.read(recorder.simulator)], axis=-1))
+        self._rows.append(np.concatenate([commanded, self._robots.read(recorder.simulator)], axis=-1))
         return step
 
     @property

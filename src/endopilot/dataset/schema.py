@@ -54,7 +54,7 @@ OWN_COLUMNS = dict(
 )
 """Signals that have a column of their own: by the column, the signal, its type and the names of its components."""
 OF_ROBOT = ("decided", "encoders", "load")
-"""Signals that a dataset made by a robot has besides: what the robot was told, and what it measured."""
+"""Signals that a dataset made by a robot has besides: what the robot was commanded, and what it measured."""
 MANOEUVRES = ("insertion", "retraction", "spin", "pause")
 _MOVES_MM_S, _TURNS_RAD_S = 0.1, 0.02
 """Below these a drive rests: mm/s, rad/s."""
@@ -68,7 +68,7 @@ def signal_columns(
     `action` is what the drives were commanded, with all its digits: simulated again it gives the same navigation to the
     bit. Under force control, `velocity` is the resulting velocity. The load of a drive is always in `drive_force_n` and
     `drive_torque_nmm`. With catheters, a column has components of each device, those of catheter k named
-    `catheter_k_...`. A robot adds what it was told, `decided`, and what it measured, `encoders` and `load`.
+    `catheter_k_...`. A robot adds what it was commanded, `decided`, and what it measured, `encoders` and `load`.
     """
     vectors: dict[str, tuple[str, list[str] | None]] = {
         "action": ("float64", LOAD if actuation == "force" else VELOCITY),

@@ -1,7 +1,8 @@
 """What the numbers of a device's file can be: ranges by field, and how they must agree with each other.
 
-docs/devices.md says where each range comes from. They hold every wire from 0.006 to 0.038 inch, catheters and sheaths
-up to 24 French, and the soft rods of published benchmarks; what lies outside was most likely given in another unit.
+docs/concepts/devices.md says where each range comes from. They hold every wire from 0.006 to 0.038 inch, catheters and
+sheaths up to 24 French, and the soft rods of published benchmarks; what lies outside was most likely given in another
+unit.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     command -> latency, jitter -> motor [encoder] -> gain -> play -> slip -> proximal end of the device [encoder]
 
-docs/robot.md describes the chain, and says where the numbers come from.
+docs/concepts/robot.md describes the chain, and says where the numbers come from.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from endopilot.files import write_yaml
 from endopilot.settings import NonNegative, Positive, Within, read_settings, settings
 
 ASSUMED, IDEAL = "assumed", "ideal"
-"""Names of the robot whose numbers are assumptions, which is the default, and of the one that does as it is told."""
+"""Names of the robot whose numbers are assumptions, which is the default, and of the one that does as commanded."""
 _SHIPPED = Path(__file__).parent / "robots"
 Kind = TypeVar("Kind", bound=Device)
 _MOST_SPREADS = 3.0

@@ -11,9 +11,9 @@ from endopilot.settings import Within, settings
 class Transmission:
     """How a drive's rotation reaches the ostium.
 
-    The device behind the ostium twists under a Coulomb friction torque along it. docs/transmission.md derives what that
-    does: of a uniform device with the torsional stiffness GJ and free at the ostium, the rotation lags behind the
-    drive's by m L²/2GJ while it turns, and starts after a reversal when the drive has turned by twice that.
+    The device behind the ostium twists under a Coulomb friction torque along it. docs/concepts/transmission.md derives
+    what that does: of a uniform device with the torsional stiffness GJ and free at the ostium, the rotation lags behind
+    the drive's by m L²/2GJ while it turns, and starts after a reversal when the drive has turned by twice that.
 
     Attributes:
         length_mm: length of the device between its drive and the ostium, mm; 0: the drive acts at the ostium.

@@ -29,7 +29,7 @@ _OSTIUM_MM, _REGISTERED_MM, _TIMES = 2.5, 1.0, 2.0
 """A random world's ostium and registration lie up to this far off, mm; friction is up to so many times more or less.
 The shipped worlds differ as much."""
 _PLAY_MM, _PLAY_RAD, _GAIN, _LATENCY_S = 2.6, 5.65, 0.05, 0.1
-"""The largest plays of a random robot, mm and rad: the largest that were measured (docs/robot.md); the largest
+"""The largest plays of a random robot, mm and rad: the largest that were measured (docs/concepts/robot.md); the largest
 difference of its gains from 1, and twice the latency that is assumed, s."""
 
 
@@ -64,7 +64,7 @@ class Drawn:
         ostium_mm: the true inserted lengths are this much more than the encoders', mm.
         registration_mm: X-ray shows the wire displaced by this, mm LPS.
         backs_out_mm: the guiding catheter has yet to back out by this, mm.
-        robots: what drives; None where the devices do as they are told.
+        robots: what drives; None where the devices do as commanded.
         readings: what the robots measured last: Δ, mm, φ, rad, N and N·mm; None likewise.
     """
 
@@ -97,7 +97,7 @@ class Reality:
         Args:
             navigations: of each world, as they are given.
             world: what differs: of all worlds, or of world i number i modulo their number; "random" draws some.
-            robot: what drives, likewise; the devices do as they are told if not given.
+            robot: what drives, likewise; the devices do as commanded if not given.
             motion: of all vessels, where worlds have none.
             config: of the rod core, where worlds have none.
 
@@ -197,7 +197,7 @@ class Reality:
         """Move the devices for a while, by robots if there are some.
 
         Args:
-            control: what drives are told, mm/s and rad/s.
+            control: what drives are commanded, mm/s and rad/s.
             period_s: how long, s.
             time_s: since each episode's start, s.
         """
@@ -235,7 +235,7 @@ class Reality:
     def _all_robots(
         given: RobotConfig | str | Path | Sequence[RobotConfig | str | Path] | None, worlds: Sequence[World]
     ) -> list[RobotConfig | None] | None:
-        """Return the robot of each world, None for one that is drawn; none at all where devices do as they are told."""
+        """Return the robot of each world, None for one that is drawn; none at all where devices do as commanded."""
         if given is None and all(each.robot is None for each in worlds):
             return None
         robots = _spread(IDEAL if given is None else given, len(worlds), read_robot)

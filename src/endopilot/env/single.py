@@ -67,7 +67,7 @@ class NavigateEnv(gymnasium.Env):
             pixels: rows and columns of an image, 64 to 128.
             c_arm: its views, one or two, and errors of detection.
             world: what reality is where it differs from the navigation, or its name or YAML file; or "random".
-            robot: what drives, likewise; the device does as it is told if not given, or where X-ray shows the tip, the
+            robot: what drives, likewise; the device does as commanded if not given, or where X-ray shows the tip, the
                 robot is as assumed.
             motion: how heart and breath move the vessel and its guiding catheter; they lie still if not given.
             config: settings of the rod core.

@@ -96,7 +96,7 @@ class NavigateVectorEnv(VectorEnv):
     `NavigateEnv` is this class with one world. A world's course does not depend on the others, to the last bit.
 
     It is no `NavigationLoop`: nobody decides every 0.5 s, all is observed as it truly is unless `observation` says
-    otherwise, and the devices do as they are told unless `robot` names a robot with its latency and play. Then Δ and φ
+    otherwise, and the devices do as commanded unless `robot` names a robot with its latency and play. Then Δ and φ
     are observed as its encoders have them, and each episode draws a robot anew. It shares with the loop what a
     navigation is: start, rule of success, time and force limit (`Navigation`, `reached`, `is_safe`), how fast and how
     far a drive goes (`DriveLimits`), and what a C-arm shows (`Fluoroscope`, `XrayImager`).
@@ -287,7 +287,7 @@ class NavigateVectorEnv(VectorEnv):
             c_arm: its views, one or two, and errors of detection.
             world: what reality is where it differs from the navigations, or its name or YAML file; or several, of which
                 world i has number i modulo their number; or "random".
-            robot: what drives, likewise; the devices do as they are told if not given, or where X-ray shows the tip,
+            robot: what drives, likewise; the devices do as commanded if not given, or where X-ray shows the tip,
                 robots are as assumed.
             autoreset_mode: whether an ended world is reset at the next step.
             motion: how heart and breath move all vessels and their guiding catheters; they lie still if not given.

@@ -41,8 +41,8 @@ class EvaluateConfig:
     seed: Seed = 0
     """Seed of the bootstrap that gives the intervals over patients."""
     robot: str | None = None
-    """Name of a robot (docs/robot.md) or a YAML file: the controls of P4 pass its drives before they move the wire. If
-    not given, they move it as they are."""
+    """Name of a robot (docs/concepts/robot.md) or a YAML file: the controls of P4 pass its drives before they move the
+    wire. If not given, they move it as they are."""
 
 
 def evaluate(

@@ -175,22 +175,22 @@ def _lost_ends(found: FoundTree) -> list[str]:
     others = np.argwhere(label > 0)
     numbers = label[tuple(others.T)]
     points = found.grid.index_to_world(others[:, ::-1].astype(float))
-    told = []
+    doubts = []
     for path, radius in zip(found.paths, found.radius, strict=True):
         to_end = np.linalg.norm(path - path[-1], axis=1)
         if to_end[0] < _STUB_MM:
             continue
         wide = float(np.median(radius[to_end <= _END_MM]))
         if _goes_on(path, points, numbers, found):
-            told.append(
+            doubts.append(
                 f"a vessel ends at {place_text(path[-1])} and seems to go on behind a gap; give a seed beyond it"
             )
         elif wide >= _WIDE_END_MM:
-            told.append(
+            doubts.append(
                 f"a vessel ends at {place_text(path[-1])} while it is still {2 * wide:.1f} mm wide; its rest may be "
                 "missing"
             )
-    return told
+    return doubts
 
 
 def _goes_on(path: np.ndarray, points: np.ndarray, numbers: np.ndarray, found: FoundTree) -> bool:
@@ -215,12 +215,12 @@ def _goes_on(path: np.ndarray, points: np.ndarray, numbers: np.ndarray, found: F
 
 def _filled(found: FoundTree) -> list[str]:
     """Tell where the mask ends at calcium or metal long before the vessel does."""
-    told, places = [], np.zeros((0, 3))
+    doubts, places = [], np.zeros((0, 3))
     for path in found.paths:
         index = np.round(found.volume.world_to_index(path)).astype(int)[:, ::-1]
         index = np.clip(index, 0, np.array(found.lumen.shape) - 1)
         inside = np.flatnonzero(found.lumen[tuple(index.T)])
-        if len(inside) == 0:  # it leaves a vessel that is told
+        if len(inside) == 0:  # it leaves a vessel that is reported
             continue
         last = inside[-1]
         beyond = float(np.linalg.norm(np.diff(path[last:], axis=0), axis=1).sum())
@@ -228,11 +228,11 @@ def _filled(found: FoundTree) -> list[str]:
         known = (np.linalg.norm(places - path[last], axis=1) < _STUB_MM).any()  # of a branch that leaves there
         if not known and beyond > _BEYOND_MM and float(found.volume.voxels[box].max()) > CALCIUM * found.lumen_hu:
             places = np.vstack([places, path[last]])
-            told.append(
+            doubts.append(
                 f"calcium or metal fills a vessel at {place_text(path[last])}: the mask ends there, and {beyond:.0f} "
                 "mm of the vessel beyond are not in it"
             )
-    return told
+    return doubts
 
 
 def _missing(found: FoundTree, vessel: str) -> list[str]:
@@ -280,7 +280,7 @@ def _across_aorta(found: FoundTree, place: Float[np.ndarray, "3"]) -> bool:
 
 def _veins(found: FoundTree) -> list[str]:
     """Tell wide vessels of the tree whose blood is dimmer than the lumen."""
-    told = []
+    doubts = []
     for path, radius in zip(found.paths, found.radius, strict=True):
         hu = ndimage.map_coordinates(found.hu, found.grid.world_to_index(path)[:, ::-1].T, order=1, mode="nearest")
         dim = (ndimage.median_filter(hu, 15, mode="nearest") < _VEIN_SHARE * found.lumen_hu) & (
@@ -292,8 +292,8 @@ def _veins(found: FoundTree) -> list[str]:
         inside = max(runs, key=lambda run: along[run[-1]] - along[run[0]], default=places)
         if len(inside) and along[inside[-1]] - along[inside[0]] >= _VEIN_MM:
             middle = inside[len(inside) // 2]
-            told.append(
+            doubts.append(
                 f"a vessel at {place_text(path[middle])} has {np.median(hu[inside]):.0f} HU where the lumen has "
                 f"{found.lumen_hu:.0f}: a vein may have been taken for the artery; check the mask there"
             )
-    return told
+    return doubts

@@ -1,4 +1,4 @@
-"""Cardiac phases of one DICOM series: several images at each slice position, told apart by a field of their headers."""
+"""Cardiac phases of one DICOM series: images at one slice position that a field of their headers distinguishes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def choose_phase(
 
     Raises:
         InputError: there are several phases and none was chosen, there is no such phase, or several images at one
-            position cannot be told apart.
+            position cannot be distinguished.
     """
     everything = np.arange(len(positions_mm))
     if np.diff(np.sort(positions_mm)).min(initial=np.inf) >= _POSITION_MM:
@@ -96,7 +96,7 @@ def _single(values: Mapping[str, Sequence[float | None]], phase: str | None, fol
 def _split(values: Sequence[float | None], positions_mm: np.ndarray) -> dict[float, np.ndarray]:
     """Return the slices of each phase by its value; none where the values do not tell phases apart.
 
-    The time after the R wave may vary from beat to beat: then phases are told apart by their order at each position.
+    The time after the R wave may vary from beat to beat: then phases are distinguished by their order at each position.
     """
     if any(value is None or not np.isfinite(value) for value in values):
         return {}

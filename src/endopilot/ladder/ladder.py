@@ -37,11 +37,12 @@ class LadderConfig:
 
     version: LadderVersion = NEWEST
     """Version of the ladder: 2 in patients that resemble real ones, 1 in the textbook patients of before, coaxial, four
-    tasks of wire and catheter in patients as of version 2, or a folder of tasks of your own (docs/ladder.md)."""
+    tasks of wire and catheter in patients as of version 2, or a folder of tasks of your own
+    (docs/concepts/ladder.md)."""
     robot: str = ASSUMED
-    """Name of the robot that drives (docs/robot.md), or a YAML file."""
+    """Name of the robot that drives (docs/concepts/robot.md), or a YAML file."""
     world: Text = NOMINAL
-    """Name of the world that reality is (docs/worlds.md), or a YAML file. The policy is not told."""
+    """Name of the world that reality is (docs/worlds.md), or a YAML file. The policy does not know it."""
 
     @model_validator(mode="after")
     def _consistent(self) -> LadderConfig:

@@ -86,7 +86,7 @@ class Ensemble:
         return simulator
 
     def replay(self, command: Float[np.ndarray, "members samples 2"]) -> Float[np.ndarray, "members samples 2"]:
-        """Drive every wire from the start as a robot was told to; return its tips (Δtip, γtip), mm.
+        """Drive every wire from the start as a robot was commanded; return its tips (Δtip, γtip), mm.
 
         Args:
             command: mm/s and rad/s of each sample.

@@ -15,7 +15,6 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.stats import qmc
 
 from endopilot.devices.device import Wire
 from endopilot.models.config import WINDOW, TwinConfig
@@ -173,6 +172,8 @@ class TwinPredictor:
 
     def _members(self, center: Float[np.ndarray, "episodes 3"], spread: Float[np.ndarray, "episodes 3"]) -> Members:
         """Return ensembles around some centers, each first: the same Sobol sequence for all."""
+        from scipy.stats import qmc  # slow to import
+
         count = self.config.members  # the point after 0 is the middle
         unit = qmc.Sobol(3, scramble=False).random_base2(count.bit_length())[1 : count + 1]
         members = center + (2 * unit[:, None] - 1) * spread

@@ -161,7 +161,7 @@ def _field_of_view(anatomy: Anatomy, config: PhantomConfig, grafts: Sequence[Cen
 
 
 def _tissue_hu(generator: np.random.Generator, lumen_hu: float, right_heart: tuple[float, float]) -> dict[str, float]:
-    """Draw the CT numbers of one scan, HU (see docs/atlas.md for their ranges)."""
+    """Draw the CT numbers of one scan, HU (see docs/concepts/phantom.md for their ranges)."""
     right = generator.uniform(*right_heart)
     return {
         "lung": generator.uniform(-830, -780),

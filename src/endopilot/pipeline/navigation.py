@@ -144,7 +144,7 @@ def _write(found: PatientNavigation, output: Path, asked: Mapping[str, Any] | No
 
 
 def navigation_table(found: PatientNavigation) -> pd.DataFrame:
-    """Return a row for the start and for the end of each decision period; docs/navigation.md has the columns."""
+    """Return a row for the start and for the end of each decision period; docs/concepts/trajectory.md has them."""
     record, navigation = found.record, found.set_up.navigation
     tip, count = record.tip[:, 0], len(record.time_s)
     tree = navigation.anatomy.tree

@@ -130,22 +130,22 @@ def calibrate(
         )
     replays = ReplayConfig(given=config.given)
     of = prepare(_evenly(episodes, config.episodes), anatomy, config.given, robot)
-    drives, told = fit_drive(of, seed=config.seed), {}
+    drives, estimated = fit_drive(of, seed=config.seed), {}
     robot = _driven(robot, drives)
     robot = replace(robot, encoders_at=where_encoders_sit(of.logs, robot) or robot.encoders_at)
     if config.wires:
         some = prepare(_evenly(episodes, config.wire_episodes), anatomy, config.given, robot)
         wires = fit_wire(some, device, robot, config)
-        told = estimates(wires, WIRE, UNITS, RESOLUTION)
-        device, robot = with_found(device, robot, {name: told[name].value for name in WIRE})
+        estimated = estimates(wires, WIRE, UNITS, RESOLUTION)
+        device, robot = with_found(device, robot, {name: estimated[name].value for name in WIRE})
     for _ in range(_TIMES):
         slack = _slack(of, replay_prepared(of, Stack(device), robot, replays))
         drives = fit_drive(of, slack, seed=config.seed)
         robot = _driven(robot, drives)
-    told = estimates(drives, DRIVE, UNITS, RESOLUTION) | told
+    estimated = estimates(drives, DRIVE, UNITS, RESOLUTION) | estimated
     found = replay_prepared(of, Stack(device), robot, replays)
     held = left_out_share(found, [log.name for log in of.logs])
-    return RobotCalibration(robot, device, told, band(found), held, found)
+    return RobotCalibration(robot, device, estimated, band(found), held, found)
 
 
 def _evenly(episodes: list[RobotLog], most: int) -> list[RobotLog]:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import differential_evolution
-from scipy.stats import qmc, t
+from scipy.special import stdtrit
 
 Costs = Callable[[Float[np.ndarray, "candidates parameters"]], Float[np.ndarray, "candidates episodes"]]
 _WIDER = 0.5
@@ -90,7 +90,7 @@ class Candidates:
         count = more.shape[1]
         standard_error = np.sqrt(count) * more.std(axis=1, ddof=1)
         first = np.argsort(np.argsort(more.sum(axis=1))) < self.least
-        return first | (more.sum(axis=1) <= t.ppf(0.975, count - 1) / 2 * standard_error)
+        return first | (more.sum(axis=1) <= stdtrit(count - 1, 0.975) / 2 * standard_error)
 
 
 def search(
@@ -147,6 +147,8 @@ def _all(names: tuple[str, ...], tried: list[np.ndarray], cost: list[np.ndarray]
 
 def _halton(size: int, number: int, seed: int) -> Float[np.ndarray, "number size"]:
     """Return points that fill the unit cube evenly."""
+    from scipy.stats import qmc  # slow to import
+
     return qmc.Halton(size, seed=seed).random(number)  # pyright: ignore[reportCallIssue]
 
 
@@ -181,10 +183,10 @@ def estimates(
         resolution: least half-widths of intervals: what the model itself does not resolve, however long the log.
     """
     as_good, best = found.values[found.as_good], found.values[found.best]
-    told = {}
+    estimated = {}
     for i, name in enumerate(found.names):
         spare, value = resolution.get(name, 0.0), float(best[i])
         low, high = min(float(as_good[:, i].min()), value - spare), max(float(as_good[:, i].max()), value + spare)
         least, largest = ranges[name]
-        told[name] = Estimate(value, max(low, least), min(high, largest), ranges[name], units.get(name, ""))
-    return told
+        estimated[name] = Estimate(value, max(low, least), min(high, largest), ranges[name], units.get(name, ""))
+    return estimated

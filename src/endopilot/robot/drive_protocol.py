@@ -1,8 +1,8 @@
 """The lines that a drive and its client exchange, and the certificates by which they know each other.
 
-docs/robot.md holds the table of messages. A line is ASCII text, `VERB ARGUMENT...`, fields separated by one space, at
-most `LONGEST_LINE` bytes with its newline. Lines travel over TLS 1.3, and each side trusts one certificate, that of the
-other: so nobody else can read a line, make one, change it or send it again.
+docs/concepts/drive-protocol.md holds the table of messages. A line is ASCII text, `VERB ARGUMENT...`, fields separated
+by one space, at most `LONGEST_LINE` bytes with its newline. Lines travel over TLS 1.3, and each side trusts one
+certificate, that of the other: so nobody else can read a line, make one, change it or send it again.
 """
 
 from __future__ import annotations

@@ -168,6 +168,11 @@ def read_log(path: Path | str, *, camera: Camera | None = None) -> RobotLog:
         raise InputError(f"{path}: translation_mm: holds no command; give one")
     pixel = _group(table, "", _PIXEL)
     if np.isfinite(pixel).any() and camera is None:
+        if not path.with_name(CAMERA_FILE).exists():
+            raise InputError(
+                f"{path}: tip_column_px: pixels need {CAMERA_FILE} beside the log; write mm_per_pixel, "
+                "origin_mm, columns and rows of a camera above a plane, or a C-arm's matrix"
+            )
         camera = read_camera(path.with_name(CAMERA_FILE))
     return RobotLog(
         name=path.stem,

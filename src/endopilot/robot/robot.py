@@ -116,7 +116,7 @@ class SimulatedRobot:
         """Return the readings of encoders and loads; every reading has a noise of its own."""
         (read,) = self._robots.read(self._simulator, encoder_noise=self._random)
         if self._readings:
-            self._readings[-1] = read  # what was told is what is recorded
+            self._readings[-1] = read  # what was returned is what is recorded
         rows = read.tolist()
         devices, load = tuple((at, turn) for at, turn, _, _ in rows), tuple((f, m) for _, _, f, m in rows)
         return ProximalState(self._robots.motion.time_s, devices, load)

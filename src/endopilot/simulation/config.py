@@ -34,7 +34,7 @@ COMPLIANT_WALL_STIFFENING_MM2 = 8.023 / _ARTERY_MM**2
 times its modulus (Holzapfel and Ogden, Phil Trans R Soc A 2009, isotropic part, from shear tests of porcine muscle)."""
 COMPLIANT_WALL_AT_TIP_MM = 6.4
 """The tip bears on a point, and takes along as much wall as this length has, mm: a rigid disc as wide as the artery, on
-the muscle of docs/physics.md, is held by E B/(1 - ν²) = 0.064 N/mm (Boussinesq), and K is 0.01 N/mm²."""
+the muscle of docs/concepts/wall.md, is held by E B/(1 - ν²) = 0.064 N/mm (Boussinesq), and K is 0.01 N/mm²."""
 Actuation = Literal["velocity", "force"]
 """What a control is: translation (mm/s) and rotation (rad/s), or the drive's axial force (N) and torque (N·mm)."""
 
@@ -58,8 +58,8 @@ class SimulatorConfig:
     compliant_wall_n_mm2: Annotated[float, Within(_SOFTEST_N_MM2, 1e6)] | None = None
     """Stiffness of a compliant wall, N/mm of wire and mm of displacement: each place of the wall yields by itself, as a
     bed of springs (Winkler) that stiffen as the heart's muscle does. It takes the place of `wall_stiffness_n_mm` if
-    given. An artery that lies in that muscle has 0.01; docs/physics.md derives it. A softer wall would yield farther
-    than distance maps reach."""
+    given. An artery that lies in that muscle has 0.01; docs/concepts/wall.md derives it. A softer wall would yield
+    farther than distance maps reach."""
     friction_along: tuple[Annotated[float, Within(0, 100)], ...] = ()
     """Factors on friction along the vessel: at even distances from the ostium to the end of the longest path, linear
     between. It is the same everywhere if none is given."""

@@ -63,7 +63,7 @@ class Simulator(Readout):
         actuation: Actuation = "velocity",
         motion: Motion | None = None,
         config: SimulatorConfig | None = None,
-        sharing: Simulator | Sequence[Simulator] = (),
+        sharing: Sequence[Simulator] = (),
         reach_mm: float = 0.0,
     ) -> None:
         """Lay the devices out; every world starts with the wire's tip at the ostium.
@@ -108,8 +108,7 @@ class Simulator(Readout):
             raise InputError("actuation: 'force' with catheters; give 'velocity'")
         if actuation == "force" and any(one.length_mm > 0 for stack in stacks for one in stack.transmissions):
             raise InputError("actuation: 'force' with a length between drive and ostium; give 'velocity'")
-        prepared = [sharing] if isinstance(sharing, Simulator) else sharing
-        groups = [group for each in prepared for group in each._groups]
+        groups = [group for each in sharing for group in each._groups]
         with gpu_errors(config.processor):
             self._groups = make_groups(anatomies, stacks, motion, config, groups, reach_mm=reach_mm)
         self._rows = np.argsort(np.concatenate([group.index for group in self._groups]))

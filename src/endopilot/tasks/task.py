@@ -39,7 +39,7 @@ from endopilot.types import Anatomy, VesselTree
 
 CORE = SimulatorConfig(element_mm=1.25, time_step_s=1 / 14, sample_tolerance_mm=1e-4)
 """Settings of the rod core on the ladder and in the environments: longer elements, two time steps a control period,
-and forces that are exact to a micronewton; docs/environment.md states the accuracy that they keep."""
+and forces that are exact to a micronewton; docs/concepts/environments.md states the accuracy that they keep."""
 ShippedVersion = Literal[1, 2, "coaxial"]
 LadderVersion = ShippedVersion | str
 NEWEST: LadderVersion = 2

@@ -31,7 +31,7 @@ from endopilot.xray.tracker import TipEstimate
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class DeviceFrame:
     """What the cameras show of a device at one time.
 
     Attributes:
@@ -44,7 +44,7 @@ class Frame:
     lines: tuple[Float[np.ndarray, "_ 2"] | None, ...]
 
 
-def frame_of(number: int, found: TipEstimate | None, views: Sequence[View]) -> Frame:
+def frame_of(number: int, found: TipEstimate | None, views: Sequence[View]) -> DeviceFrame:
     """Return the frame of one exposure's images in which `TipDetector` found a wire, or none.
 
     Args:
@@ -53,12 +53,12 @@ def frame_of(number: int, found: TipEstimate | None, views: Sequence[View]) -> F
         views: that the detector was given; the frame's pixels are those of `View.project`.
     """
     if found is None:
-        return Frame(number, (None,) * len(views))
+        return DeviceFrame(number, (None,) * len(views))
     wire = np.concatenate([found.position[None], found.wire[::-1]])
-    return Frame(number, tuple(view.project(wire) for view in views))
+    return DeviceFrame(number, tuple(view.project(wire) for view in views))
 
 
-def read_frames(path: str | Path, *, views: int = 1) -> tuple[Frame, ...]:
+def read_frames(path: str | Path, *, views: int = 1) -> tuple[DeviceFrame, ...]:
     """Read the lines of a sequence.
 
     Args:
@@ -86,7 +86,7 @@ def read_frames(path: str | Path, *, views: int = 1) -> tuple[Frame, ...]:
         for k in range(1, views + 1):
             line = pixels[(frame == number) & (view == k)]
             lines.append(line if len(line) else None)
-        found.append(Frame(int(number), tuple(lines)))
+        found.append(DeviceFrame(int(number), tuple(lines)))
     return tuple(found)
 
 

@@ -9,12 +9,16 @@ from endopilot.progress import progress
 from endopilot.types import Anatomy
 from endopilot.xray.camera import Camera
 from endopilot.xray.carm import View
-from endopilot.xray.frames import Frame
+from endopilot.xray.frames import DeviceFrame
 from endopilot.xray.tip_filter import LocateConfig, TipFilter, TipLocation
 
 
 def locate(
-    anatomy: Anatomy, *, frames: Sequence[Frame], cameras: Sequence[Camera | View], config: LocateConfig | None = None
+    anatomy: Anatomy,
+    *,
+    frames: Sequence[DeviceFrame],
+    cameras: Sequence[Camera | View],
+    config: LocateConfig | None = None,
 ) -> tuple[TipLocation, ...]:
     """Find the tip of a device in each frame of a sequence.
 

@@ -12,7 +12,7 @@ from endopilot.files import writing
 from endopilot.plotting import BLUE, GREY, ORANGE, STYLE, VERMILLION
 from endopilot.types import Anatomy
 from endopilot.xray.camera import Camera
-from endopilot.xray.frames import Frame
+from endopilot.xray.frames import DeviceFrame
 from endopilot.xray.tip_filter import TipLocation
 
 _SHOWN = 4
@@ -24,7 +24,7 @@ def draw_locations(
     locations: Sequence[TipLocation],
     output: str | Path,
     *,
-    frames: Sequence[Frame],
+    frames: Sequence[DeviceFrame],
     cameras: Sequence[Camera],
 ) -> None:
     """Draw some frames of the first camera as PNG: its line, and the vessel where it was moved to.

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 from scipy.ndimage import gaussian_filter
-from skimage.feature import hessian_matrix, hessian_matrix_eigvals
 
 from endopilot.files import read_json
 
@@ -59,6 +58,8 @@ class RidgeEvidence:
 
 def features(signal: Float32[np.ndarray, "rows columns"], photons: float) -> Float32[np.ndarray, "rows columns f"]:
     """Return the features of every pixel: ridges and darkness over the noise, and the noise itself."""
+    from skimage.feature import hessian_matrix, hessian_matrix_eigvals  # slow to import
+
     around = gaussian_filter(signal, _AROUND_PX)
     noise = np.exp(-0.5 * around) / np.float32(np.sqrt(photons))
     found = []

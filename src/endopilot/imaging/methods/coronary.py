@@ -284,9 +284,9 @@ def _rival_aortas(
     scan: _Scan, aorta: np.ndarray, roots: list[AorticRoot], vessel: str, tree: np.ndarray, start: np.ndarray
 ) -> list[str]:
     """Tell what else may be the ascending aorta, since such an artery opens into it too, or into none visibly."""
-    told = []
+    doubts = []
     if not opens_into(scan.hu, scan.blood_hu, aorta, tree, start, _GRID_MM):
-        told.append("the artery does not visibly open into the aorta: the ostium may be elsewhere; give a seed at it")
+        doubts.append("the artery does not visibly open into the aorta: the ostium may be elsewhere; give a seed at it")
     label = connected_components(scan.vessels, corners=True)
     sizes = np.bincount(label.ravel()) * _GRID_MM**3
     for root in roots:
@@ -297,11 +297,11 @@ def _rival_aortas(
         large = [o.voxel for o in found if sizes[o.vessel] >= _LEAST_TREE_MM3]
         if large and _on_side(scan, root, np.array(large), vessel).any():
             x, y, z = root.centres[len(root.centres) // 2]
-            told.append(
+            doubts.append(
                 f"two vessels may be the ascending aorta; the one not taken passes ({x:.0f}, {y:.0f}, {z:.0f}) mm, and "
                 "an artery opens into it too; if it is the aorta, give a seed at the ostium there"
             )
-    return told
+    return doubts
 
 
 def _tree_at_seed(
