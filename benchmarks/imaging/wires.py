@@ -95,7 +95,7 @@ def bench_wires(
 
     Wires of random navigations are exposed from three pairs of angles, at half, once and twice the usual dose, in both
     views and in each alone; every other among a pacemaker's lead, clips and sternal wires. A patient whose file is in
-    the output folder is not measured again.
+    the output folder is not measured again, and more may be given later, after those.
 
     Args:
         output: folder that takes a file of each patient's exposures.
@@ -111,11 +111,12 @@ def bench_wires(
     Raises:
         InputError: a folder holds no anatomy, or the output belongs to another run.
     """
-    claim(output, "benchmarks xray-wires", config=config)
+    claim(output, "benchmarks xray-wires", wires=config.wires, seed=config.seed, image=config.image)
     rows: list[Search] = []
     scenes = SceneConfig(patients=config.patients, seed=config.seed, given=config.given)
     for index in range(len(config.given) or config.patients):
-        path = output / f"patient-{index:03d}.json"
+        name = config.given[index].name if config.given else "synthetic"
+        path = output / f"{index:03d}-{name}.json"
         if not path.exists():
             write_json(path, list(_searches(draw_scene(scenes, index, config.image), config)))
         rows += [Search(**row) for row in read_json(path)]

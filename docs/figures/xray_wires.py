@@ -12,7 +12,7 @@ from pathlib import Path
 PAGE = Path(__file__).parents[1] / "xray.md"
 BEGIN, END = "<!-- wires:begin -->", "<!-- wires:end -->"
 HEAD = (
-    "| | wires | missed, two views | one view | of what is wrong, said | called found and missed | doubted though right "
+    "| | wires | missed, two views | one view | wrong and said so | called found and missed | doubted though right "
     "| in own 95 % region |"
 )
 SHARES = (

@@ -132,7 +132,7 @@ def test_the_corridor_is_the_vessel(fork):
 
 
 def test_evidence_and_encoder_both_count(fork, planes):
-    """Without evidence the odds are even, and the tip is where the encoder says: to 2 mm, and 4 % deeper or 10 % less."""
+    """Without evidence the odds are even, and the tip is where the encoder says: to 2 mm and 4 %, or 10 % less deep."""
     corridor = make_corridor(fork, 0.18, 0.3, 30.0)
     flat = np.zeros((512, 512), dtype=np.float32)
     found = track(corridor, [planes[0].view], [flat], 12.0)
