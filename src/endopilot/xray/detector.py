@@ -68,7 +68,7 @@ class DetectorConfig:
     """Share of the places off the wire that look like one, whatever the evidence."""
     independent: Share = 0.35
     """Weight of a cross-section's evidence: neighbouring pixels share their noise."""
-    least_log_odds: Finite = 15.0
+    least_log_odds: Finite = 10.0
     """There is a wire where the images are likelier with one by this logarithm."""
     sure: OpenShare = 0.92
     """A tip is ambiguous where less of the posterior lies near it."""
