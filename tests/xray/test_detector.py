@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.special import ndtr
@@ -166,3 +168,28 @@ def test_a_wire_that_folds_back_ends_behind_its_fold(imager, planes, fork, back_
             np.linalg.norm(planes[i].view.project(found.position) - planes[i].view.project(nodes[0])) for i in shown
         )
         assert error < 3.0  # pixels
+
+
+def test_lines_that_were_there_before_are_none_of_the_wire(imager, planes, fork):
+    """A metal line goes on where the wire ends."""
+    nodes, at = wire_to(fork, 0), np.arange(36.0, 15.5, -0.5)
+    metal = np.stack([0 * at, 0.4 + 0 * at, at], axis=-1)
+    among = [replace(plane, background=plane.background + imager.wire(plane, metal)) for plane in planes]
+    views, photons = [plane.view for plane in among], [imager.photons(plane) for plane in among]
+    images = views, exposed(imager, among, nodes), photons, TIP[0]
+    empty = [imager.signal(plane, np.zeros((0, 3)), seed=90 + index) for index, plane in enumerate(among)]
+    detector = TipDetector(fork, imager.stack.wire)
+    assert np.linalg.norm(detector.find(*images, before=empty).position - nodes[0]) < 1.5
+    assert np.linalg.norm(detector.find(*images).position - nodes[0]) > 5.0
+    assert detector.find(views, empty, photons, TIP[0], before=empty) is None
+
+
+def test_an_estimate_that_is_not_sure_is_ambiguous_and_its_region_holds_the_rest(imager, planes, fork):
+    images = [planes[0].view], exposed(imager, planes, wire_to(fork, 1))[:1], [imager.photons(planes[0])], TIP[1]
+    sure, strict = (
+        TipDetector(fork, imager.stack.wire, DetectorConfig(sure=share)).find(*images) for share in (0.5, 1 - 1e-12)
+    )
+    assert sure.status == "found" and strict.status == "ambiguous"
+    np.testing.assert_array_equal(sure.position, strict.position)
+    np.testing.assert_allclose(strict.covariance, sure.covariance + sure.elsewhere)
+    assert np.trace(sure.elsewhere) > 0

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32
 from scipy.ndimage import binary_dilation, gaussian_filter
-from scipy.ndimage import label as connected
+from scipy.ndimage import label as connected_parts
 
 from endopilot.devices.device import Wire
 from endopilot.settings import Finite, NonNegative, OpenShare, Share, settings
@@ -156,8 +157,10 @@ class TipDetector:
         """Return the pixels near lines of an image without a wire, which is looked at once."""
         known = [mask for image, mask in self._known_lines if image is before]
         if not known:
-            label, count = connected(self._saturated(self._evidence(before, photons)) > _LINE, np.ones((3, 3)))
-            large = np.bincount(label.ravel(), minlength=count + 1) >= _LINE_PX
+            line = self._saturated(self._evidence(before, photons)) > _LINE
+            parts: Any = connected_parts(line, np.ones((3, 3)))
+            label = parts[0]
+            large = np.bincount(label.ravel()) >= _LINE_PX
             large[0] = False
             known = [binary_dilation(large[label], iterations=_MOVED_PX)]
             self._known_lines = [*self._known_lines[-1:], (before, known[0])]

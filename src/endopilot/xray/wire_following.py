@@ -160,6 +160,7 @@ class Follower:
                 inside = _likeliest(near)
                 cell = (low[0] + inside[0], low[1] + inside[1]) if near[inside] > 0 else _likeliest(leg.alpha[at])
             else:
+                assert leg.before is not None
                 place, (leg, at) = leg.places[0][cell], leg.before
                 near = (np.exp(-2 * ((leg.places[at] - place) ** 2).sum(axis=-1)) + 1e-9).astype(np.float32)
                 cell = _likeliest(leg.alpha[at] * near)
