@@ -33,6 +33,7 @@ BENCHMARKS = {
     "ostia": "anatomy.ostia:bench_ostia",
     "imaging": "imaging.segmentation:bench_imaging",
     "xray": "imaging.xray:bench_xray",
+    "xray-wires": "imaging.wires:bench_wires",
     "xray-processing": "imaging.processing:compare_processing",
     "angiograms": "imaging.angiograms:bench_angiograms",
     "wire-evidence": "imaging.wire_evidence:train_evidence",
@@ -42,6 +43,7 @@ BENCHMARKS = {
     "ladder-patients": "agent.ladder_patients:choose_patients",
     "xray-conditions": "agent.xray_conditions:drive_under_conditions",
     "worlds": "agent.worlds:drive_in_worlds",
+    "turn-network": "agent.turn_network:train_turns",
 }
 """Name of each benchmark, and the function that measures: module and name."""
 EXIT_FAILED, EXIT_BAD_INPUT = 1, 2

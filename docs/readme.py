@@ -1,4 +1,4 @@
-"""Write the measured parts of README.md and docs/evidence/demo.md from what the commands left in `runs/`, and from other pages.
+"""Write the measured parts of README.md and docs/evidence/demo.md, from `runs/` and from other pages.
 
 `make readme` runs it, after `make demo` and `make cta`. A part whose run is not there stays as it is.
 """
@@ -105,7 +105,8 @@ def _cta(run: Path) -> str:
         f"Dice {mask['dice']:.2f} against the aorta of a segmentation network (not a human reader). The agent takes "
         "the 0.035″ J wire from the false lumen through a tear into the true one and over the arch: "
         f"{wire['deepest_tip_mm']:.0f} mm in {wire['seconds']:g} s, with {wire['exposures']} X-ray exposures and at "
-        f"most {wire['peak_force_n']:.2f} N on the wall ([navigation](docs/evidence/navigation.md#a-dissected-aorta)).\n\n"
+        f"most {wire['peak_force_n']:.2f} N on the wall "
+        "([navigation](docs/evidence/navigation.md#a-dissected-aorta)).\n\n"
         "![The CT in three slices, our lumen in green, the network's aorta in red](docs/images/cta-mask.png)\n\n"
         "![The J wire in the true lumen, over the arch](docs/images/cta-wire.png)"
     )
@@ -149,7 +150,8 @@ def stands() -> str:
         (
             "a real robot",
             f"public log of a phantom, sessions kept aside: tips err by {plane} mm (median), "
-            f"{100 * float(share):.0f} % of {forks} forks are taken as the real wire took them; a band of {band} for Δtip holds throughout "
+            f"{100 * float(share):.0f} % of {forks} forks are taken as the real wire took them; "
+            f"a band of {band} for Δtip holds throughout "
             f"{kept.split('%')[0].split()[-1]} % of the episodes",
             "forces; a robot driven by the agent",
             [("reality", "")],

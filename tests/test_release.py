@@ -18,7 +18,7 @@ CHANGELOG = """## [Unreleased]
 ## [2.0.0] - 2030-01-02
 
 ### Added
-- What is new ([how](docs/new.md)).
+- What is new ([how](CHANGELOG.md)).
 
 ## [1.0.0] - 2029-01-01
 - The first.
@@ -42,7 +42,7 @@ def test_the_version_stands_in_one_place() -> None:
 
 
 def test_notes_are_the_part_of_the_version(released: Path) -> None:
-    link = "https://github.com/endopilot/endopilot/blob/v2.0.0/docs/new.md"
+    link = "https://github.com/endopilot/endopilot/blob/v2.0.0/CHANGELOG.md"
     assert notes("2.0.0", folder=released) == f"# endopilot 2.0.0\n\n### Added\n- What is new ([how]({link})).\n"
 
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 
@@ -49,6 +49,7 @@ SHOWN = ((0, 1), (0,), (1,))
 """Both views, and each alone."""
 Case = tuple[int | None, float, float, tuple[int, ...]]
 """Of an exposure: the wire, the dose, the contrast, and the views."""
+Row = TypeVar("Row", bound="Exposure")
 _OF_95 = 2.795
 """Standard deviations within which 95 % of normally distributed errors in space lie."""
 
@@ -250,11 +251,11 @@ def expose(scene: Scene, registered: Registration, cases: Sequence[Case]) -> lis
         )
         angle = scene.angles_deg[used[0]]
         row = Exposure(len(used), dose, contrast, view_text(angle), wire is not None, found is not None)
-        rows.append(row if wire is None else _errors(row, scene, wire, used, found))
+        rows.append(row if wire is None else errors_of(row, scene, wire, used, found))
     return rows
 
 
-def _errors(row: Exposure, scene: Scene, wire: int, used: Sequence[int], found: TipEstimate | None) -> Exposure:
+def errors_of(row: Row, scene: Scene, wire: int, used: Sequence[int], found: TipEstimate | None) -> Row:
     """Return a row with what is special about the tip, and with its errors."""
     nodes = scene.nodes[wire]
     tip, direction = nodes[0], (nodes[0] - nodes[1]) / np.linalg.norm(nodes[0] - nodes[1])

@@ -148,3 +148,18 @@ def test_a_detector_needs_sensible_shares():
 
     with pytest.raises(InputError, match="hidden: 0"):
         DetectorConfig(hidden=0.0)
+
+
+@pytest.mark.parametrize("back_mm", [3.0, 8.0])
+def test_a_wire_that_folds_back_ends_behind_its_fold(imager, planes, fork, back_mm):
+    straight = wire_to(fork, 0)
+    turn = np.linspace(0, np.pi, 9)[1:-1, None]
+    bow = straight[0] + np.concatenate([0 * turn, 0.6 * (np.cos(turn) - 1), 0.6 * np.sin(turn)], axis=1)[::-1]
+    back = straight[0] + [0.0, -1.2, 0.0] - np.linspace(back_mm, 0, 17)[:, None] * [0.0, 0.0, 1.0]
+    nodes = np.concatenate([back, bow, straight])
+    for shown in ((0, 1), (1,)):
+        found = found_in(imager, planes, exposed(imager, planes, nodes), TIP[0] + back_mm, shown)
+        error = max(
+            np.linalg.norm(planes[i].view.project(found.position) - planes[i].view.project(nodes[0])) for i in shown
+        )
+        assert error < 3.0  # pixels

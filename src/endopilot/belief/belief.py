@@ -19,12 +19,14 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float, Int
 
+from endopilot.anatomy.projection import TipProjector
 from endopilot.belief.drives import Drives
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Proximals, Stack
 from endopilot.models.ensemble import likelihoods
 from endopilot.settings import NonNegative, Positive, ShareBelowOne, Within, settings
 from endopilot.simulation.config import PRESETS, SimulatorConfig
+from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
@@ -91,11 +93,17 @@ class Past:
 
     Attributes:
         proximal: where the proximal ends of the devices were believed at each decision, mm and rad.
-        exposures: what X-ray showed, by the decision.
+        exposures: what X-ray showed, by the decision, as it was measured.
+        measured: encoders and loads at each decision, and what the drives had been told.
     """
 
     proximal: list[Float[np.ndarray, "devices 2"]] = field(default_factory=list)
     exposures: dict[int, TipMeasurement] = field(default_factory=dict)
+    measured: list[tuple[Proximals, Proximals, Proximals]] = field(default_factory=list)
+
+    def by_encoders(self) -> Past:
+        """Return the same with the proximal ends where the encoders read them."""
+        return replace(self, proximal=[np.array(encoders, dtype=float) for encoders, _, _ in self.measured])
 
 
 class Vessels:
@@ -141,6 +149,12 @@ class Belief:
         drives: where the proximal ends are.
         vessels: as members have them.
         error: of each member at the last measurement, along and across its wire, mm.
+        motion: how the vessel was found to move, which the C-arm does not know; None if it was not.
+        evidence: logarithm of how likely the measurements so far were, each before it was taken, up to what all beliefs
+            share.
+        shown: at each measurement that was replayed, every member's tip and the direction of its wire there, in the
+            vessel as CT shows it, LPS mm.
+        force: largest force of the wall on a node of each member at the end of the last period, N.
     """
 
     def __init__(
@@ -151,6 +165,7 @@ class Belief:
         *,
         drives: Drives | None = None,
         vessels: Vessels | None = None,
+        motion: Motion | None = None,
     ) -> None:
         """Bring every member's wire to the start of the navigation.
 
@@ -160,8 +175,11 @@ class Belief:
             config: accuracy of measurements, and settings of the rod core.
             drives: of another belief about the same devices; at rest at the start if not given.
             vessels: that other beliefs have prepared.
+            motion: of the vessel, if one was found.
         """
-        self.navigation, self.members, self.config = navigation, tuple(members), config
+        self.motion = motion
+        self.navigation = navigation if motion is None else replace(navigation, known_motion=motion)
+        self.members, self.config = tuple(members), config
         self._accuracy_mm = config.along_sd_mm, config.across_sd_mm
         self._core = self.members[0].core(config.core)
         self._limits = [DriveLimits.of(each, navigation.anatomy) for each in navigation.devices]
@@ -171,13 +189,22 @@ class Belief:
         self.ostium_mm = np.array([each.ostium_mm for each in self.members])
         self.vessels = vessels or Vessels(navigation.anatomy)
         self.kinds, self.kind = _kinds(navigation, self.members, self.vessels)
-        self.error = np.zeros((len(self.members), 2))
+        self.error, self.force = np.zeros((len(self.members), 2)), np.zeros(len(self.members))
         self._score, self._coaxial = np.zeros(len(self.members)), bool(navigation.catheters)
+        self.evidence = 0.0
+        self.shown: list[tuple[Float[np.ndarray, "members 3"], Float[np.ndarray, "members 3"]]] = []
         self.tip = self.simulator.project()[:, 0]
 
-    def like(self, members: Sequence[World]) -> Belief:
-        """Return a belief of other members about the same devices, at the start of the navigation."""
-        return Belief(self.navigation, members, self.config, drives=self.drives, vessels=self.vessels)
+    def like(self, members: Sequence[World], motion: Motion | None = None, *, drives: Drives | None = None) -> Belief:
+        """Return a belief of other members about the same devices, at the start of the navigation.
+
+        Args:
+            members: what each takes reality to be.
+            motion: of the vessel, if another was found.
+            drives: where the devices are, if not where these have them.
+        """
+        others = {"drives": drives or self.drives, "vessels": self.vessels, "motion": motion or self.motion}
+        return Belief(self.navigation, members, self.config, **others)
 
     @staticmethod
     def around(config: BeliefConfig) -> tuple[World, ...]:
@@ -218,6 +245,31 @@ class Belief:
         return np.maximum(given_mm + self.ostium_mm.reshape(-1, *[1] * (given_mm.ndim - 1)), 0.0)
 
     @property
+    def score(self) -> float:
+        """Logarithm of the likelihood of the likeliest member, up to what all beliefs share."""
+        return float(np.where(self.simulator.valid, self._score, -1e6).max())
+
+    def in_vessel(self, measured: TipMeasurement, period: int) -> TipMeasurement:
+        """Return a measurement less the motion that was found.
+
+        Args:
+            measured: as the C-arm has it.
+            period: the decision at which it was taken.
+        """
+        if self.motion is None:
+            return measured
+        ostium = np.asarray(self.navigation.anatomy.insertion.position)
+        placed = self.motion.core(ostium).placements(np.array([period * DECISION_PERIOD_S]))[0][0]
+        position = np.linalg.solve(placed[:, :3], measured.position - placed[:, 3])
+        tip = self._projector(position[None])
+        at = {"abscissa": float(tip.abscissa[0]), "offset": float(tip.offset[0]), "branch": int(tip.branch[0])}
+        return replace(measured, position=position, **at)
+
+    @cached_property
+    def _projector(self) -> TipProjector:
+        return TipProjector(self.navigation.anatomy.tree, self.navigation.anatomy.insertion)
+
+    @property
     def weight(self) -> Float[np.ndarray, "members"]:
         """Likelihoods of the members; a member whose simulation failed has none."""
         score = np.where(self.simulator.valid, self._score, -1e6)
@@ -247,7 +299,7 @@ class Belief:
             control[:, k] = self._limits[k].clip(motion / DECISION_PERIOD_S, now[:, k, 0], DECISION_PERIOD_S)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a member that fails has no weight
-            simulator.step(control, DECISION_PERIOD_S)
+            self.force = simulator.step(control, DECISION_PERIOD_S).contact_force_max
         self.tip = simulator.project()[:, 0]
 
     def errors(self, position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "members 2"]:
@@ -268,14 +320,23 @@ class Belief:
         The density is a Cauchy density. Its tails are heavy: a tip that snapped a moment too early says little about
         friction. Its scales are no smaller than the measurement's own standard deviations.
         """
-        self._weigh(measured, measured.position - self._relocate(measured) if self.drives.lose else measured.position)
+        if self.drives.lose:
+            self._weigh(measured, measured.position - self._relocate(measured), None)
+        else:
+            self._weigh(measured, measured.position, self.weight)
         if self.drives.lose and self.navigation.known_motion is None:  # else the next period takes them there
             self._move(self.drives.proximal)
 
-    def _weigh(self, measured: TipMeasurement, position: Float[np.ndarray, "3"]) -> None:
+    def _weigh(
+        self, measured: TipMeasurement, position: Float[np.ndarray, "3"], weight: Float[np.ndarray, "members"] | None
+    ) -> None:
+        """Weigh the members; with their weights before, the measurement counts as evidence."""
         self.error = self.errors(position)
         scaled = self.error / np.maximum(self._accuracy_mm, measured.sd_mm)
-        self._score = self._score - np.log1p((scaled**2).sum(axis=1))
+        density = 1 / (1 + (scaled**2).sum(axis=1))
+        if weight is not None:
+            self.evidence += float(np.log(np.nan_to_num(weight * density).sum() + 1e-9))
+        self._score = self._score + np.log(density)
 
     def replay(self, past: Past) -> Float[np.ndarray, "members exposures 3"]:
         """Drive the members, at the start of the navigation, as the devices went so far, and weigh them alike.
@@ -287,11 +348,30 @@ class Belief:
         for period, proximal in enumerate(past.proximal):
             if period:
                 self._move(proximal)
-            measured = past.exposures.get(period)
-            if measured is not None:
-                self._weigh(measured, measured.position)
+            if period in past.exposures:
+                measured = self.in_vessel(past.exposures[period], period)
+                self.shown.append((self.simulator.tip_position[:, 0].copy(), self.simulator.tip_direction[:, 0].copy()))
+                self._weigh(measured, measured.position, self.weight)
                 errors.append(np.column_stack([self.error, np.abs(measured.offset - self.tip.offset)]))
         return np.stack(errors, axis=1)
+
+    def rerun(self, past: Past) -> list[Float[np.ndarray, "devices 2"]]:
+        """Follow a navigation so far from its start, with drives of its own.
+
+        Returns:
+            Where the proximal ends of the devices were believed at each decision, mm and rad.
+        """
+        proximal = []
+        for period, (encoders, load, told) in enumerate(past.measured):
+            self.drives.sent(told)
+            if period:
+                self.follow(encoders, load)
+            else:
+                self.drives.begin(encoders)
+            proximal.append(self.drives.proximal.copy())
+            if period in past.exposures:
+                self.weigh(self.in_vessel(past.exposures[period], period))
+        return proximal
 
     def explains(self, measured: TipMeasurement) -> bool:
         """Return whether the likeliest wire explains the last measurement, which has weighed the members."""
@@ -318,7 +398,10 @@ class Belief:
         error = measured.position - tip - self._shifted(best, left[:, 0])
         shift = np.einsum("si,si->s", error, along)
         across = np.linalg.norm(error - shift[:, None] * along, axis=1)
-        scaled = np.column_stack([shift, across]) / np.maximum(_PLACED_MM, measured.sd_mm)
+        errors = np.column_stack([shift, across])
+        likely = 1 / (1 + ((errors / np.maximum(self._accuracy_mm, measured.sd_mm)) ** 2).sum(axis=1))
+        self.evidence += float(np.log(likely.mean()))
+        scaled = errors / np.maximum(_PLACED_MM, measured.sd_mm)
         drives.weigh(0, -np.log1p(scaled**2).sum(axis=1))
         moved = (drives.proximal[0] - before)[:, None]
         return (self._turned(best, moved[1], fan)[0] - self._end(self.simulator)[best] + self._shifted(best, moved[0]))[

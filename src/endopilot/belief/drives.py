@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.devices.play import through_play
-from endopilot.devices.robot import RobotConfig
+from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.devices.stack import Proximals
 from endopilot.tasks.navigation import DECISION_PERIOD_S
 
@@ -45,6 +45,16 @@ _WORTH_IT = np.array([0.3, 0.1])
 """A device this near to where it should be stays where a play would have to be taken up first, mm and rad."""
 
 
+UNKNOWN = RobotConfig(encoders_at="motor", wire=DriveConfig(play_mm=1.5, play_rad=2.5, play_sd_share=0.5))
+"""A robot whose encoders say where its motor is, and nothing else is known. Real plays: docs/concepts/robot.md."""
+_JUMP_SHARE, _JUMPS = 0.1, np.array([2.0, 1.0])
+"""Strays of a robot that is not known: it may slip, and its guiding catheter may back out."""
+_UNKNOWN_JITTER = 0.05
+"""What its plays are moved by, as a share: less is known of them."""
+_KNOWN = 0.5
+"""A play is unknown whose interval is wider than this share of what was likely before, or begins at the least."""
+
+
 class Motion(NamedTuple):
     """What drives are to do in a period.
 
@@ -65,6 +75,8 @@ class Drives:
         proximal: Δ, mm, and φ, rad, of each device where it most likely is.
         sd: standard deviations of these.
         at_rest: where the devices are once the motors have done what they were told before.
+        told: what the drives were told last, mm/s and rad/s.
+        unknown: whether nothing is known of the robot, and its encoders were found not to say where the devices are.
     """
 
     def __init__(
@@ -80,7 +92,11 @@ class Drives:
             start: where the devices are, and what the encoders read there, mm and rad.
             fastest: translation and rotation of each drive, mm/s and rad/s.
         """
-        self._fastest, self._random = fastest, np.random.default_rng(0)
+        self._start, self._fastest, self._random = np.array(start, dtype=float), fastest, np.random.default_rng(0)
+        self.told: Proximals = ()
+        self.unknown = robot is UNKNOWN
+        self._stray = (_JUMP_SHARE, _JUMPS) if self.unknown else (_STRAY_SHARE, _STRAYS)
+        self._gap_jitter = _UNKNOWN_JITTER if self.unknown else _GAP_JITTER
         self._encoder, self._run_out = np.array(start, dtype=float), np.zeros(start.shape)
         self._sent = np.zeros(start.shape)
         self.proximal = self.at_rest = self._encoder
@@ -117,11 +133,28 @@ class Drives:
             self._encoder = place
         self._estimate()
 
+    def of_robot(self, robot: RobotConfig | None) -> Drives:
+        """Return the drives of another robot at the start of the navigation, such as `UNKNOWN`."""
+        return Drives(robot, self._start, self._fastest)
+
+    @property
+    def words(self) -> str:
+        """What was found of an unknown robot, in words; empty for one that is known."""
+        if not self.unknown:
+            return ""
+        low, high = np.quantile(self._gap[:, 0], (0.1, 0.9), axis=0)
+        before = 2 * 1.28 * self._robot.wire.play_sd_share * self._play[0]
+        units = "a play of {:.1f} to {:.1f} mm", "a play of {:.1f} to {:.1f} rad"
+        known = (high - low <= _KNOWN * before) & (low > 1.5 * _LEAST_SHARE * self._play[0])
+        found = [unit.format(*ends) for unit, *ends, sure in zip(units, low, high, known, strict=True) if sure]
+        return ", ".join(["the wire is not where its encoder says", *(found or ["unknown play"])])
+
     def sent(self, velocity: Proximals) -> None:
         """Note what the drives are told to do until the next reading, mm/s and rad/s."""
+        self.told = velocity
         if self.lose:
             told = np.zeros(self._sent.shape)
-            told[: len(velocity)] = velocity
+            told[: len(velocity)] = np.reshape(velocity, (-1, 2))
             told[~np.isfinite(told).all(axis=1)] = 0.0  # a drive stops then
             self._run_out = self._robot.run_out(self._sent)
             self._sent = np.clip(told, -self._fastest, self._fastest)
@@ -193,10 +226,11 @@ class Drives:
         self._draw(device, score)
         moving, random = self._play[device] > 0, self._random
         gap, ahead, position = (each[:, device] for each in (self._gap, self._ahead, self._position))
-        wider = 1 + _GAP_JITTER * random.standard_normal(gap.shape)
+        wider = 1 + self._gap_jitter * random.standard_normal(gap.shape)
         position = position + moving * _JITTER * random.standard_normal(position.shape)
-        stray = random.random(_SAMPLES) < _STRAY_SHARE
-        position[stray] += moving * _STRAYS * random.standard_normal((int(stray.sum()), 2))
+        share, reach = self._stray
+        stray = random.random(_SAMPLES) < share
+        position[stray] += moving * reach * random.standard_normal((int(stray.sum()), 2))
         self._gap[:, device], self._ahead[:, device] = gap * wider, ahead * wider
         self._position[:, device] = position
         self._estimate()

@@ -14,10 +14,12 @@ from jaxtyping import Float
 from endopilot.belief.adviser import AdviserConfig, XrayAdviser
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig, Past
+from endopilot.belief.drives import UNKNOWN
 from endopilot.belief.identification import Identified, identify
 from endopilot.belief.innovations import Innovations
+from endopilot.belief.patient_motion import FoundMotion, find_motion
 from endopilot.devices.stack import Proximals
-from endopilot.tasks.navigation import Navigation
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.xray.fluoroscope import TipMeasurement
 
 _LUMEN_SHARE, _LUMEN_MM = 0.12, 0.3
@@ -25,6 +27,16 @@ _LUMEN_SHARE, _LUMEN_MM = 0.12, 0.3
 assumption."""
 _MOST, _EVERY = 6, 3
 """The belief is changed as often at most, after as many further exposures at least."""
+_LEAST_EXPOSURES, _LEAST_GAIN, _MOST_MISFIT = 3, 6.0, 0.8
+"""A motion of the vessel is looked for in as many exposures at least; and believed that makes them likelier by this
+logarithm, and leaves no larger misfit."""
+_MOTION_SD_MM = np.array([0.6, 0.1])
+"""Standard deviations of (Δtip, γtip) that a motion adds which was found, mm: measured in moving vessels."""
+_FREE_MM, _HELD_SHARE = 3.0, np.array([0.3, 0.05])
+"""A wire that advances by more than this while its tip rests buckles: standard deviations of (Δtip, γtip) that this
+adds, as shares of what goes beyond, mm."""
+_BETTER = 2.0
+"""What is found must explain all exposures better by this logarithm."""
 MISMATCH = "model mismatch"
 """Why X-ray is asked for while the model is taken to be wrong."""
 AdviserInput = tuple[
@@ -66,6 +78,8 @@ class Monitor:
         lost: whether no wire explains the last exposure.
         past: what was measured so far.
         identified: what was found when the belief was last changed; None before.
+        moves: how the vessel was found to move; None if it was not.
+        seen: the last exposure, less that motion; None where X-ray is off.
         changes_left: how often it may still be changed.
     """
 
@@ -87,13 +101,17 @@ class Monitor:
         """
         self._navigation, self._config = navigation, config or BeliefConfig()
         self._advice = advice or AdviserConfig()
-        self.belief = Belief(navigation, Belief.around(self._config), self._config)
+        self._given = Belief.around(self._config)
+        self.belief = Belief(navigation, self._given, self._config)
         self._adviser = XrayAdviser(calibration, self._advice, navigation.device.tip_radius_mm)
         self._innovations, self.past, self.lost = Innovations(), Past(), False
         self.identified: Identified | None = None
+        self.moves: FoundMotion | None = None
+        self.seen: TipMeasurement | None = None
         self._tests = not navigation.catheters
         self.changes_left, self._since, self._returned = _MOST, 0, False
         proximal, tip, spread, radius = adviser_input(self.belief)
+        self._ends, self._held_mm = np.array([proximal[0, 0], tip[0, 0]]), 0.0
         self._adviser.start(proximal, tip, radius)
         self._half = self._adviser.widths(spread)[0]
 
@@ -111,34 +129,51 @@ class Monitor:
             exposure: what X-ray shows now; None where it is off.
         """
         period = len(self.past.proximal)
+        self.past.measured.append((encoders, load, self.belief.drives.told))
         if period:
             self.belief.follow(encoders, load)
         else:
             self.belief.drives.begin(encoders)
         self.past.proximal.append(self.belief.drives.proximal.copy())
-        play = self.belief.play_spread()[None]
         proximal, tip, spread, radius = adviser_input(self.belief)
+        self._hold(proximal, tip)
+        self.seen = None
         if exposure is not None:
-            seen = np.array([exposure.abscissa, exposure.offset])
+            self.seen = seen = self.belief.in_vessel(exposure, period)
             if self._tests:
-                self._innovations.take(seen - tip[0], self._half, exposure.tip_sd_mm)
+                self._innovations.take(np.array([seen.abscissa, seen.offset]) - tip[0], self._half, exposure.tip_sd_mm)
             self.past.exposures[period] = exposure
-            self.belief.weigh(exposure)
+            self.belief.weigh(seen)
             self._adviser.exposed()
-            self.lost = not self.belief.explains(exposure)
+            self._held_mm = 0.0
+            self.lost = not self.belief.explains(seen)
             self._innovations.alarm |= self.lost and self._tests
             self._since += 1
-            if self._is_to_change():
-                self._identify(exposure)
+            if self.alarm and self._finds_motion():
+                self._renew()
+            elif self._is_to_change():
+                self._identify()
             proximal, tip, spread, radius = adviser_input(self.belief)
         elif self.belief.drives.proximal[0, 0] <= self._navigation.start_inserted_length_mm:
             self.lost = False  # back where it began, the wire lies as it did, unseen in its catheter
         factor = self._innovations.factor
         wall_mm = np.minimum(_LUMEN_SHARE * radius, _LUMEN_MM) if self._tests else 0.0
         wider = {"factor": factor, "always": self.alarm, "wall_mm": wall_mm}
-        due = bool(self._adviser.advise(proximal, tip, spread, radius, play, **wider)[0])
+        due = bool(self._adviser.advise(proximal, tip, spread, radius, self._further_sd(), **wider)[0])
         self._half = self._adviser.half_width[0] / factor
         return self._believed(tip[0], due)
+
+    def _hold(self, proximal: np.ndarray, tip: np.ndarray) -> None:
+        """Note by how much the wire was moved at its proximal end while its tip rested."""
+        now = np.array([proximal[0, 0], tip[0, 0]])
+        moved, rested = np.abs(now - self._ends).tolist()
+        self._ends, self._held_mm = now, self._held_mm + max(moved - rested, 0.0)
+
+    def _further_sd(self) -> Float[np.ndarray, "1 2"]:
+        """Return the standard deviations of (Δtip, γtip) that no calibration knows of, mm."""
+        held = _HELD_SHARE * max(self._held_mm - _FREE_MM, 0.0) * self._tests
+        motion = _MOTION_SD_MM * (self.belief.motion is not None)
+        return np.sqrt(self.belief.play_spread() ** 2 + motion**2 + held**2)[None]
 
     @property
     def may_return(self) -> bool:
@@ -157,18 +192,65 @@ class Monitor:
         """Return whether another belief is sought: the first does not explain the images, or no longer the last one."""
         if self.changes_left == 0 or not self.alarm:
             return False
-        return self.identified is None or (self._since >= _EVERY and (self.lost or self._innovations.outside))
+        first = self.identified is None and self.moves is None and not self.belief.drives.unknown
+        return first or (self._since >= _EVERY and (self.lost or self._innovations.outside))
 
-    def _identify(self, exposure: TipMeasurement) -> None:
+    def _identify(self) -> None:
         """Change the belief to what explains all exposures."""
-        self.belief, self.identified = identify(self.belief, self.past, seed=self.changes_left)
-        self.changes_left, self._since = self.changes_left - 1, 0
+        found, identified = identify(self.belief, self.past, seed=self.changes_left)
+        self.changes_left -= 1
+        if len(self.past.proximal) == 1:
+            self._given = found.members
+        elif not self.belief.drives.lose:
+            other = self.belief.like(self._given, drives=self.belief.drives.of_robot(UNKNOWN))
+            proximal = other.rerun(self.past)
+            if other.evidence > found.evidence:
+                found, identified, self.past.proximal = other, None, proximal
+        self.belief, self.identified = found, identified
+        self._renew()
+
+    def _renew(self) -> None:
+        """Begin with another belief."""
+        self._since = 0
         self._innovations.renew()
-        self.lost = not self.belief.explains(exposure)
+        period = len(self.past.proximal) - 1
+        self.seen = self.belief.in_vessel(self.past.exposures[period], period)
+        self.lost = not self.belief.explains(self.seen)
+
+    def _finds_motion(self) -> bool:
+        """Return whether a motion of the vessel explains the exposures, and take it into the belief then."""
+        given, drives = self._navigation, self.belief.drives
+        if not self._tests or given.known_motion is not None or len(self.past.exposures) < _LEAST_EXPOSURES:
+            return False
+        members, past = self.belief.members, self.past
+        if self.moves is not None and not (self.lost or self._innovations.outside or self._since >= _EVERY):
+            return False
+        if self.moves is None:
+            members = self._given
+            if drives.unknown:  # its encoder may be right, and the image was wrong
+                drives, past = drives.of_robot(given.robot), self.past.by_encoders()
+        tried = self.belief.like(members, drives=drives)
+        tried.replay(past)
+        for _ in range(2):  # the wire as it lies in a vessel that lies still, and in one that moves
+            best = int(np.argmax(tried.weight))
+            tip, direction = (np.array([each[best] for each in some]) for some in zip(*tried.shown, strict=True))
+            seen = np.array([each.position for each in past.exposures.values()])
+            times_s = DECISION_PERIOD_S * np.array(list(past.exposures))
+            found = find_motion(tip, direction, seen, times_s, np.asarray(given.anatomy.insertion.position))
+            if found.gain < _LEAST_GAIN or found.misfit > _MOST_MISFIT:
+                return False
+            tried = self.belief.like(members, found.motion, drives=drives)
+            tried.replay(past)
+        if tried.evidence < self.belief.evidence + _BETTER:
+            return False
+        self.belief, self.moves, self.identified, self.past = tried, found, None, past
+        drives.begin(past.measured[-1][0])
+        return True
 
     def _believed(self, tip: np.ndarray, due: bool) -> BelievedTip:
         abscissa, offset = tip.tolist()
-        found = "" if self.identified is None else self.identified.words
+        words = [each.words for each in (self.moves, self.belief.drives, self.identified) if each is not None]
+        found = "; ".join(each for each in words if each)
         if self.lost:
             asks = "no simulated wire explains the last image" if due or not self._tests else ""
             return BelievedTip(abscissa, offset, (np.inf, np.inf), asks, found)

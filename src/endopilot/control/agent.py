@@ -140,15 +140,14 @@ class _PlanningPolicy:
         check_devices(navigation)
         self.belief, self._seed = self._believe(), seed
         self._search = self._new_search()
-        self._follower = Follower(
-            self.belief.drives, devices=len(navigation.devices), turn_rad_s=self.config.search.turn_rad_s
-        )
-        self._back_mm = np.inf
+        self._follower = self._new_follower()
+        self._back_mm, self._measured = np.inf, None
         self._lost = self._began = self._arrived = self._shows = False
         self._crept, self.plans, self._failed, self.planning_s = 0, 0, 0, 0.0
 
     def decide(self, observation: Observation) -> Decision:
         """Follow the course, search another one, or pull back, as the module describes."""
+        self._measured = None
         self._observe(observation)
         if observation.tip is None and self.belief.drives.proximal[0, 0] <= self.navigation.start_inserted_length_mm:
             self._lost = False  # back where it began, the wire lies as it did, unseen in its catheter
@@ -194,7 +193,11 @@ class _PlanningPolicy:
         return self._search.halt
 
     def _new_search(self) -> Search:
-        return Search(self.navigation, self.route, self.belief, config=self.config.search, seed=self._seed)
+        return Search(self.belief.navigation, self.route, self.belief, config=self.config.search, seed=self._seed)
+
+    def _new_follower(self) -> Follower:
+        devices, turn_rad_s = len(self.navigation.devices), self.config.search.turn_rad_s
+        return Follower(self.belief.drives, devices=devices, turn_rad_s=turn_rad_s)
 
     def _observe(self, observation: Observation) -> None:
         if self._began:
@@ -214,7 +217,7 @@ class _PlanningPolicy:
         """Note whether the wire is lost, and how far it is then pulled back."""
         if lost or self._lost:
             self._follower.begin(None)
-        self._lost = lost
+        self._lost, self._measured = lost, measured
         self._back_mm = self.belief.drives.proximal[0, 0] - self._way_back(measured)
 
     def _way_back(self, measured: TipMeasurement) -> float:
@@ -251,8 +254,8 @@ class _PlanningPolicy:
         self._arrived = self._follower.reached and self._follower.ended
         if self._arrived and arriving:
             return self._creep()
-        if self._arrived and observation.tip is not None:  # no wire says what is wrong; the image does
-            left = (self.navigation.target.abscissa - observation.tip.abscissa) / DECISION_PERIOD_S
+        if self._arrived and self._measured is not None:  # no wire says what is wrong; the image does
+            left = (self.navigation.target.abscissa - self._measured.abscissa) / DECISION_PERIOD_S
             return self._follower.move([float(np.clip(left, -_WIRE_CREEP_MM_S, _WIRE_CREEP_MM_S))])
         if self._follower.ended:
             self._shows = not self._search.draws  # another look, before another search
@@ -366,7 +369,8 @@ class AgentPolicy(_PlanningPolicy):
         decision = super().decide(observation)
         if self._losses < _LOSSES or decision.gives_up:
             return decision
-        at = "" if observation.tip is None else f" at {observation.tip.abscissa:.0f} mm"
+        seen = self.monitor.seen
+        at = "" if seen is None else f" at {seen.abscissa:.0f} mm"
         return replace(
             decision, gives_up=f"lost {self._losses} times: no wire, lumen or ostium explains what X-ray shows{at}"
         )
@@ -378,10 +382,9 @@ class AgentPolicy(_PlanningPolicy):
             monitor.return_to_given()
         if self.belief is not monitor.belief:  # another wire, lumen or ostium: another course
             self.belief, self._failed = monitor.belief, 0
-            self._search = self._new_search()
-            self._follower.begin(None)
-        if observation.tip is not None:
-            self._located(observation.tip, lost=monitor.lost)
+            self._search, self._follower = self._new_search(), self._new_follower()
+        if monitor.seen is not None:
+            self._located(monitor.seen, lost=monitor.lost)
         self._lost = monitor.lost
         self._losses += self._lost and not before
 

@@ -21,6 +21,7 @@ POLICIES = Registry(
         "in-turn": "endopilot.navigation.baseline_policies:InTurn",
         "oracle": "endopilot.control.agent:OraclePolicy",
         "agent": "endopilot.control.agent:AgentPolicy",
+        "cloned": "endopilot.control.cloned:ClonedPolicy",
         "open-loop": "endopilot.control.agent:OpenLoopPolicy",
     },
     group="endopilot.policies",

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.tree import tangents
 from endopilot.types import Anatomy
@@ -54,11 +54,12 @@ class Corridor:
     passages: tuple[Passage, ...]
     offsets: Float[np.ndarray, "g"]
 
-    def places(self, passage: Passage) -> Float[np.ndarray, "n g g 3"]:
-        """Return the places of the grids of a passage, LPS mm."""
-        aside = self.offsets[:, None, None] * passage.first[:, None, None, :]
-        across = self.offsets[None, :, None] * passage.second[:, None, None, :]
-        return passage.middle[:, None, None, :] + aside + across
+    def places(self, passage: Passage, section: Int[np.ndarray, "n"] | None = None) -> Float[np.ndarray, "n g g 3"]:
+        """Return the places of the grids of some sections of a passage, or of all, LPS mm."""
+        chosen = slice(None) if section is None else section
+        aside = self.offsets[:, None, None] * passage.first[chosen, None, None, :]
+        across = self.offsets[None, :, None] * passage.second[chosen, None, None, :]
+        return passage.middle[chosen, None, None, :] + aside + across
 
     def open(self, passage: Passage) -> Bool[np.ndarray, "n g g"]:
         """Return which places lie within the room of the wire's axis."""

@@ -121,19 +121,24 @@ def draw_scenes(config: SceneConfig, image: ImageConfig | None = None) -> Iterat
     Raises:
         InputError: a given folder holds no anatomy.
     """
-    device, patients = read_wire(config.device), len(config.given) or config.patients
+    patients = len(config.given) or config.patients
     with progress("Patients on the table", patients) as advance:
         for index in range(patients):
-            random = np.random.default_rng([config.seed, index, 0x7363656E])
-            atlas = AtlasConfig(vessel=("rca", "lca")[index % 2], seed=config.seed)
-            anatomy = read_anatomy(config.given[index]) if config.given else make_patient(atlas, index)
-            imager = XrayImager(anatomy, device, ct=surroundings(anatomy), config=image)
-            angles = config.view_angles_deg[index // 2 % len(config.view_angles_deg)]
-            pose = Pose.draw(random)
-            planes = tuple(imager.plane(angle, pose=pose) for angle in angles)
-            nodes, velocity, inserted = _wires(anatomy, device, int(random.integers(2**31)))
-            yield Scene(anatomy, device, imager, angles, pose, planes, nodes, velocity, inserted)
+            yield draw_scene(config, index, image)
             advance()
+
+
+def draw_scene(config: SceneConfig, index: int, image: ImageConfig | None = None) -> Scene:
+    """Return one patient of `draw_scenes`, by its number."""
+    device, random = read_wire(config.device), np.random.default_rng([config.seed, index, 0x7363656E])
+    atlas = AtlasConfig(vessel=("rca", "lca")[index % 2], seed=config.seed)
+    anatomy = read_anatomy(config.given[index]) if config.given else make_patient(atlas, index)
+    imager = XrayImager(anatomy, device, ct=surroundings(anatomy), config=image)
+    angles = config.view_angles_deg[index // 2 % len(config.view_angles_deg)]
+    pose = Pose.draw(random)
+    planes = tuple(imager.plane(angle, pose=pose) for angle in angles)
+    nodes, velocity, inserted = _wires(anatomy, device, int(random.integers(2**31)))
+    return Scene(anatomy, device, imager, angles, pose, planes, nodes, velocity, inserted)
 
 
 def _wires(anatomy: Anatomy, device: Wire, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
