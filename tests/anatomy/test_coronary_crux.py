@@ -44,15 +44,6 @@ def right_artery(*beyond):
 
 
 @pytest.mark.parametrize(("right", "left", "dominance"), [(5, 40, "right"), (40, 5, "left"), (5, 5, "balanced")])
-@pytest.mark.parametrize(("kind", "asked"), [("rca", "lca"), ("lca", "rca"), ("rca", "rca"), ("lca", "lca")])
-def test_lines_of_the_other_artery_are_noted(kind, asked):
-    tree, _ = make_patient_tree(AtlasConfig(vessel=kind, seed=5), 0)
-    notes = extract_anatomy(tree, config=AnatomyConfig(vessel=asked)).provenance["notes"]
-    runs = [note for note in notes if "runs as a" in note]
-    found = "right" if kind == "rca" else "left"
-    assert bool(runs) == (kind != asked) and all(f"as a {found} coronary artery does" in note for note in runs)
-
-
 def test_the_artery_that_reaches_the_crux_is_dominant(right, left, dominance):
     trees = [polyline(OSTIUM, OSTIUM + (1.0 - gap / 62.7) * CRUX_FROM_OSTIUM_MM) for gap in (right, left)]
     found = find_crux(OSTIUM, *trees)
@@ -146,3 +137,12 @@ def test_a_right_artery_that_reaches_the_crux_without_its_branches_leaves_domina
     whole = label_tree(tree_of_line(right_artery()), "rca")
     assert not {"4", "16"} & set(whole.sections_present)
     assert whole.longest_path().abscissa[-1] > 120.0 and tree_dominance(whole) is None
+
+
+@pytest.mark.parametrize(("kind", "asked"), [("rca", "lca"), ("lca", "rca"), ("rca", "rca"), ("lca", "lca")])
+def test_lines_of_the_other_artery_are_noted(kind, asked):
+    tree, _ = make_patient_tree(AtlasConfig(vessel=kind, seed=5), 0)
+    notes = extract_anatomy(tree, config=AnatomyConfig(vessel=asked)).provenance["notes"]
+    runs = [note for note in notes if "runs as a" in note]
+    found = "right" if kind == "rca" else "left"
+    assert bool(runs) == (kind != asked) and all(f"as a {found} coronary artery does" in note for note in runs)
