@@ -25,12 +25,14 @@ from endopilot.xray.fluoroscope import TipMeasurement
 
 _MOST, _EVERY = 6, 3
 """The belief is changed as often at most, after as many further exposures at least."""
-_LEAST_EXPOSURES, _LEAST_GAIN, _MOST_MISFIT = 3, 6.0, 0.8
-"""A motion of the vessel is looked for in as many exposures at least; and believed that makes them likelier by this
-logarithm, and leaves no larger misfit."""
+_LEAST_EXPOSURES, _OUTSIDE_MM = 3, 0.8
+"""A motion of the vessel is looked for in as many exposures at least, where one showed the tip so far outside the
+lumen: a wire in a vessel that lies still is not."""
+_LEAST_GAIN, _MOST_MISFIT = 6.0, 0.8
+"""A motion is believed that makes the exposures likelier by this logarithm, and leaves no larger misfit."""
 _MOTION_SD_MM = np.array([0.6, 0.1])
 """Standard deviations of (Δtip, γtip) that a motion adds which was found, mm: measured in moving vessels."""
-_BETTER = 2.0
+_BETTER = 3.0
 """What is found must explain all exposures better by this logarithm."""
 MISMATCH = "model mismatch"
 """Why X-ray is asked for while the model is taken to be wrong."""
@@ -211,6 +213,8 @@ class Monitor:
         if not self._tests or given.known_motion is not None or len(self.past.exposures) < _LEAST_EXPOSURES:
             return False
         members, past = self.belief.members, self.past
+        if self.moves is None and max(map(self._outside_mm, self.past.exposures.values())) < _OUTSIDE_MM:
+            return False
         if self.moves is not None and not (self.lost or self._innovations.outside or self._since >= _EVERY):
             return False
         if self.moves is None:
@@ -234,6 +238,11 @@ class Monitor:
         self.belief, self.moves, self.identified, self.past = tried, found, None, past
         drives.begin(past.measured[-1][0])
         return True
+
+    def _outside_mm(self, measured: TipMeasurement) -> float:
+        """Return how far outside the lumen of a vessel that lies still a tip was seen, mm."""
+        line = self._navigation.anatomy.tree.branches[measured.branch].centerline
+        return measured.offset - float(np.interp(measured.abscissa, line.abscissa, line.radius))
 
     def _believed(self, tip: np.ndarray, due: bool) -> BelievedTip:
         abscissa, offset = tip.tolist()
