@@ -11,9 +11,9 @@ def test_a_wire_that_is_pushed_while_its_tip_rests_is_known_less_well_until_it_i
     made = Allowance(10.0, 10.0, alone=True)
     made.move(30.0, 30.5)
     assert not made.sd_mm.any()  # the tip went along
-    for inserted in (32.0, 34.0, 33.0, 35.0):
+    for inserted in (33.0, 36.0, 35.0, 37.0):
         made.move(inserted, 30.5)
-    np.testing.assert_allclose(made.sd_mm, [0.3 * 4.0, 0.05 * 4.0])  # 2 + 2 + 1 + 2 mm, of which 3 are free
+    np.testing.assert_allclose(made.sd_mm, [0.3 * 4.0, 0.05 * 4.0])  # 3 + 3 + 1 + 2 mm, of which 5 are free
     made.exposed()
     assert not made.sd_mm.any()
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 _LUMEN_SHARE, _LUMEN_MM = 0.12, 0.3
 """The lumen's radius may be off by this share, and no more than this, mm: CT shows it to a tenth or a voxel, an
 assumption."""
-_FREE_MM, _HELD_SHARE = 3.0, np.array([0.3, 0.05])
+_FREE_MM, _HELD_SHARE = 5.0, np.array([0.3, 0.05])
 """A wire that is moved by more than this while its tip rests buckles: standard deviations of (Δtip, γtip) that this
 adds, as shares of what goes beyond, mm; found in vessels with compliant walls, on patients to improve agents on."""
 

@@ -223,6 +223,7 @@ class Monitor:
                 drives, past = drives.of_robot(given.robot), self.past.by_encoders()
         tried = self.belief.like(members, drives=drives)
         tried.replay(past)
+        found = self.moves
         for _ in range(2):  # the wire as it lies in a vessel that lies still, and in one that moves
             best = int(np.argmax(tried.weight))
             tip, direction = (np.array([each[best] for each in some]) for some in zip(*tried.shown, strict=True))

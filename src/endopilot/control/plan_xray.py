@@ -80,8 +80,8 @@ def plan_xray(plan: Plan, *, calibration: Calibration | None = None) -> PlannedX
     for period in range(len(plan.control)):
         proximal, tip, spread, radius = model.move(period)
         allowance.move(proximal[0, 0], tip[0, 0])
-        wider = {"play": allowance.sd_mm[None], "wall_mm": allowance.wall_mm(radius)}
-        exposure[period] = adviser.advise(proximal, tip, spread, radius, **wider)[0]
+        wall_mm = allowance.wall_mm(radius)
+        exposure[period] = adviser.advise(proximal, tip, spread, radius, allowance.sd_mm[None], wall_mm=wall_mm)[0]
         half_width[period] = adviser.half_width[0]
         if exposure[period]:
             allowance.exposed()
