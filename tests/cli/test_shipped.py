@@ -12,7 +12,9 @@ PAGE = (Path(__file__).parents[2] / "docs/concepts/shipped.md").read_text(encodi
 
 
 def test_every_file_of_data_has_a_card() -> None:
-    files = [path for kind in ("*.json", "*.safetensors", "*.yaml", "*/vendor/*") for path in PACKAGE.rglob(kind)]
+    files = [
+        path for kind in ("*.json", "*.safetensors", "*.npz", "*.yaml", "*/vendor/*") for path in PACKAGE.rglob(kind)
+    ]
     assert len(files) > 60
     for path in files:
         named = [path.relative_to(PACKAGE), *path.relative_to(PACKAGE).parents][:-1]

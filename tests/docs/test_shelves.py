@@ -1,16 +1,30 @@
-"""The documentation's shelves: pages are short, and pages that code and messages name are there."""
+"""The documentation's shelves: pages are short, links lead somewhere, and tables of measured figures are dated."""
 
 from __future__ import annotations
 
 import re
 import runpy
 import subprocess
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
 WORDS = runpy.run_path(str(ROOT / "docs/words.py"))
+PAGES = sorted((ROOT / "docs").glob("*.md")) + [
+    page for shelf in WORDS["BOUNDS"] for page in sorted((ROOT / "docs" / shelf).glob("*.md"))
+]
+AROUND = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md", "src/core/README.md")]
+LINK = re.compile(r"\]\(((?!https?:|mailto:)[^)#\s]*)(?:#([^)\s]*))?\)")
+
+
+@cache
+def headings(page: Path) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub and MyST make them."""
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    plain = [re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", line) for line in re.findall(r"^#+ (.*)$", text, re.MULTILINE)]
+    return {re.sub(r"[^\w\- ]", "", line.strip().lower()).replace(" ", "-") for line in plain}
 
 
 def test_pages_are_within_the_bound_of_their_shelf() -> None:
@@ -19,6 +33,20 @@ def test_pages_are_within_the_bound_of_their_shelf() -> None:
 
 def test_what_is_generated_is_not_counted() -> None:
     assert WORDS["words"]("# One\n<!-- a:begin -->\n| two | three |\n<!-- a:end -->\n| four | – |\n") == 2
+
+
+@pytest.mark.parametrize("page", [*PAGES, *AROUND], ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    lost = []
+    for path, anchor in LINK.findall(page.read_text(encoding="utf-8")):
+        target = (page.parent / path).resolve() if path else page
+        if "generated" in target.parts:
+            continue  # what sphinx-gallery makes
+        if target.suffix in (".png", ".gif") and not (ROOT / "docs/images").exists():
+            continue  # an sdist has no pictures
+        if not target.exists() or (anchor and target.suffix == ".md" and anchor not in headings(target)):
+            lost.append(f"{path}#{anchor}")
+    assert lost == []
 
 
 def test_pages_that_code_and_messages_name_exist() -> None:

@@ -133,9 +133,9 @@ class Drives:
             self._encoder = place
         self._estimate()
 
-    def of_unknown_robot(self) -> Drives:
-        """Return the drives at the start of the navigation, of a robot of which nothing is known."""
-        return Drives(UNKNOWN, self._start, self._fastest)
+    def of_robot(self, robot: RobotConfig | None) -> Drives:
+        """Return the drives of another robot at the start of the navigation, such as `UNKNOWN`."""
+        return Drives(robot, self._start, self._fastest)
 
     @property
     def words(self) -> str:
