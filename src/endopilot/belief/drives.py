@@ -46,7 +46,8 @@ _WORTH_IT = np.array([0.3, 0.1])
 
 
 UNKNOWN = RobotConfig(encoders_at="motor", wire=DriveConfig(play_mm=1.5, play_rad=2.5, play_sd_share=0.5))
-"""A robot whose encoders say where its motor is, and nothing else is known of it. Plays of real ones: docs/concepts/robot.md."""
+"""A robot whose encoders say where its motor is, and nothing else is known of it. Plays of real ones:
+docs/concepts/robot.md."""
 _JUMP_SHARE, _JUMPS = 0.1, np.array([2.0, 1.0])
 """Strays of a robot that is not known: it may slip, and its guiding catheter may back out."""
 _UNKNOWN_JITTER = 0.05
