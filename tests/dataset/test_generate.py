@@ -337,9 +337,7 @@ def test_a_changed_device_of_the_same_name_is_refused(tmp_path):
 def test_another_version_of_the_package_is_refused(tmp_path, monkeypatch):
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
     monkeypatch.setattr(layout, "__version__", "99.0")
-    with pytest.raises(
-        InputError, match=rf"was begun with version = endopilot {__version__}, .*endopilot 99\.0"
-    ):
+    with pytest.raises(InputError, match=rf"was begun with version = endopilot {__version__}, .*endopilot 99\.0"):
         make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
 
 
