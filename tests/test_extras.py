@@ -4,15 +4,31 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from endopilot.errors import InputError
 from endopilot.extras import extra_named, require_extras, requirements_of_extras, what_is_missing
 
 HIDE = "import sys; sys.modules[{module!r}] = None\n"
 """Makes a process where importing a module fails as if it were not installed."""
+
+WITHOUT = """
+import runpy, sys
+
+class Hidden:
+    def find_spec(self, name, path, target=None):
+        if name.partition(".")[0] in {hidden}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Hidden())
+runpy.run_path({script!r}, run_name="__main__")
+"""
+"""Runs a script where some libraries cannot be imported."""
 
 
 def run_without(module: str, code: str) -> subprocess.CompletedProcess[str]:
@@ -87,6 +103,33 @@ def test_a_run_says_so_before_it_begins(tmp_path: Path) -> None:
     assert result.returncode == 2
     assert result.stderr == "endopilot demo: needs more libraries; install them with: pip install 'endopilot[report]'\n"
     assert not (tmp_path / "demo").exists()
+
+
+def of_base_install() -> set[str]:
+    """Return the distributions that `pip install endopilot` brings, by their normal names."""
+    found: set[str] = set()
+    waiting = ["endopilot"]
+    while waiting:
+        name = canonicalize_name(waiting.pop())
+        if name not in found:
+            found.add(name)
+            needs = map(Requirement, metadata.requires(name) or ())
+            waiting += [each.name for each in needs if each.marker is None or each.marker.evaluate({"extra": ""})]
+    return found
+
+
+def test_the_base_libraries_are_enough(tmp_path: Path) -> None:
+    base = of_base_install()
+    hidden = {
+        module
+        for module, owners in metadata.packages_distributions().items()
+        if base.isdisjoint(map(canonicalize_name, owners))
+    }
+    assert {"torch", "pyarrow", "gymnasium", "pydicom", "pytest"} <= hidden and {"numpy", "scipy"}.isdisjoint(hidden)
+    script = Path(__file__).parent / "e2e" / "installed.py"
+    code = WITHOUT.format(hidden=hidden, script=str(script))
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_help_needs_no_extra() -> None:

@@ -162,7 +162,7 @@ NO_BANDS = Calibration(
     anatomies=1,
     intervals=1,
     dataset="",
-    heeded=1.0,
+    offset_share=1.0,
 )
 
 
@@ -214,7 +214,7 @@ def calibrate(folder: Path, kind: Kind) -> tuple[Calibration, list[str]]:
         anatomies=len(np.unique(owner)),
         intervals=len(rows),
         dataset=f"patients to learn on of {kind.whose}",
-        heeded=1.0,
+        offset_share=1.0,
     )
     lines = ["| patients | intervals without X-ray | in which both bands hold throughout |", "|---|---|---|"]
     for title, role in (("calibrated on", "calibrate"), ("the ladder's, not calibrated on", "test")):

@@ -1,20 +1,17 @@
 """Train what the tip detector knows of a wire in a pixel: `python -m benchmarks wire-evidence --write`.
 
-A logistic regression on ridges, from images of synthetic patients whose wire is known, half of them among other metal.
-The patients are drawn with a seed of their own; no patient that anything is measured on has it. It takes some 3 minutes
-on one core.
+A logistic regression on ridges, from images of synthetic patients whose wire is known. The patients are drawn with a
+seed of their own; no patient that anything is measured on has it. It takes some 3 minutes on one core.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.optimize import minimize
 
-from benchmarks.imaging.wires import metal_points, with_metal
 from endopilot.files import write_json
 from endopilot.xray.absorbers import in_catheter
 from endopilot.xray.corridor import make_corridor
@@ -24,8 +21,6 @@ from endopilot.xray.scenes import Scene, SceneConfig, draw_scenes
 
 SCENES = SceneConfig(patients=8, seed=9001)
 IMAGES, OFF_WIRE, STEP_MM = 10, 600, 0.25
-METAL_SHARE, ON_METAL = 0.5, 150
-"""Share of the images with other metal than the wire, and how many of their pixels off the wire lie on it."""
 DOSES, CONTRASTED_SHARE, FAR_PX, JITTER_PX = (0.25, 4.0), 0.3, 3.0, 0.35
 RIDGE = 1e-4
 """Weight of the squared coefficients."""
@@ -36,14 +31,12 @@ def samples(scene: Scene, random: np.random.Generator) -> tuple[np.ndarray, np.n
     detector = TipDetector(scene.anatomy, scene.device, evidence=RidgeEvidence(np.zeros(1), 0.0))
     corridor = make_corridor(scene.anatomy, scene.device.tip_radius_mm, 0.5, np.inf)
     places = np.concatenate([corridor.places(one)[corridor.open(one)] for one in corridor.passages])
-    metal, on, off = metal_points(scene.anatomy, random), [], []
-    among = replace(scene, planes=tuple(with_metal(plane, *metal) for plane in scene.planes))
+    on, off = [], []
     for image in range(IMAGES):
         dose = float(np.exp(random.uniform(*np.log(DOSES))))
         contrast = float(random.uniform(0.3, 1.0)) if random.random() < CONTRASTED_SHARE else 0.0
         index = int(random.integers(len(scene.nodes)))
-        shown = among if random.random() < METAL_SHARE else scene
-        signals = shown.signals(index, contrast=contrast, dose=dose, seed=1000 + image)
+        signals = scene.signals(index, contrast=contrast, dose=dose, seed=1000 + image)
         nodes = in_catheter(scene.anatomy, scene.nodes[index])
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
         drawn = _resampled(nodes, along, np.arange(0.0, along[-1], 0.1))
@@ -55,10 +48,7 @@ def samples(scene: Scene, random: np.random.Generator) -> tuple[np.ndarray, np.n
             away = distance_transform_edt(free)
             jitter = random.uniform(-JITTER_PX, JITTER_PX, (len(seen), 2))
             wire = _inside(plane.pixel(seen) + jitter, signal.shape, 1)
-            others = places[random.integers(len(places), size=OFF_WIRE)]
-            if shown is among:
-                others = np.concatenate([others, metal[0][random.integers(len(metal[0]), size=ON_METAL)]])
-            other = _inside(plane.pixel(others), signal.shape, 1)
+            other = _inside(plane.pixel(places[random.integers(len(places), size=OFF_WIRE)]), signal.shape, 1)
             other = other[map_coordinates(away, other.T, order=1) > FAR_PX]
             for pixels, kept in ((wire, on), (other, off)):
                 kept.append(

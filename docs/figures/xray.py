@@ -30,7 +30,7 @@ def tables(folder: Path) -> str:
         f"| {100 * cover['simultaneous']:.1f} % | 87 to 93 % |",
         f"| the same in the worst decile of patients | {100 * cover['worst_decile_of_patients']:.0f} % | |",
         f"| samples in which they hold | {100 * cover['samplewise']:.1f} % | |",
-        f"| share of γtip's half-width that the adviser heeds | {at['heeded']:g} | |",
+        f"| share of γtip's half-width that the adviser uses | {at['offset_share']:g} | |",
         f"| events missed | {100 * at['missed_share']:.1f} % | ≤ 5 % |",
         f"| samples at the wall, unexposed for 0.5 s | {100 * at['wall_samples_without_exposure_share']:.0f} % | |",
         f"| exposures a minute | {at['exposures_per_minute']:.1f} | |",

@@ -223,25 +223,25 @@ def approaching(split, half: float) -> monitoring.Monitored:
     )
 
 
-@pytest.mark.parametrize(("may_miss", "heeded"), [(0.45, 0.6), (0.25, 0.8), (0.001, 1.0)])
-def test_the_adviser_heeds_as_little_of_the_band_as_what_it_may_miss_allows(split, may_miss, heeded) -> None:
+@pytest.mark.parametrize(("may_miss", "offset_share"), [(0.45, 0.6), (0.25, 0.8), (0.001, 1.0)])
+def test_the_adviser_uses_as_little_of_the_band_as_what_it_may_miss_allows(split, may_miss, offset_share) -> None:
     """With a share s of the band it sees 10 s of 10 arrivals; the patients are alike, so that no error is added."""
     bands = Calibration(
         level=0.9, scale=1.0, abscissa_terms=(0.0,) * 4, offset_terms=(0.1, 0.0, 0.0, 0.0), anatomies=3, intervals=30,
-        dataset="", heeded=1.0,
+        dataset="", offset_share=1.0,
     )  # fmt: skip
     config = replace(EVENTS, missed=may_miss)
-    assert monitoring.least_heeded(approaching(split, half=0.1), bands, config) == heeded
+    assert monitoring.least_offset_share(approaching(split, half=0.1), bands, config) == offset_share
 
 
 def test_no_share_of_the_band_beyond_the_first_that_misses_too_much_is_chosen(split, monkeypatch) -> None:
-    missed = iter([0.01, 0.02, 0.06, *[0.01] * len(monitoring.HEEDED)])
+    missed = iter([0.01, 0.02, 0.06, *[0.01] * len(monitoring.OFFSET_SHARES)])
     monkeypatch.setattr(monitoring, "surely_missed", lambda *_: next(missed))
     bands = Calibration(
         level=0.9, scale=1.0, abscissa_terms=(0.0,) * 4, offset_terms=(0.0,) * 4, anatomies=3, intervals=30, dataset="",
-        heeded=1.0,
+        offset_share=1.0,
     )  # fmt: skip
-    assert monitoring.least_heeded(approaching(split, half=0.1), bands, EVENTS) == monitoring.HEEDED[1]
+    assert monitoring.least_offset_share(approaching(split, half=0.1), bands, EVENTS) == monitoring.OFFSET_SHARES[1]
 
 
 class Unsure(HoldSlack):
@@ -312,9 +312,9 @@ def test_the_command_calibrates_measures_and_draws(folder, hold_slack, capsys) -
     assert 0 <= figures["coverage"]["simultaneous"] <= figures["coverage"]["samplewise"] <= 1
     assert (output / "advice.png").stat().st_size > 10_000
     widest = figures["curves"]["adviser"][-1]
-    assert widest["heeded"] == 2.5 and figures["curves"]["adviser"][0]["heeded"] == 0.0
-    heeded = figures["calibration"]["heeded"]
-    assert figures["adviser"]["heeded"] == heeded == Calibration.read(run).heeded
+    assert widest["offset_share"] == 2.5 and figures["curves"]["adviser"][0]["offset_share"] == 0.0
+    offset_share = figures["calibration"]["offset_share"]
+    assert figures["adviser"]["offset_share"] == offset_share == Calibration.read(run).offset_share
 
 
 def test_the_calibration_of_the_model_of_the_package_goes_to_the_output(
@@ -359,7 +359,7 @@ def test_the_same_calibration_is_measured_on_navigations_made_otherwise(
     same, other = found["made_otherwise"]
     assert same["differs"] == {} and other["differs"] == {"friction": [0.3, 0.3]}
     assert same["coverage"] == found["coverage"] and same["adviser"] == {
-        name: value for name, value in found["adviser"].items() if name != "heeded"
+        name: value for name, value in found["adviser"].items() if name != "offset_share"
     }
     assert other["coverage"]["patients"] == 1
     with pytest.raises(InputError, match="which the bands are fitted to"):

@@ -10,7 +10,9 @@ from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, nar
 from endopilot.errors import InputError
 
 
-def calibration(scale: float = 1.0, abscissa: float = 0.1, offset: float = 0.05, heeded: float = 1.0) -> Calibration:
+def calibration(
+    scale: float = 1.0, abscissa: float = 0.1, offset: float = 0.05, offset_share: float = 1.0
+) -> Calibration:
     return Calibration(
         level=0.9,
         scale=scale,
@@ -19,7 +21,7 @@ def calibration(scale: float = 1.0, abscissa: float = 0.1, offset: float = 0.05,
         anatomies=10,
         intervals=40,
         dataset="key",
-        heeded=heeded,
+        offset_share=offset_share,
     )
 
 
@@ -106,8 +108,8 @@ def test_what_is_missed_for_sure_is_seldom_less_than_new_patients_miss() -> None
 def test_a_calibration_is_read_again_and_its_absence_named(tmp_path) -> None:
     with pytest.raises(InputError, match=r"the model has no calibration.*endopilot advise"):
         Calibration.read(tmp_path)
-    calibration(heeded=0.25).write(tmp_path)
-    assert Calibration.read(tmp_path) == calibration(heeded=0.25)
+    calibration(offset_share=0.25).write(tmp_path)
+    assert Calibration.read(tmp_path) == calibration(offset_share=0.25)
     (tmp_path / "xray.json").write_text('{"level": 0.9, "abscissa_terms": [], "offset_terms": []}')
     with pytest.raises(InputError, match=r"xray.json: scale: missing; .* run `endopilot advise` again"):
         Calibration.read(tmp_path)
@@ -150,13 +152,13 @@ def test_an_exposure_is_due_where_the_wire_begins_to_fill_the_lumen() -> None:
     assert due == [False, False, False, True, False, False, False]
 
 
-def test_the_adviser_heeds_a_share_of_the_band_across_and_all_of_that_along() -> None:
+def test_the_adviser_uses_a_share_of_the_band_across_and_all_of_that_along() -> None:
     inserted = [2.0 * abs(6 - i) for i in range(20)]  # back and forth by 2 mm a sample: the band grows by 0.2 mm
-    assert advices([0.3] * 20, inserted, config=AdviserConfig(abscissa_mm=1.0), heeded=0.5) == [5, 10, 15]
+    assert advices([0.3] * 20, inserted, config=AdviserConfig(abscissa_mm=1.0), offset_share=0.5) == [5, 10, 15]
     offset = [0.3] * 5 + [0.56] * 4 + [0.585] * 4 + [0.61] * 4 + [0.63] * 4
-    due = advices(offset, [10.0] * len(offset), config=AdviserConfig(wall_ratio=0.6), abscissa=0.0, heeded=0.4)
+    due = advices(offset, [10.0] * len(offset), config=AdviserConfig(wall_ratio=0.6), abscissa=0.0, offset_share=0.4)
     assert due == [9, 13, 17]  # ±0.02 mm: the upper edge, the tip, the lower edge
-    adviser = XrayAdviser(calibration(abscissa=0.0, heeded=0.4), AdviserConfig(), wire_radius_mm=0.2)
+    adviser = XrayAdviser(calibration(abscissa=0.0, offset_share=0.4), AdviserConfig(), wire_radius_mm=0.2)
     still = np.zeros((1, 2))
     adviser.start(still, still, np.ones(1))
     adviser.advise(still, still, still, np.ones(1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -11,8 +12,10 @@ import pytest
 from endopilot.belief.innovations import ASSUMED_SD_MM, Innovations
 from endopilot.belief.monitor import MISMATCH, BelievedTip, Monitor
 from endopilot.control.agent import read_agent_calibration
+from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.navigation.loop import NavigationLoop
 from endopilot.navigation.policy import Decision, Observation
+from endopilot.simulation.motion import Motion
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation, Target
 
@@ -40,8 +43,19 @@ class ToAndFro:
         return Decision(((4.0 * slow, 0.6),), expose=bool(self.last.asks))
 
 
-def driven(navigation: Navigation, world: World, seed: int = 1) -> Iterator[tuple[ToAndFro, NavigationLoop]]:
-    policy = ToAndFro()
+class Rocks(ToAndFro):
+    """Pushes and pulls by the same, and exposes every 2 s at least."""
+
+    def decide(self, observation: Observation) -> Decision:
+        decision = super().decide(observation)
+        slow = -1 if int(observation.time_s / 4) % 2 else 1
+        return Decision(((5.0 * slow, 0.6),), expose=decision.expose or observation.time_s % 2 == 0)
+
+
+def driven(
+    navigation: Navigation, world: World, seed: int = 1, kind: type[ToAndFro] = ToAndFro
+) -> Iterator[tuple[ToAndFro, NavigationLoop]]:
+    policy = kind()
     loop = NavigationLoop(navigation, policy, seed=seed, world=world)
     while loop.reason is None:
         loop.step()
@@ -74,6 +88,34 @@ def test_nothing_is_noticed_where_nothing_is_wrong(along_the_fork) -> None:
     for policy, _ in driven(along_the_fork, World()):
         assert not policy.monitor.alarm and policy.monitor.identified is None
     assert 1 <= policy.exposures <= 6
+
+
+def test_a_play_that_the_encoders_do_not_see_is_noticed_and_identified(along_the_fork) -> None:
+    """2.5 mm: tip and band are right after the wire has turned back, and the play is stated."""
+    robot = RobotConfig(encoders_at="motor", wire=DriveConfig(play_mm=2.5))
+    at = list[float]()
+    for policy, loop in driven(replace(along_the_fork, seconds=20.0), World(robot=robot), kind=Rocks):
+        found = policy.last.found
+        at.append(float(loop.simulator.project().abscissa[0, 0]))
+    assert policy.monitor.belief.drives.unknown and "the wire is not where its encoder says" in found
+    low, high = (float(each) for each in re.search(r"play of (.*) to (.*) mm", found).groups())
+    assert low - 0.3 <= 2.5 <= high + 0.3 and high - low < 1.0
+    assert policy.last.abscissa == pytest.approx(at[-2], abs=1.0)
+
+
+def test_a_vessel_that_moves_is_noticed_and_its_motion_identified(along_the_fork) -> None:
+    motion = Motion(heart_period_s=0.8, annulus_mm=9.0, breathing_period_s=4.4, breathing_caudal_mm=6.0)
+    held = list[bool]()
+    for policy, loop in driven(replace(along_the_fork, seconds=18.0), World(motion=motion), kind=Rocks):
+        tip, last = loop.simulator.project(), policy.last
+        off = abs(last.abscissa - tip.abscissa[0, 0]), abs(last.offset - tip.offset[0, 0])
+        if policy.monitor.moves is not None:
+            held.append(bool(np.less_equal(off, np.add(last.half_width, 4.0 * 0.5)).all()))
+    found = policy.monitor.moves.motion
+    assert found.heart_period_s == pytest.approx(0.8, rel=0.02)
+    assert found.breathing_period_s == pytest.approx(4.4, rel=0.05)
+    assert found.breathing_caudal_mm == pytest.approx(6.0, abs=1.5)
+    assert len(held) > 12 and np.mean(held) > 0.85
 
 
 def innovations(random: np.random.Generator, off: np.ndarray, sd: np.ndarray, count: int) -> Innovations:

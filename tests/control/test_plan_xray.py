@@ -33,7 +33,7 @@ def calibration(abscissa=STILL, offset=STILL) -> Calibration:
         anatomies=9,
         intervals=36,
         dataset="key",
-        heeded=1.0,
+        offset_share=1.0,
     )
 
 

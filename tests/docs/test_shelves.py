@@ -60,3 +60,21 @@ def test_pages_that_code_and_messages_name_exist() -> None:
             named |= set(re.findall(r"(?<![\w/])docs/[\w/-]+\.md", path.read_text(encoding="utf-8")))
     assert len(named) > 10
     assert sorted(page for page in named if not (ROOT / page).exists()) == []
+
+
+def test_generators_find_the_marks_that_they_fill() -> None:
+    found, lost = 0, []
+    for script in [*ROOT.glob("docs/**/*.py"), *ROOT.glob("benchmarks/**/*.py")]:
+        text = script.read_text(encoding="utf-8")
+        own = re.search(r'^PAGE = "(.+)"$', text, re.MULTILINE)
+        for page, mark in re.findall(r'\bfill\(\s*(PAGE|"[^"]+"), "([^"]+)"', text):
+            name = own[1] if page == "PAGE" and own else page.strip('"')
+            marks = [f"<!-- {mark}:{end} -->" for end in ("begin", "end")]
+            found += 1
+            lost += (
+                []
+                if all((ROOT / "docs" / name).read_text(encoding="utf-8").count(m) == 1 for m in marks)
+                else [(name, mark)]
+            )
+    assert found > 20
+    assert lost == []

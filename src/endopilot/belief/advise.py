@@ -25,7 +25,7 @@ FIGURES_FILE, PICTURE_FILE = "advice.json", "advice.png"
 PERIODS = (1, 2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 45, 90)
 """Samples between two exposures of periodic imaging."""
 SHARES = (0.0, 0.1, 0.25, 0.5, 0.75, 1.0, 1.5, 2.5)
-"""Shares of γtip's band that the adviser heeds, for its curve; the calibrated one is measured too."""
+"""Shares of γtip's band that the adviser uses, for its curve; the calibrated one is measured too."""
 THRESHOLDS = tuple((ratio, mm) for ratio in (0.6, 0.7, 0.8, 0.9) for mm in (1.0, 2.0))
 """Other values of τ and of δ, mm, that the adviser is measured with."""
 
@@ -69,7 +69,7 @@ def advise(
     own, test = (monitoring.monitor(predictor, split, config) for split in splits[1:])
     check_enough(len(set(own.episodes.anatomy)), config.adviser.level)
     calibration = monitoring.calibrate(fitted, own, config.adviser)
-    shares = sorted({*SHARES, calibration.heeded})
+    shares = sorted({*SHARES, calibration.offset_share})
     with progress("Advising", len(PERIODS) + len(shares) + len(THRESHOLDS) + 1) as advance:
         curves: dict[str, list[dict[str, float]]] = {"periodic": [], "adviser": []}
         thresholds: list[dict[str, float]] = []
@@ -79,11 +79,11 @@ def advise(
             )
             advance()
         for share in shares:
-            bands = replace(calibration, heeded=share)
+            bands = replace(calibration, offset_share=share)
             test.model.reset()
             policy = monitoring.adviser_policy(test, bands, config.adviser)
             point = monitoring.measure_policy(test, policy, config.adviser)
-            curves["adviser"].append({"heeded": share, **point})
+            curves["adviser"].append({"offset_share": share, **point})
             advance()
         for ratio, mm in THRESHOLDS:
             other = replace(config.adviser, wall_ratio=ratio, abscissa_mm=mm)
@@ -99,7 +99,7 @@ def advise(
         _measure_otherwise(monitoring.monitor(predictor, other, config), other, episodes, calibration, config)
         for other in others
     ]
-    at = next(point for point in curves["adviser"] if point["heeded"] == calibration.heeded)
+    at = next(point for point in curves["adviser"] if point["offset_share"] == calibration.offset_share)
     equal = monitoring.periodic_equal(curves["periodic"], at["missed_share"])
     content = {
         "calibration": calibration,
@@ -192,7 +192,7 @@ def _picture(content: Mapping[str, Any]) -> Figure:
         axes = figure.add_subplot()
         lines = (
             ("periodic", GREY, "Periodic imaging"),
-            ("adviser", BLUE, "Adviser that heeds less or more of γtip's band"),
+            ("adviser", BLUE, "Adviser that uses less or more of γtip's band"),
         )
         for name, color, label in lines:
             curve = content["curves"][name]
@@ -203,7 +203,7 @@ def _picture(content: Mapping[str, Any]) -> Figure:
                 content["adviser"],
                 "o",
                 VERMILLION,
-                f"Adviser as calibrated: {content['calibration'].heeded:g} of γtip's band",
+                f"Adviser as calibrated: {content['calibration'].offset_share:g} of γtip's band",
             ),
             (content["curves"]["oracle"][0], "*", BLACK, "Oracle"),
         )

@@ -26,7 +26,7 @@ class AdviserConfig:
     abscissa_mm: Positive = SUCCESS_MM
     """δ: an event begins where Δtip errs by this much, mm; as near as a target counts as reached if not given."""
     missed: OpenShare = 0.05
-    """Share of the events that may be missed: the calibration finds how much of γtip's band the adviser must heed."""
+    """Share of the events that may be missed: the calibration finds how much of γtip's band the adviser must use."""
 
 
 def near_exposures(exposed: Bool[np.ndarray, "*n samples"]) -> Bool[np.ndarray, "*n samples"]:
@@ -55,7 +55,7 @@ class XrayAdviser:
     """Says when to switch X-ray on, for one navigation or many side by side.
 
     Between exposures it watches two bands. Where that of Δtip is as wide as δ, an exposure is due. Of that of γtip it
-    heeds the share that the calibration found. This, over the clearance of the lumen there, lies below τ, above it, or
+    uses the share that the calibration found. This, over the clearance of the lumen there, lies below τ, above it, or
     across it. Below, nothing threatens; above, the tip is known to be at the wall; across, either may be. An exposure
     is due where the band reaches τ, where the predicted tip crosses it, and where the band has left it below. It shows
     what is within 0.5 s of it, so none follows another sooner than after 1.5 s.
@@ -111,13 +111,13 @@ class XrayAdviser:
             factor: by which the bands are wider than they are calibrated.
             always: whether an exposure is due whenever the last is 1.5 s ago.
             wall_mm: by which the lumen's radius may be another than it is given, mm, which the calibration does not
-                know: a tip on the wall is then off by as much, and the edges of that band are heeded too.
+                know: a tip on the wall is then off by as much, and the edges of that band count too.
         """
         self._since, self._travel = self._since + 1, self._travel + np.abs(proximal[:, 0] - self._proximal[:, 0])
         self._proximal = proximal
         half = factor * self.widths(spread, play)
-        heeded = self._calibration.heeded * half[:, 1]
-        edges = [tip[:, 1] + off for off in (heeded, 0.0, -heeded, wall_mm, -wall_mm)]
+        used = self._calibration.offset_share * half[:, 1]
+        edges = [tip[:, 1] + off for off in (used, 0.0, -used, wall_mm, -wall_mm)]
         half[:, 1] = np.hypot(half[:, 1], wall_mm)
         self.half_width = half
         beyond = [self._ratio(edge, radius_mm) >= self._config.wall_ratio for edge in edges]

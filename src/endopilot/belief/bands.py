@@ -37,7 +37,7 @@ class Calibration:
     Attributes:
         level: share of new intervals that the bands are to hold throughout.
         scale: half-width of a band in units of the spread.
-        heeded: share of γtip's half-width by which the adviser asks for X-ray; of Δtip it heeds the whole band.
+        offset_share: share of γtip's half-width by which the adviser asks for X-ray; of Δtip it uses the whole band.
         abscissa_terms: of the spread of Δtip, its terms as `TERMS` names them.
         offset_terms: of the spread of γtip.
         anatomies: patients that it was calibrated on.
@@ -52,7 +52,7 @@ class Calibration:
     anatomies: Annotated[int, Within(1, 10**9)]
     intervals: Annotated[int, Within(1, 10**9)]
     dataset: str
-    heeded: NonNegative
+    offset_share: NonNegative
 
     def half_width(self, seconds: Float[np.ndarray, "*n"], travel_mm: Float[np.ndarray, "*n"], spread: Tips) -> Tips:
         """Return the half-widths of the bands, mm.

@@ -101,6 +101,10 @@ class Past:
     exposures: dict[int, TipMeasurement] = field(default_factory=dict)
     measured: list[tuple[Proximals, Proximals, Proximals]] = field(default_factory=list)
 
+    def by_encoders(self) -> Past:
+        """Return the same with the proximal ends where the encoders read them."""
+        return replace(self, proximal=[np.array(encoders, dtype=float) for encoders, _, _ in self.measured])
+
 
 class Vessels:
     """The vessels of a navigation, with one lumen and another, which beliefs share: preparing one takes a second.

@@ -46,8 +46,7 @@ _WORTH_IT = np.array([0.3, 0.1])
 
 
 UNKNOWN = RobotConfig(encoders_at="motor", wire=DriveConfig(play_mm=1.5, play_rad=2.5, play_sd_share=0.5))
-"""A robot whose encoders say where its motor is, and nothing else is known of it. Plays of real ones:
-docs/concepts/robot.md."""
+"""A robot whose encoders say where its motor is, and nothing else is known. Real plays: docs/concepts/robot.md."""
 _JUMP_SHARE, _JUMPS = 0.1, np.array([2.0, 1.0])
 """Strays of a robot that is not known: it may slip, and its guiding catheter may back out."""
 _UNKNOWN_JITTER = 0.05
@@ -134,9 +133,9 @@ class Drives:
             self._encoder = place
         self._estimate()
 
-    def of_unknown_robot(self) -> Drives:
-        """Return the drives at the start of the navigation, of a robot of which nothing is known."""
-        return Drives(UNKNOWN, self._start, self._fastest)
+    def of_robot(self, robot: RobotConfig | None) -> Drives:
+        """Return the drives of another robot at the start of the navigation, such as `UNKNOWN`."""
+        return Drives(robot, self._start, self._fastest)
 
     @property
     def words(self) -> str:

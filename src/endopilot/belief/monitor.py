@@ -14,6 +14,7 @@ from jaxtyping import Float
 from endopilot.belief.adviser import AdviserConfig, XrayAdviser
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig, Past
+from endopilot.belief.drives import UNKNOWN
 from endopilot.belief.identification import Identified, identify
 from endopilot.belief.innovations import Innovations
 from endopilot.belief.patient_motion import FoundMotion, find_motion
@@ -31,6 +32,9 @@ _LEAST_EXPOSURES, _LEAST_GAIN, _MOST_MISFIT = 3, 6.0, 0.8
 logarithm, and leaves no larger misfit."""
 _MOTION_SD_MM = np.array([0.6, 0.1])
 """Standard deviations of (Δtip, γtip) that a motion adds which was found, mm: measured in moving vessels."""
+_FREE_MM, _HELD_SHARE = 3.0, np.array([0.3, 0.05])
+"""A wire that advances by more than this while its tip rests buckles: standard deviations of (Δtip, γtip) that this
+adds, as shares of what goes beyond, mm."""
 _BETTER = 2.0
 """What is found must explain all exposures better by this logarithm."""
 MISMATCH = "model mismatch"
@@ -107,6 +111,7 @@ class Monitor:
         self._tests = not navigation.catheters
         self.changes_left, self._since, self._returned = _MOST, 0, False
         proximal, tip, spread, radius = adviser_input(self.belief)
+        self._ends, self._held_mm = np.array([proximal[0, 0], tip[0, 0]]), 0.0
         self._adviser.start(proximal, tip, radius)
         self._half = self._adviser.widths(spread)[0]
 
@@ -130,8 +135,8 @@ class Monitor:
         else:
             self.belief.drives.begin(encoders)
         self.past.proximal.append(self.belief.drives.proximal.copy())
-        play = np.hypot(self.belief.play_spread(), 0.0 if self.belief.motion is None else _MOTION_SD_MM)[None]
         proximal, tip, spread, radius = adviser_input(self.belief)
+        self._hold(proximal, tip)
         self.seen = None
         if exposure is not None:
             self.seen = seen = self.belief.in_vessel(exposure, period)
@@ -140,6 +145,7 @@ class Monitor:
             self.past.exposures[period] = exposure
             self.belief.weigh(seen)
             self._adviser.exposed()
+            self._held_mm = 0.0
             self.lost = not self.belief.explains(seen)
             self._innovations.alarm |= self.lost and self._tests
             self._since += 1
@@ -153,9 +159,21 @@ class Monitor:
         factor = self._innovations.factor
         wall_mm = np.minimum(_LUMEN_SHARE * radius, _LUMEN_MM) if self._tests else 0.0
         wider = {"factor": factor, "always": self.alarm, "wall_mm": wall_mm}
-        due = bool(self._adviser.advise(proximal, tip, spread, radius, play, **wider)[0])
+        due = bool(self._adviser.advise(proximal, tip, spread, radius, self._further_sd(), **wider)[0])
         self._half = self._adviser.half_width[0] / factor
         return self._believed(tip[0], due)
+
+    def _hold(self, proximal: np.ndarray, tip: np.ndarray) -> None:
+        """Note by how much the wire was moved at its proximal end while its tip rested."""
+        now = np.array([proximal[0, 0], tip[0, 0]])
+        moved, rested = np.abs(now - self._ends).tolist()
+        self._ends, self._held_mm = now, self._held_mm + max(moved - rested, 0.0)
+
+    def _further_sd(self) -> Float[np.ndarray, "1 2"]:
+        """Return the standard deviations of (Δtip, γtip) that no calibration knows of, mm."""
+        held = _HELD_SHARE * max(self._held_mm - _FREE_MM, 0.0) * self._tests
+        motion = _MOTION_SD_MM * (self.belief.motion is not None)
+        return np.sqrt(self.belief.play_spread() ** 2 + motion**2 + held**2)[None]
 
     @property
     def may_return(self) -> bool:
@@ -184,7 +202,7 @@ class Monitor:
         if len(self.past.proximal) == 1:
             self._given = found.members
         elif not self.belief.drives.lose:
-            other = self.belief.like(self._given, drives=self.belief.drives.of_unknown_robot())
+            other = self.belief.like(self._given, drives=self.belief.drives.of_robot(UNKNOWN))
             proximal = other.rerun(self.past)
             if other.evidence > found.evidence:
                 found, identified, self.past.proximal = other, None, proximal
@@ -201,25 +219,32 @@ class Monitor:
 
     def _finds_motion(self) -> bool:
         """Return whether a motion of the vessel explains the exposures, and take it into the belief then."""
-        past, given = self.past, self._navigation
-        if not self._tests or given.known_motion is not None or len(past.exposures) < _LEAST_EXPOSURES:
+        given, drives = self._navigation, self.belief.drives
+        if not self._tests or given.known_motion is not None or len(self.past.exposures) < _LEAST_EXPOSURES:
             return False
-        members = self._given if self.moves is None else self.belief.members
-        still, found = self.belief.like(members), None
-        still.replay(past)
+        members, past = self.belief.members, self.past
+        if self.moves is not None and not (self.lost or self._innovations.outside or self._since >= _EVERY):
+            return False
+        if self.moves is None:
+            members = self._given
+            if drives.unknown:  # its encoder may be right, and the image was wrong
+                drives, past = drives.of_robot(given.robot), self.past.by_encoders()
+        tried = self.belief.like(members, drives=drives)
+        tried.replay(past)
         for _ in range(2):  # the wire as it lies in a vessel that lies still, and in one that moves
-            best = int(np.argmax(still.weight))
-            tip, direction = (np.array([each[best] for each in some]) for some in zip(*still.shown, strict=True))
+            best = int(np.argmax(tried.weight))
+            tip, direction = (np.array([each[best] for each in some]) for some in zip(*tried.shown, strict=True))
             seen = np.array([each.position for each in past.exposures.values()])
             times_s = DECISION_PERIOD_S * np.array(list(past.exposures))
             found = find_motion(tip, direction, seen, times_s, np.asarray(given.anatomy.insertion.position))
             if found.gain < _LEAST_GAIN or found.misfit > _MOST_MISFIT:
                 return False
-            still = self.belief.like(members, found.motion)
-            still.replay(past)
-        if still.score < self.belief.score + _BETTER:
+            tried = self.belief.like(members, found.motion, drives=drives)
+            tried.replay(past)
+        if tried.evidence < self.belief.evidence + _BETTER:
             return False
-        self.belief, self.moves, self.identified = still, found, None
+        self.belief, self.moves, self.identified, self.past = tried, found, None, past
+        drives.begin(past.measured[-1][0])
         return True
 
     def _believed(self, tip: np.ndarray, due: bool) -> BelievedTip:

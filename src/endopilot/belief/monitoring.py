@@ -27,7 +27,7 @@ from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig
 
 FLUOROSCOPY_HZ = 7.5
 """Frame rate of the fluoroscopy that advice is compared with."""
-HEEDED = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.0)
+OFFSET_SHARES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.0)
 """Shares of γtip's band that are tried when an adviser is calibrated."""
 _GRID_MM = 0.25
 ExposurePolicy = Callable[[int, Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]], Bool[np.ndarray, "n"]]
@@ -213,18 +213,18 @@ def calibrate(fitted: Monitored, own: Monitored, config: AdviserConfig) -> Calib
         anatomies=len(np.unique(own.episodes.anatomy)),
         intervals=len(score),
         dataset=own.dataset,
-        heeded=1.0,
+        offset_share=1.0,
     )
-    return replace(bands, heeded=least_heeded(own, bands, config))
+    return replace(bands, offset_share=least_offset_share(own, bands, config))
 
 
-def least_heeded(own: Monitored, bands: Calibration, config: AdviserConfig) -> float:
+def least_offset_share(own: Monitored, bands: Calibration, config: AdviserConfig) -> float:
     """Return the smallest share of γtip's band by which the adviser surely misses no more events than it may.
 
-    Events of Δtip are too few to find a share for: the adviser heeds the whole of that band.
+    Events of Δtip are too few to find a share for: the adviser uses the whole of that band.
 
-    The shares of `HEEDED` are tried from the largest on. The last one before the first that misses too many is taken,
-    so that chance among many shares favours none; 1, where even the whole band misses too many.
+    The shares of `OFFSET_SHARES` are tried from the largest on. The last one before the first that misses too many is
+    taken, so that chance among many shares favours none; 1, where even the whole band misses too many.
 
     Args:
         own: navigations of the calibration patients.
@@ -232,11 +232,11 @@ def least_heeded(own: Monitored, bands: Calibration, config: AdviserConfig) -> f
         config: the events, and the share of them that may be missed.
     """
     names, owner = np.unique(own.episodes.anatomy, return_inverse=True)
-    least = HEEDED[0]
-    with progress("Heeding less of the bands", len(HEEDED)) as advance:
-        for share in HEEDED:
+    least = OFFSET_SHARES[0]
+    with progress("Using less of the bands", len(OFFSET_SHARES)) as advance:
+        for share in OFFSET_SHARES:
             own.model.reset()
-            found = follow_policy(own, adviser_policy(own, replace(bands, heeded=share), config), config)
+            found = follow_policy(own, adviser_policy(own, replace(bands, offset_share=share), config), config)
             counts = np.array([np.sum(found.count(owner == index), axis=0) for index in range(len(names))])
             if surely_missed(counts[:, 1], counts[:, 0]) > config.missed:
                 break

@@ -19,14 +19,18 @@ from endopilot.settings import Finite, NonNegative, OpenShare, Share, settings
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import catheter_lumen_points, lumen_points
 from endopilot.xray.carm import View
-from endopilot.xray.corridor import CATHETER_MM, make_corridor
+from endopilot.xray.corridor import CATHETER_MM, Corridor, make_corridor
 from endopilot.xray.projector import splat
 from endopilot.xray.ridge import RidgeEvidence
 from endopilot.xray.tracker import TipEstimate, track
 from endopilot.xray.wire_end import fit_end
 
 Signal = Float32[np.ndarray, "rows columns"]
-_HIGH_PASS_PX = 12.0
+_HIGH_PASS_PX, _AROUND_PX = 12.0, 24.0
+"""Contrast is what is darker than its surroundings, blurred by this; and how much of an image around the vessel is
+looked at, pixels."""
+_TRUNCATE = 2.0
+"""Blurs reach so many standard deviations."""
 _LEAST_CONTRAST = 0.01
 """Contrast below this, 1/mm, is none."""
 _AHEAD_SHARE, _AHEAD_MM = 1.3, 8.0
@@ -118,13 +122,25 @@ class TipDetector:
         slack_mm: float | None = None,
     ) -> TipEstimate:
         """Return where the tip is if there is a wire, and how likely that is; the arguments are those of `find`."""
-        plain = [self.without_contrast(view, signal) for view, signal in zip(views, signals, strict=True)]
-        evidence = [self._saturated(self._evidence(one, count)) for one, count in zip(plain, photons, strict=True)]
         deepest = _AHEAD_SHARE * max(inserted_length, 0.0) + _AHEAD_MM
         slack_mm = self.config.slack_mm if slack_mm is None else slack_mm
         corridor = make_corridor(self._anatomy, self._radius_mm, slack_mm, deepest)
-        found = _refined(track(corridor, views, evidence, inserted_length), views, plain, self._radius_mm)
-        return replace(found, status="found" if found.log_odds >= self.config.least_log_odds else "not found")
+        seen = [self._look(*one, corridor) for one in zip(views, signals, photons, strict=True)]
+        plain, evidence = [one for one, _ in seen], [one for _, one in seen]
+        tip = track(corridor, views, evidence, inserted_length)
+        return self._judged(_refined(tip, views, plain, self._radius_mm))
+
+    def _look(self, view: View, signal: Signal, photons: float, corridor: Corridor) -> tuple[Signal, Signal]:
+        """Return an image without contrast, and how likely its pixels are on a wire, none where no vessel is near."""
+        box, evidence = _box(corridor, view, len(signal)), np.zeros_like(signal)
+        plain = self.without_contrast(view, signal, box)
+        evidence[box] = self._saturated(self._evidence(plain[box], photons))
+        return plain, evidence
+
+    def _judged(self, found: TipEstimate) -> TipEstimate:
+        """Return an estimate with its status."""
+        status = "found" if found.log_odds >= self.config.least_log_odds else "not found"
+        return replace(found, status=status)
 
     def _saturated(self, log_ratio: Signal) -> Signal:
         """Return evidence that no single pixel can overrule all others with."""
@@ -133,17 +149,30 @@ class TipDetector:
         bounded = np.log((likelier + config.hidden) / (1 + config.alike * likelier))
         return np.asarray(config.independent * bounded, dtype=np.float32)
 
-    def without_contrast(self, view: View, signal: Signal) -> Signal:
-        """Return an image without the contrast in the vessel, whose strength is estimated from the image."""
+    def without_contrast(self, view: View, signal: Signal, box: tuple[slice, slice] | None = None) -> Signal:
+        """Return an image without the contrast in the vessel, whose strength is estimated from a part of the image."""
+        box = box or (slice(None), slice(None))
         width_mm = 0.5 * self._anatomy.distance_map.spacing_mm
         path_mm = splat(view, len(signal), *self._filled, width_mm=width_mm, blur_px=_BLUR_PX)
-        edges = path_mm - gaussian_filter(path_mm, _HIGH_PASS_PX)
-        filled = path_mm > 0.3
+        path, part = path_mm[box], signal[box]
+        edges = path - gaussian_filter(path, _HIGH_PASS_PX, truncate=_TRUNCATE)
+        filled = path > 0.3
         if filled.sum() < 10:
             return signal
-        dark = gaussian_filter(signal, _HIGH_PASS_PX) - signal
+        dark = gaussian_filter(part, _HIGH_PASS_PX, truncate=_TRUNCATE) - part
         strength = float(dark[filled] @ edges[filled] / (edges[filled] @ edges[filled]))
         return signal + np.float32(strength) * path_mm if strength > _LEAST_CONTRAST else signal
+
+
+def _box(corridor: Corridor, view: View, rows: int) -> tuple[slice, slice]:
+    """Return rows and columns that show the corridor, and what lies around."""
+    middle, around = np.concatenate([one.middle for one in corridor.passages]), _AROUND_PX
+    right_up = view.project(middle)
+    around += float(np.abs(corridor.offsets).max()) * float(np.linalg.norm(view.slope(middle[0]), 2))
+    at = np.stack([(rows - 1) / 2 - right_up[:, 1], (rows - 1) / 2 + right_up[:, 0]])
+    low = np.clip(at.min(axis=1) - around, 0, rows - 1).astype(int)
+    high = np.clip(at.max(axis=1) + around + 1, 1, rows).astype(int)
+    return slice(low[0], max(high[0], low[0] + 1)), slice(low[1], max(high[1], low[1] + 1))
 
 
 def _refined(found: TipEstimate, views: Sequence[View], signals: Sequence[Signal], radius_mm: float) -> TipEstimate:

@@ -60,8 +60,8 @@ def features(signal: Float32[np.ndarray, "rows columns"], photons: float) -> Flo
     """Return the features of every pixel: ridges and darkness over the noise, and the noise itself."""
     from skimage.feature import hessian_matrix, hessian_matrix_eigvals  # slow to import
 
-    noise = np.exp(-0.5 * gaussian_filter(signal, _AROUND_PX)) / np.float32(np.sqrt(photons))
-
+    around = gaussian_filter(signal, _AROUND_PX)
+    noise = np.exp(-0.5 * around) / np.float32(np.sqrt(photons))
     found = []
     for scale in SCALES_PX:
         sigma: Any = scale  # its annotation says int; it takes floats
@@ -69,7 +69,7 @@ def features(signal: Float32[np.ndarray, "rows columns"], photons: float) -> Flo
         largest, smallest = hessian_matrix_eigvals(second)
         # The Hessian of white noise, smoothed, falls with the third power of the scale.
         found += [scale**3 * largest / noise, scale**3 * smallest / noise]
-    dark = gaussian_filter(signal, _AROUND_PX) - gaussian_filter(signal, SCALES_PX[0])
+    dark = around - gaussian_filter(signal, SCALES_PX[0])
     found += [dark / noise * SCALES_PX[0], np.log(noise)]
     return np.clip(np.stack(found, axis=-1), -_MOST, _MOST).astype(np.float32)
 

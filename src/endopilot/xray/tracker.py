@@ -24,6 +24,8 @@ _MOST_OF_CATHETER = 20.0
 """The evidence of a wire in the catheter counts no more than this."""
 _MODE_MM = 4.0
 """Mean and covariance are those of the posterior within this distance of its mode, mm."""
+_NOTHING = 1e-9
+"""A place with less of the posterior is left out of the sums."""
 _FOLDED_SHARE = 0.05
 """Share of the wires that fold back."""
 _FOLDS, _FOLDS_APART_MM, _FOLD_ODDS = 4, 4.0, 60.0
@@ -120,8 +122,9 @@ def _summary(
     section = int(weights[best].sum(axis=(1, 2)).argmax())
     here = weights[best][section]
     mode = (here[..., None] * legs[best].places[section]).sum(axis=(0, 1)) / here.sum()
-    places = np.concatenate([one.places.reshape(-1, 3) for one in legs])
-    weight = np.concatenate([weight.ravel() for weight in weights])
+    counted = [weight > _NOTHING for weight in weights]
+    places = np.concatenate([one.places[some] for one, some in zip(legs, counted, strict=True)])
+    weight = np.concatenate([weight[some] for weight, some in zip(weights, counted, strict=True)])
     near = ((places - mode) ** 2).sum(axis=1) <= _MODE_MM**2
     share = float(weight[near].sum())
     mean = weight[near] @ places[near] / share

@@ -13,6 +13,9 @@ _RADIUS_PX = 9
 """Half a side of the square that the line is fitted in, pixels."""
 _TURNS = np.deg2rad([0.0, -40.0, 40.0, -90.0, 90.0])
 """The line is fitted from each of these angles to the first guess, rad: tips are bent."""
+_FITTED = 2
+"""So many of these are fitted, those that the pixels fit best before."""
+_SINGULAR = 1e-9
 _MOST_BEND = 0.12
 """Largest curvature of the line, 1/pixel: 70° over 3 mm."""
 _FARTHEST_PX = 6.0
@@ -69,13 +72,15 @@ def fit_end(
 
     def residuals(x: np.ndarray) -> np.ndarray:
         terms = design(x)
-        return terms @ np.linalg.lstsq(terms, near * dark, rcond=None)[0] - near * dark
+        square = terms.T @ terms + _SINGULAR * np.eye(terms.shape[1])
+        return terms @ np.linalg.solve(square, terms.T @ (near * dark)) - near * dark
 
     low = np.array([guess[0] - _FARTHEST_PX, guess[1] - _FARTHEST_PX, -np.inf, -_MOST_BEND])
     high = np.array([guess[0] + _FARTHEST_PX, guess[1] + _FARTHEST_PX, np.inf, _MOST_BEND])
+    starts = [np.array([guess[0], guess[1], angle + turn, 0.0]) for turn in _TURNS]
+    starts.sort(key=lambda start: float((residuals(start) ** 2).sum()))
     best = None
-    for turn in _TURNS:
-        start = np.array([guess[0], guess[1], angle + turn, 0.0])
+    for start in starts[:_FITTED]:
         found = least_squares(residuals, start, bounds=(low, high), x_scale=(1.0, 1.0, 0.3, 0.05), max_nfev=12)
         if best is None or found.cost < best.cost:
             best = found

@@ -22,7 +22,7 @@ _TURNS = np.array([0.5, 0.2, 0.05])
 on."""
 _ASIDE = 0.2
 """Root mean square of the sine of the angle between a wire and the centerline."""
-_CHUNK, _GAP = 8, 12
+_CHUNK, _GAP = 12, 12
 """Sections that are followed at a time, and how many of the last ones do not darken what comes next: they are where it
 comes from."""
 _COVER_PX = 3

@@ -1,0 +1,47 @@
+"""The motion of a vessel by what X-ray shows of a wire in it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from endopilot.belief.patient_motion import find_motion
+from endopilot.simulation.motion import Motion, motion_named, place
+
+OSTIUM = np.array([10.0, -20.0, 5.0])
+TIMES_S = np.array([0.0, 3.5, 6.0, 7.5, 9.5, 11.0, 14.0])
+
+
+def tips(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Tips that go on along a vessel, and the directions of their wires."""
+    direction = np.tile([0.6, 0.0, -0.8], (len(TIMES_S), 1))
+    return OSTIUM + np.linspace(5.0, 60.0, len(TIMES_S))[:, None] * direction, direction
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        Motion(heart_period_s=0.95, annulus_mm=8.0, breathing_period_s=5.0, breathing_caudal_mm=6.5),
+        motion_named("breathing"),
+        motion_named("heartbeat"),
+    ],
+)
+def test_periods_and_amplitudes_are_found_from_seven_images(motion: Motion) -> None:
+    random = np.random.default_rng(1)
+    tip, direction = tips(random)
+    placed = motion.core(OSTIUM).placements(TIMES_S)[0]
+    seen = np.array([place(maps, point) for maps, point in zip(placed, tip, strict=True)])
+    found = find_motion(tip, direction, seen + 0.2 * random.standard_normal(seen.shape), TIMES_S, OSTIUM)
+    assert found.gain > 6.0 and found.misfit < 0.8
+    there = found.motion.core(OSTIUM).placements(TIMES_S)[0]
+    off = [place(a, point) - place(b, point) for a, b, point in zip(there, placed, tip, strict=True)]
+    assert np.linalg.norm(off, axis=1).mean() < 1.0
+    assert np.linalg.norm(seen - tip, axis=1).mean() > 1.5
+
+
+def test_errors_along_the_wire_and_of_another_place_are_no_motion() -> None:
+    random = np.random.default_rng(2)
+    tip, direction = tips(random)
+    for off in (2.5 * direction, 0.6 * np.ones(3), 1.5 * random.standard_normal((len(tip), 1)) * direction):
+        noise = 0.2 * random.standard_normal(tip.shape)
+        assert find_motion(tip, direction, tip + off + noise, TIMES_S, OSTIUM).gain < 6.0
