@@ -95,7 +95,7 @@ def bench_wires(
 
     Wires of random navigations are exposed from three pairs of angles, at half, once and twice the usual dose, in both
     views and in each alone; every other among a pacemaker's lead, clips and sternal wires. A patient whose file is in
-    the output folder is not measured again.
+    the output folder is not measured again, and more may be given later, after those.
 
     Args:
         output: folder that takes a file of each patient's exposures.
@@ -103,18 +103,20 @@ def bench_wires(
 
     Returns:
         Figures with bars: shares of missed wires; `said_share`: of the missed wires, and of those found where there is
-        none, those that the detector calls ambiguous or does not find; `doubted_share`: of the others;
-        `inside_own_95_share`: of the wires called found, those whose tip is within the region that the detector is
-        95 % sure of; `ms_a_view`: median. `by`: the same of some of the exposures.
+        none, those that the detector calls ambiguous or does not find; `doubted_share`: of the others, those that it
+        does not call found; `surely_wrong_share`: of all wires, those called found and missed; `inside_own_95_share`:
+        of the wires called found, those whose tip is within the region that the detector is 95 % sure of, and the same
+        of two views; `ms_a_view`: median. `by`: the same of some of the exposures.
 
     Raises:
         InputError: a folder holds no anatomy, or the output belongs to another run.
     """
-    claim(output, "benchmarks xray-wires", config=config)
+    claim(output, "benchmarks xray-wires", wires=config.wires, seed=config.seed, image=config.image)
     rows: list[Search] = []
     scenes = SceneConfig(patients=config.patients, seed=config.seed, given=config.given)
     for index in range(len(config.given) or config.patients):
-        path = output / f"patient-{index:03d}.json"
+        name = config.given[index].name if config.given else "synthetic"
+        path = output / f"{index:03d}-{name}.json"
         if not path.exists():
             write_json(path, list(_searches(draw_scene(scenes, index, config.image), config)))
         rows += [Search(**row) for row in read_json(path)]
@@ -132,6 +134,7 @@ def _searches(scene: Scene, config: WiresConfig) -> Iterator[Search]:
         registered = register(seen.anatomy, [seen.view(0), seen.view(1)], lit, before)
         views = registered.views([seen.view(0), seen.view(1)], seen.imager.isocenter)
         among = replace(seen, planes=tuple(with_metal(plane, *metal) for plane in planes))
+        masks = before, among.signals(None, seed=900_004)
         wires: list[int | None] = [*range(pair * config.wires, (pair + 1) * config.wires), None, None]
         for number, wire in enumerate(wires):
             shown = among if number % 2 else seen
@@ -145,6 +148,7 @@ def _searches(scene: Scene, config: WiresConfig) -> Iterator[Search]:
                     [signals[i] for i in used],
                     [scene.imager.photons(planes[i], dose) for i in used],
                     float(scene.inserted_length[at]),
+                    before=[masks[number % 2][i] for i in used],
                 )
                 ms = 1000 * (time.perf_counter() - began) / len(used)
                 row = Search(
@@ -203,10 +207,7 @@ def with_metal(plane: Plane, points: Float[np.ndarray, "n 3"], sizes: Float[np.n
 def figures_of(rows: Sequence[Search]) -> dict[str, Any]:
     """Return figures of all exposures with their bars, and of some of them."""
     parts: dict[str, Callable[[Search], bool]] = {
-        **{
-            f"{name} artery": lambda row, name=name: row.patient == name
-            for name in dict.fromkeys(row.patient for row in rows)
-        },
+        **{name: lambda row, name=name: row.patient == name for name in dict.fromkeys(row.patient for row in rows)},
         "without metal": lambda row: not row.metal,
         "among metal": lambda row: row.metal,
         "folded": lambda row: row.folded_mm > FOLDED_MM,

@@ -240,6 +240,7 @@ def expose(scene: Scene, registered: Registration, cases: Sequence[Case]) -> lis
     """
     detector, rows = TipDetector(scene.anatomy, scene.device), []
     views = registered.views([scene.view(0), scene.view(1)], scene.imager.isocenter)
+    before = scene.signals(None, seed=900_002)
     for index, (wire, dose, contrast, used) in enumerate(cases):
         number = index % len(scene.nodes) if wire is None else wire
         signals = scene.signals(wire, contrast=contrast, dose=dose, seed=index)
@@ -248,6 +249,7 @@ def expose(scene: Scene, registered: Registration, cases: Sequence[Case]) -> lis
             [signals[i] for i in used],
             [scene.imager.photons(scene.planes[i], dose) for i in used],
             float(scene.inserted_length[number]),
+            before=[before[i] for i in used],
         )
         angle = scene.angles_deg[used[0]]
         row = Exposure(len(used), dose, contrast, view_text(angle), wire is not None, found is not None)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.imaging.wires import Search, figures_of
 from benchmarks.imaging.xray import BARS, Exposure, _figures
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
@@ -71,3 +72,28 @@ def test_a_row_of_processed_images_keeps_views_apart():
     row = _row("any", [exposure(2), exposure(2, found=False), exposure(1), exposure(1, wire=False)], 0.1)
     assert (row["along_px"], row["missed"], row["missed_one_view"], row["false_alarms"]) == (1.0, 0.5, 0.0, 1.0)
     assert row["in_own_95"] == 0.0
+
+
+def test_what_is_wrong_counts_as_said_unless_it_is_called_found():
+    def search(status: str, **changes) -> Search:
+        return Search(**vars(exposure(found=status != "not found", **changes)), said=status, patient="rca")
+
+    far = {"along_px": 50.0, "deviations": 9.0}
+    rows = [
+        search("found"),
+        search("found", **far),
+        search("ambiguous"),
+        search("ambiguous", **far),
+        search("not found", views=1),
+        search("found", views=1, along_px=2.0, deviations=5.0),
+        search("ambiguous", wire=False),
+        search("not found", wire=False),
+    ]
+    figures = figures_of(rows)
+    assert figures["missed_share"] == 0.5 and figures["missed_share_one_view"] == 0.5
+    assert figures["wrong"] == 4 and figures["said_share"] == 0.75
+    assert figures["doubted_share"] == pytest.approx(1 / 3)
+    assert figures["surely_wrong_share"] == pytest.approx(1 / 6)
+    assert figures["inside_own_95_share"] == pytest.approx(1 / 3)
+    assert figures["false_alarms_share"] == 0.5
+    assert figures["by"]["rca"]["wires"] == 4

@@ -52,7 +52,7 @@ def followed(fork, refiner: PoseRefiner, views: list[View], aside_mm: np.ndarray
     normal = sum(rows) + 1e-3 * np.eye(3)
     shown = middle + np.linalg.solve(normal, sum(values)[..., None])[..., 0]
     room = np.full(len(at), ROOM_MM + SLACK_MM)
-    return TipEstimate(99.0, shown[-1], 0.01 * np.eye(3), 1.0, shown, middle, room)
+    return TipEstimate(99.0, shown[-1], 0.01 * np.eye(3), 1.0, np.zeros((3, 3)), shown, middle, room)
 
 
 def test_a_poisoned_depth_recovers_from_another_view(fork, views):

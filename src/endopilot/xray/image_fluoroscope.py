@@ -139,14 +139,15 @@ class ImageFluoroscope:
         signals = [self._signal(plane, nodes, random) for plane in self._planes]
         photons = [self._imager.photons(plane) for plane in self._planes]
         image = signals, photons, inserted_length
-        found = self._detector.find(self.refiner.views(self._views), *image, self._slack_mm)
+        empty = self._before
+        found = self._detector.find(self.refiner.views(self._views), *image, self._slack_mm, empty)
         if found is None:
             return None
         before, moved_mm = self.refiner.pose, 0.0
         if refine:
             moved_mm = vessel_error_mm(self._anatomy, before, self.refiner.refine(self._views, found, self._slack_mm))
         if moved_mm > _MOVED_MM or self._slack_mm > self._detector.config.slack_mm:
-            found = self._detector.find(self.refiner.views(self._views), *image) or found
+            found = self._detector.find(self.refiner.views(self._views), *image, before=empty) or found
         along = found.wire[-1] - found.wire[max(-5, -len(found.wire))]
         along = along / max(float(np.linalg.norm(along)), 1e-9)
         variance = float(along @ found.covariance @ along)

@@ -18,8 +18,9 @@ from endopilot.xray.carm import View
 from endopilot.xray.corridor import STEP_MM, Corridor
 from endopilot.xray.wire_following import Follower, Leg
 
-_NEAR_SHARE, _NEAR_MM = 0.1, 2.0
-"""The tip's abscissa differs from the inserted length by 2 mm and a tenth of it: vessels are cut short, wires snake."""
+_SHORTER_SHARE, _LONGER_SHARE, _NEAR_MM = 0.1, 0.04, 2.0
+"""The way to the tip differs from the inserted length by 2 mm, and a tenth of it where it is shorter, since wires snake
+and loop; it is hardly longer: wires only cut bends short."""
 _MOST_OF_CATHETER = 20.0
 """The evidence of a wire in the catheter counts no more than this."""
 _MODE_MM = 4.0
@@ -44,6 +45,7 @@ class TipEstimate:
         position: of the tip, LPS mm of the CT.
         covariance: of the position, mm².
         share: of the posterior that lies near this position; the rest is elsewhere.
+        elsewhere: what the rest adds to the covariance, mm².
         status: "found"; "ambiguous" where the tip may well lie elsewhere; "not found" where there is no wire.
         wire: places of the wire from the catheter to the tip, LPS mm.
         middle: the vessel's centerline at these, LPS mm.
@@ -54,6 +56,7 @@ class TipEstimate:
     position: Float[np.ndarray, "3"]
     covariance: Float[np.ndarray, "3 3"]
     share: float
+    elsewhere: Float[np.ndarray, "3 3"]
     wire: Float[np.ndarray, "n 3"]
     middle: Float[np.ndarray, "n 3"]
     room: Float[np.ndarray, "n"]
@@ -74,19 +77,23 @@ def track(
         evidence: for each view the logarithm of how much likelier each pixel is on a wire than off it.
         inserted_length: Δ by the robot's encoder, mm.
     """
-    follower, sd = Follower(corridor, views, evidence), _NEAR_MM + _NEAR_SHARE * max(inserted_length, 0.0)
+    follower, wire_mm = Follower(corridor, views, evidence), max(inserted_length, 0.0)
+    shorter, longer = _NEAR_MM + _SHORTER_SHARE * wire_mm, _NEAR_MM + _LONGER_SHARE * wire_mm
     legs = follower.forwards()
 
     def prior(lengths: Sequence[np.ndarray], share: float) -> Callable[[np.ndarray], np.ndarray]:
         def log(length: np.ndarray) -> np.ndarray:
-            return -0.5 * ((length - inserted_length) / sd) ** 2
+            excess = length - inserted_length
+            return -0.5 * (excess / np.where(excess > 0, longer, shorter)) ** 2
 
         everywhere = np.logaddexp.reduce(log(np.concatenate(lengths)))
         return lambda length: log(length) - everywhere + np.log(share)
 
     straight = prior([one.abscissa for one in corridor.passages], 1 - _FOLDED_SHARE)
     scores = [leg.log_scale + straight(leg.length) for leg in legs]
-    back = [one for leg, at in _folds(corridor, legs, inserted_length + 2 * sd) for one in follower.backwards(leg, at)]
+    back = [
+        one for leg, at in _folds(corridor, legs, inserted_length + 2 * longer) for one in follower.backwards(leg, at)
+    ]
     if back:
         folded = prior([leg.length for leg in back], _FOLDED_SHARE)
         scores += [leg.log_scale + folded(leg.length) for leg in back]
@@ -131,6 +138,8 @@ def _summary(
     off = places[near] - mean
     # A cell has a size: that of a section's step and of its grid.
     covariance = (weight[near, None] * off).T @ off / share + np.eye(3) * STEP_MM**2 / 12
+    far = places[~near] - mean
+    elsewhere = (weight[~near, None] * far).T @ far
     way = follower.way(legs[best], section)
     passed = [(corridor.passages[stop.leg.passage], stop.leg.section[stop.at]) for stop in way]
     return TipEstimate(
@@ -138,6 +147,7 @@ def _summary(
         position=mean,
         covariance=covariance,
         share=share,
+        elsewhere=elsewhere,
         wire=np.array([stop.place for stop in way]),
         middle=np.array([passage.middle[at] for passage, at in passed]),
         room=np.array([passage.room[at] for passage, at in passed]),

@@ -28,7 +28,7 @@ comes from."""
 _COVER_PX = 3
 """Pixels this near to the wire's way are darkened by it."""
 _LOST = 40.0
-"""A way that is this much less likely, in logarithms, than where it was likeliest is followed no further."""
+"""A way that is this much less likely in each view, in logarithms, than where it was likeliest is given up."""
 _BREAK = 50.0
 """Loss of a way that leaves the places that it can reach."""
 _FOLD_MM = 45.0
@@ -49,6 +49,7 @@ class Leg:
         places: LPS mm.
         before: the leg before, and the last of its sections that the way takes; None for the first.
         likeliest: largest `log_scale` of the way so far.
+        lost: whether the way was given up at the leg's end.
         free: evidence of each view that the way has not used.
     """
 
@@ -60,12 +61,8 @@ class Leg:
     places: Float[np.ndarray, "n g g 3"]
     before: tuple[Leg, int] | None
     likeliest: float
+    lost: bool
     free: Sequence[Evidence]
-
-    @property
-    def lost(self) -> bool:
-        """Whether the way was given up at the leg's end."""
-        return bool(self.log_scale[-1] < self.likeliest - _LOST)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +187,7 @@ class Follower:
         free = [image.copy() for image in (free or (self._evidence if before is None else before[0].free))]
         lengths = length + STEP_MM * np.arange(len(section))
         alpha, scales = np.empty(allowed.shape, dtype=np.float32), np.empty(len(section))
-        leg = Leg(index, section, alpha, scales, lengths, places, before, likeliest, free)
+        lost, leg = False, Leg(index, section, alpha, scales, lengths, places, before, likeliest, False, free)
         for low in range(0, len(section), _CHUNK):
             here = slice(low, min(low + _CHUNK, len(section)))
             gain = self._gain(index, section[here], places[here], allowed[here], free)
@@ -210,11 +207,11 @@ class Follower:
             likeliest = max(likeliest, float(scales[here].max()))
             passed = [stop.place for stop in self.way(leg, here.stop - 1, _CHUNK + _GAP)[:-_GAP]]
             free = self._uncovered(free, passed, copy=False)
-            if log_scale < likeliest - _LOST:
+            if lost := bool(log_scale < likeliest - _LOST * len(self._views)):
                 section, alpha, scales = section[: here.stop], alpha[: here.stop], scales[: here.stop]
                 lengths, places = lengths[: here.stop], places[: here.stop]
                 break
-        return Leg(index, section, alpha, scales, lengths, places, before, likeliest, free)
+        return Leg(index, section, alpha, scales, lengths, places, before, likeliest, lost, free)
 
     def _gain(
         self,

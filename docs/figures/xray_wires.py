@@ -1,0 +1,45 @@
+"""Write the table of wires in real arteries in docs/xray.md: `python docs/figures/xray_wires.py FILE`.
+
+FILE holds what `python -m benchmarks xray-wires --json` prints.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+PAGE = Path(__file__).parents[1] / "xray.md"
+BEGIN, END = "<!-- wires:begin -->", "<!-- wires:end -->"
+HEAD = (
+    "| | wires | missed, two views | one view | wrong and said so | called found and missed | doubted though right "
+    "| in own 95 % region |"
+)
+SHARES = (
+    "missed_share",
+    "missed_share_one_view",
+    "said_share",
+    "surely_wrong_share",
+    "doubted_share",
+    "inside_own_95_share",
+)
+
+
+def table(found: dict) -> str:
+    """Return the table as Markdown."""
+    lines = [HEAD, "|---|---|---|---|---|---|---|---|"]
+    for name, row in {"all": found, **found["by"]}.items():
+        shares = ("–" if row[one] != row[one] else f"{row[one]:.0%}".replace("%", " %") for one in SHARES)
+        lines.append(f"| {name} | {row['wires']} | " + " | ".join(shares) + " |")
+    bars = found["bars"]
+    lines.append(
+        f"| bar | | ≤ {bars['missed_share']:.0%} | ≤ {bars['missed_share_one_view']:.0%} | ≥ {bars['said_share']:.0%} "
+        "| | | 92–97 % |".replace("% |", " % |").replace("  %", " %")
+    )
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    head, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
+    text = table(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8")))
+    PAGE.write_text(f"{head}{BEGIN}\n{text}\n{END}{rest.split(END)[1]}", encoding="utf-8")
