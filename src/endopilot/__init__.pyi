@@ -42,9 +42,9 @@ from .devices.robot import read_robot as read_robot
 from .devices.stack import Stack as Stack
 from .devices.transmission import Transmission as Transmission
 from .devices.write import write_device as write_device
+from .env.episodes import NavigationState as NavigationState
 from .env.single import NavigateEnv as NavigateEnv
 from .env.vector import NavigateVectorEnv as NavigateVectorEnv
-from .env.vector import NavigationState as NavigationState
 from .errors import InputError as InputError
 from .evaluation.evaluate import EvaluateConfig as EvaluateConfig
 from .evaluation.evaluate import evaluate as evaluate

@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import errno
 import hashlib
+import io
 import json
 import os
 import platform
@@ -101,6 +102,18 @@ def _lists(content: Any) -> Any:
     if isinstance(content, dict):
         return {name: _lists(each) for name, each in content.items()}
     return [_lists(each) for each in content] if isinstance(content, (list, tuple)) else content
+
+
+def png_image(image: np.ndarray) -> bytes:
+    """Return an image as the content of a PNG file: rows and columns of bytes, grey, or red, green and blue.
+
+    Higher levels of compression take longer and save nearly nothing of a noisy image.
+    """
+    from PIL import Image  # slow to import
+
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, format="PNG", compress_level=1)
+    return file.getvalue()
 
 
 def read_text(path: Path, *, what: str = "text file", largest: int = _LARGEST_YAML) -> str:

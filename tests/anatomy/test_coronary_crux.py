@@ -14,6 +14,7 @@ from endopilot.anatomy.labels import label_tree
 from endopilot.anatomy.labels_tree import LCA_SECTIONS
 from endopilot.anatomy.sources import Polylines
 from endopilot.anatomy.tree import Line, tree_from_lines
+from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
 
 OSTIUM = np.array([5.0, -7.0, 3.0])
 CRUX = OSTIUM + CRUX_FROM_OSTIUM_MM
@@ -136,3 +137,12 @@ def test_a_right_artery_that_reaches_the_crux_without_its_branches_leaves_domina
     whole = label_tree(tree_of_line(right_artery()), "rca")
     assert not {"4", "16"} & set(whole.sections_present)
     assert whole.longest_path().abscissa[-1] > 120.0 and tree_dominance(whole) is None
+
+
+@pytest.mark.parametrize(("kind", "asked"), [("rca", "lca"), ("lca", "rca"), ("rca", "rca"), ("lca", "lca")])
+def test_lines_of_the_other_artery_are_noted(kind, asked):
+    tree, _ = make_patient_tree(AtlasConfig(vessel=kind, seed=5), 0)
+    notes = extract_anatomy(tree, config=AnatomyConfig(vessel=asked)).provenance["notes"]
+    runs = [note for note in notes if "runs as a" in note]
+    found = "right" if kind == "rca" else "left"
+    assert bool(runs) == (kind != asked) and all(f"as a {found} coronary artery does" in note for note in runs)

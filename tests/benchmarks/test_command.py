@@ -38,7 +38,7 @@ def test_commands_in_the_docs_exist(capsys: pytest.CaptureFixture[str]) -> None:
             found.setdefault(name, set()).update(OPTION.findall(rest))
     assert len(found) > 10
     for name, options in found.items():
-        assert left_with([name, "--help"]) == 0, name
+        assert left_with([name, "--help"]) == 0, f"{name}: {capsys.readouterr().err}"
         said = capsys.readouterr().out
         known = {*OPTION.findall(f" {said}"), "--json", "--against", "--rounds"}
         assert options <= known, (name, options - known)

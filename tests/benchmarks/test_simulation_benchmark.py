@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 from benchmarks.__main__ import main
+from benchmarks.core import scenes as scenes_module
 from benchmarks.core.errors import error_figures, error_intervals
 from benchmarks.core.reference import REFERENCE_FILE, check_reference, make_reference, read_reference
 from benchmarks.core.scenes import KINDS, Solution, make_scenes
@@ -22,8 +26,15 @@ WORLDS, SAMPLES = 2, 6
 CONVERGED = SimulatorConfig(element_mm=0.35, time_step_s=0.005, tolerance_mm=1e-6)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def patients() -> Iterator[None]:
+    """Make each of the scenes' patients once."""
+    with patch.object(scenes_module, "make_patient", lru_cache(scenes_module.make_patient)):
+        yield
+
+
 @pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small(patients: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("reference") / "small.npz"
     finer = replace(CONVERGED, element_mm=0.3)
     make_reference(path, worlds=WORLDS, samples=SAMPLES, converged=CONVERGED, finer=finer, finer_worlds=1)

@@ -160,6 +160,11 @@ def test_the_agents_own_calibration_asks_seldom_along_a_straight_vessel(found):
     assert xray.exposure.sum() < len(found.control) / 3
 
 
+def test_the_bands_of_the_agents_wires_allow_for_another_lumen(found):
+    half = plan_xray(found, calibration=calibration()).half_width
+    np.testing.assert_allclose(half[:, 1], 0.12, rtol=1e-3)  # 12 % of 1 mm
+
+
 def test_it_is_written_beside_the_plan(found, vessel, tmp_path):
     import pandas as pd
 

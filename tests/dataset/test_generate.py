@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from endopilot import __version__
 from endopilot.anatomy.io import write_anatomy
 from endopilot.cli import main
 from endopilot.dataset import layout
@@ -336,7 +337,7 @@ def test_a_changed_device_of_the_same_name_is_refused(tmp_path):
 def test_another_version_of_the_package_is_refused(tmp_path, monkeypatch):
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
     monkeypatch.setattr(layout, "__version__", "99.0")
-    with pytest.raises(InputError, match=r"was begun with version = endopilot 0\.1\.0, .*now it is endopilot 99\.0"):
+    with pytest.raises(InputError, match=rf"was begun with version = endopilot {__version__}, .*endopilot 99\.0"):
         make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
 
 

@@ -78,3 +78,17 @@ def test_generators_find_the_marks_that_they_fill() -> None:
             )
     assert found > 20
     assert lost == []
+
+
+def test_measured_tables_say_when_they_were_made() -> None:
+    undated = {
+        (page.name, mark)
+        for page in (ROOT / "docs/evidence").glob("*.md")
+        for mark, text in re.findall(
+            r"<!-- (.+?):begin -->\n(.*?)<!-- \1:end -->", page.read_text(encoding="utf-8"), re.S
+        )
+        if not re.search(r"^Made on \d{4}-\d\d-\d\d", text, re.MULTILINE)
+    }
+    made_of_files = {("ladder.md", "tasks"), ("ladder.md", "coaxial tasks"), ("leaderboard.md", "scores")}
+    by_make = {("demo.md", "demo-table"), ("performance.md", "gpu"), ("performance.md", "gpu-recipe")}
+    assert undated <= made_of_files | by_make

@@ -20,11 +20,13 @@ from endopilot.devices.device import read_wire
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.files import read_json
+from endopilot.navigation.policy import Decision, Observation
 from endopilot.pipeline import navigation
 from endopilot.report.navigation_figure import navigation_figure
 from endopilot.simulation.motion import motion_named
 from endopilot.simulation.trajectory_file import read_trajectory
 from endopilot.simulation.world import World
+from endopilot.tasks.navigation import Navigation
 
 SHORT = ("--tip", "own", "--seconds", "20")
 FILES = ["episode", "manifest.json", "navigation.csv", "navigation.html", "navigation.png", "run.json",
@@ -210,6 +212,17 @@ def test_the_picture_shows_wire_and_catheter(patient):
     for axes, column in ((translation, 0), (rotation, 1)):
         for line, of_device in zip(axes.lines, record.control[..., column].T, strict=False):
             np.testing.assert_array_equal(line.get_ydata(), of_device)
+
+
+def test_an_outcome_names_decisions_that_no_drive_can_follow(patient):
+    class Lost:
+        def start(self, navigation: Navigation, seed: int) -> None: ...
+
+        def decide(self, observation: Observation) -> Decision:
+            return Decision(devices=((float("nan"), 0.0),))
+
+    found = navigate(patient, "2", policy=Lost(), config=NavigateConfig(tip="own", seconds=3.0))
+    assert "before the target: 6 decisions were not finite, or beyond the drive's limits" in tell_outcome(found)
 
 
 def test_the_replayed_wire_is_the_navigations_to_the_bit(patient):

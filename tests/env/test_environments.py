@@ -15,15 +15,9 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from endopilot.devices.robot import DriveConfig, RobotConfig
+from endopilot.env.episodes import CONTROL_PERIOD_S, FORCE_REWARD, PROGRESS_REWARD, STEP_REWARD, SUCCESS_REWARD
 from endopilot.env.single import NavigateEnv
-from endopilot.env.vector import (
-    CONTROL_PERIOD_S,
-    FORCE_REWARD,
-    PROGRESS_REWARD,
-    STEP_REWARD,
-    SUCCESS_REWARD,
-    NavigateVectorEnv,
-)
+from endopilot.env.vector import NavigateVectorEnv
 from endopilot.errors import InputError
 from endopilot.simulation.motion import motion_named
 from endopilot.simulation.simulator import Simulator
@@ -275,9 +269,9 @@ def test_a_wrong_branch_lengthens_the_route():
     tip = replace(
         env.simulator.project(), abscissa=np.array([[fork + 7.0]]), branch=np.array([[side]]), offset=np.zeros((1, 1))
     )
-    length = env._worlds._routes.distance(tip)
+    length = env._worlds._episodes.routes.distance(tip)
     assert length == pytest.approx(7.0 + navigation.target.abscissa - fork)
-    assert not env._worlds._routes.place(tip[:, 0]).on_route.any()
+    assert not env._worlds._episodes.routes.place(tip[:, 0]).on_route.any()
 
 
 @pytest.mark.parametrize("action", [np.full((WORLDS, 2), np.nan), np.zeros((WORLDS, 3)), np.zeros(2)])

@@ -11,8 +11,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
+from endopilot.env.episodes import CONTROL_PERIOD_S, EXPOSURE_REWARD, STEP_REWARD
 from endopilot.env.single import NavigateEnv
-from endopilot.env.vector import CONTROL_PERIOD_S, EXPOSURE_REWARD, STEP_REWARD, NavigateVectorEnv
+from endopilot.env.vector import NavigateVectorEnv
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.tasks.task import in_catheter

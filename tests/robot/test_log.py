@@ -97,7 +97,9 @@ def test_a_log_is_written_as_it_is_read(tmp_path) -> None:
          "log.csv: column tip_row_px is missing where tip_column_px is there; give all, or none"),
         (LOG.replace("encoder_mm,encoder_rad", "translation_mm_s,rotation_rad_s"),
          "log.csv: holds translation_mm and translation_mm_s; give one of them"),
-        ("time_s,encoder_mm\n0,1\n", "log.csv: translation_mm: holds no command; give one"),
+        ("time_s,encoder_mm\n0,1\n", "log.csv: is no log of a robot: column translation_mm, or translation_mm_s, is "
+         "missing, where the drive is sent; it has time_s, encoder_mm"),
+        ("time_s,translation_mm,encoder_mm\n0,,1\n", "log.csv: translation_mm: holds no command; give one"),
         (LOG.replace("0.0,1,0.5", "0.0,1,five"),
          "log.csv: row 2: translation_mm = five is no finite number; correct it"),
     ],

@@ -197,6 +197,17 @@ def test_equal_anatomies_and_devices_are_stepped_together(anatomy: Anatomy) -> N
     simulator.set_state(shared.state)
 
 
+def test_a_wall_is_made_once_for_simulators_that_follow_each_other(anatomy: Anatomy, wider: Anatomy) -> None:
+    first, again = (Simulator(anatomy, DEVICE)._groups[0].lumen for _ in range(2))
+    assert again is first
+    for other in (
+        Simulator(wider, DEVICE),
+        Simulator(anatomy, replace(DEVICE, diameter_mm=2 * DEVICE.diameter_mm)),
+        Simulator(anatomy, DEVICE, config=SimulatorConfig(compliant_wall_n_mm2=0.05)),
+    ):
+        assert other._groups[0].lumen is not first
+
+
 def test_a_state_is_taken_without_reading_the_anatomy_again(anatomy: Anatomy, monkeypatch: pytest.MonkeyPatch) -> None:
     simulator = begun(Simulator(replace(anatomy), DEVICE, worlds=2), 2)
     simulator.set_state(simulator.state)

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from endopilot.anatomy.coronary_ends import OpenEnd
+from endopilot.types import VesselTree
 
 Side = Literal["rca", "lca"]
 
@@ -218,6 +219,14 @@ def end_score(end: OpenEnd, side: Side, flip: Float[np.ndarray, "3"] | float = 1
     heading = WEIGHT["heading"] * _log_t((_angle_deg(flip * end.heading, HEADING[side]) / HEADING_SD_DEG) ** 2)
     course = WEIGHT["course"] * _log_t((_angle_deg(flip * end.course, COURSE[side]) / COURSE_SD_DEG) ** 2)
     return shape_score(end) + float(heading + course)
+
+
+def course_off_deg(tree: VesselTree) -> dict[str, float]:
+    """Return how far the direction from a tree's ostium to its middle is from `COURSE` of either artery, degrees."""
+    lines = [branch.centerline.points for branch in tree.branches]
+    course = np.concatenate(lines).mean(axis=0) - lines[0][0]
+    course /= np.linalg.norm(course)
+    return {side: float(_angle_deg(course, usual)) for side, usual in COURSE.items()}
 
 
 def shape_score(end: OpenEnd) -> float:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import SimpleITK as sitk
+from PIL import Image
 
 from endopilot.angiograms.coco import coco
 from endopilot.angiograms.layout import CARD_FILE, MANIFEST_FILE, SAMPLES_FILE, Layout
@@ -143,9 +143,7 @@ def _write_samples(layout: Layout, records: Sequence[dict[str, Any]]) -> None:
 
 def _beside(folder: Path, number: int) -> np.ndarray:
     """Return a frame, and to its right the same with its masks, as colours."""
-    grey, masks = (
-        sitk.GetArrayFromImage(sitk.ReadImage(str(folder / part / f"{number:04d}.png"))) for part in ("frames", "masks")
-    )
+    grey, masks = (np.asarray(Image.open(folder / part / f"{number:04d}.png")) for part in ("frames", "masks"))
     plain = np.repeat(grey[..., None], 3, axis=-1)
     coloured = plain.astype(float)
     for name in ("vessel", "contrast", "guide", "catheter", "wire"):

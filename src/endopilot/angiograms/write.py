@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import SimpleITK as sitk
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import read_anatomy, write_anatomy
@@ -19,7 +18,7 @@ from endopilot.angiograms.dicom import stored, write_xa
 from endopilot.angiograms.draw import draw_cine, motion_of
 from endopilot.angiograms.layout import CT_FILE, Layout, is_anatomy
 from endopilot.angiograms.masks import CLASSES, laid_together
-from endopilot.files import write_json, writing
+from endopilot.files import png_image, write_json, writing
 from endopilot.imaging.segment import segment
 from endopilot.imaging.volume import read_volume, write_volume
 from endopilot.types import Volume
@@ -29,8 +28,6 @@ from endopilot.xray.image import XrayImager
 RECORD_FILE, COCO_FILE = "cine.json", "coco.json"
 """What a cine shows, and its keypoints and masks."""
 TRUTH_FILE, DICOM_FILE = "truth.npz", "cine.dcm"
-_COMPRESSION = 1
-"""Of PNG files: higher levels take longer and save nearly nothing of a noisy image."""
 _kept: dict[str, XrayImager] = {}
 """The imager of the last patient in this process: cines of one patient follow each other."""
 
@@ -84,8 +81,8 @@ def write_cine(layout: Layout, folder: Path) -> None:
             (partial / part).mkdir(parents=True)
         for index, frame in enumerate(cine.frames()):
             file = f"{index:04d}.png"
-            _write_png(partial / "frames" / file, frame.grey)
-            _write_png(partial / "masks" / file, laid_together(frame.masks))
+            (partial / "frames" / file).write_bytes(png_image(frame.grey))
+            (partial / "masks" / file).write_bytes(png_image(laid_together(frame.masks)))
             path = f"cines/{folder.name}/frames/{file}"
             cine_number = patient * layout.config.cines + int(number)
             image, entries = frame_entries(cine, frame, path, index, cine_number)
@@ -112,10 +109,6 @@ def _imager(layout: Layout, name: str) -> XrayImager:
         _kept.clear()
         _kept[key] = imager
     return imager
-
-
-def _write_png(path: Path, image: UInt8[np.ndarray, "rows columns"]) -> None:
-    sitk.WriteImage(sitk.GetImageFromArray(image), str(path), useCompression=True, compressionLevel=_COMPRESSION)
 
 
 def _truth_of(cine: Cine, frame: CineFrame, number: int) -> dict[str, np.ndarray]:

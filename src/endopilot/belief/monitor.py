@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.belief.adviser import AdviserConfig, XrayAdviser
+from endopilot.belief.allowance import Allowance
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig, Past
 from endopilot.belief.drives import UNKNOWN
@@ -22,20 +23,16 @@ from endopilot.devices.stack import Proximals
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.xray.fluoroscope import TipMeasurement
 
-_LUMEN_SHARE, _LUMEN_MM = 0.12, 0.3
-"""The lumen's radius may be off by this share, and no more than this, mm: CT shows it to a tenth or a voxel, an
-assumption."""
 _MOST, _EVERY = 6, 3
 """The belief is changed as often at most, after as many further exposures at least."""
-_LEAST_EXPOSURES, _LEAST_GAIN, _MOST_MISFIT = 3, 6.0, 0.8
-"""A motion of the vessel is looked for in as many exposures at least; and believed that makes them likelier by this
-logarithm, and leaves no larger misfit."""
+_LEAST_EXPOSURES, _OUTSIDE_MM = 3, 0.8
+"""A motion of the vessel is looked for in as many exposures at least, where one showed the tip so far outside the
+lumen: a wire in a vessel that lies still is not."""
+_LEAST_GAIN, _MOST_MISFIT = 6.0, 0.8
+"""A motion is believed that makes the exposures likelier by this logarithm, and leaves no larger misfit."""
 _MOTION_SD_MM = np.array([0.6, 0.1])
 """Standard deviations of (Δtip, γtip) that a motion adds which was found, mm: measured in moving vessels."""
-_FREE_MM, _HELD_SHARE = 3.0, np.array([0.3, 0.05])
-"""A wire that advances by more than this while its tip rests buckles: standard deviations of (Δtip, γtip) that this
-adds, as shares of what goes beyond, mm."""
-_BETTER = 2.0
+_BETTER = 3.0
 """What is found must explain all exposures better by this logarithm."""
 MISMATCH = "model mismatch"
 """Why X-ray is asked for while the model is taken to be wrong."""
@@ -111,7 +108,7 @@ class Monitor:
         self._tests = not navigation.catheters
         self.changes_left, self._since, self._returned = _MOST, 0, False
         proximal, tip, spread, radius = adviser_input(self.belief)
-        self._ends, self._held_mm = np.array([proximal[0, 0], tip[0, 0]]), 0.0
+        self._allowance = Allowance(proximal[0, 0], tip[0, 0], alone=self._tests)
         self._adviser.start(proximal, tip, radius)
         self._half = self._adviser.widths(spread)[0]
 
@@ -136,7 +133,7 @@ class Monitor:
             self.belief.drives.begin(encoders)
         self.past.proximal.append(self.belief.drives.proximal.copy())
         proximal, tip, spread, radius = adviser_input(self.belief)
-        self._hold(proximal, tip)
+        self._allowance.move(proximal[0, 0], tip[0, 0])
         self.seen = None
         if exposure is not None:
             self.seen = seen = self.belief.in_vessel(exposure, period)
@@ -145,7 +142,7 @@ class Monitor:
             self.past.exposures[period] = exposure
             self.belief.weigh(seen)
             self._adviser.exposed()
-            self._held_mm = 0.0
+            self._allowance.exposed()
             self.lost = not self.belief.explains(seen)
             self._innovations.alarm |= self.lost and self._tests
             self._since += 1
@@ -157,21 +154,14 @@ class Monitor:
         elif self.belief.drives.proximal[0, 0] <= self._navigation.start_inserted_length_mm:
             self.lost = False  # back where it began, the wire lies as it did, unseen in its catheter
         factor = self._innovations.factor
-        wall_mm = np.minimum(_LUMEN_SHARE * radius, _LUMEN_MM) if self._tests else 0.0
-        wider = {"factor": factor, "always": self.alarm, "wall_mm": wall_mm}
+        wider = {"factor": factor, "always": self.alarm, "wall_mm": self._allowance.wall_mm(radius)}
         due = bool(self._adviser.advise(proximal, tip, spread, radius, self._further_sd(), **wider)[0])
         self._half = self._adviser.half_width[0] / factor
         return self._believed(tip[0], due)
 
-    def _hold(self, proximal: np.ndarray, tip: np.ndarray) -> None:
-        """Note by how much the wire was moved at its proximal end while its tip rested."""
-        now = np.array([proximal[0, 0], tip[0, 0]])
-        moved, rested = np.abs(now - self._ends).tolist()
-        self._ends, self._held_mm = now, self._held_mm + max(moved - rested, 0.0)
-
     def _further_sd(self) -> Float[np.ndarray, "1 2"]:
         """Return the standard deviations of (Δtip, γtip) that no calibration knows of, mm."""
-        held = _HELD_SHARE * max(self._held_mm - _FREE_MM, 0.0) * self._tests
+        held = self._allowance.sd_mm
         motion = _MOTION_SD_MM * (self.belief.motion is not None)
         return np.sqrt(self.belief.play_spread() ** 2 + motion**2 + held**2)[None]
 
@@ -223,6 +213,8 @@ class Monitor:
         if not self._tests or given.known_motion is not None or len(self.past.exposures) < _LEAST_EXPOSURES:
             return False
         members, past = self.belief.members, self.past
+        if self.moves is None and max(map(self._outside_mm, self.past.exposures.values())) < _OUTSIDE_MM:
+            return False
         if self.moves is not None and not (self.lost or self._innovations.outside or self._since >= _EVERY):
             return False
         if self.moves is None:
@@ -231,6 +223,7 @@ class Monitor:
                 drives, past = drives.of_robot(given.robot), self.past.by_encoders()
         tried = self.belief.like(members, drives=drives)
         tried.replay(past)
+        found = self.moves
         for _ in range(2):  # the wire as it lies in a vessel that lies still, and in one that moves
             best = int(np.argmax(tried.weight))
             tip, direction = (np.array([each[best] for each in some]) for some in zip(*tried.shown, strict=True))
@@ -246,6 +239,11 @@ class Monitor:
         self.belief, self.moves, self.identified, self.past = tried, found, None, past
         drives.begin(past.measured[-1][0])
         return True
+
+    def _outside_mm(self, measured: TipMeasurement) -> float:
+        """Return how far outside the lumen of a vessel that lies still a tip was seen, mm."""
+        line = self._navigation.anatomy.tree.branches[measured.branch].centerline
+        return measured.offset - float(np.interp(measured.abscissa, line.abscissa, line.radius))
 
     def _believed(self, tip: np.ndarray, due: bool) -> BelievedTip:
         abscissa, offset = tip.tolist()

@@ -88,10 +88,9 @@ def find_motion(
     error = np.einsum("nij,nj->ni", across, seen - tip)
     weight = 1 / (1 + (error**2).sum(axis=1) / _HEAVY / 10)
     fits = [_Fit(names, np.einsum("nij,njk->nik", across, _fields(tip, ostium, names)), error) for names in _KINDS]
-    for _ in range(2):
-        found = max((fit.best(times_s, weight) for fit in fits), key=lambda each: each[0])
-        weight = 1 / (1 + found[2] / _HEAVY)
-    gain, motion, left = found
+    _, _, left = max((fit.best(times_s, weight) for fit in fits), key=lambda each: each[0])
+    gain, motion, left = max((fit.best(times_s, 1 / (1 + left / _HEAVY)) for fit in fits), key=lambda each: each[0])
+    weight = 1 / (1 + left / _HEAVY)
     return FoundMotion(motion, gain, float((weight * left).sum() / (3 * weight.sum())))
 
 
@@ -132,11 +131,11 @@ class _Fit:
                 (_HEART_HZ, _BREATH_HZ), _USUAL_HZ, (self._heart, len(self.names) - self._heart), strict=True
             )
         ]
-        evidence, _ = self._evidence(*tried, times_s, weight)
+        evidence, _ = self._evidence(tried[0], tried[1], times_s, weight)
         top = np.unravel_index(np.argmax(evidence), evidence.shape)
         total = float(evidence.max() + np.log(np.exp(evidence - evidence.max()).mean()))
         near = [hz[k] + step * _FINE if len(hz) > 1 else hz for hz, k in zip(tried, top, strict=True)]
-        evidence, amplitude = self._evidence(*near, times_s, weight)
+        evidence, amplitude = self._evidence(near[0], near[1], times_s, weight)
         k, m = np.unravel_index(np.argmax(evidence), evidence.shape)
         found = np.clip(amplitude[k, m], *np.array([_LIMITS.get(name, (-np.inf, np.inf)) for name in self.names]).T)
         motion = replace(

@@ -66,6 +66,8 @@ def why_not(found: PatientNavigation) -> str:
 def _held_up(found: PatientNavigation, route: Route) -> str:
     """Return what is likeliest to have held up the device that was to arrive, or the wire ahead of it."""
     record, navigation = found.record, found.set_up.navigation
+    if 2 * record.faults >= len(record.time_s):
+        return f"{record.faults} decisions were not finite, or beyond the drive's limits"
     wire, device, tip = navigation.device, navigation.devices[navigation.arriving], record.tip[:, navigation.arriving]
     refused, wire_came = found.set_up.choice.refused, float(route.progress(record.tip[:, 0]).max())
     if refused is not None and abs(wire_came - refused.abscissa) <= _AT_FORK_MM + wire.tip_bend_length_mm:

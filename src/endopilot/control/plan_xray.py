@@ -2,8 +2,8 @@
 
 The adviser monitors the model that predicts the tip, as it does during a navigation. For a plan that no network made,
 that model is the ensemble of simulated wires of the ladder's agent: they follow the plan's proximal end, and each
-exposure shows the tip where the plan has it. For a plan by networks it is the same run, and each exposure shows the tip
-that the run itself predicts.
+exposure shows the tip where the plan has it. What their bands allow for beside (`Allowance`) is as in a navigation. For
+a plan by networks it is the same run, and each exposure shows the tip that the run itself predicts.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.belief.adviser import AdviserConfig, XrayAdviser
+from endopilot.belief.allowance import Allowance
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief
 from endopilot.belief.monitor import AdviserInput, adviser_input
@@ -73,11 +74,17 @@ def plan_xray(plan: Plan, *, calibration: Calibration | None = None) -> PlannedX
     adviser = XrayAdviser(calibration, AdviserConfig(), plan.navigation.device.tip_radius_mm)
     proximal, tip, _, radius = model.start()
     adviser.start(proximal, tip, radius)
+    alone = plan.config.method not in NETWORK_METHODS and not plan.navigation.catheters
+    allowance = Allowance(proximal[0, 0], tip[0, 0], alone=alone)
     exposure, half_width = np.zeros(len(plan.control), dtype=bool), np.zeros((len(plan.control), 2))
     for period in range(len(plan.control)):
-        exposure[period] = adviser.advise(*model.move(period))[0]
+        proximal, tip, spread, radius = model.move(period)
+        allowance.move(proximal[0, 0], tip[0, 0])
+        wall_mm = allowance.wall_mm(radius)
+        exposure[period] = adviser.advise(proximal, tip, spread, radius, allowance.sd_mm[None], wall_mm=wall_mm)[0]
         half_width[period] = adviser.half_width[0]
         if exposure[period]:
+            allowance.exposed()
             model.observe(period)
     return PlannedXray(exposure=exposure, half_width=half_width)
 

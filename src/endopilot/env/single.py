@@ -13,8 +13,9 @@ from jaxtyping import UInt8
 from numpy.typing import ArrayLike
 
 from endopilot.devices.robot import RobotConfig
+from endopilot.env.episodes import NavigationState
 from endopilot.env.observation import Observed
-from endopilot.env.vector import NavigateVectorEnv, NavigationState, Observations
+from endopilot.env.vector import NavigateVectorEnv, Observations
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator

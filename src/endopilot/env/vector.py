@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
@@ -18,71 +17,29 @@ from numpy.typing import ArrayLike
 
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import RobotConfig
+from endopilot.env.episodes import CONTROL_PERIOD_S, Episodes, NavigationState
 from endopilot.env.exposures import CArms
 from endopilot.env.observation import Measured, Observed, observe, observe_exposed, space
 from endopilot.env.picture import Picture
 from endopilot.env.reality import Reality
-from endopilot.env.route_tables import RouteTables
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import SimulatorState
 from endopilot.simulation.world import World
-from endopilot.tasks.navigation import Navigation, is_safe, reached
+from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import CORE, LadderVersion, in_catheter, reference_navigation, training_navigations
 from endopilot.xray.fluoroscope import FluoroscopeConfig
 
-CONTROL_PERIOD_S = 2 / 15
-"""Time between two actions, s: fluoroscopy's usual 7.5 frames a second."""
 TRANSLATION_MM_S, ROTATION_RAD_S = 12.0, 3.14
 """Velocities of an action of 1: the fastest of the random navigations of `ControlConfig`, and half a turn a second."""
-PROGRESS_REWARD, STEP_REWARD, FORCE_REWARD, SUCCESS_REWARD = 0.1, -0.01, -0.1, 5.0
-"""A mm nearer to the target, every step, every step with too large a force, and the target."""
-EXPOSURE_REWARD = -0.05
-"""Every exposure, where X-ray shows the tip."""
 Observations = Any
 """An array with a row a world, or a dictionary of such where images are observed."""
 
-_MASKS = tuple(
-    f"_{name}"
-    for name in (
-        *("contact_force_max", "valid", "success", "safe", "distance_mm", "inserted_length", "rotation"),
-        *("tip_abscissa", "tip_offset", "tip_branch", "time_s"),
-    )
-)
-"""Names of the masks in the info of a vector environment."""
-_OF_CATHETER = ("inserted_length", "rotation", "tip_abscissa", "tip_offset", "tip_branch")
-"""What the info tells of each catheter."""
 _MEASURED = ("encoder_inserted_length", "encoder_rotation", "load_n", "load_nmm")
-"""What the info tells of what a robot measures of the wire."""
+"""What the info holds of what a robot measures of the wire."""
 _PIXELS = (64, 128)
 """Least and most rows of an image."""
-
-
-@dataclass(frozen=True, eq=False)
-class NavigationState:
-    """All that the future of a `NavigateVectorEnv` depends on; it can be pickled and copied.
-
-    Attributes:
-        simulator: the worlds.
-        steps: steps of each world since its reset.
-        distance: path length from each tip that counts to its target at the last step, mm, a row a device.
-        safe: worlds whose force has not been too large since their reset.
-        ended: worlds whose episode has ended, which the next step resets.
-        generators: state of each world's random generator.
-        drawn: robots and what else differs from episode to episode, as it is kept within the environment.
-        exposed: the last exposures, likewise; None where all is observed as it truly is.
-    """
-
-    simulator: SimulatorState
-    steps: np.ndarray
-    distance: np.ndarray
-    safe: np.ndarray
-    ended: np.ndarray
-    generators: tuple[dict[str, Any], ...]
-    drawn: Any
-    exposed: Any
 
 
 class NavigateVectorEnv(VectorEnv):
@@ -353,7 +310,7 @@ class NavigateVectorEnv(VectorEnv):
         self.metadata = type(self).metadata | {"autoreset_mode": autoreset_mode}
         self._pictures: dict[int, Picture] = {}
         self.num_envs = count
-        self._drives, self._counted = len(first.devices), 1 + first.arriving
+        self._drives = len(first.devices)
         self._fastest = np.tile([TRANSLATION_MM_S, ROTATION_RAD_S], self._drives)
         self.single_action_space = Box(-1.0, 1.0, (2 * self._drives + (observation != "state"),), np.float32)
         self.single_observation_space = space(observation, len(first.catheters), (1 + c_arm.biplane, pixels, pixels))
@@ -361,21 +318,12 @@ class NavigateVectorEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, count)
         self._reality = Reality(navigations, **reality)
         self._simulator = self._reality.simulator
-        self._routes = RouteTables.of(navigations)
+        self._episodes = Episodes(navigations)
         self._c_arms: CArms | None = None
         if observation != "state":
             self._c_arms = CArms(navigations, self._simulator, config=c_arm, pixels=pixels)
-        targets = [navigation.target for navigation in navigations]
-        self._target_branch = np.array([target.branch for target in targets])
-        self._target_abscissa = np.array([target.abscissa for target in targets])
-        self._most_steps = np.array([navigation.periods(CONTROL_PERIOD_S) for navigation in navigations])
-        self._seconds, self._force_limit = (
-            np.array([getattr(navigation, name) for navigation in navigations]) for name in ("seconds", "force_limit_n")
-        )
         self._everyone = np.ones(count, dtype=bool)
         self._generators = [seeding.np_random()[0] for _ in range(count)]
-        self._steps, self._distance = np.zeros(count, dtype=np.int64), np.zeros((count, self._counted))
-        self._safe, self._ended = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -398,7 +346,7 @@ class NavigateVectorEnv(VectorEnv):
                 self._generators[world] = seeding.np_random(seeds[world])[0]
         self._begin(mask)
         now = Measured.current(self._simulator, self._reality.encoders)
-        distances = self._routes.distance(now.tip)
+        distances = self._episodes.routes.distance(now.tip)
         return self._observe(now, distances), self._infos(now, mask)
 
     def step(
@@ -424,55 +372,36 @@ class NavigateVectorEnv(VectorEnv):
         control = np.array(actions, dtype=float)
         if control.shape != self.action_space.shape or not np.isfinite(control).all():
             raise InputError(f"actions: shape {control.shape}; give finite numbers of shape {self.action_space.shape}")
-        fresh = self._ended & (self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP)
+        fresh = self._episodes.ended & (self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP)
         expose = (control[:, -1] > 0.0) & ~fresh & (self._c_arms is not None)
         control = np.minimum(np.maximum(control[:, : 2 * self._drives], -1.0), 1.0) * self._fastest
         control[fresh] = 0.0
         control = control.reshape(self.num_envs, self._drives, 2)
-        step = self._reality.drive(control, CONTROL_PERIOD_S, self._steps * CONTROL_PERIOD_S)
+        step = self._reality.drive(control, CONTROL_PERIOD_S, self._episodes.time_s)
         now = Measured.after(step, self._simulator, self._reality.encoders)
-        self._steps += ~fresh
+        self._episodes.steps += ~fresh
         self._expose(expose, self._reality.encoders)
         if fresh.any():
             self._begin(fresh)
             now = Measured.current(self._simulator, self._reality.encoders)
-        return self._judge(now, fresh, expose)
+        distances = self._episodes.routes.distance(now.tip)
+        judged = self._episodes.judge(now, distances, fresh, expose)
+        return self._observe(now, distances), *judged, self._infos(now, expose | fresh)
 
     def _expose(self, mask: Bool[np.ndarray, "worlds"], encoders: Float[np.ndarray, "worlds devices 2"]) -> None:
         """Take exposures in the worlds of a mask."""
         if self._c_arms is not None:
-            drawn, time_s = self._reality.drawn, self._steps * CONTROL_PERIOD_S
-            self._c_arms.expose(mask, self._simulator, encoders, drawn.registration_mm, time_s)
-
-    def _judge(
-        self, now: Measured, fresh: Bool[np.ndarray, "worlds"], exposed: Bool[np.ndarray, "worlds"]
-    ) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Score what the worlds did in a step, of which those of `fresh` have only begun."""
-        going, before = ~fresh, self._distance
-        distances = self._routes.distance(now.tip)
-        self._distance = distances[:, : self._counted]
-        unsafe = ~is_safe(now.contact_force, self._force_limit) & going
-        self._safe &= ~unsafe
-        infos = self._infos(now, exposed | fresh)
-        success = infos["success"] & going
-        nearer = (before - self._distance).sum(axis=1)
-        rewards = PROGRESS_REWARD * nearer + STEP_REWARD + FORCE_REWARD * unsafe + SUCCESS_REWARD * success
-        rewards = rewards + EXPOSURE_REWARD * exposed
-        terminations = (success | ~now.valid) & going
-        truncations = (self._steps >= self._most_steps) & ~terminations & going
-        self._ended = terminations | truncations
-        observations = self._observe(now, distances)
-        return observations, np.where(fresh, 0.0, rewards), terminations, truncations, infos
+            registration_mm = self._reality.drawn.registration_mm
+            self._c_arms.expose(mask, self._simulator, encoders, registration_mm, self._episodes.time_s)
 
     def _observe(self, now: Measured, distances: Float[np.ndarray, "worlds devices"]) -> Observations:
-        time_s = self._steps * CONTROL_PERIOD_S
-        time_share = time_s / self._seconds
+        episodes = self._episodes
         if self._c_arms is not None:
             exposed, images = self._c_arms.exposed, self._given["observation"] == "image"
-            routes = None if images else self._routes
-            measured = observe_exposed(self._reality.proximal, exposed, routes, time_s, time_share)
+            routes = None if images else episodes.routes
+            measured = observe_exposed(self._reality.proximal, exposed, routes, episodes.time_s, episodes.time_share)
             return {"image": exposed.image.copy(), "measured": measured} if images else measured
-        return observe(now, self._routes, distances, self._force_limit, time_share)
+        return observe(now, episodes.routes, distances, episodes.force_limit_n, episodes.time_share)
 
     def draw_from(self, *generators: np.random.Generator) -> None:
         """Let each world draw its starts from a generator that the caller holds."""
@@ -481,48 +410,25 @@ class NavigateVectorEnv(VectorEnv):
     def _begin(self, mask: Bool[np.ndarray, "worlds"]) -> None:
         """Start an episode in the worlds of a mask."""
         self._reality.begin(mask, self._generators)
-        self._steps[mask], self._safe[mask], self._ended[mask] = 0, True, False
-        begun = self._routes.distance(self._simulator.project())[:, : self._counted]
-        self._distance = np.where(mask[:, None], begun, self._distance)
+        self._episodes.begin(mask, self._simulator.project())
         if self._c_arms is not None:
             self._c_arms.begin(mask, self._generators)
             self._expose(mask, self._reality.encoders)
 
     def _infos(self, now: Measured, exposed: Bool[np.ndarray, "worlds"]) -> dict[str, Any]:
-        wire = now.tip[:, 0]
-        infos: dict[str, Any] = {  # the names of `_MASKS`
-            "contact_force_max": now.contact_force,
-            "valid": now.valid,
-            "success": reached(now.tip[:, : self._counted], self._target_branch, self._target_abscissa),
-            "safe": self._safe.copy(),
-            "distance_mm": self._distance[:, -1],
-            "inserted_length": now.inserted_length[:, 0],
-            "rotation": now.rotation[:, 0],
-            "tip_abscissa": wire.abscissa,
-            "tip_offset": wire.offset,
-            "tip_branch": wire.branch,
-            "time_s": self._steps * CONTROL_PERIOD_S,
-        }
-        infos |= dict.fromkeys(_MASKS, self._everyone)
+        infos = self._episodes.infos(now)
         if (readings := self._reality.drawn.readings) is not None:
-            for name, values in zip(_MEASURED, np.moveaxis(readings[:, 0], -1, 0), strict=True):
-                infos[name], infos[f"_{name}"] = values, self._everyone
+            infos |= zip(_MEASURED, np.moveaxis(readings[:, 0], -1, 0), strict=True)
         if self._c_arms is not None:
-            for name, values in (("exposed", exposed), ("exposures", self._c_arms.exposed.count.copy())):
-                infos[name], infos[f"_{name}"] = values, self._everyone
-        for k in range(1, self._drives):
-            tip = now.tip[:, k]
-            values = (now.inserted_length[:, k], now.rotation[:, k], tip.abscissa, tip.offset, tip.branch)
-            for name, value in zip(_OF_CATHETER, values, strict=True):
-                infos[f"catheter_{k}_{name}"], infos[f"_catheter_{k}_{name}"] = value, self._everyone
-        return infos
+            infos |= {"exposed": exposed, "exposures": self._c_arms.exposed.count.copy()}
+        return infos | {f"_{name}": self._everyone for name in infos}
 
     @property
     def state(self) -> NavigationState:
         """All that the future depends on, to be kept and given to `set_state`."""
         return NavigationState(
             self._simulator.state,
-            *(array.copy() for array in (self._steps, self._distance, self._safe, self._ended)),
+            **self._episodes.arrays(),
             generators=tuple(dict(copy.deepcopy(generator.bit_generator.state)) for generator in self._generators),
             drawn=copy.deepcopy(self._reality.drawn),
             exposed=None if self._c_arms is None else copy.deepcopy(self._c_arms.exposed),
@@ -535,9 +441,7 @@ class NavigateVectorEnv(VectorEnv):
             InputError: it is that of other navigations or settings.
         """
         self._simulator.set_state(state.simulator)
-        self._steps, self._distance, self._safe, self._ended = (
-            array.copy() for array in (state.steps, state.distance, state.safe, state.ended)
-        )
+        self._episodes.set_arrays(state.steps, state.distance, state.safe, state.ended)
         self._reality.drawn = copy.deepcopy(state.drawn)
         if self._c_arms is not None:
             self._c_arms.exposed = copy.deepcopy(state.exposed)

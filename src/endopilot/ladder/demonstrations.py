@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,13 +10,12 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 from jaxtyping import UInt8
-from PIL import Image
 
 from endopilot.dataset import parquet, schema
 from endopilot.devices.stack import column_prefixes, lines_from_tips
 from endopilot.env.exposures import Views
 from endopilot.errors import InputError
-from endopilot.files import manifest, sha256, write_json, writing
+from endopilot.files import manifest, png_image, sha256, write_json, writing
 from endopilot.ladder.attempt import Recording, begun, navigation_seed
 from endopilot.ladder.submission import Submission, read_submission
 from endopilot.navigation.record import NavigationRecord
@@ -186,7 +184,7 @@ def _write_episode(
 
 def _column(values: Any, feature: Mapping[str, Any]) -> pa.Array:
     if feature["dtype"] == "image":
-        files = {id(image): _png(image) for image in values}
+        files = {id(image): png_image(np.repeat(image[..., None], 3, axis=-1)) for image in values}
         return pa.array([{"bytes": files[id(image)], "path": None} for image in values], _IMAGE)
     return parquet.column(np.asarray(values), feature["dtype"], feature["names"])
 
@@ -197,12 +195,6 @@ _IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 def _pixels(images: Sequence[UInt8[np.ndarray, "rows columns"]]) -> np.ndarray:
     """Return the pixels of images, of which white is 1."""
     return np.concatenate([image.reshape(-1) for image in images]) / 255
-
-
-def _png(image: UInt8[np.ndarray, "rows columns"]) -> bytes:
-    file = io.BytesIO()
-    Image.fromarray(image).convert("RGB").save(file, format="PNG")
-    return file.getvalue()
 
 
 def _describe(

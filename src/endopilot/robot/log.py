@@ -158,6 +158,11 @@ def read_log(path: Path | str, *, camera: Camera | None = None) -> RobotLog:
     table = read_columns(path, ["time_s"], ["episode", "flag"], sparse=[*of_devices, *_TIP, *_PIXEL])
     devices = max(k + 1 for k, p in enumerate(prefixes) if k == 0 or p + _POSITION[0] in table.values
                   or p + _VELOCITY[0] in table.values)  # fmt: skip
+    if not {_POSITION[0], _VELOCITY[0]} & table.values.keys():
+        raise InputError(
+            f"{path}: is no log of a robot: column translation_mm, or translation_mm_s, is missing, where the drive is "
+            f"sent; it has {', '.join(table.header[:8])}{' …' if len(table.header) > 8 else ''}"
+        )
     time_s = table.values["time_s"]
     back = np.flatnonzero(np.diff(time_s) < 0)
     if len(back):

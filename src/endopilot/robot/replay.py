@@ -37,6 +37,10 @@ _FADES = 0.15
 """Share of what is given over which a tip's weight falls by 1/e, when a world is chosen."""
 _TOGETHER = 8
 """Episodes that are simulated side by side, for as long as the longest of them takes."""
+_BESIDE_MM = 20.0
+"""Tips of which the middle one lies farther than this from all centerlines are of another frame, or unit, mm."""
+_TRAVEL_MM = 1000.0
+"""A drive that goes farther in an episode than this and the vessel's length is logged in another unit, mm."""
 FAR_MM = 2.0
 """No tip counts as farther from the real one than this, mm, when a world is chosen: one in a wrong branch is wrong."""
 
@@ -166,14 +170,31 @@ def replay_log(
 
 
 def prepare(logs: list[RobotLog], anatomy: Anatomy, given: float, robot: RobotConfig) -> Prepared:
-    """Project what was seen in episodes onto a vessel, once for many replays."""
+    """Project what was seen in episodes onto a vessel, once for many replays.
+
+    Raises:
+        InputError: it was seen beside the vessel, or a drive goes too far: in another frame, or another unit.
+    """
+    longest_mm = float(anatomy.tree.longest_path().abscissa[-1])
+    for log in logs:
+        if (travel := float(np.ptp(log.command[log.commanded, 0, 0]))) > longest_mm + _TRAVEL_MM:
+            raise InputError(
+                f"{log.name}: translation_mm goes over {travel:.0f} mm in episode {log.episode[0]}, and {anatomy.name} "
+                f"is {longest_mm:.0f} mm long; give mm"
+            )
     courses, project = Courses.of(logs, robot.wire), TipProjector(anatomy.tree, anatomy.insertion)
     abscissa, branch = np.full(courses.seen.shape, np.nan), np.full(courses.seen.shape, -1.0)
-    share = np.zeros(courses.seen.shape, dtype=bool)
+    share, off = np.zeros(courses.seen.shape, dtype=bool), []
     for k, log in enumerate(logs):
         count, tip = int(log.seen.sum()), project(log.tip[log.seen])
         abscissa[k, :count], branch[k, :count] = tip.abscissa, tip.branch
+        off.append(tip.offset)
         share[k, : max(1, round(given * count))] = True
+    if (away := float(np.median(np.concatenate(off)))) > _BESIDE_MM:
+        raise InputError(
+            f"{logs[0].name}: the tip was seen {away:.0f} mm from the nearest centerline of {anatomy.name}, of the "
+            "middle row; give it in LPS mm of the CT that the vessel is from"
+        )
     return Prepared(logs, courses, anatomy, project, abscissa, branch, share & courses.seen)
 
 

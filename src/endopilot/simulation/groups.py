@@ -25,6 +25,10 @@ from endopilot.types import Anatomy
 
 GroupKey = tuple[str, tuple[Any, ...]]
 """Identity of an anatomy, and constants of its devices."""
+_KEPT = 4
+"""Walls that are kept for the next simulator; each takes 4 bytes a point of the distance map."""
+_walls: dict[tuple[Any, ...], Lumen] = {}
+"""The last walls that were made, the latest last."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +72,19 @@ def _wall_key(anatomy: Anatomy, stack: Stack) -> tuple[str, float, bool]:
     return anatomy.identity, stack.outer_radius_mm, bool(stack.catheters)
 
 
+def _wall(anatomy: Anatomy, stack: Stack, config: SimulatorConfig) -> Lumen:
+    """Return a vessel's wall, as it was made where it is one of the last few: that takes longer than a short run."""
+    key = (*_wall_key(anatomy, stack), config.wall_reach_mm, config.wall_along, config.processor)
+    wall = _walls.pop(key, None)
+    if wall is None:
+        check_distance_map(anatomy)
+        wall = make_wall(anatomy, stack, config)
+    _walls[key] = wall
+    while len(_walls) > _KEPT:
+        _walls.pop(next(iter(_walls)), None)
+    return wall
+
+
 def make_groups(
     anatomies: Sequence[Anatomy],
     stacks: Sequence[Stack],
@@ -103,8 +120,7 @@ def make_groups(
         stack.check(anatomy)
         key = _wall_key(anatomy, stack)
         if key not in lumens:
-            check_distance_map(anatomy)
-            lumens[key] = make_wall(anatomy, stack, config)
+            lumens[key] = _wall(anatomy, stack, config)
         if anatomy.identity not in projectors:
             projectors[anatomy.identity] = TipProjector(anatomy.tree, anatomy.insertion)
         path_mm = float(anatomy.tree.longest_path().abscissa[-1])

@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-import SimpleITK as sitk
 from jaxtyping import Float, UInt8
 
 from endopilot.devices.stack import Stack, lines_from_tips
 from endopilot.errors import InputError
-from endopilot.files import writing
+from endopilot.files import png_image, writing
 from endopilot.settings import LONGEST_S, Finite, Positive, Seed, Share, Text, Within, settings
 from endopilot.simulation.motion import Motion, MotionName, motion_named, place, relative
 from endopilot.simulation.simulate import simulate
@@ -93,7 +92,7 @@ class XrayImage:
         if path.suffix != ".png":
             raise InputError(f"{path}: an image is written as PNG; give a name that ends in .png")
         with writing(path) as partial:
-            sitk.WriteImage(sitk.GetImageFromArray(self.grey), str(partial), useCompression=True)
+            partial.write_bytes(png_image(self.grey))
 
 
 def take_image(anatomy: Anatomy, *, config: TakeImageConfig | None = None, ct: Volume | None = None) -> XrayImage:

@@ -1,0 +1,54 @@
+"""What bands allow for that no calibration knows: `Allowance`.
+
+The lumen may be another than CT shows it, and a wire that is pushed while its tip rests buckles, and then snaps or
+folds, which no two wires do alike.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+_LUMEN_SHARE, _LUMEN_MM = 0.12, 0.3
+"""The lumen's radius may be off by this share, and no more than this, mm: CT shows it to a tenth or a voxel, an
+assumption."""
+_FREE_MM, _HELD_SHARE = 5.0, np.array([0.3, 0.05])
+"""A wire that is moved by more than this while its tip rests buckles: standard deviations of (Δtip, γtip) that this
+adds, as shares of what goes beyond, mm; found in vessels with compliant walls, on patients to improve agents on."""
+
+
+class Allowance:
+    """What a wire's bands allow for, beside what they are calibrated for.
+
+    Attributes:
+        held_mm: by how much the wire was moved while its tip rested, since the last exposure, mm.
+    """
+
+    def __init__(self, inserted_mm: float, abscissa_mm: float, *, alone: bool) -> None:
+        """Begin at an exposure.
+
+        Args:
+            inserted_mm: Δ.
+            abscissa_mm: Δtip.
+            alone: whether no catheter is around the wire; nothing is allowed for where one is.
+        """
+        self._at, self._alone, self.held_mm = np.array([inserted_mm, abscissa_mm]), alone, 0.0
+
+    def move(self, inserted_mm: float, abscissa_mm: float) -> None:
+        """Take where the wire's ends are a period later, mm."""
+        now = np.array([inserted_mm, abscissa_mm])
+        moved, tip_moved = np.abs(now - self._at).tolist()
+        self._at, self.held_mm = now, self.held_mm + max(moved - tip_moved, 0.0)
+
+    def exposed(self) -> None:
+        """Begin anew at an exposure."""
+        self.held_mm = 0.0
+
+    def wall_mm(self, radius_mm: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        """Return by how much the lumen's radius may be another, mm, where it is given as this, mm."""
+        return np.minimum(_LUMEN_SHARE * radius_mm, _LUMEN_MM) * self._alone
+
+    @property
+    def sd_mm(self) -> Float[np.ndarray, "2"]:
+        """Standard deviations of (Δtip, γtip), mm."""
+        return _HELD_SHARE * max(self.held_mm - _FREE_MM, 0.0) * self._alone

@@ -1,0 +1,154 @@
+"""What counts in the episodes of many worlds: how far each has come, what a step earns, when an episode ends."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from endopilot.env.observation import Measured
+from endopilot.env.route_tables import RouteTables
+from endopilot.simulation.state import SimulatorState
+from endopilot.tasks.navigation import Navigation, is_safe, reached
+from endopilot.types import TipProjection
+
+CONTROL_PERIOD_S = 2 / 15
+"""Time between two actions, s: fluoroscopy's usual 7.5 frames a second."""
+PROGRESS_REWARD, STEP_REWARD, FORCE_REWARD, SUCCESS_REWARD = 0.1, -0.01, -0.1, 5.0
+"""A mm nearer to the target, every step, every step with too large a force, and the target."""
+EXPOSURE_REWARD = -0.05
+"""Every exposure, where X-ray shows the tip."""
+_OF_CATHETER = ("inserted_length", "rotation", "tip_abscissa", "tip_offset", "tip_branch")
+"""What the info holds of each catheter."""
+
+
+@dataclass(frozen=True, eq=False)
+class NavigationState:
+    """All that the future of a `NavigateVectorEnv` depends on; it can be pickled and copied.
+
+    Attributes:
+        simulator: the worlds.
+        steps: steps of each world since its reset.
+        distance: path length from each tip that counts to its target at the last step, mm, a row a device.
+        safe: worlds whose force has not been too large since their reset.
+        ended: worlds whose episode has ended, which the next step resets.
+        generators: state of each world's random generator.
+        drawn: robots and what else differs from episode to episode, as it is kept within the environment.
+        exposed: the last exposures, likewise; None where all is observed as it truly is.
+    """
+
+    simulator: SimulatorState
+    steps: np.ndarray
+    distance: np.ndarray
+    safe: np.ndarray
+    ended: np.ndarray
+    generators: tuple[dict[str, Any], ...]
+    drawn: Any
+    exposed: Any
+
+
+class Episodes:
+    """The episodes that many worlds are in; row i belongs to world i.
+
+    Attributes:
+        routes: to the targets.
+        steps: of each world since its reset.
+        distance: path length from each tip that counts to its target at the last step, mm.
+        safe: worlds whose force has not been too large since their reset.
+        ended: worlds whose episode has ended.
+    """
+
+    def __init__(self, navigations: Sequence[Navigation]) -> None:
+        """Begin with no steps; the navigations are of the same devices."""
+        count, self._counted = len(navigations), 1 + navigations[0].arriving
+        self.routes = RouteTables.of(navigations)
+        targets = [navigation.target for navigation in navigations]
+        self._target_branch = np.array([target.branch for target in targets])
+        self._target_abscissa = np.array([target.abscissa for target in targets])
+        self._most_steps = np.array([navigation.periods(CONTROL_PERIOD_S) for navigation in navigations])
+        self._seconds = np.array([navigation.seconds for navigation in navigations])
+        self.force_limit_n = np.array([navigation.force_limit_n for navigation in navigations])
+        self.steps, self.distance = np.zeros(count, dtype=np.int64), np.zeros((count, self._counted))
+        self.safe, self.ended = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
+
+    @property
+    def time_s(self) -> Float[np.ndarray, "worlds"]:
+        """Time since each world's reset, s."""
+        return self.steps * CONTROL_PERIOD_S
+
+    @property
+    def time_share(self) -> Float[np.ndarray, "worlds"]:
+        """Share of each navigation's time that is used up."""
+        return self.time_s / self._seconds
+
+    def begin(self, mask: Bool[np.ndarray, "worlds"], tip: TipProjection) -> None:
+        """Start an episode in the worlds of a mask."""
+        self.steps[mask], self.safe[mask], self.ended[mask] = 0, True, False
+        self.distance = np.where(mask[:, None], self.routes.distance(tip)[:, : self._counted], self.distance)
+
+    def judge(
+        self,
+        now: Measured,
+        distances: Float[np.ndarray, "worlds devices"],
+        fresh: Bool[np.ndarray, "worlds"],
+        exposed: Bool[np.ndarray, "worlds"],
+    ) -> tuple[Float[np.ndarray, "worlds"], Bool[np.ndarray, "worlds"], Bool[np.ndarray, "worlds"]]:
+        """Score what the worlds did in a step, of which those of `fresh` have only begun.
+
+        Args:
+            now: the worlds at its end.
+            distances: path length from every tip to its target, mm.
+            fresh: worlds that were reset in place of a step.
+            exposed: worlds that took an exposure.
+
+        Returns:
+            Rewards, terminations and truncations.
+        """
+        going, before = ~fresh, self.distance
+        self.distance = distances[:, : self._counted]
+        unsafe = ~is_safe(now.contact_force, self.force_limit_n) & going
+        self.safe &= ~unsafe
+        success = self._success(now) & going
+        nearer = (before - self.distance).sum(axis=1)
+        rewards = PROGRESS_REWARD * nearer + STEP_REWARD + FORCE_REWARD * unsafe + SUCCESS_REWARD * success
+        rewards = rewards + EXPOSURE_REWARD * exposed
+        terminations = (success | ~now.valid) & going
+        truncations = (self.steps >= self._most_steps) & ~terminations & going
+        self.ended = terminations | truncations
+        return np.where(fresh, 0.0, rewards), terminations, truncations
+
+    def _success(self, now: Measured) -> Bool[np.ndarray, "worlds"]:
+        return reached(now.tip[:, : self._counted], self._target_branch, self._target_abscissa)
+
+    def infos(self, now: Measured) -> dict[str, Any]:
+        """Return what stands in the info of every world, as `NavigateVectorEnv` names it."""
+        wire = now.tip[:, 0]
+        infos: dict[str, Any] = {
+            "contact_force_max": now.contact_force,
+            "valid": now.valid,
+            "success": self._success(now),
+            "safe": self.safe.copy(),
+            "distance_mm": self.distance[:, -1],
+            "inserted_length": now.inserted_length[:, 0],
+            "rotation": now.rotation[:, 0],
+            "tip_abscissa": wire.abscissa,
+            "tip_offset": wire.offset,
+            "tip_branch": wire.branch,
+            "time_s": self.time_s,
+        }
+        for k in range(1, now.rotation.shape[1]):
+            tip = now.tip[:, k]
+            values = (now.inserted_length[:, k], now.rotation[:, k], tip.abscissa, tip.offset, tip.branch)
+            infos |= {f"catheter_{k}_{name}": value for name, value in zip(_OF_CATHETER, values, strict=True)}
+        return infos
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return copies of all that changes, by the names of `NavigationState`."""
+        return {name: getattr(self, name).copy() for name in ("steps", "distance", "safe", "ended")}
+
+    def set_arrays(self, steps: np.ndarray, distance: np.ndarray, safe: np.ndarray, ended: np.ndarray) -> None:
+        """Go back to what `arrays` returned."""
+        self.steps, self.distance, self.safe, self.ended = (array.copy() for array in (steps, distance, safe, ended))

@@ -1,0 +1,23 @@
+"""What bands allow for beside what they are calibrated for."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from endopilot.belief.allowance import Allowance
+
+
+def test_a_wire_that_is_pushed_while_its_tip_rests_is_known_less_well_until_it_is_seen() -> None:
+    made = Allowance(10.0, 10.0, alone=True)
+    made.move(30.0, 30.5)
+    assert not made.sd_mm.any()  # the tip went along
+    for inserted in (33.0, 36.0, 35.0, 37.0):
+        made.move(inserted, 30.5)
+    np.testing.assert_allclose(made.sd_mm, [0.3 * 4.0, 0.05 * 4.0])  # 3 + 3 + 1 + 2 mm, of which 5 are free
+    made.exposed()
+    assert not made.sd_mm.any()
+
+
+def test_the_lumen_may_be_another_by_a_share_and_no_more_than_some_millimetres() -> None:
+    np.testing.assert_allclose(Allowance(0.0, 0.0, alone=True).wall_mm(np.array([1.0, 10.0])), [0.12, 0.3])
+    assert not Allowance(0.0, 0.0, alone=False).wall_mm(np.array([1.0])).any()
