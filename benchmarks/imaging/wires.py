@@ -232,7 +232,7 @@ def _shares(rows: Sequence[Search]) -> dict[str, Any]:
     def share(which: Sequence[Search], of: Callable[[Search], bool]) -> float:
         return float(np.mean([of(row) for row in which])) if which else float("nan")
 
-    inside = summary(sure)["inside_own_95_share"]
+    pairs = [row for row in sure if row.views == 2]
     return {
         "missed_share": share(two, lambda row: row.missed),
         "missed_share_one_view": share(one, lambda row: row.missed),
@@ -241,8 +241,8 @@ def _shares(rows: Sequence[Search]) -> dict[str, Any]:
         "wrong": len(wrong),
         "doubted_share": share(right, lambda row: row.said != "found"),
         "surely_wrong_share": share(wires, lambda row: row.missed and row.said == "found"),
-        "inside_own_95_share": inside,
-        "inside_own_95_share_two_views": summary(row for row in sure if row.views == 2)["inside_own_95_share"],
+        "inside_own_95_share": summary(sure)["inside_own_95_share"] if sure else float("nan"),
+        "inside_own_95_share_two_views": summary(pairs)["inside_own_95_share"] if pairs else float("nan"),
         "false_alarms_share": share(none, lambda row: row.found),
         "ms_a_view": float(np.median([row.ms_a_view for row in rows])) if rows else float("nan"),
     }

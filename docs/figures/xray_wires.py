@@ -29,13 +29,10 @@ def table(found: dict) -> str:
     """Return the table as Markdown."""
     lines = [HEAD, "|---|---|---|---|---|---|---|---|"]
     for name, row in {"all": found, **found["by"]}.items():
-        shares = ("–" if row[one] != row[one] else f"{row[one]:.0%}".replace("%", " %") for one in SHARES)
+        shares = ("–" if row[one] is None else f"{row[one]:.0%}".replace("%", " %") for one in SHARES)
         lines.append(f"| {name} | {row['wires']} | " + " | ".join(shares) + " |")
-    bars = found["bars"]
-    lines.append(
-        f"| bar | | ≤ {bars['missed_share']:.0%} | ≤ {bars['missed_share_one_view']:.0%} | ≥ {bars['said_share']:.0%} "
-        "| | | 92–97 % |".replace("% |", " % |").replace("  %", " %")
-    )
+    limits = (f"{found['bars'][name]:.0%}".replace("%", " %") for name in SHARES[:3])
+    lines.append("| bar | | ≤ {} | ≤ {} | ≥ {} | | | 92 to 97 % |".format(*limits))
     return "\n".join(lines)
 
 
