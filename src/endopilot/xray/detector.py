@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float, Float32
 from scipy.ndimage import binary_dilation, gaussian_filter
 from scipy.ndimage import label as connected_parts
 
@@ -53,6 +53,8 @@ the fit moves the end: then 95 % of the tips lie in the region of 95 %, in synth
 _LINE, _LINE_PX, _MOVED_PX = 0.3, 60, 2
 """An image from before shows a line where the evidence for a wire is larger than this over so many pixels together; it
 may be displaced by so many pixels."""
+_HIDDEN_MM = 1.5
+"""Standard deviation that a tip on such a line has more, mm."""
 _BELIEVABLE = 3.0
 """An end farther than this many standard deviations from the followed wire's is another line's."""
 
@@ -141,10 +143,14 @@ class TipDetector:
         corridor = make_corridor(self._anatomy, self._radius_mm, slack_mm, deepest)
         seen = [self._look(*one, corridor) for one in zip(views, signals, photons, strict=True)]
         plain, evidence = [one for one, _ in seen], [one for _, one in seen]
-        for image, earlier, count in zip(evidence, before or (), photons, strict=before is not None):
-            image[self._lines(earlier, count)] = 0.0
-        tip = track(corridor, views, evidence, inserted_length)
-        return self._judged(_refined(tip, views, plain, self._radius_mm))
+        lines = [
+            self._lines(earlier, count) for earlier, count in zip(before or (), photons, strict=before is not None)
+        ]
+        for image, line in zip(evidence, lines, strict=before is not None):
+            image[line] = 0.0
+        found = _refined(track(corridor, views, evidence, inserted_length), views, plain, self._radius_mm)
+        hidden = any(_lies_on(line, view, found.position) for line, view in zip(lines, views, strict=False))
+        return self._judged(found, hidden=hidden)
 
     def _look(self, view: View, signal: Signal, photons: float, corridor: Corridor) -> tuple[Signal, Signal]:
         """Return an image without contrast, and how likely its pixels are on a wire, none where no vessel is near."""
@@ -166,13 +172,19 @@ class TipDetector:
             self._known_lines = [*self._known_lines[-1:], (before, known[0])]
         return known[0]
 
-    def _judged(self, found: TipEstimate) -> TipEstimate:
-        """Return an estimate with its status; an ambiguous one is as uncertain as the places are far apart."""
+    def _judged(self, found: TipEstimate, *, hidden: bool) -> TipEstimate:
+        """Return an estimate with its status; an ambiguous one is as uncertain as the places are far apart.
+
+        Args:
+            found: the tip.
+            hidden: whether it lies on a line from before: the wire may end elsewhere on it.
+        """
         if found.log_odds < self.config.least_log_odds:
             return replace(found, status="not found")
-        if found.share >= self.config.sure:
+        if found.share >= self.config.sure and not hidden:
             return found
-        return replace(found, status="ambiguous", covariance=found.covariance + found.elsewhere)
+        along = _HIDDEN_MM**2 * np.eye(3) if hidden else 0.0
+        return replace(found, status="ambiguous", covariance=found.covariance + found.elsewhere + along)
 
     def _saturated(self, log_ratio: Signal) -> Signal:
         """Return evidence that no single pixel can overrule all others with."""
@@ -194,6 +206,13 @@ class TipDetector:
         dark = gaussian_filter(part, _HIGH_PASS_PX, truncate=_TRUNCATE) - part
         strength = float(dark[filled] @ edges[filled] / (edges[filled] @ edges[filled]))
         return signal + np.float32(strength) * path_mm if strength > _LEAST_CONTRAST else signal
+
+
+def _lies_on(line: Bool[np.ndarray, "rows columns"], view: View, point: Float[np.ndarray, "3"]) -> bool:
+    """Return whether a view shows a point, LPS mm, on a line."""
+    (right, up), middle = view.project(point), (len(line) - 1) / 2
+    row, column = np.clip(np.rint([middle - up, middle + right]), 0, len(line) - 1).astype(int)
+    return bool(line[row, column])
 
 
 def _box(corridor: Corridor, view: View, rows: int) -> tuple[slice, slice]:
