@@ -210,7 +210,7 @@ def _refined(scene: Scene, registered: Registration, used: Sequence[int]) -> lis
             float(scene.inserted_length[wire]),
             slack_mm,
         )
-        if found is not None:
+        if found is not None and found.status == "found":
             refiner.refine(views, found, slack_mm)
         errors.append(vessel_error_mm(scene.anatomy, scene.pose, refiner.pose))
     return errors

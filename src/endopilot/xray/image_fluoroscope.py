@@ -134,7 +134,8 @@ class ImageFluoroscope:
             nodes: of the wire as it truly is, from its tip on, LPS mm.
             inserted_length: Δ by the robot's encoder, mm.
             random: where the noise is drawn from.
-            refine: whether the wire refines the pose that later exposures take the patient to lie in.
+            refine: whether a wire whose tip is not ambiguous refines the pose that later exposures take the patient to
+                lie in.
         """
         signals = [self._signal(plane, nodes, random) for plane in self._planes]
         photons = [self._imager.photons(plane) for plane in self._planes]
@@ -144,7 +145,7 @@ class ImageFluoroscope:
         if found is None:
             return None
         before, moved_mm = self.refiner.pose, 0.0
-        if refine:
+        if refine and found.status == "found":
             moved_mm = vessel_error_mm(self._anatomy, before, self.refiner.refine(self._views, found, self._slack_mm))
         if moved_mm > _MOVED_MM or self._slack_mm > self._detector.config.slack_mm:
             found = self._detector.find(self.refiner.views(self._views), *image, before=empty) or found
