@@ -1,4 +1,4 @@
-"""Write the tables of docs/worlds.md: `python docs/worlds.py [FILE]`.
+"""Write the tables of docs/concepts/worlds.md, and docs/evidence/worlds.md: `python docs/worlds.py [FILE]`.
 
 Those of fields and of shipped worlds are made of the package. Where the agent was driven in them, FILE holds what
 `python -m benchmarks worlds -o FOLDER --json > FILE` printed.
@@ -14,10 +14,13 @@ from typing import Any
 
 import docstring_parser
 
+sys.path.append(str(Path(__file__).parents[1]))  # where `benchmarks` is
+
+from benchmarks.figures import fill
 from endopilot.files import read_json
 from endopilot.simulation.world import NOMINAL, Stenosis, World, list_worlds, read_world
 
-PAGE = Path(__file__).with_suffix(".md")
+PAGE = Path(__file__).parent / "concepts" / "worlds.md"
 FIGURES = {
     "missed_share": "events missed, random drive",
     "missed_share_worst": "the same in the worst world",
@@ -42,12 +45,8 @@ LEAST = ("in_bands_share", "in_bands_share_worst", "safe_share", "safe_share_wor
 """Figures that are to be at least as large as their bar."""
 
 
-def page(found: Mapping[str, Any] | None = None) -> str:
-    """Return the page as it is to be: what stands between the markers is made of the record and its files.
-
-    Args:
-        found: what the benchmark of worlds printed; its tables stay as they are if not given.
-    """
+def page() -> str:
+    """Return the page as it is to be: what stands between the markers is made of the record and its files."""
     text = PAGE.read_text(encoding="utf-8")
     shipped = [f"| `{name}` | {read_world(name).about} |" for name in list_worlds() if name != NOMINAL]
     tables = {
@@ -55,8 +54,6 @@ def page(found: Mapping[str, Any] | None = None) -> str:
         "stenosis": _fields(Stenosis()),
         "shipped": ["| world | what it is |", "| --- | --- |", *shipped],
     }
-    if found is not None:
-        tables["measured"] = _measured(found)
     for name, rows in tables.items():
         begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
         head, rest = text.split(begin)
@@ -126,4 +123,6 @@ def _shown(name: str, value: float) -> str:
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(read_json(Path(sys.argv[1])) if len(sys.argv) > 1 else None), encoding="utf-8")
+    PAGE.write_text(page(), encoding="utf-8")
+    if len(sys.argv) > 1:
+        fill("evidence/worlds.md", "measured", _measured(read_json(Path(sys.argv[1]))))

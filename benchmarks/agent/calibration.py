@@ -48,7 +48,7 @@ class Kind:
         version: of the ladder; `tasks` are those of it that count.
         roles: places of the patients in a task's lists: in the training list, and for the test in the ladder's.
         folder: where the calibration goes in the package.
-        mark: of the table in docs/xray.md.
+        mark: of the table in docs/evidence/advice.md.
         whose: whose patients they are, in words.
     """
 
@@ -242,7 +242,7 @@ def calibrate_agent(kind: Positional[KindName] = "assumed", /, *, write: bool = 
     Args:
         kind: exposures with assumed errors in patients at rest (assumed), X-ray images of patients whom heart and
             breath move (images), or a wire in a catheter in the coaxial tasks (coaxial).
-        write: write the calibration into the package, and its figures into docs/xray.md.
+        write: write the calibration into the package, and its figures into docs/evidence/advice.md.
 
     Returns:
         The calibration, and a table of its coverage.
@@ -264,5 +264,5 @@ def calibrate_agent(kind: Positional[KindName] = "assumed", /, *, write: bool = 
     calibration, lines = calibrate(folder, chosen)
     if write:
         calibration.write(chosen.folder)
-        fill("xray.md", chosen.mark, lines)
+        fill("evidence/advice.md", chosen.mark, lines)
     return "\n".join([str(calibration), *lines])

@@ -102,7 +102,7 @@ def drive_under_conditions(
     Args:
         patients: of each task.
         only: conditions to drive under; the other rows of the table stay as they are.
-        write: write the table into docs/xray.md.
+        write: write the table into docs/evidence/advice.md.
 
     Returns:
         The table.
@@ -117,7 +117,7 @@ def drive_under_conditions(
     }
     claim(FOLDER, "python -m benchmarks xray-conditions", **identity("agent", NEWEST))
     make_missing("The agent under X-ray", [path for paths in wanted.values() for path in paths], measure)
-    before = (DOCS / "xray.md").read_text(encoding="utf-8").split("<!-- conditions:begin -->")[1]
+    before = (DOCS / "evidence/advice.md").read_text(encoding="utf-8").split("<!-- conditions:begin -->")[1]
     rows = {title: line for line in before.splitlines() for title, *_ in CONDITIONS.values() if f"| {title} |" in line}
     rows |= {
         CONDITIONS[name][0]: row(CONDITIONS[name][0], [read_json(path) for path in paths])
@@ -130,5 +130,5 @@ def drive_under_conditions(
         *rows.values(),
     ]
     if write:
-        fill("xray.md", "conditions", lines)
+        fill("evidence/advice.md", "conditions", lines)
     return "\n".join(lines)

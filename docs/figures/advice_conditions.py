@@ -1,4 +1,4 @@
-"""Writes what advice misses and costs with images and motion into docs/xray.md.
+"""Writes what advice misses and costs with images and motion into docs/evidence/advice.md.
 
 `python docs/figures/advice_conditions.py FOLDER`: FOLDER/advice holds what the commands beside the table make, one
 folder for each model and condition, such as `twin-both-images`; a row is written for each that is there.
@@ -10,11 +10,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.figures import fill
 from endopilot.belief.advise import FIGURES_FILE
 from endopilot.files import read_json
 
-PAGE = Path(__file__).parents[1] / "xray.md"
-BEGIN, END = "<!-- advice-conditions:begin -->\n", "<!-- advice-conditions:end -->"
 MODELS = {"pretrained": "`pretrained`", "twin": "twin of 8 wires"}
 CONDITIONS = {
     "still-assumed": "assumed errors, patients at rest",
@@ -51,8 +52,7 @@ def main() -> None:
             if path.exists():
                 lines.append(row(model, words, read_json(path)))
     lines.append("| bar | | 87 to 93 % | | | | ≤ 5 % | | ≤ 0.33 |")
-    head, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-    PAGE.write_text(f"{head}{BEGIN}" + "\n".join(lines) + f"\n{END}{rest.split(END)[1]}", encoding="utf-8")
+    fill("evidence/advice.md", "advice-conditions", lines)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Make the picture of X-ray images in docs/xray.md: `python docs/figures/fluoroscopy.py`."""
+"""Make the picture of X-ray images in docs/concepts/images.md: `python docs/figures/fluoroscopy.py`."""
 
 from __future__ import annotations
 

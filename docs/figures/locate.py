@@ -1,4 +1,4 @@
-"""Measure `endopilot locate` on the frames of a real catheter, and write figures and picture of docs/locate.md.
+"""Measure `endopilot locate` on a real catheter, and write figures and picture of docs/evidence/locate.md.
 
 `python docs/figures/locate.py FOLDER`, the folder of the published data with `authors_hmm_bruteforce_run.csv`.
 """
@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 
 DOCS = Path(__file__).parents[1]
-sys.path.insert(0, str(DOCS.parent / "examples"))
+sys.path[:0] = [str(DOCS.parent / "examples"), str(DOCS.parent)]
 
 from liver_catheter import convert, nodes_of
 
+from benchmarks.figures import fill
 from endopilot.anatomy.extract import extract_anatomy
 from endopilot.types import Anatomy
 from endopilot.xray.camera import Camera, read_camera
@@ -26,7 +27,6 @@ from endopilot.xray.locate import locate
 from endopilot.xray.locate_picture import draw_locations
 from endopilot.xray.tip_filter import LocateConfig, TipLocation
 
-BEGIN, END = "<!-- liver:begin -->\n", "<!-- liver:end -->"
 TRAINED = 37
 """Frames on which the filter's constants were chosen; the others are the test."""
 LOST_MM, NEAR_MM, OF_95 = 20.0, 5.0, 2.795
@@ -81,9 +81,7 @@ def main(folder: Path) -> None:
     ]
     rows = rows_of(trunk, frames, camera, authors)
     text = "\n".join([*head, *rows_of(replace(whole, name="whole"), frames, camera, authors), *rows])
-    page = (DOCS / "locate.md").read_text(encoding="utf-8")
-    before, after = page.partition(BEGIN)[0], page.partition(END)[2]
-    (DOCS / "locate.md").write_text(f"{before}{BEGIN}{text}\n{END}{after}", encoding="utf-8")
+    fill("evidence/locate.md", "liver", text)
     print(text)
 
 

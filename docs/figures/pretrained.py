@@ -54,7 +54,7 @@ P3 and P4 (its controls, simulated): Δ {p3:.3f} and {p4:.3f} mm over all 45 s; 
 X-ray advice by `xray.json`, calibrated on {calibrated} patients: on {advised} others the bands of level {level:g}
 hold throughout {coverage:.0f} % of the intervals of 45 s; {missed:.1f} % of the events are missed with {exposures:.1f}
 exposures a minute, {share:.2f} of what periodic imaging needs to miss as many. The adviser counts {offset_share:g} of
-the half-width of γtip's band (docs/xray.md).
+the half-width of γtip's band (docs/concepts/advice.md).
 
 **Meant for** research with this device or one much like it, in coronary arteries. It gets each patient's vessel from
 simulations of the device (`models/patient.py`), and simulates three wires under the controls that it predicts for

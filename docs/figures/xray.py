@@ -1,4 +1,4 @@
-"""Write the figures of X-ray advice into docs/xray.md.
+"""Write the figures of X-ray advice into docs/evidence/advice.md.
 
 `python docs/figures/xray.py FOLDER`: FOLDER is what `endopilot advise` made.
 """
@@ -9,10 +9,13 @@ import shutil
 import sys
 from pathlib import Path
 
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.figures import fill
 from endopilot.belief.advise import FIGURES_FILE, PICTURE_FILE
 from endopilot.files import read_json
 
-PAGE, PICTURE = Path(__file__).parents[1] / "xray.md", Path(__file__).parents[1] / "images" / "xray.png"
+PICTURE = Path(__file__).parents[1] / "images" / "xray.png"
 
 
 def tables(folder: Path) -> str:
@@ -55,7 +58,5 @@ def tables(folder: Path) -> str:
 
 if __name__ == "__main__":
     folder = Path(sys.argv[1])
-    head, rest = PAGE.read_text(encoding="utf-8").split("<!-- xray:begin -->\n")
-    tail = rest.split("<!-- xray:end -->")[1]
-    PAGE.write_text(f"{head}<!-- xray:begin -->\n{tables(folder)}\n<!-- xray:end -->{tail}", encoding="utf-8")
+    fill("evidence/advice.md", "xray", tables(folder))
     shutil.copyfile(folder / PICTURE_FILE, PICTURE)

@@ -1,4 +1,4 @@
-"""Write the figures of detection and registration into docs/xray.md.
+"""Write the figures of detection and registration into docs/evidence/detection.md.
 
 `python -m benchmarks xray --patients 4 --json > FILE`, then `python docs/figures/xray_detection.py FILE`.
 """
@@ -10,10 +10,10 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from endopilot.files import read_json
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
 
-PAGE = Path(__file__).parents[1] / "xray.md"
-BEGIN, END = "<!-- detection:begin -->\n", "<!-- detection:end -->"
+from benchmarks.figures import fill
+from endopilot.files import read_json
 
 
 def tables(found: dict[str, Any]) -> str:
@@ -97,6 +97,5 @@ def refined_rows(poses: list[dict[str, Any]]) -> list[str]:
 
 
 if __name__ == "__main__":
-    head, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
     text = tables(read_json(Path(sys.argv[1])))
-    PAGE.write_text(f"{head}{BEGIN}{text}\n{END}{rest.split(END)[1]}", encoding="utf-8")
+    fill("evidence/detection.md", "detection", text)

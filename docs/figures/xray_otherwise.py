@@ -1,4 +1,4 @@
-"""Measures X-ray advice that was calibrated with one simulation and tested with another, for a table of docs/xray.md.
+"""Measures X-ray advice, calibrated with one simulation and tested with another, for docs/evidence/advice.md.
 
 `python docs/figures/xray_otherwise.py FOLDER`: FOLDER gets patients, datasets, a twin and its advice; what is there is
 kept.
@@ -10,13 +10,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.figures import fill
 from endopilot.belief.advise import FIGURES_FILE
 from endopilot.cli import main as endopilot
 from endopilot.dataset.loader import read_dataset
 from endopilot.files import read_json
 
-PAGE = Path(__file__).parents[1] / "xray.md"
-BEGIN, END = "<!-- otherwise:begin -->\n", "<!-- otherwise:end -->"
 MADE: dict[str, tuple[str, list[str]]] = {
     "wall": ("a compliant wall, 0.01 N/mm²", ["--compliant-wall-n-mm2", "0.01"]),
     "fast": (
@@ -77,8 +78,7 @@ def main() -> None:
         _row("the settings of the calibration", found),
         *(_row(words, other) for (words, _), other in zip(MADE.values(), found["made_otherwise"], strict=True)),
     ]
-    head, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-    PAGE.write_text(f"{head}{BEGIN}" + "\n".join(rows) + f"\n{END}{rest.split(END)[1]}", encoding="utf-8")
+    fill("evidence/advice.md", "otherwise", rows)
 
 
 if __name__ == "__main__":

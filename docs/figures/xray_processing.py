@@ -1,4 +1,4 @@
-"""Write the table of processed images in docs/xray.md: `python docs/figures/xray_processing.py FILE`.
+"""Write the table of processed images in docs/evidence/detection.md: `python docs/figures/xray_processing.py FILE`.
 
 FILE holds what `python -m benchmarks xray-processing --json` prints.
 """
@@ -9,8 +9,10 @@ import json
 import sys
 from pathlib import Path
 
-PAGE = Path(__file__).parents[1] / "xray.md"
-BEGIN, END = "<!-- processing:begin -->", "<!-- processing:end -->"
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.figures import fill
+
 HEAD = (
     "| images | along, across, pixels | missed, two views | one view | in own 95 % region | found where there is none "
     "| registration |"
@@ -31,6 +33,5 @@ def table(rows: list[dict]) -> str:
 
 
 if __name__ == "__main__":
-    head, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
     text = table(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8")))
-    PAGE.write_text(f"{head}{BEGIN}\n{text}\n{END}{rest.split(END)[1]}", encoding="utf-8")
+    fill("evidence/detection.md", "processing", text)

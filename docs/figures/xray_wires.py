@@ -1,4 +1,4 @@
-"""Write the table of wires in real arteries in docs/xray.md: `python docs/figures/xray_wires.py FILE`.
+"""Write the table of wires in real arteries in docs/evidence/detection.md: `python docs/figures/xray_wires.py FILE`.
 
 FILE holds what `python -m benchmarks xray-wires --json` prints.
 """
@@ -9,8 +9,10 @@ import json
 import sys
 from pathlib import Path
 
-PAGE = Path(__file__).parents[1] / "xray.md"
-BEGIN, END = "<!-- wires:begin -->", "<!-- wires:end -->"
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.figures import fill
+
 HEAD = (
     "| | wires | missed, two views | one view | wrong and said so | called found and missed | doubted though right "
     "| in own 95 % region |"
@@ -37,6 +39,5 @@ def table(found: dict) -> str:
 
 
 if __name__ == "__main__":
-    head, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
     text = table(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8")))
-    PAGE.write_text(f"{head}{BEGIN}\n{text}\n{END}{rest.split(END)[1]}", encoding="utf-8")
+    fill("evidence/detection.md", "wires", text)

@@ -3,7 +3,7 @@
 A band is `scale` times a spread. The spread grows from the last exposure with time, travel and the model's own
 estimate of its error, and is brought to a size at which either band by itself holds throughout equally many intervals.
 The scale is conformal: on calibration patients, each interval scores its worst error in units of the spread, over all
-samples and over Δtip and γtip together. docs/xray.md measures the coverage.
+samples and over Δtip and γtip together. docs/evidence/advice.md measures the coverage.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ def command(
             each is driven at random and independently, by velocity.
         robot: name of a robot (docs/concepts/robot.md) or a YAML file that makes the motions, and measures them; if not
             given, they are made as drawn.
-        world: name of the world that reality is (docs/worlds.md), or a YAML file.
+        world: name of the world that reality is (docs/concepts/worlds.md), or a YAML file.
         scheduler: address of a Dask scheduler (tcp://host:8786) whose workers simulate and share these folders; the
             cores of this machine if not given.
         config: how many navigations, how long, and how they are split.

@@ -51,8 +51,8 @@ class NavigateConfig:
     """Name of the robot that drives them, such as assumed, ideal or kweon-2021-2d (docs/concepts/robot.md), or a YAML
     file. Policies are given it, not what the seed draws of it."""
     world: Text = NOMINAL
-    """Name of the world that reality is, such as nominal, drawn or wide-lumen (docs/worlds.md), or a YAML file. The
-    policy does not know it."""
+    """Name of the world that reality is, such as nominal, drawn or wide-lumen (docs/concepts/worlds.md), or a YAML
+    file. The policy does not know it."""
     tip: Text = "auto"
     """Shape of the wire's tip: auto (chosen for the forks of the route), own (the device's), or angle and length such
     as 75/5, 75 degrees over 5 mm."""

@@ -42,7 +42,7 @@ class LadderConfig:
     robot: str = ASSUMED
     """Name of the robot that drives (docs/concepts/robot.md), or a YAML file."""
     world: Text = NOMINAL
-    """Name of the world that reality is (docs/worlds.md), or a YAML file. The policy does not know it."""
+    """Name of the world that reality is (docs/concepts/worlds.md), or a YAML file. The policy does not know it."""
 
     @model_validator(mode="after")
     def _consistent(self) -> LadderConfig:

@@ -24,10 +24,10 @@ def score(tasks: Sequence[Task], results: Mapping[str, Sequence[Mapping[str, Any
     that never exceeded the task's limit; `success`, the share that reached it; of those that did, the medians of
     `seconds` and `path_ratio` (length of the tip's path over that of the centerline); and of all the median of
     `peak_force_n` (N) and the mean of `exposures`. Rows of `agent` have `missed_events`, the share
-    of the events of all their navigations that X-ray did not show (docs/xray.md). Rows of tasks with `near_mm` have
-    `near`, the share of navigations in which the tip came so near to the target, whatever the force. Rows of policies
-    that search have `planning_s`, the mean processor time of a navigation's searches, s; `timeless` leaves it out.
-    """
+    of the events of all their navigations that X-ray did not show (docs/concepts/advice.md). Rows of tasks with
+    `near_mm` have `near`, the share of navigations in which the tip came so near to the target, whatever the force.
+    Rows of policies that search have `planning_s`, the mean processor time of a navigation's searches, s; `timeless`
+    leaves it out."""
     rows = [{"level": task.level, "task": task.name} | score_navigations(results[task.name]) for task in tasks]
     levels = {task.level: task.name for task in tasks}
     groups = {"lower four": range(1, 5), "upper eight": UPPER, "all twelve": range(1, 13), "all coaxial": COAXIAL}

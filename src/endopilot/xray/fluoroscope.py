@@ -4,7 +4,7 @@ The tip is projected onto one or two detectors, is found there with an error in 
 most likely place given the pixels and the vessel: the tip of a wire lies about as far from the vessel's axis as its
 wall, and no deeper than the wire is inserted. It may be measured outside the lumen, which may be wider than it is
 believed. The second view or, with a single one, the vessel gives the depth. The guiding catheter is a line in each
-view. docs/xray.md says where the numbers come from.
+view. docs/concepts/exposure.md says where the numbers come from.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 What does not move (`Plane`) is computed once for a direction of the C-arm: line integrals of the attenuation through a
 CT, the path through the lumen, the guiding catheter, the scattered light. A frame adds the wire, the catheters that are
 driven with it, and the noise. All lengths and
-attenuations are physical; docs/xray.md says where the constants come from.
+attenuations are physical; docs/concepts/images.md says where the constants come from.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ _ASIDE_SD_MM, _ASIDE_RADII, _ASIDE_MM = 1.5, 0.1, 20.0
 """How far the device lies off its way: this, and this share of the lumen's radius, mm; and over which length alike."""
 _POINT_SD_MM, _END_SD_MM = 0.4, 1.0
 """Standard deviations of the points of a line, and more of its end, mm. All lengths above, and the one below, are those
-that made the first half of the frames of a real patient's catheter likeliest; docs/locate.md names them."""
+that made the first half of the frames of a real patient's catheter likeliest; docs/evidence/locate.md names them."""
 _LENGTH_SD_MM, _LENGTH_SHARE = 2.0, 0.01
 """By how much, and by which share of the line, the way to the tip is longer than the line in an image, mm."""
 _DRIFT_MM, _DRIFT_RAD = 0.5, np.deg2rad(0.2)
