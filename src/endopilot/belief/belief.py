@@ -94,7 +94,7 @@ class Past:
     Attributes:
         proximal: where the proximal ends of the devices were believed at each decision, mm and rad.
         exposures: what X-ray showed, by the decision, as it was measured.
-        measured: encoders and loads at each decision, and what the drives had been told.
+        measured: encoders and loads at each decision, and what the drives had been commanded.
     """
 
     proximal: list[Float[np.ndarray, "devices 2"]] = field(default_factory=list)
@@ -362,8 +362,8 @@ class Belief:
             Where the proximal ends of the devices were believed at each decision, mm and rad.
         """
         proximal = []
-        for period, (encoders, load, told) in enumerate(past.measured):
-            self.drives.sent(told)
+        for period, (encoders, load, commanded) in enumerate(past.measured):
+            self.drives.sent(commanded)
             if period:
                 self.follow(encoders, load)
             else:

@@ -74,8 +74,8 @@ class Drives:
         lose: whether encoders sit in front of the play, at the motors.
         proximal: Δ, mm, and φ, rad, of each device where it most likely is.
         sd: standard deviations of these.
-        at_rest: where the devices are once the motors have done what they were told before.
-        told: what the drives were told last, mm/s and rad/s.
+        at_rest: where the devices are once the motors have done what they were commanded before.
+        commanded: what the drives were commanded last, mm/s and rad/s.
         unknown: whether nothing is known of the robot, and its encoders were found not to say where the devices are.
     """
 
@@ -93,7 +93,7 @@ class Drives:
             fastest: translation and rotation of each drive, mm/s and rad/s.
         """
         self._start, self._fastest, self._random = np.array(start, dtype=float), fastest, np.random.default_rng(0)
-        self.told: Proximals = ()
+        self.commanded: Proximals = ()
         self.unknown = robot is UNKNOWN
         self._stray = (_JUMP_SHARE, _JUMPS) if self.unknown else (_STRAY_SHARE, _STRAYS)
         self._gap_jitter = _UNKNOWN_JITTER if self.unknown else _GAP_JITTER
@@ -150,14 +150,14 @@ class Drives:
         return ", ".join(["the wire is not where its encoder says", *(found or ["unknown play"])])
 
     def sent(self, velocity: Proximals) -> None:
-        """Note what the drives are told to do until the next reading, mm/s and rad/s."""
-        self.told = velocity
+        """Note what the drives are commanded until the next reading, mm/s and rad/s."""
+        self.commanded = velocity
         if self.lose:
-            told = np.zeros(self._sent.shape)
-            told[: len(velocity)] = np.reshape(velocity, (-1, 2))
-            told[~np.isfinite(told).all(axis=1)] = 0.0  # a drive stops then
+            commanded = np.zeros(self._sent.shape)
+            commanded[: len(velocity)] = np.reshape(velocity, (-1, 2))
+            commanded[~np.isfinite(commanded).all(axis=1)] = 0.0  # a drive stops then
             self._run_out = self._robot.run_out(self._sent)
-            self._sent = np.clip(told, -self._fastest, self._fastest)
+            self._sent = np.clip(commanded, -self._fastest, self._fastest)
 
     def towards(self, wanted: Float[np.ndarray, "devices 2"], slower: Float[np.ndarray, "2"]) -> Motion:
         """Return how to bring the devices to where they are wanted, mm and rad, in a period.

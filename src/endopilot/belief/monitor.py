@@ -126,7 +126,7 @@ class Monitor:
             exposure: what X-ray shows now; None where it is off.
         """
         period = len(self.past.proximal)
-        self.past.measured.append((encoders, load, self.belief.drives.told))
+        self.past.measured.append((encoders, load, self.belief.drives.commanded))
         if period:
             self.belief.follow(encoders, load)
         else:
