@@ -120,7 +120,8 @@ class TipDetector:
             photons: that a pixel of usual brightness counts, in each image.
             inserted_length: Δ by the robot's encoder, mm.
             slack_mm: how far outside the lumen the wire is looked for, mm; the configuration's if not given.
-            before: images of the same views without a wire: lines in them are none of its; none if not given.
+            before: images of the same views without a wire: lines in them are none of its; none if not given. Their
+                noise is taken to be that of `photons` when they are first given.
 
         Returns:
             The tip, found or ambiguous; None where there is no wire.
