@@ -144,8 +144,8 @@ class Forks:
         """Lay out the wire, with friction and stiffness drawn."""
         self._navigation, self._random, self._config = navigation, random, SearchConfig()
         self._route = Route.to(navigation.anatomy, navigation.target)
-        factors = {"friction_factor": FRICTION, "tip_stiffness_factor": STIFFNESS}
-        member = World(**{name: float(random.uniform(*ends)) for name, ends in factors.items()})
+        friction, stiffness = random.uniform(*FRICTION), random.uniform(*STIFFNESS)
+        member = World(friction_factor=friction, tip_stiffness_factor=stiffness)
         belief = Belief(navigation, [member], BeliefConfig())
         trials = partial(Trials.of, navigation, belief.kinds, like=belief.simulator)
         self._one, self._many = trials(1), trials(TURNS)

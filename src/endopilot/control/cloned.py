@@ -13,10 +13,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import Calibration
 from endopilot.belief.monitor import BelievedTip, Monitor
-from endopilot.control.agent import read_agent_calibration
+from endopilot.control.agent import AgentConfig, read_agent_calibration
 from endopilot.control.fork_view import ForkView
 from endopilot.control.push import stand_off
 from endopilot.control.turn_network import AZIMUTH, TurnNetwork
@@ -49,6 +48,7 @@ _FURTHER_MM = 2.0
 _FAILURES = 10
 """Failures at one place after which the policy gives up."""
 _TURNED_RAD = 0.1
+"""A wire this near to where it was to be turned is there, rad."""
 _TURNS = 3
 """A wire is turned as often at one place at most, since friction holds some of a turn back."""
 
@@ -76,7 +76,7 @@ class ClonedPolicy:
         self.navigation, self.route = navigation, Route.to(navigation.anatomy, navigation.target)
         check_passable(self.route, navigation.device)
         calibration = self._calibration or read_agent_calibration(navigation.xray, 1)
-        self.monitor = Monitor(navigation, calibration, advice=AdviserConfig())
+        self.monitor = Monitor(navigation, calibration, config=AgentConfig.of(navigation).belief)
         self._believed = BelievedTip(np.nan, np.nan)
         self._at, self._turns, self._shows = -1, 0, False
         self._failures: dict[int, list[float]] = {}

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.tasks.route import Route
 from endopilot.types import Centerline
 
@@ -40,7 +40,7 @@ class ForkView:
     azimuth: float
 
     @staticmethod
-    def of(route: Route, at_mm: float, nodes: Float[np.ndarray, "nodes 3"], device: Device) -> ForkView:
+    def of(route: Route, at_mm: float, nodes: Float[np.ndarray, "nodes 3"], device: Wire) -> ForkView:
         """Return what is seen of a place of a route.
 
         Args:
