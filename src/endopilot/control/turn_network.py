@@ -55,7 +55,7 @@ class TurnNetwork:
         arrays = {
             f"{name}{k}": each for k, pair in enumerate(self.layers) for name, each in zip("wb", pair, strict=True)
         }
-        np.savez_compressed(path, mean=self.mean, scale=self.scale, **arrays)
+        np.savez_compressed(path, mean=self.mean, scale=self.scale, **arrays)  # pyright: ignore[reportArgumentType]
 
     @staticmethod
     def read(path: Path) -> TurnNetwork:
