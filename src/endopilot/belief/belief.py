@@ -21,8 +21,9 @@ from jaxtyping import Float, Int
 
 from endopilot.anatomy.projection import TipProjector
 from endopilot.belief.drives import Drives
+from endopilot.belief.vessels import Vessels
 from endopilot.devices.drive_limits import DriveLimits
-from endopilot.devices.stack import Proximals, Stack
+from endopilot.devices.stack import Proximals
 from endopilot.models.ensemble import likelihoods
 from endopilot.settings import NonNegative, Positive, ShareBelowOne, Within, settings
 from endopilot.simulation.config import PRESETS, SimulatorConfig
@@ -30,11 +31,9 @@ from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
-from endopilot.types import Anatomy, TipProjection
+from endopilot.types import TipProjection
 from endopilot.xray.fluoroscope import TipMeasurement
 
-_OF_VESSEL = "lumen_factor", "lumen_mm", "axis_deg", "axis_side_deg"
-"""What of a `World` makes another vessel."""
 _SIDES = 16
 """Angles that a wire is turned to where its rotation is looked for."""
 _PLACED_MM = 0.5, 0.15
@@ -106,34 +105,6 @@ class Past:
         return replace(self, proximal=[np.array(encoders, dtype=float) for encoders, _, _ in self.measured])
 
 
-class Vessels:
-    """The vessels of a navigation, with one lumen and another, which beliefs share: preparing one takes a second.
-
-    Attributes:
-        simulators: in which they are prepared.
-    """
-
-    def __init__(self, given: Anatomy) -> None:
-        """Begin with the vessel as it is given."""
-        self._made = {World(): given}
-        self.simulators: list[Simulator] = []
-        self._kept = set[tuple[int, float]]()
-
-    def of(self, member: World) -> Anatomy:
-        """Return the vessel as a member has it."""
-        alone = World(**{name: getattr(member, name) for name in _OF_VESSEL})
-        if alone not in self._made:
-            self._made[alone] = alone.anatomy(self._made[World()])
-        return self._made[alone]
-
-    def prepared(self, simulator: Simulator) -> None:
-        """Keep a simulator if it holds what no other does."""
-        key = {(id(anatomy), simulator.config.wall_reach_mm) for anatomy in simulator.set_up.anatomies}
-        if not key <= self._kept:
-            self._kept |= key
-            self.simulators.append(simulator)
-
-
 class Belief:
     """An ensemble of simulated wires that follow a navigation, and how likely each is.
 
@@ -188,7 +159,7 @@ class Belief:
         self._fans = dict[int, Simulator]()
         self.ostium_mm = np.array([each.ostium_mm for each in self.members])
         self.vessels = vessels or Vessels(navigation.anatomy)
-        self.kinds, self.kind = _kinds(navigation, self.members, self.vessels)
+        self.kinds, self.kind = self.vessels.kinds(navigation.stack, self.members)
         self.error, self.force = np.zeros((len(self.members), 2)), np.zeros(len(self.members))
         self._score, self._coaxial = np.zeros(len(self.members)), bool(navigation.catheters)
         self.evidence = 0.0
@@ -479,13 +450,3 @@ class Belief:
         """Return where the tip of the likeliest member is, as arrays of one."""
         best = [int(np.argmax(self.weight))]
         return self.tip[best]
-
-
-def _kinds(
-    navigation: Navigation, members: Sequence[World], vessels: Vessels
-) -> tuple[list[tuple[Anatomy, Stack]], Int[np.ndarray, "members"]]:
-    """Return vessels and devices of members, those that differ, and which of them each member has."""
-    found: dict[World, int] = {}
-    alike = [replace(each, friction_factor=1.0, ostium_mm=0.0, about="") for each in members]
-    kind = np.array([found.setdefault(each, len(found)) for each in alike])
-    return [(vessels.of(each), each.stack(navigation.stack)) for each in found], kind

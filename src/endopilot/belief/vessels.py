@@ -1,0 +1,59 @@
+"""The vessels and devices that members of a belief have: `Vessels`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Int
+
+from endopilot.devices.stack import Stack
+from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.world import World
+from endopilot.types import Anatomy
+
+_OF_VESSEL = "lumen_factor", "lumen_mm", "axis_deg", "axis_side_deg"
+"""What of a `World` makes another vessel."""
+
+
+class Vessels:
+    """The vessels of a navigation, with one lumen and another, which beliefs share: preparing one takes a second.
+
+    Attributes:
+        simulators: in which they are prepared.
+    """
+
+    def __init__(self, given: Anatomy) -> None:
+        """Begin with the vessel as it is given."""
+        self._made = {World(): given}
+        self.simulators: list[Simulator] = []
+        self._kept = set[tuple[int, float]]()
+
+    def of(self, member: World) -> Anatomy:
+        """Return the vessel as a member has it."""
+        alone = World(**{name: getattr(member, name) for name in _OF_VESSEL})
+        if alone not in self._made:
+            self._made[alone] = alone.anatomy(self._made[World()])
+        return self._made[alone]
+
+    def prepared(self, simulator: Simulator) -> None:
+        """Keep a simulator if it holds what no other does."""
+        key = {(id(anatomy), simulator.config.wall_reach_mm) for anatomy in simulator.set_up.anatomies}
+        if not key <= self._kept:
+            self._kept |= key
+            self.simulators.append(simulator)
+
+    def kinds(
+        self, given: Stack, members: Sequence[World]
+    ) -> tuple[list[tuple[Anatomy, Stack]], Int[np.ndarray, "members"]]:
+        """Return vessels and devices of members, those that differ, and which of them each member has.
+
+        Args:
+            given: the devices as they are given.
+            members: as they take reality to be.
+        """
+        found: dict[World, int] = {}
+        alike = [replace(each, friction_factor=1.0, ostium_mm=0.0, about="") for each in members]
+        kind = np.array([found.setdefault(each, len(found)) for each in alike])
+        return [(self.of(each), each.stack(given)) for each in found], kind
