@@ -150,8 +150,10 @@ def test_another_device_in_the_same_file_is_refused(case, untouched, capsys):
 
 
 def test_another_version_of_the_package_is_refused(case, untouched, monkeypatch, capsys):
+    begun = study.__version__
     monkeypatch.setattr(study, "__version__", "99.0")
-    assert "was begun with version = 0.1.0, now it is 99.0" in command.refused(capsys, *arguments(case))
+    line = command.refused(capsys, *arguments(case))
+    assert f"was begun with version = {begun}, now it is 99.0" in line
 
 
 def test_another_setting_is_refused(case, untouched, capsys):
