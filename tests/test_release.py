@@ -34,11 +34,11 @@ def released(tmp_path: Path) -> Path:
 
 
 def test_the_version_stands_in_one_place() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     assert project["project"]["dynamic"] == ["version"]
     assert project["tool"]["scikit-build"]["metadata"]["version"]["input"] == "src/endopilot/__init__.py"
-    assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text()
-    assert f"\n## [{__version__}] - " in (ROOT / "CHANGELOG.md").read_text()
+    assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\n## [{__version__}] - " in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
 def test_notes_are_the_part_of_the_version(released: Path) -> None:
@@ -58,6 +58,6 @@ def test_notes_are_the_part_of_the_version(released: Path) -> None:
 )
 def test_a_release_that_does_not_agree_with_itself_is_refused(released, file, old, new, says) -> None:
     path = released / file
-    path.write_text(path.read_text().replace(old, new))
+    path.write_text(path.read_text(encoding="utf-8").replace(old, new))
     with pytest.raises(InputError, match=says):
         notes("2.0.0", folder=released)
