@@ -28,6 +28,7 @@ from endopilot.control.trials import WIRE, Move, Trials
 from endopilot.control.turn_network import AZIMUTH, TurnNetwork, fourier
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
+from endopilot.files import writing
 from endopilot.parallel import each
 from endopilot.settings import Within
 from endopilot.simulation.world import World
@@ -70,7 +71,7 @@ class TurnFigures:
 
 
 def train_turns(
-    *, patients: Annotated[int, Within(5, 10000)] = 120, output: Path = Path("runs/turn-network"), write: bool = False
+    *, patients: Annotated[int, Within(5, 10000)] = 100, output: Path = Path("runs/turn-network"), write: bool = False
 ) -> TurnFigures:
     """Train the network by which policy `cloned` turns a wire. It takes some 10 s a patient on one core.
 
@@ -79,16 +80,15 @@ def train_turns(
         output: folder of the trials.
         write: write the network into the package.
     """
-    output.mkdir(parents=True, exist_ok=True)
     files = [output / f"{number:05d}.npz" for number in range(patients)]
     bad = each("Trials at forks", [file for file in files if not file.exists()], drive_patient)
     for error in bad.values():
         raise error
-    trained = [file for place, file in enumerate(files) if place % KEPT_ASIDE]
-    network = fit(*_read(trained))
+    trained = _read([file for place, file in enumerate(files) if place % KEPT_ASIDE])
+    network = fit(*trained)
     if write:
         network.write(NETWORK)
-    return _figures(network, len(_read(trained)[0]), *_read(files[::KEPT_ASIDE]))
+    return _figures(network, len(trained[0]), *_read(files[::KEPT_ASIDE]))
 
 
 def drive_patient(file: Path) -> None:
@@ -105,9 +105,8 @@ def drive_patient(file: Path) -> None:
             warnings.simplefilter("ignore")  # a trial that fails does not pass
             rows += Forks(navigation, random).drive()
     view, azimuth, passed = (np.array(column) for column in zip(*rows, strict=True))
-    with file.with_suffix(".part").open("wb") as part:
-        np.savez_compressed(part, view=view, azimuth=azimuth, passed=passed)
-    file.with_suffix(".part").rename(file)
+    with writing(file) as partial:
+        np.savez_compressed(partial, view=view, azimuth=azimuth, passed=passed)
 
 
 def _drawn(task: Task, number: int, random: np.random.Generator) -> Navigation:

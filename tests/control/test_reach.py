@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from endopilot.anatomy.catheter_axis import with_axis
-from endopilot.control.reach import ROTATIONS, forks, lateral_reach, rotations_that_enter
+from endopilot.control.reach import ROTATIONS, forks, rotations_that_enter
 from endopilot.control.set_up import choose_tip
+from endopilot.devices.device import lateral_reach
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import run_core

@@ -22,6 +22,7 @@ from jaxtyping import Float, Int
 from endopilot.anatomy.projection import TipProjector
 from endopilot.belief.drives import Drives
 from endopilot.belief.vessels import Vessels
+from endopilot.devices.device import lateral_reach
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Proximals
 from endopilot.models.ensemble import likelihoods
@@ -215,11 +216,6 @@ class Belief:
         """Return inserted lengths from each member's ostium on, mm, of those from the given one on."""
         return np.maximum(given_mm + self.ostium_mm.reshape(-1, *[1] * (given_mm.ndim - 1)), 0.0)
 
-    @property
-    def score(self) -> float:
-        """Logarithm of the likelihood of the likeliest member, up to what all beliefs share."""
-        return float(np.where(self.simulator.valid, self._score, -1e6).max())
-
     def in_vessel(self, measured: TipMeasurement, period: int) -> TipMeasurement:
         """Return a measurement less the motion that was found.
 
@@ -246,6 +242,16 @@ class Belief:
         score = np.where(self.simulator.valid, self._score, -1e6)
         return likelihoods(score)
 
+    @property
+    def best(self) -> int:
+        """The likeliest member."""
+        return int(np.argmax(self.weight))
+
+    @property
+    def wires(self) -> Float[np.ndarray, "members nodes 3"]:
+        """The members' wires, the likeliest first: nodes from the foremost tip on, LPS mm."""
+        return self.simulator.position[np.argsort(-self.weight, kind="stable")]
+
     def follow(self, devices: Proximals, load: Proximals = ()) -> None:
         """Move every member's proximal ends to where they are by the encoders, in one decision period.
 
@@ -255,7 +261,7 @@ class Belief:
         """
         self.drives.follow(devices)
         if load and self.drives.lose:
-            core, pushed_n = self.simulator.config, self.simulator.base_load[np.argmax(self.weight), 0, 0]
+            core, pushed_n = self.simulator.config, self.simulator.base_load[self.best, 0, 0]
             valve = core.introducer_friction_n, core.introducer_drag_n_s_mm
             self.drives.feel(0, load[0][0], pushed_n=float(pushed_n), valve=valve)
         self._move(self.drives.proximal)
@@ -346,7 +352,7 @@ class Belief:
 
     def explains(self, measured: TipMeasurement) -> bool:
         """Return whether the likeliest wire explains the last measurement, which has weighed the members."""
-        best, config = int(np.argmax(self.weight)), self.config
+        best, config = self.best, self.config
         across_mm = max(config.lost_across_mm, config.lost_across_radii * float(self.tip.radius[best]))
         allowed = np.maximum([config.lost_along_mm, across_mm], _SURE_SDS * np.array(measured.sd_mm))
         return bool((self.error[best] <= allowed).all())
@@ -355,13 +361,12 @@ class Belief:
         """Return the standard deviations of (Δtip, γtip) that the plays of the wire's drive make, mm."""
         along, turn = self.drives.sd[0].tolist()
         wire = self.navigation.device
-        bend = max(abs(wire.tip_bend_rad), 1e-9)
-        reach = wire.tip_bend_length_mm * (1 - np.cos(bend)) / bend
+        reach = lateral_reach(wire.tip_bend_rad, wire.tip_bend_length_mm)
         return np.array([along, reach * min(turn, 1.0)])
 
     def _relocate(self, measured: TipMeasurement) -> Float[np.ndarray, "3"]:
         """Update where the wire's proximal end is believed; return how far the likeliest tip moves by that, mm."""
-        best, drives = int(np.argmax(self.weight)), self.drives
+        best, drives = self.best, self.drives
         before = drives.proximal[0].copy()
         fan = self._fan(best) if drives.sd[0, 1] > _SURE_RAD else None
         left = drives.samples(0) - before
@@ -448,5 +453,4 @@ class Belief:
 
     def likeliest_tip(self) -> TipProjection:
         """Return where the tip of the likeliest member is, as arrays of one."""
-        best = [int(np.argmax(self.weight))]
-        return self.tip[best]
+        return self.tip[[self.best]]

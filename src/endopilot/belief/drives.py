@@ -66,6 +66,11 @@ class Motion(NamedTuple):
     velocity: Float[np.ndarray, "devices 2"]
     done: bool
 
+    @property
+    def commands(self) -> Proximals:
+        """The velocities as pairs, one a device."""
+        return tuple((translation, rotation) for translation, rotation in self.velocity.tolist())
+
 
 class Drives:
     """The drives of a navigation, as they are believed to be.

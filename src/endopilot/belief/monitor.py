@@ -225,7 +225,7 @@ class Monitor:
         tried.replay(past)
         found = self.moves
         for _ in range(2):  # the wire as it lies in a vessel that lies still, and in one that moves
-            best = int(np.argmax(tried.weight))
+            best = tried.best
             tip, direction = (np.array([each[best] for each in some]) for some in zip(*tried.shown, strict=True))
             seen = np.array([each.position for each in past.exposures.values()])
             times_s = DECISION_PERIOD_S * np.array(list(past.exposures))
@@ -261,6 +261,6 @@ class Monitor:
 
 def adviser_input(belief: Belief) -> AdviserInput:
     """Return what the adviser is given: the likeliest wire, and the spread of all wires."""
-    best, tip = int(np.argmax(belief.weight)), belief.likeliest_tip()
+    best, tip = belief.best, belief.likeliest_tip()
     proximal, ends = belief.simulator.proximal[best, :1], np.array([[tip.abscissa[0], tip.offset[0]]])
     return proximal, ends, belief.tip_spread()[None], tip.radius

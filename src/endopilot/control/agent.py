@@ -176,7 +176,7 @@ class _PlanningPolicy:
 
     def believed_wires(self) -> Float[np.ndarray, "wires nodes 3"]:
         """Return the simulated wires, the likeliest first: nodes from the foremost tip on, LPS mm."""
-        return self.belief.simulator.position[np.argsort(-self.belief.weight, kind="stable")]
+        return self.belief.wires
 
     def find_course(self, seconds: float, advance: Advance | None = None) -> Course:
         """Search a course from where the likeliest devices are.

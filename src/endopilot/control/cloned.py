@@ -19,7 +19,6 @@ from endopilot.control.agent import AgentConfig, read_agent_calibration
 from endopilot.control.fork_view import ForkView
 from endopilot.control.push import stand_off
 from endopilot.control.turn_network import AZIMUTH, TurnNetwork
-from endopilot.devices.stack import Proximals
 from endopilot.errors import InputError
 from endopilot.navigation.policy import Decision, Observation
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
@@ -35,6 +34,7 @@ _GOOD_SHARE = 0.9
 _SMOOTH = 8.0
 """Concentration of the errors of a turn (von Mises): a side in the midst of others that pass is better than one at
 their edge."""
+_KERNEL = np.exp(_SMOOTH * (np.cos(AZIMUTH[:, None] - AZIMUTH) - 1))
 _AVOIDS = 6.0
 """Concentration about a side that has failed."""
 _OFF_MM = 3.0
@@ -101,8 +101,7 @@ class ClonedPolicy:
             speed, turn = self._wanted(observation)
         wanted = drives.at_rest.copy()
         wanted[0] += DECISION_PERIOD_S * np.array([speed, turn])
-        velocity = drives.towards(wanted, np.array([np.inf, _TURN_RAD_S])).velocity
-        made: Proximals = tuple((translation, rotation) for translation, rotation in velocity.tolist())
+        made = drives.towards(wanted, np.array([np.inf, _TURN_RAD_S])).commands
         drives.sent(made)
         return Decision(made, expose=bool(self._believed.asks) or self._shows)
 
@@ -112,8 +111,7 @@ class ClonedPolicy:
 
     def believed_wires(self) -> Float[np.ndarray, "wires nodes 3"]:
         """Return the simulated wires, the likeliest first: nodes from the tip on, LPS mm."""
-        belief = self.monitor.belief
-        return belief.simulator.position[np.argsort(-belief.weight, kind="stable")]
+        return self.monitor.belief.wires
 
     def _wanted(self, observation: Observation) -> tuple[float, float]:
         """Return the wanted translation and rotation of the wire, mm/s and rad/s."""
@@ -134,21 +132,26 @@ class ClonedPolicy:
             self._shows = at > self._at >= 0
             self._at, self._turns, self._pushed = at, 0, []
         left = self.navigation.target.abscissa - (progress if off > 0 else float(tip.abscissa[0]))
-        if at == len(route.waypoints) - 1 and off == 0 and abs(left) <= NEAR_MM:
+        if self._is_last and off == 0 and abs(left) <= NEAR_MM:
             return self._arrive(observation)
         if self._fails(inserted, progress, off):
             return self._give_way(progress)
-        ahead = self._place() - self._stand_off() - progress if at < len(route.waypoints) - 1 else left
-        before = at < len(route.waypoints) - 1 and ahead > 0.5
+        ahead = self._place() - self._stand_off() - progress if not self._is_last else left
+        before = not self._is_last and ahead > 0.5
         if not before and self._turns < _TURNS and self._choose(progress):
             return self._wanted(observation)
-        limit = ahead if before or at == len(route.waypoints) - 1 else np.inf
+        limit = ahead if before or self._is_last else np.inf
         return float(np.clip(limit / DECISION_PERIOD_S, -_CREEP_MM_S, _SPEED_MM_S)), 0.0
+
+    @property
+    def _is_last(self) -> bool:
+        """Whether no fork is left before the target."""
+        return self._at == len(self.route.junctions)
 
     def _place(self) -> float:
         """Return the abscissa of the fork ahead, or of the target, mm."""
         route = self.route
-        return float(route.junctions[self._at]) if self._at < len(route.junctions) else route.target.abscissa
+        return route.target.abscissa if self._is_last else float(route.junctions[self._at])
 
     @property
     def _failed(self) -> list[float]:
@@ -166,15 +169,15 @@ class ClonedPolicy:
         pushed = inserted - first_in
         caught = full and pushed > _STALL_MM and progress - first < _STALL_SHARE * pushed
         belief = self.monitor.belief
-        presses = belief.force[int(np.argmax(belief.weight))] > _PRESSES_SHARE * self.navigation.force_limit_n
-        at_target = self._at == len(self.route.waypoints) - 1 and progress >= self.navigation.target.abscissa - NEAR_MM
+        presses = belief.force[belief.best] > _PRESSES_SHARE * self.navigation.force_limit_n
+        at_target = self._is_last and progress >= self.navigation.target.abscissa - NEAR_MM
         return bool(caught or off > (0.0 if at_target else _OFF_MM) or presses)
 
     def _give_way(self, progress: float) -> tuple[float, float]:
         """Note that a side has failed, and go back to before the place."""
         self._failures[self._at] = [*self._failed, self._side]
         self._pushed, self._turns, self._shows = [], 0, True
-        fork = self._at < len(self.route.waypoints) - 1 and self._place() - 2 * self._stand_off() < progress
+        fork = not self._is_last and self._place() - 2 * self._stand_off() < progress
         back_to = (self._place() if fork else progress) - self._stand_off()
         entered = self.route.waypoints[self._at - 1] + 2 * ENTERED_MM if self._at else 0.0
         self._back_to = max(back_to, min(entered, progress - 2 * ENTERED_MM))
@@ -183,16 +186,14 @@ class ClonedPolicy:
     def _choose(self, progress: float) -> bool:
         """Choose the side that the tip is to point to; return whether the wire is to be turned."""
         belief, route = self.monitor.belief, self.route
-        nodes = belief.simulator.position[int(np.argmax(belief.weight))]
-        fork = self._at < len(route.waypoints) - 1
-        place = self._place() if fork else min(progress + self._stand_off(), self._place())
+        nodes = belief.simulator.position[belief.best]
+        place = min(progress + self._stand_off(), self._place()) if self._is_last else self._place()
         view = ForkView.of(route, place, nodes, self.navigation.device)
         likely = self._network.passes(view)
         likely = likely ** (1 / (1 + len(self._failed)))  # the oftener it has failed, the less the network is believed
         for side in self._failed:
             likely = likely * (1 - np.exp(_AVOIDS * (np.cos(AZIMUTH - side) - 1)))
-        kernel = np.exp(_SMOOTH * (np.cos(AZIMUTH[:, None] - AZIMUTH) - 1))
-        likely = kernel @ likely / kernel.sum(axis=1)
+        likely = _KERNEL @ likely / _KERNEL.sum(axis=1)
         now = int(np.argmin(np.abs(np.angle(np.exp(1j * (AZIMUTH - view.azimuth))))))
         best = now if likely[now] >= _GOOD_SHARE * likely.max() else int(np.argmax(likely))
         self._side, self._turns = view.azimuth, self._turns + 1

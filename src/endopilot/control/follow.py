@@ -8,7 +8,6 @@ is looked at, and turned to where the course has it, before it is pushed on.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
 
 from endopilot.belief.drives import Drives
 from endopilot.control.course import Course
@@ -69,7 +68,7 @@ class Follower:
             return tuple((speed, 0.0) for speed in speed_mm_s)
         wanted = self._drives.at_rest.copy()
         wanted[: len(speed_mm_s), 0] += DECISION_PERIOD_S * np.array(speed_mm_s)
-        return _pairs(self._drives.towards(wanted, self._fastest).velocity)
+        return self._drives.towards(wanted, self._fastest).commands
 
     def step(self) -> Proximals:
         """Return the velocities that lead to the next place of the course, or to the last one if the wire is not there.
@@ -95,7 +94,7 @@ class Follower:
             self.shows, self.at, self._settled = bool(course.exposed[at]), at + 1, 0
             if np.abs(motion.velocity[0, 1]) > _TURNED_RAD_S:
                 self._looked = 0
-        return _pairs(motion.velocity)
+        return motion.commands
 
     def _end_of_turn(self, course: Course) -> int:
         """Return the last of the periods in which devices only turn, which they do the shorter way, or the next."""
@@ -124,8 +123,4 @@ class Follower:
         self._whole_turns[:, 1] += nearest - wanted[:, 1]
         wanted[:, 1] = nearest
         self._settled, self._looked = self._settled + 1, 0
-        return _pairs(drives.towards(wanted, self._fastest).velocity)
-
-
-def _pairs(velocity: Float[np.ndarray, "devices 2"]) -> Proximals:
-    return tuple((translation, rotation) for translation, rotation in velocity.tolist())
+        return drives.towards(wanted, self._fastest).commands

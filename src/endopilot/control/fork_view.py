@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.devices.device import Wire
+from endopilot.devices.device import Wire, lateral_reach
 from endopilot.tasks.route import Route
 from endopilot.types import Centerline
 
@@ -32,7 +32,8 @@ class ForkView:
     """What a network is given of a fork and the wire before it.
 
     Attributes:
-        features: geometry and wire, without units, see `FEATURES`; none depends on how the wire is turned.
+        features: geometry and wire, without units; of these a turn of the wire changes a little where its tip and its
+            shaft lie.
         azimuth: to which side of the route's the wire's tip points, rad.
     """
 
@@ -59,17 +60,16 @@ class ForkView:
             else _sampled(other, other.abscissa[0] + _OTHER_MM, here, axes)
         )
         away = np.linalg.norm(nodes - nodes[0], axis=1)
-        behind = nodes[int(np.argmax(away >= min(_TIP_MM, away[-1])))]
-        second = nodes[int(np.argmax(away >= min(0.15 * _TIP_MM, away[-1])))]
-        further = nodes[int(np.argmax(away >= min(1.6 * _TIP_MM, away[-1])))]
+        second, behind, further = (
+            nodes[int(np.argmax(away >= min(share * _TIP_MM, away[-1])))] for share in (0.15, 1.0, 1.6)
+        )
         tip, shaft = nodes[0] - second, behind - further
         across = (tip / max(np.linalg.norm(tip), 1e-9) - shaft / max(np.linalg.norm(shaft), 1e-9)) @ axes.T
         lean = shaft @ axes.T / max(np.linalg.norm(shaft), 1e-9)
         place = (nodes[0] - here) @ axes.T / _SCALE_MM
-        reach = device.tip_bend_length_mm * (1 - np.cos(device.tip_bend_rad)) / max(device.tip_bend_rad, 1e-6)
         wire = [
             float(other is not None),
-            reach / 5.0,
+            lateral_reach(device.tip_bend_rad, device.tip_bend_length_mm) / 5.0,
             device.tip_bend_rad,
             device.tip_bend_length_mm / _SCALE_MM,
             float(np.hypot(across[1], across[2])),

@@ -49,19 +49,6 @@ class Fork:
         return f"the fork into section {self.section} (branch {self.branch}) at {self.abscissa:.1f} mm"
 
 
-def lateral_reach(bend_rad: float, length_mm: float) -> float:
-    """Return how far a tip stands beside the wire behind it, mm: L(1 − cos θ)/θ.
-
-    A tip that is bent by more than half a turn stands farthest beside the wire where it has turned by half of one.
-
-    Args:
-        bend_rad: angle by which it is bent, rad.
-        length_mm: length over which it is bent, with constant curvature, mm.
-    """
-    angle = abs(bend_rad)
-    return float(length_mm * (1 - np.cos(min(angle, np.pi))) / angle) if angle > 0 else 0.0
-
-
 def forks(route: Route, device: Wire) -> tuple[Fork, ...]:
     """Return the forks of a route, the nearest to the ostium first."""
     tree = route.anatomy.tree

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from endopilot.anatomy.catheter_axis import turned_axis, with_axis
-from endopilot.control.reach import ROTATIONS, Fork, forks, lateral_reach, rotations_that_enter
-from endopilot.devices.device import Wire
+from endopilot.control.reach import ROTATIONS, Fork, forks, rotations_that_enter
+from endopilot.devices.device import Wire, lateral_reach
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.route import Route

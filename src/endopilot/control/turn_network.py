@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from endopilot.control.fork_view import ForkView
 from endopilot.errors import InputError
+from endopilot.files import writing
 
 SIDES = 72
 """Azimuths for which it is asked, evenly from −π on."""
@@ -55,7 +56,8 @@ class TurnNetwork:
         arrays = {
             f"{name}{k}": each for k, pair in enumerate(self.layers) for name, each in zip("wb", pair, strict=True)
         }
-        np.savez_compressed(path, mean=self.mean, scale=self.scale, **arrays)  # pyright: ignore[reportArgumentType]
+        with writing(path) as partial:
+            np.savez_compressed(partial, mean=self.mean, scale=self.scale, **arrays)  # pyright: ignore[reportArgumentType]
 
     @staticmethod
     def read(path: Path) -> TurnNetwork:

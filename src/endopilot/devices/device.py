@@ -292,3 +292,16 @@ def check_fits(device: Device, anatomy: Anatomy) -> None:
                 f"device {device.name}: diameter_mm = {device.diameter_mm:g} is wider than the {what} of "
                 f"{anatomy.name}, {2 * radius:.2f} mm; choose a thinner device"
             )
+
+
+def lateral_reach(bend_rad: float, length_mm: float) -> float:
+    """Return how far a tip stands beside the wire behind it, mm: L(1 − cos θ)/θ.
+
+    A tip that is bent by more than half a turn stands farthest beside the wire where it has turned by half of one.
+
+    Args:
+        bend_rad: angle by which it is bent, rad.
+        length_mm: length over which it is bent, with constant curvature, mm.
+    """
+    angle = abs(bend_rad)
+    return float(length_mm * (1 - np.cos(min(angle, np.pi))) / angle) if angle > 0 else 0.0
