@@ -9,16 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
 
-from endopilot.belief.adviser import AdviserConfig, XrayAdviser
-from endopilot.belief.allowance import Allowance
+from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig, Past
 from endopilot.belief.drives import UNKNOWN
 from endopilot.belief.identification import Identified, identify
-from endopilot.belief.innovations import Innovations
 from endopilot.belief.patient_motion import FoundMotion, find_motion
+from endopilot.belief.watch import AdviserInput, Watch
 from endopilot.devices.stack import Proximals
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.xray.fluoroscope import TipMeasurement
@@ -36,11 +34,6 @@ _BETTER = 3.0
 """What is found must explain all exposures better by this logarithm."""
 MISMATCH = "model mismatch"
 """Why X-ray is asked for while the model is taken to be wrong."""
-AdviserInput = tuple[
-    Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1"]
-]
-"""What an adviser is given of a navigation: (Δ, φ), mm and rad; (Δtip, γtip), mm; the spread (standard deviation) of
-these as the model states it, mm; and the lumen's radius at the tip, mm."""
 
 
 @dataclass(frozen=True)
@@ -100,17 +93,15 @@ class Monitor:
         self._advice = advice or AdviserConfig()
         self._given = Belief.around(self._config)
         self.belief = Belief(navigation, self._given, self._config)
-        self._adviser = XrayAdviser(calibration, self._advice, navigation.device.tip_radius_mm)
-        self._innovations, self.past, self.lost = Innovations(), Past(), False
+        self.past, self.lost = Past(), False
         self.identified: Identified | None = None
         self.moves: FoundMotion | None = None
         self.seen: TipMeasurement | None = None
         self._tests = not navigation.catheters
         self.changes_left, self._since, self._returned = _MOST, 0, False
-        proximal, tip, spread, radius = adviser_input(self.belief)
-        self._allowance = Allowance(proximal[0, 0], tip[0, 0], alone=self._tests)
-        self._adviser.start(proximal, tip, radius)
-        self._half = self._adviser.widths(spread)[0]
+        tip_radius_mm, at = navigation.device.tip_radius_mm, adviser_input(self.belief)
+        self._watch = Watch(calibration, self._advice, tip_radius_mm, at, alone=self._tests)
+        self._innovations = self._watch.innovations
 
     @property
     def alarm(self) -> bool:
@@ -132,17 +123,16 @@ class Monitor:
         else:
             self.belief.drives.begin(encoders)
         self.past.proximal.append(self.belief.drives.proximal.copy())
-        proximal, tip, spread, radius = adviser_input(self.belief)
-        self._allowance.move(proximal[0, 0], tip[0, 0])
+        at = adviser_input(self.belief)
+        self._watch.move(at)
         self.seen = None
         if exposure is not None:
             self.seen = seen = self.belief.in_vessel(exposure, period)
             if self._tests:
-                self._innovations.take(np.array([seen.abscissa, seen.offset]) - tip[0], self._half, exposure.tip_sd_mm)
+                self._watch.compare(np.array([seen.abscissa, seen.offset]) - at[1][0], exposure.tip_sd_mm)
             self.past.exposures[period] = exposure
             self.belief.weigh(seen)
-            self._adviser.exposed()
-            self._allowance.exposed()
+            self._watch.exposed()
             self.lost = not self.belief.explains(seen)
             self._innovations.alarm |= self.lost and self._tests
             self._since += 1
@@ -150,20 +140,11 @@ class Monitor:
                 self._renew()
             elif self._is_to_change():
                 self._identify()
-            proximal, tip, spread, radius = adviser_input(self.belief)
+            at = adviser_input(self.belief)
         elif self.belief.drives.proximal[0, 0] <= self._navigation.start_inserted_length_mm:
             self.lost = False  # back where it began, the wire lies as it did, unseen in its catheter
-        factor = self._innovations.factor
-        wider = {"factor": factor, "always": self.alarm, "wall_mm": self._allowance.wall_mm(radius)}
-        due = bool(self._adviser.advise(proximal, tip, spread, radius, self._further_sd(), **wider)[0])
-        self._half = self._adviser.half_width[0] / factor
-        return self._believed(tip[0], due)
-
-    def _further_sd(self) -> Float[np.ndarray, "1 2"]:
-        """Return the standard deviations of (Δtip, γtip) that no calibration knows of, mm."""
-        held = self._allowance.sd_mm
         motion = _MOTION_SD_MM * (self.belief.motion is not None)
-        return np.sqrt(self.belief.play_spread() ** 2 + motion**2 + held**2)[None]
+        return self._believed(at[1][0], self._watch.advise(at, self.belief.play_spread() ** 2 + motion**2))
 
     @property
     def may_return(self) -> bool:
@@ -252,7 +233,7 @@ class Monitor:
         if self.lost:
             asks = "no simulated wire explains the last image" if due or not self._tests else ""
             return BelievedTip(abscissa, offset, (np.inf, np.inf), asks, found)
-        along, across = self._adviser.half_width[0].tolist()
+        along, across = self._watch.half_width.tolist()
         wide = along >= self._advice.abscissa_mm
         asks = f"Δtip is known to ±{along:.1f} mm only" if wide else "the tip may be reaching the wall"
         asks = MISMATCH if self.alarm else asks
