@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 
 from endopilot.anatomy.projection import TipProjector
 from endopilot.belief.drives import Drives
-from endopilot.belief.vessels import Vessels
+from endopilot.belief.vessels import SharedVessels
 from endopilot.devices.device import lateral_reach
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Proximals
@@ -136,7 +136,7 @@ class Belief:
         config: BeliefConfig,
         *,
         drives: Drives | None = None,
-        vessels: Vessels | None = None,
+        vessels: SharedVessels | None = None,
         motion: Motion | None = None,
     ) -> None:
         """Bring every member's wire to the start of the navigation.
@@ -159,7 +159,7 @@ class Belief:
         self.drives = drives or Drives(navigation.robot, navigation.start, fastest)
         self._fans = dict[int, Simulator]()
         self.ostium_mm = np.array([each.ostium_mm for each in self.members])
-        self.vessels = vessels or Vessels(navigation.anatomy)
+        self.vessels = vessels or SharedVessels(navigation.anatomy)
         self.kinds, self.kind = self.vessels.kinds(navigation.stack, self.members)
         self.error, self.force = np.zeros((len(self.members), 2)), np.zeros(len(self.members))
         self._score, self._coaxial = np.zeros(len(self.members)), bool(navigation.catheters)
