@@ -14,14 +14,14 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from endopilot.anatomy.projection import TipProjector
 from endopilot.belief.drives import Drives
-from endopilot.belief.vessels import Vessels
+from endopilot.belief.vessels import SharedVessels
 from endopilot.devices.device import lateral_reach
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Proximals
@@ -136,7 +136,7 @@ class Belief:
         config: BeliefConfig,
         *,
         drives: Drives | None = None,
-        vessels: Vessels | None = None,
+        vessels: SharedVessels | None = None,
         motion: Motion | None = None,
     ) -> None:
         """Bring every member's wire to the start of the navigation.
@@ -149,7 +149,7 @@ class Belief:
             vessels: that other beliefs have prepared.
             motion: of the vessel, if one was found.
         """
-        self.motion = motion
+        self.motion, self._given = motion, navigation
         self.navigation = navigation if motion is None else replace(navigation, known_motion=motion)
         self.members, self.config = tuple(members), config
         self._accuracy_mm = config.along_sd_mm, config.across_sd_mm
@@ -159,7 +159,7 @@ class Belief:
         self.drives = drives or Drives(navigation.robot, navigation.start, fastest)
         self._fans = dict[int, Simulator]()
         self.ostium_mm = np.array([each.ostium_mm for each in self.members])
-        self.vessels = vessels or Vessels(navigation.anatomy)
+        self.vessels = vessels or SharedVessels(navigation.anatomy)
         self.kinds, self.kind = self.vessels.kinds(navigation.stack, self.members)
         self.error, self.force = np.zeros((len(self.members), 2)), np.zeros(len(self.members))
         self._score, self._coaxial = np.zeros(len(self.members)), bool(navigation.catheters)
@@ -167,16 +167,15 @@ class Belief:
         self.shown: list[tuple[Float[np.ndarray, "members 3"], Float[np.ndarray, "members 3"]]] = []
         self.tip = self.simulator.project()[:, 0]
 
-    def like(self, members: Sequence[World], motion: Motion | None = None, *, drives: Drives | None = None) -> Belief:
+    def like(self, members: Sequence[World], **changed: Any) -> Belief:
         """Return a belief of other members about the same devices, at the start of the navigation.
 
         Args:
             members: what each takes reality to be.
-            motion: of the vessel, if another was found.
-            drives: where the devices are, if not where these have them.
+            changed: `drives` and `motion`, where they are not to be those of this belief.
         """
-        others = {"drives": drives or self.drives, "vessels": self.vessels, "motion": motion or self.motion}
-        return Belief(self.navigation, members, self.config, **others)
+        kept = {"drives": self.drives, "vessels": self.vessels, "motion": self.motion}
+        return Belief(self._given, members, self.config, **kept | changed)
 
     @staticmethod
     def around(config: BeliefConfig) -> tuple[World, ...]:

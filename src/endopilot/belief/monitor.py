@@ -164,12 +164,25 @@ class Monitor:
         return self.identified is not None and not self._returned
 
     def return_to_given(self) -> None:
-        """Take wire, lumen and wall as they are given again, with the ostium that was identified, if that may be."""
+        """Take wire, lumen and wall as they are given again, with the ostium that was identified, if that may be.
+
+        A motion that was found is given up too, unless all exposures are still likelier with it.
+        """
         if self.may_return:
             ostium_mm = float(self.belief.weight @ self.belief.ostium_mm)
             given = [replace(each, ostium_mm=each.ostium_mm + ostium_mm) for each in Belief.around(self._config)]
-            self.belief, self._returned = self.belief.like(given), True
-            self.belief.replay(self.past)
+            tried = [self.belief.like(given, motion=None)]
+            if self.moves is not None:
+                tried.append(self.belief.like(given))
+            for each in tried:
+                each.replay(self.past)
+            still, found = tried[0], tried[-1]
+            if found.evidence < still.evidence + _BETTER:
+                found, self.moves = still, None
+            self.belief, self._returned = found, True
+            period = len(self.past.proximal) - 1
+            if self.seen is not None:
+                self.seen = self.belief.in_vessel(self.past.exposures[period], period)
 
     def _is_to_change(self) -> bool:
         """Return whether another belief is sought: the first does not explain the images, or no longer the last one."""
@@ -225,7 +238,7 @@ class Monitor:
             found = find_motion(tip, direction, seen, times_s, np.asarray(given.anatomy.insertion.position))
             if found.gain < _LEAST_GAIN or found.misfit > _MOST_MISFIT:
                 return False
-            tried = self.belief.like(members, found.motion, drives=drives)
+            tried = self.belief.like(members, motion=found.motion, drives=drives)
             tried.replay(past)
         if tried.evidence < self.belief.evidence + _BETTER:
             return False
