@@ -497,7 +497,7 @@ def test_a_course_is_searched_again_where_the_drive_pushes_harder_than_simulated
     first = policy._follower.course
     assert first is not None and first.reached == 1
     for _ in range(50):  # four times the force, and what prior and margin take
-        policy.monitor._loads.take(0.84, 0.2, speed_mm_s=5.0, valve=(0.0, 0.0))
+        policy.monitor._loads.take(0.86, 0.2, speed_mm_s=5.0, valve=(0.0, 0.0))
     assert policy.monitor.load_ratio == pytest.approx(4.0, abs=0.05)
     decide(1)
     again = policy._follower.course
@@ -507,13 +507,13 @@ def test_a_course_is_searched_again_where_the_drive_pushes_harder_than_simulated
 
 
 def test_the_load_ratio_is_the_one_that_the_forces_have() -> None:
-    """Σ read · predicted / Σ predicted² of force less the valve's, less 0.1; what is slow or weak does not count."""
+    """Σ read · predicted / Σ predicted² of force less the valve's, less 0.25; what is slow or weak does not count."""
     valve = (0.05, 0.002)
     loads = LoadRatio()
     assert loads.value == 1.0
     for force_n in np.linspace(0.1, 0.3, 60):
         loads.take(1.5 * force_n + 0.05 + 0.002 * 5.0, force_n, speed_mm_s=5.0, valve=valve)
-    assert loads.value == pytest.approx(1.4, abs=0.02)
+    assert loads.value == pytest.approx(1.25, abs=0.02)
     before = loads.value
     loads.take(9.0, 0.01, speed_mm_s=5.0, valve=valve)
     loads.take(9.0, 0.2, speed_mm_s=-5.0, valve=valve)

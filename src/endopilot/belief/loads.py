@@ -6,7 +6,7 @@ _FORGETS, _PRIOR_N = 0.9, 0.1
 """What a period weighs a period later; and with what force the prior, that the drive pushes as predicted, counts, N."""
 _LEAST_N, _LEAST_MM_S = 0.02, 0.5
 """A predicted force of less, or a slower advance, says nothing: noise and the valve's friction hide it."""
-_MARGIN = 0.1
+_MARGIN = 0.25
 """A ratio is believed this much smaller than it is found: by so much it errs where the model is right, found on
 patients to improve agents on."""
 
