@@ -26,7 +26,8 @@ from jaxtyping import Float
 from benchmarks.figures import Bar, judged
 from endopilot.belief.monitor import MISMATCH, BelievedTip, Monitor
 from endopilot.cli.arguments import OutputFolder
-from endopilot.control.agent import AgentConfig, AgentPolicy, read_agent_calibration
+from endopilot.control.agent import AgentPolicy
+from endopilot.control.agent_config import AgentConfig, read_agent_calibration
 from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import navigation_events
 from endopilot.ladder.ladder import identity

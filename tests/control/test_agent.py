@@ -16,7 +16,8 @@ from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.belief.loads import LoadRatio
 from endopilot.belief.monitor import MISMATCH
 from endopilot.control import push
-from endopilot.control.agent import CALIBRATIONS, AgentConfig, AgentPolicy, OpenLoopPolicy, OraclePolicy
+from endopilot.control.agent import AgentPolicy, OpenLoopPolicy, OraclePolicy
+from endopilot.control.agent_config import CALIBRATIONS, AgentConfig
 from endopilot.control.course import Course
 from endopilot.control.halt import describe_halt
 from endopilot.control.search import Search

@@ -21,7 +21,7 @@ from endopilot.belief.belief import Belief
 from endopilot.belief.monitor import adviser_input
 from endopilot.belief.online_predictors import online_predictor
 from endopilot.belief.watch import AdviserInput, Watch
-from endopilot.control.agent import AgentConfig, read_agent_calibration
+from endopilot.control.agent_config import AgentConfig, read_agent_calibration
 from endopilot.control.plan_config import NETWORK_METHODS, Plan
 from endopilot.models.config import WINDOW, run_path
 from endopilot.tasks.route import Route
