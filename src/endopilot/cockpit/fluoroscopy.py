@@ -70,11 +70,7 @@ class XrayUnit:
     """
 
     def __init__(
-        self,
-        anatomy: Anatomy,
-        make_imager: Callable[[Volume | None], XrayImager],
-        ct: Volume | None = None,
-        settings: XraySettings | None = None,
+        self, anatomy: Anatomy, make_imager: Callable[[Volume | None], XrayImager], ct: Volume | None = None
     ) -> None:
         """Set the C-arm up; its first view is computed in the background.
 
@@ -82,9 +78,8 @@ class XrayUnit:
             anatomy: the vessel.
             make_imager: of this patient, from a CT or none.
             ct: of the patient, HU; a phantom's for a coronary artery if not given, else plain water.
-            settings: how the C-arm stands at first.
         """
-        self.settings = settings or XraySettings()
+        self.settings = XraySettings()
         self.pedal, self.frames, self.seconds, self.kerma_ugy = False, 0, 0.0, 0.0
         self.background = "plain" if ct is None else "CT"
         self._images: dict[int, bytes] = {}
