@@ -259,10 +259,18 @@ class Belief:
         """
         self.drives.follow(devices)
         if load and self.drives.lose:
-            core, pushed_n = self.simulator.config, self.simulator.base_load[self.best, 0, 0]
-            valve = core.introducer_friction_n, core.introducer_drag_n_s_mm
-            self.drives.feel(0, load[0][0], pushed_n=float(pushed_n), valve=valve)
+            self.drives.feel(0, load[0][0], pushed_n=self.pushed_n, valve=self.valve)
         self._move(self.drives.proximal)
+
+    @property
+    def pushed_n(self) -> float:
+        """Force that the likeliest wire ahead of the introducer's valve takes of its drive, N."""
+        return float(self.simulator.base_load[self.best, 0, 0])
+
+    @property
+    def valve(self) -> tuple[float, float]:
+        """Friction of the introducer's valve, N, and its drag, N·s/mm."""
+        return self.simulator.config.introducer_friction_n, self.simulator.config.introducer_drag_n_s_mm
 
     def _move(self, proximal: Float[np.ndarray, "devices 2"]) -> None:
         """Move every member's proximal ends to where they are believed to be, in one decision period."""

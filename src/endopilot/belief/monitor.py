@@ -15,6 +15,7 @@ from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig, Past
 from endopilot.belief.drives import UNKNOWN
 from endopilot.belief.identification import Identified, identify
+from endopilot.belief.loads import LoadRatio
 from endopilot.belief.patient_motion import FoundMotion, find_motion
 from endopilot.belief.watch import AdviserInput, Watch
 from endopilot.devices.stack import Proximals
@@ -97,7 +98,7 @@ class Monitor:
         self.identified: Identified | None = None
         self.moves: FoundMotion | None = None
         self.seen: TipMeasurement | None = None
-        self._tests = not navigation.catheters
+        self._tests, self._loads = not navigation.catheters, LoadRatio()
         self.changes_left, self._since, self._returned = _MOST, 0, False
         tip_radius_mm, at = navigation.device.tip_radius_mm, adviser_input(self.belief)
         self._watch = Watch(calibration, self._advice, tip_radius_mm, at, alone=self._tests)
@@ -107,6 +108,11 @@ class Monitor:
     def alarm(self) -> bool:
         """Whether the model is taken to be wrong."""
         return self._innovations.alarm
+
+    @property
+    def load_ratio(self) -> float:
+        """How much harder the drive surely pushes than the belief predicts: 1 where it does not, or is not measured."""
+        return self._loads.value
 
     def step(self, encoders: Proximals, load: Proximals = (), exposure: TipMeasurement | None = None) -> BelievedTip:
         """Take what is measured, a period after the last, and return where the tip is believed and what is asked for.
@@ -119,7 +125,11 @@ class Monitor:
         period = len(self.past.proximal)
         self.past.measured.append((encoders, load, self.belief.drives.commanded))
         if period:
+            commanded = self.belief.drives.commanded
             self.belief.follow(encoders, load)
+            if load and commanded and self._tests:
+                read_n, pushed_n, speed_mm_s = load[0][0], self.belief.pushed_n, commanded[0][0]
+                self._loads.take(read_n, pushed_n, speed_mm_s=speed_mm_s, valve=self.belief.valve)
         else:
             self.belief.drives.begin(encoders)
         self.past.proximal.append(self.belief.drives.proximal.copy())
@@ -132,7 +142,6 @@ class Monitor:
                 self._watch.compare(np.array([seen.abscissa, seen.offset]) - at[1][0], exposure.tip_sd_mm)
             self.past.exposures[period] = exposure
             self.belief.weigh(seen)
-            self._watch.exposed()
             self.lost = not self.belief.explains(seen)
             self._innovations.alarm |= self.lost and self._tests
             self._since += 1
@@ -141,10 +150,13 @@ class Monitor:
             elif self._is_to_change():
                 self._identify()
             at = adviser_input(self.belief)
+            self._watch.exposed(self.seen.offset, at)
         elif self.belief.drives.proximal[0, 0] <= self._navigation.start_inserted_length_mm:
             self.lost = False  # back where it began, the wire lies as it did, unseen in its catheter
         motion = _MOTION_SD_MM * (self.belief.motion is not None)
-        return self._believed(at[1][0], self._watch.advise(at, self.belief.play_spread() ** 2 + motion**2))
+        changed = self.identified is not None or self.moves is not None or self.belief.drives.unknown
+        due = self._watch.advise(at, self.belief.play_spread() ** 2 + motion**2, changed=changed)
+        return self._believed(at[1][0], due)
 
     @property
     def may_return(self) -> bool:
@@ -195,7 +207,7 @@ class Monitor:
 
     def _renew(self) -> None:
         """Begin with another belief."""
-        self._since = 0
+        self._since, self._loads = 0, LoadRatio()
         self._innovations.renew()
         period = len(self.past.proximal) - 1
         self.seen = self.belief.in_vessel(self.past.exposures[period], period)

@@ -52,16 +52,19 @@ class Watch:
         """Take measured less predicted (Δtip, γtip), and the standard deviations that the measurement states, mm."""
         self.innovations.take(innovation, self._half, sd_mm)
 
-    def exposed(self) -> None:
-        """Begin anew at an exposure."""
-        self._adviser.exposed()
+    def exposed(self, offset_mm: float, at: AdviserInput) -> None:
+        """Begin anew at an exposure that shows γtip, mm, with what the model then predicts."""
+        self._adviser.exposed(np.array([offset_mm]), at[3])
         self._allowance.exposed()
 
-    def advise(self, at: AdviserInput, variance_mm2: Float[np.ndarray, "2"] | float = 0.0) -> bool:
+    def advise(
+        self, at: AdviserInput, variance_mm2: Float[np.ndarray, "2"] | float = 0.0, *, changed: bool = False
+    ) -> bool:
         """Return whether an exposure is due, once a period.
 
         Args:
             at: what is predicted for now, after the exposure if there was one.
+            changed: whether the model is another than the given one, which erred.
             variance_mm2: of (Δtip, γtip), which the calibration does not know of, mm².
         """
         proximal, tip, spread, radius = at
@@ -70,6 +73,7 @@ class Watch:
             *(proximal, tip, spread, radius, further),
             factor=self.innovations.factor,
             always=self.innovations.alarm,
+            erred=changed or bool((self.innovations.factor > 1).any()),
             wall_mm=self._allowance.wall_mm(radius),
         )
         self._half = self.half_width / self.innovations.factor

@@ -36,6 +36,8 @@ _CLEAR_MM = 4.0
 """A wire that is lost is pulled back by this much at least before it is looked at again, mm."""
 _LOSSES = 4
 """Times that the wire is lost, after which the agent gives up: each time another belief was sought."""
+_HARDER = 1.1
+"""Another course is searched where the drive pushes this many times harder than the last one was searched for."""
 _CREEP_MM_S, _CREEP_PERIODS = 1.0, 6
 """A catheter, which X-ray does not show, is moved ahead and back by this where it should have arrived, for as many
 periods and twice."""
@@ -305,6 +307,10 @@ class AgentPolicy(_PlanningPolicy):
     def decide(self, observation: Observation) -> Decision:
         """Follow the course as the module describes; end where belief after belief was lost."""
         decision = super().decide(observation)
+        if decision.gives_up and self._harder > 1:
+            given = f"{self.navigation.force_limit_n:g} N is given"
+            harder = f"the drive pushes {self._harder:.1f} times as hard as simulated wires"
+            return replace(decision, gives_up=f"{decision.gives_up}: {given}, and {harder}")
         if self._losses < _LOSSES or decision.gives_up:
             return decision
         seen = self.monitor.seen
@@ -321,10 +327,25 @@ class AgentPolicy(_PlanningPolicy):
         if self.belief is not monitor.belief:  # another wire, lumen or ostium: another course
             self.belief, self._failed = monitor.belief, 0
             self._search, self._follower = self._new_search(), self._new_follower()
+        self._limit_load()
         if monitor.seen is not None:
             self._located(monitor.seen, lost=monitor.lost)
         self._lost = monitor.lost
         self._losses += self._lost and not before
+
+    def _limit_load(self) -> None:
+        """Search another course where the drive pushes so hard that the wall would press with more than is safe."""
+        course, ratio = self._follower.course, self.monitor.load_ratio
+        if course is None or ratio < _HARDER * self._harder:
+            return
+        if course.force[self._follower.at :].max(initial=0.0) * ratio > self.navigation.force_limit_n:
+            self._search, self._follower = self._new_search(), self._new_follower()
+
+    def _new_search(self) -> Search:
+        """Return a search in which walls press as much harder as the drive is felt to push."""
+        self._harder, given = self.monitor.load_ratio, self.belief.navigation
+        navigation = replace(given, force_limit_n=given.force_limit_n / self._harder)
+        return Search(navigation, self.route, self.belief, config=self.config.search, seed=self._seed)
 
     def _tries_another(self) -> bool:
         return self.monitor.may_return

@@ -80,7 +80,7 @@ def plan_xray(plan: Plan, *, calibration: Calibration | None = None) -> PlannedX
         watch.move(at)
         exposure[period], half_width[period] = watch.advise(at), watch.half_width
         if exposure[period]:
-            watch.exposed()
+            watch.exposed(float(at[1][0, 1]), at)
             model.observe(period)
     return PlannedXray(exposure=exposure, half_width=half_width)
 
