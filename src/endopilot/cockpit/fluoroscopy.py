@@ -82,7 +82,6 @@ class XrayUnit:
         self.settings = XraySettings()
         self.pedal, self.frames, self.seconds, self.kerma_ugy = False, 0, 0.0, 0.0
         self.background = "plain" if ct is None else "CT"
-        self._images: dict[int, bytes] = {}
         self._image_s = self._contrast_s = -np.inf
         self._next_s = 0.0
         self._planes: dict[tuple[Any, ...], Plane] = {}
@@ -160,12 +159,7 @@ class XrayUnit:
             image = self._imager.grey(signal, roadmap=roadmap)
             header = {"plane": number, "angles_deg": key[0], "frame": self.frames, "time_s": round(snapshot.time_s, 4)}
             messages.append(encode("image", header, grey=image))
-            self._images[number] = messages[-1]
         return messages
-
-    def held(self) -> list[bytes]:
-        """Return the last images, for a page that comes later."""
-        return list(self._images.values())
 
     def values(self, now_s: float) -> dict[str, Any]:
         """Return what the page shows of the unit at a time of the world, s."""
