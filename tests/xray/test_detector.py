@@ -9,6 +9,7 @@ import pytest
 from scipy.special import ndtr
 
 from endopilot.xray.corridor import CELL_MM, STEP_MM, make_corridor
+from endopilot.xray.corridor_view import CorridorView
 from endopilot.xray.detector import DetectorConfig, TipDetector
 from endopilot.xray.image import XrayImager
 from endopilot.xray.tracker import track
@@ -127,7 +128,7 @@ def test_the_corridor_is_the_vessel(fork):
         end = corridor.passages[one.parent].middle[-1]
         assert np.linalg.norm(one.middle[0] - end) <= 1.5 * STEP_MM
         assert one.abscissa[-1] <= 25.0
-        places = corridor.places(one)[corridor.open(one)]
+        places = one.places()[one.open]
         radius = np.interp(one.abscissa, line.abscissa, line.radius)
         away = np.linalg.norm(places[:, None] - one.middle[None], axis=2).min(axis=1)
         assert away.max() <= radius.max() - 0.18 + CELL_MM
@@ -136,8 +137,8 @@ def test_the_corridor_is_the_vessel(fork):
 def test_evidence_and_encoder_both_count(fork, planes):
     """Without evidence the odds are even, and the tip is where the encoder says: to 2 mm and 4 %, or 10 % less deep."""
     corridor = make_corridor(fork, 0.18, 0.3, 30.0)
-    flat = np.zeros((512, 512), dtype=np.float32)
-    found = track(corridor, [planes[0].view], [flat], 12.0)
+    shown, flat = [CorridorView(corridor, planes[0].view, 512)], np.zeros((512, 512), dtype=np.float32)
+    found = track(corridor, shown, [flat], 12.0)
     assert found.log_odds == pytest.approx(0.0, abs=1e-4)
     off = np.linspace(-4.0, 4.0, 801)  # within 4 mm of the mode
     weight = np.exp(-0.5 * (off / np.where(off > 0, 2.0 + 0.04 * 12.0, 2.0 + 0.1 * 12.0)) ** 2)
@@ -145,7 +146,7 @@ def test_evidence_and_encoder_both_count(fork, planes):
     assert found.position[2] == pytest.approx(12.0 + mean, abs=0.2)
     assert found.covariance[2, 2] == pytest.approx(np.average((off - mean) ** 2, weights=weight), rel=0.1)
     uphill = np.full((512, 512), -0.1, dtype=np.float32)
-    assert track(corridor, [planes[0].view], [uphill], 12.0).log_odds < -2.0
+    assert track(corridor, shown, [uphill], 12.0).log_odds < -2.0
 
 
 def test_a_detector_needs_sensible_shares():
