@@ -55,7 +55,7 @@ _LINE, _LINE_PX, _MOVED_PX = 0.3, 60, 2
 """An image from before shows a line where the evidence for a wire is larger than this over so many pixels together; it
 may be displaced by so many pixels."""
 _KEPT_LINES = 8
-"""Lines of so many images from before are kept, for the next exposures."""
+"""Lines of so many images from before, or doses, are kept for the next exposures."""
 _HIDDEN_MM = 1.5
 """Standard deviation that a tip on such a line has more, mm."""
 _BELIEVABLE = 3.0
@@ -103,7 +103,7 @@ class TipDetector:
         behind, size = catheter_lumen_points(anatomy)
         near = np.linalg.norm(behind - anatomy.insertion.position, axis=1) <= 1.25 * CATHETER_MM
         points, volume = lumen_points(anatomy)
-        self._known_lines: list[tuple[Signal, Bool[np.ndarray, "rows columns"]]] = []
+        self._known_lines: list[tuple[Signal, float, Bool[np.ndarray, "rows columns"]]] = []
         self._filled = np.concatenate([points, behind[near]]), np.concatenate([volume, size[near]])
 
     def find(
@@ -123,8 +123,8 @@ class TipDetector:
             photons: that a pixel of usual brightness counts, in each image.
             inserted_length: Δ by the robot's encoder, mm.
             slack_mm: how far outside the lumen the wire is looked for, mm; the configuration's if not given.
-            before: images of the same views without a wire: lines in them are none of its; none if not given. Their
-                noise is taken to be that of `photons` when they are first given.
+            before: images of the same views without a wire: lines in them that this exposure's noise, that of
+                `photons`, would show are none of its; none if not given.
 
         Returns:
             The tip, found or ambiguous; None where there is no wire.
@@ -165,17 +165,21 @@ class TipDetector:
         return plain, evidence
 
     def _lines(self, before: Signal, photons: float) -> Bool[np.ndarray, "rows columns"]:
-        """Return the pixels near lines of an image without a wire, which is looked at once."""
-        known = [mask for image, mask in self._known_lines if image is before]
-        if not known:
-            line = self._saturated(self._evidence(before, photons)) > _LINE
-            parts: Any = connected_parts(line, np.ones((3, 3)))
-            label = parts[0]
-            large = np.bincount(label.ravel()) >= _LINE_PX
-            large[0] = False
-            known = [binary_dilation(large[label], iterations=_MOVED_PX)]
-            self._known_lines = [*self._known_lines[1 - _KEPT_LINES :], (before, known[0])]
-        return known[0]
+        """Return the pixels near lines of an image without a wire, as clear as an exposure would show them.
+
+        The image is looked at once for each number of photons: with more, an exposure shows fainter lines.
+        """
+        for image, count, near in self._known_lines:
+            if image is before and count == photons:
+                return near
+        line = self._saturated(self._evidence(before, photons)) > _LINE
+        parts: Any = connected_parts(line, np.ones((3, 3)))
+        label = parts[0]
+        large = np.bincount(label.ravel()) >= _LINE_PX
+        large[0] = False
+        near = binary_dilation(large[label], iterations=_MOVED_PX)
+        self._known_lines = [*self._known_lines[1 - _KEPT_LINES :], (before, photons, near)]
+        return near
 
     def _judged(self, found: TipEstimate, *, hidden: bool) -> TipEstimate:
         """Return an estimate with its status; an ambiguous one is as uncertain as the places are far apart.

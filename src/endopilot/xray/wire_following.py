@@ -139,7 +139,8 @@ class Follower:
         index, sections = leg.index, leg.section[at::-1]
         legs = [self._walk(index, sections[: max(most, 1)], (leg, at), free)]
         came, most = index, most - len(sections)
-        while (parent := self._corridor.passages[came].parent) >= 0 and most > 0 and not legs[-1].lost:
+        # A wire that folds does not go back into the catheter, the first passage.
+        while (parent := self._corridor.passages[came].parent) > 0 and most > 0 and not legs[-1].lost:
             back = legs[-1]
             before, others = (back, len(back.section) - 1), []
             for other, passage in enumerate(self._corridor.passages):
