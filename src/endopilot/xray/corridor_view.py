@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32
 
 from endopilot.xray.carm import View
 from endopilot.xray.corridor import STEP_MM, Corridor, Passage
@@ -22,6 +22,7 @@ class CorridorView:
 
     Attributes:
         view: source and detector, in the CT's frame.
+        box: rows and columns that show the corridor.
         pixels: which pixels say something of a place; none but these are read.
         new: for each passage how long each section's step is in the image, as a share of one across the beam.
     """
@@ -29,11 +30,10 @@ class CorridorView:
     def __init__(self, corridor: Corridor, view: View, rows: int) -> None:
         """Project the corridor into an image of so many rows and columns."""
         self.view, self._middle = view, (rows - 1) / 2
-        low, high = _bounds(corridor, view, self._middle)
-        low, high = np.clip(low, 0, rows - 1), np.clip(high, 1, rows)
-        self.box = slice(low[0], max(high[0], low[0] + 1)), slice(low[1], max(high[1], low[1] + 1))
+        widest_mm = max(float(passage.offsets[-1]) for passage in corridor.passages)
+        self.box = box_around(view, np.concatenate([one.middle for one in corridor.passages]), rows, widest_mm)
         self._shape = tuple(side.stop - side.start + 2 * _EDGE_PX for side in self.box)
-        self._first = low - _EDGE_PX
+        self._first = np.array([side.start - _EDGE_PX for side in self.box])
         seen = np.zeros(self._shape, dtype=bool)
         self._corner, self._rest = [], []
         for passage in corridor.passages:
@@ -76,16 +76,16 @@ class CorridorView:
         part.ravel()[(at @ [self._shape[1], 1])[:, None] + self._disc] = 0.0
 
 
-def _bounds(corridor: Corridor, view: View, middle: float) -> tuple[Int[np.ndarray, "2"], Int[np.ndarray, "2"]]:
-    """Return the first row and column that show the corridor, and those after the last ones."""
-    at, around = [], []
-    for passage in corridor.passages:
-        right_up = view.project(passage.middle)
-        at.append(np.stack([middle - right_up[:, 1], middle + right_up[:, 0]]))
-        around.append(float(passage.offsets[-1]) * float(np.linalg.norm(view.slope(passage.middle[0]), 2)))
-    low = np.min([part.min(axis=1) - px for part, px in zip(at, around, strict=True)], axis=0)
-    high = np.max([part.max(axis=1) + px for part, px in zip(at, around, strict=True)], axis=0)
-    return low.astype(int) - 1, high.astype(int) + 2
+def box_around(
+    view: View, points: Float[np.ndarray, "n 3"], rows: int, around_mm: float = 0.0, around_px: int = 0
+) -> tuple[slice, slice]:
+    """Return the rows and columns of an image that show points, LPS mm, and what lies around them in space or image."""
+    right_up, middle = view.project(points), (rows - 1) / 2
+    around = around_px + around_mm * float(np.linalg.norm(view.slope(points.mean(axis=0)), 2)) + 1
+    at = np.stack([middle - right_up[:, 1], middle + right_up[:, 0]])
+    low = np.clip(at.min(axis=1) - around, 0, rows - 1).astype(int)
+    high = np.clip(at.max(axis=1) + around + 1, low + 1, rows).astype(int)
+    return slice(low[0], high[0]), slice(low[1], high[1])
 
 
 def _shown(passage: Passage, view: View, middle: Float[np.ndarray, "2"]) -> Float32[np.ndarray, "2 k"]:

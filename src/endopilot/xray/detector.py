@@ -22,7 +22,7 @@ from endopilot.types import Anatomy
 from endopilot.xray.absorbers import catheter_lumen_points, lumen_points
 from endopilot.xray.carm import View
 from endopilot.xray.corridor import CATHETER_MM, make_corridor
-from endopilot.xray.corridor_view import CorridorView
+from endopilot.xray.corridor_view import CorridorView, box_around
 from endopilot.xray.projector import splat
 from endopilot.xray.ridge import RidgeEvidence
 from endopilot.xray.tracker import TipEstimate, longest_mm, track
@@ -32,6 +32,8 @@ Signal = Float32[np.ndarray, "rows columns"]
 _HIGH_PASS_PX, _AROUND_PX = 12.0, 24
 """Contrast is what is darker than its surroundings, blurred by this; and how much of an image around the vessel is
 looked at, pixels."""
+_AROUND_MM = 10.0
+"""And around the whole vessel's centerline, where lines from before are looked for, mm: lumen and catheter."""
 _TRUNCATE = 2.0
 """Blurs reach so many standard deviations."""
 _FILLED_MM, _FEWEST_PX = 0.3, 10
@@ -104,6 +106,7 @@ class TipDetector:
         near = np.linalg.norm(behind - anatomy.insertion.position, axis=1) <= 1.25 * CATHETER_MM
         points, volume = lumen_points(anatomy)
         self._known_lines: list[tuple[Signal, float, Bool[np.ndarray, "rows columns"]]] = []
+        self._vessel = np.concatenate([branch.centerline.points for branch in anatomy.tree.branches])
         self._filled = np.concatenate([points, behind[near]]), np.concatenate([volume, size[near]])
 
     def find(
@@ -147,9 +150,7 @@ class TipDetector:
         shown = [CorridorView(corridor, *one) for one in zip(views, map(len, signals), strict=True)]
         seen = [self._look(*one) for one in zip(shown, signals, photons, strict=True)]
         plain, evidence = [one for one, _ in seen], [one for _, one in seen]
-        lines = [
-            self._lines(earlier, count) for earlier, count in zip(before or (), photons, strict=before is not None)
-        ]
+        lines = [] if before is None else [self._lines(*one) for one in zip(views, before, photons, strict=True)]
         for image, line in zip(evidence, lines, strict=before is not None):
             image[line] = 0.0
         found = _refined(track(corridor, shown, evidence, inserted_length), views, plain, self._radius_mm)
@@ -164,20 +165,24 @@ class TipDetector:
         evidence[box] = self._saturated(self._evidence(plain[box], photons, shown.pixels[box]))
         return plain, evidence
 
-    def _lines(self, before: Signal, photons: float) -> Bool[np.ndarray, "rows columns"]:
-        """Return the pixels near lines of an image without a wire, as clear as an exposure would show them.
+    def _lines(self, view: View, before: Signal, photons: float) -> Bool[np.ndarray, "rows columns"]:
+        """Return the pixels near lines of an image without a wire around the vessel, as an exposure would show them.
 
         The image is looked at once for each number of photons: with more, an exposure shows fainter lines.
         """
         for image, count, near in self._known_lines:
             if image is before and count == photons:
                 return near
-        line = self._saturated(self._evidence(before, photons)) > _LINE
+        box, near = (
+            box_around(view, self._vessel, len(before), _AROUND_MM, _AROUND_PX),
+            np.zeros(before.shape, dtype=bool),
+        )
+        line = self._saturated(self._evidence(before[box], photons)) > _LINE
         parts: Any = connected_parts(line, np.ones((3, 3)))
         label = parts[0]
         large = np.bincount(label.ravel()) >= _LINE_PX
         large[0] = False
-        near = binary_dilation(large[label], iterations=_MOVED_PX)
+        near[box] = binary_dilation(large[label], iterations=_MOVED_PX)
         self._known_lines = [*self._known_lines[1 - _KEPT_LINES :], (before, photons, near)]
         return near
 
