@@ -1,7 +1,7 @@
 """The vessel as a prior of where a wire can be: cross-sections along every branch, each a grid of places.
 
 A wire that lies in the vessel passes through one place of every cross-section between the catheter and its tip. The
-tracker follows it from section to section.
+detector follows it from section to section.
 """
 
 from __future__ import annotations

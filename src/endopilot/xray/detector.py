@@ -1,8 +1,8 @@
 """The tip of a wire found in X-ray images: `TipDetector`.
 
 Ridges say how likely each pixel is on a wire (`ridge`), a hidden Markov model follows the wire through the vessel as
-registration has it (`tracker`), and its end is fitted to the pixels there (`wire_end`). Contrast in the vessel is
-estimated and taken away first: a filled branch is a dark line too.
+registration has it (`wire_following`, `tip_posterior`), and its end is fitted to the pixels there (`wire_end`).
+Contrast in the vessel is estimated and taken away first: a filled branch is a dark line too.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from endopilot.xray.corridor import CATHETER_MM, make_corridor
 from endopilot.xray.corridor_view import CorridorView, box_around
 from endopilot.xray.projector import splat
 from endopilot.xray.ridge import RidgeEvidence
-from endopilot.xray.tracker import TipEstimate, longest_mm, track
+from endopilot.xray.tip_posterior import TipEstimate, estimate_tip, longest_mm
 from endopilot.xray.wire_end import fit_end
 
 Signal = Float32[np.ndarray, "rows columns"]
@@ -153,7 +153,7 @@ class TipDetector:
         lines = [] if before is None else [self._lines(*one) for one in zip(views, before, photons, strict=True)]
         for image, line in zip(evidence, lines, strict=before is not None):
             image[line] = 0.0
-        found = _refined(track(corridor, shown, evidence, inserted_length), views, plain, self._radius_mm)
+        found = _refined(estimate_tip(corridor, shown, evidence, inserted_length), views, plain, self._radius_mm)
         hidden = any(_lies_on(line, view, found.position) for line, view in zip(lines, views, strict=False))
         return self._judged(found, hidden=hidden)
 

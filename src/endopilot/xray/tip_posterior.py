@@ -1,4 +1,4 @@
-"""The tip of a wire in images: where the wire ends that is followed through the vessel.
+"""The tip of a wire in the images of one exposure: where the wire ends that is followed through the vessel.
 
 How likely the wire ends at a place, against no wire at all, is the tip's posterior: mean, uncertainty and the
 probability that there is a wire follow from it. With two views the evidence of both is added, so the depth is found;
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 
 from endopilot.xray.corridor import STEP_MM, Corridor
 from endopilot.xray.corridor_view import CorridorView
@@ -76,7 +76,7 @@ def _spread(inserted_length: float) -> tuple[float, float]:
     return _NEAR_MM + _SHORTER_SHARE * wire_mm, _NEAR_MM + _LONGER_SHARE * wire_mm
 
 
-def track(
+def estimate_tip(
     corridor: Corridor,
     shown: Sequence[CorridorView],
     evidence: Sequence[Float32[np.ndarray, "rows columns"]],
@@ -144,11 +144,8 @@ def _summary(
     parts = [_counted(leg, weight) for leg, weight in zip(legs, weights, strict=True)]
     places, weight = (np.concatenate(part) for part in zip(*parts, strict=True))
     near = ((places - mode) ** 2).sum(axis=1) <= _MODE_MM**2
-    share = float(weight[near].sum())
-    mean = weight[near] @ places[near] / share
-    off = places[near] - mean
     # A cell has a size: that of a section's step and of its grid.
-    covariance = (weight[near, None] * off).T @ off / share + np.eye(3) * STEP_MM**2 / 12
+    share, mean, covariance = around_mode(places, weight, near, STEP_MM)
     far = places[~near] - mean
     elsewhere = (weight[~near, None] * far).T @ far
     way = follower.way(legs[best], section)
@@ -163,6 +160,24 @@ def _summary(
         middle=np.array([passage.middle[at] for passage, at in passed]),
         room=np.array([passage.room[at] for passage, at in passed]),
     )
+
+
+def around_mode(
+    places: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, "n"], near: Bool[np.ndarray, "n"], cell_mm: float
+) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """Return the share of a posterior that lies near its mode, its mean there, and its covariance.
+
+    Args:
+        places: LPS mm.
+        weight: of each.
+        near: which lie near the mode.
+        cell_mm: distance of neighbouring places, mm.
+    """
+    share = float(weight[near].sum())
+    weight = weight[near] / share
+    mean = weight @ places[near]
+    off = places[near] - mean
+    return share, mean, (weight[:, None] * off).T @ off + cell_mm**2 / 12 * np.eye(3)
 
 
 def _counted(leg: Leg, weight: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k"]]:
