@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from endopilot.belief.bands import Calibration
 from endopilot.belief.monitor import BelievedTip, Monitor
-from endopilot.control.agent import AgentConfig, read_agent_calibration
+from endopilot.control.agent_config import AgentConfig, read_agent_calibration
 from endopilot.control.fork_view import ForkView
 from endopilot.control.push import stand_off
 from endopilot.control.turn_network import AZIMUTH, TurnNetwork
