@@ -159,8 +159,8 @@ class TipDetector:
 
     def _look(self, shown: CorridorView, signal: Signal, photons: float) -> tuple[Signal, Signal]:
         """Return an image without contrast, and how likely its pixels are on a wire, none where no vessel is near."""
-        low = (max(side.start - _AROUND_PX, 0) for side in shown.box)
-        box, evidence = tuple(map(slice, low, (side.stop + _AROUND_PX for side in shown.box))), np.zeros_like(signal)
+        rows, columns = (slice(max(side.start - _AROUND_PX, 0), side.stop + _AROUND_PX) for side in shown.box)
+        box, evidence = (rows, columns), np.zeros_like(signal)
         plain = self.without_contrast(shown.view, signal, box)
         evidence[box] = self._saturated(self._evidence(plain[box], photons, shown.pixels[box]))
         return plain, evidence
