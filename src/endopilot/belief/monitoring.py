@@ -214,6 +214,7 @@ def calibrate(fitted: Monitored, own: Monitored, config: AdviserConfig) -> Calib
         intervals=len(score),
         dataset=own.dataset,
         offset_share=1.0,
+        longest_s=SAMPLE_PERIOD_S * (own.truth.shape[1] - WINDOW),
     )
     return replace(bands, offset_share=least_offset_share(own, bands, config))
 
