@@ -27,7 +27,7 @@ from endopilot.models.config import WINDOW
 from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import jumps
 from endopilot.models.rollout import load_model
-from endopilot.models.sequences import prepare_vessels, unfold
+from endopilot.models.sequences import play_tables, unfold
 from endopilot.models.simulated_wires import FRICTION_FACTORS, read_or_simulate
 
 PAGE = Path(__file__).parents[1] / "evidence" / "learning.md"
@@ -64,7 +64,7 @@ def headline_rows(folder: Path) -> Iterator[str]:
         truth = np.stack([data.tip_abscissa, data.tip_offset], axis=-1)[:, WINDOW:, 0].astype(float)
         clear = (data.lumen_radius - data.tip_offset)[:, WINDOW:, 0] - RADIUS_MM > OFF_WALL_MM
         episodes = Episodes.of_dataset(data)
-        vessels, patient = prepare_vessels(episodes), np.unique(data.anatomy, return_inverse=True)[1]
+        vessels, patient = play_tables(episodes), np.unique(data.anatomy, return_inverse=True)[1]
         observed = np.broadcast_to(np.arange(data.valid.shape[1]) < WINDOW, data.valid.shape)
         played = unfold("forward", vessels, patient, episodes, observed).guess
         wire = read_or_simulate(episodes.setup.patients_folder, episodes)[:, :, FRICTION_FACTORS.index(1.0)]

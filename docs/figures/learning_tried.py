@@ -22,7 +22,7 @@ from endopilot.models import play
 from endopilot.models.causal import CausalNetwork, ForwardNetwork, InverseNetwork, Mixture
 from endopilot.models.config import WINDOW, CausalConfig
 from endopilot.models.episodes import Episodes
-from endopilot.models.sequences import N_INPUTS, N_WIRE_INPUTS, Sequences, prepare_vessels, unfold
+from endopilot.models.sequences import N_INPUTS, N_WIRE_INPUTS, Sequences, play_tables, unfold
 from endopilot.models.simulated_wires import FRICTION_FACTORS, read_or_simulate
 
 PATIENTS, EPOCHS, BATCH, RATE = 60, 3, 32, 2e-3
@@ -54,7 +54,7 @@ class WithoutWires(InverseNetwork):
 def guess_rows(data: Dataset) -> Iterator[str]:
     """Yield what is predicted without learning: slack held, play operator, simulated wires."""
     episodes = Episodes.of_dataset(data)
-    vessels, patient = prepare_vessels(episodes), np.unique(data.anatomy, return_inverse=True)[1]
+    vessels, patient = play_tables(episodes), np.unique(data.anatomy, return_inverse=True)[1]
     observed = np.broadcast_to(np.arange(data.valid.shape[1]) < WINDOW, data.valid.shape)
     truth = np.stack([data.tip_abscissa, data.tip_offset], axis=-1)[:, :, 0].astype(float)
     held = np.abs(hold_slack(data, WINDOW) - truth[:, WINDOW:])
@@ -71,7 +71,7 @@ def guess_rows(data: Dataset) -> Iterator[str]:
 
 def _sequences(data: Dataset) -> Sequences:
     episodes = Episodes.of_dataset(data)
-    return Sequences.of(episodes, prepare_vessels(episodes), ("ff",), 0)
+    return Sequences.of(episodes, play_tables(episodes), ("ff",), 0)
 
 
 def variant_rows(training: Dataset, held_out: Dataset) -> Iterator[str]:
