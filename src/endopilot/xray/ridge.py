@@ -89,12 +89,11 @@ def _curvatures(
 ) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"]]:
     """Return the mean of the two principal curvatures of some pixels, and half their difference."""
     (rows, columns), padded = image.shape, np.pad(image, 2, mode="edge")
-    if pixels is not None:
-        row, column = np.divmod(pixels, columns)
-        at, width, flat = (row + 2) * (columns + 4) + column + 2, columns + 4, padded.ravel()
+    width, flat = columns + 4, padded.ravel()
+    at = None if pixels is None else (pixels // columns + 2) * width + pixels % columns + 2
 
     def beside(down: int, right: int) -> Float32[np.ndarray, "n"]:
-        if pixels is None:
+        if at is None:
             return padded[2 + down : 2 + down + rows, 2 + right : 2 + right + columns].ravel()
         return flat[at + (down * width + right)]
 
