@@ -13,7 +13,7 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.world import World
 from endopilot.types import Anatomy
 
-_OF_VESSEL = "lumen_factor", "lumen_mm", "axis_deg", "axis_side_deg"
+_OF_VESSEL = "lumen_factor", "lumen_mm", "occluded", "stenosis", "axis_deg", "axis_side_deg"
 """What of a `World` makes another vessel."""
 
 
