@@ -59,9 +59,13 @@ class AgentConfig:
     @staticmethod
     def of(navigation: Navigation) -> AgentConfig:
         """Return the settings for a navigation by a wire alone, in a wide lumen or not, or by one in a catheter."""
+        target = navigation.target.abscissa
         if navigation.catheters:
-            return IN_CATHETER
-        wide = Route.to(navigation.anatomy, navigation.target).is_wide(navigation.target.abscissa)
+            wanted = _IN_TURN * target / navigation.seconds
+            fastest = min(device.max_velocity_mm_s for device in navigation.devices)
+            speed = min(max(IN_CATHETER.search.speed_mm_s, wanted), fastest)
+            return replace(IN_CATHETER, search=replace(IN_CATHETER.search, speed_mm_s=speed))
+        wide = Route.to(navigation.anatomy, navigation.target).is_wide(target)
         return IN_WIDE_LUMEN if wide else AgentConfig()
 
 
@@ -92,6 +96,9 @@ IN_CATHETER = AgentConfig(
     tries=2,
 )
 """Settings of an agent of a wire in a catheter."""
+_IN_TURN = 4.0
+"""Wire and catheter move in turn, and are pulled back now and then: they move as fast as brings them to the target in
+the time if their way is so many times as long as the route."""
 _WIRE_CREEP_MM_S = 2.0
 """Fastest translation of a wire that should have arrived, and that X-ray shows beside its target, mm/s."""
 _CLEAR_MM = 4.0

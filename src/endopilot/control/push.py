@@ -56,6 +56,7 @@ class Pushed:
         passed: which brought all wires that count past the place.
         force: largest wall force on a node of any wire that counts, N.
         farthest: how far along the route each came, mm.
+        slack: how much deeper than that each is inserted at its end, mm: what lies in loops.
         halt: why each that did not pass was given up.
     """
 
@@ -64,6 +65,7 @@ class Pushed:
     passed: Bool[np.ndarray, "trials"]
     force: Each
     farthest: Each
+    slack: Each
     halt: list[Halt]
 
     def within(self, force_n: float) -> Bool[np.ndarray, "trials"]:
@@ -202,7 +204,8 @@ class Push:
         if not alone:
             passed = self.arrived(trials) & ~trials.still
         trials.still[:] = False
-        return Pushed(trials.rows, took, passed, _largest_force(trials, took), farthest, halt.tolist())
+        slack = _deepest(trials) - progress
+        return Pushed(trials.rows, took, passed, _largest_force(trials, took), farthest, slack, halt.tolist())
 
     def arrived(self, trials: Trials) -> Bool[np.ndarray, "trials"]:
         """Return which trials are past the place, or at the target."""

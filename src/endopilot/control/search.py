@@ -47,6 +47,8 @@ _STRETCH_MM = 20.0
 """A wire in a catheter passes the route in stretches of this length at most, mm."""
 _TURNS = (0.0, np.pi)
 """Angles by which a wire alone may be turned before it goes in, rad."""
+_GENTLE_SHARE, _LOOP_SHARE = 0.5, 0.02
+"""Share of the force limit below which force costs nothing in a wide lumen, and what a millimetre in loops costs."""
 _OFTEN = 6
 """A course that has passed places this many times as often as there are is at an end."""
 _REPEATED = 3
@@ -159,8 +161,15 @@ class Search:
         )
 
     def manoeuvre_cost(self, pushed: Pushed) -> Each:
-        """Return what each trial of a manoeuvre costs, by which those that pass are compared: its largest force, N."""
-        return pushed.force
+        """Return what each trial of a manoeuvre costs, by which those that pass are compared: its largest force, N.
+
+        In a wide lumen devices may press as gently with loops in it as straight, and loops end in coils: there those
+        cost that lie in them, and force beyond a share of the limit.
+        """
+        if self._alone or not self.route.is_wide(self.route.target.abscissa):
+            return pushed.force
+        limit_n = self._navigation.force_limit_n
+        return pushed.slack * _LOOP_SHARE * limit_n + np.maximum(pushed.force - _GENTLE_SHARE * limit_n, 0.0)
 
     def _places(self) -> Sequence[float]:
         """Return the places that are passed one after another, mm: waypoints, and with a catheter others between."""
