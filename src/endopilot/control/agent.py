@@ -61,10 +61,13 @@ class AgentConfig:
         """Return the settings for a navigation by a wire alone, in a wide lumen or not, or by one in a catheter."""
         target = navigation.target.abscissa
         if navigation.catheters:
-            wanted = _IN_TURN * target / navigation.seconds
+            search = IN_CATHETER.search
+            if search.speed_mm_s * navigation.seconds >= _WAYS * target:
+                return IN_CATHETER
             fastest = min(device.max_velocity_mm_s for device in navigation.devices)
-            speed = min(max(IN_CATHETER.search.speed_mm_s, wanted), fastest)
-            return replace(IN_CATHETER, search=replace(IN_CATHETER.search, speed_mm_s=speed))
+            speed = max(search.speed_mm_s, _WAYS / 2 * target / navigation.seconds)
+            manoeuvres = replace(search.manoeuvres, together=True)
+            return replace(IN_CATHETER, search=replace(search, speed_mm_s=min(speed, fastest), manoeuvres=manoeuvres))
         wide = Route.to(navigation.anatomy, navigation.target).is_wide(target)
         return IN_WIDE_LUMEN if wide else AgentConfig()
 
@@ -96,9 +99,9 @@ IN_CATHETER = AgentConfig(
     tries=2,
 )
 """Settings of an agent of a wire in a catheter."""
-_IN_TURN = 4.0
-"""Wire and catheter move in turn, and are pulled back now and then: they move as fast as brings them to the target in
-the time if their way is so many times as long as the route."""
+_WAYS = 4.0
+"""Wire and catheter move in turn if there is time for a way so many times as long as the route; else together, and so
+fast that there is time for half as long a way."""
 _WIRE_CREEP_MM_S = 2.0
 """Fastest translation of a wire that should have arrived, and that X-ray shows beside its target, mm/s."""
 _CLEAR_MM = 4.0

@@ -289,7 +289,8 @@ class _Follower:
             behind = np.minimum(push.waypoint - trials.mean(trials.tips.abscissa[:, CATHETER]), inserted - around)
         there = np.abs(left) <= REST_MM
         self._follows = (behind > REST_MM) & (self._follows | there | (inserted - around >= self._lead))
-        wire = np.where(there | self._follows, 0.0, np.clip(left / DECISION_PERIOD_S, -_SLOWEST_MM_S, speed))
+        rests = there | (self._follows & (not push.config.manoeuvres.together))
+        wire = np.where(rests, 0.0, np.clip(left / DECISION_PERIOD_S, -_SLOWEST_MM_S, speed))
         return wire, np.where(self._follows, np.clip(behind / DECISION_PERIOD_S, 0.0, speed), 0.0)
 
     def _together(self, left: Each) -> tuple[Each, Each]:

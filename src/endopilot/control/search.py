@@ -47,8 +47,9 @@ _STRETCH_MM = 20.0
 """A wire in a catheter passes the route in stretches of this length at most, mm."""
 _TURNS = (0.0, np.pi)
 """Angles by which a wire alone may be turned before it goes in, rad."""
-_GENTLE_SHARE, _LOOP_SHARE = 0.5, 0.02
-"""Share of the force limit below which force costs nothing in a wide lumen, and what a millimetre in loops costs."""
+_GENTLE_SHARE, _LOOP_SHARE, _LOOP_MM_S = 0.1, 1e-4, 5.0
+"""Share of the force limit below which devices in a wide lumen hardly press, what a millimetre in loops costs, and how
+many of these a second is worth, mm/s."""
 _OFTEN = 6
 """A course that has passed places this many times as often as there are is at an end."""
 _REPEATED = 3
@@ -163,13 +164,14 @@ class Search:
     def manoeuvre_cost(self, pushed: Pushed) -> Each:
         """Return what each trial of a manoeuvre costs, by which those that pass are compared: its largest force, N.
 
-        In a wide lumen devices may press as gently with loops in it as straight, and loops end in coils: there those
-        cost that lie in them, and force beyond a share of the limit.
+        In a wide lumen soft devices press as gently in loops as straight, and loops end in coils: between trials that
+        hardly press, what lies in loops decides there, and the time that the trial takes.
         """
         if self._alone or not self.route.is_wide(self.route.target.abscissa):
             return pushed.force
-        limit_n = self._navigation.force_limit_n
-        return pushed.slack * _LOOP_SHARE * limit_n + np.maximum(pushed.force - _GENTLE_SHARE * limit_n, 0.0)
+        limit_n, seconds = self._navigation.force_limit_n, DECISION_PERIOD_S * pushed.periods
+        loops_mm = pushed.slack + _LOOP_MM_S * seconds
+        return np.maximum(pushed.force, _GENTLE_SHARE * limit_n) + _LOOP_SHARE * limit_n * loops_mm
 
     def _places(self) -> Sequence[float]:
         """Return the places that are passed one after another, mm: waypoints, and with a catheter others between."""

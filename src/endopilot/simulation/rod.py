@@ -20,8 +20,8 @@ _DRAG_N_S_MM2, _SOFT_N_MM2 = 5e-6, 0.1
 """Drag on one mm of wire, N·s/mm²; far below friction. On a wire softer than the latter anywhere, N·mm², it falls with
 the square of that: it would fold as it is pushed."""
 _LEAST_N_S_MM2 = 1e-10
-"""Drag is no less than this, N·s/mm². Blood's is more, 2πη / ln(length / diameter) = 1e-8 with η = 0.0035 Pa·s, and would
-fold a wire of less than some 0.005 N·mm²; no blood is modelled."""
+"""Drag is no less than this, N·s/mm². That of blood would be more, 2πη / ln(length / diameter) = 1e-8 with η = 0.0035
+Pa·s, and fold a wire of less than some 0.005 N·mm² as it is pushed; no blood is modelled."""
 _GROWTH_MM = 40.0
 """Distance from the tip at which elements are twice as long as there; they grow in proportion to it, mm."""
 LONGEST_ELEMENTS = 5.0
