@@ -43,8 +43,9 @@ _BACK_MM_S = 2.0
 _LOOKOUT_MM, _LOOKOUT_RADII = 12.0, 3.0
 """A waypoint that is searched for lies no farther ahead than this, mm, or lumen radii where that is more: beyond, a
 chord says little."""
-_STRETCH_MM = 20.0
-"""A wire in a catheter passes the route in stretches of this length at most, mm."""
+_STRETCH_MM, _LONG_STRETCH_MM = 20.0, 40.0
+"""A wire in a catheter passes the route in stretches of this length at most, mm; of the latter where the two move
+together, since each stretch ends with the wire at rest until its catheter has come."""
 _TURNS = (0.0, np.pi)
 """Angles by which a wire alone may be turned before it goes in, rad."""
 _GENTLE_SHARE, _LOOP_SHARE, _LOOP_MM_S = 0.1, 1e-4, 5.0
@@ -178,10 +179,11 @@ class Search:
         route, begun = self.route, self._here()
         if self._alone:
             return route.waypoints.tolist()
+        longest = _LONG_STRETCH_MM if self.config.manoeuvres.together else _STRETCH_MM
         places: list[float] = []
         for goal in [*route.waypoints[:-1][route.waypoints[:-1] > begun].tolist(), route.target.abscissa]:
             begin = places[-1] if places else begun
-            count = max(1, int(np.ceil((goal - begin) / _STRETCH_MM)))
+            count = max(1, int(np.ceil((goal - begin) / longest)))
             places += [begin + (goal - begin) * (k + 1) / count for k in range(count - 1)] + [goal]
         return places
 
