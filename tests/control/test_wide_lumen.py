@@ -15,7 +15,7 @@ from endopilot.control.manoeuvre import Repertoire
 from endopilot.control.push import Pushed
 from endopilot.control.search import Search
 from endopilot.control.search_config import SearchConfig
-from endopilot.control.trials import WIRE, Move, Trials
+from endopilot.control.trials import WIRE, Move, Period, Trials
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
 from endopilot.devices.drive_limits import DriveLimits, far_end_mm
@@ -88,5 +88,7 @@ def test_of_gentle_ways_of_wire_and_catheter_the_straight_and_quick_one_is_taken
     # By force: hardly any, a tenth of the limit, and half of it. By slack and periods:
     force, slack = limit_n * np.array([0.01, 0.1, 0.05, 0.5]), np.array([100.0, 0.0, 0.0, 0.0])
     passed = np.ones(4, dtype=bool)
-    pushed = Pushed([], np.array([4, 4, 20, 4]), passed, force, np.zeros(4), slack, ["late"] * 4)
+    moved = (np.arange(20)[:, None] < [4, 4, 20, 4])[..., None, None] * np.ones((2, 2))  # then they wait
+    rows = [Period(each, np.zeros((4, 2, 2)), belief.simulator.project()[:, 0], force) for each in moved]
+    pushed = Pushed(rows, np.full(4, 20), passed, force, np.zeros(4), slack, ["late"] * 4)
     assert np.argsort(one.manoeuvre_cost(pushed)).tolist() == [1, 2, 0, 3]

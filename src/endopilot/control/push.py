@@ -72,6 +72,12 @@ class Pushed:
         """Return which pass without pressing on the wall with more than some force, N."""
         return self.passed & (self.force <= force_n)
 
+    @property
+    def moving(self) -> Int[np.ndarray, "trials"]:
+        """Periods in which each trial moves, without those in which it waits for others."""
+        moves = [row.control.any(axis=(1, 2)) & (k < self.periods) for k, row in enumerate(self.rows)]
+        return np.sum(moves, axis=0, dtype=int)
+
     def controls(self, trial: int) -> Controls:
         """Return the controls of one trial."""
         return np.array([row.control[trial] for row in self.rows[: self.periods[trial]]])

@@ -170,7 +170,7 @@ class Search:
         """
         if self._alone or not self.route.is_wide(self.route.target.abscissa):
             return pushed.force
-        limit_n, seconds = self._navigation.force_limit_n, DECISION_PERIOD_S * pushed.periods
+        limit_n, seconds = self._navigation.force_limit_n, DECISION_PERIOD_S * pushed.moving
         loops_mm = pushed.slack + _LOOP_MM_S * seconds
         return np.maximum(pushed.force, _GENTLE_SHARE * limit_n) + _LOOP_SHARE * limit_n * loops_mm
 
