@@ -236,3 +236,14 @@ def test_an_exposure_is_due_after_as_long_as_was_calibrated_on() -> None:
     adviser.start(still, still, radius)
     due = [bool(adviser.advise(still, still, still, radius)[0]) for _ in range(20)]
     assert [i for i, each in enumerate(due, 1) if each] == [8, 16]  # periods of 0.5 s
+
+
+def test_what_an_exposure_of_one_navigation_shows_counts_for_that_one() -> None:
+    adviser = XrayAdviser(calibration(abscissa=0.0, offset=0.0), AdviserConfig(), wire_radius_mm=0.2)
+    still, tip, radius = np.zeros((2, 2)), np.full((2, 2), 0.9), np.full(2, 1.2)
+    adviser.start(still, tip, radius)
+    for _ in range(5):
+        adviser.advise(still, tip, still, radius)
+    adviser.exposed(np.array([0.5]), np.array([1.2]), np.array([1]))
+    due = [adviser.advise(still, tip, still, radius).tolist() for _ in range(3)]
+    assert due == [[False, False], [False, False], [False, True]]

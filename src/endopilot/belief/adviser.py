@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.special import ndtri
 
 from endopilot.anatomy.projection import safety_ratio
@@ -96,7 +96,7 @@ class XrayAdviser:
         self._proximal, self._travel = proximal, np.zeros(len(proximal))
         self._since = np.zeros(len(proximal), dtype=int)
         self._beyond = [self._is_beyond(tip[:, 1], radius_mm)] * 5
-        self._shown = self._beyond[0]
+        self._shown = self._beyond[0].copy()
         self._is_shown = np.zeros(len(proximal), dtype=bool)
 
     def advise(
@@ -152,10 +152,22 @@ class XrayAdviser:
             half = np.hypot(half, ndtri(0.5 + 0.5 * self._calibration.level) * play)
         return half
 
-    def exposed(self, offset_mm: Float[np.ndarray, "n"], radius_mm: Float[np.ndarray, "n"]) -> None:
-        """Take what an exposure shows: γtip, and the radius of the lumen there, mm; the bands begin anew."""
-        self._since, self._travel = np.zeros_like(self._since), np.zeros_like(self._travel)
-        self._shown, self._is_shown = self._is_beyond(offset_mm, radius_mm), np.ones(len(self._since), dtype=bool)
+    def exposed(
+        self,
+        offset_mm: Float[np.ndarray, "shown"],
+        radius_mm: Float[np.ndarray, "shown"],
+        navigations: Int[np.ndarray, "shown"] | slice = slice(None),
+    ) -> None:
+        """Take what an exposure shows; the bands begin anew.
+
+        Args:
+            offset_mm: γtip, mm, of each navigation with an exposure.
+            radius_mm: of the lumen there, mm.
+            navigations: which these are; all if not given.
+        """
+        self._since[navigations], self._travel[navigations] = 0, 0.0
+        self._shown[navigations] = self._is_beyond(offset_mm, radius_mm)
+        self._is_shown[navigations] = True
 
     def _is_beyond(self, offset_mm: Float[np.ndarray, "n"], radius_mm: Float[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
         return safety_ratio(offset_mm, radius_mm, self._wire_radius_mm) >= self._config.wall_ratio

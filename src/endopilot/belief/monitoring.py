@@ -354,8 +354,10 @@ def adviser_policy(monitored: Monitored, calibration: Calibration, config: Advis
 
     def decide(sample: int, tip: np.ndarray, spread: np.ndarray) -> np.ndarray:
         on = again(sample, tip, spread)
-        shown = on & monitored.found[:, sample]
+        shown = np.flatnonzero(on & monitored.found[:, sample])
         branch[shown] = monitored.episodes.branch[shown, sample]
+        seen = monitored.episodes.tip[:, sample]
+        adviser.exposed(seen[shown, 1], monitored.lumen.radius(branch, seen[:, 0])[shown], shown)
         return on
 
     return decide
