@@ -19,7 +19,7 @@ from scipy.optimize import nnls
 
 from endopilot.errors import InputError
 from endopilot.files import write_json
-from endopilot.settings import NonNegative, OpenShare, Positive, Within, read_settings, settings
+from endopilot.settings import NonNegative, OpenShare, Seconds, Within, read_settings, settings
 
 CALIBRATION_FILE = "xray.json"
 """Name of a calibration beside the run that it belongs to."""
@@ -55,7 +55,7 @@ class Calibration:
     intervals: Annotated[int, Within(1, 10**9)]
     dataset: str
     offset_share: NonNegative
-    longest_s: Positive
+    longest_s: Seconds
 
     def half_width(self, seconds: Float[np.ndarray, "*n"], travel_mm: Float[np.ndarray, "*n"], spread: Tips) -> Tips:
         """Return the half-widths of the bands, mm.
