@@ -23,7 +23,8 @@ from tyro.conf import Positional
 from benchmarks.figures import fill
 from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of
 from endopilot.belief.monitor import adviser_input
-from endopilot.control.agent import CALIBRATIONS, IN_CATHETER, AgentConfig, AgentPolicy
+from endopilot.control.agent import AgentPolicy
+from endopilot.control.agent_config import CALIBRATIONS, IN_CATHETER, AgentConfig
 from endopilot.files import read_json, write_json
 from endopilot.ladder.ladder import identity
 from endopilot.navigation.loop import LoopConfig, NavigationLoop

@@ -190,7 +190,7 @@ def suits(navigation: Navigation) -> bool:
     return shaped or _Search(alone).reachable()
 
 
-def choose(task: Task, seed: int, *, search: bool, wanted: int = WANTED) -> tuple[list[int], int, int]:
+def choose(task: Task, seed: int, *, search: bool) -> tuple[list[int], int, int]:
     """Return the numbers of the patients wanted, how many were eligible and how many were examined."""
     atlas = task.atlas(seed)
     eligible = ELIGIBLE.get(f"{task.name} in version {task.version}", ELIGIBLE.get(task.name, _always))
@@ -209,7 +209,7 @@ def choose(task: Task, seed: int, *, search: bool, wanted: int = WANTED) -> tupl
         navigation = task.navigation(task.patient(patients, 0)) if search else None
         if navigation is None or suits(navigation):
             chosen.append(number)
-            if len(chosen) == wanted:
+            if len(chosen) == WANTED:
                 return chosen, count, number + 1
     raise InputError(f"{task.name}: only {len(chosen)} of {MOST_EXAMINED} patients qualify; choose another seed")
 

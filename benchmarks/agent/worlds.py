@@ -21,11 +21,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from benchmarks.figures import Bar, judged
-from endopilot.belief.monitor import MISMATCH
+from endopilot.belief.monitor import MISMATCH, BelievedTip, Monitor
 from endopilot.cli.arguments import OutputFolder
 from endopilot.control.agent import AgentPolicy
+from endopilot.control.agent_config import AgentConfig, read_agent_calibration
 from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import navigation_events
 from endopilot.ladder.ladder import identity
@@ -86,12 +88,13 @@ BARS = {
 }
 
 
-class DrivenAtRandom(AgentPolicy):
-    """The agent's belief and adviser, while random velocities drive the wire."""
+class DrivenAtRandom:
+    """The agent's monitor, while random velocities drive the wire."""
 
     def start(self, navigation: Navigation, seed: int) -> None:
         """Lay out the simulated wires, and draw the velocities."""
-        super().start(navigation, seed)
+        calibration = read_agent_calibration(navigation.xray, len(navigation.devices))
+        self._monitor = Monitor(navigation, calibration, config=AgentConfig.of(navigation).belief)
         config = ControlConfig(first_inserted_length_mm=navigation.start_inserted_length_mm, start_spread=0.0)
         _, control = random_controls(
             config,
@@ -104,10 +107,18 @@ class DrivenAtRandom(AgentPolicy):
 
     def decide(self, observation: Observation) -> Decision:
         """Move on at random, and ask for X-ray as the agent does."""
-        self._observe(observation)
+        self._believed = self._monitor.step(observation.devices, observation.load, observation.tip)
         wanted = (self._velocities[round(observation.time_s / SAMPLE_PERIOD_S)],)
-        self.belief.drives.sent(wanted)
-        return Decision(wanted, expose=self.wants_xray())
+        self._monitor.belief.drives.sent(wanted)
+        return Decision(wanted, expose=bool(self._believed.asks))
+
+    def believed(self) -> BelievedTip:
+        """Return where the monitor has the tip."""
+        return self._believed
+
+    def believed_wires(self) -> Float[np.ndarray, "wires nodes 3"]:
+        """Return the simulated wires."""
+        return self._monitor.belief.wires
 
 
 def navigation_at(patients: Set, place: int) -> tuple[Task, Navigation, int]:

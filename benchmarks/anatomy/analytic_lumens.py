@@ -12,6 +12,8 @@ from scipy.spatial import KDTree
 from endopilot.anatomy.tree import make_centerline
 from endopilot.types import Branch, LumenMask, VesselTree, Volume
 
+TUBE_MM = 1.5
+"""Radius of a tube without a branch, mm."""
 BEND_MM = 20.0
 """Radius of the bend of `torus_distance` and of the bent tube, mm."""
 
@@ -61,22 +63,22 @@ def tree_of(*lines: tuple[Float[np.ndarray, "_ 3"], float, int]) -> VesselTree:
     return VesselTree(tuple(branches), ("vessel",))
 
 
-def straight_tree(radius: float = 1.5, length_mm: float = 40.0) -> VesselTree:
-    """Return a straight tube along z, its middle at the origin."""
-    return tree_of((np.outer(np.linspace(-0.5, 0.5, 81) * length_mm, [0.0, 0.0, 1.0]), radius, -1))
+def straight_tree() -> VesselTree:
+    """Return a straight tube of 40 mm along z, its middle at the origin."""
+    return tree_of((np.outer(np.linspace(-0.5, 0.5, 81) * 40.0, [0.0, 0.0, 1.0]), TUBE_MM, -1))
 
 
-def torus_tree(radius: float = 1.5) -> VesselTree:
+def torus_tree() -> VesselTree:
     """Return five sixths of a torus around z."""
     angle = np.linspace(np.pi / 6, 11 * np.pi / 6, 400)
-    return tree_of((BEND_MM * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1), radius, -1))
+    return tree_of((BEND_MM * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1), TUBE_MM, -1))
 
 
-def helix_tree(radius: float = 1.5, bend_mm: float = 8.0, pitch_mm: float = 12.0) -> VesselTree:
-    """Return one and a half turns of a helix around z: curvature 0.118 /mm and torsion 0.028 /mm by default."""
+def helix_tree() -> VesselTree:
+    """Return one and a half turns of a helix around z: curvature 0.118 /mm and torsion 0.028 /mm."""
     angle = np.linspace(0.0, 3 * np.pi, 400)
-    height = pitch_mm * (angle / (2 * np.pi) - 0.75)
-    return tree_of((np.stack([bend_mm * np.cos(angle), bend_mm * np.sin(angle), height], axis=1), radius, -1))
+    height = 12.0 * (angle / (2 * np.pi) - 0.75)
+    return tree_of((np.stack([8.0 * np.cos(angle), 8.0 * np.sin(angle), height], axis=1), TUBE_MM, -1))
 
 
 def forked_tree(angle_deg: float = 60.0, radius: tuple[float, float] = (2.0, 1.3)) -> VesselTree:

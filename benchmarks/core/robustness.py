@@ -79,8 +79,6 @@ class Chunk:
         base_torque_n_mm: torque of the drive, N·mm.
         over_limit: force of the drive as a share of its limit, of the drive that is nearest to its limit.
         wall_force_n: largest resultant of the wall's forces on 2 mm of the wire, N.
-        to_end_mm: distance of the tip from the end of its branch, mm; negative beyond it.
-        slipped: whether the drive slipped in the sample.
         wedged: whether a device has come through a lumen that is no wider than itself.
         valid: whether the world was valid.
         non_finite: numbers of each rollout that are not finite though its world was valid.
@@ -92,8 +90,6 @@ class Chunk:
     base_torque_n_mm: Float[np.ndarray, "rollouts samples"]
     over_limit: Float[np.ndarray, "rollouts samples"]
     wall_force_n: Float[np.ndarray, "rollouts samples"]
-    to_end_mm: Float[np.ndarray, "rollouts samples"]
-    slipped: Bool[np.ndarray, "rollouts samples"]
     wedged: Bool[np.ndarray, "rollouts samples"]
     valid: Bool[np.ndarray, "rollouts samples"]
     non_finite: Int[np.ndarray, "rollouts"]
@@ -183,14 +179,12 @@ _OF_DEVICES = (
 
 def _describe(anatomy: Anatomy, stack: Stack, rollout: Trajectory, config: SimulatorConfig, seconds: float) -> Chunk:
     wall_n_mm = wall_stiffness(config, stack.push_limit_n)
-    end = np.array([branch.centerline.abscissa[-1] for branch in anatomy.tree.branches])
     of_all = [getattr(rollout, name) for name in ("contact_force_max", "contact_force_sum", "wall_force")]
     of_devices = [getattr(rollout, name) for name in _OF_DEVICES]
     of_wire = [getattr(rollout.tip, name)[:, :, 0] for name in ("abscissa", "offset", "radius")]
     rows = rollout.valid.shape
     numbers = np.concatenate([each.reshape(*rows, -1) for each in (*of_all, *of_devices, *of_wire)], axis=-1)
     force, torque = rollout.base_force, rollout.base_torque
-    slipped = ((rollout.slip != 0) | (rollout.rotation_slip != 0)).any(axis=-1)
     most = [[device.push_limit_n, -device.pull_limit_n] for device in stack.devices]
     bad = (~np.isfinite(numbers) & rollout.valid[..., None]).sum(axis=(1, 2))
     return Chunk(
@@ -199,8 +193,6 @@ def _describe(anatomy: Anatomy, stack: Stack, rollout: Trajectory, config: Simul
         base_torque_n_mm=_largest(torque).astype(np.float32),
         over_limit=(force[..., None] / most).max(axis=(-2, -1)).astype(np.float32),
         wall_force_n=rollout.wall_force.astype(np.float32),
-        to_end_mm=(end[rollout.tip.branch] - rollout.tip.abscissa)[:, :, 0].astype(np.float32),
-        slipped=slipped,
         wedged=_wedged(anatomy, stack, rollout),
         valid=rollout.valid,
         non_finite=bad,

@@ -30,7 +30,7 @@ def samples(scene: Scene, random: np.random.Generator) -> tuple[np.ndarray, np.n
     """Return the features of pixels on wires, and of pixels in the vessel off them."""
     detector = TipDetector(scene.anatomy, scene.device, evidence=RidgeEvidence(np.zeros(1), 0.0))
     corridor = make_corridor(scene.anatomy, scene.device.tip_radius_mm, 0.5, np.inf)
-    places = np.concatenate([corridor.places(one)[corridor.open(one)] for one in corridor.passages])
+    places = np.concatenate([one.places()[one.open] for one in corridor.passages])
     on, off = [], []
     for image in range(IMAGES):
         dose = float(np.exp(random.uniform(*np.log(DOSES))))
@@ -42,7 +42,8 @@ def samples(scene: Scene, random: np.random.Generator) -> tuple[np.ndarray, np.n
         drawn = _resampled(nodes, along, np.arange(0.0, along[-1], 0.1))
         seen = _resampled(nodes, along, np.arange(0.1, scene.inserted_length[index] + 3.0, STEP_MM))
         for plane, signal in zip(scene.planes, signals, strict=True):
-            found = features(detector.without_contrast(plane.view, signal), scene.imager.photons(plane, dose))
+            plain, every = detector.without_contrast(plane.view, signal), np.arange(signal.size)
+            found = features(plain, scene.imager.photons(plane, dose), every).reshape(-1, *signal.shape)
             free = np.ones(signal.shape, dtype=bool)
             free[tuple(_inside(np.rint(plane.pixel(drawn)), signal.shape, 0).astype(int).T)] = False
             away = distance_transform_edt(free)
@@ -51,9 +52,7 @@ def samples(scene: Scene, random: np.random.Generator) -> tuple[np.ndarray, np.n
             other = _inside(plane.pixel(places[random.integers(len(places), size=OFF_WIRE)]), signal.shape, 1)
             other = other[map_coordinates(away, other.T, order=1) > FAR_PX]
             for pixels, kept in ((wire, on), (other, off)):
-                kept.append(
-                    np.stack([map_coordinates(part, pixels.T, order=1) for part in np.moveaxis(found, -1, 0)], -1)
-                )
+                kept.append(np.stack([map_coordinates(part, pixels.T, order=1) for part in found], -1))
     return np.concatenate(on), np.concatenate(off)
 
 

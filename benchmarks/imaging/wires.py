@@ -75,7 +75,7 @@ class Search(Exposure):
         metal: whether other metal lies in the images.
         folded_mm: how much less deep the tip lies than another place of the wire, mm.
         patient: name of the anatomy.
-        ms_a_view: time of the detection over the number of views, ms.
+        ms_a_view: processor time of the detection over the number of views, ms.
         log_odds, share: of `TipEstimate`.
     """
 
@@ -106,7 +106,7 @@ def bench_wires(
         none, those that the detector calls ambiguous or does not find; `doubted_share`: of the others, those that it
         does not call found; `surely_wrong_share`: of all wires, those called found and missed; `inside_own_95_share`:
         of the wires called found, those whose tip is within the region that the detector is 95 % sure of, and the same
-        of two views; `ms_a_view`: median. `by`: the same of some of the exposures.
+        of two views; `ms_a_view`: processor time, median. `by`: the same of some of the exposures.
 
     Raises:
         InputError: a folder holds no anatomy, or the output belongs to another run.
@@ -142,7 +142,7 @@ def _searches(scene: Scene, config: WiresConfig) -> Iterator[Search]:
             dose = DOSES[(number // 2 + pair) % len(DOSES)]
             signals = shown.signals(None if wire is None else at, dose=dose, seed=1000 * pair + number)
             for used in SHOWN:
-                began = time.perf_counter()
+                began = time.process_time()
                 found = detector.estimate(
                     [views[i] for i in used],
                     [signals[i] for i in used],
@@ -150,7 +150,7 @@ def _searches(scene: Scene, config: WiresConfig) -> Iterator[Search]:
                     float(scene.inserted_length[at]),
                     before=[masks[number % 2][i] for i in used],
                 )
-                ms = 1000 * (time.perf_counter() - began) / len(used)
+                ms = 1000 * (time.process_time() - began) / len(used)
                 row = Search(
                     views=len(used),
                     dose=dose,

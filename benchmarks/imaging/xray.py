@@ -23,7 +23,7 @@ from endopilot.xray.motion_registration import motion_error_mm, register_motion,
 from endopilot.xray.pose_refinement import PoseRefiner
 from endopilot.xray.registration import Registration, register, vessel_error_mm
 from endopilot.xray.scenes import Scene, SceneConfig, Signal, draw_scenes
-from endopilot.xray.tracker import TipEstimate
+from endopilot.xray.tip_posterior import TipEstimate
 
 BARS = {
     "images_per_second": Bar(15.0, at_least=True),

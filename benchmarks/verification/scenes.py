@@ -173,13 +173,10 @@ def ridged_vessel() -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
     return axis, np.where(beyond > 0, 1.2 - 0.3 * wave, 1.2)
 
 
-def stick_slip(*, friction: float = 0.1) -> Pushed:
+def stick_slip() -> Pushed:
     """Push the workhorse wire, with its bent tip, slowly over a vessel's ridges.
 
     The tip catches at a ridge; the wire behind it snakes and stores energy, until the tip slips over and ahead.
-
-    Args:
-        friction: Coulomb coefficient.
     """
     device = read_wire("workhorse-014")
     axis, radius = ridged_vessel()
@@ -191,7 +188,7 @@ def stick_slip(*, friction: float = 0.1) -> Pushed:
         np.tile([speed, 0.0], (samples, 1)),
         entry_mm=-5.0,
         inserted_length_mm=start,
-        friction=friction,
+        friction=0.1,
         config=SimulatorConfig(threads=1, wall_stiffness_n_mm=5.0),
         approach=True,
     )
@@ -241,7 +238,7 @@ class Turned:
     torque_n_mm: Float[np.ndarray, "samples"]
 
 
-def turn_in_a_bend(curved_mm: float, *, turns: float = 2.25, friction: float = 0.0) -> Turned:
+def turn_in_a_bend(curved_mm: float, *, turns: float = 2.25) -> Turned:
     """Turn a wire whose distal part is curved in a vessel that is curved alike.
 
     The wire wants to lie with its curve along the vessel's. Turned from behind, its tip lags, and where the curved part
@@ -250,7 +247,6 @@ def turn_in_a_bend(curved_mm: float, *, turns: float = 2.25, friction: float = 0
     Args:
         curved_mm: length of the curved part, mm.
         turns: turns of the drive.
-        friction: Coulomb coefficient.
     """
     size, radius, speed = 0.75, 0.2, 0.25
     axis = tortuous_axis(np.array([np.pi]), bend_radius_mm=CURVE_RADIUS_MM, lead_mm=_WHIP_LEAD_MM + 5, tail_mm=10.0)
@@ -266,7 +262,7 @@ def turn_in_a_bend(curved_mm: float, *, turns: float = 2.25, friction: float = 0
         control,
         entry_mm=-_WHIP_LEAD_MM,
         inserted_length_mm=0.0,
-        friction=friction,
+        friction=0.0,
         config=SimulatorConfig(threads=1, wall_stiffness_n_mm=20.0),
         free_behind_mm=size,
     )
@@ -312,8 +308,9 @@ def _uniform(nodes: int, size_mm: float, bend: float, twist: float, *, shear: fl
     return uniform_rod(nodes, size_mm, **section, radius_mm=0.2, drag=1e-6, spin_drag=1e-8)
 
 
-def _chamber(depth_mm: float, radius_mm: float, spacing_mm: float = 0.2) -> DistanceMap:
+def _chamber(depth_mm: float, radius_mm: float) -> DistanceMap:
     """Return the distance map of a round chamber along x that a plate closes at x = depth."""
+    spacing_mm = 0.2
     low = np.array([-4.0, -radius_mm - 1, -radius_mm - 1])
     high = np.array([depth_mm + 1.5, radius_mm + 1, radius_mm + 1])
     shape = np.ceil((high - low) / spacing_mm).astype(int) + 1

@@ -55,10 +55,9 @@ PRESSED_BEND_N_MM2 = 5.0
 """EI of the rod that is pressed into a compliant wall, N·mm²."""
 
 
-def straight_tube(
-    *, length_mm: float, radius_mm: float, spacing_mm: float = 0.2, outside_mm: float = 0.8
-) -> DistanceMap:
+def straight_tube(*, length_mm: float, radius_mm: float, outside_mm: float = 0.8) -> DistanceMap:
     """Return the distance map of a tube about the x-axis from 0 to a length, with open ends, and of some mm outside."""
+    spacing_mm = 0.2
     across = np.arange(-radius_mm - outside_mm, radius_mm + outside_mm + spacing_mm / 2, spacing_mm)
     along = np.arange(-outside_mm, length_mm + outside_mm, spacing_mm)
     values = radius_mm - np.sqrt(across[None, :, None] ** 2 + across[:, None, None] ** 2) + 0 * along

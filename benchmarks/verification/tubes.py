@@ -87,7 +87,6 @@ def drive(
     *,
     rotation: Float[np.ndarray, "tubes"] | None = None,
     control: Float[np.ndarray, "samples tubes 2"] | None = None,
-    samples: int = 2,
     loading: Loading | None = None,
     config: SimulatorConfig = STATIC,
     approach: bool = False,
@@ -99,8 +98,7 @@ def drive(
         tubes: the tubes.
         inserted_length_mm: free length of each at the start.
         rotation: of each at the start, rad; 0 if not given.
-        control: mm/s and rad/s of each.
-        samples: number of samples of 0.5 s, if no control is given.
+        control: mm/s and rad/s of each; they rest for 1 s if not given.
         loading: dead loads.
         config: settings of the core.
         approach: push them out together from within the clamp; else they start there, straight.
@@ -108,7 +106,7 @@ def drive(
     turned = np.zeros(len(inserted_length_mm)) if rotation is None else rotation
     return driven(
         rod,
-        np.zeros((samples, len(inserted_length_mm), 2)) if control is None else control,
+        np.zeros((2, len(inserted_length_mm), 2)) if control is None else control,
         initial=np.column_stack([inserted_length_mm, turned]),
         config=replace(config, sample_tolerance_mm=1e-8),
         tubes=tubes,

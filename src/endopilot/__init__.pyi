@@ -91,6 +91,7 @@ from .robot.replay import replay_log as replay_log
 from .simulation.config import SimulatorConfig as SimulatorConfig
 from .simulation.controls import ControlConfig as ControlConfig
 from .simulation.motion import Motion as Motion
+from .simulation.set_up import SimulationSetUp as SimulationSetUp
 from .simulation.simulate import simulate as simulate
 from .simulation.simulator import Simulator as Simulator
 from .simulation.state import SimulatorState as SimulatorState
@@ -98,7 +99,6 @@ from .simulation.state import Step as Step
 from .simulation.state import SupportsDLPack as SupportsDLPack
 from .simulation.tip_load import TipLoadTest as TipLoadTest
 from .simulation.tip_load import simulate_tip_load as simulate_tip_load
-from .simulation.trajectory import SimulationSetUp as SimulationSetUp
 from .simulation.trajectory import Trajectory as Trajectory
 from .simulation.trajectory_file import read_trajectory as read_trajectory
 from .simulation.world import Stenosis as Stenosis

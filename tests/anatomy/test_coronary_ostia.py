@@ -32,6 +32,12 @@ def both():
 
 
 @pytest.fixture(scope="module")
+def extracted(both):
+    """Return the anatomy of each artery of a mask of both."""
+    return {side: extract_anatomy(both, name="patient", config=AnatomyConfig(vessel=side)) for side in ("rca", "lca")}
+
+
+@pytest.fixture(scope="module")
 def right_alone():
     return mask_of_arteries(artery("rca"))
 
@@ -47,8 +53,8 @@ def test_each_artery_is_found_in_a_mask_of_both_with_crumbs(both):
         assert found.runner_up is not None and found.runner_up.probability < 0.1
 
 
-def test_the_tree_begins_at_the_found_ostium_and_the_record_says_how_sure_it_is(both):
-    anatomy = extract_anatomy(both, name="patient", config=AnatomyConfig(vessel="lca"))
+def test_the_tree_begins_at_the_found_ostium_and_the_record_says_how_sure_it_is(extracted):
+    anatomy = extracted["lca"]
     assert np.linalg.norm(anatomy.insertion.position - PLACE_MM["lca"]) < 2.0
     assert anatomy.provenance["ostium_rule"] == "shape of the coronary arteries"
     assert 0.9 < anatomy.provenance["ostium_confidence"] <= 1.0
@@ -164,9 +170,8 @@ def test_no_vessel_lies_in_the_aorta_between_the_ostia():
     assert free > 0.99 and 1.0 - crossed > 2.0 * (1.0 - free)
 
 
-def test_dominance_is_the_same_from_either_artery(both):
-    anatomies = [extract_anatomy(both, name="patient", config=AnatomyConfig(vessel=side)) for side in ("rca", "lca")]
-    assert anatomies[0].provenance["dominance"] == anatomies[1].provenance["dominance"]
+def test_dominance_is_the_same_from_either_artery(extracted):
+    assert extracted["rca"].provenance["dominance"] == extracted["lca"].provenance["dominance"]
 
 
 @pytest.mark.skipif(not REAL.exists(), reason="the real coronary masks are not here")

@@ -190,3 +190,37 @@ def test_refuses_bad_settings() -> None:
     for change, message in (({"level": 1.0}, "level: 1.0"), ({"wall_ratio": 0.0}, "wall_ratio: 0.0")):
         with pytest.raises(InputError, match=message):
             AdviserConfig(**change)
+
+
+def test_an_exposure_follows_another_as_long_as_that_showed_the_tip_on_the_other_side() -> None:
+    """γtip/(1.2 - 0.2 mm) is predicted as 0.9 and shown as 0.5 first, then as 0.8; τ is 0.7."""
+    adviser = XrayAdviser(calibration(abscissa=0.0, offset=0.0), AdviserConfig(), wire_radius_mm=0.2)
+    still, tip, radius = np.zeros((1, 2)), np.array([[0.0, 0.9]]), np.full(1, 1.2)
+    adviser.start(still, tip, radius)
+
+    def due(count: int) -> list[bool]:
+        return [bool(adviser.advise(still, tip, still, radius)[0]) for _ in range(count)]
+
+    assert not any(due(6))  # predicted at the wall since the start
+    adviser.exposed(np.array([0.5]), radius)
+    assert due(6) == [False, False, True, False, False, True]
+    adviser.exposed(np.array([0.8]), radius)
+    assert not any(due(6))
+
+
+def test_a_model_that_erred_is_looked_at_as_long_as_its_band_lies_across_the_wall() -> None:
+    """The band of γtip is ±0.05 mm, and τ is 0.6; that of Δtip grows by 0.2 mm a sample up to 0.6 δ, or δ."""
+    inserted = [2.0 * abs(6 - i) for i in range(12)]
+    for erred, across, along in ((False, [3], [5, 10]), (True, [3, 6, 9], [3, 6, 9])):
+        found = []
+        for offset, moved, config in (
+            (0.58, [10.0] * 12, AdviserConfig(wall_ratio=0.6)),
+            (0.1, inserted, AdviserConfig(abscissa_mm=1.0)),
+        ):
+            adviser = XrayAdviser(calibration(abscissa=0.1 * (offset < 0.5)), config, wire_radius_mm=0.2)
+            proximal = np.stack([moved, np.zeros(12)], axis=1)[:, None]
+            tip, radius = np.array([[0.0, offset]]), np.full(1, 1.2)
+            adviser.start(proximal[0], tip * 0, radius)
+            due = [adviser.advise(at, tip, np.zeros((1, 2)), radius, erred=erred)[0] for at in proximal[1:]]
+            found.append([i for i, each in enumerate(due, 1) if each])
+        assert found == [across, along]

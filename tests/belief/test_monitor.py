@@ -9,9 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from endopilot.belief.identification import Identified
 from endopilot.belief.innovations import ASSUMED_SD_MM, Innovations
 from endopilot.belief.monitor import MISMATCH, BelievedTip, Monitor
-from endopilot.control.agent import read_agent_calibration
+from endopilot.belief.patient_motion import FoundMotion
+from endopilot.control.agent_config import read_agent_calibration
 from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.navigation.loop import NavigationLoop
 from endopilot.navigation.policy import Decision, Observation
@@ -20,6 +22,7 @@ from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation, Target
 
 HALF_MM = np.array([0.8, 0.2])
+NOTHING = Identified(interval={}, compliant=None, explains=True)
 
 
 class ToAndFro:
@@ -116,6 +119,20 @@ def test_a_vessel_that_moves_is_noticed_and_its_motion_identified(along_the_fork
     assert found.breathing_period_s == pytest.approx(4.4, rel=0.05)
     assert found.breathing_caudal_mm == pytest.approx(6.0, abs=1.5)
     assert len(held) > 12 and np.mean(held) > 0.85
+    policy.monitor.identified = NOTHING
+    policy.monitor.return_to_given()
+    assert policy.monitor.moves.motion == policy.monitor.belief.motion == found  # the exposures still tell of it
+
+
+def test_a_motion_that_was_found_wrongly_is_given_up_with_what_was_identified(along_the_fork) -> None:
+    *_, (policy, _) = driven(replace(along_the_fork, seconds=7.0), World(), kind=Rocks)
+    monitor, wrong = policy.monitor, Motion(heart_period_s=0.8, annulus_mm=9.0)
+    monitor.belief = monitor.belief.like(monitor.belief.members, motion=wrong)
+    monitor.belief.replay(monitor.past)
+    monitor.moves, monitor.identified = FoundMotion(wrong, gain=10.0, misfit=0.1), NOTHING
+    monitor.return_to_given()
+    assert monitor.moves is None and monitor.belief.motion is None and monitor.belief.navigation.known_motion is None
+    assert not monitor.may_return
 
 
 def innovations(random: np.random.Generator, off: np.ndarray, sd: np.ndarray, count: int) -> Innovations:

@@ -170,11 +170,9 @@ def test_a_crash_and_an_invalid_world_miss_their_bars(tmp_path: Path) -> None:
     chunk = robustness.Chunk(
         penetration_mm=np.array([[0.1, 0.2, 0.3, 0.3]], dtype=np.float32),
         base_force_n=np.array([[0.3, -0.4, -9.0, 9.0]], dtype=np.float32),
-        to_end_mm=np.zeros((1, 4), dtype=np.float32),
         base_torque_n_mm=np.array([[0.1, -0.2, 9.0, 9.0]], dtype=np.float32),
         over_limit=np.array([[1.0, 1.07, 9.0, 9.0]], dtype=np.float32),
         wall_force_n=np.array([[0.1, 0.8, 9.0, 9.0]], dtype=np.float32),
-        slipped=np.zeros((1, 4), dtype=bool),
         wedged=np.array([[False, True, True, True]]),
         valid=np.array([[True, True, False, False]]),
         non_finite=np.array([2]),

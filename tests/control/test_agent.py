@@ -13,9 +13,11 @@ from hypothesis import strategies as st
 from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig
+from endopilot.belief.loads import LoadRatio
 from endopilot.belief.monitor import MISMATCH
 from endopilot.control import push
-from endopilot.control.agent import CALIBRATIONS, AgentConfig, AgentPolicy, OpenLoopPolicy, OraclePolicy
+from endopilot.control.agent import AgentPolicy, OpenLoopPolicy, OraclePolicy
+from endopilot.control.agent_config import CALIBRATIONS, AgentConfig
 from endopilot.control.course import Course
 from endopilot.control.halt import describe_halt
 from endopilot.control.search import Search
@@ -480,3 +482,43 @@ def test_a_path_that_does_not_arrive_ends_before_it_presses_too_hard(side_branch
         one._course.rows.append(Period(np.zeros((1, 1, 2)), np.zeros((1, 1, 2)), tip, force))
     one._cut_hard()
     assert len(one._course.rows) == 2
+
+
+def test_a_course_is_searched_again_where_the_drive_pushes_harder_than_simulated(side_branch) -> None:
+    """Walls press harder by as much as the drive pushes harder: a fourth of the limit leaves no way, as above."""
+    policy = AgentPolicy(config=QUICK)
+    policy.start(side_branch, seed=1)
+    limited = replace(side_branch, force_limit_n=float(policy.find_course(20.0).force.max()))
+    policy.start(limited, seed=1)
+
+    def decide(period: int) -> Decision:
+        return policy.decide(Observation(0.5 * period, ((side_branch.start_inserted_length_mm, 0.0),), None))
+
+    decide(0)
+    first = policy._follower.course
+    assert first is not None and first.reached == 1
+    for _ in range(50):  # four times the force, and what prior and margin take
+        policy.monitor._loads.take(0.86, 0.2, speed_mm_s=5.0, valve=(0.0, 0.0))
+    assert policy.monitor.load_ratio == pytest.approx(4.0, abs=0.05)
+    decide(1)
+    again = policy._follower.course
+    assert again is not None and again.reached == 0 and 3.95 * again.force.max(initial=0.0) <= limited.force_limit_n
+    said = next(words for period in range(2, 60) if (words := decide(period).gives_up))
+    assert re.search(r"cannot go on .* N is given, and the drive pushes 4\.\d times as hard", said)
+
+
+def test_the_load_ratio_is_the_one_that_the_forces_have() -> None:
+    """Σ read · predicted / Σ predicted² of force less the valve's, less 0.25; what is slow or weak does not count."""
+    valve = (0.05, 0.002)
+    loads = LoadRatio()
+    assert loads.value == 1.0
+    for force_n in np.linspace(0.1, 0.3, 60):
+        loads.take(1.5 * force_n + 0.05 + 0.002 * 5.0, force_n, speed_mm_s=5.0, valve=valve)
+    assert loads.value == pytest.approx(1.25, abs=0.02)
+    before = loads.value
+    loads.take(9.0, 0.01, speed_mm_s=5.0, valve=valve)
+    loads.take(9.0, 0.2, speed_mm_s=-5.0, valve=valve)
+    assert loads.value == before
+    for _ in range(50):
+        loads.take(0.1, 0.2, speed_mm_s=5.0, valve=valve)
+    assert loads.value == 1.0  # less force than predicted allows no more

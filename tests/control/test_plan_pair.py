@@ -11,7 +11,7 @@ import pytest
 from endopilot.anatomy.io import read_anatomy
 from endopilot.belief.bands import Calibration
 from endopilot.cli import main
-from endopilot.control.agent import CALIBRATIONS
+from endopilot.control.agent_config import CALIBRATIONS
 from endopilot.control.plan import plan
 from endopilot.control.plan_config import Plan, PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan

@@ -10,7 +10,7 @@ import pytest
 
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief
-from endopilot.control.agent import CALIBRATIONS
+from endopilot.control.agent_config import CALIBRATIONS
 from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan
 from endopilot.control.plan_xray import PlannedXray, plan_xray, read_calibration

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from endopilot.belief.belief import Belief, BeliefConfig
-from endopilot.control.agent import AgentConfig, AgentPolicy, OpenLoopPolicy, OraclePolicy
+from endopilot.control.agent import AgentPolicy, OpenLoopPolicy, OraclePolicy
+from endopilot.control.agent_config import AgentConfig
 from endopilot.control.course import Course
 from endopilot.control.search import Search
 from endopilot.control.search_config import ManoeuvreConfig

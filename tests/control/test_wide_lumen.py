@@ -9,7 +9,8 @@ import pytest
 
 from endopilot.anatomy.extract import extract_anatomy
 from endopilot.anatomy.sources import Polylines
-from endopilot.control.agent import IN_WIDE_LUMEN, AgentConfig, AgentPolicy
+from endopilot.control.agent import AgentPolicy
+from endopilot.control.agent_config import IN_WIDE_LUMEN, AgentConfig
 from endopilot.control.manoeuvre import Repertoire
 from endopilot.control.search_config import SearchConfig
 from endopilot.control.trials import WIRE, Move, Trials

@@ -17,7 +17,7 @@ from endopilot.simulation.core import make_lumen, run_core
 from endopilot.simulation.rod import lay_out
 from endopilot.types import Insertion
 
-WORLDS, SAMPLES = 5, 3
+WORLDS, SAMPLES = 5, 2
 CONFIG = SimulatorConfig(element_mm=1.0, threads=1)
 
 

@@ -36,8 +36,8 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path, capsys, monkey
     assert not (folder / "report.html").exists()
     before = {path: path.stat().st_mtime_ns for path in (folder / "truth").rglob("*.json")}
 
-    coarse = partial(PhantomConfig, in_plane_mm=0.6, slice_mm=0.7)  # seen sooner
-    monkeypatch.setattr(study, "PhantomConfig", coarse)
+    small = partial(PhantomConfig, in_plane_mm=0.6, slice_mm=0.7, margin_mm=10.0)  # seen sooner
+    monkeypatch.setattr(study, "PhantomConfig", small)
     again = command.run(capsys, "demo", "-o", folder, *SIZE)
     assert {path: path.stat().st_mtime_ns for path in before} == before  # finished work is not done twice
 

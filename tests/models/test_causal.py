@@ -26,7 +26,7 @@ from endopilot.models.open_loop import JUMP_MM, Predictor, ProbabilisticPredicto
 from endopilot.models.patient import STEP_MM, prepare
 from endopilot.models.play import N_FEATURES, mirrored
 from endopilot.models.rollout import load_model
-from endopilot.models.sequences import N_INPUTS, Sequences, prepare_vessels, unfold
+from endopilot.models.sequences import N_INPUTS, Sequences, play_tables, unfold
 from endopilot.models.simulated_wires import FRICTION_FACTORS, SimulatedWires, read_or_simulate, simulated_tips
 from endopilot.models.train import train
 from endopilot.simulation.config import SimulatorConfig
@@ -229,14 +229,14 @@ def test_a_plan_under_way_begins_where_the_drive_is_and_uses_what_was_observed(b
 def test_the_play_operator_alone_beats_holding_the_slack(everyone, dataset):
     patient = np.unique(everyone.anatomy, return_inverse=True)[1]
     observed = np.broadcast_to(given(everyone), everyone.branch.shape)
-    guess = unfold("forward", prepare_vessels(everyone), patient, everyone, observed).guess[:, GIVEN:]
+    guess = unfold("forward", play_tables(everyone), patient, everyone, observed).guess[:, GIVEN:]
     held = error(hold_slack(dataset, GIVEN), everyone)[..., 0]
     assert error(guess, everyone)[..., 0].mean() < 0.5 * held.mean()
 
 
 def test_mirrored_vessels_behave_alike(brief):
     assert mirrored().shape == (N_FEATURES,)
-    vessels = prepare_vessels(brief)
+    vessels = play_tables(brief)
     forms = Sequences.of(brief, vessels, ("ff",), 0)
     inputs, _, change = forms.window("ff", torch.tensor([[0, 0], [0, 2]]))
     np.testing.assert_array_equal(change[0], change[1])
@@ -311,7 +311,7 @@ def test_another_end_of_a_navigation_is_simulated_from_where_it_begins(brief, fi
 
 
 def test_a_wire_whose_simulation_fails_is_where_the_guess_is(brief):
-    vessels, patient = prepare_vessels(brief), np.unique(brief.anatomy, return_inverse=True)[1]
+    vessels, patient = play_tables(brief), np.unique(brief.anatomy, return_inverse=True)[1]
     observed = every(brief)
     wires = WIRES.tips(brief, observed)
     whole = unfold("forward", vessels, patient, brief, observed, wires)

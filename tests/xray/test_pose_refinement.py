@@ -10,7 +10,7 @@ from endopilot.xray.corridor import CATHETER_MM, STEP_MM
 from endopilot.xray.image import ImageConfig, isocenter_of
 from endopilot.xray.pose_refinement import PoseRefiner
 from endopilot.xray.registration import Registration, vessel_error_mm
-from endopilot.xray.tracker import TipEstimate
+from endopilot.xray.tip_posterior import TipEstimate
 
 TRUE = Pose(np.deg2rad([1.0, -2.0, 1.5]), np.array([2.0, -3.0, 1.0]))
 ROOM_MM, SLACK_MM = 0.8, 4.0
@@ -31,9 +31,9 @@ def depth_of(view: View) -> np.ndarray:
 
 
 def followed(fork, refiner: PoseRefiner, views: list[View], aside_mm: np.ndarray) -> TipEstimate:
-    """Return what the tracker gives of a wire that lies aside of the centerline, seen with the pose so far.
+    """Return what the detector gives of a wire that lies aside of the centerline, seen with the pose so far.
 
-    In one view a place is known up to its depth; the one beside the centerline is taken, as the tracker does.
+    In one view a place is known up to its depth; the one beside the centerline is taken, as the detector does.
     """
     isocenter = isocenter_of(fork)
     line = fork.tree.path(2)

@@ -63,7 +63,6 @@ def distance_map_from_spheres(
     *,
     beside: Sequence[Sequence[Centerline]] = (),
     spacing_mm: float | None = None,
-    band_mm: float = BAND_MM,
 ) -> DistanceMap:
     """Return the signed distance to the smooth union of a tree's inscribed spheres.
 
@@ -71,23 +70,22 @@ def distance_map_from_spheres(
         tree: centerlines with radii.
         beside: for each branch, further lines of spheres that belong to its lumen; none for round sections.
         spacing_mm: grid spacing, mm; chosen by `automatic_spacing` if None.
-        band_mm: how far outside the wall distances are kept, mm.
     """
     lumens = [[branch.centerline] for branch in tree.branches]
     for own, others in zip(lumens, beside, strict=False):
         own.extend(others)
     points = np.concatenate([line.points for own in lumens for line in own])
     radius = np.concatenate([line.radius for own in lumens for line in own])
-    margin = radius[:, None] + band_mm
+    margin = radius[:, None] + BAND_MM
     lower, upper = (points - margin).min(axis=0), (points + margin).max(axis=0)
     spacing = automatic_spacing(radius, upper - lower) if spacing_mm is None else float(spacing_mm)
     shape, origin = _grid(lower, upper, spacing)
-    values = np.full(shape, -band_mm, dtype=np.float32)
+    values = np.full(shape, -BAND_MM, dtype=np.float32)
     for own in lumens:
         line = own[0]
-        window = _window(_joined(own), origin, spacing, shape, band_mm)
+        window = _window(_joined(own), origin, spacing, shape, BAND_MM)
         corner = origin + spacing * np.array([window[2].start, window[1].start, window[0].start])
-        fields = [_tube_field(part, values[window].shape, corner, spacing, band_mm) for part in own]
+        fields = [_tube_field(part, values[window].shape, corner, spacing, BAND_MM) for part in own]
         field = np.maximum.reduce(fields)
         fillet = FILLET * float(line.radius[min(len(line.radius) - 1, 3)])
         values[window] = smooth_union(values[window], field, spacing_mm=spacing, fillet_mm=fillet)
@@ -147,16 +145,15 @@ def _far_field(
     return values
 
 
-def distance_map_from_mask(mask: Volume, *, spacing_mm: float | None = None, band_mm: float = BAND_MM) -> DistanceMap:
+def distance_map_from_mask(mask: Volume, *, spacing_mm: float | None = None) -> DistanceMap:
     """Return the signed distance to the smooth wall of a mask, with sub-voxel accuracy.
 
     Args:
         mask: boolean voxels on any grid, at least one of them true.
         spacing_mm: grid spacing, mm; the mask's smallest voxel edge if None.
-        band_mm: how far outside the wall distances are kept, mm.
     """
     spacing = float(mask.spacing_mm.min()) if spacing_mm is None else spacing_mm
-    return distance_map_from_surface(surface_from_mask(mask), spacing_mm=spacing, band_mm=band_mm)
+    return distance_map_from_surface(surface_from_mask(mask), spacing_mm=spacing)
 
 
 def add_catheter(

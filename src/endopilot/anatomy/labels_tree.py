@@ -110,9 +110,9 @@ class Labeller:
         heading = last - start.points[0]
         return heading / max(float(np.linalg.norm(heading)), 1e-9)
 
-    def arriving(self, branch: int, reach_mm: float = 12.0) -> Float[np.ndarray, "3"]:
-        """Unit vector along the path over the last `reach_mm` before a branch's end."""
+    def arriving(self, branch: int) -> Float[np.ndarray, "3"]:
+        """Unit vector along the path over the last 12 mm before a branch's end."""
         line = self.tree.path(branch)
-        first = line.points[max(np.searchsorted(line.abscissa, line.abscissa[-1] - reach_mm) - 1, 0)]
+        first = line.points[max(np.searchsorted(line.abscissa, line.abscissa[-1] - 12.0) - 1, 0)]
         heading = line.points[-1] - first
         return heading / max(float(np.linalg.norm(heading)), 1e-9)

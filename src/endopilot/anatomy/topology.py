@@ -163,7 +163,7 @@ def _contacts(lines: MedialLines, mask: Volume) -> list[_Cut]:
     for node in thin:
         if done[node]:
             continue
-        sides = [_crossing(lines, ways, int(node), first) for first in ways[node]]
+        sides = [_crossing(ways, int(node), first) for first in ways[node]]
         if any(side is None for side in sides):
             continue
         (one, path_one), (two, path_two) = sides  # pyright: ignore[reportGeneralTypeIssues, reportOptionalIterable]
@@ -219,7 +219,7 @@ def _without_sides(mask: Volume, lines: MedialLines) -> tuple[Volume, list[str]]
     return replace(mask, voxels=voxels), [text]
 
 
-def _crossing(lines: MedialLines, ways: list[list[int]], node: int, first: int) -> tuple[int, list[int]] | None:
+def _crossing(ways: list[list[int]], node: int, first: int) -> tuple[int, list[int]] | None:
     """Return the fork that a bridge leads to from one of its points, and the bridge's points up to it."""
     path, before = [first], node
     while len(ways[path[-1]]) == 2:

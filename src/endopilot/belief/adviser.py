@@ -13,6 +13,8 @@ from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM
 
 _SPACING = 3
 """Periods from one exposure to the next, at least."""
+_ERRED_SHARE = 0.6
+"""Share of δ at which Δtip's band asks for X-ray once the model has erred, found on patients to improve agents on."""
 
 
 @settings
@@ -57,8 +59,12 @@ class XrayAdviser:
     Between exposures it watches two bands. Where that of Δtip is as wide as δ, an exposure is due. Of that of γtip it
     uses the share that the calibration found. This, over the clearance of the lumen there, lies below τ, above it, or
     across it. Below, nothing threatens; above, the tip is known to be at the wall; across, either may be. An exposure
-    is due where the band reaches τ, where the predicted tip crosses it, and where the band has left it below. It shows
-    what is within 0.5 s of it, so none follows another sooner than after 1.5 s.
+    is due where the band reaches τ, where the predicted tip crosses it, and where the band has left it below; and as
+    long as the last exposure showed the tip on the other side of τ than it is predicted. It shows what is within 0.5 s
+    of it, so none follows another sooner than after 1.5 s.
+
+    A model that has erred is trusted less: an exposure is due as long as the band lies across τ, and where that of Δtip
+    is 0.6 δ wide.
 
     Attributes:
         half_width: of the whole bands of Δtip and γtip at the last call of `advise`, mm, a row for each navigation.
@@ -85,7 +91,9 @@ class XrayAdviser:
         """
         self._proximal, self._travel = proximal, np.zeros(len(proximal))
         self._since = np.zeros(len(proximal), dtype=int)
-        self._beyond = [self._ratio(tip[:, 1], radius_mm) >= self._config.wall_ratio] * 5
+        self._beyond = [self._is_beyond(tip[:, 1], radius_mm)] * 5
+        self._shown = self._beyond[0]
+        self._is_shown = np.zeros(len(proximal), dtype=bool)
 
     def advise(
         self,
@@ -97,6 +105,7 @@ class XrayAdviser:
         *,
         factor: Float[np.ndarray, "2"] | float = 1.0,
         always: bool = False,
+        erred: bool = False,
         wall_mm: Float[np.ndarray, "n"] | float = 0.0,
     ) -> Bool[np.ndarray, "n"]:
         """Return for which navigations X-ray is due now, a period after the last call.
@@ -110,6 +119,7 @@ class XrayAdviser:
                 not given.
             factor: by which the bands are wider than they are calibrated.
             always: whether an exposure is due whenever the last is 1.5 s ago.
+            erred: whether the model has erred by more than its calibration knows.
             wall_mm: by which the lumen's radius may be another than it is given, mm, which the calibration does not
                 know: a tip on the wall is then off by as much, and the edges of that band count too.
         """
@@ -120,9 +130,12 @@ class XrayAdviser:
         edges = [tip[:, 1] + off for off in (used, 0.0, -used, wall_mm, -wall_mm)]
         half[:, 1] = np.hypot(half[:, 1], wall_mm)
         self.half_width = half
-        beyond = [self._ratio(edge, radius_mm) >= self._config.wall_ratio for edge in edges]
+        beyond = [self._is_beyond(edge, radius_mm) for edge in edges]
         crossed = np.any([now & ~before for now, before in zip(beyond, self._beyond, strict=True)], axis=0)
-        due = (crossed | (half[:, 0] >= self._config.abscissa_mm) | always) & (self._since >= _SPACING)
+        across = np.any(beyond, axis=0) & ~np.all(beyond, axis=0)
+        disagrees = self._is_shown & (beyond[1] != self._shown)
+        wide = half[:, 0] >= self._config.abscissa_mm * (_ERRED_SHARE if erred else 1.0)
+        due = (crossed | disagrees | wide | (across & erred) | always) & (self._since >= _SPACING)
         self._beyond = [np.where(crossed & ~due, before, now) for now, before in zip(beyond, self._beyond, strict=True)]
         self._since, self._travel = np.where(due, 0, self._since), np.where(due, 0.0, self._travel)
         return due
@@ -134,9 +147,10 @@ class XrayAdviser:
             half = np.hypot(half, ndtri(0.5 + 0.5 * self._calibration.level) * play)
         return half
 
-    def exposed(self) -> None:
-        """Take an exposure that was asked for elsewhere: the bands begin anew."""
+    def exposed(self, offset_mm: Float[np.ndarray, "n"], radius_mm: Float[np.ndarray, "n"]) -> None:
+        """Take what an exposure shows: γtip, and the radius of the lumen there, mm; the bands begin anew."""
         self._since, self._travel = np.zeros_like(self._since), np.zeros_like(self._travel)
+        self._shown, self._is_shown = self._is_beyond(offset_mm, radius_mm), np.ones(len(self._since), dtype=bool)
 
-    def _ratio(self, offset_mm: Float[np.ndarray, "n"], radius_mm: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        return safety_ratio(offset_mm, radius_mm, self._wire_radius_mm)
+    def _is_beyond(self, offset_mm: Float[np.ndarray, "n"], radius_mm: Float[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+        return safety_ratio(offset_mm, radius_mm, self._wire_radius_mm) >= self._config.wall_ratio

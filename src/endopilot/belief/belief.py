@@ -14,14 +14,15 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from endopilot.anatomy.projection import TipProjector
 from endopilot.belief.drives import Drives
-from endopilot.belief.vessels import Vessels
+from endopilot.belief.turned_wires import Fans, shifted, turned
+from endopilot.belief.vessels import SharedVessels
 from endopilot.devices.device import lateral_reach
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Proximals
@@ -35,8 +36,6 @@ from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.types import TipProjection
 from endopilot.xray.fluoroscope import TipMeasurement
 
-_SIDES = 16
-"""Angles that a wire is turned to where its rotation is looked for."""
 _PLACED_MM = 0.5, 0.15
 """Scales of the errors, along and across the wire, of a tip whose proximal end is where it is believed, mm."""
 _SURE_SDS = 3.0
@@ -136,7 +135,7 @@ class Belief:
         config: BeliefConfig,
         *,
         drives: Drives | None = None,
-        vessels: Vessels | None = None,
+        vessels: SharedVessels | None = None,
         motion: Motion | None = None,
     ) -> None:
         """Bring every member's wire to the start of the navigation.
@@ -149,7 +148,7 @@ class Belief:
             vessels: that other beliefs have prepared.
             motion: of the vessel, if one was found.
         """
-        self.motion = motion
+        self.motion, self._given = motion, navigation
         self.navigation = navigation if motion is None else replace(navigation, known_motion=motion)
         self.members, self.config = tuple(members), config
         self._accuracy_mm = config.along_sd_mm, config.across_sd_mm
@@ -157,26 +156,25 @@ class Belief:
         self._limits = [DriveLimits.of(each, navigation.anatomy) for each in navigation.devices]
         fastest = np.array([limits.fastest for limits in self._limits])
         self.drives = drives or Drives(navigation.robot, navigation.start, fastest)
-        self._fans = dict[int, Simulator]()
         self.ostium_mm = np.array([each.ostium_mm for each in self.members])
-        self.vessels = vessels or Vessels(navigation.anatomy)
+        self.vessels = vessels or SharedVessels(navigation.anatomy)
         self.kinds, self.kind = self.vessels.kinds(navigation.stack, self.members)
+        self._fans = Fans(self.kinds, self.navigation.known_motion, self._core)
         self.error, self.force = np.zeros((len(self.members), 2)), np.zeros(len(self.members))
         self._score, self._coaxial = np.zeros(len(self.members)), bool(navigation.catheters)
         self.evidence = 0.0
         self.shown: list[tuple[Float[np.ndarray, "members 3"], Float[np.ndarray, "members 3"]]] = []
         self.tip = self.simulator.project()[:, 0]
 
-    def like(self, members: Sequence[World], motion: Motion | None = None, *, drives: Drives | None = None) -> Belief:
+    def like(self, members: Sequence[World], **changed: Any) -> Belief:
         """Return a belief of other members about the same devices, at the start of the navigation.
 
         Args:
             members: what each takes reality to be.
-            motion: of the vessel, if another was found.
-            drives: where the devices are, if not where these have them.
+            changed: `drives` and `motion`, where they are not to be those of this belief.
         """
-        others = {"drives": drives or self.drives, "vessels": self.vessels, "motion": motion or self.motion}
-        return Belief(self.navigation, members, self.config, **others)
+        kept = {"drives": self.drives, "vessels": self.vessels, "motion": self.motion}
+        return Belief(self._given, members, self.config, **kept | changed)
 
     @staticmethod
     def around(config: BeliefConfig) -> tuple[World, ...]:
@@ -261,10 +259,18 @@ class Belief:
         """
         self.drives.follow(devices)
         if load and self.drives.lose:
-            core, pushed_n = self.simulator.config, self.simulator.base_load[self.best, 0, 0]
-            valve = core.introducer_friction_n, core.introducer_drag_n_s_mm
-            self.drives.feel(0, load[0][0], pushed_n=float(pushed_n), valve=valve)
+            self.drives.feel(0, load[0][0], pushed_n=self.pushed_n, valve=self.valve)
         self._move(self.drives.proximal)
+
+    @property
+    def pushed_n(self) -> float:
+        """Force that the likeliest wire ahead of the introducer's valve takes of its drive, N."""
+        return float(self.simulator.base_load[self.best, 0, 0])
+
+    @property
+    def valve(self) -> tuple[float, float]:
+        """Friction of the introducer's valve, N, and its drag, N·s/mm."""
+        return self.simulator.config.introducer_friction_n, self.simulator.config.introducer_drag_n_s_mm
 
     def _move(self, proximal: Float[np.ndarray, "devices 2"]) -> None:
         """Move every member's proximal ends to where they are believed to be, in one decision period."""
@@ -368,10 +374,11 @@ class Belief:
         """Update where the wire's proximal end is believed; return how far the likeliest tip moves by that, mm."""
         best, drives = self.best, self.drives
         before = drives.proximal[0].copy()
-        fan = self._fan(best) if drives.sd[0, 1] > _SURE_RAD else None
+        fan = self._fans.of(int(self.kind[best]), best, self.simulator) if drives.sd[0, 1] > _SURE_RAD else None
+        place = self.navigation.anatomy, int(self.tip.branch[best]), float(self.tip.abscissa[best])
         left = drives.samples(0) - before
-        tip, along = self._turned(best, left[:, 1], fan)
-        error = measured.position - tip - self._shifted(best, left[:, 0])
+        tip, along = turned(self.simulator, best, left[:, 1], fan)
+        error = measured.position - tip - shifted(*place, left[:, 0])
         shift = np.einsum("si,si->s", error, along)
         across = np.linalg.norm(error - shift[:, None] * along, axis=1)
         errors = np.column_stack([shift, across])
@@ -380,63 +387,8 @@ class Belief:
         scaled = errors / np.maximum(_PLACED_MM, measured.sd_mm)
         drives.weigh(0, -np.log1p(scaled**2).sum(axis=1))
         moved = (drives.proximal[0] - before)[:, None]
-        return (self._turned(best, moved[1], fan)[0] - self._end(self.simulator)[best] + self._shifted(best, moved[0]))[
-            0
-        ]
-
-    def _turned(
-        self, best: int, turn: Float[np.ndarray, "n"], fan: Simulator | None
-    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-        """Return the end of a member's wire, turned by some angles, rad, and its direction there; LPS mm."""
-        if fan is None:
-            end, direction = self._end(self.simulator)[best], self.simulator.tip_direction[best, 0]
-            return np.tile(end, (len(turn), 1)), np.tile(direction, (len(turn), 1))
-        ends, directions = self._end(fan), fan.tip_direction[:, 0]
-        place = (turn % (2 * np.pi)) * _SIDES / (2 * np.pi)
-        low = place.astype(int) % _SIDES
-        share = (place % 1.0)[:, None]
-        mixed = [(1 - share) * each[low] + share * each[(low + 1) % _SIDES] for each in (ends, directions)]
-        return mixed[0], mixed[1] / np.maximum(np.linalg.norm(mixed[1], axis=1, keepdims=True), 1e-9)
-
-    def _end(self, simulator: Simulator) -> Float[np.ndarray, "worlds 3"]:
-        """Return the end that X-ray shows of each world's devices, LPS mm."""
-        return simulator.tip_position[:, 0]
-
-    def _fan(self, best: int) -> Simulator:
-        """Return copies of a member, each turned by another angle, those to more than half a turn backwards."""
-        kind = int(self.kind[best])
-        if kind not in self._fans:
-            anatomy, stack = self.kinds[kind]
-            self._fans[kind] = Simulator(
-                anatomy,
-                stack,
-                worlds=_SIDES,
-                motion=self.navigation.known_motion,
-                config=self._core,
-                sharing=[self.simulator],
-            )
-        fan, side = self._fans[kind], 2 * np.pi * np.arange(_SIDES) / _SIDES
-        fan.copy_worlds(np.full(_SIDES, best), of=self.simulator)
-        control = np.zeros((_SIDES, fan.devices, 2))
-        control[:, 0, 1] = np.where(side > np.pi, side - 2 * np.pi, side) / DECISION_PERIOD_S
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # one that fails stays where it was
-            fan.step(control, DECISION_PERIOD_S)
-        return fan
-
-    def _shifted(self, best: int, along_mm: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
-        """Return how far a member's tip moves, mm, that goes some way along the vessel."""
-        line = self.navigation.anatomy.tree.path(int(self.tip.branch[best]))
-        at = float(self.tip.abscissa[best])
-        insertion = self.navigation.anatomy.insertion
-        behind = np.array([-20.0, -10.0])
-        abscissa = np.concatenate([behind, line.abscissa])
-        points = np.concatenate([insertion.position + behind[:, None] * insertion.direction, line.points])
-        there, here = (
-            np.column_stack([np.interp(x, abscissa, axis) for axis in points.T])
-            for x in (at + along_mm, np.array([at]))
-        )
-        return there - here
+        end = turned(self.simulator, best, moved[1], fan)[0]
+        return (end - self.simulator.tip_position[best, 0] + shifted(*place, moved[0]))[0]
 
     def likeliest(self) -> tuple[Int[np.ndarray, "kinds"], Float[np.ndarray, "kinds"]]:
         """Return the likeliest member of every kind, and how likely each kind is."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -18,7 +18,6 @@ from scipy.special import ndtr, ndtri
 from endopilot.belief.belief import Belief, BeliefConfig, Past
 from endopilot.errors import InputError
 from endopilot.models.ensemble import likelihoods
-from endopilot.settings import Within, settings
 from endopilot.simulation.world import World
 
 RANGES: Mapping[str, tuple[float, float]] = {
@@ -69,18 +68,9 @@ _SHRINKS, _NARROWEST, _LEAST_OF_A_WALL = 0.7, 0.04, 2
 so many kinds have each kind of wall at least."""
 _UNEXPLAINED = 3.0
 """A member that errs by this many of the scales at every exposure is as likely as none of all."""
-
-
-@settings
-class IdentificationConfig:
-    """How many members are tried."""
-
-    kinds: Annotated[int, Within(4, 1000)] = 8
-    """Wires in vessels that are tried in a generation; a third of the first ones in a compliant vessel."""
-    each: Annotated[int, Within(1, 1000)] = 8
-    """Frictions and ostia that are tried with each."""
-    generations: Annotated[int, Within(1, 10)] = 2
-    """Generations."""
+_KINDS, _EACH, _GENERATIONS = 8, 8, 2
+"""Wires in vessels that are tried in a generation, a third of the first ones in a compliant vessel; frictions and ostia
+that are tried with each; and generations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,35 +98,31 @@ class Identified:
         return found if self.explains else f"nothing explains the images well; likeliest {found}"
 
 
-def identify(
-    belief: Belief, past: Past, *, config: IdentificationConfig | None = None, seed: int = 0
-) -> tuple[Belief, Identified]:
+def identify(belief: Belief, past: Past, *, seed: int = 0) -> tuple[Belief, Identified]:
     """Find what explains the exposures of a navigation so far.
 
     Args:
         belief: that does not explain them, or not well.
         past: of the navigation.
-        config: how much is tried.
         seed: of the members that are drawn.
 
     Returns:
         The belief that takes its place, at the same moment, and what was found.
     """
-    config = config or IdentificationConfig()
     random = np.random.default_rng([seed, len(past.proximal), 0x1DE])
     ostium = _ostium(belief, past)
     if len(past.proximal) == 1:  # nothing but the ostium shows before the wire moves
         return _deeper(belief, past, *ostium)
-    theta, walls = _first(config, ostium, random)
+    theta, walls = _first(ostium, random)
     lumens = _LUMENS if belief.navigation.anatomy.distance_map.values.size <= _LARGEST_MAP else (1.0,)
     members, score, weight, explains = _weighed(belief, past, theta, walls, lumens)
-    for _ in range(config.generations - 1):
-        theta, walls = _redrawn(theta, walls, weight, config, random)
+    for _ in range(_GENERATIONS - 1):
+        theta, walls = _redrawn(theta, walls, weight, random)
         members, score, weight, explains = _weighed(belief, past, theta, walls, lumens)
     flat = theta.reshape(-1, len(RANGES))
     interval = {name: _interval(name, flat[:, k], weight) for k, name in enumerate(RANGES)}
-    compliant = float(weight[np.repeat(walls, config.each)].sum())
-    found = belief.like(_chosen(members, score, weight, config.each, belief.config))
+    compliant = float(weight[np.repeat(walls, _EACH)].sum())
+    found = belief.like(_chosen(members, score, weight, _EACH, belief.config))
     found.replay(past)
     return found, Identified(interval, compliant, explains)
 
@@ -180,13 +166,11 @@ def _deeper(belief: Belief, past: Past, ostium_mm: float, sd_mm: float) -> tuple
 Theta = Float[np.ndarray, "kinds each parameters"]
 
 
-def _first(
-    config: IdentificationConfig, ostium: tuple[float, float], random: np.random.Generator
-) -> tuple[Theta, np.ndarray]:
+def _first(ostium: tuple[float, float], random: np.random.Generator) -> tuple[Theta, np.ndarray]:
     """Return evenly spread parameters: the first kind is as given, and ostia are about where the first image has it."""
     from scipy.stats import qmc  # slow to import
 
-    kinds, each = config.kinds, config.each
+    kinds, each = _KINDS, _EACH
     of_kind = qmc.Sobol(_OF_KIND, rng=random).random(kinds)
     of_kind[0] = [_to_unit(name, 1.0) for name in list(RANGES)[:_OF_KIND]]
     rest = qmc.Sobol(len(RANGES) - _OF_KIND, rng=random).random(kinds * each).reshape(kinds, each, -1)
@@ -269,7 +253,7 @@ def _tempered(score: Float[np.ndarray, "n"], least: float) -> Float[np.ndarray, 
 
 
 def _redrawn(
-    theta: Theta, walls: np.ndarray, weight: np.ndarray, config: IdentificationConfig, random: np.random.Generator
+    theta: Theta, walls: np.ndarray, weight: np.ndarray, random: np.random.Generator
 ) -> tuple[Theta, np.ndarray]:
     """Draw the next generation around the likeliest members, as kernels that keep mean and variance (Liu and West)."""
     kinds, each, count = theta.shape

@@ -9,16 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
 
-from endopilot.belief.adviser import AdviserConfig, XrayAdviser
-from endopilot.belief.allowance import Allowance
+from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig, Past
 from endopilot.belief.drives import UNKNOWN
 from endopilot.belief.identification import Identified, identify
-from endopilot.belief.innovations import Innovations
+from endopilot.belief.loads import LoadRatio
 from endopilot.belief.patient_motion import FoundMotion, find_motion
+from endopilot.belief.watch import AdviserInput, Watch
 from endopilot.devices.stack import Proximals
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.xray.fluoroscope import TipMeasurement
@@ -36,11 +35,6 @@ _BETTER = 3.0
 """What is found must explain all exposures better by this logarithm."""
 MISMATCH = "model mismatch"
 """Why X-ray is asked for while the model is taken to be wrong."""
-AdviserInput = tuple[
-    Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1"]
-]
-"""What an adviser is given of a navigation: (Δ, φ), mm and rad; (Δtip, γtip), mm; the spread (standard deviation) of
-these as the model states it, mm; and the lumen's radius at the tip, mm."""
 
 
 @dataclass(frozen=True)
@@ -100,22 +94,25 @@ class Monitor:
         self._advice = advice or AdviserConfig()
         self._given = Belief.around(self._config)
         self.belief = Belief(navigation, self._given, self._config)
-        self._adviser = XrayAdviser(calibration, self._advice, navigation.device.tip_radius_mm)
-        self._innovations, self.past, self.lost = Innovations(), Past(), False
+        self.past, self.lost = Past(), False
         self.identified: Identified | None = None
         self.moves: FoundMotion | None = None
         self.seen: TipMeasurement | None = None
-        self._tests = not navigation.catheters
+        self._tests, self._loads = not navigation.catheters, LoadRatio()
         self.changes_left, self._since, self._returned = _MOST, 0, False
-        proximal, tip, spread, radius = adviser_input(self.belief)
-        self._allowance = Allowance(proximal[0, 0], tip[0, 0], alone=self._tests)
-        self._adviser.start(proximal, tip, radius)
-        self._half = self._adviser.widths(spread)[0]
+        tip_radius_mm, at = navigation.device.tip_radius_mm, adviser_input(self.belief)
+        self._watch = Watch(calibration, self._advice, tip_radius_mm, at, alone=self._tests)
+        self._innovations = self._watch.innovations
 
     @property
     def alarm(self) -> bool:
         """Whether the model is taken to be wrong."""
         return self._innovations.alarm
+
+    @property
+    def load_ratio(self) -> float:
+        """How much harder the drive surely pushes than the belief predicts: 1 where it does not, or is not measured."""
+        return self._loads.value
 
     def step(self, encoders: Proximals, load: Proximals = (), exposure: TipMeasurement | None = None) -> BelievedTip:
         """Take what is measured, a period after the last, and return where the tip is believed and what is asked for.
@@ -128,21 +125,23 @@ class Monitor:
         period = len(self.past.proximal)
         self.past.measured.append((encoders, load, self.belief.drives.commanded))
         if period:
+            commanded = self.belief.drives.commanded
             self.belief.follow(encoders, load)
+            if load and commanded and self._tests:
+                read_n, pushed_n, speed_mm_s = load[0][0], self.belief.pushed_n, commanded[0][0]
+                self._loads.take(read_n, pushed_n, speed_mm_s=speed_mm_s, valve=self.belief.valve)
         else:
             self.belief.drives.begin(encoders)
         self.past.proximal.append(self.belief.drives.proximal.copy())
-        proximal, tip, spread, radius = adviser_input(self.belief)
-        self._allowance.move(proximal[0, 0], tip[0, 0])
+        at = adviser_input(self.belief)
+        self._watch.move(at)
         self.seen = None
         if exposure is not None:
             self.seen = seen = self.belief.in_vessel(exposure, period)
             if self._tests:
-                self._innovations.take(np.array([seen.abscissa, seen.offset]) - tip[0], self._half, exposure.tip_sd_mm)
+                self._watch.compare(np.array([seen.abscissa, seen.offset]) - at[1][0], exposure.tip_sd_mm)
             self.past.exposures[period] = exposure
             self.belief.weigh(seen)
-            self._adviser.exposed()
-            self._allowance.exposed()
             self.lost = not self.belief.explains(seen)
             self._innovations.alarm |= self.lost and self._tests
             self._since += 1
@@ -150,20 +149,14 @@ class Monitor:
                 self._renew()
             elif self._is_to_change():
                 self._identify()
-            proximal, tip, spread, radius = adviser_input(self.belief)
+            at = adviser_input(self.belief)
+            self._watch.exposed(self.seen.offset, at)
         elif self.belief.drives.proximal[0, 0] <= self._navigation.start_inserted_length_mm:
             self.lost = False  # back where it began, the wire lies as it did, unseen in its catheter
-        factor = self._innovations.factor
-        wider = {"factor": factor, "always": self.alarm, "wall_mm": self._allowance.wall_mm(radius)}
-        due = bool(self._adviser.advise(proximal, tip, spread, radius, self._further_sd(), **wider)[0])
-        self._half = self._adviser.half_width[0] / factor
-        return self._believed(tip[0], due)
-
-    def _further_sd(self) -> Float[np.ndarray, "1 2"]:
-        """Return the standard deviations of (Δtip, γtip) that no calibration knows of, mm."""
-        held = self._allowance.sd_mm
         motion = _MOTION_SD_MM * (self.belief.motion is not None)
-        return np.sqrt(self.belief.play_spread() ** 2 + motion**2 + held**2)[None]
+        changed = self.identified is not None or self.moves is not None or self.belief.drives.unknown
+        due = self._watch.advise(at, self.belief.play_spread() ** 2 + motion**2, changed=changed)
+        return self._believed(at[1][0], due)
 
     @property
     def may_return(self) -> bool:
@@ -171,12 +164,25 @@ class Monitor:
         return self.identified is not None and not self._returned
 
     def return_to_given(self) -> None:
-        """Take wire, lumen and wall as they are given again, with the ostium that was identified, if that may be."""
+        """Take wire, lumen and wall as they are given again, with the ostium that was identified, if that may be.
+
+        A motion that was found is given up too, unless all exposures are still likelier with it.
+        """
         if self.may_return:
             ostium_mm = float(self.belief.weight @ self.belief.ostium_mm)
             given = [replace(each, ostium_mm=each.ostium_mm + ostium_mm) for each in Belief.around(self._config)]
-            self.belief, self._returned = self.belief.like(given), True
-            self.belief.replay(self.past)
+            tried = [self.belief.like(given, motion=None)]
+            if self.moves is not None:
+                tried.append(self.belief.like(given))
+            for each in tried:
+                each.replay(self.past)
+            still, found = tried[0], tried[-1]
+            if found.evidence < still.evidence + _BETTER:
+                found, self.moves = still, None
+            self.belief, self._returned = found, True
+            period = len(self.past.proximal) - 1
+            if self.seen is not None:
+                self.seen = self.belief.in_vessel(self.past.exposures[period], period)
 
     def _is_to_change(self) -> bool:
         """Return whether another belief is sought: the first does not explain the images, or no longer the last one."""
@@ -201,7 +207,7 @@ class Monitor:
 
     def _renew(self) -> None:
         """Begin with another belief."""
-        self._since = 0
+        self._since, self._loads = 0, LoadRatio()
         self._innovations.renew()
         period = len(self.past.proximal) - 1
         self.seen = self.belief.in_vessel(self.past.exposures[period], period)
@@ -232,7 +238,7 @@ class Monitor:
             found = find_motion(tip, direction, seen, times_s, np.asarray(given.anatomy.insertion.position))
             if found.gain < _LEAST_GAIN or found.misfit > _MOST_MISFIT:
                 return False
-            tried = self.belief.like(members, found.motion, drives=drives)
+            tried = self.belief.like(members, motion=found.motion, drives=drives)
             tried.replay(past)
         if tried.evidence < self.belief.evidence + _BETTER:
             return False
@@ -252,7 +258,7 @@ class Monitor:
         if self.lost:
             asks = "no simulated wire explains the last image" if due or not self._tests else ""
             return BelievedTip(abscissa, offset, (np.inf, np.inf), asks, found)
-        along, across = self._adviser.half_width[0].tolist()
+        along, across = self._watch.half_width.tolist()
         wide = along >= self._advice.abscissa_mm
         asks = f"Δtip is known to ±{along:.1f} mm only" if wide else "the tip may be reaching the wall"
         asks = MISMATCH if self.alarm else asks

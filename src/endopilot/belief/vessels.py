@@ -1,4 +1,4 @@
-"""The vessels and devices that members of a belief have: `Vessels`."""
+"""The vessels and devices that members of a belief have: `SharedVessels`."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.world import World
 from endopilot.types import Anatomy
 
-_OF_VESSEL = "lumen_factor", "lumen_mm", "axis_deg", "axis_side_deg"
+_OF_VESSEL = "lumen_factor", "lumen_mm", "occluded", "stenosis", "axis_deg", "axis_side_deg"
 """What of a `World` makes another vessel."""
 
 
-class Vessels:
+class SharedVessels:
     """The vessels of a navigation, with one lumen and another, which beliefs share: preparing one takes a second.
 
     Attributes:

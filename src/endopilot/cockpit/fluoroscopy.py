@@ -70,11 +70,7 @@ class XrayUnit:
     """
 
     def __init__(
-        self,
-        anatomy: Anatomy,
-        make_imager: Callable[[Volume | None], XrayImager],
-        ct: Volume | None = None,
-        settings: XraySettings | None = None,
+        self, anatomy: Anatomy, make_imager: Callable[[Volume | None], XrayImager], ct: Volume | None = None
     ) -> None:
         """Set the C-arm up; its first view is computed in the background.
 
@@ -82,12 +78,10 @@ class XrayUnit:
             anatomy: the vessel.
             make_imager: of this patient, from a CT or none.
             ct: of the patient, HU; a phantom's for a coronary artery if not given, else plain water.
-            settings: how the C-arm stands at first.
         """
-        self.settings = settings or XraySettings()
+        self.settings = XraySettings()
         self.pedal, self.frames, self.seconds, self.kerma_ugy = False, 0, 0.0, 0.0
         self.background = "plain" if ct is None else "CT"
-        self._images: dict[int, bytes] = {}
         self._image_s = self._contrast_s = -np.inf
         self._next_s = 0.0
         self._planes: dict[tuple[Any, ...], Plane] = {}
@@ -165,12 +159,7 @@ class XrayUnit:
             image = self._imager.grey(signal, roadmap=roadmap)
             header = {"plane": number, "angles_deg": key[0], "frame": self.frames, "time_s": round(snapshot.time_s, 4)}
             messages.append(encode("image", header, grey=image))
-            self._images[number] = messages[-1]
         return messages
-
-    def held(self) -> list[bytes]:
-        """Return the last images, for a page that comes later."""
-        return list(self._images.values())
 
     def values(self, now_s: float) -> dict[str, Any]:
         """Return what the page shows of the unit at a time of the world, s."""

@@ -9,95 +9,35 @@ from there.
 from __future__ import annotations
 
 import time
-from dataclasses import field, replace
-from pathlib import Path
-from typing import Annotated
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
 from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import Calibration
-from endopilot.belief.belief import Belief, BeliefConfig
+from endopilot.belief.belief import Belief
 from endopilot.belief.monitor import BelievedTip, Monitor
+from endopilot.control.agent_config import AgentConfig, read_agent_calibration
 from endopilot.control.course import Course
 from endopilot.control.follow import Follower
 from endopilot.control.search import Search, check_devices
-from endopilot.control.search_config import SearchConfig
 from endopilot.devices.stack import Proximals
-from endopilot.errors import InputError
 from endopilot.navigation.policy import Decision, Observation
 from endopilot.progress import Advance
-from endopilot.settings import Positive, Within, settings
 from endopilot.simulation.world import World
-from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, XrayKind
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.tasks.route import Route, check_passable
 from endopilot.xray.fluoroscope import TipMeasurement
 
-CALIBRATIONS: dict[tuple[XrayKind, int], Path] = {
-    ("assumed", 1): Path(__file__).parent,
-    ("images", 1): Path(__file__).parent / "images",
-    ("assumed", 2): Path(__file__).parent / "coaxial",
-}
-"""Where the calibrations of the agent's ensembles lie, by how exposures find the tip and by the number of devices."""
-
-
-@settings
-class AgentConfig:
-    """Settings of an agent: search, belief, and when the plan or the wire counts as lost."""
-
-    search: SearchConfig = field(default_factory=SearchConfig)
-    """The search for a course."""
-    belief: BeliefConfig = field(default_factory=BeliefConfig)
-    """The simulated wires."""
-    off_course_mm: Positive = 2.5
-    """Another course is searched when the likeliest tip is this far along the centerline from where it should be, mm.
-    """
-    tries: Annotated[int, Within(1, 100)] = 3
-    """Failed searches, one after another and each from where the last has led, after which the agent gives up."""
-
-    @staticmethod
-    def of(navigation: Navigation) -> AgentConfig:
-        """Return the settings for a navigation by a wire alone, in a wide lumen or not, or by one in a catheter."""
-        if navigation.catheters:
-            return IN_CATHETER
-        wide = Route.to(navigation.anatomy, navigation.target).is_wide(navigation.target.abscissa)
-        return IN_WIDE_LUMEN if wide else AgentConfig()
-
-
-IN_WIDE_LUMEN = AgentConfig(
-    belief=BeliefConfig(
-        members=24,
-        ostium_spread_mm=3.5,
-        element_mm=1.25,
-        time_step_s=0.1,
-        lost_along_mm=6.0,
-        lost_across_mm=2.5,
-        lost_across_radii=0.3,
-    ),
-)
-"""Settings of an agent of a wire alone on a route through a wide lumen, such as an aorta. The wire lies more freely in
-it, and the place of the ostium is known less well; bends are wide, so that longer elements and steps do."""
-IN_CATHETER = AgentConfig(
-    search=SearchConfig(speed_mm_s=5.0),
-    belief=BeliefConfig(
-        members=4,
-        stiffness_levels=1,
-        element_mm=1.25,
-        lost_along_mm=5.0,
-        lost_across_mm=2.5,
-        lost_across_radii=0.5,
-    ),
-    off_course_mm=3.0,
-    tries=2,
-)
-"""Settings of an agent of a wire in a catheter."""
 _WIRE_CREEP_MM_S = 2.0
 """Fastest translation of a wire that should have arrived, and that X-ray shows beside its target, mm/s."""
 _CLEAR_MM = 4.0
 """A wire that is lost is pulled back by this much at least before it is looked at again, mm."""
 _LOSSES = 4
 """Times that the wire is lost, after which the agent gives up: each time another belief was sought."""
+_HARDER = 1.1
+"""Another course is searched where the drive pushes this many times harder than the last one was searched for."""
 _CREEP_MM_S, _CREEP_PERIODS = 1.0, 6
 """A catheter, which X-ray does not show, is moved ahead and back by this where it should have arrived, for as many
 periods and twice."""
@@ -367,6 +307,10 @@ class AgentPolicy(_PlanningPolicy):
     def decide(self, observation: Observation) -> Decision:
         """Follow the course as the module describes; end where belief after belief was lost."""
         decision = super().decide(observation)
+        if decision.gives_up and self._harder > 1:
+            given = f"{self.navigation.force_limit_n:g} N is given"
+            harder = f"the drive pushes {self._harder:.1f} times as hard as simulated wires"
+            return replace(decision, gives_up=f"{decision.gives_up}: {given}, and {harder}")
         if self._losses < _LOSSES or decision.gives_up:
             return decision
         seen = self.monitor.seen
@@ -383,10 +327,25 @@ class AgentPolicy(_PlanningPolicy):
         if self.belief is not monitor.belief:  # another wire, lumen or ostium: another course
             self.belief, self._failed = monitor.belief, 0
             self._search, self._follower = self._new_search(), self._new_follower()
+        self._limit_load()
         if monitor.seen is not None:
             self._located(monitor.seen, lost=monitor.lost)
         self._lost = monitor.lost
         self._losses += self._lost and not before
+
+    def _limit_load(self) -> None:
+        """Search another course where the drive pushes so hard that the wall would press with more than is safe."""
+        course, ratio = self._follower.course, self.monitor.load_ratio
+        if course is None or ratio < _HARDER * self._harder:
+            return
+        if course.force[self._follower.at :].max(initial=0.0) * ratio > self.navigation.force_limit_n:
+            self._search, self._follower = self._new_search(), self._new_follower()
+
+    def _new_search(self) -> Search:
+        """Return a search in which walls press as much harder as the drive is felt to push."""
+        self._harder, given = self.monitor.load_ratio, self.belief.navigation
+        navigation = replace(given, force_limit_n=given.force_limit_n / self._harder)
+        return Search(navigation, self.route, self.belief, config=self.config.search, seed=self._seed)
 
     def _tries_another(self) -> bool:
         return self.monitor.may_return
@@ -402,21 +361,3 @@ class AgentPolicy(_PlanningPolicy):
             asks = "a manoeuvre is over" if self._shows else asks
             asks = "the tip should be at the target" if self._arrived else asks
         return replace(self._believed, asks=asks)
-
-
-def read_agent_calibration(xray: XrayKind, devices: int) -> Calibration:
-    """Return the calibration of the agent's ensemble.
-
-    Args:
-        xray: how exposures find the tip.
-        devices: 1 for a wire alone, 2 with a catheter.
-
-    Raises:
-        InputError: there is none.
-    """
-    if (xray, devices) not in CALIBRATIONS:
-        raise InputError(
-            f"policy: the agent is not calibrated for xray: {xray} with {devices - 1} catheters; give a wire alone, or "
-            "xray: assumed and one catheter"
-        )
-    return Calibration.read(CALIBRATIONS[xray, devices])

@@ -13,9 +13,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.belief.bands import Calibration
 from endopilot.belief.monitor import BelievedTip, Monitor
-from endopilot.control.agent import AgentConfig, read_agent_calibration
+from endopilot.control.agent_config import AgentConfig, read_agent_calibration
 from endopilot.control.fork_view import ForkView
 from endopilot.control.push import stand_off
 from endopilot.control.turn_network import AZIMUTH, TurnNetwork
@@ -56,14 +55,9 @@ _TURNS = 3
 class ClonedPolicy:
     """Turns the wire as a network says, and pushes; X-ray is on when the monitor asks for it."""
 
-    def __init__(self, network: TurnNetwork | None = None, *, calibration: Calibration | None = None) -> None:
-        """Take the network.
-
-        Args:
-            network: how the wire is turned; the package's own if not given.
-            calibration: of the bands around what the simulated wires predict; the agent's if not given.
-        """
-        self._network, self._calibration = network or TurnNetwork.read(NETWORK), calibration
+    def __init__(self, network: TurnNetwork | None = None) -> None:
+        """Take the network by which the wire is turned, the package's own if not given."""
+        self._network = network or TurnNetwork.read(NETWORK)
 
     def start(self, navigation: Navigation, seed: int) -> None:
         """Lay out the simulated wires.
@@ -75,7 +69,7 @@ class ClonedPolicy:
             raise InputError("policy: cloned drives a wire alone; leave the catheters out, or take the agent")
         self.navigation, self.route = navigation, Route.to(navigation.anatomy, navigation.target)
         check_passable(self.route, navigation.device)
-        calibration = self._calibration or read_agent_calibration(navigation.xray, 1)
+        calibration = read_agent_calibration(navigation.xray, 1)
         self.monitor = Monitor(navigation, calibration, config=AgentConfig.of(navigation).belief)
         self._believed = BelievedTip(np.nan, np.nan)
         self._at, self._turns, self._shows = -1, 0, False

@@ -40,7 +40,7 @@ def describe_halt(halt: Halt, at_mm: float, route: Route, navigation: Navigation
     where = f"at {near}" if near else f"at {at_mm:.0f} mm, where no branch leaves,"
     if halt == "pressed":
         limit = (
-            f"{where} it cannot go on with less than {SPARE_SHARE:.0%} of the limit of {navigation.force_limit_n:g} N"
+            f"{where} it cannot go on with less than {SPARE_SHARE:.0%} of the limit of {navigation.force_limit_n:.2g} N"
         )
         return f"{limit} on the wall; give a larger force_limit_n or a softer wire"
     if halt == "slipped":

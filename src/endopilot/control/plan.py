@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.control.agent import AgentConfig, OraclePolicy
+from endopilot.control.agent import OraclePolicy
+from endopilot.control.agent_config import AgentConfig
 from endopilot.control.course import Controls
 from endopilot.control.desired import last_place, read_tips, tips_along
 from endopilot.control.plan_config import NETWORK_METHODS, Plan, PlanConfig, Steps

@@ -15,13 +15,13 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Bool, Float
 
-from endopilot.belief.adviser import AdviserConfig, XrayAdviser
-from endopilot.belief.allowance import Allowance
+from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief
-from endopilot.belief.monitor import AdviserInput, adviser_input
+from endopilot.belief.monitor import adviser_input
 from endopilot.belief.online_predictors import online_predictor
-from endopilot.control.agent import AgentConfig, read_agent_calibration
+from endopilot.belief.watch import AdviserInput, Watch
+from endopilot.control.agent_config import AgentConfig, read_agent_calibration
 from endopilot.control.plan_config import NETWORK_METHODS, Plan
 from endopilot.models.config import WINDOW, run_path
 from endopilot.tasks.route import Route
@@ -70,21 +70,17 @@ def plan_xray(plan: Plan, *, calibration: Calibration | None = None) -> PlannedX
     """
     if calibration is None:
         calibration = read_calibration(plan.config.method, plan.model, len(plan.navigation.devices))
-    model: _Model = _Networks(plan) if plan.config.method in NETWORK_METHODS else _Wires(plan)
-    adviser = XrayAdviser(calibration, AdviserConfig(), plan.navigation.device.tip_radius_mm)
-    proximal, tip, _, radius = model.start()
-    adviser.start(proximal, tip, radius)
-    alone = plan.config.method not in NETWORK_METHODS and not plan.navigation.catheters
-    allowance = Allowance(proximal[0, 0], tip[0, 0], alone=alone)
+    networks = plan.config.method in NETWORK_METHODS
+    model: _Model = _Networks(plan) if networks else _Wires(plan)
+    alone = not networks and not plan.navigation.catheters
+    watch = Watch(calibration, AdviserConfig(), plan.navigation.device.tip_radius_mm, model.start(), alone=alone)
     exposure, half_width = np.zeros(len(plan.control), dtype=bool), np.zeros((len(plan.control), 2))
     for period in range(len(plan.control)):
-        proximal, tip, spread, radius = model.move(period)
-        allowance.move(proximal[0, 0], tip[0, 0])
-        wall_mm = allowance.wall_mm(radius)
-        exposure[period] = adviser.advise(proximal, tip, spread, radius, allowance.sd_mm[None], wall_mm=wall_mm)[0]
-        half_width[period] = adviser.half_width[0]
+        at = model.move(period)
+        watch.move(at)
+        exposure[period], half_width[period] = watch.advise(at), watch.half_width
         if exposure[period]:
-            allowance.exposed()
+            watch.exposed(float(at[1][0, 1]), at)
             model.observe(period)
     return PlannedXray(exposure=exposure, half_width=half_width)
 

@@ -13,8 +13,9 @@ from endopilot.dataset.loader import Dataset
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.set_up import SimulationSetUp
 from endopilot.simulation.simulate import simulate
-from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
+from endopilot.simulation.trajectory import Trajectory
 from endopilot.simulation.world import World
 from endopilot.types import Anatomy
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from endopilot.belief.vessels import SharedVessels
 from endopilot.devices.drive_limits import DriveLimits, within_travel
 from endopilot.devices.robot import IDEAL, DriveConfig, RobotConfig, read_robot
 from endopilot.errors import InputError
@@ -265,13 +266,5 @@ def _common(worlds: Sequence[World], names: str, values: Sequence[Any]) -> Any:
 
 def _vessels(navigations: Sequence[Navigation], worlds: Sequence[World]) -> list[Anatomy]:
     """Return the vessel of each world; worlds with the same differences share one."""
-    nominal, made = World(), {}
-    vessels = []
-    for navigation, world in zip(navigations, worlds, strict=True):
-        names = ("lumen_factor", "lumen_mm", "occluded", "stenosis", "axis_deg", "axis_side_deg")
-        lumen = replace(nominal, **{name: getattr(world, name) for name in names})
-        key = (id(navigation.anatomy), lumen)
-        if key not in made:
-            made[key] = lumen.anatomy(navigation.anatomy)
-        vessels.append(made[key])
-    return vessels
+    made = {id(each.anatomy): SharedVessels(each.anatomy) for each in navigations}
+    return [made[id(each.anatomy)].of(world) for each, world in zip(navigations, worlds, strict=True)]

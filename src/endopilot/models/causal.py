@@ -33,8 +33,8 @@ from endopilot.errors import InputError
 from endopilot.models.config import WINDOW, CausalConfig
 from endopilot.models.episodes import Episodes, EpisodeSetUp
 from endopilot.models.open_loop import EachObserved, Observed, OpenLoop, Prediction, Steps2, begin_after, given_states
-from endopilot.models.play import Direction, Vessels
-from endopilot.models.sequences import N_INPUTS, N_WIRE_INPUTS, Unfolded, prepare_vessels, unfold
+from endopilot.models.play import Direction, PlayTables
+from endopilot.models.sequences import N_INPUTS, N_WIRE_INPUTS, Unfolded, play_tables, unfold
 from endopilot.models.simulated_wires import FRICTION_FACTORS, SimulatedWires
 from endopilot.types import SAMPLE_PERIOD_S
 
@@ -205,7 +205,7 @@ class CausalPredictor:
     forward: CausalNetwork | None
     inverse: CausalNetwork | None
     limits: DriveLimits
-    prepared: WeakKeyDictionary[EpisodeSetUp, tuple[tuple[str, ...], Vessels]] = field(
+    prepared: WeakKeyDictionary[EpisodeSetUp, tuple[tuple[str, ...], PlayTables]] = field(
         default_factory=WeakKeyDictionary, repr=False
     )
     wires: SimulatedWires = field(default_factory=SimulatedWires, repr=False)
@@ -283,11 +283,11 @@ class CausalPredictor:
         inputs, others = (torch.as_tensor(part, dtype=torch.float32) for part in (unfolded.inputs, unfolded.others))
         return unfolded, Mixture.of(network(inputs, others), network.n_guesses)
 
-    def _vessels(self, episodes: Episodes) -> tuple[Vessels, Int[np.ndarray, "episodes"]]:
+    def _vessels(self, episodes: Episodes) -> tuple[PlayTables, Int[np.ndarray, "episodes"]]:
         """Return the tables of the episodes' patients, perhaps of others too, and which row each episode has."""
         names, vessels = self.prepared.get(episodes.setup, ((), None))
         if vessels is None or not set(episodes.anatomy.tolist()) <= set(names):
-            names, vessels = tuple(np.unique(episodes.anatomy).tolist()), prepare_vessels(episodes)
+            names, vessels = tuple(np.unique(episodes.anatomy).tolist()), play_tables(episodes)
             self.prepared[episodes.setup] = names, vessels
         return vessels, np.searchsorted(names, episodes.anatomy)
 

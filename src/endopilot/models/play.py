@@ -48,7 +48,7 @@ class PlayState:
 
 
 @dataclass(frozen=True, eq=False)
-class Vessels:
+class PlayTables:
     """Tables of several patients, padded to one size; the first axis is the patient.
 
     Attributes:
@@ -69,12 +69,12 @@ class Vessels:
     wire_radius_mm: float
 
     @staticmethod
-    def of(patients: Sequence[Patient], device: Wire) -> Vessels:
+    def of(patients: Sequence[Patient], device: Wire) -> PlayTables:
         """Return the tables of patients that were prepared for a device."""
         motions = ("push", "pull")
         push, pull = ([getattr(p, f"{motion}_tip") for p in patients] for motion in motions)
         clearance = (_padded([_clearance(p, motion, device.tip_radius_mm) for p in patients]) for motion in motions)
-        return Vessels(
+        return PlayTables(
             known={
                 "forward": (_padded(push), _padded(pull)),
                 "inverse": (_padded([_inverted(t) for t in pull]), _padded([_inverted(t) for t in push])),

@@ -14,7 +14,7 @@ from endopilot.models import play
 from endopilot.models.config import WINDOW
 from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import jumps
-from endopilot.models.play import PARTIAL_PLAYS, Direction, Vessels
+from endopilot.models.play import PARTIAL_PLAYS, Direction, PlayTables
 from endopilot.models.simulated_wires import FRICTION_FACTORS, WireTips, read_or_simulate
 from endopilot.progress import progress
 
@@ -52,7 +52,7 @@ class Unfolded:
     jump: Bool[np.ndarray, "episodes samples"]
 
 
-def prepare_vessels(episodes: Episodes) -> Vessels:
+def play_tables(episodes: Episodes) -> PlayTables:
     """Return the tables of the episodes' patients, in the order of their names; those not yet prepared are prepared.
 
     Raises:
@@ -64,12 +64,12 @@ def prepare_vessels(episodes: Episodes) -> Vessels:
         for name in names:
             patients.append(episodes.setup.patient(name))
             advance(1, name)
-    return Vessels.of(patients, episodes.setup.device)
+    return PlayTables.of(patients, episodes.setup.device)
 
 
 def unfold(
     direction: Direction,
-    vessels: Vessels,
+    vessels: PlayTables,
     patient: Int[np.ndarray, "episodes"],
     episodes: Episodes,
     observed: Bool[np.ndarray, "episodes samples"],
@@ -189,12 +189,12 @@ class Sequences:
     change: dict[str, Float[Tensor, "episodes forms samples 3"]]
 
     @staticmethod
-    def of(episodes: Episodes, vessels: Vessels, networks: Sequence[str], seed: int) -> Sequences:
+    def of(episodes: Episodes, vessels: PlayTables, networks: Sequence[str], seed: int) -> Sequences:
         """Return the sequences of some episodes.
 
         Args:
             episodes: the navigations, with their true tips.
-            vessels: tables of their patients, as `prepare_vessels` gives them.
+            vessels: tables of their patients, as `play_tables` gives them.
             networks: "ff", "if" or both.
             seed: of the samples at which tips are observed.
         """

@@ -38,7 +38,7 @@ from endopilot.models.config import TrainConfig
 from endopilot.models.episodes import Episodes
 from endopilot.models.learning_curves import tensorboard_writer
 from endopilot.models.process_group import ProcessGroup, joined
-from endopilot.models.sequences import Sequences, prepare_vessels
+from endopilot.models.sequences import Sequences, play_tables
 from endopilot.models.transformer import Network
 from endopilot.models.windows import Windows
 from endopilot.progress import Advance, progress
@@ -139,7 +139,7 @@ def examples_of(dataset: Dataset, split: str, config: TrainConfig) -> Examples:
     episodes = Episodes.of_dataset(chosen)
     if config.model != "causal":
         return Windows.of(episodes)
-    return Sequences.of(episodes, prepare_vessels(episodes), config.networks, config.seed)
+    return Sequences.of(episodes, play_tables(episodes), config.networks, config.seed)
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,16 +37,14 @@ def navigation_scene(
     anatomy: Anatomy,
     rollout: Trajectory | None = None,
     *,
-    world: int = 0,
     devices: Sequence[Device] = (),
     believed: Sequence[Wires] | None = None,
 ) -> go.Figure:
-    """Return a plotly figure of the wall, the centerline by section, and one world of a rollout replayed.
+    """Return a plotly figure of the wall, the centerline by section, and the first world of a rollout replayed.
 
     Args:
         anatomy: the vessel.
         rollout: navigations with `shape`; without one the vessel is shown alone.
-        world: which of its worlds is replayed.
         devices: the wire and the catheters of the rollout, whose names and diameters are shown; a wire alone is drawn
             without.
         believed: wires that a policy holds possible at each sample, nodes from the tip on, LPS mm.
@@ -55,7 +53,7 @@ def navigation_scene(
     figure = go.Figure([wall, *_centerlines(anatomy)])
     figure.update_layout(_layout(np.ptp([np.asarray(axis) for axis in (wall.x, wall.y, wall.z)], axis=1)))
     if rollout is not None and rollout.shape is not None:
-        _add_navigation(figure, rollout, world, devices, believed)
+        _add_navigation(figure, rollout, devices, believed)
     return figure
 
 
@@ -146,9 +144,9 @@ def _centerlines(anatomy: Anatomy) -> list[go.Scatter3d]:
 
 
 def _add_navigation(
-    figure: go.Figure, rollout: Trajectory, world: int, devices: Sequence[Device], believed: Sequence[Wires] | None
+    figure: go.Figure, rollout: Trajectory, devices: Sequence[Device], believed: Sequence[Wires] | None
 ) -> None:
-    samples = np.flatnonzero(rollout.valid[world]).tolist()
+    samples = np.flatnonzero(rollout.valid[0]).tolist()
     if not samples:
         return
     first = len(list(figure.data))
@@ -156,8 +154,8 @@ def _add_navigation(
     def moving(sample: int) -> list[go.Scatter3d]:
         behind = []
         if believed is not None:
-            behind = [_possible(believed[sample], float(rollout.inserted_length[world, sample].max()))]
-        return [*behind, *_moving(rollout, world, sample, devices)]
+            behind = [_possible(believed[sample], float(rollout.inserted_length[0, sample].max()))]
+        return [*behind, *_moving(rollout, sample, devices)]
 
     figure.add_traces(moving(samples[0]))
     traces = list(range(first, len(list(figure.data))))
@@ -206,25 +204,25 @@ def _add_navigation(
     )
 
 
-def _moving(rollout: Trajectory, world: int, sample: int, devices: Sequence[Device]) -> list[go.Scatter3d]:
+def _moving(rollout: Trajectory, sample: int, devices: Sequence[Device]) -> list[go.Scatter3d]:
     """Return what changes from frame to frame: wire, catheters, the wire's tip and the tip's trail."""
-    wire, *around = (np.round(line, 2).astype(np.float32) for line in _uncovered(rollout, world, sample))
+    wire, *around = (np.round(line, 2).astype(np.float32) for line in _uncovered(rollout, sample))
     begin = max(0, sample - round(TRAIL_S / rollout.period_s))
-    trail = np.round(rollout.tip_position[world, begin : sample + 1, 0], 2).astype(np.float32)
+    trail = np.round(rollout.tip_position[0, begin : sample + 1, 0], 2).astype(np.float32)
     tip = trail[-1:]
     time = f"<extra>{(sample + 1) * rollout.period_s:g} s</extra>"
     hover = (
-        f"Δ = {rollout.inserted_length[world, sample, 0]:.1f} mm<br>"
-        f"φ = {np.rad2deg(rollout.rotation[world, sample, 0]):.0f}°<br>"
-        f"Δtip = {rollout.tip.abscissa[world, sample, 0]:.1f} mm<br>"
-        f"γtip = {rollout.tip.offset[world, sample, 0]:.2f} mm<br>"
-        f"lumen radius = {rollout.tip.radius[world, sample, 0]:.2f} mm<br>"
-        f"largest wall force = {rollout.contact_force_max[world, sample]:.3f} N"
+        f"Δ = {rollout.inserted_length[0, sample, 0]:.1f} mm<br>"
+        f"φ = {np.rad2deg(rollout.rotation[0, sample, 0]):.0f}°<br>"
+        f"Δtip = {rollout.tip.abscissa[0, sample, 0]:.1f} mm<br>"
+        f"γtip = {rollout.tip.offset[0, sample, 0]:.2f} mm<br>"
+        f"lumen radius = {rollout.tip.radius[0, sample, 0]:.2f} mm<br>"
+        f"largest wall force = {rollout.contact_force_max[0, sample]:.3f} N"
     )
     name = "Guidewire"
     if around:
         name += f" {devices[0].name}"
-        hover += f"<br>push of its drive = {rollout.drive_force[world, sample, 0]:.2f} N"
+        hover += f"<br>push of its drive = {rollout.drive_force[0, sample, 0]:.2f} N"
     hover += time
     tubes = [
         _line(
@@ -232,7 +230,7 @@ def _moving(rollout: Trajectory, world: int, sample: int, devices: Sequence[Devi
             color=CATHETER_COLORS[k],
             width=round(_WIRE_WIDTH * devices[k + 1].diameter_mm / devices[0].diameter_mm, 1),
             name=f"Catheter {devices[k + 1].name}",
-            hovertemplate=_catheter_state(rollout, world, sample, k + 1) + time,
+            hovertemplate=_catheter_state(rollout, sample, k + 1) + time,
         )
         for k, line in enumerate(around)
     ]
@@ -246,9 +244,9 @@ def _moving(rollout: Trajectory, world: int, sample: int, devices: Sequence[Devi
     ]
 
 
-def _uncovered(rollout: Trajectory, world: int, sample: int) -> list[Float[np.ndarray, "_ 3"]]:
+def _uncovered(rollout: Trajectory, sample: int) -> list[Float[np.ndarray, "_ 3"]]:
     """Return the nodes of each device up to where the one around it ends; its tip alone if it lies within."""
-    lines, inserted = visible_devices(rollout, world, sample), rollout.inserted_length[world, sample]
+    lines, inserted = visible_devices(rollout, 0, sample), rollout.inserted_length[0, sample]
     found = []
     for k, line in enumerate(lines):
         outer = max(range(k + 1, len(lines)), key=lambda j: inserted[j], default=None)
@@ -262,12 +260,12 @@ def _uncovered(rollout: Trajectory, world: int, sample: int) -> list[Float[np.nd
     return found
 
 
-def _catheter_state(rollout: Trajectory, world: int, sample: int, k: int) -> str:
+def _catheter_state(rollout: Trajectory, sample: int, k: int) -> str:
     """Return how far device k is inserted and turned, and how its drive pushes it."""
     return (
-        f"Δ = {rollout.inserted_length[world, sample, k]:.1f} mm<br>"
-        f"φ = {np.rad2deg(rollout.rotation[world, sample, k]):.0f}°<br>"
-        f"push of its drive = {rollout.drive_force[world, sample, k]:.2f} N"
+        f"Δ = {rollout.inserted_length[0, sample, k]:.1f} mm<br>"
+        f"φ = {np.rad2deg(rollout.rotation[0, sample, k]):.0f}°<br>"
+        f"push of its drive = {rollout.drive_force[0, sample, k]:.2f} N"
     )
 
 

@@ -256,17 +256,13 @@ def where_encoders_sit(episodes: Sequence[RobotLog], robot: RobotConfig) -> str 
     return min(far, key=lambda place: np.median(far[place]))
 
 
-def band(replays: Sequence[EpisodeReplay], level: float = _LEVEL) -> float | None:
-    """Return the half-width, mm, within which Δtip was predicted throughout a share of the episodes (conformal).
-
-    Args:
-        replays: of episodes.
-        level: the share.
+def band(replays: Sequence[EpisodeReplay]) -> float | None:
+    """Return the half-width, mm, within which Δtip was predicted throughout most of the episodes (conformal).
 
     Returns:
         None with too few episodes.
     """
-    rank = math.ceil(level * (len(replays) + 1))
+    rank = math.ceil(_LEVEL * (len(replays) + 1))
     return float(np.sort(_worst(replays))[rank - 1]) if rank <= len(replays) else None
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from endopilot import _core
-from endopilot.progress import Advance, progress
+from endopilot.progress import progress
 from endopilot.simulation.config import (
     COMPLIANT_WALL_AT_TIP_MM,
     COMPLIANT_WALL_STIFFENING_MM2,
@@ -41,7 +41,6 @@ def run_core(
     initial: Float[np.ndarray, "worlds numbers"],
     control: Float[np.ndarray, "worlds samples numbers"],
     friction: Float[np.ndarray, "worlds *devices"],
-    period_s: float = SAMPLE_PERIOD_S,
     actuation: Actuation = "velocity",
     loads: _core.Loads | None = None,
     record_shape: bool = False,
@@ -53,7 +52,6 @@ def run_core(
     pull_limit_n: float = np.inf,
     torque_limit_n_mm: float = np.inf,
     tubes: TubeLayout | None = None,
-    motion: CoreMotion | None = None,
     transmission: TransmissionLayout | None = None,
 ) -> dict[str, np.ndarray]:
     """Run the C++ core on rods and walls of one's own making, as the verification does.
@@ -68,8 +66,6 @@ def run_core(
         initial: inserted length (mm) and rotation (rad) of each device before the first period.
         control: mm/s and rad/s, or N and N·mm.
         friction: Coulomb coefficients.
-        period_s: time that each control holds, and from one recorded sample to the next, s; it is cut into equal time
-            steps of at most `config.time_step_s`, as `Simulator.step` cuts it.
         actuation: what the controls are.
         loads: dead loads and springs.
         record_shape: record node positions, mm.
@@ -81,7 +77,6 @@ def run_core(
         pull_limit_n: the same where it pulls, N.
         torque_limit_n_mm: torque at which it slips, N·mm.
         tubes: telescoping tubes, which have limits of their own.
-        motion: of the vessel and the insertion; positions and directions are returned in the vessel as it was at first.
         transmission: how the drives act on the devices; at the ostium if not given.
 
     Returns:
@@ -101,7 +96,6 @@ def run_core(
         worlds=worlds,
         config=config,
         tubes=tubes,
-        motion=motion,
         transmission=transmission,
         loads=loads,
         approach=approach,
@@ -114,29 +108,18 @@ def run_core(
         sample_period=SAMPLE_PERIOD_S,
     )
 
-    def run(
-        control: Float[np.ndarray, "worlds samples devices 2"], steps: int, time_step: float, advance: Advance | None
-    ) -> dict:
-        return simulation.run(
+    with gpu_errors(config.processor), progress("Simulating the wire", total=worlds * samples) as advance:
+        result = simulation.run(
             control=control,
             force_driven=actuation == "force",
-            time_step=time_step,
-            steps_per_sample=steps,
+            time_step=config.time_step_s,
+            steps_per_sample=config.steps_per_sample,
             record_shape=record_shape,
             record_attitude=record_attitude,
             threads=config.threads_for(worlds, lanes),
             lanes=lanes,
             progress=advance,
         )
-
-    with gpu_errors(config.processor), progress("Simulating the wire", total=worlds * samples) as advance:
-        if period_s == SAMPLE_PERIOD_S:
-            result = run(control, config.steps_per_sample, config.time_step_s, advance)
-        else:  # the wire is brought to its start in the usual steps
-            begun = run(np.zeros((worlds, 0, devices, 2)), config.steps_per_sample, config.time_step_s, None)
-            steps = config.steps_of(period_s)
-            result = run(control, steps, period_s / steps, advance)
-            result["approach_slip"] += begun["approach_slip"]
     return {**result, "reason": simulation.reason().astype(int), "contacts": simulation.contacts()}
 
 

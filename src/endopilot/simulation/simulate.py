@@ -16,8 +16,9 @@ from endopilot.progress import progress
 from endopilot.simulation.checks import check_control, check_memory, check_shape_memory, with_device_axis
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.motion import Motion
+from endopilot.simulation.set_up import SimulationSetUp
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
+from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 WALL_FORCE_LIMIT_N = 0.7

@@ -29,8 +29,9 @@ from endopilot.simulation.groups import Group, group_key, make_groups
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.processor import gpu_errors
 from endopilot.simulation.readout import Readout
+from endopilot.simulation.set_up import SimulationSetUp
 from endopilot.simulation.state import SimulatorState, Step, SupportsDLPack
-from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
+from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 _DEEPEST_START = 0.8

@@ -30,8 +30,9 @@ from endopilot.extras import extra_named
 from endopilot.files import json_text, writing
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion, place
+from endopilot.simulation.set_up import SimulationSetUp
 from endopilot.simulation.signals import SIGNALS, SolvedOutputs, table_columns
-from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
+from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import Anatomy, TipProjection
 
 if TYPE_CHECKING:

@@ -1,12 +1,13 @@
 """The vessel as a prior of where a wire can be: cross-sections along every branch, each a grid of places.
 
 A wire that lies in the vessel passes through one place of every cross-section between the catheter and its tip. The
-tracker follows it from section to section.
+detector follows it from section to section.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -41,30 +42,48 @@ class Passage:
     second: Float[np.ndarray, "n 3"]
     room: Float[np.ndarray, "n"]
 
+    @cached_property
+    def offsets(self) -> Float[np.ndarray, "g"]:
+        """Places of a section's grid along either axis, mm."""
+        half = int(np.ceil(max(float(self.room.max()), CELL_MM) / CELL_MM))
+        return CELL_MM * np.arange(-half, half + 1)
+
+    @cached_property
+    def open(self) -> Bool[np.ndarray, "n g g"]:
+        """Which places lie within the room of the wire's axis."""
+        distance = np.hypot(self.offsets[:, None], self.offsets)
+        return distance <= np.maximum(self.room, CELL_MM)[:, None, None]
+
+    @cached_property
+    def cells(self) -> Int[np.ndarray, "k"]:
+        """Indices of the open places in the flat array of all."""
+        return np.flatnonzero(self.open)
+
+    @cached_property
+    def start(self) -> Int[np.ndarray, "n_and_1"]:
+        """Which of the open places are a section's: from its number on, up to the next one's."""
+        return np.concatenate([[0], np.cumsum(np.count_nonzero(self.open, axis=(1, 2)))])
+
+    def places(self, section: Int[np.ndarray, "n"] | None = None) -> Float[np.ndarray, "n g g 3"]:
+        """Return the places of the grids of some sections, or of all, LPS mm."""
+        chosen = slice(None) if section is None else section
+        aside = self.offsets[:, None, None] * self.first[chosen, None, None, :]
+        across = self.offsets[None, :, None] * self.second[chosen, None, None, :]
+        return self.middle[chosen, None, None, :] + aside + across
+
+    def place(
+        self, section: Int[np.ndarray, "k"], row: Int[np.ndarray, "k"], column: Int[np.ndarray, "k"]
+    ) -> Float[np.ndarray, "k 3"]:
+        """Return single places of some sections' grids, LPS mm."""
+        aside = self.offsets[row, None] * self.first[section]
+        return self.middle[section] + aside + self.offsets[column, None] * self.second[section]
+
 
 @dataclass(frozen=True, eq=False)
 class Corridor:
-    """All passages, parents before their children, and the grid that every cross-section has.
-
-    Attributes:
-        passages: the catheter's end, then the branches.
-        offsets: places of a grid along either axis, mm.
-    """
+    """All passages: the catheter's end, then the branches, parents before their children."""
 
     passages: tuple[Passage, ...]
-    offsets: Float[np.ndarray, "g"]
-
-    def places(self, passage: Passage, section: Int[np.ndarray, "n"] | None = None) -> Float[np.ndarray, "n g g 3"]:
-        """Return the places of the grids of some sections of a passage, or of all, LPS mm."""
-        chosen = slice(None) if section is None else section
-        aside = self.offsets[:, None, None] * passage.first[chosen, None, None, :]
-        across = self.offsets[None, :, None] * passage.second[chosen, None, None, :]
-        return passage.middle[chosen, None, None, :] + aside + across
-
-    def open(self, passage: Passage) -> Bool[np.ndarray, "n g g"]:
-        """Return which places lie within the room of the wire's axis."""
-        distance = np.hypot(self.offsets[:, None], self.offsets[None, :])
-        return distance <= np.maximum(passage.room, CELL_MM)[:, None, None]
 
 
 def make_corridor(anatomy: Anatomy, wire_radius_mm: float, slack_mm: float, deepest_mm: float) -> Corridor:
@@ -114,6 +133,4 @@ def make_corridor(anatomy: Anatomy, wire_radius_mm: float, slack_mm: float, deep
                 radius - wire_radius_mm + slack_mm,
             )
         )
-    widest = max(float(passage.room.max()) for passage in passages)
-    half = int(np.ceil(widest / CELL_MM))
-    return Corridor(tuple(passages), CELL_MM * np.arange(-half, half + 1))
+    return Corridor(tuple(passages))

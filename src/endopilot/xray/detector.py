@@ -1,8 +1,8 @@
 """The tip of a wire found in X-ray images: `TipDetector`.
 
 Ridges say how likely each pixel is on a wire (`ridge`), a hidden Markov model follows the wire through the vessel as
-registration has it (`tracker`), and its end is fitted to the pixels there (`wire_end`). Contrast in the vessel is
-estimated and taken away first: a filled branch is a dark line too.
+registration has it (`wire_following`, `tip_posterior`), and its end is fitted to the pixels there (`wire_end`).
+Contrast in the vessel is estimated and taken away first: a filled branch is a dark line too.
 """
 
 from __future__ import annotations
@@ -21,22 +21,25 @@ from endopilot.settings import Finite, NonNegative, OpenShare, Share, settings
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import catheter_lumen_points, lumen_points
 from endopilot.xray.carm import View
-from endopilot.xray.corridor import CATHETER_MM, Corridor, make_corridor
+from endopilot.xray.corridor import CATHETER_MM, make_corridor
+from endopilot.xray.corridor_view import CorridorView, box_around
 from endopilot.xray.projector import splat
 from endopilot.xray.ridge import RidgeEvidence
-from endopilot.xray.tracker import TipEstimate, track
+from endopilot.xray.tip_posterior import TipEstimate, estimate_tip, longest_mm
 from endopilot.xray.wire_end import fit_end
 
 Signal = Float32[np.ndarray, "rows columns"]
-_HIGH_PASS_PX, _AROUND_PX = 12.0, 24.0
+_HIGH_PASS_PX, _AROUND_PX = 12.0, 24
 """Contrast is what is darker than its surroundings, blurred by this; and how much of an image around the vessel is
 looked at, pixels."""
+_AROUND_MM = 10.0
+"""And around the whole vessel's centerline, where lines from before are looked for, mm: lumen and catheter."""
 _TRUNCATE = 2.0
 """Blurs reach so many standard deviations."""
+_FILLED_MM, _FEWEST_PX = 0.3, 10
+"""Contrast is looked for where this much of the lumen lies behind a pixel, mm, if there are so many pixels."""
 _LEAST_CONTRAST = 0.01
 """Contrast below this, 1/mm, is none."""
-_AHEAD_SHARE, _AHEAD_MM = 1.3, 8.0
-"""A tip lies no deeper than this many times the inserted length, and this much more."""
 _END_SECTIONS = 6
 """Cross-sections of the wire's end that give its first direction."""
 _DOUBT = 1.5
@@ -53,6 +56,8 @@ the fit moves the end: then 95 % of the tips lie in the region of 95 %, in synth
 _LINE, _LINE_PX, _MOVED_PX = 0.3, 60, 2
 """An image from before shows a line where the evidence for a wire is larger than this over so many pixels together; it
 may be displaced by so many pixels."""
+_KEPT_LINES = 8
+"""Lines of so many images from before, or doses, are kept for the next exposures."""
 _HIDDEN_MM = 1.5
 """Standard deviation that a tip on such a line has more, mm."""
 _BELIEVABLE = 3.0
@@ -100,7 +105,8 @@ class TipDetector:
         behind, size = catheter_lumen_points(anatomy)
         near = np.linalg.norm(behind - anatomy.insertion.position, axis=1) <= 1.25 * CATHETER_MM
         points, volume = lumen_points(anatomy)
-        self._known_lines: list[tuple[Signal, Bool[np.ndarray, "rows columns"]]] = []
+        self._known_lines: list[tuple[Signal, float, Bool[np.ndarray, "rows columns"]]] = []
+        self._vessel = np.concatenate([branch.centerline.points for branch in anatomy.tree.branches])
         self._filled = np.concatenate([points, behind[near]]), np.concatenate([volume, size[near]])
 
     def find(
@@ -120,8 +126,8 @@ class TipDetector:
             photons: that a pixel of usual brightness counts, in each image.
             inserted_length: Δ by the robot's encoder, mm.
             slack_mm: how far outside the lumen the wire is looked for, mm; the configuration's if not given.
-            before: images of the same views without a wire: lines in them are none of its; none if not given. Their
-                noise is taken to be that of `photons` when they are first given.
+            before: images of the same views without a wire: lines in them that this exposure's noise, that of
+                `photons`, would show are none of its; none if not given.
 
         Returns:
             The tip, found or ambiguous; None where there is no wire.
@@ -139,39 +145,46 @@ class TipDetector:
         before: Sequence[Signal] | None = None,
     ) -> TipEstimate:
         """Return where the tip is if there is a wire, and how likely that is; the arguments are those of `find`."""
-        deepest = _AHEAD_SHARE * max(inserted_length, 0.0) + _AHEAD_MM
         slack_mm = self.config.slack_mm if slack_mm is None else slack_mm
-        corridor = make_corridor(self._anatomy, self._radius_mm, slack_mm, deepest)
-        seen = [self._look(*one, corridor) for one in zip(views, signals, photons, strict=True)]
+        corridor = make_corridor(self._anatomy, self._radius_mm, slack_mm, longest_mm(inserted_length))
+        shown = [CorridorView(corridor, *one) for one in zip(views, map(len, signals), strict=True)]
+        seen = [self._look(*one) for one in zip(shown, signals, photons, strict=True)]
         plain, evidence = [one for one, _ in seen], [one for _, one in seen]
-        lines = [
-            self._lines(earlier, count) for earlier, count in zip(before or (), photons, strict=before is not None)
-        ]
+        lines = [] if before is None else [self._lines(*one) for one in zip(views, before, photons, strict=True)]
         for image, line in zip(evidence, lines, strict=before is not None):
             image[line] = 0.0
-        found = _refined(track(corridor, views, evidence, inserted_length), views, plain, self._radius_mm)
+        found = _refined(estimate_tip(corridor, shown, evidence, inserted_length), views, plain, self._radius_mm)
         hidden = any(_lies_on(line, view, found.position) for line, view in zip(lines, views, strict=False))
         return self._judged(found, hidden=hidden)
 
-    def _look(self, view: View, signal: Signal, photons: float, corridor: Corridor) -> tuple[Signal, Signal]:
+    def _look(self, shown: CorridorView, signal: Signal, photons: float) -> tuple[Signal, Signal]:
         """Return an image without contrast, and how likely its pixels are on a wire, none where no vessel is near."""
-        box, evidence = _box(corridor, view, len(signal)), np.zeros_like(signal)
-        plain = self.without_contrast(view, signal, box)
-        evidence[box] = self._saturated(self._evidence(plain[box], photons))
+        rows, columns = (slice(max(side.start - _AROUND_PX, 0), side.stop + _AROUND_PX) for side in shown.box)
+        box, evidence = (rows, columns), np.zeros_like(signal)
+        plain = self.without_contrast(shown.view, signal, box)
+        evidence[box] = self._saturated(self._evidence(plain[box], photons, shown.pixels[box]))
         return plain, evidence
 
-    def _lines(self, before: Signal, photons: float) -> Bool[np.ndarray, "rows columns"]:
-        """Return the pixels near lines of an image without a wire, which is looked at once."""
-        known = [mask for image, mask in self._known_lines if image is before]
-        if not known:
-            line = self._saturated(self._evidence(before, photons)) > _LINE
-            parts: Any = connected_parts(line, np.ones((3, 3)))
-            label = parts[0]
-            large = np.bincount(label.ravel()) >= _LINE_PX
-            large[0] = False
-            known = [binary_dilation(large[label], iterations=_MOVED_PX)]
-            self._known_lines = [*self._known_lines[-1:], (before, known[0])]
-        return known[0]
+    def _lines(self, view: View, before: Signal, photons: float) -> Bool[np.ndarray, "rows columns"]:
+        """Return the pixels near lines of an image without a wire around the vessel, as an exposure would show them.
+
+        The image is looked at once for each number of photons: with more, an exposure shows fainter lines.
+        """
+        for image, count, near in self._known_lines:
+            if image is before and count == photons:
+                return near
+        box, near = (
+            box_around(view, self._vessel, len(before), _AROUND_MM, _AROUND_PX),
+            np.zeros(before.shape, dtype=bool),
+        )
+        line = self._saturated(self._evidence(before[box], photons)) > _LINE
+        parts: Any = connected_parts(line, np.ones((3, 3)))
+        label = parts[0]
+        large = np.bincount(label.ravel()) >= _LINE_PX
+        large[0] = False
+        near[box] = binary_dilation(large[label], iterations=_MOVED_PX)
+        self._known_lines = [*self._known_lines[1 - _KEPT_LINES :], (before, photons, near)]
+        return near
 
     def _judged(self, found: TipEstimate, *, hidden: bool) -> TipEstimate:
         """Return an estimate with its status; an ambiguous one is as uncertain as the places are far apart.
@@ -199,14 +212,19 @@ class TipDetector:
         box = box or (slice(None), slice(None))
         width_mm = 0.5 * self._anatomy.distance_map.spacing_mm
         path_mm = splat(view, len(signal), *self._filled, width_mm=width_mm, blur_px=_BLUR_PX)
-        path, part = path_mm[box], signal[box]
-        edges = path - gaussian_filter(path, _HIGH_PASS_PX, truncate=_TRUNCATE)
-        filled = path > 0.3
-        if filled.sum() < 10:
+        path, part = _halved(path_mm[box]), _halved(signal[box])
+        filled = path > _FILLED_MM
+        if 4 * filled.sum() < _FEWEST_PX:
             return signal
-        dark = gaussian_filter(part, _HIGH_PASS_PX, truncate=_TRUNCATE) - part
+        edges, dark = (one - gaussian_filter(one, _HIGH_PASS_PX / 2, truncate=_TRUNCATE) for one in (path, -part))
         strength = float(dark[filled] @ edges[filled] / (edges[filled] @ edges[filled]))
         return signal + np.float32(strength) * path_mm if strength > _LEAST_CONTRAST else signal
+
+
+def _halved(image: Signal) -> Float32[np.ndarray, "half_rows half_columns"]:
+    """Return means of two by two pixels."""
+    rows, columns = len(image) // 2, image.shape[1] // 2
+    return image[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2).mean(axis=(1, 3))
 
 
 def _lies_on(line: Bool[np.ndarray, "rows columns"], view: View, point: Float[np.ndarray, "3"]) -> bool:
@@ -214,17 +232,6 @@ def _lies_on(line: Bool[np.ndarray, "rows columns"], view: View, point: Float[np
     (right, up), middle = view.project(point), (len(line) - 1) / 2
     row, column = np.clip(np.rint([middle - up, middle + right]), 0, len(line) - 1).astype(int)
     return bool(line[row, column])
-
-
-def _box(corridor: Corridor, view: View, rows: int) -> tuple[slice, slice]:
-    """Return rows and columns that show the corridor, and what lies around."""
-    middle, around = np.concatenate([one.middle for one in corridor.passages]), _AROUND_PX
-    right_up = view.project(middle)
-    around += float(np.abs(corridor.offsets).max()) * float(np.linalg.norm(view.slope(middle[0]), 2))
-    at = np.stack([(rows - 1) / 2 - right_up[:, 1], (rows - 1) / 2 + right_up[:, 0]])
-    low = np.clip(at.min(axis=1) - around, 0, rows - 1).astype(int)
-    high = np.clip(at.max(axis=1) + around + 1, 1, rows).astype(int)
-    return slice(low[0], max(high[0], low[0] + 1)), slice(low[1], max(high[1], low[1] + 1))
 
 
 def _refined(found: TipEstimate, views: Sequence[View], signals: Sequence[Signal], radius_mm: float) -> TipEstimate:

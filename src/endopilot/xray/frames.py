@@ -27,7 +27,7 @@ from endopilot.files import writing
 from endopilot.simulation.csv_file import read_columns
 from endopilot.xray.carm import View
 from endopilot.xray.tip_filter import TipLocation
-from endopilot.xray.tracker import TipEstimate
+from endopilot.xray.tip_posterior import TipEstimate
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from endopilot.xray.carm import Pose, View, view_of
 from endopilot.xray.corridor import CATHETER_MM, STEP_MM
 from endopilot.xray.image import isocenter_of
 from endopilot.xray.registration import Registration
-from endopilot.xray.tracker import TipEstimate
+from endopilot.xray.tip_posterior import TipEstimate
 
 _EVERY = 4
 """Every so many cross-sections of the wire count, 1 mm apart."""

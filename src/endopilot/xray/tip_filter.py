@@ -1,46 +1,51 @@
-"""The tip of a device in a vessel tree, followed through lines in images: a grid filter with a pose for each place.
+"""The tip of a device in a vessel tree, followed over time through lines in images: a pose for each place of a grid.
 
 The state is the place of the tip, one of a grid along all branches, and for each place a normal distribution of the
 patient's pose: three shifts and three rotations. From frame to frame the tip travels a little, or, in a small share of
 the frames, is anywhere: so a tip in the wrong branch is found again. Heart and breath move the way smoothly, and anew
 in each frame.
 
-In a frame the device's line is compared with the projected way to each place. A point of the line belongs to the point
-of the way that is nearest, among those about as far behind the tip; its distance across the line is an observation,
-normally distributed, with what is known of pose, of breathing, and of how far the device lies off its way.
+In a frame the device's line is compared with the projected way to each place (`line_observations`), with what is known
+of pose, of breathing, and of how far the device lies off its way. Lines are those of any detector; those of
+`TipDetector`, which knows nothing of other times, are turned into frames by `frames.frame_of`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from endopilot.lines import length_along, places_on
 from endopilot.settings import Finite, NonNegative, OpenShare, Positive, Within, settings
 from endopilot.types import VesselTree
 from endopilot.xray.camera import Camera
 from endopilot.xray.carm import View
+from endopilot.xray.line_observations import (
+    POINT_SD_MM,
+    Line,
+    Observations,
+    SeenLine,
+    joined,
+    line_observations,
+    see,
+    shown_by,
+    tip_observations,
+)
+from endopilot.xray.tip_posterior import Status, around_mode
 from endopilot.xray.vessel_grid import VesselGrid, make_grid
 
-Line = Float[np.ndarray, "_ 2"]
-_STEP_MM, _SAMPLE_MM = 1.0, 6.0
-"""Distance of the grid's places, and of the compared points of a line, mm."""
+_STEP_MM = 1.0
+"""Distance of the grid's places, mm."""
 _BREATH_MM = 120.0
 """Length along the vessel over which breathing and heartbeat move it alike, mm."""
 _BEND_SD_MM, _BEND_MM = 2.0, 30.0
 """How far the device bends the vessel, mm, and over which length of it alike."""
 _ASIDE_SD_MM, _ASIDE_RADII, _ASIDE_MM = 1.5, 0.1, 20.0
 """How far the device lies off its way: this, and this share of the lumen's radius, mm; and over which length alike."""
-_POINT_SD_MM, _END_SD_MM = 0.4, 1.0
-"""Standard deviations of the points of a line, and more of its end, mm. All lengths above, and the one below, are those
-that made the first half of the frames of a real patient's catheter likeliest; docs/evidence/locate.md names them."""
-_LENGTH_SD_MM, _LENGTH_SHARE = 2.0, 0.01
-"""By how much, and by which share of the line, the way to the tip is longer than the line in an image, mm."""
 _DRIFT_MM, _DRIFT_RAD = 0.5, np.deg2rad(0.2)
 """Standard deviations of how the pose drifts from frame to frame."""
 _LANDMARK_SD_MM, _TIP_SD_MM = 6.0, 2.0
@@ -50,9 +55,6 @@ _STRAY, _BEYOND = np.log(1 / 200), -2.5
 vessel before the root, where the way is not known."""
 _LEAST_ODDS = 20.0
 """A line is the device's where it is likelier so, by this logarithm, than if its points were strays."""
-_WINDOW, _SLACK_MM, _SLACK_SHARE = 30, 3.0, 0.25
-"""A point of the line belongs to the way within so many places, and this length and share of the line, of where it
-should be by its length."""
 _ROUNDS = 3
 _PRUNE, _MOST = 18.0, 600
 """Places whose tip alone is less likely than the best one's by this logarithm are not compared further, nor more than
@@ -105,7 +107,7 @@ class TipLocation:
     """
 
     frame: int
-    status: Literal["found", "ambiguous", "not found"]
+    status: Status
     position: Float[np.ndarray, "3"]
     covariance: Float[np.ndarray, "3 3"]
     share: float
@@ -114,50 +116,6 @@ class TipLocation:
     section: str
     moved_mm: Float[np.ndarray, "3"]
     residual_mm: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """One view of a frame: the line's points, and the grid as this camera shows it.
-
-    Attributes:
-        tip: pixel of the line's end.
-        at: length from there to each of its points, mm in the patient.
-        points: of the line behind its end, pixels.
-        across: unit vectors across the line at each.
-        shown: pixels of the grid's places.
-        slope: derivative of these by the place, pixels/mm.
-        scale: pixels in a mm there.
-        along: length from the root to each place in the image, mm in the patient.
-    """
-
-    tip: Float[np.ndarray, "2"]
-    at: Float[np.ndarray, "k"]
-    points: Float[np.ndarray, "k 2"]
-    across: Float[np.ndarray, "k 2"]
-    shown: Float[np.ndarray, "n 2"]
-    slope: Float[np.ndarray, "n 2 3"]
-    scale: Float[np.ndarray, "n"]
-    along: Float[np.ndarray, "n"]
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Observations, for each of some places of the tip.
-
-    Attributes:
-        place: of the grid that an observation is of.
-        towards: unit vector of the displacement that it observes; 0 where it observes a length.
-        value: observed, mm.
-        variance: of its own noise, mm².
-        used: whether it was made.
-    """
-
-    place: Int[np.ndarray, "m r"]
-    towards: Float[np.ndarray, "m r 3"]
-    value: Float[np.ndarray, "m r"]
-    variance: Float[np.ndarray, "r"]
-    used: Bool[np.ndarray, "m r"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,9 +180,9 @@ class TipFilter:
         share = np.exp(self._log)
         base = share @ self._mean
         pairs, way = zip(self._cameras, lines, strict=True), self._moved(base)
-        seen = [_see(self.grid, camera, line, way) for camera, line in pairs if line is not None]
+        seen = [see(self.grid, camera, line, way) for camera, line in pairs if line is not None]
         everywhere = np.arange(len(self._log))
-        tips = _tip_rows(seen, everywhere)
+        tips = tip_observations(seen, everywhere)
         score = self._log + self._fit(everywhere, tips, base).log_density
         best = np.argsort(-score, kind="stable")[:_MOST]
         places = np.sort(best[score[best] > score[best[0]] - _PRUNE])
@@ -256,7 +214,7 @@ class TipFilter:
             self._log = log - np.logaddexp.reduce(log)
         shift = np.zeros(3)
         for _ in range(4):  # the shift across the beam that takes the point to the pixel
-            shown, slope = _shown(self._cameras[0], point[None] + shift)
+            shown, slope = shown_by(self._cameras[0], point[None] + shift)
             shift = shift + np.linalg.pinv(slope[0]) @ (np.array(pixel) - shown[0])
         self._mean[:, :3] = shift
         self._covariance[:, :3, :3] = _LANDMARK_SD_MM**2 * np.eye(3)
@@ -279,10 +237,10 @@ class TipFilter:
         return (self.grid.way - self._centre) @ matrix.T + self._centre + pose[:3]
 
     def _compare(
-        self, seen: Sequence[_Seen], places: Int[np.ndarray, "m"], base: Float[np.ndarray, "6"]
-    ) -> tuple[_Fit, _Rows, Int[np.ndarray, "m"]]:
+        self, seen: Sequence[SeenLine], places: Int[np.ndarray, "m"], base: Float[np.ndarray, "6"]
+    ) -> tuple[_Fit, Observations, Int[np.ndarray, "m"]]:
         """Return what whole lines say of some places of the tip, and how many of their points lie before the root."""
-        tips = _tip_rows(seen, places)
+        tips = tip_observations(seen, places)
         fit, rows, beyond = self._fit(places, tips, base), tips, np.zeros(len(places), dtype=np.int64)
         count = [len(one.at) for one in seen]
         if not any(count):
@@ -291,11 +249,11 @@ class TipFilter:
         bounds = np.cumsum([0, *count])
         for _ in range(_ROUNDS):
             parts = [
-                _line_rows(self.grid, one, places, moved[:, low:high])
+                line_observations(self.grid, one, places, moved[:, low:high])
                 for one, low, high in zip(seen, bounds[:-1], bounds[1:], strict=True)
                 if high > low
             ]
-            rows = _joined([tips, *(part for part, _ in parts)])
+            rows = joined([tips, *(part for part, _ in parts)])
             beyond = np.sum([outside for _, outside in parts], axis=0)
             fit = self._fit(places, rows, base)
             # Each view's rows are those of its points, and one of its length.
@@ -306,7 +264,7 @@ class TipFilter:
             moved = np.concatenate(kept, axis=1)
         return fit, rows, beyond
 
-    def _fit(self, places: Int[np.ndarray, "m"], rows: _Rows, base: Float[np.ndarray, "6"]) -> _Fit:
+    def _fit(self, places: Int[np.ndarray, "m"], rows: Observations, base: Float[np.ndarray, "6"]) -> _Fit:
         """Return the density of observations, and the posterior of what they depend on."""
         arm = self._moved(base)[rows.place] - self._centre - base[:3]
         towards, used = rows.towards, rows.used
@@ -348,24 +306,21 @@ class TipFilter:
         return TipLocation(frame, "not found", nothing, np.full((3, 3), np.nan), 0.0, np.nan, -1, "", nothing, np.nan)
 
     def _answer(
-        self, frame: int, places: Int[np.ndarray, "m"], fit: _Fit, rows: _Rows, base: Float[np.ndarray, "6"]
+        self, frame: int, places: Int[np.ndarray, "m"], fit: _Fit, rows: Observations, base: Float[np.ndarray, "6"]
     ) -> TipLocation:
         """Return mean and covariance around the mode of the posterior."""
         grid, weight = self.grid, np.exp(self._log[places])
         best = int(weight.argmax())
         near = np.linalg.norm(grid.middle[places] - grid.middle[places[best]], axis=1) <= _NEAR_MM
-        share = float(weight[near].sum())
-        weight, close = weight[near] / share, places[near]
-        tips = grid.middle[close] + fit.aside[near]
-        mean = weight @ tips
-        off = tips - mean
-        cell = grid.step_mm**2 / 12 * np.eye(3)
-        covariance = (weight[:, None] * off).T @ off + np.einsum("m,mij->ij", weight, fit.aside_covariance[near]) + cell
+        close, tips = places[near], grid.middle[places] + fit.aside
+        share, mean, covariance = around_mode(tips, weight, near, grid.step_mm)
+        weight = weight[near] / share
+        covariance = covariance + np.einsum("m,mij->ij", weight, fit.aside_covariance[near])
         place = int(close[np.linalg.norm(grid.middle[close] - weight @ grid.middle[close], axis=1).argmin()])
         here = self._tree.branches[grid.branch[place]]
         section = here.section[np.abs(here.centerline.abscissa - grid.abscissa[place]).argmin()]
         left = np.abs(rows.value - np.einsum("mri,mri->mr", rows.towards, fit.moved))[best]
-        of_line = rows.used[best] & (rows.variance == _POINT_SD_MM**2)
+        of_line = rows.used[best] & (rows.variance == POINT_SD_MM**2)
         moved = self._moved(base)[places[best]] - grid.way[places[best]] + fit.moved[best, 0]
         return TipLocation(
             frame=frame,
@@ -384,99 +339,3 @@ class TipFilter:
 def _alike(apart: np.ndarray, length: float) -> np.ndarray:
     """Return the correlation of what lies so far apart along the vessel, mm."""
     return np.exp(-0.5 * (apart / length) ** 2)
-
-
-def _shown(
-    camera: Camera | View, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
-    """Return the pixels of points, and the derivative by the point, pixels/mm."""
-    slope = [(camera.project(points + axis) - camera.project(points - axis)) / 2 for axis in np.eye(3)]
-    return camera.project(points), np.stack(slope, axis=-1)
-
-
-def _see(grid: VesselGrid, camera: Camera | View, line: Line, way: Float[np.ndarray, "n 3"]) -> _Seen:
-    """Return a line's points, evenly apart, and the grid as the camera shows it where the pose has it."""
-    shown, slope = _shown(camera, way)
-    scale = np.sqrt((slope**2).sum(axis=(1, 2)) / 2)
-    usual = float(np.median(scale))
-    length = length_along(line)
-    at = np.arange(_SAMPLE_MM * usual, length[-1], _SAMPLE_MM * usual)
-    around = 0.4 * _SAMPLE_MM * usual
-    ahead = places_on(line, length, at + around) - places_on(line, length, at - around)
-    ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
-    return _Seen(
-        tip=line[0],
-        at=at / usual,
-        points=places_on(line, length, at),
-        across=np.stack([-ahead[:, 1], ahead[:, 0]], axis=-1),
-        shown=shown,
-        slope=slope,
-        scale=scale,
-        along=grid.along(shown) / usual,
-    )
-
-
-def _tip_rows(seen: Sequence[_Seen], places: Int[np.ndarray, "m"]) -> _Rows:
-    """Return what the ends of the lines say: two observations a view."""
-    shape = len(places), 2 * len(seen)
-    return _Rows(
-        place=np.repeat(places[:, None], shape[1], axis=1),
-        towards=np.concatenate([one.slope[places] / one.scale[places, None, None] for one in seen], axis=1),
-        value=np.concatenate([(one.tip - one.shown[places]) / one.scale[places, None] for one in seen], axis=1),
-        variance=np.full(shape[1], _POINT_SD_MM**2 + _END_SD_MM**2),
-        used=np.ones(shape, dtype=bool),
-    )
-
-
-def _line_rows(
-    grid: VesselGrid, seen: _Seen, places: Int[np.ndarray, "m"], moved: Float[np.ndarray, "m k 3"]
-) -> tuple[_Rows, Int[np.ndarray, "m"]]:
-    """Return what a line's points say, and its length, and how many of them lie before the root.
-
-    Args:
-        grid: the places.
-        seen: the line.
-        places: of its tip.
-        moved: how far the way is moved at each point, as found so far, mm.
-    """
-    each, behind = np.arange(len(places)), grid.behind[places]
-    arc = seen.along[places, None] - seen.along[behind]
-    within = np.arange(behind.shape[1]) <= grid.depth[places, None]
-    arc[~within] = np.inf
-    first = (arc[:, None, :] < seen.at[:, None]).sum(axis=2)
-    window = np.clip(first[..., None] + np.arange(-_WINDOW, _WINDOW + 1), 0, behind.shape[1] - 1)
-    near = each[:, None, None]
-    candidates = behind[near, window]
-    slack = _SLACK_MM + _SLACK_SHARE * seen.at
-    inside = np.abs(arc[near, window] - seen.at[:, None]) <= slack[:, None]
-    wanted = seen.points - np.einsum("mij,mkj->mki", seen.slope[places], moved)
-    gap = ((seen.shown[candidates] - wanted[:, :, None]) ** 2).sum(axis=3)
-    gap[~inside] = np.inf
-    chosen = gap.argmin(axis=2)[..., None]
-    place = np.take_along_axis(candidates, chosen, axis=2)[..., 0]
-    beyond = seen.at > seen.along[places, None]
-    used = np.isfinite(np.take_along_axis(gap, chosen, axis=2)[..., 0]) & (place != 0) & ~beyond
-    scale = seen.scale[place]
-    towards = np.einsum("ki,mkij->mkj", seen.across, seen.slope[place]) / scale[..., None]
-    value = np.einsum("ki,mki->mk", seen.across, seen.points - seen.shown[place]) / scale
-    any_used = used.any(axis=1)
-    last = np.where(any_used, len(seen.at) - 1 - used[:, ::-1].argmax(axis=1), 0)
-    longer = seen.along[places] - seen.along[place[each, last]] - seen.at[last]
-    rows = _Rows(
-        place=np.column_stack([place, places]),
-        towards=np.concatenate([towards, np.zeros((len(places), 1, 3))], axis=1),
-        value=np.column_stack([value, longer]),
-        variance=np.array([*[_POINT_SD_MM**2] * len(seen.at), (_LENGTH_SD_MM + _LENGTH_SHARE * seen.at[-1]) ** 2]),
-        used=np.column_stack([used, any_used]),
-    )
-    return rows, beyond.sum(axis=1)
-
-
-def _joined(parts: Sequence[_Rows]) -> _Rows:
-    fields = vars(parts[0])
-    return _Rows(
-        **{
-            name: np.concatenate([getattr(part, name) for part in parts], axis=min(1, fields[name].ndim - 1))
-            for name in fields
-        }
-    )

@@ -1,4 +1,4 @@
-"""The tip of a wire in images: where the wire ends that is followed through the vessel.
+"""The tip of a wire in the images of one exposure: where the wire ends that is followed through the vessel.
 
 How likely the wire ends at a place, against no wire at all, is the tip's posterior: mean, uncertainty and the
 probability that there is a wire follow from it. With two views the evidence of both is added, so the depth is found;
@@ -12,20 +12,22 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 
-from endopilot.xray.carm import View
 from endopilot.xray.corridor import STEP_MM, Corridor
-from endopilot.xray.wire_following import Follower, Leg
+from endopilot.xray.corridor_view import CorridorView
+from endopilot.xray.wire_following import Follower, Leg, places_of
 
 _SHORTER_SHARE, _LONGER_SHARE, _NEAR_MM = 0.1, 0.04, 2.0
 """The way to the tip differs from the inserted length by 2 mm, and a tenth of it where it is shorter, since wires snake
 and loop; it is hardly longer: wires only cut bends short."""
+_LONGEST = 4.0
+"""No way is longer than the inserted length by more than so many standard deviations."""
 _MOST_OF_CATHETER = 20.0
 """The evidence of a wire in the catheter counts no more than this."""
 _MODE_MM = 4.0
 """Mean and covariance are those of the posterior within this distance of its mode, mm."""
-_NOTHING = 1e-9
+_NOTHING = 1e-8
 """A place with less of the posterior is left out of the sums."""
 _FOLDED_SHARE = 0.05
 """Share of the wires that fold back."""
@@ -63,9 +65,20 @@ class TipEstimate:
     status: Status = "found"
 
 
-def track(
+def longest_mm(inserted_length: float) -> float:
+    """Return how long the way to the tip is at most, by the robot's encoder, mm."""
+    return inserted_length + _LONGEST * _spread(inserted_length)[1]
+
+
+def _spread(inserted_length: float) -> tuple[float, float]:
+    """Return by how much the way to the tip is shorter and longer than the inserted length: standard deviations, mm."""
+    wire_mm = max(inserted_length, 0.0)
+    return _NEAR_MM + _SHORTER_SHARE * wire_mm, _NEAR_MM + _LONGER_SHARE * wire_mm
+
+
+def estimate_tip(
     corridor: Corridor,
-    views: Sequence[View],
+    shown: Sequence[CorridorView],
     evidence: Sequence[Float32[np.ndarray, "rows columns"]],
     inserted_length: float,
 ) -> TipEstimate:
@@ -73,12 +86,11 @@ def track(
 
     Args:
         corridor: of the vessel.
-        views: in the CT's frame, as registration has them.
+        shown: it in each view, as registration has them.
         evidence: for each view the logarithm of how much likelier each pixel is on a wire than off it.
         inserted_length: Δ by the robot's encoder, mm.
     """
-    follower, wire_mm = Follower(corridor, views, evidence), max(inserted_length, 0.0)
-    shorter, longer = _NEAR_MM + _SHORTER_SHARE * wire_mm, _NEAR_MM + _LONGER_SHARE * wire_mm
+    follower, (shorter, longer) = Follower(corridor, shown, evidence), _spread(inserted_length)
     legs = follower.forwards()
 
     def prior(lengths: Sequence[np.ndarray], share: float) -> Callable[[np.ndarray], np.ndarray]:
@@ -91,21 +103,19 @@ def track(
 
     straight = prior([one.abscissa for one in corridor.passages], 1 - _FOLDED_SHARE)
     scores = [leg.log_scale + straight(leg.length) for leg in legs]
-    back = [
-        one for leg, at in _folds(corridor, legs, inserted_length + 2 * longer) for one in follower.backwards(leg, at)
-    ]
+    folds = _folds(legs, inserted_length + 2 * longer)
+    back = [one for leg, at in folds for one in follower.backwards(leg, at, longest_mm(inserted_length))]
     if back:
         folded = prior([leg.length for leg in back], _FOLDED_SHARE)
         scores += [leg.log_scale + folded(leg.length) for leg in back]
         legs += back
     total = float(np.logaddexp.reduce(np.concatenate(scores)))
-    weights = [np.exp(values - total)[:, None, None] * one.alpha for values, one in zip(scores, legs, strict=True)]
     # What lies in the catheter alone is a poor sign of a wire: the catheter is a dark line too.
     catheter = max(float(legs[0].log_scale[-1]) - _MOST_OF_CATHETER, 0.0)
-    return _summary(corridor, follower, legs, weights, total - catheter)
+    return _summary(follower, legs, [np.exp(values - total) for values in scores], total - catheter)
 
 
-def _folds(corridor: Corridor, legs: Sequence[Leg], deepest_mm: float) -> list[tuple[Leg, int]]:
+def _folds(legs: Sequence[Leg], deepest_mm: float) -> list[tuple[Leg, int]]:
     """Return where a wire may fold: the foremost places that it seems to reach, whatever its length there."""
     found: list[tuple[Leg, int]] = []
     ends = [(value, k, at) for k, leg in enumerate(legs) for at, value in enumerate(leg.log_scale)]
@@ -114,41 +124,66 @@ def _folds(corridor: Corridor, legs: Sequence[Leg], deepest_mm: float) -> list[t
         leg = legs[k]
         if value < ends[0][0] - _FOLD_ODDS or len(found) == _FOLDS:
             break
-        place = corridor.passages[leg.passage].middle[leg.section[at]]
-        apart = [np.linalg.norm(place - corridor.passages[one.passage].middle[one.section[n]]) for one, n in found]
+        place = leg.passage.middle[leg.section[at]]
+        apart = [np.linalg.norm(place - one.passage.middle[one.section[n]]) for one, n in found]
         if 0 < leg.length[at] <= deepest_mm and min(apart, default=np.inf) > _FOLDS_APART_MM:
             found.append((leg, at))
     return found
 
 
 def _summary(
-    corridor: Corridor, follower: Follower, legs: Sequence[Leg], weights: Sequence[np.ndarray], log_odds: float
+    follower: Follower, legs: Sequence[Leg], weights: Sequence[Float[np.ndarray, "n"]], log_odds: float
 ) -> TipEstimate:
-    """Return mean and covariance around the mode of the posterior."""
-    best = int(np.argmax([weight.sum(axis=(1, 2)).max() for weight in weights]))
-    section = int(weights[best].sum(axis=(1, 2)).argmax())
-    here = weights[best][section]
-    mode = (here[..., None] * legs[best].places[section]).sum(axis=(0, 1)) / here.sum()
-    counted = [weight > _NOTHING for weight in weights]
-    places = np.concatenate([one.places[some] for one, some in zip(legs, counted, strict=True)])
-    weight = np.concatenate([weight[some] for weight, some in zip(weights, counted, strict=True)])
+    """Return mean and covariance around the mode of the posterior, whose weight in each leg's sections is given."""
+    best = int(np.argmax([weight.max() for weight in weights]))
+    section = int(weights[best].argmax())
+    here = legs[best].alpha[section, ..., None]
+    mode = (here * legs[best].passage.places(legs[best].section[section : section + 1])[0]).sum(
+        axis=(0, 1)
+    ) / here.sum()
+    parts = [_counted(leg, weight) for leg, weight in zip(legs, weights, strict=True)]
+    places, weight = (np.concatenate(part) for part in zip(*parts, strict=True))
     near = ((places - mode) ** 2).sum(axis=1) <= _MODE_MM**2
-    share = float(weight[near].sum())
-    mean = weight[near] @ places[near] / share
-    off = places[near] - mean
     # A cell has a size: that of a section's step and of its grid.
-    covariance = (weight[near, None] * off).T @ off / share + np.eye(3) * STEP_MM**2 / 12
+    share, mean, covariance = around_mode(places, weight, near, STEP_MM)
     far = places[~near] - mean
     elsewhere = (weight[~near, None] * far).T @ far
     way = follower.way(legs[best], section)
-    passed = [(corridor.passages[stop.leg.passage], stop.leg.section[stop.at]) for stop in way]
+    passed = [(stop.leg.passage, stop.leg.section[stop.at]) for stop in way]
     return TipEstimate(
         log_odds=log_odds,
         position=mean,
         covariance=covariance,
         share=share,
         elsewhere=elsewhere,
-        wire=np.array([stop.place for stop in way]),
+        wire=places_of(way),
         middle=np.array([passage.middle[at] for passage, at in passed]),
         room=np.array([passage.room[at] for passage, at in passed]),
     )
+
+
+def around_mode(
+    places: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, "n"], near: Bool[np.ndarray, "n"], cell_mm: float
+) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """Return the share of a posterior that lies near its mode, its mean there, and its covariance.
+
+    Args:
+        places: LPS mm.
+        weight: of each.
+        near: which lie near the mode.
+        cell_mm: distance of neighbouring places, mm.
+    """
+    share = float(weight[near].sum())
+    weight = weight[near] / share
+    mean = weight @ places[near]
+    off = places[near] - mean
+    return share, mean, (weight[:, None] * off).T @ off + cell_mm**2 / 12 * np.eye(3)
+
+
+def _counted(leg: Leg, weight: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k"]]:
+    """Return the places of a leg that count in the posterior, LPS mm, and their weights."""
+    sections = np.flatnonzero(weight > _NOTHING)
+    share = weight[sections, None, None] * leg.alpha[sections]
+    kept = np.flatnonzero(share.ravel() > _NOTHING)
+    which, row, column = np.unravel_index(kept, share.shape)
+    return leg.passage.place(leg.section[sections[which]], row, column), share.ravel()[kept]

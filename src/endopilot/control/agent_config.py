@@ -1,0 +1,92 @@
+"""Settings of agents, and the calibrations of their ensembles: `AgentConfig`, `read_agent_calibration`."""
+
+from __future__ import annotations
+
+from dataclasses import field
+from pathlib import Path
+from typing import Annotated
+
+from endopilot.belief.bands import Calibration
+from endopilot.belief.belief import BeliefConfig
+from endopilot.control.search_config import SearchConfig
+from endopilot.errors import InputError
+from endopilot.settings import Positive, Within, settings
+from endopilot.tasks.navigation import Navigation, XrayKind
+from endopilot.tasks.route import Route
+
+CALIBRATIONS: dict[tuple[XrayKind, int], Path] = {
+    ("assumed", 1): Path(__file__).parent,
+    ("images", 1): Path(__file__).parent / "images",
+    ("assumed", 2): Path(__file__).parent / "coaxial",
+}
+"""Where the calibrations of the agent's ensembles lie, by how exposures find the tip and by the number of devices."""
+
+
+@settings
+class AgentConfig:
+    """Settings of an agent: search, belief, and when the plan or the wire counts as lost."""
+
+    search: SearchConfig = field(default_factory=SearchConfig)
+    """The search for a course."""
+    belief: BeliefConfig = field(default_factory=BeliefConfig)
+    """The simulated wires."""
+    off_course_mm: Positive = 2.5
+    """Another course is searched when the likeliest tip is this far along the centerline from where it should be, mm.
+    """
+    tries: Annotated[int, Within(1, 100)] = 3
+    """Failed searches, one after another and each from where the last has led, after which the agent gives up."""
+
+    @staticmethod
+    def of(navigation: Navigation) -> AgentConfig:
+        """Return the settings for a navigation by a wire alone, in a wide lumen or not, or by one in a catheter."""
+        if navigation.catheters:
+            return IN_CATHETER
+        wide = Route.to(navigation.anatomy, navigation.target).is_wide(navigation.target.abscissa)
+        return IN_WIDE_LUMEN if wide else AgentConfig()
+
+
+IN_WIDE_LUMEN = AgentConfig(
+    belief=BeliefConfig(
+        members=24,
+        ostium_spread_mm=3.5,
+        element_mm=1.25,
+        time_step_s=0.1,
+        lost_along_mm=6.0,
+        lost_across_mm=2.5,
+        lost_across_radii=0.3,
+    ),
+)
+"""Settings of an agent of a wire alone on a route through a wide lumen, such as an aorta. The wire lies more freely in
+it, and the place of the ostium is known less well; bends are wide, so that longer elements and steps do."""
+IN_CATHETER = AgentConfig(
+    search=SearchConfig(speed_mm_s=5.0),
+    belief=BeliefConfig(
+        members=4,
+        stiffness_levels=1,
+        element_mm=1.25,
+        lost_along_mm=5.0,
+        lost_across_mm=2.5,
+        lost_across_radii=0.5,
+    ),
+    off_course_mm=3.0,
+    tries=2,
+)
+"""Settings of an agent of a wire in a catheter."""
+
+
+def read_agent_calibration(xray: XrayKind, devices: int) -> Calibration:
+    """Return the calibration of the agent's ensemble.
+
+    Args:
+        xray: how exposures find the tip.
+        devices: 1 for a wire alone, 2 with a catheter.
+
+    Raises:
+        InputError: there is none.
+    """
+    if (xray, devices) not in CALIBRATIONS:
+        raise InputError(
+            f"policy: the agent is not calibrated for xray: {xray} with {devices - 1} catheters; give a wire alone, or "
+            "xray: assumed and one catheter"
+        )
+    return Calibration.read(CALIBRATIONS[xray, devices])

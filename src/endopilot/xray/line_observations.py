@@ -1,0 +1,171 @@
+"""What a device's line in an image says of the place of its tip in a vessel: observations for `tip_filter`.
+
+A point of the line belongs to the point of the projected way that is nearest, among those about as far behind the tip;
+its distance across the line is an observation. So are both coordinates of the line's end, and the line's length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from endopilot.lines import length_along, places_on
+from endopilot.xray.camera import Camera
+from endopilot.xray.carm import View
+from endopilot.xray.vessel_grid import VesselGrid
+
+Line = Float[np.ndarray, "_ 2"]
+_SAMPLE_MM = 6.0
+"""Distance of the compared points of a line, mm."""
+POINT_SD_MM, _END_SD_MM = 0.4, 1.0
+"""Standard deviations of the points of a line, and more of its end, mm. The lengths here and in `tip_filter` are those
+that made the first half of the frames of a real patient's catheter likeliest; docs/evidence/locate.md names them."""
+_LENGTH_SD_MM, _LENGTH_SHARE = 2.0, 0.01
+"""By how much, and by which share of the line, the way to the tip is longer than the line in an image, mm."""
+_WINDOW, _SLACK_MM, _SLACK_SHARE = 30, 3.0, 0.25
+"""A point of the line belongs to the way within so many places, and this length and share of the line, of where it
+should be by its length."""
+
+
+@dataclass(frozen=True, eq=False)
+class SeenLine:
+    """One view of a frame: the line's points, and the grid as this camera shows it.
+
+    Attributes:
+        tip: pixel of the line's end.
+        at: length from there to each of its points, mm in the patient.
+        points: of the line behind its end, pixels.
+        across: unit vectors across the line at each.
+        shown: pixels of the grid's places.
+        slope: derivative of these by the place, pixels/mm.
+        scale: pixels in a mm there.
+        along: length from the root to each place in the image, mm in the patient.
+    """
+
+    tip: Float[np.ndarray, "2"]
+    at: Float[np.ndarray, "k"]
+    points: Float[np.ndarray, "k 2"]
+    across: Float[np.ndarray, "k 2"]
+    shown: Float[np.ndarray, "n 2"]
+    slope: Float[np.ndarray, "n 2 3"]
+    scale: Float[np.ndarray, "n"]
+    along: Float[np.ndarray, "n"]
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Observations, for each of some places of the tip.
+
+    Attributes:
+        place: of the grid that an observation is of.
+        towards: unit vector of the displacement that it observes; 0 where it observes a length.
+        value: observed, mm.
+        variance: of its own noise, mm².
+        used: whether it was made.
+    """
+
+    place: Int[np.ndarray, "m r"]
+    towards: Float[np.ndarray, "m r 3"]
+    value: Float[np.ndarray, "m r"]
+    variance: Float[np.ndarray, "r"]
+    used: Bool[np.ndarray, "m r"]
+
+
+def shown_by(
+    camera: Camera | View, points: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
+    """Return the pixels of points, and the derivative by the point, pixels/mm."""
+    slope = [(camera.project(points + axis) - camera.project(points - axis)) / 2 for axis in np.eye(3)]
+    return camera.project(points), np.stack(slope, axis=-1)
+
+
+def see(grid: VesselGrid, camera: Camera | View, line: Line, way: Float[np.ndarray, "n 3"]) -> SeenLine:
+    """Return a line's points, evenly apart, and the grid as the camera shows it where the pose has it."""
+    shown, slope = shown_by(camera, way)
+    scale = np.sqrt((slope**2).sum(axis=(1, 2)) / 2)
+    usual = float(np.median(scale))
+    length = length_along(line)
+    at = np.arange(_SAMPLE_MM * usual, length[-1], _SAMPLE_MM * usual)
+    around = 0.4 * _SAMPLE_MM * usual
+    ahead = places_on(line, length, at + around) - places_on(line, length, at - around)
+    ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+    return SeenLine(
+        tip=line[0],
+        at=at / usual,
+        points=places_on(line, length, at),
+        across=np.stack([-ahead[:, 1], ahead[:, 0]], axis=-1),
+        shown=shown,
+        slope=slope,
+        scale=scale,
+        along=grid.along(shown) / usual,
+    )
+
+
+def tip_observations(seen: Sequence[SeenLine], places: Int[np.ndarray, "m"]) -> Observations:
+    """Return what the ends of the lines say: two observations a view."""
+    shape = len(places), 2 * len(seen)
+    return Observations(
+        place=np.repeat(places[:, None], shape[1], axis=1),
+        towards=np.concatenate([one.slope[places] / one.scale[places, None, None] for one in seen], axis=1),
+        value=np.concatenate([(one.tip - one.shown[places]) / one.scale[places, None] for one in seen], axis=1),
+        variance=np.full(shape[1], POINT_SD_MM**2 + _END_SD_MM**2),
+        used=np.ones(shape, dtype=bool),
+    )
+
+
+def line_observations(
+    grid: VesselGrid, seen: SeenLine, places: Int[np.ndarray, "m"], moved: Float[np.ndarray, "m k 3"]
+) -> tuple[Observations, Int[np.ndarray, "m"]]:
+    """Return what a line's points say, and its length, and how many of them lie before the root.
+
+    Args:
+        grid: the places.
+        seen: the line.
+        places: of its tip.
+        moved: how far the way is moved at each point, as found so far, mm.
+    """
+    each, behind = np.arange(len(places)), grid.behind[places]
+    arc = seen.along[places, None] - seen.along[behind]
+    within = np.arange(behind.shape[1]) <= grid.depth[places, None]
+    arc[~within] = np.inf
+    first = (arc[:, None, :] < seen.at[:, None]).sum(axis=2)
+    window = np.clip(first[..., None] + np.arange(-_WINDOW, _WINDOW + 1), 0, behind.shape[1] - 1)
+    near = each[:, None, None]
+    candidates = behind[near, window]
+    slack = _SLACK_MM + _SLACK_SHARE * seen.at
+    inside = np.abs(arc[near, window] - seen.at[:, None]) <= slack[:, None]
+    wanted = seen.points - np.einsum("mij,mkj->mki", seen.slope[places], moved)
+    gap = ((seen.shown[candidates] - wanted[:, :, None]) ** 2).sum(axis=3)
+    gap[~inside] = np.inf
+    chosen = gap.argmin(axis=2)[..., None]
+    place = np.take_along_axis(candidates, chosen, axis=2)[..., 0]
+    beyond = seen.at > seen.along[places, None]
+    used = np.isfinite(np.take_along_axis(gap, chosen, axis=2)[..., 0]) & (place != 0) & ~beyond
+    scale = seen.scale[place]
+    towards = np.einsum("ki,mkij->mkj", seen.across, seen.slope[place]) / scale[..., None]
+    value = np.einsum("ki,mki->mk", seen.across, seen.points - seen.shown[place]) / scale
+    any_used = used.any(axis=1)
+    last = np.where(any_used, len(seen.at) - 1 - used[:, ::-1].argmax(axis=1), 0)
+    longer = seen.along[places] - seen.along[place[each, last]] - seen.at[last]
+    rows = Observations(
+        place=np.column_stack([place, places]),
+        towards=np.concatenate([towards, np.zeros((len(places), 1, 3))], axis=1),
+        value=np.column_stack([value, longer]),
+        variance=np.array([*[POINT_SD_MM**2] * len(seen.at), (_LENGTH_SD_MM + _LENGTH_SHARE * seen.at[-1]) ** 2]),
+        used=np.column_stack([used, any_used]),
+    )
+    return rows, beyond.sum(axis=1)
+
+
+def joined(parts: Sequence[Observations]) -> Observations:
+    """Return several observations of the same places of the tip as one."""
+    fields = vars(parts[0])
+    return Observations(
+        **{
+            name: np.concatenate([getattr(part, name) for part in parts], axis=min(1, fields[name].ndim - 1))
+            for name in fields
+        }
+    )
