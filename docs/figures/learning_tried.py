@@ -22,7 +22,7 @@ from endopilot.models import play
 from endopilot.models.causal import CausalNetwork, ForwardNetwork, InverseNetwork, Mixture
 from endopilot.models.config import WINDOW, CausalConfig
 from endopilot.models.episodes import Episodes
-from endopilot.models.sequences import N_INPUTS, N_WIRE_INPUTS, Sequences, prepare_vessels, unfold
+from endopilot.models.sequences import N_INPUTS, N_WIRE_INPUTS, Sequences, play_tables, unfold
 from endopilot.models.simulated_wires import FRICTION_FACTORS, read_or_simulate
 
 PATIENTS, EPOCHS, BATCH, RATE = 60, 3, 32, 2e-3
@@ -54,24 +54,25 @@ class WithoutWires(InverseNetwork):
 def guess_rows(data: Dataset) -> Iterator[str]:
     """Yield what is predicted without learning: slack held, play operator, simulated wires."""
     episodes = Episodes.of_dataset(data)
-    vessels, patient = prepare_vessels(episodes), np.unique(data.anatomy, return_inverse=True)[1]
+    vessels, patient = play_tables(episodes), np.unique(data.anatomy, return_inverse=True)[1]
     observed = np.broadcast_to(np.arange(data.valid.shape[1]) < WINDOW, data.valid.shape)
     truth = np.stack([data.tip_abscissa, data.tip_offset], axis=-1)[:, :, 0].astype(float)
     held = np.abs(hold_slack(data, WINDOW) - truth[:, WINDOW:])
     yield row("hold slack and offset", np.pad(held, ((0, 0), (WINDOW, 0), (0, 0))))
     guess = unfold("forward", vessels, patient, episodes, observed).guess
     yield row("play operator, nothing learned", np.abs(guess - truth))
-    wires = read_or_simulate(episodes.setup.patients_folder, episodes)
-    wires = np.where(np.isfinite(wires), wires, guess[:, :, None])
-    off = np.abs(wires - truth[:, :, None])
-    yield row("simulated wire of the device's friction, nothing learned", off[:, :, FRICTION_FACTORS.index(1.0)])
-    best = off[:, :WINDOW, :, 0].mean(axis=1).argmin(axis=1)
-    yield row("of the simulated wires the best in the given states", off[np.arange(len(off)), :, best])
+    middle = FRICTION_FACTORS.index(1.0)
+    for name, seen in (
+        ("simulated wire as it is given, nothing learned", np.zeros_like(observed)),
+        ("simulated wire fitted to the given states, nothing learned", observed),
+    ):
+        wire = read_or_simulate(episodes.setup.patients_folder, episodes, seen).tip[:, :, middle]
+        yield row(name, np.abs(np.where(np.isfinite(wire), wire, guess) - truth))
 
 
 def _sequences(data: Dataset) -> Sequences:
     episodes = Episodes.of_dataset(data)
-    return Sequences.of(episodes, prepare_vessels(episodes), ("ff",), 0)
+    return Sequences.of(episodes, play_tables(episodes), ("ff",), 0)
 
 
 def variant_rows(training: Dataset, held_out: Dataset) -> Iterator[str]:
