@@ -22,6 +22,7 @@ from endopilot.files import read_json, sha256
 from endopilot.models.causal import CausalPredictor, ForwardNetwork, InverseNetwork, Mixture
 from endopilot.models.config import CausalConfig, TrainConfig
 from endopilot.models.episodes import Episodes
+from endopilot.models.fitted_wires import SCALES_MM, SPREADS, posterior, rounded
 from endopilot.models.open_loop import JUMP_MM, Predictor, ProbabilisticPredictor, jumps
 from endopilot.models.patient import STEP_MM, prepare
 from endopilot.models.play import N_FEATURES, mirrored
@@ -400,3 +401,26 @@ def test_a_wire_that_the_vessel_holds_ends_where_it_is(folder):
     slack = np.arange(patient.pull_tip.shape[1]) * STEP_MM - patient.pull_tip
     assert (patient.deepest > 20.0).all()
     assert (np.ptp(slack[:, :5], axis=1) < 1e-9).any()  # nothing is known of lengths that it is not pulled back to
+
+
+@pytest.mark.parametrize("noise_mm", [0.0, 0.3])
+def test_a_fit_is_as_sure_as_what_it_explains(noise_mm):
+    random = np.random.default_rng(0)
+    slopes = random.normal(size=(4, 30, 2)) * [0.2, 0.05]  # mm a spread of each parameter
+
+    def tips(theta):
+        return 50.0 + np.einsum("...k,ksd->...sd", (theta - 1) / SPREADS, slopes)
+
+    theta = rounded(1 + SPREADS * random.uniform(-1, 1, (16, 4)))
+    truth = 1 + SPREADS * np.array([0.8, -0.5, 0.3, -0.9])
+    seen = tips(truth) + noise_mm * random.normal(size=(30, 2))
+    seen[7, 0] += 1.5  # a snap that the true wire made elsewhere
+    given = np.ones(30, dtype=bool)
+    mean, sd = posterior(theta, tips(theta), seen, np.tile(SCALES_MM, (30, 1)), given)
+    off = np.abs(mean - truth) / SPREADS
+    assert (off < (0.05 if noise_mm == 0 else 1.0)).all() and (off < 3.5 * sd / SPREADS + 0.02).all(), (
+        off,
+        sd / SPREADS,
+    )
+    nothing = posterior(theta, tips(theta), seen, np.tile(SCALES_MM, (30, 1)), ~given)
+    np.testing.assert_array_equal(nothing, [np.ones(4), SPREADS])

@@ -36,6 +36,10 @@ LEVELS = np.array([0.0, 0.05, 0.05, 0.05])
 """Parameters are rounded to these: wires of one stiffness in one motion are simulated side by side."""
 _FAR_MM = 2.0
 """Differences between tips are cut off here, mm: beyond, a wire has snapped, or lies in another branch."""
+_MEDIAN_SQUARE = 0.455
+"""Median of the square of a normal deviate."""
+_REFITS = 10
+"""Times that the tips' weights follow from how well they are explained."""
 _STILL = np.array([(f, s, 0.0, 0.0) for f, s in product((-0.9, -0.3, 0.3, 0.9), (-0.75, 0.0, 0.75))])
 _MOVING = np.array(
     [(f, 0.0, a, v) for a, v in ((0, 0), (-1.2, 0), (1.2, 0), (0, -1.4), (0, 1.4)) for f in (-0.75, 0.0, 0.75)]
@@ -67,7 +71,7 @@ def fitted(episodes: Episodes, given: Bool[np.ndarray, "episodes given"]) -> Wir
         theta = rounded(mean[:, None] + sd[:, None] * design)
         paths = _replayed(episodes, anatomy, theta, samples)
         scales = np.maximum(SCALES_MM, sd_mm)
-        found = [_posterior(*each) for each in zip(theta, paths, tips, scales, given, strict=True)]
+        found = [posterior(*each) for each in zip(theta, paths, tips, scales, given, strict=True)]
         mean, sd = np.array([each[0] for each in found]), np.array([each[1] for each in found])
         sd = np.clip(2 * sd, NARROWEST * SPREADS, SPREADS)
     return rounded(mean)
@@ -123,14 +127,22 @@ def by_motion(theta: Float[np.ndarray, "n 4"]) -> list[np.ndarray]:
     return [np.flatnonzero(kind == k) for k in range(kind.max() + 1)]
 
 
-def _posterior(
+def posterior(
     theta: Float[np.ndarray, "members 4"],
     paths: Float[np.ndarray, "members samples 2"],
     tip: Float[np.ndarray, "samples 2"],
     scale_mm: Float[np.ndarray, "samples 2"],
     given: Bool[np.ndarray, "samples"],
 ) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "4"]]:
-    """Return mean and standard deviation of the parameters after the given tips."""
+    """Return mean and standard deviation of the parameters of one episode after the given tips.
+
+    Args:
+        theta: of the wires that were tried.
+        paths: their tips, mm; NaN from where a simulation fails.
+        tip: the observed ones, mm.
+        scale_mm: of a good wire's errors.
+        given: samples at which the tip was observed.
+    """
     whole = np.isfinite(paths).all(axis=(1, 2))
     if whole.sum() < 8 or not given.any():
         return np.ones(4), SPREADS
@@ -142,10 +154,11 @@ def _posterior(
     lines = np.column_stack([np.ones(len(unit)), unit])
     slope = np.linalg.solve(lines.T @ lines + 1e-3 * np.eye(5), lines.T @ y)
     left = ((y - lines @ slope) ** 2).mean(axis=0)
-    variance = 0.25 * scale**2 + 4 * left
     found, precision = np.zeros(4), np.eye(4)
-    for _ in range(5):
+    for _ in range(_REFITS):
         misfit = (away - slope[0] - found @ slope[1:]) ** 2
+        noise = np.median(misfit.reshape(-1, 2), axis=0) / _MEDIAN_SQUARE  # of Δtip and γtip, which no wire explains
+        variance = 0.25 * scale**2 + 4 * left + np.tile(noise, len(misfit) // 2)
         weight = 1 / (variance * (1 + misfit / (4 * variance)))
         precision = (slope[1:] * weight) @ slope[1:].T + np.eye(4)
         found = np.linalg.solve(precision, (slope[1:] * weight) @ (away - slope[0]))
