@@ -68,11 +68,12 @@ def device(
         diameter_mm: outer diameters of tip and shaft, mm.
         modulus_mpa: Young's moduli of tip and shaft, MPa: the benchmark's files give kPa, which follow from their
             densities (kg, mm, s).
-        bore_mm: inner diameter of a catheter, mm.
+        bore_mm: inner diameter of a catheter, mm. The benchmark's simulator is not given it: there, catheters bend as
+            if they were solid.
     """
     like = "micro-devices" if bore_mm or diameter_mm[1] < 0.5 else "j-035"
     newtons, torque = (0.5, 0.5) if like == "micro-devices" else (2.0, 10.0)
-    sections = [np.pi * (d**4 - bore_mm**4) / 64 for d in diameter_mm]
+    sections = [np.pi * d**4 / 64 for d in diameter_mm]
     tip, shaft = (round(float(e * i), 5) for e, i in zip(modulus_mpa, sections, strict=True))
     bend = [tip, tip, shaft]
     friction = 0.001 if like == "micro-devices" else 0.1

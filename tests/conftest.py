@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import locale
 from unittest.mock import patch
 
 import pytest
@@ -11,6 +12,8 @@ from missing_libraries import missing_library
 from shape_checks import begin_test, check_quickly
 
 check_quickly()
+
+LOCALE, ENCODING = locale.setlocale(locale.LC_ALL), locale.getencoding()
 
 
 @pytest.hookimpl(wrapper=True)
@@ -40,6 +43,17 @@ def pytest_runtest_setup():
 def pytest_runtest_call():
     """Skip a test that needs such a library."""
     return (yield from skipping())
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown():
+    """Fail a test that leaves another encoding of text files to the tests after it, as ITK's writer of DICOM does."""
+    result = yield
+    if locale.getencoding() != ENCODING:
+        left = locale.getencoding()
+        locale.setlocale(locale.LC_ALL, LOCALE)
+        pytest.fail(f"leaves the locale's encoding at {left}; it was {ENCODING}")
+    return result
 
 
 def skipping():

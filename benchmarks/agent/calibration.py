@@ -164,6 +164,7 @@ NO_BANDS = Calibration(
     intervals=1,
     dataset="",
     offset_share=1.0,
+    longest_s=EXPOSED_EVERY * DECISION_PERIOD_S,
 )
 
 
@@ -216,6 +217,7 @@ def calibrate(folder: Path, kind: Kind) -> tuple[Calibration, list[str]]:
         intervals=len(rows),
         dataset=f"patients to learn on of {kind.whose}",
         offset_share=1.0,
+        longest_s=EXPOSED_EVERY * DECISION_PERIOD_S,
     )
     lines = ["| patients | intervals without X-ray | in which both bands hold throughout |", "|---|---|---|"]
     for title, role in (("calibrated on", "calibrate"), ("the ladder's, not calibrated on", "test")):

@@ -24,7 +24,8 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks.figures import Bar, judged
-from endopilot.belief.monitor import MISMATCH, BelievedTip, Monitor
+from endopilot.belief.monitor import BelievedTip, Monitor
+from endopilot.belief.watch import MISMATCH
 from endopilot.cli.arguments import OutputFolder
 from endopilot.control.agent import AgentPolicy
 from endopilot.control.agent_config import AgentConfig, read_agent_calibration

@@ -42,8 +42,8 @@ def samples(scene: Scene, random: np.random.Generator) -> tuple[np.ndarray, np.n
         drawn = _resampled(nodes, along, np.arange(0.0, along[-1], 0.1))
         seen = _resampled(nodes, along, np.arange(0.1, scene.inserted_length[index] + 3.0, STEP_MM))
         for plane, signal in zip(scene.planes, signals, strict=True):
-            plain, every = detector.without_contrast(plane.view, signal), np.arange(signal.size)
-            found = features(plain, scene.imager.photons(plane, dose), every).reshape(-1, *signal.shape)
+            plain = detector.without_contrast(plane.view, signal)
+            found = features(plain, scene.imager.photons(plane, dose)).reshape(-1, *signal.shape)
             free = np.ones(signal.shape, dtype=bool)
             free[tuple(_inside(np.rint(plane.pixel(drawn)), signal.shape, 0).astype(int).T)] = False
             away = distance_transform_edt(free)

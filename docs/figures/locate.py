@@ -22,7 +22,7 @@ from benchmarks.figures import fill
 from endopilot.anatomy.extract import extract_anatomy
 from endopilot.types import Anatomy
 from endopilot.xray.camera import Camera, read_camera
-from endopilot.xray.frames import Frame, read_frames
+from endopilot.xray.frames import DeviceFrame, read_frames
 from endopilot.xray.locate import locate
 from endopilot.xray.locate_picture import draw_locations
 from endopilot.xray.tip_filter import LocateConfig, TipLocation
@@ -48,7 +48,7 @@ def judged(found: list[TipLocation], authors: np.ndarray, seconds: float) -> str
     )
 
 
-def rows_of(anatomy: Anatomy, frames: tuple[Frame, ...], camera: Camera, authors: np.ndarray) -> list[str]:
+def rows_of(anatomy: Anatomy, frames: tuple[DeviceFrame, ...], camera: Camera, authors: np.ndarray) -> list[str]:
     """Return the rows of one tree: registered by a landmark and by the catheter alone, the frames in two parts."""
     rows = []
     for name, landmark in (

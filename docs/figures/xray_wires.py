@@ -12,6 +12,7 @@ from pathlib import Path
 sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
 
 from benchmarks.figures import fill
+from endopilot.files import processor_name
 
 HEAD = (
     "| | wires | missed, two views | one view | wrong and said so | called found and missed | doubted though right "
@@ -35,6 +36,12 @@ def table(found: dict) -> str:
         lines.append(f"| {name} | {row['wires']} | " + " | ".join(shares) + " |")
     limits = (f"{found['bars'][name]:.0%}".replace("%", " %") for name in SHARES[:3])
     lines.append("| bar | | ≤ {} | ≤ {} | ≥ {} | | | 92 to 97 % |".format(*limits))
+    false, most_ms = f"{found['false_alarms_share']:.0%}".replace("%", " %"), found["bars"]["ms_a_view"]
+    lines += [
+        "",
+        f"A wire is found in {false} of the exposures without one. A detection takes {found['ms_a_view']:.0f} ms of "
+        f"one core's time a view (median; bar ≤ {most_ms:g}), on {processor_name()} that others use too.",
+    ]
     return "\n".join(lines)
 
 

@@ -228,7 +228,7 @@ def test_the_adviser_uses_as_little_of_the_band_as_what_it_may_miss_allows(split
     """With a share s of the band it sees 10 s of 10 arrivals; the patients are alike, so that no error is added."""
     bands = Calibration(
         level=0.9, scale=1.0, abscissa_terms=(0.0,) * 4, offset_terms=(0.1, 0.0, 0.0, 0.0), anatomies=3, intervals=30,
-        dataset="", offset_share=1.0,
+        dataset="", offset_share=1.0, longest_s=45.0,
     )  # fmt: skip
     config = replace(EVENTS, missed=may_miss)
     assert monitoring.least_offset_share(approaching(split, half=0.1), bands, config) == offset_share
@@ -239,7 +239,7 @@ def test_no_share_of_the_band_beyond_the_first_that_misses_too_much_is_chosen(sp
     monkeypatch.setattr(monitoring, "surely_missed", lambda *_: next(missed))
     bands = Calibration(
         level=0.9, scale=1.0, abscissa_terms=(0.0,) * 4, offset_terms=(0.0,) * 4, anatomies=3, intervals=30, dataset="",
-        offset_share=1.0,
+        offset_share=1.0, longest_s=45.0,
     )  # fmt: skip
     assert monitoring.least_offset_share(approaching(split, half=0.1), bands, EVENTS) == monitoring.OFFSET_SHARES[1]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -22,6 +24,7 @@ def calibration(
         intervals=40,
         dataset="key",
         offset_share=offset_share,
+        longest_s=45.0,
     )
 
 
@@ -224,3 +227,23 @@ def test_a_model_that_erred_is_looked_at_as_long_as_its_band_lies_across_the_wal
             due = [adviser.advise(at, tip, np.zeros((1, 2)), radius, erred=erred)[0] for at in proximal[1:]]
             found.append([i for i, each in enumerate(due, 1) if each])
         assert found == [across, along]
+
+
+def test_an_exposure_is_due_after_as_long_as_was_calibrated_on() -> None:
+    bands = replace(calibration(abscissa=0.0), longest_s=4.0)
+    adviser = XrayAdviser(bands, AdviserConfig(), wire_radius_mm=0.2)
+    still, radius = np.zeros((1, 2)), np.full(1, 1.2)
+    adviser.start(still, still, radius)
+    due = [bool(adviser.advise(still, still, still, radius)[0]) for _ in range(20)]
+    assert [i for i, each in enumerate(due, 1) if each] == [8, 16]  # periods of 0.5 s
+
+
+def test_what_an_exposure_of_one_navigation_shows_counts_for_that_one() -> None:
+    adviser = XrayAdviser(calibration(abscissa=0.0, offset=0.0), AdviserConfig(), wire_radius_mm=0.2)
+    still, tip, radius = np.zeros((2, 2)), np.full((2, 2), 0.9), np.full(2, 1.2)
+    adviser.start(still, tip, radius)
+    for _ in range(5):
+        adviser.advise(still, tip, still, radius)
+    adviser.exposed(np.array([0.5]), np.array([1.2]), np.array([1]))
+    due = [adviser.advise(still, tip, still, radius).tolist() for _ in range(3)]
+    assert due == [[False, False], [False, False], [False, True]]

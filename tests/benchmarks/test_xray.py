@@ -7,8 +7,6 @@ import pytest
 
 from benchmarks.imaging.wires import Search, figures_of
 from benchmarks.imaging.xray import BARS, Exposure, _figures
-from endopilot.anatomy.io import write_anatomy
-from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.errors import InputError
 from endopilot.xray.scenes import SceneConfig, draw_scenes
 
@@ -53,11 +51,9 @@ def test_a_tip_found_elsewhere_is_missed_and_one_found_without_a_wire_is_a_false
     assert figures["images_per_second"] == 20.0
 
 
-def test_anatomies_of_ones_own_lie_on_the_table(tmp_path):
-    patient = make_patient(AtlasConfig(population="textbook"), 0)
-    write_anatomy(patient, output=tmp_path / "mine")
-    (scene,) = draw_scenes(SceneConfig(given=(tmp_path / "mine",)))
-    assert scene.anatomy.identity == patient.identity
+def test_anatomies_of_ones_own_lie_on_the_table(fork, vessel, tmp_path):
+    (scene,) = draw_scenes(SceneConfig(given=(vessel,)))
+    assert scene.anatomy.identity == fork.identity
     with pytest.raises(InputError, match="no such folder"):
         next(draw_scenes(SceneConfig(given=(tmp_path / "absent",))))
 

@@ -34,6 +34,7 @@ def calibration(abscissa=STILL, offset=STILL) -> Calibration:
         intervals=36,
         dataset="key",
         offset_share=1.0,
+        longest_s=45.0,
     )
 
 

@@ -187,3 +187,21 @@ def test_of_manoeuvres_that_pass_alike_the_cheapest_is_taken(side_branch, found,
     monkeypatch.setattr(Search, "manoeuvre_cost", lambda _, pushed: -pushed.force)
     _, _, harder = search(side_branch)
     assert harder.reached == 1.0 and harder.force.max() > course.force.max()
+
+
+def test_where_there_is_little_time_wire_and_catheter_move_together_and_faster(side_branch, monkeypatch) -> None:
+    monkeypatch.setattr("endopilot.control.manoeuvre._LEADS_MM", (2.0,))
+    straight = replace(side_branch, target=Target(branch=0, abscissa=18.0))
+    assert AgentConfig.of(straight) is AgentConfig.of(side_branch)  # there is time for 4 x 18 mm at 5 mm/s
+    hurried = replace(straight, seconds=6.0)
+    config = AgentConfig.of(hurried).search
+    assert config.manoeuvres.together and config.speed_mm_s == pytest.approx(2 * 18.0 / 6.0)
+    belief = Belief(straight, [World()], BELIEF)
+    route = Route.to(straight.anatomy, straight.target)
+    slow, fast = (
+        Search(straight, route, belief, config=each, seed=0).find(belief, seconds=60.0)
+        for each in (agent_config(straight).search, config)
+    )
+    assert slow.reached == fast.reached == 1.0 and len(fast.control) < 0.75 * len(slow.control)
+    both = [(np.abs(course.control[:, :, 0]) > 0.5).all(axis=1).any() for course in (slow, fast)]
+    assert both == [False, True]

@@ -9,14 +9,20 @@ import pytest
 
 from endopilot.anatomy.extract import extract_anatomy
 from endopilot.anatomy.sources import Polylines
+from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.agent import AgentPolicy
 from endopilot.control.agent_config import IN_WIDE_LUMEN, AgentConfig
 from endopilot.control.manoeuvre import Repertoire
+from endopilot.control.push import Pushed
+from endopilot.control.search import Search
 from endopilot.control.search_config import SearchConfig
-from endopilot.control.trials import WIRE, Move, Trials
+from endopilot.control.trials import WIRE, Move, Period, Trials
+from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
 from endopilot.devices.drive_limits import DriveLimits, far_end_mm
+from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
+from endopilot.tasks.route import Route
 
 
 @pytest.fixture(scope="module")
@@ -72,3 +78,18 @@ def test_what_holds_for_two_periods_leaves_no_travel_after_them(aorta, started):
     for periods in (1, 2):
         control = trials.possible(trials.control(Move(WIRE, 30.0)), periods=periods)
         assert control[0, WIRE, 0] == pytest.approx(6.0 / (periods * DECISION_PERIOD_S))
+
+
+def test_of_gentle_ways_of_wire_and_catheter_the_straight_and_quick_one_is_taken(aorta):
+    """Soft devices press as gently in loops, which end in coils."""
+    pair = replace(aorta, catheters=(read_catheter("microcatheter-1.7f"),), device=read_wire("workhorse-014"))
+    belief = Belief(pair, [World()], BeliefConfig(members=1))
+    one = Search(pair, Route.to(pair.anatomy, pair.target), belief, config=SearchConfig(), seed=0)
+    limit_n = pair.force_limit_n
+    # By force: hardly any, a tenth of the limit, and half of it. By slack and periods:
+    force, slack = limit_n * np.array([0.01, 0.1, 0.05, 0.5]), np.array([100.0, 0.0, 0.0, 0.0])
+    passed = np.ones(4, dtype=bool)
+    moved = (np.arange(20)[:, None] < [4, 4, 20, 4])[..., None, None] * np.ones((2, 2))  # then they wait
+    rows = [Period(each, np.zeros((4, 2, 2)), belief.simulator.project()[:, 0], force) for each in moved]
+    pushed = Pushed(rows, np.full(4, 20), passed, force, np.zeros(4), slack, ["late"] * 4)
+    assert np.argsort(one.manoeuvre_cost(pushed)).tolist() == [1, 2, 0, 3]

@@ -11,6 +11,7 @@ import SimpleITK as sitk
 from command import refused, run
 
 import endopilot
+from dicom_by_itk import write_dicom
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.cli import main
@@ -34,16 +35,13 @@ def write_image(array: np.ndarray, path: Path, *, vector: bool = False) -> Path:
 
 def write_slices(folder: Path, series: str, first: int) -> None:
     image = sitk.GetImageFromArray(np.zeros((4, 8, 8), dtype=np.int16))
-    writer = sitk.ImageFileWriter()
-    writer.KeepOriginalImageUIDOn()
     for k in range(4):
         cut = image[:, :, k]
         tags = {"0008|0060": "CT", "0020|000e": series, "0020|0013": str(k), "0008|0018": f"{series}.{k}"}
         tags |= {"0020|0032": f"0\\0\\{k}", "0020|0037": "1\\0\\0\\0\\1\\0", "0028|1052": "-1024", "0028|1053": "1"}
         for tag, value in tags.items():
             cut.SetMetaData(tag, value)
-        writer.SetFileName(str(folder / f"{first + k}.dcm"))
-        writer.Execute(cut)
+        write_dicom(cut, folder / f"{first + k}.dcm")
 
 
 def test_volumes(tmp_path, capsys):

@@ -12,6 +12,7 @@ import SimpleITK as sitk
 from pydicom.uid import DeflatedExplicitVRLittleEndian, JPEGLSLossless, RLELossless
 from scipy.spatial.transform import Rotation
 
+from dicom_by_itk import write_dicom
 from endopilot.errors import InputError
 from endopilot.imaging.volume import read_volume, write_mask, write_volume
 from endopilot.types import LumenMask, Volume
@@ -112,12 +113,7 @@ def test_compressed_series_are_read_and_truncated_ones_refused(tmp_path, compres
             slice_.compress(RLELossless if compression == "RLE" else JPEGLSLossless)
             slice_.save_as(file)
             continue
-        writer = sitk.ImageFileWriter()  # ITK writes both without loss
-        writer.KeepOriginalImageUIDOn()
-        writer.UseCompressionOn()
-        writer.SetCompressor(compression)
-        writer.SetFileName(str(file))
-        writer.Execute(sitk.ReadImage(str(file)))
+        write_dicom(sitk.ReadImage(str(file)), file, compressor=compression)  # ITK writes both without loss
     syntax = pydicom.dcmread(file).file_meta.TransferSyntaxUID
     assert syntax.is_compressed or syntax.is_deflated
     _change(folder, RescaleSlope="2", RescaleIntercept="-24")

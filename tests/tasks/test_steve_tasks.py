@@ -51,9 +51,9 @@ def test_targets_of_two_devices_lie_in_carotid_and_vertebral_arteries_alone(tmp_
     (task,) = list_tasks(str(tmp_path / "dual"))
     navigation = task.ladder_navigation(0)
     (catheter,) = navigation.catheters
-    # 1 MPa on a solid section of 0.36 mm, and on rings of 0.57 in 0.6 and in 0.7 mm.
+    # 1 MPa on solid sections of 0.36 mm, and of 0.6 and 0.7 mm: the benchmark's simulator knows no bore.
     np.testing.assert_allclose(navigation.device.bend_stiffness_n_mm2, 8.2e-4, atol=1e-5)
-    np.testing.assert_allclose(catheter.bend_stiffness_n_mm2, [1.18e-3, 1.18e-3, 6.6e-3], atol=1e-5)
+    np.testing.assert_allclose(catheter.bend_stiffness_n_mm2, [6.36e-3, 6.36e-3, 1.179e-2], atol=1e-5)
     assert catheter.inner_diameter_mm == 0.57 and np.rad2deg(catheter.turned(np.array([20.0]))[0]) == pytest.approx(72)
     # The aorta ends at 450 mm; no target lies in the tubes of the arteries behind the four.
     assert len(targets) == 20 and len({tuple(point) for point in targets}) == 20

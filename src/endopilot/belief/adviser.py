@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.special import ndtri
 
 from endopilot.anatomy.projection import safety_ratio
@@ -60,7 +60,8 @@ class XrayAdviser:
     uses the share that the calibration found. This, over the clearance of the lumen there, lies below τ, above it, or
     across it. Below, nothing threatens; above, the tip is known to be at the wall; across, either may be. An exposure
     is due where the band reaches τ, where the predicted tip crosses it, and where the band has left it below; and as
-    long as the last exposure showed the tip on the other side of τ than it is predicted. It shows what is within 0.5 s
+    long as the last exposure showed the tip on the other side of τ than it is predicted; and after an interval as long
+    as any that was calibrated on. It shows what is within 0.5 s
     of it, so none follows another sooner than after 1.5 s.
 
     A model that has erred is trusted less: an exposure is due as long as the band lies across τ, and where that of Δtip
@@ -68,6 +69,8 @@ class XrayAdviser:
 
     Attributes:
         half_width: of the whole bands of Δtip and γtip at the last call of `advise`, mm, a row for each navigation.
+        wide: whether Δtip's band was too wide then.
+        late: whether the last exposure was as long ago then as any interval that was calibrated on.
     """
 
     def __init__(self, calibration: Calibration, config: AdviserConfig, wire_radius_mm: float) -> None:
@@ -80,6 +83,7 @@ class XrayAdviser:
         """
         self._calibration, self._config, self._wire_radius_mm = calibration, config, wire_radius_mm
         self.half_width = np.zeros((0, 2))
+        self.wide = self.late = np.zeros(0, dtype=bool)
 
     def start(self, proximal: Float[np.ndarray, "n 2"], tip: Tips, radius_mm: Float[np.ndarray, "n"]) -> None:
         """Begin at an exposure.
@@ -92,7 +96,7 @@ class XrayAdviser:
         self._proximal, self._travel = proximal, np.zeros(len(proximal))
         self._since = np.zeros(len(proximal), dtype=int)
         self._beyond = [self._is_beyond(tip[:, 1], radius_mm)] * 5
-        self._shown = self._beyond[0]
+        self._shown = self._beyond[0].copy()
         self._is_shown = np.zeros(len(proximal), dtype=bool)
 
     def advise(
@@ -134,8 +138,9 @@ class XrayAdviser:
         crossed = np.any([now & ~before for now, before in zip(beyond, self._beyond, strict=True)], axis=0)
         across = np.any(beyond, axis=0) & ~np.all(beyond, axis=0)
         disagrees = self._is_shown & (beyond[1] != self._shown)
-        wide = half[:, 0] >= self._config.abscissa_mm * (_ERRED_SHARE if erred else 1.0)
-        due = (crossed | disagrees | wide | (across & erred) | always) & (self._since >= _SPACING)
+        self.wide = half[:, 0] >= self._config.abscissa_mm * (_ERRED_SHARE if erred else 1.0)
+        self.late = self._since * DECISION_PERIOD_S >= self._calibration.longest_s
+        due = (crossed | disagrees | self.wide | (across & erred) | self.late | always) & (self._since >= _SPACING)
         self._beyond = [np.where(crossed & ~due, before, now) for now, before in zip(beyond, self._beyond, strict=True)]
         self._since, self._travel = np.where(due, 0, self._since), np.where(due, 0.0, self._travel)
         return due
@@ -147,10 +152,22 @@ class XrayAdviser:
             half = np.hypot(half, ndtri(0.5 + 0.5 * self._calibration.level) * play)
         return half
 
-    def exposed(self, offset_mm: Float[np.ndarray, "n"], radius_mm: Float[np.ndarray, "n"]) -> None:
-        """Take what an exposure shows: γtip, and the radius of the lumen there, mm; the bands begin anew."""
-        self._since, self._travel = np.zeros_like(self._since), np.zeros_like(self._travel)
-        self._shown, self._is_shown = self._is_beyond(offset_mm, radius_mm), np.ones(len(self._since), dtype=bool)
+    def exposed(
+        self,
+        offset_mm: Float[np.ndarray, "shown"],
+        radius_mm: Float[np.ndarray, "shown"],
+        navigations: Int[np.ndarray, "shown"] | slice = slice(None),
+    ) -> None:
+        """Take what an exposure shows; the bands begin anew.
+
+        Args:
+            offset_mm: γtip, mm, of each navigation with an exposure.
+            radius_mm: of the lumen there, mm.
+            navigations: which these are; all if not given.
+        """
+        self._since[navigations], self._travel[navigations] = 0, 0.0
+        self._shown[navigations] = self._is_beyond(offset_mm, radius_mm)
+        self._is_shown[navigations] = True
 
     def _is_beyond(self, offset_mm: Float[np.ndarray, "n"], radius_mm: Float[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
         return safety_ratio(offset_mm, radius_mm, self._wire_radius_mm) >= self._config.wall_ratio

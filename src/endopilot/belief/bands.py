@@ -19,7 +19,7 @@ from scipy.optimize import nnls
 
 from endopilot.errors import InputError
 from endopilot.files import write_json
-from endopilot.settings import NonNegative, OpenShare, Within, read_settings, settings
+from endopilot.settings import NonNegative, OpenShare, Seconds, Within, read_settings, settings
 
 CALIBRATION_FILE = "xray.json"
 """Name of a calibration beside the run that it belongs to."""
@@ -37,6 +37,8 @@ class Calibration:
     Attributes:
         level: share of new intervals that the bands are to hold throughout.
         scale: half-width of a band in units of the spread.
+        longest_s: how long the intervals without X-ray were that it was calibrated on, s. Nothing is known of longer
+            ones, so X-ray is due then.
         offset_share: share of γtip's half-width by which the adviser asks for X-ray; of Δtip it uses the whole band.
         abscissa_terms: of the spread of Δtip, its terms as `TERMS` names them.
         offset_terms: of the spread of γtip.
@@ -53,6 +55,7 @@ class Calibration:
     intervals: Annotated[int, Within(1, 10**9)]
     dataset: str
     offset_share: NonNegative
+    longest_s: Seconds
 
     def half_width(self, seconds: Float[np.ndarray, "*n"], travel_mm: Float[np.ndarray, "*n"], spread: Tips) -> Tips:
         """Return the half-widths of the bands, mm.

@@ -33,8 +33,6 @@ _MOTION_SD_MM = np.array([0.6, 0.1])
 """Standard deviations of (Δtip, γtip) that a motion adds which was found, mm: measured in moving vessels."""
 _BETTER = 3.0
 """What is found must explain all exposures better by this logarithm."""
-MISMATCH = "model mismatch"
-"""Why X-ray is asked for while the model is taken to be wrong."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +89,6 @@ class Monitor:
             advice: which events X-ray must not miss.
         """
         self._navigation, self._config = navigation, config or BeliefConfig()
-        self._advice = advice or AdviserConfig()
         self._given = Belief.around(self._config)
         self.belief = Belief(navigation, self._given, self._config)
         self.past, self.lost = Past(), False
@@ -101,7 +98,7 @@ class Monitor:
         self._tests, self._loads = not navigation.catheters, LoadRatio()
         self.changes_left, self._since, self._returned = _MOST, 0, False
         tip_radius_mm, at = navigation.device.tip_radius_mm, adviser_input(self.belief)
-        self._watch = Watch(calibration, self._advice, tip_radius_mm, at, alone=self._tests)
+        self._watch = Watch(calibration, advice or AdviserConfig(), tip_radius_mm, at, alone=self._tests)
         self._innovations = self._watch.innovations
 
     @property
@@ -259,10 +256,8 @@ class Monitor:
             asks = "no simulated wire explains the last image" if due or not self._tests else ""
             return BelievedTip(abscissa, offset, (np.inf, np.inf), asks, found)
         along, across = self._watch.half_width.tolist()
-        wide = along >= self._advice.abscissa_mm
-        asks = f"Δtip is known to ±{along:.1f} mm only" if wide else "the tip may be reaching the wall"
-        asks = MISMATCH if self.alarm else asks
-        return BelievedTip(abscissa, offset, (along, across), asks if due else "", found)
+        asks = self._watch.reason if due else ""
+        return BelievedTip(abscissa, offset, (along, across), asks, found)
 
 
 def adviser_input(belief: Belief) -> AdviserInput:

@@ -214,6 +214,7 @@ def calibrate(fitted: Monitored, own: Monitored, config: AdviserConfig) -> Calib
         intervals=len(score),
         dataset=own.dataset,
         offset_share=1.0,
+        longest_s=SAMPLE_PERIOD_S * (own.truth.shape[1] - WINDOW),
     )
     return replace(bands, offset_share=least_offset_share(own, bands, config))
 
@@ -353,8 +354,10 @@ def adviser_policy(monitored: Monitored, calibration: Calibration, config: Advis
 
     def decide(sample: int, tip: np.ndarray, spread: np.ndarray) -> np.ndarray:
         on = again(sample, tip, spread)
-        shown = on & monitored.found[:, sample]
+        shown = np.flatnonzero(on & monitored.found[:, sample])
         branch[shown] = monitored.episodes.branch[shown, sample]
+        seen = monitored.episodes.tip[:, sample]
+        adviser.exposed(seen[shown, 1], monitored.lumen.radius(branch, seen[:, 0])[shown], shown)
         return on
 
     return decide

@@ -16,6 +16,9 @@ AdviserInput = tuple[
 """What an adviser is given of a navigation: (Δ, φ), mm and rad; (Δtip, γtip), mm; the spread (standard deviation) of
 these as the model states it, mm; and the lumen's radius at the tip, mm."""
 
+MISMATCH = "model mismatch"
+"""Why X-ray is asked for while the model is taken to be wrong."""
+
 
 class Watch:
     """Watches where a model predicts one tip: its adviser, what the bands allow for beside, and the innovations.
@@ -78,6 +81,17 @@ class Watch:
         )
         self._half = self.half_width / self.innovations.factor
         return bool(due[0])
+
+    @property
+    def reason(self) -> str:
+        """Why X-ray is due if it was at the last call of `advise`."""
+        if self.innovations.alarm:
+            return MISMATCH
+        if self._adviser.late[0]:
+            return "the last exposure is long ago"
+        if self._adviser.wide[0]:
+            return f"Δtip is known to ±{self.half_width[0]:.1f} mm only"
+        return "the tip may be reaching the wall"
 
     @property
     def half_width(self) -> Float[np.ndarray, "2"]:

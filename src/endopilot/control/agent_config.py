@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -39,9 +39,16 @@ class AgentConfig:
     @staticmethod
     def of(navigation: Navigation) -> AgentConfig:
         """Return the settings for a navigation by a wire alone, in a wide lumen or not, or by one in a catheter."""
+        target = navigation.target.abscissa
         if navigation.catheters:
-            return IN_CATHETER
-        wide = Route.to(navigation.anatomy, navigation.target).is_wide(navigation.target.abscissa)
+            search = IN_CATHETER.search
+            if search.speed_mm_s * navigation.seconds >= _WAYS * target:
+                return IN_CATHETER
+            fastest = min(device.max_velocity_mm_s for device in navigation.devices)
+            speed = max(search.speed_mm_s, _WAYS / 2 * target / navigation.seconds)
+            manoeuvres = replace(search.manoeuvres, together=True)
+            return replace(IN_CATHETER, search=replace(search, speed_mm_s=min(speed, fastest), manoeuvres=manoeuvres))
+        wide = Route.to(navigation.anatomy, navigation.target).is_wide(target)
         return IN_WIDE_LUMEN if wide else AgentConfig()
 
 
@@ -90,3 +97,8 @@ def read_agent_calibration(xray: XrayKind, devices: int) -> Calibration:
             "xray: assumed and one catheter"
         )
     return Calibration.read(CALIBRATIONS[xray, devices])
+
+
+_WAYS = 4.0
+"""Wire and catheter move in turn if there is time for a way so many times as long as the route; else together, and so
+fast that there is time for half as long a way."""

@@ -56,6 +56,7 @@ class Pushed:
         passed: which brought all wires that count past the place.
         force: largest wall force on a node of any wire that counts, N.
         farthest: how far along the route each came, mm.
+        slack: how much deeper than that each is inserted at its end, mm: what lies in loops.
         halt: why each that did not pass was given up.
     """
 
@@ -64,11 +65,18 @@ class Pushed:
     passed: Bool[np.ndarray, "trials"]
     force: Each
     farthest: Each
+    slack: Each
     halt: list[Halt]
 
     def within(self, force_n: float) -> Bool[np.ndarray, "trials"]:
         """Return which pass without pressing on the wall with more than some force, N."""
         return self.passed & (self.force <= force_n)
+
+    @property
+    def moving(self) -> Int[np.ndarray, "trials"]:
+        """Periods in which each trial moves, without those in which it waits for others."""
+        moves = [row.control.any(axis=(1, 2)) & (k < self.periods) for k, row in enumerate(self.rows)]
+        return np.sum(moves, axis=0, dtype=int)
 
     def controls(self, trial: int) -> Controls:
         """Return the controls of one trial."""
@@ -202,7 +210,8 @@ class Push:
         if not alone:
             passed = self.arrived(trials) & ~trials.still
         trials.still[:] = False
-        return Pushed(trials.rows, took, passed, _largest_force(trials, took), farthest, halt.tolist())
+        slack = _deepest(trials) - progress
+        return Pushed(trials.rows, took, passed, _largest_force(trials, took), farthest, slack, halt.tolist())
 
     def arrived(self, trials: Trials) -> Bool[np.ndarray, "trials"]:
         """Return which trials are past the place, or at the target."""
@@ -286,7 +295,8 @@ class _Follower:
             behind = np.minimum(push.waypoint - trials.mean(trials.tips.abscissa[:, CATHETER]), inserted - around)
         there = np.abs(left) <= REST_MM
         self._follows = (behind > REST_MM) & (self._follows | there | (inserted - around >= self._lead))
-        wire = np.where(there | self._follows, 0.0, np.clip(left / DECISION_PERIOD_S, -_SLOWEST_MM_S, speed))
+        rests = there | (self._follows & (not push.config.manoeuvres.together))
+        wire = np.where(rests, 0.0, np.clip(left / DECISION_PERIOD_S, -_SLOWEST_MM_S, speed))
         return wire, np.where(self._follows, np.clip(behind / DECISION_PERIOD_S, 0.0, speed), 0.0)
 
     def _together(self, left: Each) -> tuple[Each, Each]:

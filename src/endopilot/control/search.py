@@ -43,10 +43,14 @@ _BACK_MM_S = 2.0
 _LOOKOUT_MM, _LOOKOUT_RADII = 12.0, 3.0
 """A waypoint that is searched for lies no farther ahead than this, mm, or lumen radii where that is more: beyond, a
 chord says little."""
-_STRETCH_MM = 20.0
-"""A wire in a catheter passes the route in stretches of this length at most, mm."""
+_STRETCH_MM, _LONG_STRETCH_MM = 20.0, 40.0
+"""A wire in a catheter passes the route in stretches of this length at most, mm; of the latter where the two move
+together, since each stretch ends with the wire at rest until its catheter has come."""
 _TURNS = (0.0, np.pi)
 """Angles by which a wire alone may be turned before it goes in, rad."""
+_GENTLE_SHARE, _LOOP_SHARE, _LOOP_MM_S = 0.1, 1e-4, 5.0
+"""Share of the force limit below which devices in a wide lumen hardly press, what a millimetre in loops costs, and how
+many of these a second is worth, mm/s."""
 _OFTEN = 6
 """A course that has passed places this many times as often as there are is at an end."""
 _REPEATED = 3
@@ -159,18 +163,27 @@ class Search:
         )
 
     def manoeuvre_cost(self, pushed: Pushed) -> Each:
-        """Return what each trial of a manoeuvre costs, by which those that pass are compared: its largest force, N."""
-        return pushed.force
+        """Return what each trial of a manoeuvre costs, by which those that pass are compared: its largest force, N.
+
+        In a wide lumen soft devices press as gently in loops as straight, and loops end in coils: between trials that
+        hardly press, what lies in loops decides there, and the time that the trial takes.
+        """
+        if self._alone or not self.route.is_wide(self.route.target.abscissa):
+            return pushed.force
+        limit_n, seconds = self._navigation.force_limit_n, DECISION_PERIOD_S * pushed.moving
+        loops_mm = pushed.slack + _LOOP_MM_S * seconds
+        return np.maximum(pushed.force, _GENTLE_SHARE * limit_n) + _LOOP_SHARE * limit_n * loops_mm
 
     def _places(self) -> Sequence[float]:
         """Return the places that are passed one after another, mm: waypoints, and with a catheter others between."""
         route, begun = self.route, self._here()
         if self._alone:
             return route.waypoints.tolist()
+        longest = _LONG_STRETCH_MM if self.config.manoeuvres.together else _STRETCH_MM
         places: list[float] = []
         for goal in [*route.waypoints[:-1][route.waypoints[:-1] > begun].tolist(), route.target.abscissa]:
             begin = places[-1] if places else begun
-            count = max(1, int(np.ceil((goal - begin) / _STRETCH_MM)))
+            count = max(1, int(np.ceil((goal - begin) / longest)))
             places += [begin + (goal - begin) * (k + 1) / count for k in range(count - 1)] + [goal]
         return places
 

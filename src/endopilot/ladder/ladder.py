@@ -28,7 +28,7 @@ class LadderConfig:
     """What climbs the ladder, and how much of it."""
 
     policy: str = "forward"
-    """forward, spin, retract-rotate, oracle, agent, open-loop, with a catheter in-turn or catheter-alone,
+    """forward, spin, retract-rotate, cloned, agent, oracle, open-loop, with a catheter in-turn or catheter-alone,
     the name of a policy of an installed package, or MODULE:OBJECT of a policy of your own."""
     tasks: tuple[str, ...] = ()
     """Names of the tasks; all if none is given."""

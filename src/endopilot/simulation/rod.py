@@ -19,8 +19,9 @@ SHEAR_CORRECTION = 6 * (1 + POISSON_RATIO) / (7 + 6 * POISSON_RATIO)
 _DRAG_N_S_MM2, _SOFT_N_MM2 = 5e-6, 0.1
 """Drag on one mm of wire, N·s/mm²; far below friction. On a wire softer than the latter anywhere, N·mm², it falls with
 the square of that: it would fold as it is pushed."""
-_BLOOD_N_S_MM2 = 1e-8
-"""Drag is no less than that of blood on a slender wire, N·s/mm²: 2πη / ln(length / diameter) with η = 0.0035 Pa·s."""
+_LEAST_N_S_MM2 = 1e-10
+"""Drag is no less than this, N·s/mm². That of blood would be more, 2πη / ln(length / diameter) = 1e-8 with η = 0.0035
+Pa·s, and fold a wire of less than some 0.005 N·mm² as it is pushed; no blood is modelled."""
 _GROWTH_MM = 40.0
 """Distance from the tip at which elements are twice as long as there; they grow in proportion to it, mm."""
 LONGEST_ELEMENTS = 5.0
@@ -94,7 +95,7 @@ def lay_out(device: Wire, *, element_mm: float, length_mm: float) -> RodLayout:
         bent = device.tip_bend_rad * np.diff(ends) / device.tip_bend_length_mm
         curvature[1:, 0] = bent / np.diff(middle)
     softness = min(1.0, min(device.bend_stiffness_n_mm2) / _SOFT_N_MM2)
-    drag = max(_DRAG_N_S_MM2 * softness**2, _BLOOD_N_S_MM2)
+    drag = max(_DRAG_N_S_MM2 * softness**2, _LEAST_N_S_MM2)
     return RodLayout(
         abscissa_mm=abscissa,
         shear_n=shear,

@@ -50,47 +50,56 @@ class RidgeEvidence:
             photons: that a pixel of usual brightness counts.
             where: pixels that it is wanted of; 0 elsewhere; all if not given.
         """
-        pixels = np.arange(signal.size) if where is None else np.flatnonzero(where)
+        pixels = None if where is None else np.flatnonzero(where)
         found = features(signal, photons, pixels)
         count = len(found)
         square = np.zeros((count, count), dtype=np.float32)
         square[np.triu_indices(count)] = self.weight[count:] / _MOST
         # The same as `products` times the weights, without an image for each product.
         terms = square @ found + self.weight[:count, None].astype(np.float32)
+        likelier = np.einsum("fn,fn->n", terms, found) + np.float32(self.offset)
+        if pixels is None:
+            return likelier.reshape(signal.shape)
         evidence = np.zeros(signal.shape, dtype=np.float32)
-        evidence.ravel()[pixels] = np.einsum("fn,fn->n", terms, found) + np.float32(self.offset)
+        evidence.ravel()[pixels] = likelier
         return evidence
 
 
 def features(
-    signal: Float32[np.ndarray, "rows columns"], photons: float, pixels: Int[np.ndarray, "n"]
+    signal: Float32[np.ndarray, "rows columns"], photons: float, pixels: Int[np.ndarray, "n"] | None = None
 ) -> Float32[np.ndarray, "f n"]:
-    """Return the features of some pixels of the flat image: ridges and darkness over the noise, and the noise."""
+    """Return the features of some pixels of the flat image, or of all: ridges and darkness over the noise, and that."""
+    chosen = slice(None) if pixels is None else pixels
     smooth = [gaussian_filter(signal, scale, mode="nearest") for scale in SCALES_PX]
-    around = _smoother(smooth[-1], SCALES_PX[-1], _AROUND_PX).ravel()[pixels]
+    around = _smoother(smooth[-1], SCALES_PX[-1], _AROUND_PX).ravel()[chosen]
     noise = np.exp(-0.5 * around) / np.float32(np.sqrt(photons))
-    found = np.empty((2 * len(SCALES_PX) + 2, len(pixels)), dtype=np.float32)
+    found = np.empty((2 * len(SCALES_PX) + 2, len(around)), dtype=np.float32)
     for number, (scale, image) in enumerate(zip(SCALES_PX, smooth, strict=True)):
         mean, half = _curvatures(image, pixels)
         # The Hessian of white noise, smoothed, falls with the third power of the scale.
         weight = np.float32(scale**3) / noise
         found[2 * number], found[2 * number + 1] = weight * (mean + half), weight * (mean - half)
-    found[-2] = (around - smooth[0].ravel()[pixels]) / noise * np.float32(SCALES_PX[0])
+    found[-2] = (around - smooth[0].ravel()[chosen]) / noise * np.float32(SCALES_PX[0])
     found[-1] = np.log(noise)
     return np.clip(found, -_MOST, _MOST, out=found)
 
 
 def _curvatures(
-    image: Float32[np.ndarray, "rows columns"], pixels: Int[np.ndarray, "n"]
+    image: Float32[np.ndarray, "rows columns"], pixels: Int[np.ndarray, "n"] | None
 ) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"]]:
     """Return the mean of the two principal curvatures of some pixels, and half their difference."""
-    row, column = np.divmod(pixels, image.shape[1])
-    width = image.shape[1] + 4
-    at, flat = (row + 2) * width + column + 2, np.pad(image, 2, mode="edge").ravel()
-    here = 2 * flat[at]
-    down = flat[at + 2 * width] - here + flat[at - 2 * width]
-    right = flat[at + 2] - here + flat[at - 2]
-    mixed = flat[at + width + 1] - flat[at + width - 1] - flat[at - width + 1] + flat[at - width - 1]
+    (rows, columns), padded = image.shape, np.pad(image, 2, mode="edge")
+    width, flat = columns + 4, padded.ravel()
+    at = None if pixels is None else (pixels // columns + 2) * width + pixels % columns + 2
+
+    def beside(down: int, right: int) -> Float32[np.ndarray, "n"]:
+        if at is None:
+            return padded[2 + down : 2 + down + rows, 2 + right : 2 + right + columns].ravel()
+        return flat[at + (down * width + right)]
+
+    here = 2 * beside(0, 0)
+    down, right = beside(2, 0) - here + beside(-2, 0), beside(0, 2) - here + beside(0, -2)
+    mixed = beside(1, 1) - beside(1, -1) - beside(-1, 1) + beside(-1, -1)
     return 0.125 * (down + right), 0.125 * np.sqrt((down - right) ** 2 + 4 * mixed**2)
 
 

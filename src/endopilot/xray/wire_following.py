@@ -133,8 +133,8 @@ class Follower:
             at: index of the section in the leg.
             longest_mm: a wire is not followed beyond this length.
         """
-        free = [image.copy() for image in self._evidence]
-        self._darken(free, self.way(leg, at))
+        free = [image.copy() for image in (self._evidence if leg.before is None else leg.before[0].free)]
+        self._darken(free, self.way(leg, at, at + 1 + _GAP))
         most = round(min(_FOLD_MM, longest_mm - float(leg.length[at])) / STEP_MM)
         index, sections = leg.index, leg.section[at::-1]
         legs = [self._walk(index, sections[: max(most, 1)], (leg, at), free)]
