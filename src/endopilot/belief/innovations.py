@@ -19,7 +19,7 @@ an exact measurement shows weighs 1."""
 _FAR, _RECENT = 2.0, 6
 """Innovations to the same side add up: one this many times its bound is enough, and so is a mean of n, at most so many,
 this many times its bound over √n. Bounds are those of bands as calibrated."""
-_OUTSIDE, _OF = 1.3, 3
+_OUTSIDE, _OF = 1.5, 3
 """Two of so many innovations this many times their bounds are enough too. Bounds are those of widened bands."""
 _PROOF, _WIDER = 3, 1.5
 """Images in a row that lie within the bands of a belief that was identified before it is trusted; and how much wider
