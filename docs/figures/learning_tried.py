@@ -61,12 +61,13 @@ def guess_rows(data: Dataset) -> Iterator[str]:
     yield row("hold slack and offset", np.pad(held, ((0, 0), (WINDOW, 0), (0, 0))))
     guess = unfold("forward", vessels, patient, episodes, observed).guess
     yield row("play operator, nothing learned", np.abs(guess - truth))
-    wires = read_or_simulate(episodes.setup.patients_folder, episodes)
-    wires = np.where(np.isfinite(wires), wires, guess[:, :, None])
-    off = np.abs(wires - truth[:, :, None])
-    yield row("simulated wire of the device's friction, nothing learned", off[:, :, FRICTION_FACTORS.index(1.0)])
-    best = off[:, :WINDOW, :, 0].mean(axis=1).argmin(axis=1)
-    yield row("of the simulated wires the best in the given states", off[np.arange(len(off)), :, best])
+    middle = FRICTION_FACTORS.index(1.0)
+    for name, seen in (
+        ("simulated wire as it is given, nothing learned", np.zeros_like(observed)),
+        ("simulated wire fitted to the given states, nothing learned", observed),
+    ):
+        wire = read_or_simulate(episodes.setup.patients_folder, episodes, seen).tip[:, :, middle]
+        yield row(name, np.abs(np.where(np.isfinite(wire), wire, guess) - truth))
 
 
 def _sequences(data: Dataset) -> Sequences:

@@ -56,11 +56,12 @@ hold throughout {coverage:.0f} % of the intervals of 45 s; {missed:.1f} % of the
 exposures a minute, {share:.2f} of what periodic imaging needs to miss as many. The adviser counts {offset_share:g} of
 the half-width of γtip's band (docs/concepts/advice.md).
 
-**Meant for** research with this device or one much like it, in coronary arteries. It gets each patient's vessel from
-simulations of the device (`models/patient.py`), and simulates three wires under the controls that it predicts for
+**Meant for** research with this device or one much like it, in coronary arteries, at rest or moved by heart and breath.
+It gets each patient's vessel from simulations of the device (`models/patient.py`), fits a simulated wire to the given
+states (`models/fitted_wires.py`), and simulates three wires under the controls that it predicts for
 (`models/simulated_wires.py`). Where a wire snags, prolapses or may enter another branch, the errors are large and rare:
 the means are several times the medians. The probability of a jump says where.
-**Not for** other devices (refused), other vessels, vessels that move. **No medical device.**
+**Not for** other devices (refused), other vessels. **No medical device.**
 """
 
 
@@ -68,7 +69,7 @@ def recipe() -> str:
     """Return the commands of `make recipe-laptop`."""
     text = (PACKAGED.parents[3] / "Makefile").read_text(encoding="utf-8")
     lines = text.split("recipe-laptop: $(INSTALLED)\n")[1].split("\n\n")[0]
-    return dedent(lines.expandtabs(4)).replace("$(BIN)/", "").replace("$(LEARNING)", "runs/causal")
+    return dedent(lines.expandtabs(4)).replace("$(BIN)/", "").replace("$(LEARNING)", "runs/causal").replace("$$", "$")
 
 
 def card(folder: Path) -> str:

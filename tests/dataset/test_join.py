@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from endopilot.dataset import join
 from endopilot.dataset.join import read_joined
 from endopilot.dataset.loader import read_dataset
 from endopilot.errors import InputError
+from endopilot.simulation.motion import Motion
 from toy_navigation import make_toy_dataset
 
 
@@ -51,6 +52,9 @@ def test_what_does_not_go_together_is_refused(toy_dataset, second, monkeypatch):
         "another tip_bend_rad; join datasets of one wire": {"device": device | {"tip_bend_rad": 1.0}},
         "is another than that of .*; rename one": {
             "anatomies": [record | {"sha256": "0"} for record in other.manifest["anatomies"]]
+        },
+        "moves otherwise than in .*; join datasets of other patients": {
+            "anatomies": [record | {"motion": asdict(Motion())} for record in other.manifest["anatomies"]]
         },
     }
     for message, changed in cases.items():

@@ -22,6 +22,7 @@ from endopilot.files import read_json, sha256
 from endopilot.models.causal import CausalPredictor, ForwardNetwork, InverseNetwork, Mixture
 from endopilot.models.config import CausalConfig, TrainConfig
 from endopilot.models.episodes import Episodes
+from endopilot.models.fitted_wires import SCALES_MM, SPREADS, posterior, rounded
 from endopilot.models.open_loop import JUMP_MM, Predictor, ProbabilisticPredictor, jumps
 from endopilot.models.patient import STEP_MM, prepare
 from endopilot.models.play import N_FEATURES, mirrored
@@ -86,6 +87,10 @@ def untrained() -> CausalPredictor:
 
 def given(episodes) -> np.ndarray:
     return np.arange(episodes.samples) < GIVEN
+
+
+def every(episodes) -> np.ndarray:
+    return np.tile(given(episodes), (len(episodes), 1))
 
 
 def error(tip, episodes) -> np.ndarray:
@@ -263,47 +268,70 @@ def test_mirrored_vessels_behave_alike(brief):
     np.testing.assert_allclose(ours, theirs, atol=2e-3)
 
 
-def test_a_simulated_wire_of_the_true_friction_retraces_the_navigation_and_is_simulated_once(brief, tmp_path):
-    wires = SimulatedWires()
-    tips = wires.tips(brief)
-    own = np.abs(tips[:, :, FRICTION_FACTORS.index(1.0)] - brief.tip).mean(axis=(0, 1))
-    assert (own < 0.5 * np.abs(tips[:, :, 0] - brief.tip).mean(axis=(0, 1))).all() and own.max() < 0.1  # mm
+def test_the_wire_that_retraces_the_given_tips_is_found_and_simulated_once(brief, tmp_path):
+    own = brief.setup.device
+    smoother = replace(brief, setup=replace(brief.setup, device=replace(own, friction=0.85 * own.friction)))
+    brief, smoother = brief.select(np.arange(4)), smoother.select(np.arange(4))  # of one patient
+    wires, seen, unseen = SimulatedWires(), every(brief), np.zeros(brief.branch.shape, dtype=bool)
+    tips, blind = wires.tips(smoother, seen).tip, wires.tips(smoother, unseen).tip
+    fits = np.array(list(wires.fits[smoother.setup].values()))
+    assert (fits[len(brief) :] == 1.0).all()  # where nothing was observed, the wire is as it is given
+    assert np.abs(np.median(fits[: len(brief), 0]) - 1 / 0.85) < 0.05, fits
+    middle, later = FRICTION_FACTORS.index(1.0), slice(GIVEN, None)
+    off, blind_off = (np.abs(tip[:, later, middle, 0] - brief.tip[:, later, 0]).mean() for tip in (tips, blind))
+    assert off < 0.35 * blind_off, (off, blind_off)
     some = np.array([len(brief) - 1, 0])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("endopilot.models.simulated_wires.simulated_tips", None)
-        np.testing.assert_array_equal(wires.tips(brief.select(some)), tips[some])
-    np.testing.assert_array_equal(read_or_simulate(tmp_path, brief), tips)
+        patch.setattr("endopilot.models.simulated_wires.ensemble_of", None)
+        patch.setattr("endopilot.models.fitted_wires.ensemble_of", None)
+        np.testing.assert_array_equal(wires.tips(smoother.select(some), seen[some]).tip, tips[some])
+    np.testing.assert_array_equal(read_or_simulate(tmp_path, smoother, seen).tip, tips)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("endopilot.models.simulated_wires.simulated_tips", lambda episodes: np.full((1, 1, 3, 2), 7.0))
-        np.testing.assert_array_equal(read_or_simulate(tmp_path, brief), tips)
-        assert (read_or_simulate(tmp_path, brief.select(some)) == 7.0).all()  # other episodes are other wires
+        made = np.full((len(some), brief.samples, len(FRICTION_FACTORS) + 1, 2), 7.0)
+        patch.setattr("endopilot.models.simulated_wires.simulated_tips", lambda *_: made)
+        np.testing.assert_array_equal(read_or_simulate(tmp_path, smoother, seen).tip, tips)
+        other = read_or_simulate(tmp_path, smoother.select(some), seen[some])  # other episodes are other wires
+        assert (other.tip == 7.0).all() and (other.moved == 0.0).all()
 
 
-@pytest.mark.parametrize("first", [20, 35])
+@pytest.mark.parametrize("first", [30, 35])
 def test_another_end_of_a_navigation_is_simulated_from_where_it_begins(brief, first):
     some = brief.select(np.array([0, len(brief) - 1]))
     wires = SimulatedWires()
-    before = wires.tips(some)
+    before = wires.tips(some, every(some)).tip
     later = some.control[:, first:].copy()
     later[..., 0] *= 0.5
     other = some.driven(some.proximal[:, first:], later)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("endopilot.models.simulated_wires.Ensemble", None)  # none is brought to its start again
-        tips = wires.tips(other)
-    np.testing.assert_array_equal(tips, simulated_tips(other))
+    with pytest.MonkeyPatch.context() as patch:  # none is brought to its start again
+        patch.setattr("endopilot.models.simulated_wires.ensemble_of", None)
+        patch.setattr("endopilot.models.fitted_wires.ensemble_of", None)
+        tips = wires.tips(other, every(some)).tip
+    fits = np.array(list(wires.fits[some.setup].values()))
+    np.testing.assert_array_equal(tips, simulated_tips(other, fits)[:, :, : len(FRICTION_FACTORS)])
     assert (tips != before).any()
 
 
 def test_a_wire_whose_simulation_fails_is_where_the_guess_is(brief):
     vessels, patient = play_tables(brief), np.unique(brief.anatomy, return_inverse=True)[1]
-    observed = np.broadcast_to(given(brief), brief.branch.shape)
-    tips = simulated_tips(brief)
-    whole = unfold("forward", vessels, patient, brief, observed, tips)
-    tips[2, 40:, 1] = np.nan
-    found = unfold("forward", vessels, patient, brief, observed, tips)
+    observed = every(brief)
+    wires = WIRES.tips(brief, observed)
+    whole = unfold("forward", vessels, patient, brief, observed, wires)
+    wires.tip[2, 40:, 1] = np.nan
+    found = unfold("forward", vessels, patient, brief, observed, wires)
     assert np.isfinite(found.inputs).all() and (found.others[2, 40:, 1] == 0).all()
     np.testing.assert_array_equal(found.inputs[2, :40], whole.inputs[2, :40])
     np.testing.assert_array_equal(np.delete(found.inputs, 2, axis=0), np.delete(whole.inputs, 2, axis=0))
+
+
+def test_a_jump_of_the_wires_that_are_trusted_is_announced(packaged, brief, monkeypatch):
+    observed, at = every(brief), 40
+    wires = WIRES.tips(brief, observed)
+    jumped = replace(wires, tip=wires.tip.copy())
+    jumped.tip[:, at:, :, 0] += 2 * JUMP_MM
+    calm = packaged.predict(brief, observed).jump
+    monkeypatch.setattr(SimulatedWires, "tips", lambda *_: jumped)
+    found = packaged.predict(brief, observed).jump
+    assert np.median(calm[:, at]) < 0.1 < np.median(found[:, at])
 
 
 def test_the_median_of_a_mixture_has_half_of_it_below():
@@ -373,3 +401,26 @@ def test_a_wire_that_the_vessel_holds_ends_where_it_is(folder):
     slack = np.arange(patient.pull_tip.shape[1]) * STEP_MM - patient.pull_tip
     assert (patient.deepest > 20.0).all()
     assert (np.ptp(slack[:, :5], axis=1) < 1e-9).any()  # nothing is known of lengths that it is not pulled back to
+
+
+@pytest.mark.parametrize("noise_mm", [0.0, 0.3])
+def test_a_fit_is_as_sure_as_what_it_explains(noise_mm):
+    random = np.random.default_rng(0)
+    slopes = random.normal(size=(4, 30, 2)) * [0.2, 0.05]  # mm a spread of each parameter
+
+    def tips(theta):
+        return 50.0 + np.einsum("...k,ksd->...sd", (theta - 1) / SPREADS, slopes)
+
+    theta = rounded(1 + SPREADS * random.uniform(-1, 1, (16, 4)))
+    truth = 1 + SPREADS * np.array([0.8, -0.5, 0.3, -0.9])
+    seen = tips(truth) + noise_mm * random.normal(size=(30, 2))
+    seen[7, 0] += 1.5  # a snap that the true wire made elsewhere
+    given = np.ones(30, dtype=bool)
+    mean, sd = posterior(theta, tips(theta), seen, np.tile(SCALES_MM, (30, 1)), given)
+    off = np.abs(mean - truth) / SPREADS
+    assert (off < (0.05 if noise_mm == 0 else 1.0)).all() and (off < 3.5 * sd / SPREADS + 0.02).all(), (
+        off,
+        sd / SPREADS,
+    )
+    nothing = posterior(theta, tips(theta), seen, np.tile(SCALES_MM, (30, 1)), ~given)
+    np.testing.assert_array_equal(nothing, [np.ones(4), SPREADS])

@@ -19,7 +19,7 @@ from endopilot.models.config import TrainConfig, TwinConfig
 from endopilot.models.ensemble import Ensemble
 from endopilot.models.episodes import Episodes
 from endopilot.models.rollout import load_model
-from endopilot.models.simulated_wires import simulated_tips
+from endopilot.models.simulated_wires import FRICTION_FACTORS
 from endopilot.models.train import train
 from endopilot.simulation.simulate import simulate
 
@@ -105,13 +105,17 @@ def test_in_a_patient_who_moves_its_wires_move_as_far_as_is_known(folder, tmp_pa
     twin, later = load_model(folder / "run"), slice(30, None)
 
     def error(tip: np.ndarray) -> float:
-        return float(np.abs(tip[:, later, 0] - moving.tip[:, later, 0]).mean())
+        return float(np.abs(tip[:, later, 0] - moving.tip[: len(tip), later, 0]).mean())
 
     aware, unaware = (error(twin.predict(episodes, GIVEN).tip) for episodes in (moving, blind))
     assert aware < 0.5 * unaware, (aware, unaware)
-    # so do the wires that the causal network starts from
-    aware, unaware = (error(simulated_tips(episodes)[..., 1, :]) for episodes in (moving, blind))
-    assert aware < 0.5 * unaware, (aware, unaware)
+    # so do the wires that the causal network starts from, as far as the given tips show the patient's own motion
+    moving, packaged = moving.select(np.arange(2)), load_model("pretrained")
+    seen, middle = np.tile(GIVEN, (len(moving), 1)), FRICTION_FACTORS.index(1.0)
+    fitted, mean = (error(packaged.wires.tips(moving, each).tip[:, :, middle]) for each in (seen, np.zeros_like(seen)))
+    assert fitted < 0.3 * mean, (fitted, mean)
+    # and the network, which was trained in vessels at rest, goes on from there
+    assert error(packaged.predict(moving, GIVEN).tip) < 0.1  # mm
 
 
 def test_it_finds_controls_that_lead_the_tip_along(folder, episodes) -> None:

@@ -29,7 +29,7 @@ def read_joined(folders: Sequence[Path]) -> Dataset:
 
     Raises:
         InputError: none is given; one cannot be read, was made with another wire or other catheters, has episodes of
-            another length, or has another patient of the same name.
+            another length, or has another patient of the same name, or the same one who moves otherwise.
     """
     if not folders:
         raise InputError("dataset: none given; name at least one folder made by `endopilot dataset`")
@@ -88,3 +88,8 @@ def _check_alike(first: Dataset, other: Dataset) -> None:
     for name in first.patients.keys() & other.patients.keys():
         if first.patients[name] != other.patients[name]:
             raise InputError(f"{other.folder}: its patient {name} is another than that of {first.folder}; rename one")
+        if first.motion(name) != other.motion(name):
+            raise InputError(
+                f"{other.folder}: its patient {name} moves otherwise than in {first.folder}; join datasets of other "
+                "patients, or of one motion"
+            )

@@ -34,7 +34,7 @@ from endopilot.models.config import WINDOW, CausalConfig
 from endopilot.models.episodes import Episodes, EpisodeSetUp
 from endopilot.models.open_loop import EachObserved, Observed, OpenLoop, Prediction, Steps2, begin_after, given_states
 from endopilot.models.play import Direction, PlayTables
-from endopilot.models.sequences import N_INPUTS, N_WIRE_INPUTS, play_tables, unfold
+from endopilot.models.sequences import N_INPUTS, N_WIRE_INPUTS, Unfolded, play_tables, unfold
 from endopilot.models.simulated_wires import FRICTION_FACTORS, SimulatedWires
 from endopilot.types import SAMPLE_PERIOD_S
 
@@ -219,11 +219,13 @@ class CausalPredictor:
         """
         network = _needed(self.forward, "forward")
         given = np.broadcast_to(observed, episodes.branch.shape)
-        guess, found = self._run(network, "forward", episodes, given)
+        unfolded, found = self._run(network, "forward", episodes, given)
         median = found.median()
-        tip = np.where(given[..., None], episodes.tip.astype(float), guess + median.double().numpy())
+        tip = np.where(given[..., None], episodes.tip.astype(float), unfolded.guess + median.double().numpy())
         spread = np.where(given[..., None], 0.0, found.deviation(median).double().numpy())
-        return Prediction(tip, spread, found.jump.sigmoid().double().numpy())
+        weight = found.log_weight[..., 1:].exp().double().numpy()
+        jump = np.maximum(found.jump.sigmoid().double().numpy(), (weight * unfolded.jumping).sum(axis=-1))
+        return Prediction(tip, spread, jump)
 
     def rollout_forward(self, episodes: Episodes) -> OpenLoop:
         """P1: predict the tip under the true controls."""
@@ -262,8 +264,8 @@ class CausalPredictor:
         """Return IF's inserted length (mm) and turn (rad) of every sample from `begin` on."""
         network = _needed(self.inverse, "inverse")
         given = np.broadcast_to(np.arange(episodes.samples) < begin, episodes.branch.shape)
-        guess, found = self._run(network, "inverse", episodes, given)
-        wanted = (guess + found.location[..., 0, :].double().numpy())[:, begin:]
+        unfolded, found = self._run(network, "inverse", episodes, given)
+        wanted = (unfolded.guess + found.location[..., 0, :].double().numpy())[:, begin:]
         return wanted[..., 0], wanted[..., 1]
 
     @torch.inference_mode()
@@ -273,13 +275,13 @@ class CausalPredictor:
         direction: Direction,
         episodes: Episodes,
         observed: Bool[np.ndarray, "episodes samples"],
-    ) -> tuple[Float[np.ndarray, "episodes samples 2"], Mixture]:
-        """Return the play operator's guess for episodes, and the distribution of the change against it."""
+    ) -> tuple[Unfolded, Mixture]:
+        """Return the guesses for episodes, and the distribution of the change against the play operator's."""
         vessels, patient = self._vessels(episodes)
-        wires = self.wires.tips(episodes) if direction == "forward" else None
+        wires = self.wires.tips(episodes, observed) if direction == "forward" else None
         unfolded = unfold(direction, vessels, patient, episodes, observed, wires)
         inputs, others = (torch.as_tensor(part, dtype=torch.float32) for part in (unfolded.inputs, unfolded.others))
-        return unfolded.guess, Mixture.of(network(inputs, others), network.n_guesses)
+        return unfolded, Mixture.of(network(inputs, others), network.n_guesses)
 
     def _vessels(self, episodes: Episodes) -> tuple[PlayTables, Int[np.ndarray, "episodes"]]:
         """Return the tables of the episodes' patients, perhaps of others too, and which row each episode has."""

@@ -34,16 +34,19 @@ class Unfolded:
 
     Attributes:
         inputs: of the network.
-        guess: forward: (Δtip, γtip) of play and envelopes, mm; inverse: Δ by the play (mm) and a turn of 0 (rad).
+        guess: forward: (Δtip, γtip) of play and envelopes, mm, displaced by the patient's motion; inverse: Δ by the
+            play (mm) and a turn of 0 (rad).
         others: forward: by how much the simulated wires differ from that guess, mm; inverse: none.
+        jumping: forward: whether each simulated wire jumps in the sample; inverse: none.
         branch: branch that the play operator puts the tip in.
         truth: forward: (Δtip, γtip), mm; inverse: Δ (mm) and the turn over the sample (rad).
-        jump: whether the tip jumps in the sample.
+        jump: whether the tip jumps in the sample, the patient's motion left aside.
     """
 
     inputs: Float[np.ndarray, "episodes samples inputs"]
     guess: Float[np.ndarray, "episodes samples 2"]
     others: Float[np.ndarray, "episodes samples wires 2"]
+    jumping: Bool[np.ndarray, "episodes samples wires"]
     branch: Int[np.ndarray, "episodes samples"]
     truth: Float[np.ndarray, "episodes samples 2"]
     jump: Bool[np.ndarray, "episodes samples"]
@@ -83,8 +86,11 @@ def unfold(
         patient: row of the tables, for each episode.
         episodes: the navigations.
         observed: samples at which the tip was observed.
-        wires: forward: tips of the simulated wires, as `simulated_wires` gives them.
+        wires: forward: what the simulated wires did. By how much the patient's motion displaces the tip is taken off
+            all tips before, and added to the guess behind.
     """
+    if wires is not None:
+        episodes = replace(episodes, tip=episodes.tip - wires.moved)
     (tip, offset), (inserted, rotation) = (
         np.moveaxis(signal.astype(float), -1, 0) for signal in (episodes.tip, episodes.proximal)
     )
@@ -124,15 +130,17 @@ def unfold(
             turn, angle = np.where(now, rotation[:, t] - angle, 0.0), np.where(now, rotation[:, t], angle)
     turned = np.diff(rotation, axis=1, prepend=initial_angle[:, None])
     truth = np.stack([tip, offset] if forward else [inserted, turned], axis=-1)
-    others = np.zeros((*tip.shape, 0, 2))
+    others, jumping, jump = np.zeros((*tip.shape, 0, 2)), np.zeros((*tip.shape, 0), dtype=bool), jumps(tip, inserted)
     if wires is not None:
-        others, columns = _beside(wires, guess, inserted, episodes.tip.astype(float), observed)
+        others, columns = _beside(wires.tip - wires.moved[:, :, None], guess, inserted, episodes.tip, observed)
         inputs = np.concatenate([inputs, columns], axis=-1, dtype=np.float32)
-    return Unfolded(inputs, guess, others, branches, truth, jumps(tip, inserted))
+        guess, truth = guess + wires.moved, truth + wires.moved
+        jumping = np.stack([jumps(wire, inserted) for wire in np.moveaxis(wires.tip[..., 0], 2, 0)], axis=-1)
+    return Unfolded(inputs, guess, others, jumping, branches, truth, jump)
 
 
 def _beside(
-    wires: WireTips,
+    wires: Float[np.ndarray, "episodes samples wires 2"],
     guess: Float[np.ndarray, "episodes samples 2"],
     inserted: Float[np.ndarray, "episodes samples"],
     tip: Float[np.ndarray, "episodes samples 2"],
@@ -199,8 +207,12 @@ class Sequences:
         inputs, others, change = {}, {}, {}
         for network in networks:
             direction: Direction = "forward" if network == "ff" else "inverse"
-            wires = read_or_simulate(episodes.setup.patients_folder, episodes) if network == "ff" else None
-            forms = [unfold(direction, vessels, patient, episodes, observed, wires) for observed in (given, some)]
+            forms = []
+            for observed in (given, some):
+                wires = None
+                if network == "ff":
+                    wires = read_or_simulate(episodes.setup.patients_folder, episodes, observed)
+                forms.append(unfold(direction, vessels, patient, episodes, observed, wires))
             rest = [np.concatenate([form.truth - form.guess, form.jump[..., None]], axis=-1) for form in forms]
             for kept, parts in (
                 (inputs, [form.inputs for form in forms]),
