@@ -120,9 +120,9 @@ class Monitor:
             exposure: what X-ray shows now; None where it is off.
         """
         period = len(self.past.proximal)
-        self.past.measured.append((encoders, load, self.belief.drives.commanded))
+        commanded = self.belief.drives.commanded
+        self.past.measured.append((encoders, load, commanded))
         if period:
-            commanded = self.belief.drives.commanded
             self.belief.follow(encoders, load)
             if load and commanded and self._tests:
                 read_n, pushed_n, speed_mm_s = load[0][0], self.belief.pushed_n, commanded[0][0]

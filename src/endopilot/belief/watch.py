@@ -67,8 +67,8 @@ class Watch:
 
         Args:
             at: what is predicted for now, after the exposure if there was one.
-            changed: whether the model is another than the given one, which erred.
             variance_mm2: of (Δtip, γtip), which the calibration does not know of, mm².
+            changed: whether the model is another than the given one, which erred.
         """
         proximal, tip, spread, radius = at
         further = np.sqrt(variance_mm2 + self._allowance.sd_mm**2)[None]

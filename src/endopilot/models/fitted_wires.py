@@ -7,7 +7,6 @@ the next wires are tried, closer together. What is known before are the spreads 
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 from itertools import product
 
@@ -114,10 +113,8 @@ def _replayed(
     command = np.repeat(episodes.command[:, :samples], members, axis=0)
     start = np.repeat(episodes.initial, members, axis=0).astype(float)
     tips = np.full((len(flat), samples, 2), np.nan)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a wire that fails is left out
-        for rows in by_motion(flat):
-            tips[rows] = ensemble_of(episodes.setup, anatomy, flat[rows], start[rows]).replay(command[rows])
+    for rows in by_motion(flat):
+        tips[rows] = ensemble_of(episodes.setup, anatomy, flat[rows], start[rows]).replay(command[rows])
     return tips.reshape(len(episodes), members, samples, 2)
 
 
