@@ -71,7 +71,7 @@ readme: $(INSTALLED)
 	$(BIN)/python docs/commands.py
 	$(BIN)/python docs/signals.py
 
-# docs/evidence/learning.md's figures: two cores and an hour. What is there already is not made again.
+# docs/evidence/learning.md's figures, sized for two cores and an hour. What is there already is not made again.
 LEARNING := runs/causal
 recipe-laptop: $(INSTALLED)
 	$(BIN)/endopilot atlas --count 40 --seed 51 -o $(LEARNING)/patients
