@@ -53,13 +53,13 @@ REAL = {
 
 @pytest.fixture(scope="module")
 def measured():
-    """Return the quantities of `COUNT` patients of a kind; a fine wall takes most of the time: every fourth has one."""
+    """Return the quantities of `COUNT` patients of a kind; a fine wall takes most of the time: every eighth has one."""
     coarse = partial(distance_map_from_spheres, spacing_mm=3.0)
     found = {}
     for kind in REAL:
         values = defaultdict(list)
         for index in range(COUNT):
-            fine = index % 4 == 0
+            fine = index % 8 == 0
             wall = distance_map_from_spheres if fine else coarse
             with patch.object(distance, "distance_map_from_spheres", wall):
                 patient = make_patient(AtlasConfig(vessel=kind, seed=0), index)
