@@ -139,6 +139,7 @@ def test_the_packaged_inverse_beats_the_mean_and_the_held_slack(packaged, everyo
 
 
 def test_the_loop_of_both_leads_the_predicted_tip_along(packaged, everyone):
+    everyone = everyone.select(np.arange(0, len(everyone), 2))
     found = packaged.rollout_dual(everyone)
     start = everyone.proximal[:, GIVEN - 1 : GIVEN].astype(float)
     np.testing.assert_allclose(found.proximal, start + 0.5 * np.cumsum(found.control, axis=1), atol=1e-9)
