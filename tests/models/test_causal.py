@@ -73,7 +73,9 @@ def brief(everyone) -> Episodes:
 
 @pytest.fixture(scope="module")
 def packaged() -> CausalPredictor:
-    return replace(load_model(Path("pretrained")), wires=WIRES)
+    found = load_model(Path("pretrained"))
+    assert isinstance(found, CausalPredictor)
+    return replace(found, wires=WIRES)
 
 
 def untrained() -> CausalPredictor:
