@@ -12,6 +12,7 @@ from __future__ import annotations
 import sys
 import tempfile
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -34,9 +35,14 @@ class ScriptedHand:
         return endopilot.Decision(((float(translation), 0.8 * float(np.sin(2 * observation.time_s))),), expose=True)
 
 
+@cache
+def training_patient(place: int) -> endopilot.Anatomy:
+    return TASK.patient(TASK.training, place)
+
+
 def drive_session(number: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return what the scripted hand saw in one training patient, and what it did."""
-    navigation = TASK.navigation(TASK.patient(TASK.training, number), start_rotation_rad=0.6 * number)
+    """Return what the scripted hand saw in one of three training patients, and what it did."""
+    navigation = TASK.navigation(training_patient(number % 3), start_rotation_rad=0.6 * number)
     record = endopilot.NavigationLoop(replace(navigation, seconds=20.0), ScriptedHand(), seed=number).run()
     left_mm = navigation.target.abscissa - record.tip.abscissa[:-1, 0]
     return features(left_mm, record.tip.offset[:-1, 0]), torch.tensor(record.control[:-1, 0] / SCALE).float()

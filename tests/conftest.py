@@ -12,6 +12,7 @@ from missing_libraries import missing_library
 from shape_checks import begin_test, check_quickly
 
 check_quickly()
+gc.disable()  # while all is imported, and nothing is garbage
 
 LOCALE, ENCODING = locale.setlocale(locale.LC_ALL), locale.getencoding()
 
@@ -27,9 +28,11 @@ def pytest_make_collect_report(collector):
 
 
 def pytest_collection_finish():
-    """Leave what is imported out of garbage collection, which else goes through all of it again and again."""
+    """Leave what is imported out of garbage collection, and collect seldom: it takes up to a tenth of some tests."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(20_000, 20, 20)
+    gc.enable()
 
 
 @pytest.hookimpl(wrapper=True)

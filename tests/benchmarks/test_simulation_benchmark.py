@@ -22,7 +22,7 @@ from benchmarks.core.simulation import against_reference
 from endopilot.errors import InputError
 from endopilot.simulation.config import PRESETS, SimulatorConfig
 
-WORLDS, SAMPLES = 2, 6
+WORLDS, SAMPLES = 2, 4
 CONVERGED = SimulatorConfig(element_mm=0.35, time_step_s=0.005, tolerance_mm=1e-6)
 
 

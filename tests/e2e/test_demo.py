@@ -19,7 +19,7 @@ from endopilot.pipeline import study
 from endopilot.pipeline.study import DemoConfig
 from endopilot.runs import claim
 
-SIZE = ("--patients", "3", "--sequences", "3", "--seconds", "25")
+SIZE = ("--patients", "3", "--sequences", "1", "--seconds", "25")
 STAGES = ["atlas", "phantom", "segmentation", "anatomy", "navigation", "dataset", "evaluation", "report"]
 
 
@@ -31,7 +31,7 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path, capsys, monkey
         while not (folder / "stages.json").exists():  # written as the first stage ends
             assert first.poll() is None and time.monotonic() < deadline
             time.sleep(0.1)
-        time.sleep(2.0)  # in the midst of the second
+        time.sleep(0.5)  # in the midst of the second
         first.send_signal(signal.SIGKILL)
     assert not (folder / "report.html").exists()
     before = {path: path.stat().st_mtime_ns for path in (folder / "truth").rglob("*.json")}
@@ -50,7 +50,7 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path, capsys, monkey
     metrics = read_json(folder / "metrics.json")
     unseen = metrics["splits"]["test"]
     assert list(metrics["splits"]) == ["test"]
-    assert len(unseen["anatomies"]) == 3 and unseen["episodes"] == 9
+    assert len(unseen["anatomies"]) == 3 and unseen["episodes"] == 3
     assert unseen["tip"]["P1"]["abscissa"]["all"]["skill"]["hold_slack"] > 0.4  # the packaged networks
     for series in ("P1", "P3", "P4", "hold_slack"):
         assert unseen["tip"][series]["abscissa"]["all"]["count"] > 0
@@ -88,4 +88,4 @@ def test_another_size_in_the_same_folder_is_refused(tmp_path, capsys):
     )
     (tmp_path / "stages.json").write_text("{}")
     line = command.refused(capsys, "demo", "-o", tmp_path, *SIZE)
-    assert "was begun with config.sequences = 60, now it is 3" in line
+    assert "was begun with config.sequences = 60, now it is 1" in line

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import command
@@ -19,6 +20,7 @@ from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.device_files import device_yaml
 from endopilot.files import input_hash, read_json
 from endopilot.imaging.volume import read_mask, write_volume
+from endopilot.models.config import TrainConfig
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.pipeline import study
 from endopilot.types import Volume
@@ -64,7 +66,8 @@ def made_before(case, monkeypatch):
         monkeypatch.setattr(study, "extract_anatomy", lambda source, name, config: read_anatomy(anatomy))
 
 
-def test_a_killed_run_goes_on_to_its_report_and_is_then_left_alone(case, capsys):
+def test_a_killed_run_goes_on_to_its_report_and_is_then_left_alone(case, capsys, monkeypatch):
+    monkeypatch.setattr(study, "TrainConfig", partial(TrainConfig, epochs=3))  # each checks and writes the networks
     before = masks(case)
     assert before and not (case / "run" / "report.html").exists()
     found = command.run(capsys, *arguments(case))
@@ -86,7 +89,7 @@ def test_a_killed_run_goes_on_to_its_report_and_is_then_left_alone(case, capsys)
 
 
 def test_a_target_is_driven_to_with_the_packaged_networks_beside(case, made_before, tmp_path, capsys):
-    line = ("run", case / "ct.nii.gz", "-o", tmp_path / "run", "--sequences", "3", "--seconds", "20")
+    line = ("run", case / "ct.nii.gz", "-o", tmp_path / "run", "--sequences", "1", "--seconds", "20")
     found = command.run(capsys, *line, "--target", "2")
     assert list(found)[:2] == ["outcome", "page"] and found["outcome"].startswith("reached section 2 at ")
     assert found["page"] == str(tmp_path / "run" / "navigation" / "2" / "navigation.html")

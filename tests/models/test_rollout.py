@@ -28,7 +28,7 @@ def learnt(toy_dataset, tmp_path_factory):
     train(
         toy_dataset,
         output=run,
-        config=TrainConfig(epochs=6, windows_per_epoch=4000, batch_size=32, learning_rate=3e-3, size=SMALL),
+        config=TrainConfig(epochs=6, windows_per_epoch=2000, batch_size=32, learning_rate=3e-3, size=SMALL),
     )
     return load_model(run)
 

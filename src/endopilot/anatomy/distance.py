@@ -100,18 +100,18 @@ def distance_map_from_surface(surface: Surface, *, spacing_mm: float, band_mm: f
         spacing_mm: grid spacing, mm.
         band_mm: how far outside the wall distances are kept, mm.
     """
-    from scipy.ndimage import maximum_filter, minimum_filter
+    from endopilot.imaging.grid import dilated  # brings SimpleITK, which takes a while to import
 
     lower = surface.vertices.min(axis=0) - band_mm
     shape, origin = _grid(lower, surface.vertices.max(axis=0) + band_mm, spacing_mm)
     inside = surface.inside(shape, origin, spacing_mm)
     surface = surface.refined(3.0 * spacing_mm)
-    reach = 2 * (math.ceil(band_mm / spacing_mm) + 2) + 1
-    values = _far_field(surface, inside, maximum_filter(inside, size=reach), origin, spacing_mm, band_mm)
-    outside = maximum_filter(inside, size=2 * _NEAR_WALL[0] + 1) & ~inside
+    wanted = dilated(inside, math.ceil(band_mm / spacing_mm) + 2)
+    values = _far_field(surface, inside, wanted, origin, spacing_mm, band_mm)
+    outside = dilated(inside, _NEAR_WALL[0]) & ~inside
     index = np.argwhere(outside)
     values[outside] = -surface.distance(origin + spacing_mm * index[:, ::-1], limit_mm=band_mm)
-    shallow = inside & ~np.asarray(minimum_filter(inside, size=2 * _NEAR_WALL[1] + 1), dtype=bool)
+    shallow = inside & dilated(~inside, _NEAR_WALL[1])
     index = np.argwhere(shallow)
     values[shallow] = surface.distance(origin + spacing_mm * index[:, ::-1])
     return DistanceMap(values=values, spacing_mm=float(spacing_mm), origin_mm=origin)

@@ -30,7 +30,10 @@ _BRANCH_MM = 4.0
 def component(distance_map: DistanceMap, given: Insertion | None) -> Bool[np.ndarray, "nz ny nx"]:
     """Return the connected inside at the ostium, or the largest one."""
     labels = connected_components(distance_map.values > 0, corners=True)
-    if labels.max() <= 1 or given is None:
+    count = labels.max()
+    if count == 1:
+        return labels == 1
+    if count == 0 or given is None:
         sizes = np.bincount(labels.ravel())
         sizes[0] = 0
         return labels == sizes.argmax()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import functools
+import gc
 import importlib
 import sys
 from collections.abc import Sequence
@@ -65,6 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     elif name in COMMANDS:
         if is_process:
             own_streams()
+            gc.disable()  # until the command is imported, which leaves no garbage
         code = carry_out(name, functools.partial(_work, name, arguments[1:]))
         leave(code) if is_process else sys.exit(code)
     else:
@@ -105,4 +107,8 @@ def overview() -> str:
 
 def _work(name: str, arguments: Sequence[str]) -> None:
     """Read a command's arguments and do its work."""
-    command_of(name).run(arguments)
+    command = command_of(name)
+    if not gc.isenabled():
+        gc.freeze()  # what is imported stays, and need not be gone through again and again
+        gc.enable()
+    command.run(arguments)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from endopilot.imaging.grid import connected_components, distance_to_outside
+from endopilot.imaging.grid import connected_components, dilated, distance_to_outside
 from endopilot.types import Volume
 
 _SMOOTHING_MM = 0.3
@@ -55,8 +55,7 @@ def lumen_at_half_height(
     band = (distance <= 1.35 * local_radius + 0.7) & ~excluded
     rough = band & (hu > 0.5 * lumen_hu)
     beside = (distance <= 1.35 * local_radius + 4.0) & (hu < 0.6 * lumen_hu)
-    reach = [2 * round(step) + 1 for step in 2 * _BLUR_MM / spacing]
-    beside &= ~np.asarray(ndimage.maximum_filter(rough, reach), dtype=bool)
+    beside &= ~dilated(rough, [round(step) for step in 2 * _BLUR_MM / spacing])
     window = _SURROUNDINGS_MM / spacing
     weight = ndimage.gaussian_filter(beside.astype(np.float32), window, truncate=3.0)
     surroundings = ndimage.gaussian_filter(np.where(beside, hu, np.float32(0)), window, truncate=3.0)

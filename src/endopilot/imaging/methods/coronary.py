@@ -22,7 +22,14 @@ from endopilot.errors import InputError
 from endopilot.imaging.aortic_root import AorticRoot, find_aortic_roots
 from endopilot.imaging.contour import lumen_at_half_height
 from endopilot.imaging.coronary_doubts import FoundTree, coronary_doubts
-from endopilot.imaging.grid import LEAST_BLOOD_HU, connected_components, distance_to_outside, interpolate_like, resample
+from endopilot.imaging.grid import (
+    LEAST_BLOOD_HU,
+    connected_components,
+    dilated,
+    distance_to_outside,
+    interpolate_like,
+    resample,
+)
 from endopilot.imaging.openings import TO_WALL_MM, box_around, openings, opens_into
 from endopilot.imaging.ostium import find_ostium
 from endopilot.imaging.segment import SegmentConfig
@@ -203,8 +210,7 @@ def _find_vessels(grid: Volume, lumen_hu: float) -> _Scan:
         contrast_hu=lumen_hu,
     )
     # Short shapeless gaps, such as at a bifurcation, are bridged through bright voxels.
-    reach = round(_GAP_MM / _GRID_MM / 2)
-    vessels = thin & np.asarray(ndimage.maximum_filter(response > _RESPONSE, 2 * reach + 1), dtype=bool)
+    vessels = thin & dilated(response > _RESPONSE, round(_GAP_MM / _GRID_MM / 2))
     return _Scan(grid, hu, lumen_hu, pools, vessels, response)
 
 
