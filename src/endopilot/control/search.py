@@ -52,7 +52,7 @@ _TURNS = (0.0, np.pi)
 _GENTLE_SHARE, _LOOP_SHARE, _LOOP_MM_S = 0.1, 1e-4, 5.0
 """Share of the force limit below which devices in a wide lumen hardly press, what a millimetre in loops costs, and how
 many of these a second is worth, mm/s."""
-_LOOPS_MM = 25.0
+_LOOPS_MM = 30.0
 """What a manoeuvre may lay into loops, unless nothing else passes, mm."""
 _BEHIND_WIDTHS = 2
 """Soft devices may slide out of a branch from so many widths of the lumen beyond its fork."""
