@@ -24,8 +24,9 @@ A forward and an inverse causal network (`endopilot.models.causal`) for the devi
 | --- | --- |
 | patients | {patients} synthetic coronary arteries, half of them left ones, `endopilot atlas` seed {atlas_seed} |
 | split | {train} train, {calibrate} calibrate, {test} test |
-| navigations | {sequences} of {seconds:g} s a patient, and {more} with the wire as given; dataset seed {dataset_seed} |
-| trained on | {episodes} of them; {held} of the same patients are held out |
+| navigations | {sequences} of {seconds:g} s a patient, dataset seed {dataset_seed} |
+| beside them | {moving} navigations of patients who move, and one of each patient in each world of the commands |
+| trained on | {episodes} of all these; {held} of the same patients are held out |
 | wires | friction {friction[0]:g} to {friction[1]:g}, stiffness of the tip ×{stiffness[0]:g} to ×{stiffness[1]:g} |
 | training | seed {seed}, {epochs} epochs, learning rate {rate:g}, {steps} sequences a step |
 | time | {hours:.2f} hours by the clock on one thread of {processor}, shared with other work |
@@ -92,7 +93,7 @@ def card(folder: Path) -> str:
         calibrate=counts["calibrate"] // per,
         test=counts["test"] // per,
         sequences=per,
-        more=read_json(folder / "fixed" / "meta/manifest.json")["config"]["sequences"],
+        moving=sum(read_json(folder / "moving" / "meta/manifest.json")["splits"].values()),
         seconds=made["seconds"],
         dataset_seed=made["seed"],
         episodes=run["episodes"]["train"],

@@ -4,7 +4,7 @@ A dataset and a model
 
 Simulate random navigations, train a small model of the wire on them, and set it beside the packaged one.
 
-**You need** anatomies. This tutorial draws ten from the atlas. The real recipe takes 160 patients and an evening
+**You need** anatomies. This tutorial draws ten from the atlas. The real recipe takes 126 patients and an hour
 (``make recipe-laptop``); here everything is small, so that it runs in two minutes.
 """
 
@@ -82,7 +82,7 @@ endopilot.train(
 # Predict
 # -------
 # The first 30 states (15 s) are given. The network predicts the tip for the other 45 s from the controls alone. Three
-# predictions of the test patients: our small model; the packaged one (``"pretrained"``, trained on 116 patients of the
+# predictions of the test patients: our small model; the packaged one (``"pretrained"``, trained on patients of the
 # atlas, none of them here); and a baseline that holds slack and offset as they were last given.
 
 given = 30

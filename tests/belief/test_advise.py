@@ -244,6 +244,24 @@ def test_no_share_of_the_band_beyond_the_first_that_misses_too_much_is_chosen(sp
     assert monitoring.least_offset_share(approaching(split, half=0.1), bands, EVENTS) == monitoring.OFFSET_SHARES[1]
 
 
+def test_the_adviser_asks_for_more_where_exposures_show_that_the_model_errs(split) -> None:
+    """Bands of ±0.3 mm that never grow ask for X-ray after `longest_s` alone, and the tip drifts by 0.6 mm/s."""
+    bands = Calibration(
+        level=0.9, scale=1.0, abscissa_terms=(0.3, 0, 0, 0), offset_terms=(0.3, 0, 0, 0), anatomies=3, intervals=30,
+        dataset="", offset_share=0.0, longest_s=3.0,
+    )  # fmt: skip
+    never_at_the_wall = replace(EVENTS, wall_ratio=50.0, abscissa_mm=9.0)
+    asked = []
+    for drift_mm in (0.0, 0.3):
+        tip = np.stack([split.episodes.proximal[..., 0], np.full(split.found.shape, 0.4)], axis=-1)
+        tip[:, WINDOW:, 0] -= drift_mm * np.arange(1, tip.shape[1] - WINDOW + 1)
+        episodes = replace(split.episodes, tip=tip, tip_sd=np.full(tip.shape, 0.05))
+        drifting = replace(split, episodes=episodes, model=online_predictor(HoldSlack(), episodes))
+        policy = monitoring.adviser_policy(drifting, bands, never_at_the_wall)
+        asked.append(monitoring.follow_policy(drifting, policy, never_at_the_wall).exposed.sum(axis=1))
+    assert (asked[0] == 3).all() and (asked[1] > 3).all()  # in 10 s
+
+
 class Unsure(HoldSlack):
     """Holds the slack of the last observed tip; its spread is 0.1 mm for each sample since."""
 

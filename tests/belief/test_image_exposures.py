@@ -43,7 +43,7 @@ class Arm:
         self._images += 1
         self.refined.append(refine)
         tip = nodes[0]
-        return None if self._images == 3 else TipMeasurement(tip, float(tip[0]), float(tip[1]), 0, (0.2, 0.1))
+        return None if self._images == 3 else TipMeasurement(tip, float(tip[0]), float(tip[1]), 0, tip_sd_mm=(0.2, 0.1))
 
 
 @pytest.fixture

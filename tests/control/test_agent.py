@@ -208,8 +208,8 @@ def test_an_unsure_measurement_weighs_little(side_branch) -> None:
     """The scales of the weights are no smaller than the standard deviations that the detector states."""
     config = BeliefConfig(members=6, time_step_s=0.05, ostium_spread_mm=2.0)
     sure, unsure = (Belief(side_branch, Belief.around(config), config) for _ in range(2))
-    sure.weigh(replace(measured(sure, 4), sd_mm=(0.01, 0.01)))
-    unsure.weigh(replace(measured(unsure, 4), sd_mm=(50.0, 50.0)))
+    sure.weigh(replace(measured(sure, 4), covariance=1e-4 * np.eye(3)))
+    unsure.weigh(replace(measured(unsure, 4), covariance=2500.0 * np.eye(3)))
     assert np.ptp(sure.weight) > 0.1 > 0.01 > np.ptp(unsure.weight)
 
 
@@ -258,7 +258,9 @@ def test_a_tip_that_is_measured_badly_is_not_lost(side_branch) -> None:
         policy.start(side_branch, 0)
         shown = measured(policy.belief, int(np.argmax(policy.belief.weight)))
         aside = np.cross(side_branch.anatomy.insertion.direction, [1.0, 0.0, 0.0])
-        off = replace(shown, position=shown.position + 6.0 * aside / np.linalg.norm(aside), sd_mm=(sd_mm, sd_mm))
+        off = replace(
+            shown, position=shown.position + 6.0 * aside / np.linalg.norm(aside), covariance=sd_mm**2 * np.eye(3)
+        )
         assert (policy.decide(Observation(0.0, ((2.0, 0.0),), off)).devices[0][0] < 0) == lost
 
 

@@ -128,7 +128,7 @@ def test_a_wire_that_no_simulated_one_explains_is_pulled_back_until_one_does(sid
     believed = policy.belief.simulator.tip_position[0, 0]
 
     def seen(shift_mm: float, sd_mm: float = 0.0) -> Observation:
-        tip = TipMeasurement(believed + np.array([0.0, 0.0, shift_mm]), 10.0 + shift_mm, 0.0, 0, (sd_mm, sd_mm))
+        tip = TipMeasurement(believed + np.array([0.0, 0.0, shift_mm]), 10.0 + shift_mm, 0.0, 0, sd_mm**2 * np.eye(3))
         return Observation(0.0, ((10.0, np.pi), (0.0, 0.0)), tip)
 
     lost = policy.decide(seen(8.0))

@@ -93,6 +93,12 @@ def every(episodes) -> np.ndarray:
     return np.tile(given(episodes), (len(episodes), 1))
 
 
+def each_numbered(episodes, *_) -> np.ndarray:
+    """Return tips of wires, in each episode its row."""
+    shape = (len(episodes), episodes.samples, len(FRICTION_FACTORS) + 1, 2)
+    return np.broadcast_to(np.arange(len(episodes))[:, None, None, None], shape)
+
+
 def error(tip, episodes) -> np.ndarray:
     return np.abs(tip - episodes.tip[:, GIVEN:])
 
@@ -285,13 +291,20 @@ def test_the_wire_that_retraces_the_given_tips_is_found_and_simulated_once(brief
         patch.setattr("endopilot.models.simulated_wires.ensemble_of", None)
         patch.setattr("endopilot.models.fitted_wires.ensemble_of", None)
         np.testing.assert_array_equal(wires.tips(smoother.select(some), seen[some]).tip, tips[some])
-    np.testing.assert_array_equal(read_or_simulate(tmp_path, smoother, seen).tip, tips)
+    twice = np.tile(np.arange(len(brief)), 2)
+    for half in read_or_simulate(tmp_path, smoother.select(twice), seen[twice]).halves():
+        np.testing.assert_array_equal(half.tip, tips)
     with pytest.MonkeyPatch.context() as patch:
-        made = np.full((len(some), brief.samples, len(FRICTION_FACTORS) + 1, 2), 7.0)
-        patch.setattr("endopilot.models.simulated_wires.simulated_tips", lambda *_: made)
-        np.testing.assert_array_equal(read_or_simulate(tmp_path, smoother, seen).tip, tips)
-        other = read_or_simulate(tmp_path, smoother.select(some), seen[some])  # other episodes are other wires
-        assert (other.tip == 7.0).all() and (other.moved == 0.0).all()
+        patch.setattr("endopilot.models.simulated_wires.fitted", lambda few, _: np.ones((len(few), 4)))
+        patch.setattr("endopilot.models.simulated_wires._of_one_patient", each_numbered)
+        np.testing.assert_array_equal(
+            read_or_simulate(tmp_path, smoother.select(twice), seen[twice]).halves()[1].tip, tips
+        )
+        again = np.array([3, 0, 3])
+        other = read_or_simulate(tmp_path, smoother.select(again), seen[again])  # other episodes are other wires
+        np.testing.assert_array_equal(other.tip[:, 0, 0, 0], [0, 1, 0])  # those that are the same are simulated once
+        unlike = read_or_simulate(None, smoother.select(again), np.stack([seen[3], seen[0], unseen[3]]))
+        np.testing.assert_array_equal(unlike.tip[:, 0, 0, 0], [0, 1, 2])
 
 
 @pytest.mark.parametrize("first", [30, 35])

@@ -250,7 +250,7 @@ def test_images_show_the_tip(straight) -> None:
     assert record.reason == "reached" and record.exposures >= 2
     for sample in np.flatnonzero(record.exposed):
         shown = record.measured[sample]
-        assert shown is not None and min(shown.sd_mm) > 0
+        assert shown is not None and min(shown.tip_sd_mm) > 0
         assert abs(shown.abscissa - record.tip.abscissa[sample, 0]) < 1.5
 
 

@@ -58,6 +58,34 @@ def test_two_views_show_a_tip_outside_the_lumen_as_it_is_believed_and_say_how_we
     np.testing.assert_allclose(off.std(axis=0), np.mean([tip.tip_sd_mm for tip in seen], axis=0), rtol=0.2)
 
 
+def test_one_view_says_how_little_it_knows_of_the_offset(fork) -> None:
+    """A tip before or behind the line shows on it: its γ is known to lie between 0 and the wall, and no better."""
+    arm, random = Fluoroscope(fork, RADIUS, config=FluoroscopeConfig(biplane=False)), np.random.default_rng(4)
+    turn = random.uniform(0, 2 * np.pi, 200)
+    true = np.stack([0.7 * np.cos(turn), 0.7 * np.sin(turn), np.full(200, 12.0)], axis=1)
+    seen = [arm.measure(place, np.array([0.0, 0.0, 1.0]), 12.0, random) for place in true]
+    taken = np.array([tip.offset - 0.7 for tip in seen])
+    off = np.array([tip.less(np.array([12.0, 0.7])) for tip in seen]) / [tip.tip_sd_mm for tip in seen]
+    assert taken.min() < -0.5 and taken.mean() < -0.2  # the likeliest place is too near to the line
+    assert np.abs(off.mean(axis=0)).max() < 0.3 and (np.abs(off) < 1.645).mean(axis=0).min() > 0.88
+
+
+def test_one_view_of_two_branches_that_overlap_states_both(fork) -> None:
+    """Along x, a tip in the side branch, 60° off, shows at the place of one half as far along the straight vessel."""
+    config = FluoroscopeConfig(biplane=False, view_angles_deg=((90.0, 0.0), (0.0, 0.0)))
+    arm, random = Fluoroscope(fork, RADIUS, config=config), np.random.default_rng(5)
+    line, heading = fork.tree.branches[2].centerline, np.array([np.sqrt(0.75), 0, 0.5])
+    branches = set()
+    for index in range(10, len(line.points), 2):
+        between = 0.75 * float(line.abscissa[index]) + 0.25 * float(line.abscissa[0])
+        tip = arm.measure(line.points[index], heading, between, random)
+        branches.add(tip.branch)
+        assert abs(tip.abscissa - line.abscissa[index]) < 3 * tip.tip_sd_mm[0]
+        off = tip.position - line.points[index]
+        assert off @ np.linalg.solve(tip.covariance, off) < 16.0
+    assert len(branches) > 1  # it is not always in the right one
+
+
 def test_the_branch_is_observed(fork) -> None:
     arm, random = Fluoroscope(fork, RADIUS), np.random.default_rng(1)
     line = fork.tree.branches[2].centerline

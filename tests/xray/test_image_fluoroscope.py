@@ -32,7 +32,7 @@ def test_an_exposure_measures_the_tip_with_its_uncertainty(arm):
     assert shown is not None and shown.branch == 0
     assert np.linalg.norm(shown.position - nodes[0]) < 0.8
     assert shown.abscissa == pytest.approx(15.0, abs=0.6)
-    assert all(0.02 < sd < 1.0 for sd in shown.sd_mm)
+    assert all(0.02 < sd < 1.0 for sd in shown.tip_sd_mm)
     again = arm.measure(nodes, 15.3, np.random.default_rng(0))
     np.testing.assert_array_equal(shown.position, again.position)
 

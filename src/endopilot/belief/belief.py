@@ -105,6 +105,24 @@ class Past:
         return replace(self, proximal=[np.array(encoders, dtype=float) for encoders, _, _ in self.measured])
 
 
+Errors = Float[np.ndarray, "n 2"]
+"""Along and across each wire, mm."""
+
+
+def _split(error: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> tuple[Errors, np.ndarray]:
+    """Return the sizes of errors along and across wires, mm, given their unit vectors, and the unit vectors of both."""
+    shift = np.einsum("ni,ni->n", error, along)
+    across = error - shift[:, None] * along
+    size = np.linalg.norm(across, axis=1)
+    axes = np.stack([along, across / np.maximum(size, 1e-9)[:, None]], axis=1)
+    return np.column_stack([np.abs(shift), size]), axes
+
+
+def _sds(axes: Float[np.ndarray, "n 2 3"], measured: TipMeasurement) -> Errors:
+    """Return the standard deviations of a measured tip along axes, mm."""
+    return np.sqrt(np.einsum("nai,ij,naj->na", axes, measured.covariance, axes))
+
+
 class Belief:
     """An ensemble of simulated wires that follow a navigation, and how likely each is.
 
@@ -161,6 +179,7 @@ class Belief:
         self.kinds, self.kind = self.vessels.kinds(navigation.stack, self.members)
         self._fans = Fans(self.kinds, self.navigation.known_motion, self._core)
         self.error, self.force = np.zeros((len(self.members), 2)), np.zeros(len(self.members))
+        self._error_sd = self.error
         self._score, self._coaxial = np.zeros(len(self.members)), bool(navigation.catheters)
         self.evidence = 0.0
         self.shown: list[tuple[Float[np.ndarray, "members 3"], Float[np.ndarray, "members 3"]]] = []
@@ -285,17 +304,15 @@ class Belief:
             self.force = simulator.step(control, DECISION_PERIOD_S).contact_force_max
         self.tip = simulator.project()[:, 0]
 
-    def errors(self, position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "members 2"]:
-        """Return the distances of the members' tips from a place, along and across each wire, mm."""
+    def errors(self, position: Float[np.ndarray, "3"]) -> tuple[Errors, Float[np.ndarray, "members 2 3"]]:
+        """Return the distances of the members' tips from a place, along and across each wire, mm, and these axes."""
         if self._coaxial:  # the first nodes are the foremost tube's
             end, along = self.simulator.tip_position[:, 0], self.simulator.tip_direction[:, 0]
         else:
             nodes = self.simulator.position[:, :2]
             end, along = nodes[:, 0], nodes[:, 0] - nodes[:, 1]
             along /= np.linalg.norm(along, axis=1, keepdims=True)
-        error = position - end
-        shift = np.einsum("mi,mi->m", error, along)
-        return np.column_stack([np.abs(shift), np.linalg.norm(error - shift[:, None] * along, axis=1)])
+        return _split(position - end, along)
 
     def weigh(self, measured: TipMeasurement) -> None:
         """Update the likelihoods by a measurement, and before them where the proximal end of the wire is believed.
@@ -314,8 +331,9 @@ class Belief:
         self, measured: TipMeasurement, position: Float[np.ndarray, "3"], weight: Float[np.ndarray, "members"] | None
     ) -> None:
         """Weigh the members; with their weights before, the measurement counts as evidence."""
-        self.error = self.errors(position)
-        scaled = self.error / np.maximum(self._accuracy_mm, measured.sd_mm)
+        self.error, axes = self.errors(position)
+        self._error_sd = _sds(axes, measured)
+        scaled = self.error / np.maximum(self._accuracy_mm, self._error_sd)
         density = 1 / (1 + (scaled**2).sum(axis=1))
         if weight is not None:
             self.evidence += float(np.log(np.nan_to_num(weight * density).sum() + 1e-9))
@@ -335,7 +353,8 @@ class Belief:
                 measured = self.in_vessel(past.exposures[period], period)
                 self.shown.append((self.simulator.tip_position[:, 0].copy(), self.simulator.tip_direction[:, 0].copy()))
                 self._weigh(measured, measured.position, self.weight)
-                errors.append(np.column_stack([self.error, np.abs(measured.offset - self.tip.offset)]))
+                tip = np.column_stack([self.tip.abscissa, self.tip.offset])
+                errors.append(np.column_stack([self.error, np.abs(measured.less(tip)[:, 1])]))
         return np.stack(errors, axis=1)
 
     def rerun(self, past: Past) -> list[Float[np.ndarray, "devices 2"]]:
@@ -356,11 +375,12 @@ class Belief:
                 self.weigh(self.in_vessel(past.exposures[period], period))
         return proximal
 
-    def explains(self, measured: TipMeasurement) -> bool:
-        """Return whether the likeliest wire explains the last measurement, which has weighed the members."""
+    @property
+    def explains(self) -> bool:
+        """Whether the likeliest wire explains the last measurement, which has weighed the members."""
         best, config = self.best, self.config
         across_mm = max(config.lost_across_mm, config.lost_across_radii * float(self.tip.radius[best]))
-        allowed = np.maximum([config.lost_along_mm, across_mm], _SURE_SDS * np.array(measured.sd_mm))
+        allowed = np.maximum([config.lost_along_mm, across_mm], _SURE_SDS * self._error_sd[best])
         return bool((self.error[best] <= allowed).all())
 
     def play_spread(self) -> Float[np.ndarray, "2"]:
@@ -379,12 +399,11 @@ class Belief:
         left = drives.samples(0) - before
         tip, along = turned(self.simulator, best, left[:, 1], fan)
         error = measured.position - tip - shifted(*place, left[:, 0])
-        shift = np.einsum("si,si->s", error, along)
-        across = np.linalg.norm(error - shift[:, None] * along, axis=1)
-        errors = np.column_stack([shift, across])
-        likely = 1 / (1 + ((errors / np.maximum(self._accuracy_mm, measured.sd_mm)) ** 2).sum(axis=1))
+        errors, axes = _split(error, along)
+        sd = _sds(axes, measured)
+        likely = 1 / (1 + ((errors / np.maximum(self._accuracy_mm, sd)) ** 2).sum(axis=1))
         self.evidence += float(np.log(likely.mean()))
-        scaled = errors / np.maximum(_PLACED_MM, measured.sd_mm)
+        scaled = errors / np.maximum(_PLACED_MM, sd)
         drives.weigh(0, -np.log1p(scaled**2).sum(axis=1))
         moved = (drives.proximal[0] - before)[:, None]
         end = turned(self.simulator, best, moved[1], fan)[0]

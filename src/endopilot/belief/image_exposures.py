@@ -31,7 +31,7 @@ from endopilot.xray.moving_patient import seen_in_episodes
 
 EXPOSURES_FOLDER = "exposures"
 """Folder of a dataset in which what images show of its navigations is kept."""
-_FORMAT_VERSION = 2
+_FORMAT_VERSION = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Exposures:
     Attributes:
         tip: (Δtip, γtip), mm.
         branch: of that tip.
-        sd_mm: standard deviations along and across the wire as the detector states them, mm; 0 where it states none.
+        sd_mm: standard deviations of (Δtip, γtip) as the detector states them, mm; 0 where it states none.
         found: whether an image shows a wire.
         motion: the patient's motion as a run of contrast shows it, the numbers of `Motion` in their order; empty for a
             patient who lies still.
@@ -195,5 +195,5 @@ def _held(
                 later = slice(sample, None)
                 tip[index, later, 0] = encoder[index, later] - (encoder[index, sample] - one.abscissa)
                 tip[index, later, 1], branch[index, later] = one.offset, one.branch
-                sd_mm[index, sample], found[index, sample] = one.sd_mm, True
+                sd_mm[index, sample], found[index, sample] = one.tip_sd_mm, True
     return Exposures(tip, branch, sd_mm, found, np.array(astuple(known) if known else (), dtype=float))

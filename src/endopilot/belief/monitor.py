@@ -136,10 +136,10 @@ class Monitor:
         if exposure is not None:
             self.seen = seen = self.belief.in_vessel(exposure, period)
             if self._tests:
-                self._watch.compare(np.array([seen.abscissa, seen.offset]) - at[1][0], exposure.tip_sd_mm)
+                self._watch.compare(seen.less(at[1][0]), exposure.tip_sd_mm)
             self.past.exposures[period] = exposure
             self.belief.weigh(seen)
-            self.lost = not self.belief.explains(seen)
+            self.lost = not self.belief.explains
             self._innovations.alarm |= self.lost and self._tests
             self._since += 1
             if self.alarm and self._finds_motion():
@@ -147,7 +147,7 @@ class Monitor:
             elif self._is_to_change():
                 self._identify()
             at = adviser_input(self.belief)
-            self._watch.exposed(self.seen.offset, at)
+            self._watch.exposed(float((at[1] + self.seen.less(at[1]))[0, 1]), at)
         elif self.belief.drives.proximal[0, 0] <= self._navigation.start_inserted_length_mm:
             self.lost = False  # back where it began, the wire lies as it did, unseen in its catheter
         motion = _MOTION_SD_MM * (self.belief.motion is not None)
@@ -208,7 +208,7 @@ class Monitor:
         self._innovations.renew()
         period = len(self.past.proximal) - 1
         self.seen = self.belief.in_vessel(self.past.exposures[period], period)
-        self.lost = not self.belief.explains(self.seen)
+        self.lost = not self.belief.explains
 
     def _finds_motion(self) -> bool:
         """Return whether a motion of the vessel explains the exposures, and take it into the belief then."""

@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.belief.adviser import AdviserConfig, XrayAdviser, count_events, near_exposures
+from endopilot.belief.adviser import AdviserConfig, count_events, near_exposures
 from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of, surely_missed
 from endopilot.belief.image_exposures import Exposures, ImageSettings, deeper_ostium_mm, image_exposures
 from endopilot.belief.online_predictors import OnlinePredictor, online_predictor
+from endopilot.belief.watch import AdviserInput, Watch
 from endopilot.dataset.loader import Dataset
 from endopilot.devices.device import Wire
 from endopilot.models.config import WINDOW
@@ -340,24 +341,32 @@ def measure_policy(monitored: Monitored, policy: ExposurePolicy, config: Adviser
 
 
 def adviser_policy(monitored: Monitored, calibration: Calibration, config: AdviserConfig) -> ExposurePolicy:
-    """Return the adviser as an exposure policy."""
-    adviser = XrayAdviser(calibration, config, monitored.wire_radius_mm)
-    proximal, last = monitored.proximal, WINDOW - 1
-    branch = monitored.episodes.branch[:, last].astype(int)
-    tip = monitored.model.tip[:, last]
-    adviser.start(proximal[:, last], tip, monitored.lumen.radius(branch, tip[:, 0]))
+    """Return the adviser as an exposure policy: a `Watch` of each navigation, which tests the model by innovations."""
+    episodes, last = monitored.episodes, WINDOW - 1
+    branch = episodes.branch[:, last].astype(int)
+
+    def at(sample: int, tip: np.ndarray, spread: np.ndarray) -> list[AdviserInput]:
+        each = monitored.proximal[:, sample], tip, spread, monitored.lumen.radius(branch, tip[:, 0])
+        return [tuple(part[[k]] for part in each) for k in range(len(tip))]
+
+    first = at(last, monitored.model.tip[:, last], monitored.model.spread[:, last])
+    watches = [Watch(calibration, config, monitored.wire_radius_mm, each, alone=False) for each in first]
 
     def due(sample: int, tip: np.ndarray, spread: np.ndarray) -> np.ndarray:
-        return adviser.advise(proximal[:, sample], tip, spread, monitored.lumen.radius(branch, tip[:, 0]))
+        now = at(sample, tip, spread)
+        return np.array([watch.advise(each) for watch, each in zip(watches, now, strict=True)])
 
     again = taken_again(monitored, due)
 
     def decide(sample: int, tip: np.ndarray, spread: np.ndarray) -> np.ndarray:
         on = again(sample, tip, spread)
-        shown = np.flatnonzero(on & monitored.found[:, sample])
-        branch[shown] = monitored.episodes.branch[shown, sample]
-        seen = monitored.episodes.tip[:, sample]
-        adviser.exposed(seen[shown, 1], monitored.lumen.radius(branch, seen[:, 0])[shown], shown)
+        shown = np.flatnonzero(on & monitored.found[:, sample]).tolist()
+        branch[shown] = episodes.branch[shown, sample]
+        seen = episodes.tip[:, sample].astype(float)
+        radius_mm = monitored.lumen.radius(branch, seen[:, 0])
+        for k in shown:
+            watches[k].compare(seen[k] - tip[k], tuple(episodes.tip_sd[k, sample].tolist()))
+            watches[k].exposed(seen[k, 1], (monitored.proximal[[k], sample], seen[[k]], spread[[k]], radius_mm[[k]]))
         return on
 
     return decide

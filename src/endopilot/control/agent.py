@@ -151,7 +151,7 @@ class _PlanningPolicy:
     def _update(self, measured: TipMeasurement) -> None:
         """Weight the simulated wires by a measurement, and note whether all are wrong."""
         self.belief.weigh(measured)
-        self._located(measured, lost=not self.belief.explains(measured))
+        self._located(measured, lost=not self.belief.explains)
 
     def _located(self, measured: TipMeasurement, *, lost: bool) -> None:
         """Note whether the wire is lost, and how far it is then pulled back."""

@@ -107,15 +107,20 @@ def ensemble_of(
 def _replayed(
     episodes: Episodes, anatomy: Anatomy, theta: Members, samples: int
 ) -> Float[np.ndarray, "episodes members s 2"]:
-    """Return (Δtip, γtip) of wires over the first samples, mm; NaN from where a simulation fails."""
+    """Return (Δtip, γtip) of wires over the first samples, mm; NaN from where a simulation fails.
+
+    Wires that are the same, under the same commands, are simulated once.
+    """
     members = theta.shape[1]
-    flat = theta.reshape(-1, 4)
-    command = np.repeat(episodes.command[:, :samples], members, axis=0)
+    command = np.repeat(episodes.command[:, :samples], members, axis=0).astype(float)
     start = np.repeat(episodes.initial, members, axis=0).astype(float)
+    each = np.column_stack([theta.reshape(-1, 4), start, command.reshape(len(command), -1)])
+    _, first, back = np.unique(each, axis=0, return_index=True, return_inverse=True)
+    flat, command, start = theta.reshape(-1, 4)[first], command[first], start[first]
     tips = np.full((len(flat), samples, 2), np.nan)
     for rows in by_motion(flat):
         tips[rows] = ensemble_of(episodes.setup, anatomy, flat[rows], start[rows]).replay(command[rows])
-    return tips.reshape(len(episodes), members, samples, 2)
+    return tips[back.ravel()].reshape(len(episodes), members, samples, 2)
 
 
 def by_motion(theta: Float[np.ndarray, "n 4"]) -> list[np.ndarray]:

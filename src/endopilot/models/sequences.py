@@ -207,12 +207,14 @@ class Sequences:
         inputs, others, change = {}, {}, {}
         for network in networks:
             direction: Direction = "forward" if network == "ff" else "inverse"
-            forms = []
-            for observed in (given, some):
-                wires = None
-                if network == "ff":
-                    wires = read_or_simulate(episodes.setup.patients_folder, episodes, observed)
-                forms.append(unfold(direction, vessels, patient, episodes, observed, wires))
+            wires = (None, None)
+            if network == "ff":  # of both forms at once: where all given states are observed they are the same
+                twice = episodes.select(np.tile(np.arange(shape[0]), 2))
+                wires = read_or_simulate(episodes.setup.patients_folder, twice, np.concatenate([given, some])).halves()
+            forms = [
+                unfold(direction, vessels, patient, episodes, observed, of_form)
+                for observed, of_form in zip((given, some), wires, strict=True)
+            ]
             rest = [np.concatenate([form.truth - form.guess, form.jump[..., None]], axis=-1) for form in forms]
             for kept, parts in (
                 (inputs, [form.inputs for form in forms]),

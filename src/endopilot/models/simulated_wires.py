@@ -40,7 +40,7 @@ _KEPT_WORLDS = 1024
 """Wires of a setup whose states are kept in memory."""
 _STATE_EVERY = 20
 """Samples from one kept state to the next, from the given states on."""
-_FORMAT_VERSION = 3
+_FORMAT_VERSION = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +61,11 @@ class WireTips:
         wires = len(FRICTION_FACTORS)
         moved = tips[:, :, FRICTION_FACTORS.index(1.0)] - tips[:, :, wires]
         return WireTips(tips[:, :, :wires], np.nan_to_num(moved))
+
+    def halves(self) -> tuple[WireTips, WireTips]:
+        """Return those of the first half of the navigations, and those of the second."""
+        tip, moved = np.split(self.tip, 2), np.split(self.moved, 2)
+        return WireTips(tip[0], moved[0]), WireTips(tip[1], moved[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,24 +268,42 @@ def read_or_simulate(folder: Path | None, episodes: Episodes, observed: EachObse
     """Return the tips of the wires of a dataset's episodes: read from a folder, or simulated now and kept there.
 
     Args:
-        folder: where they are kept, one file for each set of episodes; nowhere if None.
-        episodes: the navigations.
+        folder: where they are kept, one file for each patient with these episodes; nowhere if None.
+        episodes: the navigations; one may be there several times, with other samples observed.
         observed: samples at which the tip was observed; wires are fitted to those among the first `WINDOW`.
+
+    Raises:
+        InputError: an anatomy is missing or damaged.
     """
-    if folder is None:
-        return WireTips.of(simulated_tips(episodes, fitted_wires(episodes, observed)))
-    setup = episodes.setup
-    settings = (_FORMAT_VERSION, FRICTION_FACTORS, asdict(replace(setup.simulator, threads=0)))
-    names = np.unique(episodes.anatomy).tolist()
-    vessels = [((setup.identities or {}).get(name), setup.known_motions.get(name)) for name in names]
-    key = json_text((settings, asdict(setup.device), vessels))
-    each = b"".join(_digest(episodes, i) + _digest(episodes, i, observed) for i in range(len(episodes)))
-    path = folder / f"wires-{hashlib.sha256(key.encode() + each).hexdigest()[:16]}.npz"
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            return WireTips.of(stored["tips"])
-    except (OSError, ValueError, KeyError, BadZipFile):
-        tips = simulated_tips(episodes, fitted_wires(episodes, observed))
-    with writing(path) as partial, partial.open("wb") as stream:
-        np.savez_compressed(stream, tips=tips)
+
+    def of_one(chosen: Int[np.ndarray, "chosen"]) -> np.ndarray:
+        part, seen = episodes.select(chosen), observed[chosen]
+        each = [_digest(part, i) + _digest(part, i, seen) for i in range(len(part))]
+        path = None if folder is None else folder / f"{part.anatomy[0]}-wires-{_key(part, each)}.npz"
+        try:
+            with np.load(path or "", allow_pickle=False) as stored:
+                return stored["tips"]
+        except (OSError, ValueError, KeyError, BadZipFile):
+            first = {digest: i for i, digest in reversed(list(enumerate(each)))}
+            some = np.array(sorted(first.values()))
+            few = part.select(some)
+            made = _of_one_patient(few, fitted(few, seen[some, :WINDOW]), {})
+            tips = made[np.searchsorted(some, [first[digest] for digest in each])]
+        if path is not None:
+            with writing(path) as partial, partial.open("wb") as stream:
+                np.savez_compressed(stream, tips=tips)
+        return tips
+
+    tips = np.empty((*episodes.branch.shape, len(FRICTION_FACTORS) + 1, 2))
+    for chosen, found in _each_patient(episodes, "Fitted and simulated wires", of_one):
+        tips[chosen] = found
     return WireTips.of(tips)
+
+
+def _key(episodes: Episodes, each: list[bytes]) -> str:
+    """Return what identifies wires of one patient: the patient, the device, and a digest of each navigation."""
+    setup, name = episodes.setup, str(episodes.anatomy[0])
+    settings = (_FORMAT_VERSION, FRICTION_FACTORS, asdict(replace(setup.simulator, threads=0)))
+    vessel = (setup.identities or {}).get(name), setup.known_motions.get(name)
+    text = json_text((settings, asdict(setup.device), vessel))
+    return hashlib.sha256(text.encode() + b"".join(each)).hexdigest()[:16]

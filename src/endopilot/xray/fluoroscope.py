@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from endopilot.anatomy.projection import TipProjector
 from endopilot.anatomy.tree import tangents
@@ -35,7 +35,7 @@ _UNCLAMPED = 3.0
 """Two views need the vessel to tell branches apart, not to place the tip: across it, the prior is this much wider, so
 that a tip outside the lumen as it is believed is measured where it is."""
 _HOPELESS = 30.0
-"""Branches whose best vertex is this much less likely than the best of all (twice the log-likelihood) are left out."""
+"""Vertices that are this much less likely than the best of all (twice the log-likelihood) are left out."""
 _NEAR_SHARE = 0.1
 """Standard deviation of (abscissa of the tip)/(inserted length): curved vessels are cut short, wires snake."""
 
@@ -49,17 +49,28 @@ class TipMeasurement:
         abscissa: Δtip of that position on the vessel's tree, mm.
         offset: γtip, mm.
         branch: index of the branch that it is observed in.
-        sd_mm: standard deviations of the position along and across the wire as the detector states them, mm; 0 where it
-            states none.
-        tip_sd_mm: those of Δtip and γtip, mm, as the views and the errors of detection make them; likewise.
+        covariance: of the position, mm²; 0 where it is not stated.
+        tip_sd_mm: standard deviations of Δtip and γtip, mm; likewise.
+        around_sd_mm: that of the position around the vessel's line, across both, mm; likewise.
     """
 
     position: Float[np.ndarray, "3"]
     abscissa: float
     offset: float
     branch: int
-    sd_mm: tuple[float, float] = (0.0, 0.0)
+    covariance: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
     tip_sd_mm: tuple[float, float] = (0.0, 0.0)
+    around_sd_mm: float = 0.0
+
+    def less(self, tip: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+        """Return what was measured less (Δtip, γtip) as predicted, mm.
+
+        A position that errs by σ around the vessel's line may be of any γtip from √(γ² − σ²) to √(γ² + σ²): what a
+        single view shows near the line may lie on the wall before or behind it. Predictions between agree with it.
+        """
+        square, around = self.offset**2, self.around_sd_mm**2
+        low, high = np.sqrt(max(square - around, 0.0)), np.sqrt(square + around)
+        return np.stack([self.abscissa - tip[..., 0], np.clip(tip[..., 1], low, high) - tip[..., 1]], axis=-1)
 
 
 @runtime_checkable
@@ -132,13 +143,22 @@ class _Detection:
 def measurement_at(
     project: TipProjector,
     anatomy: Anatomy,
-    position: Float[np.ndarray, "3"],
-    covariance: Float[np.ndarray, "3 3"],
-    sd_mm: tuple[float, float] = (0.0, 0.0),
+    places: Float[np.ndarray, "n 3"],
+    covariances: Float[np.ndarray, "n 3 3"],
+    weight: Float[np.ndarray, "n"] | None = None,
 ) -> TipMeasurement:
-    """Return the measurement of a position, LPS mm, with its covariance, mm²; `sd_mm` as in `TipMeasurement`."""
-    tip = project(position[None])
-    branch, abscissa = int(tip.branch[0]), float(tip.abscissa[0])
+    """Return the measurement of a tip at one of some places.
+
+    Args:
+        project: onto the vessel's tree.
+        anatomy: the vessel.
+        places: LPS mm, the likeliest first.
+        covariances: of the tip around each place, if it is there, mm².
+        weight: how likely each place is; equally if not given.
+    """
+    weight = np.full(len(places), 1.0 / len(places)) if weight is None else weight / weight.sum()
+    tips = project(places)
+    branch, abscissa = int(tips.branch[0]), float(tips.abscissa[0])
     line, tangent = anatomy.tree.branches[branch].centerline, np.asarray(anatomy.insertion.direction)
     centre = anatomy.insertion.position + abscissa * tangent
     if abscissa > 0:
@@ -146,10 +166,23 @@ def measurement_at(
             np.array([np.interp(abscissa, line.abscissa, axis) for axis in values.T])
             for values in (line.points, tangents(line.points))
         )
-    outwards = position - centre
-    axes = np.array([tangent, outwards / max(float(np.linalg.norm(outwards)), 1e-9)])
-    along, out = np.sqrt(np.einsum("ai,ij,aj->a", axes, covariance, axes)).tolist()
-    return TipMeasurement(position, abscissa, float(tip.offset[0]), branch, sd_mm, (along, out))
+    outwards = places[0] - centre
+    outwards = outwards / max(float(np.linalg.norm(outwards)), 1e-9)
+    axes = np.array([tangent, outwards, np.cross(tangent, outwards)])
+    within = np.einsum("p,pij->ij", weight, covariances)
+    along, out, around = np.sqrt(np.einsum("ai,ij,aj->a", axes, within, axes)).tolist()
+    off, tip = places - places[0], np.stack([tips.abscissa, tips.offset], axis=-1)
+    tip_sd = np.hypot([along, out], np.sqrt(weight @ (tip - tip[0]) ** 2)).tolist()
+    covariance = within + np.einsum("p,pi,pj->ij", weight, off, off)
+    return TipMeasurement(
+        places[0], abscissa, float(tips.offset[0]), branch, covariance, (tip_sd[0], tip_sd[1]), around
+    )
+
+
+def _valleys(cost: Float[np.ndarray, "vertices"], most: float) -> Int[np.ndarray, "valleys"]:
+    """Return the vertices of a line that cost less than their neighbours, and no more than `most`."""
+    fence = np.pad(cost, 1, constant_values=np.inf)
+    return np.flatnonzero((cost <= most) & (cost < fence[:-2]) & (cost <= fence[2:]))
 
 
 class Fluoroscope:
@@ -259,7 +292,7 @@ class Fluoroscope:
             random: where the errors are drawn from.
         """
         detections = [self._detect(view, tip_position, tip_direction, random) for view in self._views]
-        return self._likeliest(detections, inserted_length)[0]
+        return self._likeliest(detections, inserted_length)[0][0]
 
     def expose_episodes(
         self, episodes: Dataset, inserted_length: Float[np.ndarray, "episodes samples"], seed: int
@@ -306,9 +339,11 @@ class Fluoroscope:
 
     def _likeliest(
         self, detections: list[_Detection], inserted_length: float
-    ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-        """Return the most likely place of the tip, LPS mm, the best of the likeliest places in every branch, and its
-        covariance."""
+    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n"]]:
+        """Return where the tip may be, LPS mm, the likeliest place first, with covariances and weights.
+
+        A view may show several parts of the vessel at one place: the likeliest place of every such part is returned.
+        """
         length_sd = 2.0 + _NEAR_SHARE * max(inserted_length, 0.0)
         prior = [((abscissa - inserted_length) / length_sd) ** 2 for abscissa in self._abscissa]
         magnified = self._views[0].scale / self._config.geometry.source_to_isocenter_mm
@@ -320,15 +355,16 @@ class Fluoroscope:
             )
             first.append(squared / (self._config.along_sd**2 + (magnified * sd) ** 2) + unlikely)
         least = min(float(cost.min()) for cost in first)
-        best, found = np.inf, (self._points[0][-1], np.eye(3))
-        for branch, cost in enumerate(first):
-            if cost.min() > least + _HOPELESS:
-                continue
-            place, cost_there, nearest, covariance = self._refine(detections, branch, int(np.argmin(cost)))
-            cost_there += float(prior[branch][nearest])
-            if cost_there < best:
-                best, found = cost_there, (place, covariance)
-        return found
+        found = list[tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]]()
+        for branch, guess in enumerate(first):
+            for vertex in _valleys(guess, least + _HOPELESS).tolist():
+                place, cost_there, nearest, covariance = self._refine(detections, branch, vertex)
+                found.append((cost_there + float(prior[branch][nearest]), place, covariance))
+        cost, places, covariances = (
+            np.array(each) for each in zip(*sorted(found, key=lambda each: each[0]), strict=True)
+        )
+        # The likelihood of a place is that of its best point by the volume of its errors.
+        return places, covariances, np.exp(0.5 * (cost[0] - cost)) * np.sqrt(np.linalg.det(covariances))
 
     def _refine(
         self, detections: list[_Detection], branch: int, nearest: int

@@ -149,12 +149,7 @@ class ImageFluoroscope:
             moved_mm = vessel_error_mm(self._anatomy, before, self.refiner.refine(self._views, found, self._slack_mm))
         if moved_mm > _MOVED_MM or self._slack_mm > self._detector.config.slack_mm:
             found = self._detector.find(self.refiner.views(self._views), *image, before=empty) or found
-        along = found.wire[-1] - found.wire[max(-5, -len(found.wire))]
-        along = along / max(float(np.linalg.norm(along)), 1e-9)
-        variance = float(along @ found.covariance @ along)
-        across = max(float(np.trace(found.covariance)) - variance, 0.0) / 2
-        sd_mm = float(np.sqrt(variance)), float(np.sqrt(across))
-        return measurement_at(self._project, self._anatomy, found.position, found.covariance, sd_mm)
+        return measurement_at(self._project, self._anatomy, found.position[None], found.covariance[None])
 
     def _signal(
         self, plane: Plane, nodes: Float[np.ndarray, "n 3"], random: np.random.Generator, contrast: float = 0.0
