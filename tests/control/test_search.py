@@ -232,7 +232,8 @@ def test_where_there_is_little_time_loops_are_the_last_resort(hurried, monkeypat
     def nothing_passes(search: Search, grid: Grid, _: float) -> Pushed:
         tried.append(grid)
         many = search._many.count
-        return Pushed([], np.zeros(many, int), np.zeros(many, bool), *np.zeros((3, many)), ["off"] * many)
+        none = np.zeros(many)
+        return Pushed([], none.astype(int), none > 0, none, none, none, ["off"] * many)
 
     monkeypatch.setattr(Search, "_try", nothing_passes)
     assert search_straight(straight, config).reached == 1.0 and not tried
