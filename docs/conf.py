@@ -24,6 +24,7 @@ extensions = [
 myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 3  # links to headings, as GitHub has them
 html_theme = "furo"
+html_show_copyright = False  # LICENSE names the holders
 html_title = "endopilot"
 html_static_path = ["static"]
 html_css_files = ["site.css"]

@@ -88,7 +88,7 @@ def test_a_class_or_a_function_of_a_module_in_the_current_directory_makes_a_poli
     [
         ("backward", "policy: 'backward'; choose from forward, .*, open-loop, or give MODULE:OBJECT"),
         ("my_module:", "policy: 'my_module:'; choose from"),
-        ("my_module.py:Waits", "there is no module my_module.py in the current directory or on Python's path"),
+        ("my_module.py:Waits", "no module my_module.py .*; a module is named without .py: my_module:Waits"),
         ("../my_module:Waits", "choose from"),
         ("no_module:Waits", "policy: 'no_module:Waits': there is no module no_module in the current directory"),
         ("my_module.sub:Waits", "there is no module my_module.sub"),

@@ -38,7 +38,7 @@ _PARTS = {
     "read the patient": "_imager",
     "masks of devices": "_device_masks",
     "COCO": "frame_entries",
-    "PNG": "_write_png",
+    "PNG": "png_image",
     "DICOM": "write_xa",
 }
 

@@ -72,8 +72,8 @@ def motion_sentence(found: dict[str, Any]) -> str:
     errors = [row["motion_mm"] for row in found["registration"]]
     measured = [each["measured"] for each in errors if each["measured"] is not None]
     return (
-        f"With heart and breath, a run of contrast says where the vessel is to {found['motion_error_mm']:.2f} mm "
-        f"(median of {len(measured)} patients; largest {max(measured):.2f}), the published mean to "
+        f"With heart and breath, a run of contrast finds the vessel to within {found['motion_error_mm']:.2f} mm "
+        f"(median of {len(measured)} patients; largest {max(measured):.2f}), the published mean motion to within "
         f"{found['motion_error_of_published_mean_mm']:.2f} mm (largest {max(each['mean'] for each in errors):.2f})."
     )
 

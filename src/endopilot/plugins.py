@@ -122,9 +122,12 @@ class Registry:
             except ModuleNotFoundError as error:
                 if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
                     raise
+                mend = "go to its folder, or add that to PYTHONPATH"
+                if module_name.endswith(".py"):
+                    mend = f"a module is named without .py: {name.replace('.py:', ':')}"
                 raise InputError(
                     f"{self.setting}: {name!r}: there is no module {error.name} in the current directory or on "
-                    "Python's path; go to its folder, or add that to PYTHONPATH"
+                    f"Python's path; {mend}"
                 ) from error
 
     @contextlib.contextmanager

@@ -77,6 +77,15 @@ def test_the_oracle_knows_a_catheter_that_leans(side_branch) -> None:
     assert abs(along @ axis) == pytest.approx(np.linalg.norm(along), rel=1e-6)
 
 
+def test_the_agent_takes_no_more_exposures_than_it_may(side_branch) -> None:
+    truth = World(ostium_mm=2.5)  # images disagree with its belief
+    policies = [AgentPolicy(replace(QUICK, most_exposures=most)) for most in (40, 2)]
+    free, bound = (NavigationLoop(side_branch, policy, seed=2, world=truth).run() for policy in policies)
+    assert free.exposures > 2 and free.reason == "reached"
+    assert bound.exposures == 2 and bound.reason == "gave up"
+    assert bound.gives_up == "2 exposures did not suffice; AgentConfig.most_exposures allows more"
+
+
 @pytest.mark.parametrize("known", ["still", "both"])
 def test_a_course_is_what_the_simulator_does_under_its_controls(side_branch, known) -> None:
     side_branch = replace(side_branch, known_motion=motion_named(known))

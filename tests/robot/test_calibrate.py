@@ -10,7 +10,7 @@ import pytest
 
 import endopilot
 from benchmarks.robot.synthetic import drawn, logged
-from endopilot.errors import InputError
+from endopilot.errors import InputError, Remark
 from endopilot.robot.calibrate import (
     RESOLUTION,
     UNITS,
@@ -18,10 +18,11 @@ from endopilot.robot.calibrate import (
     CalibrateConfig,
     band,
     calibrate,
+    doubt_ends,
     fit_wire,
     left_out_share,
 )
-from endopilot.robot.candidates import estimates
+from endopilot.robot.candidates import Estimate, estimates
 from endopilot.robot.replay import EpisodeReplay, prepare, usable_episodes
 
 sys.path.append(str(Path(__file__).parents[2] / "examples"))
@@ -61,6 +62,19 @@ def test_intervals_of_the_wire_hold_the_truth(fork, wire) -> None:
     }
     assert all(found[name].low <= value <= found[name].high for name, value in truth.items()), found
     assert found["play_rad"].identified and not found["friction"].identified
+
+
+def test_a_drive_that_fits_best_at_the_end_of_what_was_searched_is_doubted(recwarn) -> None:
+    """As of a log in which forward is counted negative."""
+    sure = {"gain_translation": Estimate(1.01, 0.99, 1.03, (0.8, 1.25)), "play_mm": Estimate(0.1, 0.0, 0.2, (0.0, 6.0))}
+    known, unknown = Estimate(0.05, 0.0, 0.1, (0.0, 0.5)), Estimate(0.4, 0.0, 0.5, (0.0, 0.5))
+    doubt_ends("log", sure | {"latency_s": known})
+    doubt_ends("log", sure | {"latency_s": unknown})  # the table says so
+    assert not recwarn.list
+    with pytest.warns(Remark, match="^log: the best fit has latency_s at the end .* forward is counted positive"):
+        doubt_ends("log", sure | {"latency_s": Estimate(0.48, 0.47, 0.5, (0.0, 0.5))})
+    with pytest.warns(Remark, match="^log: the best fit has gain_translation at the end"):
+        doubt_ends("log", sure | {"latency_s": known, "gain_translation": Estimate(0.8, 0.8, 0.805, (0.8, 1.25))})
 
 
 def test_too_few_episodes_are_refused(fork, wire) -> None:

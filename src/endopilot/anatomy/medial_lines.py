@@ -49,7 +49,7 @@ class MedialLines:
 
     @cached_property
     def share_mm(self) -> Float[np.ndarray, "n"]:
-        """Length that each point stands for, mm: half of that of the forest's edges at it."""
+        """Length that each point stands for, mm: half the length of the forest's edges at it."""
         half = 0.5 * self.lengths(self.edges)
         return np.bincount(self.edges.ravel(), weights=np.repeat(half, 2), minlength=len(self.points))
 

@@ -37,7 +37,7 @@ tags: [x-ray, angiography, guidewire, simulated]
 
 # Angiograms with the truth in them
 
-{cines} cines of {frames} frames at {rate} frames a second, {pixels} × {pixels} pixels, of {patients} patients.
+{cines} cines of {frames} frames at {rate} frames a second, {pixels} × {pixels} pixels. Patients: {patients}.
 Simulated by endopilot {version}; no patient was exposed. Devices: {devices}. With contrast: {injected} cines; with
 devices: {driven}.
 

@@ -56,15 +56,16 @@ def count_events(state: Bool[np.ndarray, "*n samples"], near: Bool[np.ndarray, "
 class XrayAdviser:
     """Says when to switch X-ray on, for one navigation or many side by side.
 
-    Between exposures it watches two bands. Where that of Δtip is as wide as δ, an exposure is due. Of that of γtip it
-    uses the share that the calibration found. This, over the clearance of the lumen there, lies below τ, above it, or
-    across it. Below, nothing threatens; above, the tip is known to be at the wall; across, either may be. An exposure
-    is due where the band reaches τ, where the predicted tip crosses it, and where the band has left it below; as long
-    as the last exposure showed the tip on the other side of τ than it is predicted; and after an interval as long as
-    any that was calibrated on. It shows what is within 0.5 s of it, so none follows another sooner than after 1.5 s.
+    Between exposures it watches two bands. Where the band of Δtip is as wide as δ, an exposure is due. Of the band of
+    γtip it uses the share that the calibration found. This, over the clearance of the lumen there, lies below τ, above
+    it, or across it. Below, nothing threatens; above, the tip is known to be at the wall; across, either may be. An
+    exposure is due where the band reaches τ, where the predicted tip crosses it, and where the band has left it below;
+    as long as the last exposure showed the tip on the other side of τ than it is predicted; and after an interval as
+    long as any that was calibrated on. It shows what is within 0.5 s of it, so none follows another sooner than after
+    1.5 s.
 
-    A model that has erred is trusted less: an exposure is due as long as the band lies across τ, and where that of Δtip
-    is 0.6 δ wide.
+    A model that has erred is trusted less: an exposure is due as long as the band lies across τ, and where the band of
+    Δtip is 0.6 δ wide.
 
     Attributes:
         half_width: of the whole bands of Δtip and γtip at the last call of `advise`, mm, a row for each navigation.

@@ -302,6 +302,7 @@ class AgentPolicy(_PlanningPolicy):
         self._calibration = self._given or read_agent_calibration(navigation.xray, len(navigation.devices))
         self.monitor = Monitor(navigation, self._calibration, config=self.config.belief, advice=self._advice)
         self._believed, self._losses = BelievedTip(np.nan, np.nan), 0
+        self._exposures = 1  # a navigation begins with one
         return self.monitor.belief
 
     def decide(self, observation: Observation) -> Decision:
@@ -312,11 +313,22 @@ class AgentPolicy(_PlanningPolicy):
             harder = f"the drive pushes {self._harder:.1f} times as hard as simulated wires"
             return replace(decision, gives_up=f"{decision.gives_up}: {given}, and {harder}")
         if self._losses < _LOSSES or decision.gives_up:
-            return decision
+            return self._within_dose(decision)
         seen = self.monitor.seen
         at = "" if seen is None else f" at {seen.abscissa:.0f} mm"
         return replace(
             decision, gives_up=f"lost {self._losses} times: no wire, lumen or ostium explains what X-ray shows{at}"
+        )
+
+    def _within_dose(self, decision: Decision) -> Decision:
+        """Return a decision, or one that gives up where it asks for more exposures than the agent may take."""
+        self._exposures, most = self._exposures + decision.expose, self.config.most_exposures
+        if self._exposures <= most:
+            return decision
+        return replace(
+            decision,
+            expose=False,
+            gives_up=decision.gives_up or f"{most} exposures did not suffice; AgentConfig.most_exposures allows more",
         )
 
     def _observe(self, observation: Observation) -> None:

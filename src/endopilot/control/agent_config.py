@@ -35,6 +35,8 @@ class AgentConfig:
     """
     tries: Annotated[int, Within(1, 100)] = 3
     """Failed searches, one after another and each from where the last has led, after which the agent gives up."""
+    most_exposures: Annotated[int, Within(1, 10**6)] = 40
+    """Exposures that an agent which looks when its adviser asks may take; it gives up where it needs more."""
 
     @staticmethod
     def of(navigation: Navigation) -> AgentConfig:

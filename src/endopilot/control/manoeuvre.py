@@ -70,8 +70,6 @@ _LEADS_MM = (ALL_ALONG_MM, 40.0, 20.0, 10.0, 5.0, 2.0)
 _LEADS_SHAPED_MM = (-5.0, -30.0)
 """Leads of a wire that is pushed straight on, mm, see `Push.run`; the latter too where the catheter has a shape of its
 own, which shows where the wire is withdrawn."""
-_SHARES = 3
-"""So many shares of the force limit are tried with a wire alone, gentle ones first: walls may press harder."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +90,7 @@ class Repertoire:
     def of(catheters: Sequence[Catheter], config: SearchConfig, *, wide: bool) -> Repertoire:
         """Return the manoeuvres of a wire alone, in a wide lumen or not, or of one in a catheter."""
         if not catheters:
-            gentle = config.cost.forbidden_share
-            shares, grids = np.linspace(gentle, SPARE_SHARE, _SHARES).tolist(), _ALONE + _BACK * wide
+            shares, grids = (config.cost.forbidden_share, SPARE_SHARE), _ALONE + _BACK * wide
             return Repertoire((ALL_ALONG_MM,), config.candidates, tuple(product(shares, grids)))
         shaped = bool(catheters[0].shape)
         grids = (_GRID, *(_SHAPED if shaped else _UNSHAPED))

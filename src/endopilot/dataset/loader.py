@@ -298,7 +298,7 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
 
 
 def _of_signal(name: str, values: np.ndarray, devices: int) -> np.ndarray:
-    """Return a signal (episodes, samples, ...) with axes of devices and numbers in place of that of components."""
+    """Return a signal (episodes, samples, ...) with axes of devices and numbers in place of its axis of components."""
     if not SIGNALS[name].of_devices:
         return values
     return values.reshape(*values.shape[:2], devices, *([-1] if len(SIGNALS[name].columns) > 1 else []))

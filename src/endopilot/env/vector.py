@@ -192,11 +192,11 @@ class NavigateVectorEnv(VectorEnv):
     positions are those in the vessel as CT shows it, and every episode begins at the phase of the CT; an exposure takes
     off what `Navigation.known_motion` says.
 
-    `world` is what reality is where it differs: a `World`, its name or file, or several, of which world i has number i
-    modulo their number. What these draw by chance they draw by the number i. With "random" each episode draws friction,
-    half to twice what is given, ostium (±2.5 mm) and registration (±1 mm along each axis). `robot` is the same of
-    robots; a random one has plays of up to 2.6 mm and 0.9 turns, gains of 0.95 to 1.05, a latency of up to 0.1 s, and
-    encoders at its motors or on the devices.
+    `world` says where reality differs from what is given: a `World`, its name or file, or several, which the worlds
+    have in turn. Where a `World` leaves something to chance, the number of the world is the seed. With "random" each
+    episode draws friction (half to twice what is given), ostium (±2.5 mm) and registration (±1 mm along each axis).
+    `robot` is one robot or several, likewise. A random one has plays of up to 2.6 mm and 0.9 turns, gains of 0.95 to
+    1.05, a latency of up to 0.1 s, and encoders at its motors or on the devices.
 
     ## Version history
 

@@ -9,6 +9,7 @@ drive's force where the log has it, with a world for each candidate, episode and
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -20,7 +21,7 @@ from jaxtyping import Float, Int
 from endopilot.devices.device import Wire
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
-from endopilot.errors import InputError
+from endopilot.errors import InputError, Remark
 from endopilot.progress import Advance, progress
 from endopilot.robot.candidates import LEAST_EPISODES, Candidates, Estimate, estimates, search
 from endopilot.robot.course import STARTS, Courses
@@ -143,9 +144,26 @@ def calibrate(
         drives = fit_drive(of, slack, seed=config.seed)
         robot = _driven(robot, drives)
     estimated = estimates(drives, DRIVE, UNITS, RESOLUTION) | estimated
+    doubt_ends(logs[0].name, estimated)
     found = replay_prepared(of, Stack(device), robot, replays)
     held = left_out_share(found, [log.name for log in of.logs])
     return RobotCalibration(robot, device, estimated, band(found), held, found)
+
+
+def doubt_ends(log: str, found: Mapping[str, Estimate]) -> None:
+    """Warn (`Remark`) of constants of the drive that fit best at an end of what was searched, as no robot's should."""
+    at_ends = [
+        name
+        for name, (least, most) in DRIVE.items()
+        if found[name].identified and (found[name].low <= least > 0 or found[name].high >= most)
+    ]
+    if at_ends:
+        warnings.warn(
+            f"{log}: the best fit has {', '.join(at_ends)} at the end of what was searched; check that forward is "
+            "counted positive, and that times are in s",
+            Remark,
+            stacklevel=3,
+        )
 
 
 def _evenly(episodes: list[RobotLog], most: int) -> list[RobotLog]:

@@ -180,7 +180,7 @@ def prepare(logs: list[RobotLog], anatomy: Anatomy, given: float, robot: RobotCo
         if (travel := float(np.ptp(log.command[log.commanded, 0, 0]))) > longest_mm + _TRAVEL_MM:
             raise InputError(
                 f"{log.name}: translation_mm goes over {travel:.0f} mm in episode {log.episode[0]}, and {anatomy.name} "
-                f"is {longest_mm:.0f} mm long; give mm"
+                f"is {longest_mm:.0f} mm long; give mm, and times in s"
             )
     courses, project = Courses.of(logs, robot.wire), TipProjector(anatomy.tree, anatomy.insertion)
     abscissa, branch = np.full(courses.seen.shape, np.nan), np.full(courses.seen.shape, -1.0)
@@ -192,8 +192,8 @@ def prepare(logs: list[RobotLog], anatomy: Anatomy, given: float, robot: RobotCo
         share[k, : max(1, round(given * count))] = True
     if (away := float(np.median(np.concatenate(off)))) > _BESIDE_MM:
         raise InputError(
-            f"{logs[0].name}: the tip was seen {away:.0f} mm from the nearest centerline of {anatomy.name}, of the "
-            "middle row; give it in LPS mm of the CT that the vessel is from"
+            f"{logs[0].name}: half of the tips lie {away:.0f} mm or more from the nearest centerline of "
+            f"{anatomy.name}; give them in LPS mm of the CT that the vessel is from"
         )
     return Prepared(logs, courses, anatomy, project, abscissa, branch, share & courses.seen)
 

@@ -109,7 +109,8 @@ def _header(path: Path, row: list[str], needed: Sequence[str], optional: Sequenc
         if name not in header:
             near = difflib.get_close_matches(name, header, n=1)
             hint = f" ({near[0]} is there)" if near else ""
-            raise InputError(f"{path}: column {name} is missing{hint}; the columns are {', '.join(needed)}")
+            mend = f"the columns are {', '.join(needed)}" if len(needed) > 1 else "rename or add it"
+            raise InputError(f"{path}: column {name} is missing{hint}; {mend}")
     for name in (*needed, *optional):
         if header.count(name) > 1:
             raise InputError(f"{path}: column {name} stands there {header.count(name)} times; leave one")
