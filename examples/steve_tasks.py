@@ -15,8 +15,8 @@ benchmark's wire and catheter, and a task with twenty targets: points of the car
 lie in no other curve's tube, drawn with SEED (0 if not given).
 
 The benchmark counts a target as reached when the tip is within 5 mm of it; it gives 1000 steps of 1/7.5 s. It has no
-limits of force: those are here the ones of shipped devices, and 0.7 N on a node of the wall. Without arguments, a
-made-up arch is converted.
+limits of force: those are here the ones of a shipped wire, less for DualDeviceNav's, and 0.7 N on a node of the wall.
+Without arguments, a made-up arch is converted.
 """
 
 from __future__ import annotations
@@ -38,6 +38,9 @@ POISSON = 0.49
 TIP_RADIUS_MM, TIP_DEG = 12.1, 72.0
 """The tip's bend, of all its devices."""
 TIP_MM = round(float(TIP_RADIUS_MM * np.radians(TIP_DEG)), 2)
+SOFT_N, SOFT_N_MM = 0.01, 0.01
+"""Limits of the drives of DualDeviceNav's devices, N and N·mm: in a loop of 2 mm radius they bear EI/r² = 0.003 N.
+Walls are the stiffer the more drives may push: with a hospital's 0.5 N, a micrometre of rounding would press harder."""
 TASK = {
     "level": 1,
     "tip_bend_deg": TIP_DEG,
@@ -71,20 +74,21 @@ def device(
         bore_mm: inner diameter of a catheter, mm. The benchmark's simulator is not given it: there, catheters bend as
             if they were solid.
     """
-    like = "micro-devices" if bore_mm or diameter_mm[1] < 0.5 else "j-035"
-    newtons, torque = (0.5, 0.5) if like == "micro-devices" else (2.0, 10.0)
+    micro = bool(bore_mm) or diameter_mm[1] < 0.5
+    newtons, torque = (SOFT_N, SOFT_N_MM) if micro else (2.0, 10.0)
+    limit = f"{'more than it bears' if micro else 'as shipped j-035'}: the benchmark has no such limit"
     sections = [np.pi * d**4 / 64 for d in diameter_mm]
     tip, shaft = (round(float(e * i), 5) for e, i in zip(modulus_mpa, sections, strict=True))
     bend = [tip, tip, shaft]
-    friction = 0.001 if like == "micro-devices" else 0.1
+    friction = 0.001 if micro else 0.1
     values = {
         "diameter_mm": (diameter_mm[1], f"{source}: of the shaft"),
         "friction": (friction, source),
         "max_velocity_mm_s": (35.0, source),
         "max_rotation_rad_s": (3.14, source),
-        "push_limit_n": (newtons, f"as shipped {like}: the benchmark has no such limit"),
-        "pull_limit_n": (newtons, f"as shipped {like}: the benchmark has no such limit"),
-        "torque_limit_n_mm": (torque, f"as shipped {like}: the benchmark has no such limit"),
+        "push_limit_n": (newtons, limit),
+        "pull_limit_n": (newtons, limit),
+        "torque_limit_n_mm": (torque, limit),
         "abscissa_mm": ([0.0, TIP_MM, TIP_MM + 0.5], f"{source}: its tip is bent"),
         "bend_stiffness_n_mm2": (bend, f"{source}: moduli and round sections"),
         "twist_stiffness_n_mm2": ([round(ei / (1 + POISSON), 5) for ei in bend], f"{source}: GJ = EI / (1 + nu)"),

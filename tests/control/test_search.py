@@ -11,6 +11,8 @@ from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.agent import AgentPolicy, OpenLoopPolicy, OraclePolicy
 from endopilot.control.agent_config import AgentConfig
 from endopilot.control.course import Course
+from endopilot.control.manoeuvre import Grid
+from endopilot.control.push import Push, Pushed
 from endopilot.control.search import Search
 from endopilot.control.search_config import ManoeuvreConfig
 from endopilot.devices.catheter import read_catheter
@@ -189,19 +191,51 @@ def test_of_manoeuvres_that_pass_alike_the_cheapest_is_taken(side_branch, found,
     assert harder.reached == 1.0 and harder.force.max() > course.force.max()
 
 
-def test_where_there_is_little_time_wire_and_catheter_move_together_and_faster(side_branch, monkeypatch) -> None:
-    monkeypatch.setattr("endopilot.control.manoeuvre._LEADS_MM", (2.0,))
+@pytest.fixture(scope="module")
+def hurried(side_branch) -> tuple[Navigation, AgentConfig]:
+    """Return a target straight ahead, and the settings of an agent that has little time for it."""
     straight = replace(side_branch, target=Target(branch=0, abscissa=18.0))
     assert AgentConfig.of(straight) is AgentConfig.of(side_branch)  # there is time for 4 x 18 mm at 5 mm/s
-    hurried = replace(straight, seconds=6.0)
-    config = AgentConfig.of(hurried).search
-    assert config.manoeuvres.together and config.speed_mm_s == pytest.approx(2 * 18.0 / 6.0)
-    belief = Belief(straight, [World()], BELIEF)
-    route = Route.to(straight.anatomy, straight.target)
-    slow, fast = (
-        Search(straight, route, belief, config=each, seed=0).find(belief, seconds=60.0)
-        for each in (agent_config(straight).search, config)
-    )
+    return straight, AgentConfig.of(replace(straight, seconds=6.0))
+
+
+def search_straight(navigation: Navigation, config: AgentConfig) -> Course:
+    belief = Belief(navigation, [World()], BELIEF)
+    route = Route.to(navigation.anatomy, navigation.target)
+    return Search(navigation, route, belief, config=config.search, seed=0).find(belief, seconds=60.0)
+
+
+def test_where_there_is_little_time_wire_and_catheter_move_together_and_faster(hurried, monkeypatch) -> None:
+    monkeypatch.setattr("endopilot.control.manoeuvre._LEADS_MM", (2.0,))
+    straight, config = hurried
+    assert config.search.manoeuvres.together and config.search.speed_mm_s == pytest.approx(2 * 18.0 / 6.0)
+    slow, fast = (search_straight(straight, each) for each in (agent_config(straight), config))
     assert slow.reached == fast.reached == 1.0 and len(fast.control) < 0.75 * len(slow.control)
     both = [(np.abs(course.control[:, :, 0]) > 0.5).all(axis=1).any() for course in (slow, fast)]
     assert both == [False, True]
+
+
+def test_where_there_is_little_time_slow_trials_are_given_up(hurried, monkeypatch) -> None:
+    monkeypatch.setattr("endopilot.control.manoeuvre._LEADS_MM", (2.0, 1000.0))
+    monkeypatch.setattr("endopilot.control.push._LATE", 1)
+    straight, config = hurried
+    pushes, run = [], Push.run
+    monkeypatch.setattr(Push, "run", lambda *given: pushes.append(run(*given)) or pushes[-1])
+    assert search_straight(straight, config).reached == 1.0
+    assert [push.passed.tolist() for push in pushes] == [[True, False]] and pushes[0].halt[1] == "late"
+
+
+def test_where_there_is_little_time_loops_are_the_last_resort(hurried, monkeypatch) -> None:
+    straight, config = hurried
+    tried = []
+
+    def nothing_passes(search: Search, grid: Grid, _: float) -> Pushed:
+        tried.append(grid)
+        many = search._many.count
+        none = np.zeros(many)
+        return Pushed([], none.astype(int), none > 0, none, none, none, ["off"] * many)
+
+    monkeypatch.setattr(Search, "_try", nothing_passes)
+    assert search_straight(straight, config).reached == 1.0 and not tried
+    monkeypatch.setattr("endopilot.control.search._LOOPS_MM", -1000.0)
+    assert search_straight(straight, config).reached == 1.0 and tried

@@ -42,16 +42,20 @@ class AgentConfig:
     def of(navigation: Navigation) -> AgentConfig:
         """Return the settings for a navigation by a wire alone, in a wide lumen or not, or by one in a catheter."""
         target = navigation.target.abscissa
-        if navigation.catheters:
-            search = IN_CATHETER.search
-            if search.speed_mm_s * navigation.seconds >= _WAYS * target:
-                return IN_CATHETER
-            fastest = min(device.max_velocity_mm_s for device in navigation.devices)
-            speed = max(search.speed_mm_s, _WAYS / 2 * target / navigation.seconds)
-            manoeuvres = replace(search.manoeuvres, together=True)
-            return replace(IN_CATHETER, search=replace(search, speed_mm_s=min(speed, fastest), manoeuvres=manoeuvres))
         wide = Route.to(navigation.anatomy, navigation.target).is_wide(target)
-        return IN_WIDE_LUMEN if wide else AgentConfig()
+        if not navigation.catheters:
+            return IN_WIDE_LUMEN if wide else AgentConfig()
+        search, belief = IN_CATHETER.search, IN_CATHETER.belief
+        if search.speed_mm_s * navigation.seconds >= _WAYS * target:
+            return IN_CATHETER
+        fastest = min(device.max_velocity_mm_s for device in navigation.devices)
+        speed = max(search.speed_mm_s, _WAYS / 2 * target / navigation.seconds)
+        manoeuvres = replace(search.manoeuvres, together=True, longest_s=_HURRIED_S)
+        return replace(
+            IN_CATHETER,
+            search=replace(search, speed_mm_s=min(speed, fastest), manoeuvres=manoeuvres),
+            belief=replace(belief, **_COARSE) if wide else belief,
+        )
 
 
 IN_WIDE_LUMEN = AgentConfig(
@@ -104,3 +108,7 @@ def read_agent_calibration(xray: XrayKind, devices: int) -> Calibration:
 _WAYS = 4.0
 """Wire and catheter move in turn if there is time for a way so many times as long as the route; else together, and so
 fast that there is time for half as long a way."""
+_HURRIED_S = 10.0
+"""A catheter is then brought to its place in this time at most, s."""
+_COARSE = {"element_mm": 2.0, "time_step_s": 0.1}
+"""What such a belief takes on a route through a wide lumen: its bends are wide, and the devices half a metre long."""

@@ -94,8 +94,10 @@ class Repertoire:
             return Repertoire((ALL_ALONG_MM,), config.candidates, tuple(product(shares, grids)))
         shaped = bool(catheters[0].shape)
         grids = (_GRID, *(_SHAPED if shaped else _UNSHAPED))
-        ways = (*product((SPARE_SHARE,), grids), *product((1.0,), (STRAIGHT, _GRID)))
-        return Repertoire(_LEADS_MM + _LEADS_SHAPED_MM * shaped, config.manoeuvres.turns, ways)
+        ways = [*product((SPARE_SHARE,), grids), *product((1.0,), (STRAIGHT, _GRID))]
+        if config.manoeuvres.together:  # what straight pushes lay into loops costs less than all further grids
+            ways.insert(1, ways.pop(len(grids)))
+        return Repertoire(_LEADS_MM + _LEADS_SHAPED_MM * shaped, config.manoeuvres.turns, tuple(ways))
 
     @property
     def trials(self) -> int:

@@ -44,6 +44,8 @@ _SLACK_MM, _SLACK_WIDTHS = 40.0, 2.0
 lies down on the outer walls before it comes forward."""
 _AT_MM, REST_MM = 1.0, 0.1
 """A catheter this near to its place is there, mm; what is this near to its goal rests."""
+_LATE = 2
+"""Where time is short, trials that need this many times as long as the first of them to pass are given up."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +70,9 @@ class Pushed:
     slack: Each
     halt: list[Halt]
 
-    def within(self, force_n: float) -> Bool[np.ndarray, "trials"]:
-        """Return which pass without pressing on the wall with more than some force, N."""
-        return self.passed & (self.force <= force_n)
+    def within(self, force_n: float, slack_mm: float = np.inf) -> Bool[np.ndarray, "trials"]:
+        """Return which pass without pressing on the wall with more than some force, N, or ending in more slack, mm."""
+        return self.passed & (self.force <= force_n) & (self.slack <= slack_mm)
 
     @property
     def moving(self) -> Int[np.ndarray, "trials"]:
@@ -178,11 +180,15 @@ class Push:
 
         if self.strict:
             stop(self._off(trials, off_mm), "off")
-        for _ in range(min(periods, longest)):
+        longest, hurries = begun + min(periods, longest), self.config.manoeuvres.together
+        while len(trials.rows) < longest:
             going, before = ~trials.still, trials.lengths[:, WIRE]
             control = self._straight(trials, progress) if alone else follower.control(progress)
             if not control[going].any():
                 break
+            rests = going & ~control.any(axis=(1, 2))
+            if hurries and (rests & self.arrived(trials)).any():
+                hurries, longest = False, min(longest, begun + _LATE * (len(trials.rows) - begun))
             presses = trials.move(control, force_n=force_n)
             took[going] = len(trials.rows)
             progress, inserted = self._progress(trials), _deepest(trials)
@@ -294,6 +300,8 @@ class _Follower:
             left = goal - progress
             behind = np.minimum(push.waypoint - trials.mean(trials.tips.abscissa[:, CATHETER]), inserted - around)
         there = np.abs(left) <= REST_MM
+        if push.last and push.config.manoeuvres.together and not push.navigation.arriving:
+            there |= trials.all(push.navigation.reached(trials.tips))
         self._follows = (behind > REST_MM) & (self._follows | there | (inserted - around >= self._lead))
         rests = there | (self._follows & (not push.config.manoeuvres.together))
         wire = np.where(rests, 0.0, np.clip(left / DECISION_PERIOD_S, -_SLOWEST_MM_S, speed))

@@ -21,6 +21,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from functools import partial
+from itertools import product
 
 import numpy as np
 
@@ -51,6 +52,10 @@ _TURNS = (0.0, np.pi)
 _GENTLE_SHARE, _LOOP_SHARE, _LOOP_MM_S = 0.1, 1e-4, 5.0
 """Share of the force limit below which devices in a wide lumen hardly press, what a millimetre in loops costs, and how
 many of these a second is worth, mm/s."""
+_LOOPS_MM = 30.0
+"""What a manoeuvre may lay into loops, unless nothing else passes, mm."""
+_BEHIND_WIDTHS = 2
+"""Soft devices may slide out of a branch from so many widths of the lumen beyond its fork."""
 _OFTEN = 6
 """A course that has passed places this many times as often as there are is at an end."""
 _REPEATED = 3
@@ -228,9 +233,9 @@ class Search:
             kept: where the devices are.
         """
         course, tried = self._course, self._tried.get(grid)
-        if tried is not None and not tried.within(share * self._navigation.force_limit_n).any():
-            return False
         course.restore(kept)
+        if tried is not None and not tried.within(*self._limits(share)).any():
+            return False
         if self._alone and grid[0].beyond is not None:
             self._approach(waypoint)
         if tried is None:
@@ -259,20 +264,35 @@ class Search:
         """Let the course do what the best trial of a manoeuvre did; return whether any passes within a share of force.
 
         Of the places that most rotations pass, and among these of the cheapest, it is the rotation in the middle. Where
-        there is a catheter, trials have waited for each other. The course does not, and so has to pass again.
+        there is a catheter, trials have waited for each other. The course does not, and so has to pass again; but soft
+        devices go on to unbend as they wait, and what moves them together may keep the pauses.
         """
-        course, limit_n, cost = self._course, share * self._navigation.force_limit_n, self.manoeuvre_cost(pushed)
-        rows, kept = pushed.within(limit_n).reshape(-1, turns), course.kept()
+        course, cost, kept = self._course, self.manoeuvre_cost(pushed), self._course.kept()
+        limit_n, slack_mm = self._limits(share)
+        rows = pushed.within(limit_n, slack_mm).reshape(-1, turns)
         trials = [at * turns + middle(row) for at, row in enumerate(rows) if row.any()]
         trials.sort(key=lambda trial: (-int(rows[trial // turns].sum()), cost[trial]))
-        for trial in trials[:_REPEATED]:
+        pauses = (self._alone, True) if self.config.manoeuvres.together else (self._alone,)
+        for trial, waits in product(trials[:_REPEATED], pauses):
             for control in pushed.controls(trial):
-                if self._alone or control.any():
+                if waits or control.any():
                     course.still |= course.move(control[None], force_n=limit_n)
             if self._arrives(self._push(waypoint)):
                 return True
             course.restore(kept)
         return False
+
+    def _limits(self, share: float) -> tuple[float, float]:
+        """Return how hard a manoeuvre may press, N, and how much slack it may leave, mm, at some share of the limits.
+
+        Devices that move together where time is short are so soft that loops end in coils: all but the last resort may
+        lay little into loops.
+        """
+        limit_n, course = share * self._navigation.force_limit_n, self._course
+        if not self.config.manoeuvres.together or share >= 1.0:
+            return limit_n, np.inf
+        slack_mm = float(course.mean(course.lengths.max(axis=1))[0]) - self._here()
+        return limit_n, max(slack_mm, 0.0) + _LOOPS_MM
 
     def _obstacle(self, waypoint: float) -> tuple[float, float]:
         """Return what lies in the way of a place, and the steps in which devices are placed about it, mm.
@@ -282,7 +302,8 @@ class Search:
         route = self.route
         near = float(route.junctions[route.junctions < waypoint].max(initial=0.0))
         width = 2 * float(route.radius(np.array([near]))[0])
-        obstacle = min(near, self._hard) if near > max(self._here() - width, 0.0) else self._hard
+        behind = width * (_BEHIND_WIDTHS if self.config.manoeuvres.together else 1)
+        obstacle = min(near, self._hard) if near > max(self._here() - behind, 0.0) else self._hard
         return obstacle, stand_off(route, obstacle, self.config.lead_mm)
 
     def _approach(self, waypoint: float) -> None:
