@@ -69,7 +69,7 @@ template <class V>
     bool all_deep = true;
     lumen.stencils(cell, first);
     for (int lane = 0; lane < W; ++lane) all_deep = all_deep && lumen.deep(first[lane]);
-    if (all_deep) return {broadcast<V>(Lumen::kDeep), {V{}, V{}, V{}}, {S{}, S{}, S{}, S{}, S{}, S{}}};
+    if (all_deep) return {broadcast<V>(lumen.clearance), {V{}, V{}, V{}}, {S{}, S{}, S{}, S{}, S{}, S{}}};
 
     const auto weights = [](const V& p, V (&w)[3], V (&d)[3]) {
         const V left = 0.5 - p, right = 0.5 + p;

@@ -15,12 +15,13 @@ namespace endopilot {
 template <template <class> class Array>
 struct LumenArrays {
     double origin[3]{}, inverse_spacing = 0, cells[3]{};
+    double clearance = 0;          // mm: cells deep inside are at least as far from the wall
     int bricks[3]{};
     Array<std::int32_t> index{};   // the brick of each 8³ cells; 0: deep inside, 1: outside
     Array<float> pool{};           // the bricks' coefficients
 
     static constexpr int kEdge = 8, kStored = kEdge + 2, kVolume = kStored * kStored * kStored;
-    static constexpr double kDeep = 1e3;
+    static constexpr double kDeep = 1e3;   // mm: farther from a wall than any place
 
     // The first coefficient of the 3³ stencils around the cells with whole-numbered coordinates `cell`, for each lane.
     template <class V>
@@ -54,12 +55,13 @@ LumenMap gather_bricks(const int (&size)[3], const double (&origin)[3], double s
     constexpr int kEdge = Lumen::kEdge, kVolume = Lumen::kVolume;
     LumenMap map;
     map.inverse_spacing = 1.0 / spacing;
+    map.clearance = near;
     for (int a = 0; a < 3; ++a) {
         map.origin[a] = origin[a];
         map.bricks[a] = (size[a] + kEdge - 1) / kEdge;
         map.cells[a] = map.bricks[a] * kEdge;
     }
-    map.pool.assign(2 * kVolume, float(Lumen::kDeep));  // brick 0: deep inside, brick 1: outside
+    map.pool.assign(2 * kVolume, float(near));  // brick 0: deep inside, brick 1: outside
     std::fill(map.pool.begin() + kVolume, map.pool.end(), std::numeric_limits<float>::quiet_NaN());
     map.index.resize(std::size_t(map.bricks[0]) * map.bricks[1] * map.bricks[2]);
     std::vector<float> brick(kVolume);
@@ -111,7 +113,7 @@ inline std::size_t bytes(const LumenMap& map) {
 // `place` puts a vector where the stepper reads it, and returns its address there.
 template <class Place>
 Lumen view(const LumenMap& map, const Place& place) {
-    Lumen lumen{.inverse_spacing = map.inverse_spacing, .index = place(map.index), .pool = place(map.pool)};
+    Lumen lumen{.inverse_spacing = map.inverse_spacing, .clearance = map.clearance, .index = place(map.index), .pool = place(map.pool)};
     for (int a = 0; a < 3; ++a) {
         lumen.origin[a] = map.origin[a];
         lumen.cells[a] = map.cells[a];
