@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import endopilot
+from benchmarks.anatomy.analytic_lumens import forked_tree, tree_distance
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import make_lumen
+from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.vessel_wall import FINE_MM, make_wall
-from endopilot.types import Anatomy
+from endopilot.types import Anatomy, DistanceMap
+from toy_fork import SPACING_MM, make_fork
 
 
 @pytest.fixture(scope="module")
@@ -72,3 +77,22 @@ def test_a_straight_catheter_that_fills_the_guiding_catheter_does_not_press_it(v
     trajectory = endopilot.simulate(vessel, wide, np.zeros((1, 4, 2, 2)), initial=initial)
     assert trajectory.valid.all()
     assert trajectory.contact_force_max.max() < 0.2  # N; 10 N and more where the map is too coarse
+
+
+def test_a_wire_from_the_middle_of_a_wide_vessel_is_held_by_the_wall_that_it_reaches_within_a_period() -> None:
+    """Where no wall is near none is stored; the vessel of 8 mm radius ends in a half sphere at z = 48 mm."""
+    tree, low = forked_tree(radius=(8.0, 0.8)), np.array([-12.0, -12.0, -26.0])
+    axes = [np.arange(a, b, SPACING_MM) for a, b in zip(low, (22.0, 12.0, 52.0), strict=True)]
+    z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
+    catheter = np.where(z < 1.0, 0.9 - np.hypot(x, y), -1.0)
+    inside = np.minimum(tree_distance(tree, np.stack([x, y, z], axis=-1)), z)
+    values = np.maximum(np.maximum(inside, catheter), -1.0)
+    anatomy = replace(make_fork(), tree=tree, distance_map=DistanceMap(values, SPACING_MM, low))
+    simulator = Simulator([anatomy], [read_wire("workhorse-014")], config=SimulatorConfig(threads=1))
+    simulator.reset(inserted_length=[20.0], rotation=[0.0])
+    clearance = []
+    for _ in range(2):
+        assert simulator.step([[[40.0, 0.0]]], 0.5).valid.all()
+        ahead = simulator.position[0, simulator.position[0, :, 2] > 2.0]
+        clearance.append(tree_distance(tree, ahead).min())
+    assert clearance[0] > 3.0 and 0.05 < clearance[1] < 0.19  # the wire's radius is 0.18 mm
