@@ -10,6 +10,7 @@ import re
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from endopilot.evaluation.metrics import OFF_WALL_MM
 from endopilot.evaluation.prediction_baselines import hold_slack
 from endopilot.files import read_json
 from endopilot.models.causal import CausalPredictor
-from endopilot.models.config import WINDOW
+from endopilot.models.config import PRETRAINED, WINDOW
 from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import Prediction, jumps
 from endopilot.models.rollout import load_model
@@ -32,9 +33,9 @@ from endopilot.models.sequences import play_tables, unfold
 from endopilot.models.simulated_wires import FRICTION_FACTORS
 
 PAGE = Path(__file__).parents[1] / "evidence" / "learning.md"
-RUNS = {"`pretrained`": "seed-0", "seed 1": "seed-1", "seed 2": "seed-2", "`paper`": "paper"}
+OURS = f"`{PRETRAINED}`"
+RUNS = {"the recipe's pair": "seed-0", "the paper's pair": "paper"}
 """Runs of `make recipe-laptop`, by the name of the row; those that are not there are left out."""
-OURS = next(iter(RUNS))
 PATIENTS = {
     "atlas, wires of ±20 %": "dataset",
     "atlas, moving, wires of ±20 %": "moving",
@@ -80,12 +81,18 @@ def p1_rows(folder: Path) -> tuple[list[str], list[str]]:
         played = unfold("forward", vessels, patient, episodes, observed).guess
         there = {name: folder / run for name, run in RUNS.items() if (folder / run / "manifest.json").is_file()}
         runs = {name: load_model(run) for name, run in there.items()}
-        ours = runs[OURS]
+        ours = load_model(PRETRAINED)
         assert isinstance(ours, CausalPredictor)
         found = ours.predict(episodes, observed)
-        jumping.append(f"| {patients} | {_jump_cells(episodes, found)} |")
+        jumping.append(f"| {patients} | {OURS} | {_jump_cells(episodes, found)} |")
         tips = {OURS: found.tip[:, WINDOW:]}
-        tips |= {name: run.rollout_forward(episodes).tip for name, run in runs.items() if name != OURS}
+        for name, run in runs.items():
+            if isinstance(run, CausalPredictor):  # of the same wires
+                predicted = replace(run, wires=ours.wires).predict(episodes, observed)
+                jumping.append(f"| {patients} | {name} | {_jump_cells(episodes, predicted)} |")
+                tips[name] = predicted.tip[:, WINDOW:]
+            else:
+                tips[name] = run.rollout_forward(episodes).tip
         tips["play operator alone"] = played[:, WINDOW:]
         for name, seen in (("simulated wire as given", np.zeros_like(observed)), ("simulated wire, fitted", observed)):
             wire = ours.wires.tips(episodes, seen).tip[:, :, FRICTION_FACTORS.index(1.0)]
