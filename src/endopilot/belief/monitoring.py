@@ -346,8 +346,8 @@ def adviser_policy(monitored: Monitored, calibration: Calibration, config: Advis
     branch = episodes.branch[:, last].astype(int)
 
     def at(sample: int, tip: np.ndarray, spread: np.ndarray) -> list[AdviserInput]:
-        each = monitored.proximal[:, sample], tip, spread, monitored.lumen.radius(branch, tip[:, 0])
-        return [tuple(part[[k]] for part in each) for k in range(len(tip))]
+        proximal, radius_mm = monitored.proximal[:, sample], monitored.lumen.radius(branch, tip[:, 0])
+        return [(proximal[[k]], tip[[k]], spread[[k]], radius_mm[[k]]) for k in range(len(tip))]
 
     first = at(last, monitored.model.tip[:, last], monitored.model.spread[:, last])
     watches = [Watch(calibration, config, monitored.wire_radius_mm, each, alone=False) for each in first]

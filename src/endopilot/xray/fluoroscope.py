@@ -156,7 +156,7 @@ def measurement_at(
         covariances: of the tip around each place, if it is there, mm².
         weight: how likely each place is; equally if not given.
     """
-    weight = np.full(len(places), 1.0 / len(places)) if weight is None else weight / weight.sum()
+    share = np.full(len(places), 1.0 / len(places)) if weight is None else weight / weight.sum()
     tips = project(places)
     branch, abscissa = int(tips.branch[0]), float(tips.abscissa[0])
     line, tangent = anatomy.tree.branches[branch].centerline, np.asarray(anatomy.insertion.direction)
@@ -169,11 +169,11 @@ def measurement_at(
     outwards = places[0] - centre
     outwards = outwards / max(float(np.linalg.norm(outwards)), 1e-9)
     axes = np.array([tangent, outwards, np.cross(tangent, outwards)])
-    within = np.einsum("p,pij->ij", weight, covariances)
+    within = np.einsum("p,pij->ij", share, covariances)
     along, out, around = np.sqrt(np.einsum("ai,ij,aj->a", axes, within, axes)).tolist()
     off, tip = places - places[0], np.stack([tips.abscissa, tips.offset], axis=-1)
-    tip_sd = np.hypot([along, out], np.sqrt(weight @ (tip - tip[0]) ** 2)).tolist()
-    covariance = within + np.einsum("p,pi,pj->ij", weight, off, off)
+    tip_sd = np.hypot([along, out], np.sqrt(share @ (tip - tip[0]) ** 2)).tolist()
+    covariance = within + np.einsum("p,pi,pj->ij", share, off, off)
     return TipMeasurement(
         places[0], abscissa, float(tips.offset[0]), branch, covariance, (tip_sd[0], tip_sd[1]), around
     )
