@@ -419,7 +419,10 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
         .def_ro("nodes", &Rod::nodes);
     module.def("make_rod", &make_rod, nb::kw_only(), nb::arg("abscissa"), nb::arg("shear"), nb::arg("stretch"),
                nb::arg("bend"), nb::arg("twist"), nb::arg("rest"), nb::arg("radius"), nb::arg("drag"), nb::arg("spin_drag"));
-    nb::class_<LumenMap>(module, "Lumen").def_prop_ro("bytes", &bytes).def("distance", &distance, nb::arg("points"));
+    nb::class_<LumenMap>(module, "Lumen")
+        .def_prop_ro("bytes", &bytes)
+        .def_ro("steepest", &LumenMap::steepest)
+        .def("distance", &distance, nb::arg("points"));
     module.def("make_lumen", &make_lumen, nb::kw_only(), nb::arg("values"), nb::arg("origin"), nb::arg("spacing"),
                nb::arg("near"), nb::arg("far"), nb::arg("finer"), nb::arg("spheres"));
     nb::class_<Projector>(module, "Projector")

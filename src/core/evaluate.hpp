@@ -7,7 +7,6 @@
 namespace endopilot {
 
 constexpr double kStickyReach = 0.1;     // mm: in a step's first iteration, a wall that was touched and is this near still holds
-constexpr double kSteepest = 1.5;        // more than any slope of the spline through a distance map
 
 // Whether a lane's first node that follows the drive is node i.
 template <class V, int T>
@@ -64,10 +63,10 @@ ENDOPILOT_LARGE void add_rod(const RodModel& rod, Lanes<V, T>& lanes, int first,
 
 // Whether any lane's contact point may be within reach of the wall, going by how far it has moved since the wall was evaluated.
 template <class V, class Radius>
-ENDOPILOT_DEVICE bool near_wall(const ContactPoint<V>& point, const Vec3<V>& x, const Radius& radius, Mask<V> on) {
+ENDOPILOT_DEVICE bool near_wall(const ContactPoint<V>& point, double steepest, const Vec3<V>& x, const Radius& radius, Mask<V> on) {
     const Vec3<V> moved = x - point.evaluated;
     const V spare = point.clearance - (radius + kStickyReach);
-    const Mask<V> clear = (spare > V{}) & (spare * spare > kSteepest * kSteepest * dot(moved, moved));  // false for NaN
+    const Mask<V> clear = (spare > V{}) & (spare * spare > steepest * steepest * dot(moved, moved));  // false for NaN
     return any<V>(on & ~clear);
 }
 
@@ -112,7 +111,7 @@ ENDOPILOT_LARGE bool add_contact(const Scene& scene, Lanes<V, T>& lanes, Contact
     point.gap = broadcast<V>(kStickyReach);
     const bool moves = scene.motion.cycles > 0;
     const Vec3<V> at = moves ? lanes.step.vessel.to_vessel(x) : x;   // where the distance map is asked
-    const bool near = near_wall(point, at, radius, on), rubs = any<V>(on & ~(point.friction.limit <= zero));  // a NaN goes on
+    const bool near = near_wall(point, scene.lumen.steepest, at, radius, on), rubs = any<V>(on & ~(point.friction.limit <= zero));  // a NaN goes on
     if (near) {
         Distance<V> d = distance_to_wall(scene.lumen, at);
         if (moves) lanes.step.vessel.to_laboratory(d.gradient, d.hessian);

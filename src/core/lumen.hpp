@@ -2,6 +2,7 @@
 #pragma once
 
 #include <algorithm>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <limits>
@@ -16,6 +17,7 @@ template <template <class> class Array>
 struct LumenArrays {
     double origin[3]{}, inverse_spacing = 0, cells[3]{};
     double clearance = 0;          // mm: cells deep inside are at least as far from the wall
+    double steepest = 0;           // the largest slope of the spline inside
     int bricks[3]{};
     Array<std::int32_t> index{};   // the brick of each 8³ cells; 0: deep inside, 1: outside
     Array<float> pool{};           // the bricks' coefficients
@@ -47,8 +49,59 @@ struct LumenArrays {
 using LumenMap = LumenArrays<Owned>;
 using Lumen = LumenArrays<Viewed>;   // no lumen if it refers to nothing
 
+// The largest slope, squared, in (coefficient per cell)², of the spline in the cell whose 3³ stencil begins at `stencil`; or a bound of
+// it that is no larger than `enough`. In each axis a cell's three coefficients a, b, c are a parabola through (a + b)/2 and (b + c)/2
+// with the control point b between them, and its slope runs from b - a to c - b. A polynomial stays in the hull of its control points
+// (Farin, Curves and Surfaces for CAGD, 2002, section 4.3), here 3³ of the gradient.
+inline float steepest_in_cell(const float* stencil, float enough) {
+    constexpr int kStored = Lumen::kStored, kRow[3] = {1, kStored, kStored * kStored};
+    float bound = 0.0f, largest = 0.0f;
+    for (int a = 0; a < 3; ++a) {
+        const int along = kRow[a], u = kRow[(a + 1) % 3], v = kRow[(a + 2) % 3];
+        float step = 0.0f;
+        for (int i = 0; i < 2; ++i)
+            for (int j = 0; j < 9; ++j) {
+                const float* c = stencil + i * along + j / 3 * u + j % 3 * v;
+                step = std::max(step, std::abs(c[along] - c[0]));
+            }
+        bound += step * step;
+    }
+    if (!(bound > enough)) return bound;
+    static constexpr float kValue[3][3] = {{0.5f, 0.5f, 0.0f}, {0.0f, 1.0f, 0.0f}, {0.0f, 0.5f, 0.5f}};
+    static constexpr float kSlope[3][3] = {{-1.0f, 1.0f, 0.0f}, {-0.5f, 0.0f, 0.5f}, {0.0f, -1.0f, 1.0f}};
+    for (int at = 0; at < 27; ++at) {
+        const int p[3] = {at % 3, at / 3 % 3, at / 9};
+        float slope[3] = {};
+        for (int m = 0; m < 27; ++m) {
+            const int s[3] = {m % 3, m / 3 % 3, m / 9};
+            const float c = stencil[s[0] + s[1] * kStored + s[2] * kStored * kStored];
+            for (int a = 0; a < 3; ++a) {
+                float weight = c;
+                for (int b = 0; b < 3; ++b) weight *= (a == b ? kSlope : kValue)[p[b]][s[b]];
+                slope[a] += weight;
+            }
+        }
+        largest = std::max(largest, slope[0] * slope[0] + slope[1] * slope[1] + slope[2] * slope[2]);
+    }
+    return largest;
+}
+
+// The largest slope, squared, of the spline in a brick's cells that reach inside; at least `so_far`.
+inline float steepest_in_brick(const std::vector<float>& brick, float so_far) {
+    constexpr int kEdge = Lumen::kEdge, kStored = Lumen::kStored;
+    for (int z = 0; z < kEdge; ++z)
+        for (int y = 0; y < kEdge; ++y)
+            for (int x = 0; x < kEdge; ++x) {
+                const float* stencil = &brick[std::size_t((z * kStored + y) * kStored + x)];
+                float highest = stencil[0];
+                for (int m = 0; m < 27; ++m) highest = std::max(highest, stencil[m % 3 + m / 3 % 3 * kStored + m / 9 * kStored * kStored]);
+                if (highest > 0) so_far = std::max(so_far, steepest_in_cell(stencil, so_far));
+            }
+    return so_far;
+}
+
 // Gathers the bricks of a grid of `size` cells. `fill` is asked for each brick: it writes its coefficients and the lowest and highest of
-// them; or it returns false and bounds of them where no wall is near. Cells whose whole stencil is deeper inside than `near` carry no
+// them; or it returns false where all are farther outside than `far`. Cells whose whole stencil is deeper inside than `near` carry no
 // contact; cells whose whole stencil is farther outside than `far` count as outside the map.
 template <class Fill>
 LumenMap gather_bricks(const int (&size)[3], const double (&origin)[3], double spacing, double near, double far, Fill&& fill) {
@@ -66,12 +119,14 @@ LumenMap gather_bricks(const int (&size)[3], const double (&origin)[3], double s
     map.index.resize(std::size_t(map.bricks[0]) * map.bricks[1] * map.bricks[2]);
     std::vector<float> brick(kVolume);
     std::size_t at = 0;
+    float steepest = 0.0f;
     for (int z = 0; z < map.bricks[2]; ++z)
         for (int y = 0; y < map.bricks[1]; ++y)
             for (int x = 0; x < map.bricks[0]; ++x, ++at) {
                 float lowest, highest;
                 const bool filled = fill({x, y, z}, brick, lowest, highest);
-                if (lowest > near) {
+                if (filled && highest > 0) steepest = steepest_in_brick(brick, steepest);
+                if (filled && lowest > near) {
                     map.index[at] = 0;
                 } else if (!filled || highest < -far) {
                     map.index[at] = 1;
@@ -80,6 +135,7 @@ LumenMap gather_bricks(const int (&size)[3], const double (&origin)[3], double s
                     map.pool.insert(map.pool.end(), brick.begin(), brick.end());
                 }
             }
+    map.steepest = std::sqrt(double(steepest)) / spacing;
     map.pool.push_back(0.0f);  // rows are read four at a time
     return map;
 }
@@ -113,7 +169,8 @@ inline std::size_t bytes(const LumenMap& map) {
 // `place` puts a vector where the stepper reads it, and returns its address there.
 template <class Place>
 Lumen view(const LumenMap& map, const Place& place) {
-    Lumen lumen{.inverse_spacing = map.inverse_spacing, .clearance = map.clearance, .index = place(map.index), .pool = place(map.pool)};
+    Lumen lumen{.inverse_spacing = map.inverse_spacing, .clearance = map.clearance, .steepest = map.steepest};
+    lumen.index = place(map.index), lumen.pool = place(map.pool);
     for (int a = 0; a < 3; ++a) {
         lumen.origin[a] = map.origin[a];
         lumen.cells[a] = map.cells[a];

@@ -21,8 +21,8 @@ struct InscribedSpheres {
 class RefinedBricks {
 public:
     RefinedBricks(const float* coefficients, const int (&size)[3], const double (&origin)[3], double spacing, int factor,
-                  const std::vector<InscribedSpheres>& spheres, double near, double far)
-        : coarse_(coefficients), factor_(factor), spacing_(float(spacing / factor)), spheres_(spheres), near_(near), far_(far), rounded_off_(0.5 * spacing) {
+                  const std::vector<InscribedSpheres>& spheres, double far)
+        : coarse_(coefficients), factor_(factor), spacing_(float(spacing / factor)), spheres_(spheres), far_(far), rounded_off_(0.5 * spacing) {
         for (int a = 0; a < 3; ++a) size_[a] = size[a], origin_[a] = origin[a];
     }
 
@@ -35,7 +35,7 @@ public:
             count_[a] = coarse_cell(first_[a] + kSampled - 1) + 2 - low_[a];
         }
         bounds(lowest, highest);
-        if (lowest > near_ || highest + rounded_off_ < -far_) return false;
+        if (highest + rounded_off_ < -far_) return false;
         find_spheres(middle);
         sample_coarse();
         for (const InscribedSpheres* each : here_) join(*each);
@@ -156,7 +156,7 @@ private:
     double origin_[3];
     float spacing_;   // of the fine grid, mm
     const std::vector<InscribedSpheres>& spheres_;
-    double near_, far_, rounded_off_;   // mm; the coarse spline rounds off no more than this
+    double far_, rounded_off_;   // mm; the coarse spline rounds off no more than this
     std::vector<const InscribedSpheres*> here_;
     int first_[3], low_[3], count_[3];   // the brick's first fine point, its first coarse coefficient, and how many of those it takes
     std::vector<float> block_, rows_, planes_, values_;
@@ -164,7 +164,7 @@ private:
 
 inline LumenMap refined_lumen_map(const float* coefficients, const int (&size)[3], const double (&origin)[3], double spacing, int factor,
                                   const std::vector<InscribedSpheres>& spheres, double near, double far) {
-    RefinedBricks bricks(coefficients, size, origin, spacing, factor, spheres, near, far);
+    RefinedBricks bricks(coefficients, size, origin, spacing, factor, spheres, far);
     int fine[3];
     for (int a = 0; a < 3; ++a) fine[a] = (size[a] - 1) * factor + 1;
     return gather_bricks(fine, origin, spacing / factor, near, far, bricks);

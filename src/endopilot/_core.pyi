@@ -10,6 +10,7 @@ class RodModel:
 
 class Lumen:
     bytes: int
+    steepest: float
     def distance(self, points: np.ndarray) -> np.ndarray: ...
 
 class Projector:

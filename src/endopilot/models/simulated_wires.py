@@ -178,13 +178,22 @@ class Course:
                 self.states[end] = [simulator.state for _, simulator in self._parts]
 
 
-def _each_patient(episodes: Episodes, what: str, of_one) -> list[tuple[Int[np.ndarray, "chosen"], np.ndarray]]:
-    """Return what a function of the episodes of one patient returns, with their rows, on all cores."""
-    names = np.unique(episodes.anatomy)
-    each = [np.flatnonzero(episodes.anatomy == name) for name in names]
+def _each_patient(
+    episodes: Episodes, what: str, of_one, *, parts: int = 1
+) -> list[tuple[Int[np.ndarray, "chosen"], np.ndarray]]:
+    """Return what a function of episodes of one patient returns, with their rows, on all cores.
+
+    Args:
+        episodes: the navigations.
+        what: this is, for the progress bar.
+        of_one: the function.
+        parts: into which each patient's episodes are split; fewer if there are fewer episodes.
+    """
+    patients = [np.flatnonzero(episodes.anatomy == name) for name in np.unique(episodes.anatomy)]
+    each = [part for rows in patients for part in np.array_split(rows, min(parts, len(rows)))]
     found = []
     with (
-        progress(what, total=len(names)) as advance,
+        progress(what, total=len(each)) as advance,
         warnings.catch_warnings(),  # around the threads, which change what all of them see
         ThreadPoolExecutor(CORES) as pool,  # few wires leave threads of one simulation idle
     ):
@@ -193,6 +202,11 @@ def _each_patient(episodes: Episodes, what: str, of_one) -> list[tuple[Int[np.nd
             found.append((chosen, made))
             advance(1)
     return found
+
+
+def _parts(episodes: Episodes) -> int:
+    """Return into how many parts each patient's episodes are split, so that a few patients keep all cores busy."""
+    return -(-CORES // max(1, len(np.unique(episodes.anatomy))))
 
 
 def fitted_wires(episodes: Episodes, observed: EachObserved) -> Wires:
@@ -206,7 +220,7 @@ def fitted_wires(episodes: Episodes, observed: EachObserved) -> Wires:
         return fitted(episodes.select(chosen), observed[chosen, :WINDOW])
 
     wires = np.ones((len(episodes), 4))
-    for chosen, found in _each_patient(episodes, "Fitted wires", of_one):
+    for chosen, found in _each_patient(episodes, "Fitted wires", of_one, parts=_parts(episodes)):
         wires[chosen] = found
     return wires
 
@@ -233,7 +247,7 @@ def simulated_tips(
     def of_one(chosen: Int[np.ndarray, "chosen"]) -> np.ndarray:
         return _of_one_patient(episodes.select(chosen), wires[chosen], courses)
 
-    for chosen, found in _each_patient(episodes, "Simulated wires", of_one):
+    for chosen, found in _each_patient(episodes, "Simulated wires", of_one, parts=_parts(episodes)):
         tips[chosen] = found
     return tips
 
