@@ -96,3 +96,30 @@ def test_a_wire_from_the_middle_of_a_wide_vessel_is_held_by_the_wall_that_it_rea
         ahead = simulator.position[0, simulator.position[0, :, 2] > 2.0]
         clearance.append(tree_distance(tree, ahead).min())
     assert clearance[0] > 3.0 and 0.05 < clearance[1] < 0.19  # the wire's radius is 0.18 mm
+
+
+@pytest.mark.parametrize("slope", [0.5, 3.0])
+def test_the_largest_slope_of_a_map_is_known(slope: float) -> None:
+    """A spline keeps a linear function, of gradient g = slope · (1, 2, 2)/3, as it is: its slope is |g| everywhere."""
+    axis = SPACING_MM * np.arange(24)
+    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
+    plane = DistanceMap(slope * (x + 2 * y + 2 * z) / 3, SPACING_MM, np.zeros(3))
+    bent = DistanceMap(slope * np.abs(x - axis.mean()), SPACING_MM, np.zeros(3))
+    assert slope * (1 - 1e-4) <= make_lumen(plane, 0.2).steepest <= 1.25 * slope  # it is mirrored at the map's edges
+    wall, draw = make_lumen(bent, 10.0), np.random.default_rng(0)
+    points = draw.uniform(axis[2], axis[-3], (20000, 3))
+    beside = points + 1e-3 * draw.normal(size=points.shape)
+    apart = np.abs(wall.distance(points) - wall.distance(beside)) / np.linalg.norm(points - beside, axis=1)
+    assert apart.max() <= wall.steepest * (1 + 1e-3)
+
+
+def test_a_wire_in_a_map_with_steep_walls_moves_alone_as_in_company() -> None:
+    fork = make_fork(radius=(2.0, 1.5))
+    values = np.maximum(4.0 * fork.distance_map.values, -1.0)
+    steep = replace(fork, distance_map=replace(fork.distance_map, values=values))
+    draw = np.random.default_rng(3)
+    control = np.stack([draw.uniform(-20, 40, (16, 12)), draw.uniform(-6, 6, (16, 12))], axis=-1)
+    together = endopilot.simulate(steep, read_wire("workhorse-014"), control)
+    for world in range(len(control)):
+        alone = endopilot.simulate(steep, read_wire("workhorse-014"), control[[world]])
+        np.testing.assert_array_equal(alone.tip_position, together.tip_position[[world]])
