@@ -47,7 +47,7 @@ from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import Volume
 
 VOLUME_SUFFIX = ".nii.gz"
-EVALUATED = 48
+EVALUATED = 32
 """Navigations that are evaluated in each split; each is simulated seven times."""
 MISMATCH = (0.8, 1.2)
 """Friction and tip stiffness of the navigations that the packaged networks are evaluated on, over those they know."""
