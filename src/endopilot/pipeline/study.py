@@ -71,7 +71,7 @@ class StudyConfig:
 
     device: str = "workhorse-014"
     """Name of a shipped device (`endopilot devices`) or a YAML file."""
-    sequences: Annotated[int, Within(1, 100000)] = 60
+    sequences: Annotated[int, Within(1, 100000)] = 40
     """Random navigations simulated in each patient."""
     seconds: Seconds = 60.0
     """Length of a navigation, s."""
