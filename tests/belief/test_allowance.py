@@ -9,15 +9,24 @@ from endopilot.belief.allowance import Allowance
 
 def test_a_wire_that_is_pushed_while_its_tip_rests_is_known_less_well_until_it_is_seen() -> None:
     made, tip_mm = Allowance(10.0, 10.0, alone=True), [0.2, 0.0]
-    made.move(30.0, 30.5)
+    made.move(30.0, 30.5, 2.0)
     np.testing.assert_array_equal(made.sd_mm, tip_mm)  # the tip went along
     for inserted in (33.0, 36.0, 35.0, 37.0):
-        made.move(inserted, 30.5)
+        made.move(inserted, 30.5, 2.0)
     held = [0.3 * 4.0, 0.05 * 4.0]  # 3 + 3 + 1 + 2 mm, of which 5 are free
     np.testing.assert_allclose(made.sd_mm, np.hypot(held, tip_mm))
     made.exposed()
     np.testing.assert_array_equal(made.sd_mm, tip_mm)
     assert not Allowance(0.0, 0.0, alone=False).sd_mm.any()
+
+
+def test_in_a_wide_lumen_a_wire_lies_down_on_the_walls_before_it_is_known_less_well() -> None:
+    made, tip_mm = Allowance(10.0, 10.0, alone=True), [0.2, 0.0]
+    made.move(100.0, 100.0, 10.0)
+    made.move(140.0, 100.0, 3.0)  # the tip is in an artery that leaves; the wire lies in what is 20 mm wide
+    np.testing.assert_array_equal(made.sd_mm, tip_mm)
+    made.move(144.0, 100.0, 3.0)  # two widths, and 4 mm more
+    np.testing.assert_allclose(made.sd_mm, np.hypot([0.3 * 4.0, 0.05 * 4.0], tip_mm))
 
 
 def test_the_lumen_may_be_another_by_a_share_and_no_more_than_some_millimetres() -> None:

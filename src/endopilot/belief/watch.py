@@ -48,8 +48,8 @@ class Watch:
 
     def move(self, at: AdviserInput) -> None:
         """Take what is predicted a period later."""
-        proximal, tip, _, _ = at
-        self._allowance.move(proximal[0, 0], tip[0, 0])
+        proximal, tip, _, radius = at
+        self._allowance.move(proximal[0, 0], tip[0, 0], float(radius[0]))
 
     def compare(self, innovation: Float[np.ndarray, "2"], sd_mm: tuple[float, float]) -> None:
         """Take measured less predicted (Δtip, γtip), and the standard deviations that the measurement states, mm."""

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from endopilot.control.course import Controls
 from endopilot.control.search_config import SearchConfig
 from endopilot.control.trials import CATHETER, STALL_PERIODS, WIRE, Control, Move, Period, Trials
+from endopilot.devices.drive_limits import SLACK_WIDTHS
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.tasks.route import Route
 
@@ -39,9 +40,8 @@ _OFF_WIDE_MM, _OFF_RADII = 5.0, 2.0
 """The same where there is a catheter, or a wide lumen: this far, and as many radii of the route's lumen."""
 _MOUTH_RADII = 1.4
 """Half the width of a branch's mouth, lumen radii."""
-_SLACK_MM, _SLACK_WIDTHS = 40.0, 2.0
-"""A wire that was pushed this far and did not come forward folds, mm; in a wide lumen by so many widths of it, since it
-lies down on the outer walls before it comes forward."""
+_SLACK_MM = 40.0
+"""A wire that was pushed this far and did not come forward folds, mm; in a wide lumen see `SLACK_WIDTHS`."""
 _AT_MM, REST_MM = 1.0, 0.1
 """A catheter this near to its place is there, mm; what is this near to its goal rests."""
 _LATE = 2
@@ -171,7 +171,7 @@ class Push:
         inserted_there, follower = _deepest(trials), _Follower(self, trials, lead)
         beyond = progress > self.waypoint
         waits = alone and not self.strict and self.route.is_wide(self.waypoint)
-        slack_mm = _SLACK_WIDTHS * self.route.width_mm(self.waypoint) if waits else _SLACK_MM
+        slack_mm = SLACK_WIDTHS * self.route.width_mm(self.waypoint) if waits else _SLACK_MM
         off_mm, longest, force_n = self._limits(trials, waits)
 
         def stop(which: Bool[np.ndarray, "trials"], why: Halt) -> None:
