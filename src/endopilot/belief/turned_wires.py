@@ -48,11 +48,15 @@ class Fans:
             )
         fan, side = self._made[kind], 2 * np.pi * np.arange(_SIDES) / _SIDES
         fan.copy_worlds(np.full(_SIDES, member), of=simulator)
+        turn = np.where(side > np.pi, side - 2 * np.pi, side)
+        fastest = self._kinds[kind][1].wire.max_rotation_rad_s
+        periods = int(np.ceil(np.pi / (fastest * DECISION_PERIOD_S)))
         control = np.zeros((_SIDES, fan.devices, 2))
-        control[:, 0, 1] = np.where(side > np.pi, side - 2 * np.pi, side) / DECISION_PERIOD_S
+        control[:, 0, 1] = turn / (periods * DECISION_PERIOD_S)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # one that fails stays where it was
-            fan.step(control, DECISION_PERIOD_S)
+            for _ in range(periods):
+                fan.step(control, DECISION_PERIOD_S)
         return fan
 
 
