@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -45,3 +47,21 @@ def test_errors_along_the_wire_and_of_another_place_are_no_motion() -> None:
     for off in (2.5 * direction, 0.6 * np.ones(3), 1.5 * random.standard_normal((len(tip), 1)) * direction):
         noise = 0.2 * random.standard_normal(tip.shape)
         assert find_motion(tip, direction, tip + off + noise, TIMES_S, OSTIUM).gain < 6.0
+
+
+def test_amplitudes_are_found_around_a_known_motion_and_only_where_they_differ() -> None:
+    """A seventh image of another amplitude is enough, since the periods are known; with those that are known the
+    motion gains nothing."""
+    random, known = np.random.default_rng(3), Motion()
+    tip, direction = tips(random)
+    for motion, gains in ((known, False), (replace(known, breathing_caudal_mm=9.0, breathing_anterior_mm=4.5), True)):
+        placed = motion.core(OSTIUM).placements(TIMES_S)[0]
+        seen = np.array([place(maps, point) for maps, point in zip(placed, tip, strict=True)])
+        noise = 0.2 * random.standard_normal(seen.shape)
+        found = find_motion(tip, direction, seen + noise, TIMES_S, OSTIUM, known=known)
+        assert (found.gain > 6.0) == gains
+        assert found.motion.heart_period_s == pytest.approx(known.heart_period_s)
+        assert found.motion.breathing_period_s == pytest.approx(known.breathing_period_s)
+        there = found.motion.core(OSTIUM).placements(TIMES_S)[0]
+        off = [place(a, point) - place(b, point) for a, b, point in zip(there, placed, tip, strict=True)]
+        assert np.linalg.norm(off, axis=1).mean() < 1.0

@@ -234,20 +234,31 @@ class Belief:
         return np.maximum(given_mm + self.ostium_mm.reshape(-1, *[1] * (given_mm.ndim - 1)), 0.0)
 
     def in_vessel(self, measured: TipMeasurement, period: int) -> TipMeasurement:
-        """Return a measurement less the motion that was found.
+        """Return a measurement less the motion that was found, in place of the one that is known.
 
         Args:
-            measured: as the C-arm has it.
+            measured: as the C-arm has it, less the known motion.
             period: the decision at which it was taken.
         """
         if self.motion is None:
             return measured
-        ostium = np.asarray(self.navigation.anatomy.insertion.position)
-        placed = self.motion.core(ostium).placements(np.array([period * DECISION_PERIOD_S]))[0][0]
-        position = np.linalg.solve(placed[:, :3], measured.position - placed[:, 3])
+        placed = self._placed(self.motion, period)
+        position = np.linalg.solve(placed[:, :3], self.in_laboratory(measured, period) - placed[:, 3])
         tip = self._projector(position[None])
         at = {"abscissa": float(tip.abscissa[0]), "offset": float(tip.offset[0]), "branch": int(tip.branch[0])}
         return replace(measured, position=position, **at)
+
+    def in_laboratory(self, measured: TipMeasurement, period: int) -> Float[np.ndarray, "3"]:
+        """Return where a tip was seen, LPS mm: the C-arm has taken the known motion off."""
+        if self._given.known_motion is None:
+            return measured.position
+        placed = self._placed(self._given.known_motion, period)
+        return placed[:, :3] @ measured.position + placed[:, 3]
+
+    def _placed(self, motion: Motion, period: int) -> Float[np.ndarray, "3 4"]:
+        """Return the map from the vessel as CT shows it to where a motion has taken it at a decision."""
+        ostium = np.asarray(self._given.anatomy.insertion.position)
+        return motion.core(ostium).placements(np.array([period * DECISION_PERIOD_S]))[0][0]
 
     @cached_property
     def _projector(self) -> TipProjector:

@@ -26,7 +26,7 @@ _MOST, _EVERY = 6, 3
 """The belief is changed as often at most, after as many further exposures at least."""
 _LEAST_EXPOSURES, _OUTSIDE_MM = 3, 0.8
 """A motion of the vessel is looked for in as many exposures at least, where one showed the tip so far outside the
-lumen: a wire in a vessel that lies still is not."""
+lumen: a wire in a vessel that moves as it is known to is not."""
 _LEAST_GAIN, _MOST_MISFIT = 6.0, 0.8
 """A motion is believed that makes the exposures likelier by this logarithm, and leaves no larger misfit."""
 _MOTION_SD_MM = np.array([0.6, 0.1])
@@ -213,7 +213,7 @@ class Monitor:
     def _finds_motion(self) -> bool:
         """Return whether a motion of the vessel explains the exposures, and take it into the belief then."""
         given, drives = self._navigation, self.belief.drives
-        if not self._tests or given.known_motion is not None or len(self.past.exposures) < _LEAST_EXPOSURES:
+        if not self._tests or len(self.past.exposures) < _LEAST_EXPOSURES:
             return False
         members, past = self.belief.members, self.past
         if self.moves is None and max(map(self._outside_mm, self.past.exposures.values())) < _OUTSIDE_MM:
@@ -230,9 +230,10 @@ class Monitor:
         for _ in range(2):  # the wire as it lies in a vessel that lies still, and in one that moves
             best = tried.best
             tip, direction = (np.array([each[best] for each in some]) for some in zip(*tried.shown, strict=True))
-            seen = np.array([each.position for each in past.exposures.values()])
+            seen = np.array([self.belief.in_laboratory(each, period) for period, each in past.exposures.items()])
             times_s = DECISION_PERIOD_S * np.array(list(past.exposures))
-            found = find_motion(tip, direction, seen, times_s, np.asarray(given.anatomy.insertion.position))
+            ostium = np.asarray(given.anatomy.insertion.position)
+            found = find_motion(tip, direction, seen, times_s, ostium, known=given.known_motion)
             if found.gain < _LEAST_GAIN or found.misfit > _MOST_MISFIT:
                 return False
             tried = self.belief.like(members, motion=found.motion, drives=drives)
@@ -244,7 +245,7 @@ class Monitor:
         return True
 
     def _outside_mm(self, measured: TipMeasurement) -> float:
-        """Return how far outside the lumen of a vessel that lies still a tip was seen, mm."""
+        """Return how far outside the lumen of a vessel that moves as it is known to a tip was seen, mm."""
         line = self._navigation.anatomy.tree.branches[measured.branch].centerline
         return measured.offset - float(np.interp(measured.abscissa, line.abscissa, line.radius))
 

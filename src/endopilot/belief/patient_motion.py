@@ -1,13 +1,14 @@
-"""How heart and breath move a vessel that was taken to lie still, by what X-ray shows of the wire: `find_motion`.
+"""How heart and breath move a vessel, by what X-ray shows of the wire: `find_motion`.
 
-A tip that is predicted at a place of the vessel is seen where the motion has taken that place. For given periods of
-heart and breath the displacement is linear in the amplitudes, whose published distributions are known before: the
-evidence of each pair of periods has a closed form, and so have the likeliest amplitudes.
+The vessel was taken to lie still, or to move with known periods and with amplitudes that may be another patient's. A
+tip that is predicted at a place of the vessel is seen where the motion has taken that place. For given periods of heart
+and breath the displacement is linear in the amplitudes, whose published distributions are known before: the evidence of
+each pair of periods has a closed form, and so have the likeliest amplitudes.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -49,7 +50,8 @@ class FoundMotion:
 
     Attributes:
         motion: with the likeliest periods and amplitudes.
-        gain: logarithm of how much likelier it makes what X-ray showed than a vessel that lies still.
+        gain: logarithm of how much likelier it makes what X-ray showed than the known motion, or a vessel that lies
+            still.
         misfit: mean square of the errors that are left, in standard deviations; near 1 where the motion explains them.
     """
 
@@ -74,6 +76,7 @@ def find_motion(
     seen: Float[np.ndarray, "n 3"],
     times_s: Float[np.ndarray, "n"],
     ostium: Float[np.ndarray, "3"],
+    known: Motion | None = None,
 ) -> FoundMotion:
     """Return the motion of heart, breath or both that best explains where X-ray showed tips.
 
@@ -83,11 +86,16 @@ def find_motion(
         seen: by X-ray, LPS mm.
         times_s: of these exposures, s after the motion began.
         ostium: LPS mm.
+        known: how the vessel is taken to move: its periods are kept, and amplitudes are sought around its own. A vessel
+            that lies still if not given, for which the published means of both are where the search begins.
     """
     across = np.eye(3) / _ACROSS_MM + (1 / _ALONG_MM - 1 / _ACROSS_MM) * direction[:, :, None] * direction[:, None, :]
     error = np.einsum("nij,nj->ni", across, seen - tip)
     weight = 1 / (1 + (error**2).sum(axis=1) / _HEAVY / 10)
-    fits = [_Fit(names, np.einsum("nij,njk->nik", across, _fields(tip, ostium, names)), error) for names in _KINDS]
+    kinds = _KINDS if known is None else _KINDS[-1:]
+    fits = [
+        _Fit(names, np.einsum("nij,njk->nik", across, _fields(tip, ostium, names)), error, known) for names in kinds
+    ]
     _, _, left = max((fit.best(times_s, weight) for fit in fits), key=lambda each: each[0])
     gain, motion, left = max((fit.best(times_s, 1 / (1 + left / _HEAVY)) for fit in fits), key=lambda each: each[0])
     weight = 1 / (1 + left / _HEAVY)
@@ -111,26 +119,33 @@ class _Fit:
     """Linear fits of some amplitudes, for many periods at once."""
 
     def __init__(
-        self, names: tuple[str, ...], field: Float[np.ndarray, "n 3 k"], error: Float[np.ndarray, "n 3"]
+        self,
+        names: tuple[str, ...],
+        field: Float[np.ndarray, "n 3 k"],
+        error: Float[np.ndarray, "n 3"],
+        known: Motion | None,
     ) -> None:
-        self.names, self._error = names, error
+        self.names, self._error, self._known = names, error, known
         self._heart = len([name for name in names if name in _HEART])
         self._field = field
-        self._mean = np.array([_AMPLITUDES[name][0] for name in names])
+        before = {name: mean for name, (mean, _) in _AMPLITUDES.items()} if known is None else asdict(known)
+        self._mean = np.array([before[name] for name in names])
         self._sd = _WIDER * np.array([_AMPLITUDES[name][1] for name in names])
 
     def best(
         self, times_s: Float[np.ndarray, "n"], weight: Float[np.ndarray, "n"]
     ) -> tuple[float, Motion, Float[np.ndarray, "n"]]:
-        """Return the logarithm of the evidence over that of a vessel that lies still, the motion, and the squared
-        errors that it leaves."""
-        step = _PHASE / max(float(times_s.max()), 1.0)
+        """Return the logarithm of the evidence over that of the known motion, or of a vessel that lies still; the
+        likeliest motion; and the squared errors that it leaves."""
+        step, known = _PHASE / max(float(times_s.max()), 1.0), self._known
         tried = [
             np.arange(low, high, step) if any_of else np.array([usual])
             for (low, high), (usual, _), any_of in zip(
                 (_HEART_HZ, _BREATH_HZ), _USUAL_HZ, (self._heart, len(self.names) - self._heart), strict=True
             )
         ]
+        if known is not None:
+            tried = [np.array([1 / period_s]) for period_s in (known.heart_period_s, known.breathing_period_s)]
         evidence, _ = self._evidence(tried[0], tried[1], times_s, weight)
         top = np.unravel_index(np.argmax(evidence), evidence.shape)
         total = float(evidence.max() + np.log(np.exp(evidence - evidence.max()).mean()))
@@ -148,7 +163,9 @@ class _Fit:
         done = [each[0][:, None, None] for each in shape]
         parts = np.split(self._field, [self._heart], axis=-1)
         moved = np.concatenate([share * part for share, part in zip(done, parts, strict=True)], axis=-1)
-        left = ((self._error - moved @ found) ** 2).sum(axis=1)
+        left, as_known = (((self._error - moved @ each) ** 2).sum(axis=1) for each in (found, self._mean))
+        if known is not None:
+            total -= 0.5 * float(weight @ ((self._error**2).sum(axis=1) - as_known))
         return total, motion, left
 
     def _shapes(
@@ -185,6 +202,8 @@ class _Fit:
         amplitude = np.linalg.solve(normal, right[..., None])[..., 0]
         explained = (amplitude * right).sum(axis=-1) - float(self._mean**2 @ self._sd**-2)
         evidence = 0.5 * explained - 0.5 * np.linalg.slogdet(normal)[1] - float(np.log(self._sd).sum())
+        if self._known is not None:
+            return evidence, amplitude
         (heart, heart_sd), (breathing, breathing_sd) = _USUAL_HZ
         evidence -= 0.5 * (((heart_hz - heart) / heart_sd) ** 2)[:, None] * (h > 0)
         return evidence - 0.5 * ((breath_hz - breathing) / breathing_sd) ** 2 * (h < size), amplitude
