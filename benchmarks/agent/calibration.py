@@ -22,7 +22,7 @@ from tyro.conf import Positional
 
 from benchmarks.figures import fill
 from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of
-from endopilot.belief.monitor import adviser_input
+from endopilot.belief.monitor import predicted_tip
 from endopilot.control.agent import AgentPolicy
 from endopilot.control.agent_config import CALIBRATIONS, IN_CATHETER, AgentConfig
 from endopilot.files import read_json, write_json
@@ -105,8 +105,8 @@ class MonitoredAgent(AgentPolicy):
     def decide(self, observation: Observation) -> Decision:
         """Decide as the agent does, and keep the prediction."""
         decision = super().decide(observation)  # pyright: ignore[reportAttributeAccessIssue]
-        proximal, tip, spread, _ = adviser_input(self.belief)
-        self.kept.append(np.concatenate([proximal[0], tip[0], spread[0]]))
+        at = predicted_tip(self.belief)
+        self.kept.append(np.concatenate([at.proximal, at.tip, at.spread]))
         return decision
 
     def wants_xray(self) -> bool:

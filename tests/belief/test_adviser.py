@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endopilot.belief.adviser import AdviserConfig, XrayAdviser, count_events, near_exposures
+from endopilot.belief.adviser import AdviserConfig, Predicted, XrayAdviser, count_events, near_exposures
 from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of, surely_missed
 from endopilot.errors import InputError
 
@@ -118,17 +118,21 @@ def test_a_calibration_is_read_again_and_its_absence_named(tmp_path) -> None:
         Calibration.read(tmp_path)
 
 
+def predicted(offset_mm: float = 0.0, *, inserted_mm: float = 0.0, radius_mm: float = 1.2) -> Predicted:
+    """Return what a model predicts of a tip that follows the wire; one of 0.2 mm radius has a clearance of 1 mm."""
+    ends = np.array([[inserted_mm, 0.0], [inserted_mm, offset_mm]])
+    return Predicted(ends[0], ends[1], np.zeros(2), radius_mm)
+
+
+def adviser_at(at: Predicted, config: AdviserConfig | None = None, **bands: float) -> XrayAdviser:
+    return XrayAdviser(calibration(**bands), config or AdviserConfig(), wire_radius_mm=0.2, at=at)
+
+
 def advices(at: list[float], inserted: list[float], *, config: AdviserConfig, **bands: float) -> list[int]:
-    """Return at which samples an exposure is due; the lumen leaves a clearance of 1 mm."""
-    adviser = XrayAdviser(calibration(**bands), config, wire_radius_mm=0.2)
-    proximal = np.stack([inserted, np.zeros(len(inserted))], axis=1)[:, None]
-    tips, radius = np.stack([inserted, at], axis=1)[:, None], np.full(1, 1.2)
-    adviser.start(proximal[0], tips[0], radius)
-    return [
-        index
-        for index in range(1, len(at))
-        if adviser.advise(proximal[index], tips[index], np.zeros((1, 2)), radius)[0]
-    ]
+    """Return at which samples an exposure is due."""
+    each = [predicted(offset, inserted_mm=mm) for offset, mm in zip(at, inserted, strict=True)]
+    adviser = adviser_at(each[0], config, **bands)
+    return [index for index, now in enumerate(each) if index and adviser.advise(now)]
 
 
 def test_an_exposure_is_due_when_the_band_of_the_abscissa_is_as_wide_as_delta() -> None:
@@ -147,11 +151,8 @@ def test_an_exposure_is_due_where_the_band_meets_the_wall() -> None:
 
 
 def test_an_exposure_is_due_where_the_wire_begins_to_fill_the_lumen() -> None:
-    adviser = XrayAdviser(calibration(abscissa=0.0, offset=0.0), AdviserConfig(), wire_radius_mm=0.2)
-    still, centred = np.zeros((1, 2)), np.zeros((1, 2))
-    adviser.start(still, centred, np.full(1, 1.2))
-    radius = [1.2, 1.2, 1.2, 0.2, 0.1, 0.1, 0.1]
-    due = [bool(adviser.advise(still, centred, np.zeros((1, 2)), np.full(1, r))[0]) for r in radius]
+    adviser = adviser_at(predicted(), abscissa=0.0, offset=0.0)
+    due = [adviser.advise(predicted(radius_mm=r)) for r in (1.2, 1.2, 1.2, 0.2, 0.1, 0.1, 0.1)]
     assert due == [False, False, False, True, False, False, False]
 
 
@@ -161,25 +162,22 @@ def test_the_adviser_uses_a_share_of_the_band_across_and_all_of_that_along() -> 
     offset = [0.3] * 5 + [0.56] * 4 + [0.585] * 4 + [0.61] * 4 + [0.63] * 4
     due = advices(offset, [10.0] * len(offset), config=AdviserConfig(wall_ratio=0.6), abscissa=0.0, offset_share=0.4)
     assert due == [9, 13, 17]  # ±0.02 mm: the upper edge, the tip, the lower edge
-    adviser = XrayAdviser(calibration(abscissa=0.0, offset_share=0.4), AdviserConfig(), wire_radius_mm=0.2)
-    still = np.zeros((1, 2))
-    adviser.start(still, still, np.ones(1))
-    adviser.advise(still, still, still, np.ones(1))
-    assert adviser.half_width[0, 1] == 0.05
+    adviser = adviser_at(predicted(radius_mm=1.0), abscissa=0.0, offset_share=0.4)
+    adviser.advise(predicted(radius_mm=1.0))
+    assert adviser.half_width[1] == 0.05
 
 
 def test_what_a_play_adds_widens_both_bands_at_once() -> None:
     """90 % of a normal distribution lie within 1.645 standard deviations."""
-    adviser = XrayAdviser(calibration(abscissa=0.0, offset=0.3), AdviserConfig(), wire_radius_mm=0.2)
-    adviser.start(np.zeros((1, 2)), np.zeros((1, 2)), np.full(1, 9.0))
-    args = np.zeros((1, 2)), np.zeros((1, 2)), np.zeros((1, 2)), np.full(1, 9.0)
-    adviser.advise(*args)
+    at = predicted(radius_mm=9.0)
+    adviser = adviser_at(at, abscissa=0.0, offset=0.3)
+    adviser.advise(at)
     known = adviser.half_width
-    adviser.advise(*args, np.zeros((1, 2)))
+    adviser.advise(at, np.zeros(2))
     assert np.array_equal(adviser.half_width, known)
-    due = adviser.advise(*args, np.array([[1.5, 0.2]]))
-    np.testing.assert_allclose(adviser.half_width, [[1.645 * 1.5, np.hypot(0.3, 1.645 * 0.2)]], rtol=1e-3)
-    assert due[0]  # Δtip is known to no more than 2 mm
+    due = adviser.advise(at, np.array([1.5, 0.2]))
+    np.testing.assert_allclose(adviser.half_width, [1.645 * 1.5, np.hypot(0.3, 1.645 * 0.2)], rtol=1e-3)
+    assert due  # Δtip is known to no more than 2 mm
 
 
 def test_exposures_keep_their_distance() -> None:
@@ -197,17 +195,16 @@ def test_refuses_bad_settings() -> None:
 
 def test_an_exposure_follows_another_as_long_as_that_showed_the_tip_on_the_other_side() -> None:
     """γtip/(1.2 - 0.2 mm) is predicted as 0.9 and shown as 0.5 first, then as 0.8; τ is 0.7."""
-    adviser = XrayAdviser(calibration(abscissa=0.0, offset=0.0), AdviserConfig(), wire_radius_mm=0.2)
-    still, tip, radius = np.zeros((1, 2)), np.array([[0.0, 0.9]]), np.full(1, 1.2)
-    adviser.start(still, tip, radius)
+    at = predicted(0.9)
+    adviser = adviser_at(at, abscissa=0.0, offset=0.0)
 
     def due(count: int) -> list[bool]:
-        return [bool(adviser.advise(still, tip, still, radius)[0]) for _ in range(count)]
+        return [adviser.advise(at) for _ in range(count)]
 
     assert not any(due(6))  # predicted at the wall since the start
-    adviser.exposed(np.array([0.5]), radius)
+    adviser.exposed(0.5, 1.2)
     assert due(6) == [False, False, True, False, False, True]
-    adviser.exposed(np.array([0.8]), radius)
+    adviser.exposed(0.8, 1.2)
     assert not any(due(6))
 
 
@@ -220,30 +217,14 @@ def test_a_model_that_erred_is_looked_at_as_long_as_its_band_lies_across_the_wal
             (0.58, [10.0] * 12, AdviserConfig(wall_ratio=0.6)),
             (0.1, inserted, AdviserConfig(abscissa_mm=1.0)),
         ):
-            adviser = XrayAdviser(calibration(abscissa=0.1 * (offset < 0.5)), config, wire_radius_mm=0.2)
-            proximal = np.stack([moved, np.zeros(12)], axis=1)[:, None]
-            tip, radius = np.array([[0.0, offset]]), np.full(1, 1.2)
-            adviser.start(proximal[0], tip * 0, radius)
-            due = [adviser.advise(at, tip, np.zeros((1, 2)), radius, erred=erred)[0] for at in proximal[1:]]
+            adviser = adviser_at(predicted(inserted_mm=moved[0]), config, abscissa=0.1 * (offset < 0.5))
+            due = [adviser.advise(predicted(offset, inserted_mm=mm), erred=erred) for mm in moved[1:]]
             found.append([i for i, each in enumerate(due, 1) if each])
         assert found == [across, along]
 
 
 def test_an_exposure_is_due_after_as_long_as_was_calibrated_on() -> None:
     bands = replace(calibration(abscissa=0.0), longest_s=4.0)
-    adviser = XrayAdviser(bands, AdviserConfig(), wire_radius_mm=0.2)
-    still, radius = np.zeros((1, 2)), np.full(1, 1.2)
-    adviser.start(still, still, radius)
-    due = [bool(adviser.advise(still, still, still, radius)[0]) for _ in range(20)]
+    adviser = XrayAdviser(bands, AdviserConfig(), wire_radius_mm=0.2, at=predicted())
+    due = [adviser.advise(predicted()) for _ in range(20)]
     assert [i for i, each in enumerate(due, 1) if each] == [8, 16]  # periods of 0.5 s
-
-
-def test_what_an_exposure_of_one_navigation_shows_counts_for_that_one() -> None:
-    adviser = XrayAdviser(calibration(abscissa=0.0, offset=0.0), AdviserConfig(), wire_radius_mm=0.2)
-    still, tip, radius = np.zeros((2, 2)), np.full((2, 2), 0.9), np.full(2, 1.2)
-    adviser.start(still, tip, radius)
-    for _ in range(5):
-        adviser.advise(still, tip, still, radius)
-    adviser.exposed(np.array([0.5]), np.array([1.2]), np.array([1]))
-    due = [adviser.advise(still, tip, still, radius).tolist() for _ in range(3)]
-    assert due == [[False, False], [False, False], [False, True]]

@@ -21,5 +21,6 @@ def test_a_wire_that_is_pushed_while_its_tip_rests_is_known_less_well_until_it_i
 
 
 def test_the_lumen_may_be_another_by_a_share_and_no_more_than_some_millimetres() -> None:
-    np.testing.assert_allclose(Allowance(0.0, 0.0, alone=True).wall_mm(np.array([1.0, 10.0])), [0.12, 0.3])
-    assert not Allowance(0.0, 0.0, alone=False).wall_mm(np.array([1.0])).any()
+    alone = Allowance(0.0, 0.0, alone=True)
+    np.testing.assert_allclose([alone.wall_mm(1.0), alone.wall_mm(10.0)], [0.12, 0.3])
+    assert not Allowance(0.0, 0.0, alone=False).wall_mm(1.0)

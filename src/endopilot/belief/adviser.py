@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.special import ndtri
 
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.belief.bands import Calibration, Tips
+from endopilot.belief.bands import Calibration
 from endopilot.settings import OpenShare, Positive, settings
 from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM
 
@@ -53,8 +55,21 @@ def count_events(state: Bool[np.ndarray, "*n samples"], near: Bool[np.ndarray, "
     return int(begins.sum()), int((begins & ~near[..., 1:-1]).sum())
 
 
+class Predicted(NamedTuple):
+    """What a model predicts of one tip."""
+
+    proximal: Float[np.ndarray, "2"]
+    """Δ, mm, and φ, rad, of the wire."""
+    tip: Float[np.ndarray, "2"]
+    """Δtip and γtip, mm."""
+    spread: Float[np.ndarray, "2"]
+    """The model's estimate of its own error of these, a standard deviation, mm."""
+    radius_mm: float
+    """Of the lumen at that Δtip."""
+
+
 class XrayAdviser:
-    """Says when to switch X-ray on, for one navigation or many side by side.
+    """Says when to switch X-ray on in a navigation.
 
     Between exposures it watches two bands. Where the band of Δtip is as wide as δ, an exposure is due. Of the band of
     γtip it uses the share that the calibration found. This, over the clearance of the lumen there, lies below τ, above
@@ -68,106 +83,83 @@ class XrayAdviser:
     Δtip is 0.6 δ wide.
 
     Attributes:
-        half_width: of the whole bands of Δtip and γtip at the last call of `advise`, mm, a row for each navigation.
+        half_width: of the whole bands of Δtip and γtip at the last call of `advise`, mm.
         wide: whether Δtip's band was too wide then.
         late: whether the last exposure was as long ago then as any interval that was calibrated on.
     """
 
-    def __init__(self, calibration: Calibration, config: AdviserConfig, wire_radius_mm: float) -> None:
-        """Take the bands, and what must not be missed.
-
-        Args:
-            calibration: of the model whose predictions come.
-            config: τ and δ.
-            wire_radius_mm: radius of the wire at its tip, mm.
-        """
-        self._calibration, self._config, self._wire_radius_mm = calibration, config, wire_radius_mm
-        self.half_width = np.zeros((0, 2))
-        self.wide = self.late = np.zeros(0, dtype=bool)
-
-    def start(self, proximal: Float[np.ndarray, "n 2"], tip: Tips, radius_mm: Float[np.ndarray, "n"]) -> None:
+    def __init__(self, calibration: Calibration, config: AdviserConfig, wire_radius_mm: float, at: Predicted) -> None:
         """Begin at an exposure.
 
         Args:
-            proximal: Δ, mm, and φ, rad, of each navigation.
-            tip: where the model has the tip, mm.
-            radius_mm: of the lumen there, mm.
+            calibration: of the model that predicts.
+            config: τ and δ.
+            wire_radius_mm: radius of the wire at its tip, mm.
+            at: what the model predicts there.
         """
-        self._proximal, self._travel = proximal, np.zeros(len(proximal))
-        self._since = np.zeros(len(proximal), dtype=int)
-        self._beyond = [self._is_beyond(tip[:, 1], radius_mm)] * 5
-        self._shown = self._beyond[0].copy()
-        self._is_shown = np.zeros(len(proximal), dtype=bool)
+        self._calibration, self._config, self._wire_radius_mm = calibration, config, wire_radius_mm
+        self._inserted_mm, self._travel_mm, self._periods = float(at.proximal[0]), 0.0, 0
+        self._beyond = self._is_beyond(np.full(5, at.tip[1]), at.radius_mm)
+        self._shown: bool | None = None
+        self.half_width, self.wide, self.late = self.widths(at.spread), False, False
 
     def advise(
         self,
-        proximal: Float[np.ndarray, "n 2"],
-        tip: Tips,
-        spread: Tips,
-        radius_mm: Float[np.ndarray, "n"],
-        play: Tips | None = None,
+        at: Predicted,
+        beside_mm: Float[np.ndarray, "2"] | None = None,
         *,
         factor: Float[np.ndarray, "2"] | float = 1.0,
         always: bool = False,
         erred: bool = False,
-        wall_mm: Float[np.ndarray, "n"] | float = 0.0,
-    ) -> Bool[np.ndarray, "n"]:
-        """Return for which navigations X-ray is due now, a period after the last call.
+        wall_mm: float = 0.0,
+    ) -> bool:
+        """Return whether X-ray is due now, a period after the last call.
 
         Args:
-            proximal: Δ, mm, and φ, rad.
-            tip: predicted for now, mm.
-            spread: the model's estimate of its own error, mm.
-            radius_mm: of the lumen at the predicted Δtip, mm.
-            play: standard deviation that the plays of the drives add, which the calibration does not know, mm; none if
-                not given.
+            at: what is predicted for now.
+            beside_mm: standard deviations of Δtip and γtip by what the calibration does not know, such as the play of a
+                drive, mm; none if not given.
             factor: by which the bands are wider than they are calibrated.
             always: whether an exposure is due whenever the last is 1.5 s ago.
             erred: whether the model has erred by more than its calibration knows.
             wall_mm: by which the lumen's radius may be another than it is given, mm, which the calibration does not
                 know: a tip on the wall is then off by as much, and the edges of that band count too.
         """
-        self._since, self._travel = self._since + 1, self._travel + np.abs(proximal[:, 0] - self._proximal[:, 0])
-        self._proximal = proximal
-        half = factor * self.widths(spread, play)
-        used = self._calibration.offset_share * half[:, 1]
-        edges = [tip[:, 1] + off for off in (used, 0.0, -used, wall_mm, -wall_mm)]
-        half[:, 1] = np.hypot(half[:, 1], wall_mm)
-        self.half_width = half
-        beyond = [self._is_beyond(edge, radius_mm) for edge in edges]
-        crossed = np.any([now & ~before for now, before in zip(beyond, self._beyond, strict=True)], axis=0)
-        across = np.any(beyond, axis=0) & ~np.all(beyond, axis=0)
-        disagrees = self._is_shown & (beyond[1] != self._shown)
-        self.wide = half[:, 0] >= self._config.abscissa_mm * (_ERRED_SHARE if erred else 1.0)
-        self.late = self._since * DECISION_PERIOD_S >= self._calibration.longest_s
-        due = (crossed | disagrees | self.wide | (across & erred) | self.late | always) & (self._since >= _SPACING)
-        self._beyond = [np.where(crossed & ~due, before, now) for now, before in zip(beyond, self._beyond, strict=True)]
-        self._since, self._travel = np.where(due, 0, self._since), np.where(due, 0.0, self._travel)
+        inserted_mm, offset_mm = float(at.proximal[0]), float(at.tip[1])
+        self._periods, self._travel_mm = self._periods + 1, self._travel_mm + abs(inserted_mm - self._inserted_mm)
+        self._inserted_mm = inserted_mm
+        half = factor * self.widths(at.spread, beside_mm)
+        used = self._calibration.offset_share * half[1]
+        beyond = self._is_beyond(offset_mm + np.array([used, 0.0, -used, wall_mm, -wall_mm]), at.radius_mm)
+        self.half_width = np.array([half[0], np.hypot(half[1], wall_mm)])
+        crossed = bool((beyond & ~self._beyond).any())
+        across = bool(beyond.any() and not beyond.all())
+        disagrees = self._shown is not None and bool(beyond[1]) != self._shown
+        self.wide = bool(half[0] >= self._config.abscissa_mm * (_ERRED_SHARE if erred else 1.0))
+        self.late = self._periods * DECISION_PERIOD_S >= self._calibration.longest_s
+        due = crossed or disagrees or self.wide or (across and erred) or self.late or always
+        due = due and self._periods >= _SPACING
+        if due or not crossed:
+            self._beyond = beyond
+        if due:
+            self._periods, self._travel_mm = 0, 0.0
         return due
 
-    def widths(self, spread: Tips, play: Tips | None = None) -> Tips:
+    def widths(
+        self, spread: Float[np.ndarray, "2"], beside_mm: Float[np.ndarray, "2"] | None = None
+    ) -> Float[np.ndarray, "2"]:
         """Return the half-widths of the bands at the last call of `advise`, mm, for a spread; see there."""
-        half = self._calibration.half_width(self._since * DECISION_PERIOD_S, self._travel, spread)
-        if play is not None and play.any():
-            half = np.hypot(half, ndtri(0.5 + 0.5 * self._calibration.level) * play)
+        seconds, travel_mm = np.array([self._periods * DECISION_PERIOD_S]), np.array([self._travel_mm])
+        half = self._calibration.half_width(seconds, travel_mm, spread[None])[0]
+        if beside_mm is not None and beside_mm.any():
+            half = np.hypot(half, ndtri(0.5 + 0.5 * self._calibration.level) * beside_mm)
         return half
 
-    def exposed(
-        self,
-        offset_mm: Float[np.ndarray, "shown"],
-        radius_mm: Float[np.ndarray, "shown"],
-        navigations: Int[np.ndarray, "shown"] | slice = slice(None),
-    ) -> None:
-        """Take what an exposure shows; the bands begin anew.
+    def exposed(self, offset_mm: float, radius_mm: float) -> None:
+        """Take what an exposure shows: γtip and the lumen's radius there, mm. The bands begin anew."""
+        self._periods, self._travel_mm = 0, 0.0
+        self._shown = bool(self._is_beyond(np.array([offset_mm]), radius_mm)[0])
 
-        Args:
-            offset_mm: γtip, mm, of each navigation with an exposure.
-            radius_mm: of the lumen there, mm.
-            navigations: which these are; all if not given.
-        """
-        self._since[navigations], self._travel[navigations] = 0, 0.0
-        self._shown[navigations] = self._is_beyond(offset_mm, radius_mm)
-        self._is_shown[navigations] = True
-
-    def _is_beyond(self, offset_mm: Float[np.ndarray, "n"], radius_mm: Float[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
-        return safety_ratio(offset_mm, radius_mm, self._wire_radius_mm) >= self._config.wall_ratio
+    def _is_beyond(self, offset_mm: Float[np.ndarray, "n"], radius_mm: float) -> Bool[np.ndarray, "n"]:
+        ratio = safety_ratio(offset_mm, np.full(len(offset_mm), radius_mm), self._wire_radius_mm)
+        return ratio >= self._config.wall_ratio

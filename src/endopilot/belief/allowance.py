@@ -47,9 +47,9 @@ class Allowance:
         """Begin anew at an exposure."""
         self.held_mm = 0.0
 
-    def wall_mm(self, radius_mm: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    def wall_mm(self, radius_mm: float) -> float:
         """Return by how much the lumen's radius may be another, mm, where it is given as this, mm."""
-        return np.minimum(_LUMEN_SHARE * radius_mm, _LUMEN_MM) * self._alone
+        return min(_LUMEN_SHARE * radius_mm, _LUMEN_MM) * self._alone
 
     @property
     def sd_mm(self) -> Float[np.ndarray, "2"]:

@@ -10,14 +10,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from endopilot.belief.adviser import AdviserConfig
+from endopilot.belief.adviser import AdviserConfig, Predicted
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig, Past
 from endopilot.belief.drives import UNKNOWN
 from endopilot.belief.identification import Identified, identify
 from endopilot.belief.loads import LoadRatio
 from endopilot.belief.patient_motion import FoundMotion, find_motion
-from endopilot.belief.watch import AdviserInput, Watch
+from endopilot.belief.watch import Watch
 from endopilot.devices.stack import Proximals
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.xray.fluoroscope import TipMeasurement
@@ -97,7 +97,7 @@ class Monitor:
         self.seen: TipMeasurement | None = None
         self._tests, self._loads = not navigation.catheters, LoadRatio()
         self.changes_left, self._since, self._returned = _MOST, 0, False
-        tip_radius_mm, at = navigation.device.tip_radius_mm, adviser_input(self.belief)
+        tip_radius_mm, at = navigation.device.tip_radius_mm, predicted_tip(self.belief)
         self._watch = Watch(calibration, advice or AdviserConfig(), tip_radius_mm, at, alone=self._tests)
         self._innovations = self._watch.innovations
 
@@ -130,13 +130,13 @@ class Monitor:
         else:
             self.belief.drives.begin(encoders)
         self.past.proximal.append(self.belief.drives.proximal.copy())
-        at = adviser_input(self.belief)
+        at = predicted_tip(self.belief)
         self._watch.move(at)
         self.seen = None
         if exposure is not None:
             self.seen = seen = self.belief.in_vessel(exposure, period)
             if self._tests:
-                self._watch.compare(seen.less(at[1][0]), exposure.tip_sd_mm)
+                self._watch.compare(seen.less(at.tip), exposure.tip_sd_mm)
             self.past.exposures[period] = exposure
             self.belief.weigh(seen)
             self.lost = not self.belief.explains
@@ -146,14 +146,14 @@ class Monitor:
                 self._renew()
             elif self._is_to_change():
                 self._identify()
-            at = adviser_input(self.belief)
-            self._watch.exposed(float((at[1] + self.seen.less(at[1]))[0, 1]), at)
+            at = predicted_tip(self.belief)
+            self._watch.exposed(float((at.tip + self.seen.less(at.tip))[1]), at)
         elif self.belief.drives.proximal[0, 0] <= self._navigation.start_inserted_length_mm:
             self.lost = False  # back where it began, the wire lies as it did, unseen in its catheter
         motion = _MOTION_SD_MM * (self.belief.motion is not None)
         changed = self.identified is not None or self.moves is not None or self.belief.drives.unknown
         due = self._watch.advise(at, self.belief.play_spread() ** 2 + motion**2, changed=changed)
-        return self._believed(at[1][0], due)
+        return self._believed(at.tip, due)
 
     @property
     def may_return(self) -> bool:
@@ -260,8 +260,8 @@ class Monitor:
         return BelievedTip(abscissa, offset, (along, across), asks, found)
 
 
-def adviser_input(belief: Belief) -> AdviserInput:
-    """Return what the adviser is given: the likeliest wire, and the spread of all wires."""
+def predicted_tip(belief: Belief) -> Predicted:
+    """Return what a belief predicts of the tip: that of the likeliest wire, and the spread of all wires."""
     best, tip = belief.best, belief.likeliest_tip()
-    proximal, ends = belief.simulator.proximal[best, :1], np.array([[tip.abscissa[0], tip.offset[0]]])
-    return proximal, ends, belief.tip_spread()[None], tip.radius
+    ends = np.array([tip.abscissa[0], tip.offset[0]])
+    return Predicted(belief.simulator.proximal[best, 0], ends, belief.tip_spread(), float(tip.radius[0]))

@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.belief.adviser import AdviserConfig, count_events, near_exposures
+from endopilot.belief.adviser import AdviserConfig, Predicted, count_events, near_exposures
 from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of, surely_missed
 from endopilot.belief.image_exposures import Exposures, ImageSettings, deeper_ostium_mm, image_exposures
 from endopilot.belief.online_predictors import OnlinePredictor, online_predictor
-from endopilot.belief.watch import AdviserInput, Watch
+from endopilot.belief.watch import Watch
 from endopilot.dataset.loader import Dataset
 from endopilot.devices.device import Wire
 from endopilot.models.config import WINDOW
@@ -345,9 +345,9 @@ def adviser_policy(monitored: Monitored, calibration: Calibration, config: Advis
     episodes, last = monitored.episodes, WINDOW - 1
     branch = episodes.branch[:, last].astype(int)
 
-    def at(sample: int, tip: np.ndarray, spread: np.ndarray) -> list[AdviserInput]:
+    def at(sample: int, tip: np.ndarray, spread: np.ndarray) -> list[Predicted]:
         proximal, radius_mm = monitored.proximal[:, sample], monitored.lumen.radius(branch, tip[:, 0])
-        return [(proximal[[k]], tip[[k]], spread[[k]], radius_mm[[k]]) for k in range(len(tip))]
+        return [Predicted(*each) for each in zip(proximal, tip, spread, radius_mm.tolist(), strict=True)]
 
     first = at(last, monitored.model.tip[:, last], monitored.model.spread[:, last])
     watches = [Watch(calibration, config, monitored.wire_radius_mm, each, alone=False) for each in first]
@@ -366,7 +366,8 @@ def adviser_policy(monitored: Monitored, calibration: Calibration, config: Advis
         radius_mm = monitored.lumen.radius(branch, seen[:, 0])
         for k in shown:
             watches[k].compare(seen[k] - tip[k], tuple(episodes.tip_sd[k, sample].tolist()))
-            watches[k].exposed(seen[k, 1], (monitored.proximal[[k], sample], seen[[k]], spread[[k]], radius_mm[[k]]))
+            at = Predicted(monitored.proximal[k, sample], seen[k], spread[k], float(radius_mm[k]))
+            watches[k].exposed(float(seen[k, 1]), at)
         return on
 
     return decide

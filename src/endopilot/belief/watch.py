@@ -5,16 +5,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.belief.adviser import AdviserConfig, XrayAdviser
+from endopilot.belief.adviser import AdviserConfig, Predicted, XrayAdviser
 from endopilot.belief.allowance import Allowance
 from endopilot.belief.bands import Calibration
 from endopilot.belief.innovations import Innovations
-
-AdviserInput = tuple[
-    Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1"]
-]
-"""What an adviser is given of a navigation: (Δ, φ), mm and rad; (Δtip, γtip), mm; the spread (standard deviation) of
-these as the model states it, mm; and the lumen's radius at the tip, mm."""
 
 MISMATCH = "model mismatch"
 """Why X-ray is asked for while the model is taken to be wrong."""
@@ -28,7 +22,7 @@ class Watch:
     """
 
     def __init__(
-        self, calibration: Calibration, config: AdviserConfig, tip_radius_mm: float, at: AdviserInput, *, alone: bool
+        self, calibration: Calibration, config: AdviserConfig, tip_radius_mm: float, at: Predicted, *, alone: bool
     ) -> None:
         """Begin at an exposure.
 
@@ -39,29 +33,26 @@ class Watch:
             at: what the model predicts there.
             alone: whether the model is of a wire that no catheter is around; else nothing is allowed for.
         """
-        proximal, tip, spread, radius = at
         self.innovations = Innovations()
-        self._adviser = XrayAdviser(calibration, config, tip_radius_mm)
-        self._allowance = Allowance(proximal[0, 0], tip[0, 0], alone=alone)
-        self._adviser.start(proximal, tip, radius)
-        self._half = self._adviser.widths(spread)[0]
+        self._adviser = XrayAdviser(calibration, config, tip_radius_mm, at)
+        self._allowance = Allowance(at.proximal[0], at.tip[0], alone=alone)
+        self._half = self.half_width
 
-    def move(self, at: AdviserInput) -> None:
+    def move(self, at: Predicted) -> None:
         """Take what is predicted a period later."""
-        proximal, tip, _, _ = at
-        self._allowance.move(proximal[0, 0], tip[0, 0])
+        self._allowance.move(at.proximal[0], at.tip[0])
 
     def compare(self, innovation: Float[np.ndarray, "2"], sd_mm: tuple[float, float]) -> None:
         """Take measured less predicted (Δtip, γtip), and the standard deviations that the measurement states, mm."""
         self.innovations.take(innovation, self._half, sd_mm)
 
-    def exposed(self, offset_mm: float, at: AdviserInput) -> None:
+    def exposed(self, offset_mm: float, at: Predicted) -> None:
         """Begin anew at an exposure that shows γtip, mm, with what the model then predicts."""
-        self._adviser.exposed(np.array([offset_mm]), at[3])
+        self._adviser.exposed(offset_mm, at.radius_mm)
         self._allowance.exposed()
 
     def advise(
-        self, at: AdviserInput, variance_mm2: Float[np.ndarray, "2"] | float = 0.0, *, changed: bool = False
+        self, at: Predicted, variance_mm2: Float[np.ndarray, "2"] | float = 0.0, *, changed: bool = False
     ) -> bool:
         """Return whether an exposure is due, once a period.
 
@@ -70,30 +61,29 @@ class Watch:
             variance_mm2: of (Δtip, γtip), which the calibration does not know of, mm².
             changed: whether the model is another than the given one, which erred.
         """
-        proximal, tip, spread, radius = at
-        further = np.sqrt(variance_mm2 + self._allowance.sd_mm**2)[None]
         due = self._adviser.advise(
-            *(proximal, tip, spread, radius, further),
+            at,
+            np.sqrt(variance_mm2 + self._allowance.sd_mm**2),
             factor=self.innovations.factor,
             always=self.innovations.alarm,
             erred=changed or bool((self.innovations.factor > 1).any()),
-            wall_mm=self._allowance.wall_mm(radius),
+            wall_mm=self._allowance.wall_mm(at.radius_mm),
         )
         self._half = self.half_width / self.innovations.factor
-        return bool(due[0])
+        return due
 
     @property
     def reason(self) -> str:
         """Why X-ray is due if it was at the last call of `advise`."""
         if self.innovations.alarm:
             return MISMATCH
-        if self._adviser.late[0]:
+        if self._adviser.late:
             return "the last exposure is long ago"
-        if self._adviser.wide[0]:
+        if self._adviser.wide:
             return f"Δtip is known to ±{self.half_width[0]:.1f} mm only"
         return "the tip may be reaching the wall"
 
     @property
     def half_width(self) -> Float[np.ndarray, "2"]:
         """Half-widths of the bands of Δtip and γtip at the last call of `advise`, mm."""
-        return self._adviser.half_width[0]
+        return self._adviser.half_width

@@ -15,12 +15,12 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Bool, Float
 
-from endopilot.belief.adviser import AdviserConfig
+from endopilot.belief.adviser import AdviserConfig, Predicted
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief
-from endopilot.belief.monitor import adviser_input
+from endopilot.belief.monitor import predicted_tip
 from endopilot.belief.online_predictors import online_predictor
-from endopilot.belief.watch import AdviserInput, Watch
+from endopilot.belief.watch import Watch
 from endopilot.control.agent_config import AgentConfig, read_agent_calibration
 from endopilot.control.plan_config import NETWORK_METHODS, Plan
 from endopilot.models.config import WINDOW, run_path
@@ -80,7 +80,7 @@ def plan_xray(plan: Plan, *, calibration: Calibration | None = None) -> PlannedX
         watch.move(at)
         exposure[period], half_width[period] = watch.advise(at), watch.half_width
         if exposure[period]:
-            watch.exposed(float(at[1][0, 1]), at)
+            watch.exposed(float(at.tip[1]), at)
             model.observe(period)
     return PlannedXray(exposure=exposure, half_width=half_width)
 
@@ -88,11 +88,11 @@ def plan_xray(plan: Plan, *, calibration: Calibration | None = None) -> PlannedX
 class _Model(Protocol):
     """Predicts the tip along a plan."""
 
-    def start(self) -> AdviserInput:
+    def start(self) -> Predicted:
         """Return where the tip is before the first period."""
         ...
 
-    def move(self, period: int) -> AdviserInput:
+    def move(self, period: int) -> Predicted:
         """Return where it is predicted to be at the end of the next period."""
         ...
 
@@ -106,14 +106,14 @@ class _Wires:
         config = AgentConfig.of(plan.navigation).belief
         self._plan, self._belief = plan, Belief(plan.navigation, Belief.around(config), config)
 
-    def start(self) -> AdviserInput:
-        return adviser_input(self._belief)
+    def start(self) -> Predicted:
+        return predicted_tip(self._belief)
 
-    def move(self, period: int) -> AdviserInput:
+    def move(self, period: int) -> Predicted:
         self._belief.follow(
             tuple((inserted, turn) for inserted, turn in self._plan.trajectory.proximal[0, period].tolist())
         )
-        return adviser_input(self._belief)
+        return predicted_tip(self._belief)
 
     def observe(self, period: int) -> None:
         tip = self._plan.tip[:, 0]
@@ -139,10 +139,10 @@ class _Networks:
         self._route = Route.to(navigation.anatomy, navigation.target)
         self._proximal = episodes.proximal[0]
 
-    def start(self) -> AdviserInput:
+    def start(self) -> Predicted:
         return self._at(WINDOW - 1)
 
-    def move(self, period: int) -> AdviserInput:
+    def move(self, period: int) -> Predicted:
         return self._at(WINDOW + period)
 
     def observe(self, period: int) -> None:
@@ -150,6 +150,7 @@ class _Networks:
         tip = self._model.tip[:, sample].copy()
         self._model.observe(np.array([0]), sample, tip, self._route.branch(tip[:, 0]))
 
-    def _at(self, sample: int) -> AdviserInput:
+    def _at(self, sample: int) -> Predicted:
         tip = self._model.tip[:, sample]
-        return self._proximal[None, sample], tip, self._model.spread[:, sample], self._route.radius(tip[:, 0])
+        radius_mm = float(self._route.radius(tip[:, 0])[0])
+        return Predicted(self._proximal[sample], tip[0], self._model.spread[0, sample], radius_mm)
