@@ -39,7 +39,8 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path, capsys, monkey
 
     small = partial(PhantomConfig, in_plane_mm=0.75, slice_mm=0.8, margin_mm=10.0)  # seen sooner
     monkeypatch.setattr(study, "PhantomConfig", small)
-    monkeypatch.setattr(study, "NavigateConfig", partial(NavigateConfig, seconds=20.0))  # which may end on its way
+    given = partial(NavigateConfig, seconds=20.0, tip="75/5")  # no tip is chosen, and the navigation may end on its way
+    monkeypatch.setattr(study, "NavigateConfig", given)
     again = command.run(capsys, "demo", "-o", folder, *SIZE)
     assert {path: path.stat().st_mtime_ns for path in before} == before  # finished work is not done twice
 
