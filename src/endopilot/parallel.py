@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import signal
@@ -113,6 +114,7 @@ class Workers(ProcessPoolExecutor):
 def _follow() -> None:
     """Leave interrupts and progress bars to the parent process, and end when it ends, even if it is killed."""
     silence()
+    gc.disable()  # until the first piece of work is imported, which leaves no garbage
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _leave)
     parent = multiprocessing.parent_process()
@@ -129,6 +131,9 @@ def _follow() -> None:
 
 def _work(work: Callable[..., T], *args: Any, **kwargs: Any) -> T:
     """Do a piece of work in a worker process; one that is stopped leaves with it, and begins no other."""
+    if not gc.isenabled():
+        gc.freeze()
+        gc.enable()
     try:
         return work(*args, **kwargs)
     except Stopped as stopped:

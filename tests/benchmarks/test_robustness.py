@@ -36,6 +36,17 @@ def patient():
     return make_patient(AtlasConfig(seed=3), 0)
 
 
+@pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Simulate chunks here: a process takes seconds to start."""
+
+    class Here(robustness._Worker):
+        def run(self, *chunk):
+            robustness.run_chunk(*chunk)
+
+    monkeypatch.setattr(robustness, "_Worker", Here)
+
+
 def test_a_small_run_holds_its_bars_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
     measured = measure_robustness(small(tmp_path / "run"))
     figures = {row["figure"]: row for row in measured["figures"]}
@@ -95,7 +106,7 @@ def test_pairs_are_random_and_fit_into_each_other() -> None:
     assert [stack.devices for stack in again] == [stack.devices for stack in drawn[3]]
 
 
-def test_pairs_are_driven_and_told_by_name(tmp_path: Path) -> None:
+def test_pairs_are_driven_and_told_by_name(tmp_path: Path, in_this_process) -> None:
     config = replace(small(tmp_path / "run"), rollouts=5, seconds=5.0, catheters=True)
     measured = measure_robustness(config)
     assert measured["rollouts"] + len(measured["did_not_fit"]) == 5 and measured["invalid"] == 0
@@ -154,15 +165,15 @@ class Hungry(Wire):
         raise MemoryError
 
 
-def test_a_crash_is_counted_and_survived(tmp_path: Path) -> None:
-    config = small(tmp_path)
+def test_a_crash_is_counted_and_survived(tmp_path: Path, vessel) -> None:
+    config = replace(small(tmp_path), given=(vessel,))
     with robustness._Worker() as worker:
         worker.run(tmp_path / "0.npz", config, 0, Stack(Fatal(**vars(DEVICE))), 1)
         worker.run(tmp_path / "1.npz", config, 0, Stack(Hungry(**vars(DEVICE))), 1)
         worker.run(tmp_path / "2.npz", replace(config, seconds=5.0), 0, Stack(DEVICE), 1)
     assert "the process died" in read_json(tmp_path / "0.json")["crash"]
     assert "MemoryError" in read_json(tmp_path / "1.json")["crash"]
-    assert read_json(tmp_path / "2.json") == {"anatomy": "rca-3-0000", "invalid": []}
+    assert read_json(tmp_path / "2.json") == {"anatomy": "fork", "invalid": []}
 
 
 def test_a_crash_and_an_invalid_world_miss_their_bars(tmp_path: Path) -> None:
@@ -195,7 +206,7 @@ def test_a_crash_and_an_invalid_world_miss_their_bars(tmp_path: Path) -> None:
     assert (row["largest_wall_force_n"], row["wall_force_worlds"], row["invalid"]) == (0.8, 1, 1)
 
 
-def test_anatomies_of_ones_own_are_driven_through(tmp_path: Path, patient) -> None:
+def test_anatomies_of_ones_own_are_driven_through(tmp_path: Path, patient, in_this_process) -> None:
     folders = (tmp_path / "one", tmp_path / "two")
     for folder in folders:
         write_anatomy(replace(patient, name=folder.name), output=folder)

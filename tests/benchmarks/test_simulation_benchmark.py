@@ -17,10 +17,11 @@ from benchmarks.__main__ import main
 from benchmarks.core import scenes as scenes_module
 from benchmarks.core.errors import error_figures, error_intervals
 from benchmarks.core.reference import REFERENCE_FILE, check_reference, make_reference, read_reference
-from benchmarks.core.scenes import KINDS, Solution, make_scenes
+from benchmarks.core.scenes import KINDS, Scene, Solution, make_scenes
 from benchmarks.core.simulation import against_reference
 from endopilot.errors import InputError
 from endopilot.simulation.config import PRESETS, SimulatorConfig
+from endopilot.simulation.trajectory import Trajectory
 
 WORLDS, SAMPLES = 2, 4
 CONVERGED = SimulatorConfig(element_mm=0.35, time_step_s=0.005, tolerance_mm=1e-6)
@@ -34,11 +35,24 @@ def patients() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def small(patients: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(patients: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Trajectory]]:
+    """Return a small reference, and the rollouts that it holds."""
     path = tmp_path_factory.mktemp("reference") / "small.npz"
-    finer = replace(CONVERGED, element_mm=0.3)
-    make_reference(path, worlds=WORLDS, samples=SAMPLES, converged=CONVERGED, finer=finer, finer_worlds=1)
-    return path
+    finer, rollouts, run = replace(CONVERGED, element_mm=0.3), [], Scene.run
+
+    def kept(*args: Any) -> Trajectory:
+        rollouts.append(run(*args))
+        return rollouts[-1]
+
+    with patch.object(Scene, "run", kept):
+        make_reference(path, worlds=WORLDS, samples=SAMPLES, converged=CONVERGED, finer=finer, finer_worlds=1)
+    return path, rollouts[: len(KINDS)]
+
+
+@pytest.fixture(scope="module")
+def small(made: tuple[Path, list[Trajectory]]) -> Path:
+    """Return a small reference."""
+    return made[0]
 
 
 def refused(path: Path) -> str:
@@ -54,11 +68,11 @@ def rewritten(small: Path, to: Path, change: dict[str, Any]) -> Path:
     return to
 
 
-def test_the_figures_of_the_preset_are_those_against_the_reference(small: Path) -> None:
-    measured = against_reference("fast", small)
+def test_the_figures_of_the_preset_are_those_against_the_reference(made: tuple[Path, list[Trajectory]]) -> None:
+    path, exact = made
+    measured = against_reference("fast", path)
     scenes = make_scenes(WORLDS, SAMPLES)
     rollouts = [scene.run(PRESETS["fast"]) for scene in scenes]
-    exact = [scene.run(CONVERGED) for scene in scenes]
     tip = np.concatenate(
         [np.linalg.norm(a.tip_position - b.tip_position, axis=-1) for a, b in zip(rollouts, exact, strict=True)]
     )

@@ -19,7 +19,7 @@ from endopilot.pipeline import study
 from endopilot.pipeline.study import DemoConfig
 from endopilot.runs import claim
 
-SIZE = ("--patients", "3", "--sequences", "1", "--seconds", "25")
+SIZE = ("--patients", "3", "--sequences", "1", "--seconds", "20")
 STAGES = ["atlas", "phantom", "segmentation", "anatomy", "navigation", "dataset", "evaluation", "report"]
 
 
@@ -36,7 +36,7 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path, capsys, monkey
     assert not (folder / "report.html").exists()
     before = {path: path.stat().st_mtime_ns for path in (folder / "truth").rglob("*.json")}
 
-    small = partial(PhantomConfig, in_plane_mm=0.6, slice_mm=0.7, margin_mm=10.0)  # seen sooner
+    small = partial(PhantomConfig, in_plane_mm=0.75, slice_mm=0.8, margin_mm=10.0)  # seen sooner
     monkeypatch.setattr(study, "PhantomConfig", small)
     again = command.run(capsys, "demo", "-o", folder, *SIZE)
     assert {path: path.stat().st_mtime_ns for path in before} == before  # finished work is not done twice
@@ -88,4 +88,4 @@ def test_another_size_in_the_same_folder_is_refused(tmp_path, capsys):
     )
     (tmp_path / "stages.json").write_text("{}")
     line = command.refused(capsys, "demo", "-o", tmp_path, *SIZE)
-    assert "was begun with config.sequences = 60, now it is 1" in line
+    assert f"was begun with config.sequences = {DemoConfig().sequences}, now it is 1" in line

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endopilot.anatomy.io import write_anatomy
+from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
@@ -47,12 +47,23 @@ def episodes(folder):
     return replace(true, initial=true.initial - error, proximal=true.proximal - error)
 
 
-def test_identified_from_the_given_tips_it_predicts_the_others(folder, episodes) -> None:
-    twin = load_model(folder / "run")
-    found = twin.predict(episodes, GIVEN)
+@pytest.fixture(scope="module")
+def twin(folder):
+    """Return the twin."""
+    return load_model(folder / "run")
+
+
+@pytest.fixture(scope="module")
+def found(twin, episodes):
+    """Return what the twin predicts from the given tips."""
+    twin.rollout_forward(episodes)
+    return twin.predicted[episodes]
+
+
+def test_identified_from_the_given_tips_it_predicts_the_others(folder, twin, episodes, found) -> None:
     later = slice(30, None)
     error = np.abs(found.tip - episodes.tip)[:, later]
-    anatomy = make_patient(AtlasConfig(seed=77), 0)
+    anatomy = read_anatomy(folder / "anatomy")
     control = episodes.control.astype(float)
     drawn_out = -0.5 * np.cumsum(control[..., 0], axis=1).min(axis=1)
     start = np.column_stack([np.maximum(episodes.initial[:, 0], drawn_out), episodes.initial[:, 1]])
@@ -69,19 +80,18 @@ def test_identified_from_the_given_tips_it_predicts_the_others(folder, episodes)
     np.testing.assert_array_equal(twin.predict(blind.select(np.array([1])), GIVEN).tip[0], found.tip[1])
 
 
-def test_members_that_err_alike_have_a_wide_spread(folder, episodes) -> None:
-    few, twin = episodes.select(np.array([0, 1])), load_model(folder / "run")
-    own = twin.predict(few, GIVEN).spread
-    elsewhere, once = few.tip.copy(), few.tip.copy()
+def test_members_that_err_alike_have_a_wide_spread(twin, episodes, found) -> None:
+    few, one = (episodes.select(np.arange(count)) for count in (2, 1))
+    elsewhere, once = few.tip.copy(), one.tip.copy()
     elsewhere[0, :, 0] += 30.0  # whatever friction, stiffness and ostium
     once[0, 29, 0] += 30.0  # a measurement that went wrong
     doubtful = twin.predict(replace(few, tip=elsewhere), GIVEN).spread
     assert (doubtful[0, 30:, 0] > 20.0).all()
-    np.testing.assert_array_equal(doubtful[1], own[1])
-    assert twin.predict(replace(few, tip=once), GIVEN).spread[0, 30:].max() < 5.0
+    np.testing.assert_array_equal(doubtful[1], found.spread[1])
+    assert twin.predict(replace(one, tip=once), GIVEN).spread[0, 30:].max() < 5.0
 
 
-def test_a_wire_that_is_held_while_it_is_pulled_starts_where_it_lies(folder, episodes, monkeypatch) -> None:
+def test_a_wire_that_is_held_while_it_is_pulled_starts_where_it_lies(twin, episodes, monkeypatch) -> None:
     """What a drive was commanded and did not make moves no wire: the sum of commands says nothing of where it began."""
     starts = []
 
@@ -92,17 +102,16 @@ def test_a_wire_that_is_held_while_it_is_pulled_starts_where_it_lies(folder, epi
 
     monkeypatch.setattr(twin_module, "Ensemble", Kept)
     held = replace(episodes, command=episodes.command - np.array([10.0, 0.0]))
-    twin = load_model(folder / "run")
     twin.predict(held.select(np.array([0])), GIVEN)
     assert np.abs(np.concatenate(starts) - held.initial[0, 0]).max() <= twin.config.ostium_spread_mm + 1e-6
 
 
-def test_in_a_patient_who_moves_its_wires_move_as_far_as_is_known(folder, tmp_path) -> None:
-    config = DatasetConfig(sequences=3, seconds=22.5, seed=4, motion="both")
+def test_in_a_patient_who_moves_its_wires_move_as_far_as_is_known(folder, twin, tmp_path) -> None:
+    config = DatasetConfig(sequences=2, seconds=22.5, seed=4, motion="both")
     generate_dataset([folder / "anatomy"], output=tmp_path / "moving", device=read_wire("workhorse-014"), config=config)
     moving = Episodes.of_dataset(read_dataset(tmp_path / "moving"))
     blind = replace(moving, setup=replace(moving.setup, known_motions={}))
-    twin, later = load_model(folder / "run"), slice(30, None)
+    later = slice(30, None)
 
     def error(tip: np.ndarray) -> float:
         return float(np.abs(tip[:, later, 0] - moving.tip[: len(tip), later, 0]).mean())
@@ -110,7 +119,7 @@ def test_in_a_patient_who_moves_its_wires_move_as_far_as_is_known(folder, tmp_pa
     aware, unaware = (error(twin.predict(episodes, GIVEN).tip) for episodes in (moving, blind))
     assert aware < 0.5 * unaware, (aware, unaware)
     # so do the wires that the causal network starts from, as far as the given tips show the patient's own motion
-    moving, packaged = moving.select(np.arange(2)), load_model("pretrained")
+    packaged = load_model("pretrained")
     seen, middle = np.tile(GIVEN, (len(moving), 1)), FRICTION_FACTORS.index(1.0)
     fitted, mean = (error(packaged.wires.tips(moving, each).tip[:, :, middle]) for each in (seen, np.zeros_like(seen)))
     assert fitted < 0.3 * mean, (fitted, mean)
@@ -118,8 +127,7 @@ def test_in_a_patient_who_moves_its_wires_move_as_far_as_is_known(folder, tmp_pa
     assert error(packaged.predict(moving, GIVEN).tip) < 0.1  # mm
 
 
-def test_it_finds_controls_that_lead_the_tip_along(folder, episodes) -> None:
-    twin = load_model(folder / "run")
+def test_it_finds_controls_that_lead_the_tip_along(twin, episodes) -> None:
     found = twin.rollout_dual(episodes)
     later = slice(30, None)
     assert np.abs(found.tip - episodes.tip[:, later])[..., 0].mean() < 0.4  # mm
@@ -131,11 +139,11 @@ def test_it_finds_controls_that_lead_the_tip_along(folder, episodes) -> None:
     assert np.abs(found.control - episodes.control[:, later]).mean() > 0.1
 
 
-def test_under_way_it_drives_on_from_what_was_driven(folder, episodes) -> None:
-    few, now = episodes.select(np.array([0, 1])), 37
+def test_under_way_it_drives_on_from_what_was_driven(twin, episodes) -> None:
+    few, now = episodes.select(np.array([0])), 37
     observed = GIVEN.copy()
     observed[now] = True
-    found = load_model(folder / "run").rollout_dual(few, observed)
+    found = twin.rollout_dual(few, observed)
     assert np.abs(found.tip - few.tip[:, now + 1 :])[..., 0].mean() < 0.4  # mm
     start = few.proximal[:, now].astype(float)
     np.testing.assert_allclose(found.proximal[:, 0], start + 0.5 * found.control[:, 0], atol=1e-9)

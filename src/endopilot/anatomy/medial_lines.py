@@ -59,20 +59,33 @@ class MedialLines:
         return self.matrix(self.edges)
 
     @cached_property
-    def from_widest(self) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-        """Length of the path from each piece's widest place to each point, and of all at and beyond that point, mm."""
-        length, behind = np.zeros(len(self.points)), self.share_mm.copy()
+    def _rooted(self) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+        """Length of the path from each piece's widest place to each point, mm, and the point before it."""
         piece = pieces(self.edges, len(self.points))
-        roots = [
-            np.flatnonzero(piece == i)[self.clearance[piece == i].argmax()] for i in range(piece.max(initial=-1) + 1)
-        ]
+        order = np.lexsort((-self.clearance, piece))
+        roots = order[np.unique(piece[order], return_index=True)[1]]
         length, before, _ = dijkstra(
             self.forest, directed=False, indices=roots, return_predecessors=True, min_only=True
         )  # pyright: ignore[reportAssignmentType]
+        return length, before
+
+    @cached_property
+    def from_widest(self) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+        """Length of the path from each piece's widest place to each point, and of all at and beyond that point, mm."""
+        (length, before), behind = self._rooted, self.share_mm.copy()
         for node in np.argsort(-length):
             if before[node] >= 0:
                 behind[before[node]] += behind[node]
         return length, behind
+
+    def way(self, one: int, two: int) -> list[int]:
+        """Return the points of the only path between two points of a piece."""
+        length, before = self._rooted
+        there, back = [one], [two]
+        while there[-1] != back[-1]:  # the deeper one goes up, until both are where the two ways from the root part
+            deeper = there if length[there[-1]] > length[back[-1]] else back
+            deeper.append(int(before[deeper[-1]]))
+        return there + back[-2::-1]
 
     def lengths(self, edges: Int[np.ndarray, "m 2"]) -> Float[np.ndarray, "m"]:
         """Return the lengths of edges, mm."""

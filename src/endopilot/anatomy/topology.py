@@ -135,11 +135,8 @@ def _loops(lines: MedialLines, mask: Volume) -> list[_Cut]:
     """Return a cut for every loop of the vessel's middle."""
     cuts = []
     for start, end in lines.closing:
-        length, before = dijkstra(lines.forest, indices=start, return_predecessors=True)
-        around = float(length[end])
-        loop = [int(end)]
-        while loop[-1] != start:
-            loop.append(int(before[loop[-1]]))
+        loop = lines.way(int(end), int(start))
+        around = float(np.cumsum(lines.lengths(np.column_stack([loop[:0:-1], loop[-2::-1]])))[-1])
         clearance = lines.clearance[loop]
         across = np.linalg.norm(lines.points[loop] - np.roll(lines.points[loop], len(loop) // 2, axis=0), axis=1)
         slit = across.min() < _SLIT_VOXELS * mask.spacing_mm.max()
