@@ -129,14 +129,14 @@ def test_amplitudes_that_differ_from_the_known_motion_are_identified(along_the_f
     known = Motion()
     motion = replace(known, breathing_caudal_mm=10.0, breathing_anterior_mm=5.0)
     navigation = replace(along_the_fork, seconds=14.0, known_motion=known)
-    at = list[float]()
-    for policy, loop in driven(navigation, World(motion=motion), kind=Rocks):
-        at.append(float(loop.simulator.project().abscissa[0, 0]))
+    tips = ((each, loop.simulator.project()) for each, loop in driven(navigation, World(motion=motion), kind=Rocks))
+    run = [(each, float(tip.abscissa[0, 0])) for each, tip in tips]
+    policy = run[-1][0]
     found = policy.monitor.moves.motion
     assert found.heart_period_s == pytest.approx(known.heart_period_s)
     assert found.breathing_caudal_mm == pytest.approx(10.0, abs=1.5)
     assert not policy.monitor.lost
-    assert policy.last.abscissa == pytest.approx(at[-2], abs=1.0)
+    assert policy.last.abscissa == pytest.approx(run[-2][1], abs=1.0)
 
 
 def test_a_motion_that_was_found_wrongly_is_given_up_with_what_was_identified(along_the_fork) -> None:
