@@ -117,7 +117,7 @@ def drive_under_conditions(
     }
     claim(FOLDER, "python -m benchmarks xray-conditions", **identity("agent", NEWEST))
     make_missing("The agent under X-ray", [path for paths in wanted.values() for path in paths], measure)
-    before = (DOCS / "evidence/advice.md").read_text(encoding="utf-8").split("<!-- conditions:begin -->")[1]
+    before = (DOCS / "evidence/advice.md").read_text(encoding="utf-8").split("<!-- conditions:")[1]
     rows = {title: line for line in before.splitlines() for title, *_ in CONDITIONS.values() if f"| {title} |" in line}
     rows |= {
         CONDITIONS[name][0]: row(CONDITIONS[name][0], [read_json(path) for path in paths])
