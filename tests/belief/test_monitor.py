@@ -56,6 +56,15 @@ class Rocks(ToAndFro):
         return Decision(((5.0 * slow, 0.6),), expose=decision.expose or observation.time_s % 2 == 0)
 
 
+class SeesTheLumen(Rocks):
+    """The same, where images are searched for a wire within the lumen, whose radius is 0.8 mm at least."""
+
+    def decide(self, observation: Observation) -> Decision:
+        if (seen := observation.tip) is not None:
+            observation = replace(observation, tip=replace(seen, offset=min(seen.offset, 0.8)))
+        return super().decide(observation)
+
+
 def driven(
     navigation: Navigation, world: World, seed: int = 1, kind: type[ToAndFro] = ToAndFro
 ) -> Iterator[tuple[ToAndFro, NavigationLoop]]:
@@ -125,11 +134,12 @@ def test_a_vessel_that_moves_is_noticed_and_its_motion_identified(along_the_fork
     assert policy.monitor.moves.motion == policy.monitor.belief.motion == found  # the exposures still tell of it
 
 
-def test_amplitudes_that_differ_from_the_known_motion_are_identified(along_the_fork) -> None:
+@pytest.mark.parametrize("kind", [Rocks, SeesTheLumen])
+def test_amplitudes_that_differ_from_the_known_motion_are_identified(along_the_fork, kind) -> None:
     known = Motion()
     motion = replace(known, breathing_caudal_mm=10.0, breathing_anterior_mm=5.0)
     navigation = replace(along_the_fork, seconds=14.0, known_motion=known)
-    tips = ((each, loop.simulator.project()) for each, loop in driven(navigation, World(motion=motion), kind=Rocks))
+    tips = ((each, loop.simulator.project()) for each, loop in driven(navigation, World(motion=motion), kind=kind))
     run = [(each, float(tip.abscissa[0, 0])) for each, tip in tips]
     policy = run[-1][0]
     found = policy.monitor.moves.motion

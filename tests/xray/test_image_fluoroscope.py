@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from endopilot.errors import InputError
+from endopilot.simulation.motion import Motion
 from endopilot.xray import image_fluoroscope
 from endopilot.xray.carm import Pose
 from endopilot.xray.image_fluoroscope import ImageFluoroscope
@@ -52,6 +53,22 @@ def test_exposures_refine_a_pose_that_is_not_sure(arm, fork):
     room_mm = 1.0 - 0.18  # of the lumen and of the wire
     assert vessel_error_mm(fork, arm.pose, unsure.refiner.pose) < room_mm and errors[1] < room_mm
     np.testing.assert_array_equal(arm.refiner.pose.vector, arm.registration.pose.vector)
+
+
+def test_a_wire_is_found_where_the_known_motion_does_not_take_the_vessel(arm):
+    """The vessel lies 2 mm beside where the known motion takes it, and the wire in it: the lumen's radius is 1 mm."""
+    at = np.arange(15.0, -30.0, -0.5)
+    nodes = np.stack([0 * at, np.where(at > 0, 2.0, 0.0), at], axis=-1)
+    moving = copy(arm)
+    moving.forget_wires()
+    moving.known_motion = Motion()
+    before = moving.refiner.pose
+    shown = moving.measure(nodes, 15.3, np.random.default_rng(0))
+    assert shown is not None and np.linalg.norm(shown.position - nodes[0]) < 0.5
+    assert moving.refiner.pose == before  # the patient lies where they lay
+    inside = np.stack([0.4 + 0 * at, 0 * at, at], axis=-1)
+    as_known, at_rest = (each.measure(inside, 15.3, np.random.default_rng(0)) for each in (moving, arm))
+    np.testing.assert_array_equal(as_known.position, at_rest.position)
 
 
 def test_an_image_without_a_wire_measures_nothing(arm):

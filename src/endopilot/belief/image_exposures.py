@@ -31,7 +31,7 @@ from endopilot.xray.moving_patient import seen_in_episodes
 
 EXPOSURES_FOLDER = "exposures"
 """Folder of a dataset in which what images show of its navigations is kept."""
-_FORMAT_VERSION = 3
+_FORMAT_VERSION = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +156,7 @@ def expose_navigations(data: Dataset, anatomy: Anatomy, settings: ImageSettings)
     known, motion = None, data.motion(name)
     if motion is not None:
         known = arm.measure_motion(motion, np.random.default_rng([seed, 6, *name.encode()]))
+        arm.known_motion = known
     shown = seen_in_episodes(motion, known, ostium, shape[1], data.sample_period_s)
     encoder = data.inserted_length[:, :, 0].astype(float) - deeper_ostium_mm(name, settings.ostium_mm, seed)
     encoder = encoder - world.ostium_mm

@@ -25,8 +25,8 @@ from endopilot.xray.fluoroscope import TipMeasurement
 _MOST, _EVERY = 6, 3
 """The belief is changed as often at most, after as many further exposures at least."""
 _LEAST_EXPOSURES, _OUTSIDE_MM = 3, 0.8
-"""A motion of the vessel is looked for in as many exposures at least, where one showed the tip so far outside the
-lumen: a wire in a vessel that moves as it is known to is not."""
+"""A motion of the vessel is looked for in as many exposures at least. Where none is known, one must have shown the tip
+so far outside the lumen."""
 _LEAST_GAIN, _MOST_MISFIT = 6.0, 0.8
 """A motion is believed that makes the exposures likelier by this logarithm, and leaves no larger misfit."""
 _MOTION_SD_MM = np.array([0.6, 0.1])
@@ -216,7 +216,7 @@ class Monitor:
         if not self._tests or len(self.past.exposures) < _LEAST_EXPOSURES:
             return False
         members, past = self.belief.members, self.past
-        if self.moves is None and max(map(self._outside_mm, self.past.exposures.values())) < _OUTSIDE_MM:
+        if self.moves is None and given.known_motion is None and self._farthest_outside_mm() < _OUTSIDE_MM:
             return False
         if self.moves is not None and not (self.lost or self._innovations.outside or self._since >= _EVERY):
             return False
@@ -244,10 +244,13 @@ class Monitor:
         drives.begin(past.measured[-1][0])
         return True
 
-    def _outside_mm(self, measured: TipMeasurement) -> float:
-        """Return how far outside the lumen of a vessel that moves as it is known to a tip was seen, mm."""
-        line = self._navigation.anatomy.tree.branches[measured.branch].centerline
-        return measured.offset - float(np.interp(measured.abscissa, line.abscissa, line.radius))
+    def _farthest_outside_mm(self) -> float:
+        """Return how far outside the lumen an exposure showed the tip at most, mm."""
+        lines = [branch.centerline for branch in self._navigation.anatomy.tree.branches]
+        return max(
+            seen.offset - float(np.interp(seen.abscissa, lines[seen.branch].abscissa, lines[seen.branch].radius))
+            for seen in self.past.exposures.values()
+        )
 
     def _believed(self, tip: np.ndarray, due: bool) -> BelievedTip:
         abscissa, offset = tip.tolist()
