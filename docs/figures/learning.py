@@ -10,7 +10,6 @@ import re
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +33,7 @@ from endopilot.models.simulated_wires import FRICTION_FACTORS
 
 PAGE = Path(__file__).parents[1] / "evidence" / "learning.md"
 OURS = f"`{PRETRAINED}`"
-RUNS = {"the recipe's pair": "seed-0", "the paper's pair": "paper"}
+RUNS = {"the paper's pair": "paper"}
 """Runs of `make recipe-laptop`, by the name of the row; those that are not there are left out."""
 PATIENTS = {
     "atlas, wires of ±20 %": "dataset",
@@ -87,12 +86,7 @@ def p1_rows(folder: Path) -> tuple[list[str], list[str]]:
         jumping.append(f"| {patients} | {OURS} | {_jump_cells(episodes, found)} |")
         tips = {OURS: found.tip[:, WINDOW:]}
         for name, run in runs.items():
-            if isinstance(run, CausalPredictor):  # of the same wires
-                predicted = replace(run, wires=ours.wires).predict(episodes, observed)
-                jumping.append(f"| {patients} | {name} | {_jump_cells(episodes, predicted)} |")
-                tips[name] = predicted.tip[:, WINDOW:]
-            else:
-                tips[name] = run.rollout_forward(episodes).tip
+            tips[name] = run.rollout_forward(episodes).tip
         tips["play operator alone"] = played[:, WINDOW:]
         for name, seen in (("simulated wire as given", np.zeros_like(observed)), ("simulated wire, fitted", observed)):
             wire = ours.wires.tips(episodes, seen).tip[:, :, FRICTION_FACTORS.index(1.0)]
@@ -122,7 +116,8 @@ def _jump_cells(episodes: Episodes, found: Prediction) -> str:
 def speed_rows(folder: Path) -> Iterator[str]:
     """Yield the processor time of a rollout, ms a step and sequence, on one thread."""
     data = Episodes.of_dataset(read_dataset(folder / "dataset").of_split("test"))
-    run = load_model(folder / RUNS[OURS])
+    run = load_model(PRETRAINED)
+    assert isinstance(run, CausalPredictor)
     for count, repeats in ((1, 5), (256, 1)):
         few = data.select(np.arange(count) % len(data))
         run.rollout_forward(few)  # prepares the patients
