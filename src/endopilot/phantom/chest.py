@@ -19,7 +19,7 @@ from endopilot.types import Centerline, VesselTree
 
 _KNOTS = 16
 """Points of each of the left reference courses."""
-_SLAB = 4
+_SLAB = 8
 """Slices of the coarse grid whose depths are computed at once: they stay in the processor's cache."""
 
 
