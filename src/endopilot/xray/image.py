@@ -155,9 +155,9 @@ class XrayImager:
         """
         self.anatomy, self.stack, self.config = anatomy, Stack.of(device), config or ImageConfig()
         self.isocenter = isocenter_of(anatomy)
-        self.ct = None if ct is None else without_contrast(ct, anatomy)
-        self._guide = catheter_line(anatomy)
         self.lumen_points, self._lumen_size = lumen_points(anatomy)
+        self.ct = None if ct is None else without_contrast(ct, self.lumen_points)
+        self._guide = catheter_line(anatomy)
         self._guide_wall, self._guide_lumen = catheter_points(anatomy), catheter_lumen_points(anatomy)
 
     def plane(

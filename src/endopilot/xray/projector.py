@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Float32
-from scipy.ndimage import gaussian_filter, map_coordinates
+from jaxtyping import Float, Float32, Int
+from scipy.ndimage import gaussian_filter
 
 from endopilot.types import Volume
 from endopilot.xray.absorbers import WATER_MM
@@ -37,14 +37,34 @@ def cast(ct: Volume, view: View, pixels: int, rays: int) -> Float32[np.ndarray, 
     size = np.array(ct.voxels.shape[::-1])
     corners = np.array(np.meshgrid(*([0, n - 1] for n in size))).reshape(3, -1).T
     depths = (ct.index_to_world(corners) - view.source) @ view.axes[2]
-    into = ((direction @ ct.direction) / ct.spacing_mm).astype(np.float32)
-    begin = (((view.source - ct.origin_mm) @ ct.direction) / ct.spacing_mm).astype(np.float32)
-    total = np.zeros((rays, rays), dtype=np.float32)
+    into = ((direction.reshape(-1, 3) @ ct.direction) / ct.spacing_mm).T.astype(np.float32, order="C")
+    begin = (((view.source - ct.origin_mm) @ ct.direction) / ct.spacing_mm)[:, None].astype(np.float32)
+    voxels, total = ct.voxels.astype(np.float32, copy=False), np.zeros(rays * rays, dtype=np.float32)
     for depth in np.arange(depths.min(), depths.max(), _RAY_STEP_MM, dtype=np.float32):
-        index = begin + depth * into
-        values = map_coordinates(ct.voxels, np.moveaxis(index, -1, 0)[::-1], order=1, mode="nearest", output=np.float32)
-        total += np.maximum(1 + values / 1000, 0)
-    return total * np.float32(WATER_MM * _RAY_STEP_MM) * np.linalg.norm(direction, axis=-1).astype(np.float32)
+        total += np.maximum(1 + _between(voxels, begin + depth * into) / 1000, 0)
+    slope = np.linalg.norm(direction, axis=-1).astype(np.float32)
+    return total.reshape(rays, rays) * np.float32(WATER_MM * _RAY_STEP_MM) * slope
+
+
+def _between(voxels: Float32[np.ndarray, "nz ny nx"], index: Float32[np.ndarray, "3 n"]) -> Float32[np.ndarray, "n"]:
+    """Return values between voxels, linearly, and beyond their sides those at the edge; `index` is along x, y and z.
+
+    SciPy's `map_coordinates` does the same in more than three times the time.
+    """
+    last = np.array(voxels.shape[::-1])[:, None] - 1
+    index = np.clip(index, 0, last, dtype=np.float32)
+    low = np.minimum(index.astype(np.intp), np.maximum(last - 1, 0))
+    share = index - low.astype(np.float32)
+    _, ny, nx = voxels.shape
+    flat, step = voxels.ravel(), (1, nx, nx * ny)
+
+    def along(axis: int, at: Int[np.ndarray, "n"]) -> Float32[np.ndarray, "n"]:
+        if axis < 0:
+            return flat.take(at, mode="clip")
+        here, next_ = along(axis - 1, at), along(axis - 1, at + step[axis])
+        return here + share[axis] * (next_ - here)
+
+    return along(2, low[0] + nx * (low[1] + ny * low[2]))
 
 
 def splat(
