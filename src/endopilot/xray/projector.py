@@ -102,10 +102,12 @@ class Shadow:
         placed: Float[np.ndarray, "3 4"] | None = None,
     ) -> None:
         """Project the volumes; arguments as `splat` has."""
-        turn, shift = np.split(np.eye(3, 4) if placed is None else placed, [3], axis=1)
-        shift = view.axes @ (shift - view.source[:, None])
+        onto = np.eye(3, 4) if placed is None else placed.copy()
+        onto[:, 3] -= view.source
         self._pixels, self._count = pixels, len(points)
-        right, up, depth = (view.axes @ turn) @ points.T + shift
+        x, y, z = np.ascontiguousarray(points.T)
+        # Written out: as a product of matrices it is shared among threads, which cost more than they save.
+        right, up, depth = (a * x + b * y + c * z + d for a, b, c, d in view.axes @ onto)
         self._per_mm = per_mm = view.scale / depth
         row, column = pixels / 2 - 0.5 - up * per_mm, pixels / 2 - 0.5 + right * per_mm
         inside = (row > 0) & (row < pixels - 1) & (column > 0) & (column < pixels - 1)
