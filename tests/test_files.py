@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import errno
-import io
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from endopilot.errors import InputError
-from endopilot.files import input_hash, manifest, png_image, read_json, sha256, write_json, writing
+from endopilot.files import input_hash, manifest, read_json, sha256, write_json, writing
 
 
 def test_a_finished_block_leaves_the_file_alone(tmp_path: Path) -> None:
@@ -83,11 +81,3 @@ def test_the_hash_of_a_folder_sees_every_file(tmp_path: Path) -> None:
     before = input_hash(folder)
     (folder / "2").write_text("c")
     assert input_hash(folder) != before
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (7, 5), (6, 4, 3)])
-def test_a_png_holds_the_image(shape):
-    image = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
-    image[1:3] = image[0]
-    content = png_image(image)
-    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(content))), image)
