@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,13 +27,16 @@ TO_CLEAN_UP_S = 5.0
 """Time that a process which is stopped has to remove its half-written files, s; then it is killed."""
 
 
-def each(title: str, items: Sequence[Path], work: Callable[[Path], None]) -> dict[Path, InputError]:
+def each(
+    title: str, items: Sequence[Path], work: Callable[[Path], None], pool: Workers | None = None
+) -> dict[Path, InputError]:
     """Do the same work for every item, in as many processes as there are cores, under one progress bar.
 
     Args:
         title: name of the work, for the progress bar.
         items: files or folders to work on.
         work: a function of a module, or a `functools.partial` of one, since other processes import it.
+        pool: the processes, which go on afterwards; own ones if not given.
 
     Returns:
         The items whose work raised `InputError`, each with its error. Any other exception ends the work and is raised.
@@ -55,8 +59,8 @@ def each(title: str, items: Sequence[Path], work: Callable[[Path], None]) -> dic
                 settle(item, lambda item=item: work(item))
                 advance(remark=item.name)
             return bad
-        with Workers(processes) as pool:
-            futures: dict[Future[None], Path] = {pool.submit(work, item): item for item in items}
+        with nullcontext(pool) if pool else Workers(processes) as running:
+            futures: dict[Future[None], Path] = {running.submit(work, item): item for item in items}
             try:
                 for future in as_completed(futures):
                     settle(futures[future], future.result)
@@ -76,8 +80,8 @@ class Workers(ProcessPoolExecutor):
     workers, which leaves those files, and lets them live on where this process is killed.)
     """
 
-    def __init__(self, processes: int) -> None:
-        """Make ready for so many processes; the first piece of work starts them."""
+    def __init__(self, processes: int = min(CORES, MOST_PROCESSES)) -> None:
+        """Make ready for so many processes; work starts them."""
         # Spawned, since a fork of a process with running threads can deadlock.
         super().__init__(processes, mp_context=multiprocessing.get_context("spawn"), initializer=_follow)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from endopilot.errors import InputError
 from endopilot.files import json_text, read_json, write_json
-from endopilot.parallel import each
+from endopilot.parallel import Workers, each
 
 RECORD_FILE = "run.json"
 _LONGEST_VALUE = 60
@@ -53,18 +53,19 @@ def claim(folder: Path, command: str, **identity: Any) -> None:
     remove_partial_files(folder)
 
 
-def make_missing(title: str, paths: Sequence[Path], make: Callable[[Path], None]) -> None:
+def make_missing(title: str, paths: Sequence[Path], make: Callable[[Path], None], pool: Workers | None = None) -> None:
     """Make those result files of a run that are not there yet, in several processes.
 
     Args:
         title: name of the work, for the progress bar.
         paths: all files of the run.
         make: writes one of them; a function of a module, or a `functools.partial` of one.
+        pool: the processes, as `each` takes them.
 
     Raises:
         InputError: some could not be made, of which the first is named; the others are there.
     """
-    bad = each(title, [path for path in paths if not path.exists()], make)
+    bad = each(title, [path for path in paths if not path.exists()], make, pool)
     if bad:
         path, error = next(iter(bad.items()))
         raise InputError(f"{path}: {error}")

@@ -54,7 +54,7 @@ def frame_entries(
             "image_id": image_id,
             "category_id": category["id"],
             "segmentation": encoded(mask),
-            "area": int(mask.sum()),
+            "area": int(np.count_nonzero(mask)),
             "bbox": box_of(mask),
             "iscrowd": 0,
         }

@@ -19,6 +19,7 @@ from endopilot.angiograms.write import write_cine, write_patient
 from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
 from endopilot.extras import require_extras
+from endopilot.parallel import Workers
 from endopilot.progress import progress
 from endopilot.runs import claim, make_missing
 
@@ -56,17 +57,19 @@ def make_angiograms(
     if all(path.exists() for path in (*described, *layout.patients, *layout.cines)):
         return
     (layout.output / MANIFEST_FILE).unlink(missing_ok=True)
-    _make("Patients", layout.patients, write_patient, layout, scheduler)
-    _make("Making cines", layout.cines, write_cine, layout, scheduler)
+    with Workers() as pool:
+        where = pool if scheduler is None else scheduler
+        _make("Patients", layout.patients, write_patient, layout, where)
+        _make("Making cines", layout.cines, write_cine, layout, where)
     describe(layout)
 
 
 def _make(
-    title: str, paths: Sequence[Path], work: Callable[[Layout, Path], None], layout: Layout, scheduler: str | None
+    title: str, paths: Sequence[Path], work: Callable[[Layout, Path], None], layout: Layout, where: Workers | str
 ) -> None:
-    """Make the folders that are not there yet, on this machine or on a cluster."""
-    if scheduler is None:
-        make_missing(title, paths, partial(work, layout))
+    """Make the folders that are not there yet, in processes of this machine or on the cluster of a scheduler."""
+    if isinstance(where, Workers):
+        make_missing(title, paths, partial(work, layout), where)
         return
     from endopilot.dataset.workers import run_on_cluster  # brings the libraries of data sets
 
@@ -77,4 +80,4 @@ def _make(
     )
     missing = [path.resolve() for path in paths if not path.exists()]
     with progress(title, len(missing)) as advance:
-        run_on_cluster(partial(work, remote), missing, lambda path, _: advance(remark=path.name), scheduler)
+        run_on_cluster(partial(work, remote), missing, lambda path, _: advance(remark=path.name), where)

@@ -61,10 +61,13 @@ def laid_together(masks: Mapping[str, Bool[np.ndarray, "rows columns"]]) -> UInt
 
 def encoded(mask: Bool[np.ndarray, "rows columns"]) -> dict[str, Any]:
     """Return COCO's compressed run lengths of a mask, column after column, as `pycocotools` reads them."""
-    flat = np.asarray(mask.T, order="C").ravel()
-    edges = np.flatnonzero(flat[1:] != flat[:-1]) + 1
-    runs = np.diff(np.concatenate([[0], edges, [flat.size]]))
-    runs = np.concatenate([[0], runs]) if flat[0] else runs  # the first run is of what the mask leaves out
+    used = np.flatnonzero(mask.any(axis=0))
+    left, right = (used[0], used[-1] + 1) if len(used) else (0, 0)
+    flat = np.zeros(1 + (right - left) * len(mask) + 1, dtype=bool)  # between two pixels that the mask leaves out
+    flat[1:-1] = mask[:, left:right].T.ravel()
+    edges = left * len(mask) + np.flatnonzero(flat[1:] != flat[:-1])
+    runs = np.diff(edges, prepend=0, append=mask.size)  # the first is of what the mask leaves out
+    runs = runs if runs[-1] else runs[:-1]
     rest = runs.astype(np.int64)
     rest[3:] = runs[3:] - runs[1:-2]
     digits, used = [], np.ones(len(rest), dtype=bool)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -17,6 +19,8 @@ from endopilot.types import Centerline, VesselTree
 
 _KNOTS = 16
 """Points of each of the left reference courses."""
+_SLAB = 8
+"""Slices of the coarse grid whose depths are computed at once: they stay in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,34 +90,40 @@ def organs(
         generator: random stream of the surfaces' unevenness.
         appendage_mm: the left atrial appendage is wider by this, mm, and touches the coronary walls; 0: it does not.
     """
-    x = heart.to_reference(grid.reshape(-1, 3)).reshape(grid.shape).astype(np.float32)
+    slabs = [
+        heart.to_reference(slab.reshape(-1, 3)).reshape(slab.shape).astype(np.float32)
+        for slab in np.split(grid, range(_SLAB, len(grid), _SLAB))
+    ]
     spacing_mm = float(grid[0, 0, 1, 0] - grid[0, 0, 0, 0])
 
+    def shaped(depth: Callable[..., np.ndarray], *of: Any) -> Float[np.ndarray, "nz ny nx"]:
+        return np.concatenate([depth(slab, *of) for slab in slabs])
+
     def uneven(amplitude_mm: float, extent_mm: float) -> Float32[np.ndarray, "nz ny nx"]:
-        noise = gaussian_filter(generator.standard_normal(x.shape[:3], dtype=np.float32), extent_mm / spacing_mm)
+        noise = gaussian_filter(generator.standard_normal(grid.shape[:3], dtype=np.float32), extent_mm / spacing_mm)
         return amplitude_mm * noise / noise.std()
 
     rough, wavy = uneven(0.7, 3.0), uneven(0.8, 10.0)
-    lv_wall, lv = reference.left_ventricle_wall(x) + wavy, reference.left_ventricle(x) + 1.3 * rough
-    rv, ra, la = reference.right_ventricle(x), reference.right_atrium(x), reference.left_atrium(x)
+    lv_wall, lv = shaped(reference.left_ventricle_wall) + wavy, shaped(reference.left_ventricle) + 1.3 * rough
+    rv, ra, la = shaped(reference.right_ventricle), shaped(reference.right_atrium), shaped(reference.left_atrium)
     rv_wall, rv, ra, la = rv + 3 + wavy, rv + wavy + rough, ra + 0.7 * rough, la + 0.5 * wavy
-    aorta, pulmonary = reference.aorta(x), reference.pulmonary_artery(x)
-    cava, lower_cava = tube(x, _UPPER_CAVA, (8, 8.5, 9)), tube(x, _LOWER_CAVA, (10, 11, 11))
-    veins = np.max([tube(x, line, (6, 5, 3)) for line in _PULMONARY_VEINS], axis=0)
-    appendage = reference.left_appendage(x) + appendage_mm + 0.5 * wavy if appendage_mm > 0 else la
+    aorta, pulmonary = shaped(reference.aorta), shaped(reference.pulmonary_artery)
+    cava, lower_cava = shaped(tube, _UPPER_CAVA, (8, 8.5, 9)), shaped(tube, _LOWER_CAVA, (10, 11, 11))
+    veins = np.max([shaped(tube, line, (6, 5, 3)) for line in _PULMONARY_VEINS], axis=0)
+    appendage = shaped(reference.left_appendage) + appendage_mm + 0.5 * wavy if appendage_mm > 0 else la
     epicardium = np.max([lv_wall, rv_wall, ra + 2, np.maximum(la, appendage) + 2], axis=0)
     large_vessels = np.max([aorta, pulmonary, cava, lower_cava], axis=0)
     pericardium = _close(np.max([epicardium + 2.5, large_vessels + 3, around_vessels], axis=0), 26.0, spacing_mm)
-    bone = _bone(x)
+    bone = shaped(_bone)
     found = (
-        Organ("chest wall", 0.6 * wavy - _chest(x)),
+        Organ("chest wall", 0.6 * wavy - shaped(_chest)),
         Organ("lung vessels", veins),
-        Organ("liver", ellipsoid(x, (-45, -5, -141), (120, 95, 66), (1.0, 0.0, 0.0)) + wavy),
-        Organ("stomach", ellipsoid(x, (80, -5, -122), (55, 60, 42), (1.0, 0.0, 0.0)) + wavy),
+        Organ("liver", shaped(ellipsoid, (-45, -5, -141), (120, 95, 66), (1.0, 0.0, 0.0)) + wavy),
+        Organ("stomach", shaped(ellipsoid, (80, -5, -122), (55, 60, 42), (1.0, 0.0, 0.0)) + wavy),
         Organ("cortical bone", bone),
         Organ("spongy bone", bone - 1.6 + 0.4 * rough),
         Organ("fat", pericardium + 0.5 * wavy),
-        Organ("descending aorta", tube(x, _DESCENDING_AORTA, (11, 11, 10.5))),
+        Organ("descending aorta", shaped(tube, _DESCENDING_AORTA, (11, 11, 10.5))),
         Organ("myocardium", epicardium, 0.9),
         Organ("vessel wall", np.maximum(aorta, pulmonary) + 1.3),
         Organ("right atrium", np.maximum(ra, lower_cava), 2.2),

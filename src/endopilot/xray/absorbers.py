@@ -48,10 +48,9 @@ def surroundings(anatomy: Anatomy) -> Volume | None:
     return make_phantom(anatomy, config=_SURROUNDINGS, seed=0) if is_coronary(anatomy) else None
 
 
-def without_contrast(ct: Volume, anatomy: Anatomy) -> Volume:
-    """Return a CT, HU, with the blood of the vessel as it is without contrast."""
+def without_contrast(ct: Volume, points: Places) -> Volume:
+    """Return a CT, HU, with the blood at the points of the vessel's lumen, LPS mm, as it is without contrast."""
     voxels = ct.voxels.astype(np.float32)
-    points, _ = lumen_points(anatomy)
     index = np.rint(ct.world_to_index(points)).astype(int)[:, ::-1]
     index = index[((index >= 0) & (index < voxels.shape)).all(axis=1)]
     at = tuple(index.T)
@@ -65,9 +64,11 @@ def lumen_points(anatomy: Anatomy) -> tuple[Places, Float[np.ndarray, "n"]]:
     What lies behind the ostium is the catheter, which the distance map holds too; it is left out.
     """
     lumen, start = anatomy.distance_map, anatomy.insertion
-    share = np.clip(np.asarray(lumen.values) / lumen.spacing_mm + 0.5, 0, 1)
-    index = np.argwhere(share > 0)
-    points, size = lumen.origin_mm + index[:, ::-1] * lumen.spacing_mm, share[tuple(index.T)] * lumen.spacing_mm**3
+    share = np.asarray(lumen.values) / lumen.spacing_mm + 0.5
+    within = np.flatnonzero(share > 0)
+    index = np.stack(np.unravel_index(within, share.shape)[::-1], axis=-1)
+    points = lumen.origin_mm + index * lumen.spacing_mm
+    size = np.minimum(share.ravel()[within], 1) * lumen.spacing_mm**3
     behind = (points - start.position) @ start.direction
     aside = np.linalg.norm(points - start.position - behind[:, None] * start.direction, axis=1)
     vessel = (behind >= 0) | (aside > anatomy.catheter_radius_mm + lumen.spacing_mm)

@@ -155,10 +155,10 @@ class XrayImager:
         """
         self.anatomy, self.stack, self.config = anatomy, Stack.of(device), config or ImageConfig()
         self.isocenter = isocenter_of(anatomy)
-        self.ct = None if ct is None else without_contrast(ct, anatomy)
-        self._guide = catheter_line(anatomy)
         self.lumen_points, self._lumen_size = lumen_points(anatomy)
-        self._guide_lumen = catheter_lumen_points(anatomy)
+        self.ct = None if ct is None else without_contrast(ct, self.lumen_points)
+        self._guide = catheter_line(anatomy)
+        self._guide_wall, self._guide_lumen = catheter_points(anatomy), catheter_lumen_points(anatomy)
 
     def plane(
         self,
@@ -226,9 +226,9 @@ class XrayImager:
         self, view: View, zoom_factor: float, placed: Float[np.ndarray, "3 4"]
     ) -> Float32[np.ndarray, "rows columns"]:
         """Return the attenuation of the guiding catheter's wall along each ray; arguments as `plane_through` has."""
-        points, size = catheter_points(self.anatomy)
+        points, size = self._guide_wall
         blur = self.blur_px(zoom_factor)
-        return splat(view, self.config.pixels, place(placed, points), size * CATHETER_MM, blur_px=blur)
+        return splat(view, self.config.pixels, points, size * CATHETER_MM, placed=placed, blur_px=blur)
 
     def guide_lumen(
         self, view: View, zoom_factor: float, placed: Float[np.ndarray, "3 4"]
@@ -236,7 +236,7 @@ class XrayImager:
         """Return the path of each ray inside the guiding catheter, mm; arguments as `plane_through` has."""
         points, size = self._guide_lumen
         blur = self.blur_px(zoom_factor)
-        return splat(view, self.config.pixels, place(placed, points), size, width_mm=0.1, blur_px=blur)
+        return splat(view, self.config.pixels, points, size, placed=placed, width_mm=0.1, blur_px=blur)
 
     def lumen(
         self,
@@ -253,7 +253,7 @@ class XrayImager:
                 and the standard deviation of the detector's blur, pixels.
         """
         width = self.anatomy.distance_map.spacing_mm / 2
-        shadow = Shadow(view, self.config.pixels, place(placed, self.lumen_points))
+        shadow = Shadow(view, self.config.pixels, self.lumen_points, placed)
         return [shadow.of(share * self._lumen_size, width_mm=width, blur_px=blur) for share, blur in parts]
 
     def signal(
@@ -295,14 +295,15 @@ class XrayImager:
             attenuation += self._moving(plane, partial(self.catheter, number=number), line, its_velocity)
         if contrast > 0:
             attenuation += np.float32(contrast * config.iodine_mm) * plane.vessel_mm
-        light = np.exp(-attenuation)
+        light = np.exp(np.negative(attenuation, out=attenuation), out=attenuation)
         light += plane.scatter
         light *= np.float32(np.exp(-plane.reference))
         if noise is None:
             noise = np.random.default_rng([seed, 0x78726179]).standard_normal(light.shape, dtype=np.float32)
         noise = noise / np.sqrt(light * np.float32(self.photons(plane, dose)))
         per_mm = plane.zoom / config.geometry.pixel_mm
-        read = np.log(light) + blurred(noise, config.scintillator_mm * per_mm)
+        read = np.log(light)
+        read += blurred(noise, config.scintillator_mm * per_mm)
         if config.electronic_noise_ugy > 0:  # it is white, and grows in dark parts as one over the light
             random = np.random.default_rng([seed, 0x656C6563])
             share = config.electronic_noise_ugy / (config.detector_ugy * dose * self.photons(plane, dose))
@@ -333,38 +334,51 @@ class XrayImager:
             value = value + _ROADMAP_GREY * (1 - np.exp(-np.float32(self.config.iodine_mm) * roadmap))
         return np.clip(value, 0, 255).astype(np.uint8)
 
-    def wire(self, plane: Plane, nodes: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "rows columns"]:
-        """Return the attenuation of a wire along each ray.
+    def wire(self, plane: Plane, *lines: Float[np.ndarray, "_ 3"]) -> Float32[np.ndarray, "rows columns"]:
+        """Return the attenuation of a wire along each ray, mean over some places of it.
 
         Args:
             plane: the view.
-            nodes: of the wire from its tip on, LPS mm.
+            lines: nodes of the wire from its tip on at each place, LPS mm.
         """
         radius = self.stack.wire.tip_radius_mm
         step_mm = _WIRE_STEP_MM * max(1.0, self.config.geometry.pixel_mm / CArmGeometry().pixel_mm)
-        points, size = wire_points(
-            in_catheter(self.anatomy, nodes, self._guide), radius, self.config.opaque_tip_mm, step_mm
-        )
-        blur = self.blur_px(plane.zoom)
-        points = place(plane.placed, points)
-        return splat(plane.view, self.config.pixels, points, size, width_mm=radius / 2, blur_px=blur)
+        draw = partial(wire_points, radius_mm=radius, opaque_tip_mm=self.config.opaque_tip_mm, step_mm=step_mm)
+        return self._device(plane, draw, lines, radius / 2)
 
     def catheter(
-        self, plane: Plane, nodes: Float[np.ndarray, "n 3"], number: int = 0
+        self, plane: Plane, *lines: Float[np.ndarray, "_ 3"], number: int = 0
     ) -> Float32[np.ndarray, "rows columns"]:
-        """Return the attenuation of a catheter that is driven around the wire along each ray.
+        """Return the attenuation of a catheter that is driven around the wire along each ray, as `wire` does.
 
         Args:
             plane: the view.
-            nodes: of its axis from its tip on, LPS mm.
+            lines: nodes of its axis from its tip on at each place, LPS mm.
             number: which one, from the inside out.
         """
         catheter = self.stack.catheters[number]
-        points, size = driven_catheter_points(catheter, in_catheter(self.anatomy, nodes, self._guide))
         wall_mm = catheter.tip_radius_mm - catheter.inner_diameter_mm / 2
-        blur = self.blur_px(plane.zoom)
-        points = place(plane.placed, points)
-        return splat(plane.view, self.config.pixels, points, size, width_mm=wall_mm / np.sqrt(12), blur_px=blur)
+        return self._device(plane, partial(driven_catheter_points, catheter), lines, wall_mm / np.sqrt(12))
+
+    def _device(
+        self,
+        plane: Plane,
+        draw: Callable[[Float[np.ndarray, "n 3"]], tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]],
+        lines: Sequence[Float[np.ndarray, "_ 3"]],
+        width_mm: float,
+    ) -> Float32[np.ndarray, "rows columns"]:
+        """Return the attenuation of a device, of which `draw` makes small volumes of `width_mm`, as `wire` does."""
+        drawn = [draw(in_catheter(self.anatomy, nodes, self._guide)) for nodes in lines]
+        points, sizes = (np.concatenate(each) for each in zip(*drawn, strict=True))
+        return splat(
+            plane.view,
+            self.config.pixels,
+            points,
+            sizes / len(lines),
+            placed=plane.placed,
+            width_mm=width_mm,
+            blur_px=self.blur_px(plane.zoom),
+        )
 
     def air_kerma_ugy(self, plane: Plane, dose: float) -> float:
         """Return the air kerma of a frame at the patient's entrance reference point, µGy."""
@@ -381,7 +395,7 @@ class XrayImager:
     def _moving(
         self,
         plane: Plane,
-        draw: Callable[[Plane, Float[np.ndarray, "n 3"]], Float32[np.ndarray, "rows columns"]],
+        draw: Callable[..., Float32[np.ndarray, "rows columns"]],
         nodes: Float[np.ndarray, "n 3"],
         velocity: Float[np.ndarray, "n 3"] | None,
     ) -> Float32[np.ndarray, "rows columns"]:
@@ -391,8 +405,7 @@ class XrayImager:
         path_px = float(np.linalg.norm(velocity, axis=1).max()) * self.config.pulse_s
         path_px *= plane.view.scale / self.config.geometry.source_to_isocenter_mm
         times = self.config.pulse_s * (np.arange(count := min(1 + int(2 * path_px), _MOST_PULSES)) + 0.5) / count
-        drawn = [draw(plane, nodes - time * velocity) for time in times]
-        return np.asarray(np.mean(drawn, axis=0), dtype=np.float32)
+        return draw(plane, *(nodes - time * velocity for time in times))
 
     def blur_px(self, zoom_factor: float) -> float:
         """Return the blur of focal spot and scintillator, standard deviation, pixels of the image."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Float32
-from scipy.ndimage import gaussian_filter, map_coordinates
+from jaxtyping import Float, Float32, Int
+from scipy.ndimage import gaussian_filter
 
 from endopilot.types import Volume
 from endopilot.xray.absorbers import WATER_MM
@@ -15,6 +15,10 @@ from endopilot.xray.carm import View
 _RAY_STEP_MM = 1.5
 _SHARP_PX = 0.17
 """A Gaussian of a standard deviation below this leaves all of a pixel in it, to a part in 10⁷."""
+
+_APART = 8
+"""So many pixels lie between the rows of an image that is blurred: columns of one whose rows are a power of two apart
+compete for the same lines of the processor's cache, which doubles the time."""
 
 
 def cast(ct: Volume, view: View, pixels: int, rays: int) -> Float32[np.ndarray, "rays rays"]:
@@ -33,14 +37,34 @@ def cast(ct: Volume, view: View, pixels: int, rays: int) -> Float32[np.ndarray, 
     size = np.array(ct.voxels.shape[::-1])
     corners = np.array(np.meshgrid(*([0, n - 1] for n in size))).reshape(3, -1).T
     depths = (ct.index_to_world(corners) - view.source) @ view.axes[2]
-    into = ((direction @ ct.direction) / ct.spacing_mm).astype(np.float32)
-    begin = (((view.source - ct.origin_mm) @ ct.direction) / ct.spacing_mm).astype(np.float32)
-    total = np.zeros((rays, rays), dtype=np.float32)
+    into = ((direction.reshape(-1, 3) @ ct.direction) / ct.spacing_mm).T.astype(np.float32, order="C")
+    begin = (((view.source - ct.origin_mm) @ ct.direction) / ct.spacing_mm)[:, None].astype(np.float32)
+    voxels, total = ct.voxels.astype(np.float32, copy=False), np.zeros(rays * rays, dtype=np.float32)
     for depth in np.arange(depths.min(), depths.max(), _RAY_STEP_MM, dtype=np.float32):
-        index = begin + depth * into
-        values = map_coordinates(ct.voxels, np.moveaxis(index, -1, 0)[::-1], order=1, mode="nearest", output=np.float32)
-        total += np.maximum(1 + values / 1000, 0)
-    return total * np.float32(WATER_MM * _RAY_STEP_MM) * np.linalg.norm(direction, axis=-1).astype(np.float32)
+        total += np.maximum(1 + _between(voxels, begin + depth * into) / 1000, 0)
+    slope = np.linalg.norm(direction, axis=-1).astype(np.float32)
+    return total.reshape(rays, rays) * np.float32(WATER_MM * _RAY_STEP_MM) * slope
+
+
+def _between(voxels: Float32[np.ndarray, "nz ny nx"], index: Float32[np.ndarray, "3 n"]) -> Float32[np.ndarray, "n"]:
+    """Return values between voxels, linearly, and beyond their sides those at the edge; `index` is along x, y and z.
+
+    SciPy's `map_coordinates` does the same in more than three times the time.
+    """
+    last = np.array(voxels.shape[::-1])[:, None] - 1
+    index = np.clip(index, 0, last, dtype=np.float32)
+    low = np.minimum(index.astype(np.intp), np.maximum(last - 1, 0))
+    share = index - low.astype(np.float32)
+    _, ny, nx = voxels.shape
+    flat, step = voxels.ravel(), (1, nx, nx * ny)
+
+    def along(axis: int, at: Int[np.ndarray, "n"]) -> Float32[np.ndarray, "n"]:
+        if axis < 0:
+            return flat.take(at, mode="clip")
+        here, next_ = along(axis - 1, at), along(axis - 1, at + step[axis])
+        return here + share[axis] * (next_ - here)
+
+    return along(2, low[0] + nx * (low[1] + ny * low[2]))
 
 
 def splat(
@@ -49,6 +73,7 @@ def splat(
     points: Float[np.ndarray, "n 3"],
     volume: Float[np.ndarray, "n"] | float,
     *,
+    placed: Float[np.ndarray, "3 4"] | None = None,
     width_mm: float = 0.0,
     blur_px: float = 0.0,
 ) -> Float32[np.ndarray, "pixels pixels"]:
@@ -59,55 +84,66 @@ def splat(
         pixels: of the image along a side.
         points: places, LPS mm.
         volume: mm³, or mm² where it is weighted by an attenuation.
+        placed: affine map that moves the points first, LPS mm.
         width_mm: standard deviation of each in space, mm.
         blur_px: standard deviation of the detector's blur, pixels.
     """
-    return Shadow(view, pixels, points).of(volume, width_mm=width_mm, blur_px=blur_px)
+    return Shadow(view, pixels, points, placed).of(volume, width_mm=width_mm, blur_px=blur_px)
 
 
 class Shadow:
     """Where small volumes fall on the detector, for the line integrals of several quantities of them."""
 
-    def __init__(self, view: View, pixels: int, points: Float[np.ndarray, "n 3"]) -> None:
-        """Project the volumes.
-
-        Args:
-            view: source and detector.
-            pixels: of the image along a side.
-            points: places, LPS mm.
-        """
+    def __init__(
+        self,
+        view: View,
+        pixels: int,
+        points: Float[np.ndarray, "n 3"],
+        placed: Float[np.ndarray, "3 4"] | None = None,
+    ) -> None:
+        """Project the volumes; arguments as `splat` has."""
+        onto = np.eye(3, 4) if placed is None else placed.copy()
+        onto[:, 3] -= view.source
         self._pixels, self._count = pixels, len(points)
-        in_view = (points - view.source) @ view.axes.T
-        self._per_mm = view.scale / in_view[:, 2]
-        row, column = pixels / 2 - 0.5 - in_view[:, 1] * self._per_mm, pixels / 2 - 0.5 + in_view[:, 0] * self._per_mm
+        x, y, z = np.ascontiguousarray(points.T)
+        # Written out: as a product of matrices it is shared among threads, which cost more than they save.
+        right, up, depth = (a * x + b * y + c * z + d for a, b, c, d in view.axes @ onto)
+        self._per_mm = per_mm = view.scale / depth
+        row, column = pixels / 2 - 0.5 - up * per_mm, pixels / 2 - 0.5 + right * per_mm
         inside = (row > 0) & (row < pixels - 1) & (column > 0) & (column < pixels - 1)
-        self._inside = np.flatnonzero(inside)
-        if len(self._inside) < len(points):
-            row, column = row[self._inside], column[self._inside]
-        self._corner = np.floor(row).astype(int), np.floor(column).astype(int)
-        self._rest = row - self._corner[0], column - self._corner[1]
+        self._inside = slice(None) if inside.all() else np.flatnonzero(inside)
+        row, column = row[self._inside], column[self._inside]
+        upper, left = row.astype(int), column.astype(int)
+        self._down, self._right = row - upper, column - left
+        self._low = low = [int(corner.min(initial=pixels)) for corner in (upper, left)]
+        self._shape = [
+            int(corner.max(initial=-1)) + 2 - least for corner, least in zip((upper, left), low, strict=True)
+        ]
+        self._first = (upper - low[0]) * self._shape[1] + (left - low[1])
 
     def of(
         self, volume: Float[np.ndarray, "n"] | float, *, width_mm: float = 0.0, blur_px: float = 0.0
     ) -> Float32[np.ndarray, "pixels pixels"]:
         """Return line integrals of the volumes; arguments as `splat` has."""
-        pixels = self._pixels
-        image = np.zeros((pixels, pixels), dtype=np.float32)
-        if not len(self._inside):
+        image = np.zeros((self._pixels, self._pixels), dtype=np.float32)
+        if not len(self._first):
             return image
         mass = (np.broadcast_to(volume, self._count) * self._per_mm**2)[self._inside]
+        lower = mass * self._down
+        mass -= lower
         sigma = float(np.hypot(width_mm * self._per_mm.mean(), blur_px))
         reach = int(4 * sigma) + 1
-        low = [max(int(corner.min()) - reach, 0) for corner in self._corner]
-        high = [min(int(corner.max()) + 2 + reach, pixels) for corner in self._corner]
-        rows, columns = high[0] - low[0], high[1] - low[1]
-        first = (self._corner[0] - low[0]) * columns + (self._corner[1] - low[1])
-        box = np.zeros(rows * columns)
-        for down in (0, 1):
-            for right in (0, 1):
-                share = np.abs(1 - down - self._rest[0]) * np.abs(1 - right - self._rest[1])
-                box += np.bincount(first + (down * columns + right), mass * share, minlength=rows * columns)
-        image[low[0] : high[0], low[1] : high[1]] = blurred(box.reshape(rows, columns), sigma, mode="constant")
+        rows, columns = self._shape
+        begin = [max(low - reach, 0) for low in self._low]
+        end = [min(low + n + reach, self._pixels) for low, n in zip(self._low, self._shape, strict=True)]
+        box = np.zeros((end[0] - begin[0], end[1] - begin[1]))
+        corner = box[self._low[0] - begin[0] :, self._low[1] - begin[1] :]
+        for down, part in enumerate((mass, lower)):
+            beside = part * self._right
+            for right, share in enumerate((part - beside, beside)):
+                laid = np.bincount(self._first, share, minlength=rows * columns).reshape(rows, columns)
+                corner[down:rows, right:columns] += laid[: rows - down, : columns - right]
+        image[begin[0] : end[0], begin[1] : end[1]] = blurred(box, sigma, mode="constant")
         return image
 
 
@@ -117,4 +153,9 @@ def blurred(
     mode: Literal["constant", "reflect"] = "reflect",
 ) -> Float[np.ndarray, "rows columns"] | Float32[np.ndarray, "rows columns"]:
     """Return an image, blurred by a standard deviation in pixels, which may be too small to change it."""
-    return image if sigma_px < _SHARP_PX else np.asarray(gaussian_filter(image, sigma_px, mode=mode))
+    if sigma_px < _SHARP_PX:
+        return image
+    rows, columns = image.shape
+    apart = np.empty((rows, columns + _APART), image.dtype)[:, :columns]
+    apart[:] = image
+    return np.asarray(gaussian_filter(apart, sigma_px, mode=mode, output=apart))
