@@ -7,8 +7,6 @@ that is found bounds the pose.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float, Float32
 
@@ -20,7 +18,7 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import surroundings
 from endopilot.xray.carm import Pose, view_at
-from endopilot.xray.detector import TipDetector
+from endopilot.xray.detector import Signal, TipDetector
 from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement, measurement_at
 from endopilot.xray.image import ImageConfig, Plane, XrayImager
 from endopilot.xray.motion_registration import register_motion, take_run
@@ -148,7 +146,7 @@ class ImageFluoroscope:
         image = signals, photons, inserted_length
         empty = self._before
         found = self._detector.find(self.refiner.views(self._views), *image, self._slack_mm, empty)
-        beside = self._beside(found, *image) if self.known_motion is not None else None
+        beside = self._beside(found, image) if self.known_motion is not None else None
         found = beside or found
         if found is None:
             return None
@@ -159,10 +157,10 @@ class ImageFluoroscope:
             found = self._detector.find(self.refiner.views(self._views), *image, before=empty) or found
         return measurement_at(self._project, self._anatomy, found.position[None], found.covariance[None])
 
-    def _beside(self, found: TipEstimate | None, *image: Any) -> TipEstimate | None:
+    def _beside(self, found: TipEstimate | None, image: tuple[list[Signal], list[float], float]) -> TipEstimate | None:
         """Return the tip of a wire that lies where the known motion does not take the vessel; None if it does not."""
         slack_mm = max(_MOVING_SLACK_MM, self._slack_mm)
-        beside = self._detector.find(self.refiner.views(self._views), *image, slack_mm, self._before)
+        beside = self._detector.find(self.refiner.views(self._views), *image, slack_mm=slack_mm, before=self._before)
         if beside is None or (found is not None and beside.log_odds < found.log_odds + _LIKELIER):
             return None
         return beside
