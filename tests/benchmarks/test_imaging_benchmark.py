@@ -78,7 +78,7 @@ def test_only_missing_cases_are_measured(tmp_path, monkeypatch):
     write(tmp_path, [GOOD])
     asked = []
 
-    def measured(title, paths, work):
+    def measured(title, paths, work, pool):
         asked.extend(path.name for path in paths)
         write(tmp_path, [GOOD] * 3)
         return {}

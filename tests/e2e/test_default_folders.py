@@ -15,7 +15,7 @@ LADDER = ("ladder", "--mismatch", "0.2", "--policy", "forward", "--tasks", "stra
 BENCH = ("robustness", "--rollouts", "1", "--anatomies", "1", "--seconds", "5", "--threads", "1")
 
 
-def here(title, items, work):
+def here(title, items, work, pool):
     """Do the work in this process."""
     for item in items:
         work(item)

@@ -57,7 +57,7 @@ def test_pushing_solves_the_straight_run(climbed):
 def test_an_interrupted_run_goes_on_with_what_is_missing(climbed, monkeypatch):
     folder, rows = climbed
     asked = []
-    monkeypatch.setattr(runs, "each", lambda title, items, work: asked.extend(items) or {})
+    monkeypatch.setattr(runs, "each", lambda title, items, work, pool: asked.extend(items) or {})
     assert climb(output=folder, config=LadderConfig(policy="forward", tasks=("straight",), patients=1)) == rows
     assert asked == []
 

@@ -63,7 +63,7 @@ def test_an_interrupted_run_goes_on_and_another_share_needs_another_folder(measu
     folder, rows = measured
     monkeypatch.setattr(mismatches, "CASES", ("matched", "ostium-more", "all"))
     asked = []
-    monkeypatch.setattr(runs, "each", lambda title, items, work: asked.extend(items) or {})
+    monkeypatch.setattr(runs, "each", lambda title, items, work, pool: asked.extend(items) or {})
     assert measure_mismatch(folder, ONE, 0.2) == rows and asked == []
     with pytest.raises(InputError, match=r"was begun with mismatch = 0\.2, now it is 0\.3"):
         measure_mismatch(folder, ONE, 0.3)

@@ -73,8 +73,8 @@ def test_the_twin_knows_nobody(toy_dataset, own, tmp_path):
 
 def test_the_packaged_model_names_its_patients():
     record = read_json(run_path(Path(PRETRAINED)) / "manifest.json")
-    assert len(set(record["patients"])) == 145  # as its model card says
-    assert record["episodes"]["train"] == 145 * (7 + 1)  # of 8 and 2 navigations each, one of either is held out
+    assert len(set(record["patients"])) == 44 + 21  # as its model card says: at rest, and moving
+    assert record["episodes"]["train"] == 44 * (4 + 4) + 21 * 3  # one of five is held out; one in each of four worlds
 
 
 @pytest.mark.parametrize(
