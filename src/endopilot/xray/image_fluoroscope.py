@@ -146,15 +146,18 @@ class ImageFluoroscope:
         image = signals, photons, inserted_length
         empty = self._before
         found = self._detector.find(self.refiner.views(self._views), *image, self._slack_mm, empty)
-        beside = self._beside(found, image) if self.known_motion is not None else None
-        found = beside or found
+        if self.known_motion is not None and (beside := self._beside(found, image)) is not None:
+            return self._measured(beside)
         if found is None:
             return None
         before, moved_mm = self.refiner.pose, 0.0
-        if refine and found.status == "found" and beside is None:
+        if refine and found.status == "found":
             moved_mm = vessel_error_mm(self._anatomy, before, self.refiner.refine(self._views, found, self._slack_mm))
-        if moved_mm > _MOVED_MM or (self._slack_mm > self._detector.config.slack_mm and beside is None):
+        if moved_mm > _MOVED_MM or self._slack_mm > self._detector.config.slack_mm:
             found = self._detector.find(self.refiner.views(self._views), *image, before=empty) or found
+        return self._measured(found)
+
+    def _measured(self, found: TipEstimate) -> TipMeasurement:
         return measurement_at(self._project, self._anatomy, found.position[None], found.covariance[None])
 
     def _beside(self, found: TipEstimate | None, image: tuple[list[Signal], list[float], float]) -> TipEstimate | None:
