@@ -476,6 +476,19 @@ def test_a_wire_that_should_have_arrived_goes_by_the_image(side_branch) -> None:
         assert seen.expose and seen.devices[0] == pytest.approx((translation, 0.0))
 
 
+def test_a_wire_beside_its_target_gets_another_course(side_branch) -> None:
+    """A second rule of a task asks for more than the right place along the vessel."""
+    policy = AgentPolicy(QUICK)
+    policy.start(side_branch, 0)
+    shown, here = measured(policy.belief, 0), float(policy.belief.tip.abscissa[0])
+    for near_mm, goes_on in ((None, False), (0.01, True)):
+        policy.start(replace(side_branch, target=Target(branch=0, abscissa=here, near_mm=near_mm)), 0)
+        policy._search.find = lambda *_, **__: nowhere_to_go()
+        policy.decide(Observation(0.0, ((2.0, 0.0),), None))
+        policy.decide(Observation(0.5, ((2.0, 0.0),), shown))
+        assert (policy._follower.course is None) == goes_on
+
+
 def test_a_course_may_begin_with_a_turn(side_branch) -> None:
     policy = OraclePolicy(config=QUICK)
     policy.start(side_branch, 0)

@@ -43,6 +43,16 @@ def test_a_waypoint_is_passed_in_the_right_branch_alone(route):
     assert route.next_waypoint(10.0) == 22.5 and route.next_waypoint(24.0) == 35.0
 
 
+def test_a_second_rule_asks_for_a_straight_distance_too(route):
+    """1.2 mm along the vessel and 0.5 mm beside it are √(1.2² + 0.5²) = 1.3 mm."""
+    out, side = np.array([np.sin(np.pi / 3), 0, np.cos(np.pi / 3)]), np.array([0.0, 1.0, 0.0])
+    tip = tips(route, np.array([0, 0, 20.0]) + (15.0 - 1.2) * out + 0.5 * side)
+    for near_mm, there in ((None, True), (1.35, True), (1.25, False)):
+        target = replace(route.target, near_mm=near_mm)
+        assert target.reached(tip[:, None]).tolist() == [there]
+        assert replace(route, target=target).passed(tip, 35.0).tolist() == [there]
+
+
 def test_the_waypoint_of_a_short_branch_lies_before_its_end(fork):
     """A branch of 2 mm between two forks, in a vessel of 1 mm: its end comes before 1.5 mm beyond the parent's wall."""
     axis = np.arange(0.0, 41.0)[:, None] * np.array([0.0, 0.0, 0.5])

@@ -27,7 +27,7 @@ def test_a_made_up_arch_becomes_a_task_with_the_benchmarks_wire(tmp_path):
     np.testing.assert_allclose(wire.bend_stiffness_n_mm2[::2], [0.2, 2.46], atol=0.01)
     np.testing.assert_allclose([np.degrees(wire.tip_bend_rad), wire.tip_bend_length_mm], [72, 15.2], atol=0.01)
     assert (wire.max_velocity_mm_s, wire.max_rotation_rad_s, wire.friction) == (35.0, 3.14, 0.1)
-    assert navigation.near_mm == 5.0 and navigation.seconds == pytest.approx(1000 / 7.5)
+    assert navigation.target.near_mm == 5.0 and navigation.seconds == pytest.approx(1000 / 7.5)
     np.testing.assert_allclose(direction, [0, 0, 1], atol=1e-9)
     np.testing.assert_allclose(navigation.target.position(navigation.anatomy), [32, 0, 74], atol=0.5)
 

@@ -144,7 +144,7 @@ def test_a_folder_of_tasks_has_its_own_anatomies_targets_and_wire(tmp_path):
     navigation = task.ladder_navigation(1)
     place = navigation.target.position(navigation.anatomy)
     assert np.linalg.norm(place - task.targets_mm[1]) < 0.5 and place[2] == pytest.approx(30, abs=0.5)
-    assert navigation.device.name == "workhorse-014" and navigation.near_mm == 5.0
+    assert navigation.device.name == "workhorse-014" and navigation.target.near_mm == 5.0
     assert len({task.ladder_navigation(number).start_rotation_rad for number in (0, 1)}) == 2
     with pytest.raises(InputError, match="no patients to learn on; add training"):
         task.patient(task.training, 0)

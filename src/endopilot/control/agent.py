@@ -27,7 +27,7 @@ from endopilot.navigation.policy import Decision, Observation
 from endopilot.progress import Advance
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
-from endopilot.tasks.route import Route, check_passable
+from endopilot.tasks.route import NEAR_MM, Route, check_passable
 from endopilot.xray.fluoroscope import TipMeasurement
 
 _WIRE_CREEP_MM_S = 2.0
@@ -195,7 +195,10 @@ class _PlanningPolicy:
         if self._arrived and arriving:
             return self._creep()
         if self._arrived and self._measured is not None:  # no wire says what is wrong; the image does
-            left = (self.navigation.target.abscissa - self._measured.abscissa) / DECISION_PERIOD_S
+            along_mm = self.navigation.target.abscissa - self._measured.abscissa
+            if self.navigation.target.near_mm and abs(along_mm) <= NEAR_MM:  # beside the target: another course
+                self._follower.begin(None)
+            left = along_mm / DECISION_PERIOD_S
             return self._follower.move([float(np.clip(left, -_WIRE_CREEP_MM_S, _WIRE_CREEP_MM_S))])
         if self._follower.ended:
             self._shows = not self._search.draws  # another look, before another search

@@ -20,8 +20,8 @@ class Course:
     Attributes:
         control: (mm/s, rad/s) of each device in each decision period.
         proximal: inserted length (mm) and rotation (rad) of each device at the end of each period, as encoders tell.
-        tip: of the wires then, a column a wire.
-        force: largest wall force on a node, N.
+        tip: of the wires then, a column a wire; those that the course leaves behind are not among them.
+        force: largest wall force on a node, N, of all wires.
         checked: whether a wire that is elsewhere then has left the course.
         exposed: whether X-ray is to show where a manoeuvre has led.
         reached: whether they end at the target, by weight: 1 if all do.

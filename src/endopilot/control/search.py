@@ -122,18 +122,31 @@ class Search:
             if (course.reached > 0.5 and course.force.max(initial=0.0) <= gentle_n) or self._at_fork:
                 break
         assert best is not None
+        if best.reached <= 0.5 and self._behind_mm > 0:
+            course = self.find_turned(belief, 0.0, seconds=seconds, advance=advance, out=True)
+            if course.reached > 0.5:
+                return course
         self.halt = halt
         return best
 
-    def find_turned(self, belief: Belief, angle: float, *, seconds: float, advance: Advance | None = None) -> Course:
-        """Find a course that begins with a turn of the devices, rad; the other arguments are those of `find`."""
+    def find_turned(
+        self, belief: Belief, angle: float, *, seconds: float, advance: Advance | None = None, out: bool = False
+    ) -> Course:
+        """Find a course that begins with a turn of the devices, rad; the other arguments are those of `find`.
+
+        Args:
+            out: whether a wire alone is first pulled back to before the last fork that it has passed.
+        """
         course, reported, settled = self._course, 0.0, []
         source, weight = belief.likeliest()
         course.put(source, belief.simulator, weight)
+        self._behind_mm = self._before_fork()
         self.halt, self._at_fork = "", False
         self._periods = max(1, int(seconds / DECISION_PERIOD_S)) if self._alone else _ENDLESS
         if angle:
             turn(course, np.array([angle]), periods=self._periods)
+        while out and self._here() > self._behind_mm and course.lengths[:, WIRE].min() > 1.0 and self._left > 0:
+            course.move(course.control(Move(WIRE, -self.config.speed_mm_s)))
         places = self._places()
         while len(course.rows) < self._periods:
             here = self._here()
@@ -326,6 +339,17 @@ class Search:
                 course.move(course.control(Move(WIRE, min(speed, (begin - here) / DECISION_PERIOD_S))))
             else:
                 return
+
+    def _before_fork(self) -> float:
+        """Return a place before the last fork that a wire alone in a wide lumen has passed, mm; 0 if there is none.
+
+        Pulled back to there, what lies in loops behind the fork comes out, and the wire goes in otherwise.
+        """
+        route = self.route
+        if not (self._alone and route.is_wide(route.target.abscissa)):
+            return 0.0
+        fork = float(route.junctions[route.junctions < self._here()].max(initial=0.0))
+        return fork - stand_off(route, fork, self.config.lead_mm) if fork else 0.0
 
     def _drawn(self, waypoint: float, kept: Kept) -> bool:
         """Let candidates draw their motions, and follow the best; return whether it passes the next place.

@@ -257,12 +257,13 @@ class Trials:
         """
         ends = np.isin(np.arange(len(self.rows)), settled or ())
         columns = {name: np.array([getattr(row.tip, name) for row in self.rows]) for name in _TIP}
+        columns = {name: column.reshape(-1, self.wires)[:, self.counted] for name, column in columns.items()}
         columns["branch"] = columns["branch"].astype(int)
         proximal = np.array([row.proximal[0] for row in self.rows]).reshape(-1, self.devices, 2)
         return Course(
             control=np.array([row.control[0] for row in self.rows]).reshape(-1, self.devices, 2),
             proximal=proximal - [ostium_mm, 0.0],
-            tip=TipProjection(**{name: column.reshape(-1, self.wires) for name, column in columns.items()}),
+            tip=TipProjection(**columns),
             force=np.array([row.force for row in self.rows]).reshape(-1, self.wires),
             checked=np.ones_like(ends) if settled is None else ends,
             exposed=ends,

@@ -68,6 +68,7 @@ class Episodes:
         targets = [navigation.target for navigation in navigations]
         self._target_branch = np.array([target.branch for target in targets])
         self._target_abscissa = np.array([target.abscissa for target in targets])
+        self._near_mm = np.array([target.near_mm or np.inf for target in targets])
         self._most_steps = np.array([navigation.periods(CONTROL_PERIOD_S) for navigation in navigations])
         self._seconds = np.array([navigation.seconds for navigation in navigations])
         self.force_limit_n = np.array([navigation.force_limit_n for navigation in navigations])
@@ -121,7 +122,7 @@ class Episodes:
         return np.where(fresh, 0.0, rewards), terminations, truncations
 
     def _success(self, now: Measured) -> Bool[np.ndarray, "worlds"]:
-        return reached(now.tip[:, : self._counted], self._target_branch, self._target_abscissa)
+        return reached(now.tip[:, : self._counted], self._target_branch, self._target_abscissa, self._near_mm)
 
     def infos(self, now: Measured) -> dict[str, Any]:
         """Return what stands in the info of every world, as `NavigateVectorEnv` names it."""

@@ -226,9 +226,9 @@ def _figures(navigation: Navigation, record: NavigationRecord, recording: Record
         "peak_force_n": record.peak_force_n,
         "exposures": record.exposures,
     }
-    if navigation.near_mm is not None:
+    if navigation.target.near_mm is not None:
         away = record.tip_position[:, navigation.arriving] - navigation.target.position(navigation.anatomy)
-        scored["near"] = bool(np.linalg.norm(away, axis=-1).min() <= navigation.near_mm)
+        scored["near"] = bool(np.linalg.norm(away, axis=-1).min() <= navigation.target.near_mm)
     if recording.believed_mm is not None:
         radius = navigation.device.tip_radius_mm
         scored["events"] = list(navigation_events(record.tip[:, 0], record.exposed, recording.believed_mm, radius))

@@ -35,15 +35,22 @@ class Target:
     Attributes:
         branch: index of the branch in `VesselTree.branches`.
         abscissa: distance from the ostium along the path, mm; it lies on that branch.
+        near_mm: straight distance from it, mm, within which a tip has to lie as well: a second rule by which a task
+            of somebody else is scored.
     """
 
     branch: CountOrZero
     abscissa: NonNegative
+    near_mm: Positive | None = None
 
     def position(self, anatomy: Anatomy) -> Float[np.ndarray, "3"]:
         """Return the target's place on the centerline, LPS mm."""
         line = anatomy.tree.branches[self.branch].centerline
         return np.array([np.interp(self.abscissa, line.abscissa, axis) for axis in line.points.T])
+
+    def reached(self, tip: TipProjection) -> Bool[np.ndarray, "..."]:
+        """Return which worlds have reached it, see `reached`; the tips of each lie along the last axis."""
+        return reached(tip, self.branch, self.abscissa, self.near_mm or np.inf)
 
     def check(self, tree: VesselTree) -> None:
         """Check that the place lies in a vessel.
@@ -81,8 +88,6 @@ class Navigation:
         known_motion: how heart and breath are known to move the vessel, which the C-arm takes off what it measures and
             policies simulate; it is taken to lie still if not given.
         xray: how an exposure finds the tip; `NavigationLoop` says what its C-arm does.
-        near_mm: straight distance from the target, mm, within which another rule counts it as reached. Nothing ends
-            there: it is noted in the scores.
         robot: as it is known, not what a seed draws of it. `NavigationLoop` takes its own if not given; else encoders
             sit at the devices.
     """
@@ -99,7 +104,6 @@ class Navigation:
     force_limit_n: Positive = 0.5
     known_motion: Motion | None = None
     xray: XrayKind = "assumed"
-    near_mm: Positive | None = None
     robot: RobotConfig | None = None
 
     @model_validator(mode="after")
@@ -142,24 +146,30 @@ class Navigation:
         Args:
             tip: of all devices, along the last axis.
         """
-        return reached(tip[..., : self.arriving + 1], self.target.branch, self.target.abscissa)
+        return self.target.reached(tip[..., : self.arriving + 1])
 
 
 def reached(
-    tip: TipProjection, branch: int | Int[np.ndarray, "..."], abscissa: float | Float[np.ndarray, "..."]
+    tip: TipProjection,
+    branch: int | Int[np.ndarray, "..."],
+    abscissa: float | Float[np.ndarray, "..."],
+    near_mm: float | Float[np.ndarray, "..."] = np.inf,
 ) -> Bool[np.ndarray, "..."]:
     """Return which worlds have reached their targets.
 
     The tip that is to arrive lies in the target's branch, within `SUCCESS_MM` of it along the centerline, and the
-    wire's tip lies no more than that behind it.
+    wire's tip lies no more than that behind it. Where a straight distance is given, the tip lies within that too, as
+    far as its distances along the centerline and from it say.
 
     Args:
         tip: of the wires, and if a catheter's are to arrive, those last, along the last axis.
         branch: of the target of all, or of each.
         abscissa: of the target of all, or of each, mm.
+        near_mm: straight distance from the target of all, or of each, mm.
     """
     wire, arriving = tip[..., 0], tip[..., -1]
-    there = (np.abs(arriving.abscissa - abscissa) <= SUCCESS_MM) & (arriving.branch == branch)
+    along_mm = np.abs(arriving.abscissa - abscissa)
+    there = (along_mm <= SUCCESS_MM) & (arriving.branch == branch) & (np.hypot(along_mm, arriving.offset) <= near_mm)
     return there & (wire.abscissa >= arriving.abscissa - SUCCESS_MM)
 
 

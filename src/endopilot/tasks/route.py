@@ -81,7 +81,8 @@ class Route:
         """Return which tips have entered the branch of a waypoint, or reached the target if it is the last."""
         on_route = self.off_route(tip) == 0
         if waypoint >= self.target.abscissa:
-            return on_route & (tip.branch == self.target.branch) & (np.abs(tip.abscissa - waypoint) <= NEAR_MM)
+            there = np.abs(tip.abscissa - waypoint) <= NEAR_MM
+            return on_route & there & self.target.reached(tip[..., None])
         return on_route & (tip.abscissa >= min(waypoint + ENTERED_MM, self.target.abscissa))
 
     def next_waypoint(self, progress: float) -> float:

@@ -92,7 +92,7 @@ class Task:
             task's file. The numbers and the seed then draw the first rotations alone.
         targets_mm: a point for each of them, LPS mm, nearest to which the target lies on the centerline.
         near_mm: a straight distance from the target, mm, within which another rule counts it as reached; scored beside
-            the ladder's own.
+            the ladder's own, and a navigation ends where both hold.
     """
 
     name: str
@@ -195,10 +195,11 @@ class Task:
             InputError: the anatomy lacks the section, it is too short, or the point lies outside the lumen.
         """
         bend = {"tip_bend_rad": float(np.deg2rad(self.tip_bend_deg)), "tip_bend_length_mm": self.tip_bend_mm}
+        target = self.target(anatomy.tree) if target_mm is None else find_target(anatomy.tree, target_mm)
         return Navigation(
             anatomy=anatomy,
             device=replace(read_wire(self.device), **bend),
-            target=self.target(anatomy.tree) if target_mm is None else find_target(anatomy.tree, target_mm),
+            target=replace(target, near_mm=self.near_mm),
             start_inserted_length_mm=self.start_inserted_length_mm,
             start_rotation_rad=start_rotation_rad,
             seconds=self.seconds,
@@ -206,7 +207,6 @@ class Task:
             catheters=(read_catheter(self.catheter),) if self.catheter else (),
             arrives=self.arrives or "wire",
             start_catheter_mm=self.start_catheter_mm or 0.0,
-            near_mm=self.near_mm,
         )
 
 
