@@ -164,6 +164,18 @@ def test_reward_is_what_the_table_says_and_success_terminates(near):
     assert info["success"] and info["valid"] and info["safe"] and info["distance_mm"] <= 2.0
 
 
+def test_a_second_rule_of_a_target_has_to_hold_too(near):
+    for near_mm in (3.0, 0.01):  # a tip on the wall lies beside the line
+        env, reached = NavigateEnv(navigation=replace(near, target=replace(near.target, near_mm=near_mm))), False
+        env.reset(seed=0)
+        for _ in range(30):
+            _, _, ended, _, info = env.step(np.array([1.0, 0.0]))
+            reached |= info["success"]
+            if ended:
+                break
+        assert reached == (near_mm == 3.0)
+
+
 def test_wire_and_catheter_are_driven_and_observed_each_by_itself(near):
     navigation = in_catheter([near], "microcatheter-1.7f")[0]
     env = NavigateEnv(navigation=navigation)
