@@ -54,6 +54,7 @@ class AgentConfig:
         return replace(
             IN_CATHETER,
             search=replace(search, speed_mm_s=min(speed, fastest), manoeuvres=manoeuvres),
+            most_exposures=_HURRIED_EXPOSURES,
             belief=replace(belief, **_COARSE) if wide else belief,
         )
 
@@ -110,5 +111,7 @@ _WAYS = 4.0
 fast that there is time for half as long a way."""
 _HURRIED_S = 10.0
 """A catheter is then brought to its place in this time at most, s."""
+_HURRIED_EXPOSURES = 100
+"""Exposures that may then be taken: soft devices fold and snap on half a metre of route."""
 _COARSE = {"element_mm": 2.0, "time_step_s": 0.1}
 """What such a belief takes on a route through a wide lumen: its bends are wide, and the devices half a metre long."""

@@ -251,6 +251,8 @@ class Search:
             return False
         if self._alone and grid[0].beyond is not None:
             self._approach(waypoint)
+            if len(course.rows) == kept.periods:  # where it is already: that is another grid
+                return self._turned(tuple(at._replace(beyond=None) for at in grid), share, waypoint, kept)
         if tried is None:
             tried = self._tried[grid] = self._try(grid, waypoint)
         return self._follow(tried, share, waypoint, turns=self._repertoire.turns if grid else 1)
