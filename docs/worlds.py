@@ -39,9 +39,11 @@ FIGURES = {
     "missed_share_planned": "events missed, planned",
     "false_alarms_share": "navigations in the nominal world with a false alarm",
     "alarms_share": "navigations in other worlds with an alarm",
+    "ostium_error_mm": "error of an ostium that is off, after 5 exposures, median, mm",
+    "wall_right_share": "kinds of wall found right, of those that are stated",
 }
 """Figures of the agent in other worlds, in words."""
-LEAST = ("in_bands_share", "in_bands_share_worst", "safe_share", "safe_share_worst")
+LEAST = ("in_bands_share", "in_bands_share_worst", "safe_share", "safe_share_worst", "wall_right_share")
 """Figures that are to be at least as large as their bar."""
 
 
@@ -119,7 +121,15 @@ def _counts(row: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _shown(name: str, value: float) -> str:
-    return f"{100 * value:.1f} %" if "share" in name else f"{value:.1f}" if value % 1 else f"{value:.0f}"
+    return (
+        f"{100 * value:.1f} %"
+        if "share" in name
+        else f"{value:.2f}"
+        if name.endswith("_mm")
+        else f"{value:.1f}"
+        if value % 1
+        else f"{value:.0f}"
+    )
 
 
 if __name__ == "__main__":

@@ -68,6 +68,8 @@ PATIENTS: dict[Set, dict[str, tuple[int, tuple[int, ...]]]] = {
 """Of each set and task, the seed of the atlas and the numbers of the patients in it."""
 PLACES = 28
 """Patients of a set."""
+SHOWN = 5
+"""Exposures after which the ostium is to be known."""
 SECONDS = 60.0
 """Length of a navigation at random, s."""
 MOST_EXPOSURES = 40
@@ -86,11 +88,19 @@ BARS = {
     "navigations_above_40_exposures": Bar(0),
     "unsafe_by_force_share": Bar(0.01),
     "false_alarms_share": Bar(0.1),
+    "ostium_error_mm": Bar(0.25),
+    "wall_right_share": Bar(0.85, at_least=True),
 }
 
 
 class DrivenAtRandom:
-    """The agent's monitor, while random velocities drive the wire."""
+    """The agent's monitor, while random velocities drive the wire.
+
+    Attributes:
+        ostium_mm: where the ostium is believed to be after `SHOWN` exposures, mm deeper than given; None before.
+    """
+
+    ostium_mm: float | None = None
 
     def start(self, navigation: Navigation, seed: int) -> None:
         """Lay out the simulated wires, and draw the velocities."""
@@ -104,14 +114,24 @@ class DrivenAtRandom:
             seed=seed,
             max_inserted_length_mm=float(navigation.anatomy.tree.longest_path().abscissa[-1]),
         )
-        self._velocities = [(v, w) for v, w in control[0, :, 0].tolist()]
+        self._velocities, self._shown = [(v, w) for v, w in control[0, :, 0].tolist()], 0
 
     def decide(self, observation: Observation) -> Decision:
         """Move on at random, and ask for X-ray as the agent does."""
         self._believed = self._monitor.step(observation.devices, observation.load, observation.tip)
+        self._shown += observation.tip is not None
+        if self._shown == SHOWN and self.ostium_mm is None:
+            belief = self._monitor.belief
+            self.ostium_mm = float(belief.weight @ belief.ostium_mm)
         wanted = (self._velocities[round(observation.time_s / SAMPLE_PERIOD_S)],)
         self._monitor.belief.drives.sent(wanted)
         return Decision(wanted, expose=bool(self._believed.asks))
+
+    @property
+    def wall(self) -> str:
+        """Of which kind the wall was found to be; "unknown" where nothing was identified."""
+        identified = self._monitor.identified
+        return "unknown" if identified is None else identified.wall
 
     def believed(self) -> BelievedTip:
         """Return where the monitor has the tip."""
@@ -137,15 +157,18 @@ def measure(path: Path, worlds: Mapping[str, World], patients: Set) -> None:
     """Navigate in one patient of one world, and write what came of it."""
     task, navigation, seed = navigation_at(patients, int(path.stem))
     at_random = path.parent.name == "random"
+    world, driver = worlds[path.parent.parent.name], DrivenAtRandom() if at_random else AgentPolicy()
     loop = NavigationLoop(
         replace(navigation, seconds=SECONDS) if at_random else navigation,
-        DrivenAtRandom() if at_random else AgentPolicy(),
+        driver,
         config=LoopConfig(simulator=replace(CORE, threads=1)),
         seed=seed,
-        world=worlds[path.parent.parent.name],
+        world=world,
     )
-    record = driven_on(loop) if at_random else loop.run()
-    write_json(path, {"task": task.name, "patient": navigation.anatomy.name} | counted(record, navigation))
+    result = counted(driven_on(loop) if at_random else loop.run(), navigation)
+    if isinstance(driver, DrivenAtRandom):
+        result |= identified(driver, world)
+    write_json(path, {"task": task.name, "patient": navigation.anatomy.name} | result)
 
 
 def driven_on(loop: NavigationLoop) -> NavigationRecord:
@@ -174,6 +197,16 @@ def counted(record: NavigationRecord, navigation: Navigation) -> dict[str, Any]:
     }
 
 
+def identified(driver: DrivenAtRandom, world: World) -> dict[str, Any]:
+    """Return how well a wrong ostium (error in mm) and the kind of wall were found; None where they were not."""
+    compliant = "rigid" if world.compliant_wall_n_mm2 is None else "compliant"
+    found_mm = driver.ostium_mm if world.ostium_mm else None
+    return {
+        "ostium_error_mm": None if found_mm is None else abs(found_mm - world.ostium_mm),
+        "wall_right": None if driver.wall == "unknown" else driver.wall == compliant,
+    }
+
+
 def row(world: str, drive: Drive, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the row of one world and drive."""
     (happened, missed), (held, decisions) = (
@@ -195,7 +228,14 @@ def row(world: str, drive: Drive, results: Sequence[Mapping[str, Any]]) -> dict[
         "above_40": sum(result["exposures"] > MOST_EXPOSURES for result in results),
         "seconds": seconds,
         "alarmed": sum(result["alarms"] > 0 for result in results),
+        "ostium_errors_mm": _known(results, "ostium_error_mm"),
+        "walls": len(_known(results, "wall_right")),
+        "walls_right": sum(_known(results, "wall_right")),
     }
+
+
+def _known(results: Sequence[Mapping[str, Any]], name: str) -> list[Any]:
+    return [result[name] for result in results if result.get(name) is not None]
 
 
 def share(rows: Sequence[Mapping[str, Any]], part: str, whole: str) -> float | None:
@@ -224,6 +264,7 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
         a_second = share(rows, "exposures", "seconds")
         return None if a_second is None else 60 * a_second
 
+    ostia = [error for each in rows for error in each["ostium_errors_mm"]]
     bands = {drive: share(of(drive), "in_bands", "decisions") for drive in ("random", "planned")}
     found = {
         "missed_share": share(of("random"), "missed", "events"),
@@ -244,6 +285,8 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
         "false_alarms_share": share(nominal, "alarmed", "navigations"),
         "alarms_share": share(other, "alarmed", "navigations"),
         "events": sum(each["events"] for each in rows),
+        "wall_right_share": share(of("random", rows), "walls_right", "walls"),
+        "ostium_error_mm": float(np.median(ostia)) if ostia else None,
     }
     return {name: round(value, 4) for name, value in found.items() if value is not None}
 

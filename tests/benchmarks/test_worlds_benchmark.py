@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from benchmarks.agent import worlds
-from benchmarks.agent.worlds import DrivenAtRandom, counted, drive_in_worlds, driven_on, figures, row
+from benchmarks.agent.worlds import DrivenAtRandom, counted, drive_in_worlds, driven_on, figures, identified, row
+from endopilot.belief.identification import Identified
 from endopilot.errors import InputError
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.simulation.config import SimulatorConfig
@@ -87,6 +89,23 @@ def test_figures_are_those_of_other_worlds_and_of_the_worst():
     assert found["in_bands_share"] == 0.675 and found["in_bands_share_worst"] == 0.45
     assert found["false_alarms_share"] == pytest.approx(1 / 3, abs=1e-4) and found["alarms_share"] == 0
     assert "exposures_planned" not in figures([each for each in rows if each["drive"] == "random"])
+
+
+def test_an_ostium_that_is_off_and_stated_walls_are_compared_with_the_truth():
+    found = {"ostium_error_mm": 0.5, "wall_right": None}, {"ostium_error_mm": 0.2, "wall_right": False}
+    rows = [
+        row("nominal", "random", [GOOD | {"ostium_error_mm": None, "wall_right": True}]),
+        row("deeper", "random", [GOOD | each for each in found]),
+        row("deeper", "planned", [GOOD]),
+    ]
+    assert figures(rows)["ostium_error_mm"] == 0.35 and figures(rows)["wall_right_share"] == 0.5
+    driver = DrivenAtRandom()
+    driver._monitor = SimpleNamespace(identified=Identified({}, 0.9, True))  # pyright: ignore[reportAttributeAccessIssue]
+    driver.ostium_mm = 1.7
+    assert identified(driver, World(ostium_mm=2.0)) == {"ostium_error_mm": pytest.approx(0.3), "wall_right": False}
+    assert identified(driver, World(compliant_wall_n_mm2=0.01)) == {"ostium_error_mm": None, "wall_right": True}
+    driver._monitor = SimpleNamespace(identified=Identified({}, 0.5, True))  # pyright: ignore[reportAttributeAccessIssue]
+    assert identified(driver, World())["wall_right"] is None
 
 
 def test_patients_are_those_of_no_task_and_of_one_set():

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -89,12 +89,17 @@ class Identified:
     explains: bool
 
     @property
+    def wall(self) -> Literal["compliant", "rigid", "unknown"]:
+        """Of which kind the wall is."""
+        if self.compliant is None or _UNSURE <= self.compliant <= 1 - _UNSURE:
+            return "unknown"
+        return "compliant" if self.compliant > 0.5 else "rigid"
+
+    @property
     def words(self) -> str:
         """What was found, in words."""
         known = [_NAMES[name].format(*ends) for name, ends in self.interval.items() if ends is not None]
-        unsure = self.compliant is None or _UNSURE <= self.compliant <= 1 - _UNSURE
-        wall = "unknown wall" if unsure else "compliant wall" if (self.compliant or 0.0) > 0.5 else "rigid wall"
-        found = ", ".join([*known, wall])
+        found = ", ".join([*known, f"{self.wall} wall"])
         return found if self.explains else f"nothing explains the images well; likeliest {found}"
 
 
