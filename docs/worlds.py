@@ -121,15 +121,10 @@ def _counts(row: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _shown(name: str, value: float) -> str:
-    return (
-        f"{100 * value:.1f} %"
-        if "share" in name
-        else f"{value:.2f}"
-        if name.endswith("_mm")
-        else f"{value:.1f}"
-        if value % 1
-        else f"{value:.0f}"
-    )
+    if "share" in name:
+        return f"{100 * value:.1f} %"
+    digits = 2 if name.endswith("_mm") else 1 if value % 1 else 0
+    return f"{value:.{digits}f}"
 
 
 if __name__ == "__main__":
