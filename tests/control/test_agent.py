@@ -531,6 +531,19 @@ def test_a_course_is_searched_again_where_the_drive_pushes_harder_than_simulated
     assert re.search(r"cannot go on .* N is given, and the drive pushes 4\.\d times as hard", said)
 
 
+def test_failed_searches_are_forgotten_where_the_drive_pushes_harder(side_branch) -> None:
+    """A new search says why it fails; one that never ran says nothing, and the agent would wait until time is over."""
+    policy = AgentPolicy(config=QUICK)
+    policy.start(side_branch, seed=1)
+    at_start = ((side_branch.start_inserted_length_mm, 0.0),)
+    policy.decide(Observation(0.0, at_start, None))
+    policy._failed, plans = policy.config.tries, policy.plans
+    for _ in range(50):
+        policy.monitor._loads.take(9.0, 0.2, speed_mm_s=5.0, valve=(0.0, 0.0))
+    policy.decide(Observation(0.5, at_start, None))
+    assert policy.plans == plans + 1 and policy.halt
+
+
 def test_the_load_ratio_is_the_one_that_the_forces_have() -> None:
     """Σ read · predicted / Σ predicted² of force less the valve's, less 0.25; what is slow or weak does not count."""
     valve = (0.05, 0.002)

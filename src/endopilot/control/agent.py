@@ -340,8 +340,8 @@ class AgentPolicy(_PlanningPolicy):
         if self._failed >= self.config.tries:  # what was identified leads nowhere
             monitor.return_to_given()
         if self.belief is not monitor.belief:  # another wire, lumen or ostium: another course
-            self.belief, self._failed = monitor.belief, 0
-            self._search, self._follower = self._new_search(), self._new_follower()
+            self.belief = monitor.belief
+            self._begin_anew()
         self._limit_load()
         if monitor.seen is not None:
             self._located(monitor.seen, lost=monitor.lost)
@@ -354,7 +354,11 @@ class AgentPolicy(_PlanningPolicy):
         if course is None or ratio < _HARDER * self._harder:
             return
         if course.force[self._follower.at :].max(initial=0.0) * ratio > self.navigation.force_limit_n:
-            self._search, self._follower = self._new_search(), self._new_follower()
+            self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        """Forget course and failed searches: what they were made with is no longer believed."""
+        self._search, self._follower, self._failed = self._new_search(), self._new_follower(), 0
 
     def _new_search(self) -> Search:
         """Return a search in which walls press as much harder as the drive is felt to push."""
