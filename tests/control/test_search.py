@@ -15,6 +15,7 @@ from endopilot.control.manoeuvre import Grid
 from endopilot.control.push import Push, Pushed
 from endopilot.control.search import Search
 from endopilot.control.search_config import ManoeuvreConfig
+from endopilot.control.trials import CATHETER, WIRE, Move
 from endopilot.devices.catheter import read_catheter
 from endopilot.errors import InputError
 from endopilot.ladder.attempt import Recording, attempt, repeat
@@ -208,7 +209,7 @@ def search_straight(navigation: Navigation, config: AgentConfig) -> Course:
 def test_where_there_is_little_time_wire_and_catheter_move_together_and_faster(hurried, monkeypatch) -> None:
     monkeypatch.setattr("endopilot.control.manoeuvre._LEADS_MM", (2.0,))
     straight, config = hurried
-    assert config.search.manoeuvres.together and config.search.speed_mm_s == pytest.approx(2 * 18.0 / 6.0)
+    assert config.search.manoeuvres.together and config.search.speed_mm_s == pytest.approx(4 * 18.0 / 6.0)
     slow, fast = (search_straight(straight, each) for each in (agent_config(straight), config))
     assert slow.reached == fast.reached == 1.0 and len(fast.control) < 0.75 * len(slow.control)
     both = [(np.abs(course.control[:, :, 0]) > 0.5).all(axis=1).any() for course in (slow, fast)]
@@ -237,5 +238,28 @@ def test_where_there_is_little_time_loops_are_the_last_resort(hurried, monkeypat
 
     monkeypatch.setattr(Search, "_try", nothing_passes)
     assert search_straight(straight, config).reached == 1.0 and not tried
-    monkeypatch.setattr("endopilot.control.search._LOOPS_MM", -1000.0)
+    monkeypatch.setattr("endopilot.control.search.LOOPS_MM", -1000.0)
     assert search_straight(straight, config).reached == 1.0 and tried
+
+
+@pytest.mark.parametrize(("stays_mm", "slack_mm"), [(10.0, 8.0), (30.0, 30.0)])
+def test_where_there_is_little_time_slack_is_pulled_out_unless_the_tip_leaves(
+    hurried, monkeypatch, stays_mm, slack_mm
+) -> None:
+    """The tip lies 30 mm behind what is inserted; it stays until so much is left, and then comes along twice as far."""
+    straight, config = hurried
+    belief = Belief(straight, [World()], BELIEF)
+    one = Search(straight, Route.to(straight.anatomy, straight.target), belief, config=config.search, seed=0)
+    course = one._course
+    course.put(np.array([0]), belief.simulator, np.ones(1))
+    course.move(course.control(Move(WIRE, 30.0), Move(CATHETER, 50.0)))
+    inserted = float(course.lengths.max())
+
+    def here(_: Search) -> float:
+        pulled = inserted - float(course.lengths.max())
+        return inserted - 30.0 - 20.0 * max(pulled - (30.0 - stays_mm), 0.0)
+
+    monkeypatch.setattr(Search, "_here", here)
+    one._pull_taut(waypoint=5.0)
+    assert one._slack == pytest.approx(slack_mm, abs=config.search.speed_mm_s * DECISION_PERIOD_S)
+    assert (len(course.rows) == 1) == (stays_mm == 30.0)

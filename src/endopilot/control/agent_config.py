@@ -49,7 +49,7 @@ class AgentConfig:
         if search.speed_mm_s * navigation.seconds >= _WAYS * target:
             return IN_CATHETER
         fastest = min(device.max_velocity_mm_s for device in navigation.devices)
-        speed = max(search.speed_mm_s, _WAYS / 2 * target / navigation.seconds)
+        speed = max(search.speed_mm_s, _WAYS * target / navigation.seconds)
         manoeuvres = replace(search.manoeuvres, together=True, longest_s=_HURRIED_S)
         return replace(
             IN_CATHETER,
@@ -108,7 +108,7 @@ def read_agent_calibration(xray: XrayKind, devices: int) -> Calibration:
 
 _WAYS = 4.0
 """Wire and catheter move in turn if there is time for a way so many times as long as the route; else together, and so
-fast that there is time for half as long a way."""
+fast that there is time for it."""
 _HURRIED_S = 10.0
 """A catheter is then brought to its place in this time at most, s."""
 _HURRIED_EXPOSURES = 100

@@ -42,6 +42,8 @@ _MOUTH_RADII = 1.4
 """Half the width of a branch's mouth, lumen radii."""
 _SLACK_MM = 40.0
 """A wire that was pushed this far and did not come forward folds, mm; in a wide lumen see `SLACK_WIDTHS`."""
+LOOPS_MM = 120.0
+"""The same of soft devices that move together: what they lay into loops in a wide lumen holds what comes after, mm."""
 _AT_MM, REST_MM = 1.0, 0.1
 """A catheter this near to its place is there, mm; what is this near to its goal rests."""
 _LATE = 2
@@ -172,6 +174,7 @@ class Push:
         beyond = progress > self.waypoint
         waits = alone and not self.strict and self.route.is_wide(self.waypoint)
         slack_mm = SLACK_WIDTHS * self.route.width_mm(self.waypoint) if waits else _SLACK_MM
+        slack_mm = LOOPS_MM if self.config.manoeuvres.together and not alone else slack_mm
         off_mm, longest, force_n = self._limits(trials, waits)
 
         def stop(which: Bool[np.ndarray, "trials"], why: Halt) -> None:

@@ -30,7 +30,7 @@ from endopilot.control.course import Course
 from endopilot.control.halt import SPARE_SHARE, describe_halt, near_fork
 from endopilot.control.manoeuvre import STRAIGHT, Grid, Repertoire, place, retract
 from endopilot.control.population import Population
-from endopilot.control.push import TURN_PERIODS, Each, Halt, Push, Pushed, middle, sides, stand_off, turn
+from endopilot.control.push import LOOPS_MM, TURN_PERIODS, Each, Halt, Push, Pushed, middle, sides, stand_off, turn
 from endopilot.control.search_config import SearchConfig
 from endopilot.control.trials import STALL_PERIODS, WIRE, Kept, Move, Trials
 from endopilot.errors import InputError
@@ -52,8 +52,9 @@ _TURNS = (0.0, np.pi)
 _GENTLE_SHARE, _LOOP_SHARE, _LOOP_MM_S = 0.1, 1e-4, 5.0
 """Share of the force limit below which devices in a wide lumen hardly press, what a millimetre in loops costs, and how
 many of these a second is worth, mm/s."""
-_LOOPS_MM = 30.0
-"""What a manoeuvre may lay into loops, unless nothing else passes, mm."""
+_SLACK_MM, _TAUT_MM, _COMES_MM, _LEAVES_MM = 25.0, 8.0, 3.0, 10.0
+"""Soft devices with more slack than the first of these are pulled back, mm, until they have no more than the second, or
+the tip comes along by the third. Where it then slides back by more than the last, they stay as they were."""
 _BEHIND_WIDTHS = 2
 """Soft devices may slide out of a branch from so many widths of the lumen beyond its fork."""
 _OFTEN = 6
@@ -156,6 +157,7 @@ class Search:
             waypoint, kept, self._tried = self._next(places, here), course.kept(), {}
             halt = self._straight(waypoint)
             if halt is None:
+                self._pull_taut(waypoint)
                 settled.append(len(course.rows) - 1)
                 if self._reached() > 0.5:
                     break
@@ -165,6 +167,7 @@ class Search:
                     self._halted("stalled", waypoint)
                     break
             elif any(self._turned(grid, share, waypoint, kept) for share, grid in self._repertoire.ways):
+                self._pull_taut(waypoint)
                 settled.append(len(course.rows) - 1)
             elif not (self._alone and self._drawn(waypoint, kept)):
                 self._halted(halt, waypoint)
@@ -303,11 +306,25 @@ class Search:
         Devices that move together where time is short are so soft that loops end in coils: all but the last resort may
         lay little into loops.
         """
-        limit_n, course = share * self._navigation.force_limit_n, self._course
+        limit_n = share * self._navigation.force_limit_n
         if not self.config.manoeuvres.together or share >= 1.0:
             return limit_n, np.inf
-        slack_mm = float(course.mean(course.lengths.max(axis=1))[0]) - self._here()
-        return limit_n, max(slack_mm, 0.0) + _LOOPS_MM
+        return limit_n, max(self._slack, 0.0) + LOOPS_MM
+
+    def _pull_taut(self, waypoint: float) -> None:
+        """Pull soft devices back that have passed a place with slack: what lies in loops comes out, and the tip stays.
+
+        A device in loops presses forward with EI / 2R² as it unbends, R being the radius of the wide lumen.
+        """
+        course, speed = self._course, self.config.speed_mm_s
+        if not self.config.manoeuvres.together or self._slack <= _SLACK_MM or waypoint >= self.route.target.abscissa:
+            return
+        kept, passed = course.kept(), self._here()
+        back = course.control(*(Move(device, -speed) for device in range(course.devices)))
+        while self._slack > _TAUT_MM and self._here() > passed - _COMES_MM and course.lengths.min() > 1.0:
+            course.move(back)
+        if self._here() < passed - _LEAVES_MM:
+            course.restore(kept)
 
     def _obstacle(self, waypoint: float) -> tuple[float, float]:
         """Return what lies in the way of a place, and the steps in which devices are placed about it, mm.
@@ -381,6 +398,11 @@ class Search:
     def _here(self) -> float:
         """Return how far along the route the devices have come, mm."""
         return float(self._course.mean(self.route.progress(self._course.foremost))[0])
+
+    @property
+    def _slack(self) -> float:
+        """How much deeper than that the foremost of them is inserted, mm: what lies in loops."""
+        return float(self._course.mean(self._course.lengths.max(axis=1))[0]) - self._here()
 
     def _reached(self) -> float:
         return float(self._course.mean(self._navigation.reached(self._course.tips))[0])
