@@ -117,7 +117,7 @@ def stands() -> str:
     speed, error = (_row("performance", block, row)[0] for block, row in SPEED)
     (agent, *_) = _row("ladder", "scores", "all twelve")
     theirs = {task: _row("ladder", "benchmark", task.lower()) for task in ("ArchVariety", "DualDeviceNav")}
-    ours = {task: _row("ladder", "benchmark", task.lower(), "agent") for task in theirs}
+    ours = {task: _row("ladder", "benchmark", task.lower(), "`agent`") for task in theirs}
     plane = _row("reality", "reality", "error in the camera")[-1]
     share, forks = _row("reality", None, "the real branch, of forks in two")[1].split(" of ")
     band, kept = _row("reality", "calibration", "band of Δtip")

@@ -127,9 +127,10 @@ def main() -> None:
     ladder, mismatched, steve = [*given, *[ROOT / "runs" / name for name in names][len(given) :]]
     fill(PAGE, "tasks", tasks(), dated=False)
     fill(PAGE, "coaxial tasks", coaxial_tasks(), dated=False)
-    if ladder.is_dir():
-        fill(PAGE, "scores", scores(ladder, NEWEST, "scores"))
-        fill(PAGE, "coaxial scores", scores(ladder, "coaxial", "coaxial scores"))
+    driven = {json.loads(path.read_text(encoding="utf-8"))["ladder"] for path in ladder.glob("*/ladder.json")}
+    for version, mark in ((NEWEST, "scores"), ("coaxial", "coaxial scores")):
+        if version in driven:
+            fill(PAGE, mark, scores(ladder, version, mark))
     if mismatched.is_dir():
         fill(PAGE, "mismatch", mismatch(mismatched))
     if steve.is_dir():
