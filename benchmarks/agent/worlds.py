@@ -121,8 +121,7 @@ class DrivenAtRandom:
         self._believed = self._monitor.step(observation.devices, observation.load, observation.tip)
         self._shown += observation.tip is not None
         if self._shown == SHOWN and self.ostium_mm is None:
-            belief = self._monitor.belief
-            self.ostium_mm = float(belief.weight @ belief.ostium_mm)
+            self.ostium_mm = self._monitor.belief.mean_ostium_mm
         wanted = (self._velocities[round(observation.time_s / SAMPLE_PERIOD_S)],)
         self._monitor.belief.drives.sent(wanted)
         return Decision(wanted, expose=bool(self._believed.asks))

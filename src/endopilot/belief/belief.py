@@ -271,6 +271,11 @@ class Belief:
         return likelihoods(score)
 
     @property
+    def mean_ostium_mm(self) -> float:
+        """How much deeper the devices are believed to lie than the encoders say, mm."""
+        return float(self.weight @ self.ostium_mm)
+
+    @property
     def best(self) -> int:
         """The likeliest member."""
         return int(np.argmax(self.weight))

@@ -166,8 +166,8 @@ class Monitor:
         A motion that was found is given up too, unless all exposures are still likelier with it.
         """
         if self.may_return:
-            ostium_mm = float(self.belief.weight @ self.belief.ostium_mm)
-            given = [replace(each, ostium_mm=each.ostium_mm + ostium_mm) for each in Belief.around(self._config)]
+            deeper_mm = self.belief.mean_ostium_mm
+            given = [replace(each, ostium_mm=each.ostium_mm + deeper_mm) for each in Belief.around(self._config)]
             tried = [self.belief.like(given, motion=None)]
             if self.moves is not None:
                 tried.append(self.belief.like(given))
