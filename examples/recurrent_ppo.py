@@ -1,28 +1,36 @@
-"""Train a recurrent policy where seeing costs, by PPO in one file: it decides by itself when to take an X-ray image.
+"""Train a recurrent policy by PPO in one file, and score it in patients that it was not trained in.
 
     pip install -c constraints.txt -e '.[env,learn]'
     python examples/recurrent_ppo.py --minutes 4
-    python examples/recurrent_ppo.py --minutes 60 --environment endopilot/Crux-v2 --patients 20
+    python examples/recurrent_ppo.py --minutes 60 --tasks 8 --observation state --output state.pt
+    python examples/recurrent_ppo.py --score state.pt
 
-Between two exposures only encoders and loads of the drives are observed, so the policy has a memory, a GRU. The loop is
-that of CleanRL's `ppo_atari_lstm.py` (Huang et al., JMLR 23, 2022) with continuous actions. The run ends with an error
-if nothing was learned.
+Without `--tasks` it learns one task in one patient; with it the lowest tasks of the ladder, in 20 training patients
+each. With the observation `xray` seeing costs: between two exposures only encoders and loads of the drives are
+observed, and the policy decides by itself when to take one. So it has a memory, a GRU. The loop is that of CleanRL's
+`ppo_atari_lstm.py` (Huang et al., JMLR 23, 2022) with continuous actions. The run ends with an error if nothing was
+learned. `--score` lets the mean action of a saved policy drive the ladder's own patients.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from pathlib import Path
 
-import gymnasium
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
 from torch import nn
 
+import endopilot
+from endopilot.tasks.task import list_tasks
+
 STEPS, EPOCHS, MINIBATCHES = 64, 4, 4
 GAMMA, LAMBDA, CLIP, LEARNING_RATE, LARGEST_GRADIENT = 0.995, 0.95, 0.2, 5e-4, 0.5
 HIDDEN = 128
+PATIENTS, WORLDS_EACH = 20, 8
+"""Patients of each task, and worlds of each patient: worlds of one patient are stepped side by side."""
 
 
 class Agent(nn.Module):
@@ -30,14 +38,16 @@ class Agent(nn.Module):
 
     def __init__(self, observed: int, actions: int) -> None:
         super().__init__()
-        self.encoder = nn.Sequential(nn.Linear(observed, HIDDEN), nn.Tanh())
+        self.given = observed, actions
+        self.encoder = nn.Sequential(nn.Linear(observed, HIDDEN), nn.Tanh(), nn.Linear(HIDDEN, HIDDEN), nn.Tanh())
         self.memory = nn.GRUCell(HIDDEN, HIDDEN)
         self.actor, self.critic = nn.Linear(HIDDEN, actions), nn.Linear(HIDDEN, 1)
         self.log_std = nn.Parameter(torch.full((actions,), -0.5))
         with torch.no_grad():
             self.actor.weight.mul_(0.01)
             self.actor.bias.zero_()
-            self.actor.bias[-1] = -1.0  # at first one step in twenty asks for an exposure, and not one in two
+            if actions == 3:
+                self.actor.bias[-1] = -1.0  # at first one step in twenty asks for an exposure, and not one in two
 
     def remember(self, observation: torch.Tensor, memory: torch.Tensor, begun: torch.Tensor) -> torch.Tensor:
         """Return the memory after an observation; where an episode has begun, nothing is remembered from before."""
@@ -71,7 +81,7 @@ class Rollout:
 class Player:
     """Plays episodes in many worlds, and keeps what became of each: seconds, return, safe success, exposures."""
 
-    def __init__(self, worlds: gymnasium.vector.VectorEnv, seed: int) -> None:
+    def __init__(self, worlds: endopilot.NavigateVectorEnv, seed: int) -> None:
         self.worlds, self.episodes, self.began = worlds, [], time.monotonic()
         self.observation = torch.as_tensor(worlds.reset(seed=seed)[0])
         self.begun = torch.ones(worlds.num_envs)
@@ -98,7 +108,8 @@ class Player:
         self.returns += reward
         for world in np.flatnonzero(ended):
             safe, now = bool(info["success"][world] and info["safe"][world]), time.monotonic() - self.began
-            self.episodes.append((now, self.returns[world], safe, int(info["exposures"][world])))
+            exposures = int(info["exposures"][world]) if "exposures" in info else 0
+            self.episodes.append((now, self.returns[world], safe, exposures))
         if ended.any():
             self.returns[ended] = 0.0
             observation, _ = self.worlds.reset(options={"reset_mask": ended})
@@ -128,23 +139,58 @@ def improve(agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, la
             optimizer.step()
 
 
-def train(worlds: gymnasium.vector.VectorEnv, seconds: float, seed: int) -> tuple[Agent, np.ndarray]:
+def train(worlds: endopilot.NavigateVectorEnv, seconds: float, seed: int) -> tuple[Agent, np.ndarray]:
     """Train for some seconds, at least one rollout; return the agent, and a row for each episode (see `Player`)."""
     torch.manual_seed(seed)
     observed, actions = worlds.single_observation_space.shape[0], worlds.single_action_space.shape[0]
     agent, rollout = Agent(observed, actions), Rollout(worlds.num_envs, observed, actions)
-    optimizer = torch.optim.Adam(agent.parameters(), lr=LEARNING_RATE)
-    player, steps, said = Player(worlds, seed), 0, 0.0
-    while steps == 0 or time.monotonic() - player.began < seconds:
+    optimizer = torch.optim.Adam(agent.parameters())
+    player, steps, said, now = Player(worlds, seed), 0, 0.0, 0.0
+    while steps == 0 or now < seconds:
+        optimizer.param_groups[0]["lr"] = LEARNING_RATE * max(1.0 - now / max(seconds, 1.0), 0.05)
         improve(agent, optimizer, rollout, player.play(agent, rollout))
         steps += STEPS * worlds.num_envs
         now = time.monotonic() - player.began
         if player.episodes and now > said + 30.0:
             said = now
-            print(
-                f"{now:5.0f} s, {steps} steps: {_described(np.array(player.episodes[-100:], dtype=float))}", flush=True
-            )
+            last = np.array(player.episodes[-worlds.num_envs :], dtype=float)
+            print(f"{now:5.0f} s, {steps} steps: {_described(last)}", flush=True)
     return agent, np.array(player.episodes, dtype=float).reshape(-1, 4)
+
+
+@torch.no_grad()
+def score(path: Path) -> list[tuple[str, int, int, int, float]]:
+    """Let the mean action of a saved policy drive the ladder's patients of the tasks that it was trained on.
+
+    Returns:
+        For each task its name, safe successes, successes, navigations, and mean exposures (0 where all is observed).
+    """
+    saved, scores = torch.load(path), []
+    agent, observation = Agent(*saved["given"]), "xray" if saved["given"][1] == 3 else "state"
+    agent.load_state_dict(saved["weights"])
+    for task in list_tasks()[: saved["tasks"]]:
+        given = [task.ladder_navigation(place) for place in range(len(task.ladder.numbers))]
+        worlds = _worlds(len(given), observation, navigations=given)
+        seen, begun = torch.as_tensor(worlds.reset(seed=0)[0]), torch.ones(len(given))
+        memory, going, exposures = (
+            torch.zeros(len(given), HIDDEN),
+            np.ones(len(given), dtype=bool),
+            np.zeros(len(given)),
+        )
+        success, safe = np.zeros((2, len(given)), dtype=bool)
+        while going.any():
+            memory, begun = agent.remember(seen, memory, begun), torch.zeros_like(begun)
+            after, _, terminated, truncated, info = worlds.step(agent.decide(memory)[0].mean.numpy())
+            seen, ends = torch.as_tensor(after), going & (terminated | truncated)
+            success[ends], safe[ends] = info["success"][ends], info["safe"][ends]
+            exposures[ends] = info["exposures"][ends] if "exposures" in info else 0
+            going &= ~ends
+        scores.append((task.name, int((success & safe).sum()), int(success.sum()), len(given), float(exposures.mean())))
+    return scores
+
+
+def _worlds(count: int, observation: str, **given: object) -> endopilot.NavigateVectorEnv:
+    return endopilot.NavigateVectorEnv(count, observation=observation, autoreset_mode=AutoresetMode.DISABLED, **given)
 
 
 def _described(episodes: np.ndarray) -> str:
@@ -153,24 +199,31 @@ def _described(episodes: np.ndarray) -> str:
 
 
 def main() -> None:
-    """Train, and check that the return has risen."""
+    """Train, and check that the return has risen; or score."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=4.0)
-    parser.add_argument("--environment", default="endopilot/NavigateXray-v0")
-    parser.add_argument("--patients", type=int, default=1)
-    parser.add_argument("--worlds", type=int, default=64)
+    parser.add_argument("--tasks", type=int, default=0)
+    parser.add_argument("--observation", choices=("xray", "state"), default="xray")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--output", type=Path)
+    parser.add_argument("--score", type=Path)
     asked = parser.parse_args()
     torch.set_num_threads(1)
-    given = {"patients": asked.patients} if asked.patients > 1 else {}
-    worlds = gymnasium.make_vec(
-        f"endopilot.env:{asked.environment}",
-        num_envs=asked.worlds,
-        observation="xray",
-        autoreset_mode=AutoresetMode.DISABLED,
-        **given,
-    )
-    _, episodes = train(worlds, 60.0 * asked.minutes, asked.seed)
+    if asked.score:
+        for name, safe, success, count, exposures in score(asked.score):
+            print(f"{name}: safe success {safe} of {count}, success {success}, exposures {exposures:.1f}", flush=True)
+        return
+    if asked.tasks:
+        given = [task.learning_navigation(place) for task in list_tasks()[: asked.tasks] for place in range(PATIENTS)]
+        worlds = _worlds(WORLDS_EACH * len(given), asked.observation, navigations=given)
+    else:
+        worlds = _worlds(64, asked.observation)
+    agent, episodes = train(worlds, 60.0 * asked.minutes, asked.seed)
+    if asked.output:
+        torch.save({"given": agent.given, "tasks": asked.tasks, "weights": agent.state_dict()}, asked.output)
+        np.savetxt(
+            asked.output.with_suffix(".csv"), episodes, "%.4g", ",", header="s,return,safe,exposures", comments=""
+        )
     fifth = max(len(episodes) // 5, 1)
     for name, part in (("first", episodes[:fifth]), ("last", episodes[-fifth:])):
         print(f"{name} fifth of {len(episodes)} episodes: {_described(part)}")

@@ -54,6 +54,14 @@ def test_an_agent_holds_more_possible_of_the_ostium_and_pulls_loops_out(aorta, s
     assert {grid[0].back for _, grid in Repertoire.of((), SearchConfig(), wide=False).ways} == {0.0}
 
 
+def test_a_hurried_pair_keeps_a_course_that_it_is_little_off(aorta):
+    """Fifty millimetres in 6 s leave no time for wire and catheter in turn; in a narrow vessel 3 mm are off course."""
+    pair = replace(aorta, catheters=(read_catheter("vertebral-5f"),), seconds=6.0)
+    hurried = AgentConfig.of(pair)
+    assert hurried.search.manoeuvres.together and hurried.off_course_mm == 10.0
+    assert AgentConfig.of(replace(pair, seconds=60.0)).off_course_mm == 3.0
+
+
 def test_a_course_ends_where_most_wires_are_at_the_target(started, aorta):
     course = started.find_course(aorta.seconds)
     at = course.tip.abscissa[-1]

@@ -56,6 +56,7 @@ class AgentConfig:
             search=replace(search, speed_mm_s=min(speed, fastest), manoeuvres=manoeuvres),
             most_exposures=_HURRIED_EXPOSURES,
             belief=replace(belief, **_COARSE) if wide else belief,
+            off_course_mm=_OFF_WIDE_MM if wide else IN_CATHETER.off_course_mm,
         )
 
 
@@ -113,5 +114,8 @@ _HURRIED_S = 10.0
 """A catheter is then brought to its place in this time at most, s."""
 _HURRIED_EXPOSURES = 100
 """Exposures that may then be taken: soft devices fold and snap on half a metre of route."""
+_OFF_WIDE_MM = 10.0
+"""Another course for such a pair is searched in a wide lumen where it is off by so much, mm: soft devices do not lie
+there as simulated, and what counts is how they come to the next fork."""
 _COARSE = {"element_mm": 2.0, "time_step_s": 0.1}
 """What such a belief takes on a route through a wide lumen: its bends are wide, and the devices half a metre long."""
