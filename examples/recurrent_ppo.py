@@ -9,7 +9,7 @@ Without `--tasks` it learns one task in one patient; with it the lowest tasks of
 each. With the observation `xray` seeing costs: between two exposures only encoders and loads of the drives are
 observed, and the policy decides by itself when to take one. So it has a memory, a GRU. The loop is that of CleanRL's
 `ppo_atari_lstm.py` (Huang et al., JMLR 23, 2022) with continuous actions. The run ends with an error if nothing was
-learned. `--score` lets the mean action of a saved policy drive the ladder's own patients.
+learned. `--score` lets the mean motions of a saved policy drive the ladder's own patients.
 """
 
 from __future__ import annotations
@@ -160,11 +160,12 @@ def train(worlds: endopilot.NavigateVectorEnv, seconds: float, seed: int) -> tup
 
 @torch.no_grad()
 def score(path: Path) -> list[tuple[str, int, int, int, float]]:
-    """Let the mean action of a saved policy drive the ladder's patients of the tasks that it was trained on.
+    """Let the mean motions of a saved policy drive the ladder's patients of the tasks that it was trained on.
 
     Returns:
         For each task its name, safe successes, successes, navigations, and mean exposures (0 where all is observed).
     """
+    torch.manual_seed(0)
     saved, scores = torch.load(path), []
     agent, observation = Agent(*saved["given"]), "xray" if saved["given"][1] == 3 else "state"
     agent.load_state_dict(saved["weights"])
@@ -180,7 +181,10 @@ def score(path: Path) -> list[tuple[str, int, int, int, float]]:
         success, safe = np.zeros((2, len(given)), dtype=bool)
         while going.any():
             memory, begun = agent.remember(seen, memory, begun), torch.zeros_like(begun)
-            after, _, terminated, truncated, info = worlds.step(agent.decide(memory)[0].mean.numpy())
+            chances, _ = agent.decide(memory)
+            action = chances.mean
+            action[:, 2:] = chances.sample()[:, 2:]  # when to look is drawn: the mean would look always or never
+            after, _, terminated, truncated, info = worlds.step(action.numpy())
             seen, ends = torch.as_tensor(after), going & (terminated | truncated)
             success[ends], safe[ends] = info["success"][ends], info["safe"][ends]
             exposures[ends] = info["exposures"][ends] if "exposures" in info else 0
@@ -213,6 +217,8 @@ def main() -> None:
         for name, safe, success, count, exposures in score(asked.score):
             print(f"{name}: safe success {safe} of {count}, success {success}, exposures {exposures:.1f}", flush=True)
         return
+    if asked.output:
+        asked.output.parent.mkdir(parents=True, exist_ok=True)
     if asked.tasks:
         given = [task.learning_navigation(place) for task in list_tasks()[: asked.tasks] for place in range(PATIENTS)]
         worlds = _worlds(WORLDS_EACH * len(given), asked.observation, navigations=given)

@@ -38,12 +38,12 @@ def table(folder: Path) -> list[str]:
 
 
 def draw(folder: Path, path: Path) -> None:
-    """Draw what share of the episodes that ended was safe, and the exposures that they took, against time."""
+    """Draw what share of the episodes that ended was safe, and the exposures that they took: running means."""
     figure = Figure(figsize=(8, 3.2), layout="constrained")
     safe, seen = figure.subplots(1, 2)
     for name, title in POLICIES.items():
         seconds, _, success, exposures = np.loadtxt(folder / f"{name}.csv", delimiter=",", skiprows=1).T
-        width = min(1000, len(seconds))
+        width = max(len(seconds) // 8, 1)  # episodes that run out of time end in bursts
         mean, minutes = np.ones(width) / width, seconds[width - 1 :] / 60
         safe.plot(minutes, 100 * np.convolve(success, mean, mode="valid"), label=title)
         if exposures.any():

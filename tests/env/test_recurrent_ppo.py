@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import runpy
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -72,3 +73,16 @@ def test_advantages_are_discounted_errors_that_end_with_an_episode(learner):
     rollout.ended[-2] = 1.0
     found = rollout.advantages(torch.tensor([10.0]))[-3:, 0]
     torch.testing.assert_close(found, torch.tensor([1.0 + gamma * lam * 2.0, 2.0, 3.0 + gamma * 10.0]))
+
+
+@pytest.mark.parametrize(("name", "looks"), [("state", False), ("xray", True)])
+def test_saved_policies_are_scored_again(learner, fork, wire, monkeypatch, name, looks):
+    """They find a target straight ahead, each in its own way: by the true state, or by exposures that they ask for."""
+    ahead = Navigation(
+        anatomy=fork, device=wire, target=Target(branch=1, abscissa=38.0), start_inserted_length_mm=6.0, seconds=20.0
+    )
+    task = SimpleNamespace(name="ahead", ladder=SimpleNamespace(numbers=(0, 1)), ladder_navigation=lambda _: ahead)
+    monkeypatch.setitem(learner["score"].__wrapped__.__globals__, "list_tasks", lambda: (task,))
+    ((said, safe, success, count, exposures),) = learner["score"](EXAMPLE.parent / "policies" / f"{name}.pt")
+    assert (said, count) == ("ahead", 2) and 0 < safe <= success <= 2
+    assert (exposures > 1) == looks and (exposures == 0) != looks
