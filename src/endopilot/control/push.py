@@ -170,7 +170,7 @@ class Push:
         took, halt = np.full(trials.count, begun), np.full(trials.count, "late", dtype=object)
         passed, been = np.zeros(trials.count, dtype=bool), np.zeros(trials.simulator.worlds, dtype=bool)
         progress = farthest = self._progress(trials)
-        inserted_there, follower = _deepest(trials), _Follower(self, trials, lead)
+        inserted_there, follower = trials.deepest, _Follower(self, trials, lead)
         beyond = progress > self.waypoint
         waits = alone and not self.strict and self.route.is_wide(self.waypoint)
         slack_mm = SLACK_WIDTHS * self.route.width_mm(self.waypoint) if waits else _SLACK_MM
@@ -194,7 +194,7 @@ class Push:
                 hurries, longest = False, min(longest, begun + _LATE * (len(trials.rows) - begun))
             presses = trials.move(control, force_n=force_n)
             took[going] = len(trials.rows)
-            progress, inserted = self._progress(trials), _deepest(trials)
+            progress, inserted = self._progress(trials), trials.deepest
             inserted_there = np.where(progress > farthest + REST_MM, inserted, inserted_there)
             farthest = np.maximum(farthest, progress)
             if alone:
@@ -219,7 +219,7 @@ class Push:
         if not alone:
             passed = self.arrived(trials) & ~trials.still
         trials.still[:] = False
-        slack = _deepest(trials) - progress
+        slack = trials.deepest - progress
         return Pushed(trials.rows, took, passed, _largest_force(trials, took), farthest, slack, halt.tolist())
 
     def arrived(self, trials: Trials) -> Bool[np.ndarray, "trials"]:
@@ -332,11 +332,6 @@ def _slips(trials: Trials, before: Float[np.ndarray, "worlds"]) -> Bool[np.ndarr
     """Return which drives have slipped in the last period, given the wires' inserted lengths before, mm."""
     commanded = np.tile(trials.rows[-1].control[:, WIRE, 0], trials.wires) * DECISION_PERIOD_S
     return ~trials.all((trials.lengths[:, WIRE] - before >= _SLIP_SHARE * commanded) | (commanded < 0))
-
-
-def _deepest(trials: Trials) -> Each:
-    """Return the inserted length of each trial's foremost device, mm."""
-    return trials.mean(trials.lengths.max(axis=1))
 
 
 def _largest_force(trials: Trials, periods: Int[np.ndarray, "trials"]) -> Each:

@@ -304,7 +304,7 @@ class Search:
         """Return how hard a manoeuvre may press, N, and how much slack it may leave, mm, at some share of the limits.
 
         Devices that move together where time is short are so soft that loops end in coils: all but the last resort may
-        lay little into loops.
+        lay no more than `LOOPS_MM` into them.
         """
         limit_n = share * self._navigation.force_limit_n
         if not self.config.manoeuvres.together or share >= 1.0:
@@ -402,7 +402,7 @@ class Search:
     @property
     def _slack(self) -> float:
         """How much deeper than that the foremost of them is inserted, mm: what lies in loops."""
-        return float(self._course.mean(self._course.lengths.max(axis=1))[0]) - self._here()
+        return float(self._course.deepest[0]) - self._here()
 
     def _reached(self) -> float:
         return float(self._course.mean(self._navigation.reached(self._course.tips))[0])

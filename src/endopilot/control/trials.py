@@ -176,6 +176,11 @@ class Trials:
         """Return the inserted lengths of a device, mm."""
         return self.mean(self.lengths[:, device])
 
+    @property
+    def deepest(self) -> Float[np.ndarray, "trials"]:
+        """Inserted length of each trial's foremost device, mm."""
+        return self.mean(self.lengths.max(axis=1))
+
     def mean(self, values: Float[np.ndarray, "worlds"] | Bool[np.ndarray, "worlds"]) -> Float[np.ndarray, "trials"]:
         """Return the mean over the wires, by weight."""
         return self.weight @ values.reshape(self.wires, -1)
