@@ -21,6 +21,7 @@ from jaxtyping import Float, Int
 
 from endopilot.anatomy.projection import TipProjector
 from endopilot.belief.drives import Drives
+from endopilot.belief.moved_copies import MovedCopies
 from endopilot.belief.turned_wires import Fans, shifted, turned
 from endopilot.belief.vessels import SharedVessels
 from endopilot.devices.device import lateral_reach
@@ -68,6 +69,9 @@ class BeliefConfig:
     """The same across the wire, mm."""
     lost_across_radii: NonNegative = 0.0
     """The same in radii of the lumen, where that is more."""
+    copies: Annotated[int, Within(0, 4096)] = 0
+    """Copies of the likeliest devices that are moved to and fro where no member explains a measurement, until one does;
+    none if 0, or where members differ in more than friction and ostium."""
     element_mm: Annotated[float, Within(0.02, 5)] = 0.75
     """Length of the rod core's elements at the wire's tip, mm: longer ones catch in hairpin bends."""
     time_step_s: Annotated[float, Within(1e-5, 0.5)] = 0.05
@@ -320,12 +324,20 @@ class Belief:
             self.force = simulator.step(control, DECISION_PERIOD_S).contact_force_max
         self.tip = simulator.project()[:, 0]
 
-    def errors(self, position: Float[np.ndarray, "3"]) -> tuple[Errors, Float[np.ndarray, "members 2 3"]]:
-        """Return the distances of the members' tips from a place, along and across each wire, mm, and these axes."""
+    def errors(
+        self, position: Float[np.ndarray, "3"], simulator: Simulator | None = None
+    ) -> tuple[Errors, Float[np.ndarray, "members 2 3"]]:
+        """Return the distances of tips from a place, along and across each wire, mm, and these axes.
+
+        Args:
+            position: the place, LPS mm.
+            simulator: whose tips; the members' if not given.
+        """
+        simulator = simulator or self.simulator
         if self._coaxial:  # the first nodes are the foremost tube's
-            end, along = self.simulator.tip_position[:, 0], self.simulator.tip_direction[:, 0]
+            end, along = simulator.tip_position[:, 0], simulator.tip_direction[:, 0]
         else:
-            nodes = self.simulator.position[:, :2]
+            nodes = simulator.position[:, :2]
             end, along = nodes[:, 0], nodes[:, 0] - nodes[:, 1]
             along /= np.linalg.norm(along, axis=1, keepdims=True)
         return _split(position - end, along)
@@ -394,10 +406,41 @@ class Belief:
     @property
     def explains(self) -> bool:
         """Whether the likeliest wire explains the last measurement, which has weighed the members."""
-        best, config = self.best, self.config
-        across_mm = max(config.lost_across_mm, config.lost_across_radii * float(self.tip.radius[best]))
-        allowed = np.maximum([config.lost_along_mm, across_mm], _SURE_SDS * self._error_sd[best])
-        return bool((self.error[best] <= allowed).all())
+        best = self.best
+        return bool((self.error[best] <= self._allowed(self._error_sd[best])).all())
+
+    def _allowed(self, sd_mm: Errors) -> Errors:
+        """Return the errors that a wire may have which explains a measurement, mm, given its standard deviations."""
+        config = self.config
+        across_mm = max(config.lost_across_mm, config.lost_across_radii * float(self.tip.radius[self.best]))
+        return np.maximum([config.lost_along_mm, across_mm], _SURE_SDS * sd_mm)
+
+    def seek(self, measured: TipMeasurement) -> bool:
+        """Look for devices that explain a measurement which none of the members does; return whether there are.
+
+        Copies of the likeliest devices are moved to and fro. All members become the one that is found, with the ostium
+        that each has.
+        """
+        if self.config.copies == 0 or len(self.kinds) > 1:
+            return False
+
+        def misfit(simulator: Simulator) -> Float[np.ndarray, "worlds"]:
+            error, axes = self.errors(measured.position, simulator)
+            return (error / self._allowed(_sds(axes, measured))).max(axis=1)
+
+        best = self._copies.seek(self.best, self.simulator, misfit)
+        if best > 1:
+            return False
+        self.simulator.copy_worlds(np.full(len(self.members), self._copies.at), of=self._copies.simulator)
+        self.tip, self._score = self.simulator.project()[:, 0], np.zeros(len(self.members))
+        self.error, axes = self.errors(measured.position)
+        self._error_sd = _sds(axes, measured)
+        return True
+
+    @cached_property
+    def _copies(self) -> MovedCopies:
+        motion, simulator = self.navigation.known_motion, self.simulator
+        return MovedCopies(self.kinds[0], self.config.copies, motion=motion, config=self._core, sharing=simulator)
 
     def play_spread(self) -> Float[np.ndarray, "2"]:
         """Return the standard deviations of (Δtip, γtip) that the plays of the wire's drive make, mm."""

@@ -65,6 +65,7 @@ class Monitor:
     Attributes:
         belief: about the wire; another one once the model was taken to be wrong and another was identified.
         lost: whether no wire explains the last exposure.
+        sought: whether one was sought for this exposure, and found.
         past: what was measured so far.
         identified: what was found when the belief was last changed; None before.
         moves: how the vessel was found to move; None if it was not.
@@ -91,7 +92,7 @@ class Monitor:
         self._navigation, self._config = navigation, config or BeliefConfig()
         self._given = Belief.around(self._config)
         self.belief = Belief(navigation, self._given, self._config)
-        self.past, self.lost = Past(), False
+        self.past, self.lost, self.sought = Past(), False, False
         self.identified: Identified | None = None
         self.moves: FoundMotion | None = None
         self.seen: TipMeasurement | None = None
@@ -132,14 +133,15 @@ class Monitor:
         self.past.proximal.append(self.belief.drives.proximal.copy())
         at = predicted_tip(self.belief)
         self._watch.move(at)
-        self.seen = None
+        self.seen, self.sought = None, False
         if exposure is not None:
             self.seen = seen = self.belief.in_vessel(exposure, period)
             if self._tests:
                 self._watch.compare(seen.less(at.tip), exposure.tip_sd_mm)
             self.past.exposures[period] = exposure
             self.belief.weigh(seen)
-            self.lost = not self.belief.explains
+            self.sought = not self.belief.explains and self.belief.seek(seen)
+            self.lost = not (self.sought or self.belief.explains)
             self._innovations.alarm |= self.lost and self._tests
             self._since += 1
             if self.alarm and self._finds_motion():

@@ -34,8 +34,6 @@ _WIRE_CREEP_MM_S = 2.0
 """Fastest translation of a wire that should have arrived, and that X-ray shows beside its target, mm/s."""
 _CLEAR_MM = 4.0
 """A wire that is lost is pulled back by this much at least before it is looked at again, mm."""
-_LOSSES = 4
-"""Times that the wire is lost, after which the agent gives up: each time another belief was sought."""
 _HARDER = 1.1
 """Another course is searched where the drive pushes this many times harder than the last one was searched for."""
 _CREEP_MM_S, _CREEP_PERIODS = 1.0, 6
@@ -75,6 +73,8 @@ class _PlanningPolicy:
         """
         self.navigation, self.config = navigation, self._given_config or AgentConfig.of(navigation)
         self.route = Route.to(navigation.anatomy, navigation.target)
+        if self.config.search.manoeuvres.together:
+            self.route = self.route.beyond_carinas()
         for device in navigation.devices:
             check_passable(self.route, device)
         check_devices(navigation)
@@ -118,14 +118,16 @@ class _PlanningPolicy:
         """Return the simulated wires, the likeliest first: nodes from the foremost tip on, LPS mm."""
         return self.belief.wires
 
-    def find_course(self, seconds: float, advance: Advance | None = None) -> Course:
+    def find_course(self, seconds: float, advance: Advance | None = None, *, horizon_mm: float = np.inf) -> Course:
         """Search a course from where the likeliest devices are.
 
         Args:
             seconds: time that is left, s.
             advance: called with every millimetre along the route.
+            horizon_mm: the course may end when it leads so far on, mm.
         """
-        return self._search.find(self.belief, seconds=seconds, first=self.plans <= 1, advance=advance)
+        first = self.plans <= 1
+        return self._search.find(self.belief, seconds=seconds, horizon_mm=horizon_mm, first=first, advance=advance)
 
     @property
     def halt(self) -> str:
@@ -234,9 +236,10 @@ class _PlanningPolicy:
             self._follower.begin(None)
             return
         self._crept, self.plans, worked = 0, self.plans + 1, time.process_time()
-        self._follower.begin(self.find_course(seconds) if seconds >= DECISION_PERIOD_S else None)
+        horizon_mm = self.config.horizon_mm or np.inf
+        self._follower.begin(self.find_course(seconds, horizon_mm=horizon_mm) if seconds >= DECISION_PERIOD_S else None)
         self.planning_s += time.process_time() - worked
-        self._failed = self._failed + 1 if self._follower.course is not None and not self._follower.reached else 0
+        self._failed = self._failed + 1 if self._follower.course is not None and self.halt else 0
 
 
 class OraclePolicy(_PlanningPolicy):
@@ -315,7 +318,7 @@ class AgentPolicy(_PlanningPolicy):
             given = f"{self.navigation.force_limit_n:g} N is given"
             harder = f"the drive pushes {self._harder:.1f} times as hard as simulated wires"
             return replace(decision, gives_up=f"{decision.gives_up}: {given}, and {harder}")
-        if self._losses < _LOSSES or decision.gives_up:
+        if self._losses < self.config.losses or decision.gives_up:
             return self._within_dose(decision)
         seen = self.monitor.seen
         at = "" if seen is None else f" at {seen.abscissa:.0f} mm"
@@ -343,6 +346,8 @@ class AgentPolicy(_PlanningPolicy):
             self.belief = monitor.belief
             self._begin_anew()
         self._limit_load()
+        if monitor.sought:  # the devices lie otherwise than the course was searched for
+            self._follower.begin(None)
         if monitor.seen is not None:
             self._located(monitor.seen, lost=monitor.lost)
         self._lost = monitor.lost

@@ -35,6 +35,10 @@ class AgentConfig:
     """
     tries: Annotated[int, Within(1, 100)] = 3
     """Failed searches, one after another and each from where the last has led, after which the agent gives up."""
+    losses: Annotated[int, Within(1, 100)] = 4
+    """Times that the devices may be lost, after which the agent gives up: each time another belief was sought."""
+    horizon_mm: Positive | None = None
+    """A course may end when it leads this far on, mm, and is searched on from there; all the way if not given."""
     most_exposures: Annotated[int, Within(1, 10**6)] = 40
     """Exposures that an agent which looks when its adviser asks may take; it gives up where it needs more."""
 
@@ -53,9 +57,12 @@ class AgentConfig:
         manoeuvres = replace(search.manoeuvres, together=True, longest_s=_HURRIED_S)
         return replace(
             IN_CATHETER,
-            search=replace(search, speed_mm_s=min(speed, fastest), manoeuvres=manoeuvres),
+            search=replace(search, speed_mm_s=min(speed, fastest), attempts=_HURRIED_ATTEMPTS, manoeuvres=manoeuvres),
+            tries=_HURRIED_TRIES,
+            losses=_HURRIED_TRIES,
+            horizon_mm=_HURRIED_HORIZON_MM,
             most_exposures=_HURRIED_EXPOSURES,
-            belief=replace(belief, **_COARSE) if wide else belief,
+            belief=replace(belief, copies=_COPIES, time_step_s=_COARSE_S if wide else belief.time_step_s),
             off_course_mm=_OFF_WIDE_MM if wide else IN_CATHETER.off_course_mm,
         )
 
@@ -117,5 +124,13 @@ _HURRIED_EXPOSURES = 100
 _OFF_WIDE_MM = 10.0
 """Another course for such a pair is searched in a wide lumen where it is off by so much, mm: soft devices do not lie
 there as simulated, and what counts is how they come to the next fork."""
-_COARSE = {"element_mm": 2.0, "time_step_s": 0.1}
-"""What such a belief takes on a route through a wide lumen: its bends are wide, and the devices half a metre long."""
+_HURRIED_ATTEMPTS = 2
+"""Attempts at a place in which motions are drawn at random: turned manoeuvres are left."""
+_HURRIED_TRIES = 20
+"""Times that such a pair may be lost, or a search for it may fail: its motions are drawn anew each time."""
+_HURRIED_HORIZON_MM = 60.0
+"""A course for it leads so far on, mm: soft devices soon lie otherwise than simulated."""
+_COPIES = 32
+"""Copies of such devices by which others are sought where none explains an exposure."""
+_COARSE_S = 0.1
+"""Time step of such a belief on a route through a wide lumen, s: the devices are half a metre long."""

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.course import Controls
 from endopilot.control.search_config import SearchConfig
-from endopilot.control.trials import WIRE, Control, Move, Trials
+from endopilot.control.trials import CATHETER, WIRE, Control, Move, Trials
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.tasks.route import Route
 
@@ -28,7 +28,7 @@ _OFF_ROUTE = 0.5
 
 
 class Population:
-    """Candidates of a wire alone."""
+    """Candidates of a wire; a catheter around it rests."""
 
     def __init__(
         self,
@@ -62,7 +62,7 @@ class Population:
             rounds: of each attempt at most.
             spare_share: share of the force limit that the first attempts stay within; the last leave nothing to spare.
         """
-        attempts, nearest, best = self._config.attempts, np.inf, np.zeros((0, 1, 2))
+        attempts, nearest, best = self._config.attempts, np.inf, np.zeros((0, one.devices, 2))
         for attempt in range(attempts):
             share = spare_share if 2 * attempt < attempts else 1.0
             score, controls, won = self.attempt(one, waypoint, rounds, attempt, share)
@@ -77,11 +77,12 @@ class Population:
     ) -> tuple[float, Controls, bool]:
         """Search once; return the least cost so far and to go, its controls, and whether they pass the place."""
         trials, count = self._trials.copy_of(one), self._trials.count
-        history, spent, peak = np.zeros((0, count, 1, 2)), np.zeros(count), np.zeros(trials.simulator.worlds)
+        begun = np.zeros((count, trials.devices, 2))
+        history, spent, peak = begun[None][:0], np.zeros(count), np.zeros(trials.simulator.worlds)
         most_n = force_share * self._navigation.force_limit_n
-        nearest, best = np.inf, np.zeros((0, 1, 2))
+        nearest, best = np.inf, history[:, 0]
         for number in range(rounds):
-            before = history[-1] if number else np.zeros((count, 1, 2))
+            before = history[-1] if number else begun
             drawn = self._draw(before, number, attempt)
             drawn = trials.possible(drawn, alike=True, periods=self._config.round_periods)
             spent += self._run_round(drawn, before, waypoint, peak)
@@ -119,6 +120,10 @@ class Population:
             back = random.random(count) < 0.45
             speed = np.where(back, random.uniform(-0.8, 0.0, count), random.uniform(0.1, 0.8, count))
         drawn = self._trials.control(Move(WIRE, np.clip(speed, -1.0, 1.0) * config.speed_mm_s, turn))
+        if drawn.shape[1] > 1:
+            follows = random.random(count)
+            follow = np.where(follows < 0.4, 0.0, np.where(follows < 0.7, random.uniform(0.0, 1.0, count), speed))
+            drawn[:, CATHETER, 0] = np.clip(follow, -1.0, 1.0) * config.speed_mm_s
         same = (random.random(count) < 0.2) & (number > 1)
         drawn[same] = last[same]
         return drawn
@@ -126,12 +131,12 @@ class Population:
     def _run_round(self, control: Control, before: Control, waypoint: float, peak: Float[np.ndarray, "worlds"]) -> Each:
         """Drive all candidates for a round; return what it cost each, and note the largest forces."""
         trials, cost = self._trials, self._config.cost
-        spent = cost.roughness(before[:, 0], control[:, 0], trials.fastest)
+        spent = cost.roughness(before[:, WIRE], control[:, WIRE], trials.fastest)
         for _ in range(self._config.round_periods):
             step = trials.drive(control)
-            tip = trials.tips[:, 0]
+            tip = trials.tips[:, WIRE]
             running = cost.running(
-                error=self._distance(step.tip_position[:, 0], waypoint),
+                error=self._distance(step.tip_position[:, WIRE], waypoint),
                 ratio=safety_ratio(tip.offset, tip.radius, self._wire_radius),
                 force_share=step.contact_force_max / self._navigation.force_limit_n,
             )
@@ -145,8 +150,8 @@ class Population:
     def _judge(self, waypoint: float, spent: Each, gentle: Bool[np.ndarray, "worlds"]) -> tuple[Each, Each]:
         """Return each candidate's cost so far and to go, and the share of its wires that passed gently."""
         trials, route = self._trials, self._route
-        tip = trials.tips[:, 0]
-        to_go = self._distance(trials.simulator.position[:, 0], waypoint) + _OFF_ROUTE * route.off_route(tip)
+        tip = trials.tips[:, WIRE]
+        to_go = self._distance(trials.simulator.tip_position[:, WIRE], waypoint) + _OFF_ROUTE * route.off_route(tip)
         passed = route.passed(tip, waypoint) & trials.simulator.valid & gentle
         return trials.mean(to_go) + spent, trials.mean(passed)
 

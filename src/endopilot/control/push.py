@@ -139,7 +139,9 @@ class Push:
         navigation: with the force limit, at which a trial is given up.
         config: speed, and how catheters follow.
         waypoint: the place, mm; the target's own ends the push there.
-        strict: whether a wire alone is given up at the first sign that it will not pass, since there are other ways.
+        strict: whether a wire alone is given up at the first sign that it will not pass, since there are other ways;
+            and one of a soft pair as soon as it folds.
+        rests: whether a catheter rests while its wire goes all the way.
     """
 
     route: Route
@@ -147,6 +149,7 @@ class Push:
     config: SearchConfig
     waypoint: float
     strict: bool = False
+    rests: bool = False
 
     @property
     def last(self) -> bool:
@@ -169,19 +172,19 @@ class Push:
         alone, begun = trials.devices == 1, len(trials.rows)
         took, halt = np.full(trials.count, begun), np.full(trials.count, "late", dtype=object)
         passed, been = np.zeros(trials.count, dtype=bool), np.zeros(trials.simulator.worlds, dtype=bool)
-        progress = farthest = self._progress(trials)
+        progress = farthest = trials.progress(self.route)
         inserted_there, follower = trials.deepest, _Follower(self, trials, lead)
         beyond = progress > self.waypoint
         waits = alone and not self.strict and self.route.is_wide(self.waypoint)
         slack_mm = SLACK_WIDTHS * self.route.width_mm(self.waypoint) if waits else _SLACK_MM
-        slack_mm = LOOPS_MM if self.config.manoeuvres.together and not alone else slack_mm
+        slack_mm = LOOPS_MM if self.config.manoeuvres.together and not (alone or self.strict) else slack_mm
         off_mm, longest, force_n = self._limits(trials, waits)
 
         def stop(which: Bool[np.ndarray, "trials"], why: Halt) -> None:
             halt[which & ~trials.still] = why
             trials.still |= which
 
-        if self.strict:
+        if self.strict and alone:
             stop(self._off(trials, off_mm), "off")
         longest, hurries = begun + min(periods, longest), self.config.manoeuvres.together
         while len(trials.rows) < longest:
@@ -194,7 +197,7 @@ class Push:
                 hurries, longest = False, min(longest, begun + _LATE * (len(trials.rows) - begun))
             presses = trials.move(control, force_n=force_n)
             took[going] = len(trials.rows)
-            progress, inserted = self._progress(trials), trials.deepest
+            progress, inserted = trials.progress(self.route), trials.deepest
             inserted_there = np.where(progress > farthest + REST_MM, inserted, inserted_there)
             farthest = np.maximum(farthest, progress)
             if alone:
@@ -242,22 +245,19 @@ class Push:
             speed = np.where(left < 0, back, speed)
         return trials.control(Move(WIRE, speed))
 
-    def _progress(self, trials: Trials) -> Each:
-        return trials.mean(self.route.progress(trials.foremost))
-
     def _off(self, trials: Trials, off_mm: float) -> Bool[np.ndarray, "trials"]:
         return ~trials.all(self.route.off_route(trials.foremost) <= off_mm)
 
     def _limits(self, trials: Trials, waits: bool) -> tuple[float, int, float]:
         """Return how far in a wrong branch (mm), after how many periods, and at what force (N) a trial is given up."""
         limit_n, config = self.navigation.force_limit_n, self.config
-        if self.strict:
+        if self.strict and trials.devices == 1:
             return 0.0, sys.maxsize, config.cost.forbidden_share * limit_n
         if trials.devices == 1:
             before = self.route.junctions[self.route.junctions < self.waypoint]
             wide_mm = _OFF_WIDE_MM + _OFF_RADII * float(self.route.radius(before[-1:]).max(initial=0.0))
             return wide_mm if waits else _OFF_MM, sys.maxsize, limit_n
-        begun = float(self._progress(trials).min())
+        begun = float(trials.progress(self.route).min())
         off_mm = _OFF_WIDE_MM + _OFF_RADII * float(self.route.radius(np.array([begun, self.waypoint])).max())
         seconds = 2 * max(self.waypoint - begun, 0.0) / config.speed_mm_s + config.manoeuvres.longest_s
         return off_mm, round(seconds / DECISION_PERIOD_S), limit_n
@@ -276,6 +276,8 @@ class _Follower:
         self._lead = np.full(trials.count, ALL_ALONG_MM) if lead is None else lead
         self._follows = np.zeros(trials.count, dtype=bool)
         self._behind = np.minimum(self._lead, push.config.manoeuvres.behind_mm)
+        if push.rests:
+            self._behind[self._lead == ALL_ALONG_MM] = np.inf
 
     def control(self, progress: Each) -> Control:
         """Return what drives wires on, and catheters once they follow, from how far along the route they are, mm."""

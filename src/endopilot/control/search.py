@@ -19,7 +19,6 @@ the first. `manoeuvre_cost` decides between trials that are else as good.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from functools import partial
 from itertools import product
 
@@ -29,14 +28,27 @@ from endopilot.belief.belief import Belief
 from endopilot.control.course import Course
 from endopilot.control.halt import SPARE_SHARE, describe_halt, near_fork
 from endopilot.control.manoeuvre import STRAIGHT, Grid, Repertoire, place, retract
+from endopilot.control.places import next_place, places_of
 from endopilot.control.population import Population
-from endopilot.control.push import LOOPS_MM, TURN_PERIODS, Each, Halt, Push, Pushed, middle, sides, stand_off, turn
+from endopilot.control.push import (
+    LOOPS_MM,
+    REST_MM,
+    TURN_PERIODS,
+    Each,
+    Halt,
+    Push,
+    Pushed,
+    middle,
+    sides,
+    stand_off,
+    turn,
+)
 from endopilot.control.search_config import SearchConfig
-from endopilot.control.trials import STALL_PERIODS, WIRE, Kept, Move, Trials
+from endopilot.control.trials import CATHETER, STALL_PERIODS, WIRE, Kept, Move, Trials
 from endopilot.errors import InputError
 from endopilot.progress import Advance
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
-from endopilot.tasks.route import ENTERED_MM, Route
+from endopilot.tasks.route import Route
 
 _ENDLESS = sys.maxsize
 _BACK_MM_S = 2.0
@@ -44,9 +56,6 @@ _BACK_MM_S = 2.0
 _LOOKOUT_MM, _LOOKOUT_RADII = 12.0, 3.0
 """A waypoint that is searched for lies no farther ahead than this, mm, or lumen radii where that is more: beyond, a
 chord says little."""
-_STRETCH_MM, _LONG_STRETCH_MM = 20.0, 40.0
-"""A wire in a catheter passes the route in stretches of this length at most, mm; of the latter where the two move
-together, since each stretch ends with the wire at rest until its catheter has come."""
 _TURNS = (0.0, np.pi)
 """Angles by which a wire alone may be turned before it goes in, rad."""
 _GENTLE_SHARE, _LOOP_SHARE, _LOOP_MM_S = 0.1, 1e-4, 5.0
@@ -57,6 +66,9 @@ _SLACK_MM, _TAUT_MM, _COMES_MM, _LEAVES_MM = 25.0, 8.0, 3.0, 10.0
 the tip comes along by the third. Where it then slides back by more than the last, they stay as they were."""
 _BEHIND_WIDTHS = 2
 """Soft devices may slide out of a branch from so many widths of the lumen beyond its fork."""
+_GAIN_MM, _COMES_ALONG_MM = 3.0, 10.0
+"""What is drawn for soft devices is a step if they come this much forward, mm; a catheter that comes this much along
+the wire supports it."""
 _OFTEN = 6
 """A course that has passed places this many times as often as there are is at an end."""
 _REPEATED = 3
@@ -86,21 +98,30 @@ class Search:
             InputError: there is more than one catheter.
         """
         check_devices(navigation)
-        self._navigation, self.route, self.config = navigation, route, config
+        self._navigation, self.route, self.config, self._soft = navigation, route, config, config.manoeuvres.together
         self._alone, wide = not navigation.catheters, route.is_wide(route.target.abscissa)
         self._repertoire = Repertoire.of(navigation.catheters, config, wide=wide)
         trials_of = partial(Trials.of, navigation, belief.kinds, like=belief.simulator)
         self._course, self._many = trials_of(count=1), trials_of(count=self._repertoire.trials)
         self._few = self._course if self._alone else trials_of(count=len(self._repertoire.leads))
-        self._population = Population(navigation, route, self._many, config, np.random.default_rng([seed, 0x5EA]))
+        drawn = self._many if self._alone else trials_of(count=config.candidates)
+        self._population = Population(navigation, route, drawn, config, np.random.default_rng([seed, 0x5EA]))
         self.halt = ""
 
     @property
     def draws(self) -> bool:
         """Whether it draws at random, so that another search from the same belief may find another course."""
-        return self._alone
+        return self._alone or self._soft
 
-    def find(self, belief: Belief, *, seconds: float, first: bool = False, advance: Advance | None = None) -> Course:
+    def find(
+        self,
+        belief: Belief,
+        *,
+        seconds: float,
+        horizon_mm: float = np.inf,
+        first: bool = False,
+        advance: Advance | None = None,
+    ) -> Course:
         """Find a course from where the likeliest devices are to the target.
 
         In a tortuous vessel forces depend on the side that the bent tip of a wire alone looks to as it goes in. So
@@ -109,7 +130,8 @@ class Search:
 
         Args:
             belief: of the devices; nothing of it is changed.
-            seconds: time that is left, s. With a catheter a course may take longer.
+            seconds: time that is left, s. Where devices move in turn a course may take longer.
+            horizon_mm: a course may end when it has come so far forward, mm.
             first: whether it is the first of the navigation, which may turn the devices before all else.
             advance: called with every millimetre along the route.
         """
@@ -117,7 +139,7 @@ class Search:
         best: Course | None = None
         halt = ""
         for angle in _TURNS if first and self._alone else _TURNS[:1]:
-            course = self.find_turned(belief, angle, seconds=seconds, advance=advance)
+            course = self.find_turned(belief, angle, seconds=seconds, horizon_mm=horizon_mm, advance=advance)
             if best is None or _merit(course) > _merit(best):
                 best, halt = course, self.halt
             if (course.reached > 0.5 and course.force.max(initial=0.0) <= gentle_n) or self._at_fork:
@@ -131,7 +153,14 @@ class Search:
         return best
 
     def find_turned(
-        self, belief: Belief, angle: float, *, seconds: float, advance: Advance | None = None, out: bool = False
+        self,
+        belief: Belief,
+        angle: float,
+        *,
+        seconds: float,
+        horizon_mm: float = np.inf,
+        advance: Advance | None = None,
+        out: bool = False,
     ) -> Course:
         """Find a course that begins with a turn of the devices, rad; the other arguments are those of `find`.
 
@@ -143,18 +172,20 @@ class Search:
         course.put(source, belief.simulator, weight)
         self._behind_mm = self._before_fork()
         self.halt, self._at_fork = "", False
-        self._periods = max(1, int(seconds / DECISION_PERIOD_S)) if self._alone else _ENDLESS
+        self._periods = max(1, int(seconds / DECISION_PERIOD_S)) if self.draws else _ENDLESS
         if angle:
             turn(course, np.array([angle]), periods=self._periods)
         while out and self._here() > self._behind_mm and course.lengths[:, WIRE].min() > 1.0 and self._left > 0:
             course.move(course.control(Move(WIRE, -self.config.speed_mm_s)))
-        places = self._places()
+        begun = self._here()
+        places = places_of(self.route, begun, alone=self._alone, together=self._soft)
         while len(course.rows) < self._periods:
             here = self._here()
             if advance is not None:
                 advance(max(here - reported, 0.0))
                 reported = max(here, reported)
-            waypoint, kept, self._tried = self._next(places, here), course.kept(), {}
+            self._goes_ahead = self._soft and not self._navigation.arriving and here >= self.route.narrow_from
+            waypoint, kept, self._tried = next_place(places, here, alone=self._alone), course.kept(), {}
             halt = self._straight(waypoint)
             if halt is None:
                 self._pull_taut(waypoint)
@@ -166,11 +197,17 @@ class Search:
                 if len(settled) > _OFTEN * len(places):  # it goes to and fro about a place
                     self._halted("stalled", waypoint)
                     break
+            elif self._soft and self._ahead(waypoint, kept, halt):
+                settled.append(len(course.rows) - 1)
             elif any(self._turned(grid, share, waypoint, kept) for share, grid in self._repertoire.ways):
                 self._pull_taut(waypoint)
                 settled.append(len(course.rows) - 1)
-            elif not (self._alone and self._drawn(waypoint, kept)):
+            elif self._alone and self._drawn(waypoint, kept):
+                settled.append(len(course.rows) - 1)
+            else:
                 self._halted(halt, waypoint)
+                break
+            if self._here() >= begun + horizon_mm:
                 break
         else:
             self._halted("late", 0.0)
@@ -195,33 +232,18 @@ class Search:
         loops_mm = pushed.slack + _LOOP_MM_S * seconds
         return np.maximum(pushed.force, _GENTLE_SHARE * limit_n) + _LOOP_SHARE * limit_n * loops_mm
 
-    def _places(self) -> Sequence[float]:
-        """Return the places that are passed one after another, mm: waypoints, and with a catheter others between."""
-        route, begun = self.route, self._here()
-        if self._alone:
-            return route.waypoints.tolist()
-        longest = _LONG_STRETCH_MM if self.config.manoeuvres.together else _STRETCH_MM
-        places: list[float] = []
-        for goal in [*route.waypoints[:-1][route.waypoints[:-1] > begun].tolist(), route.target.abscissa]:
-            begin = places[-1] if places else begun
-            count = max(1, int(np.ceil((goal - begin) / longest)))
-            places += [begin + (goal - begin) * (k + 1) / count for k in range(count - 1)] + [goal]
-        return places
-
-    def _next(self, places: Sequence[float], here: float) -> float:
-        """Return the first place that devices which have come to an abscissa, mm, have not passed."""
-        beyond = ENTERED_MM if self._alone else 0.0
-        return next((place for place in places if place + beyond > here), self.route.target.abscissa)
-
     def _straight(self, waypoint: float) -> Halt | None:
         """Push straight on past a place; return why not, or None if the course has passed it."""
-        course, push = self._course, self._push(waypoint, strict=self._alone)
+        course, push = self._course, self._push(waypoint, strict=self._alone or self._goes_ahead)
         if push.arrived(course)[0]:
             return None
-        trials = course if self._alone else self._few.copy_of(course)
-        pushed = self._tried[STRAIGHT] = push.run(trials, self._left, np.array(self._repertoire.leads))
+        if push.strict:
+            pushed = push.run(course, self._left)
+            passes = pushed.passed[0]
+        else:
+            pushed = self._tried[STRAIGHT] = self._try(STRAIGHT, waypoint)
+            passes = self._follow(pushed, SPARE_SHARE, waypoint, turns=1)
         self._hard = float(pushed.farthest.max())
-        passes = pushed.passed[0] if self._alone else self._follow(pushed, SPARE_SHARE, waypoint, turns=1)
         if push.spreads(course):
             passes = passes and self._arrives(push)
         return None if passes else pushed.halt[int(np.argmax(pushed.farthest))]
@@ -261,7 +283,11 @@ class Search:
         return self._follow(tried, share, waypoint, turns=self._repertoire.turns if grid else 1)
 
     def _try(self, grid: Grid, waypoint: float) -> Pushed:
-        """Place devices as a grid has them, turn them to all sides, and push them on."""
+        """Place devices as a grid has them, turn them to all sides, and push them on; `STRAIGHT` with every lead."""
+        if not grid:
+            return self._push(waypoint).run(
+                self._few.copy_of(self._course), self._left, np.array(self._repertoire.leads)
+            )
         many, limit_n = self._many.copy_of(self._course), self._navigation.force_limit_n
         left, turns = self._left, self._repertoire.turns
         beyond, lead, back, push_lead = (
@@ -269,14 +295,13 @@ class Search:
         )
         obstacle, step = self._obstacle(waypoint)
         if not self._alone:
-            wanted = np.maximum(obstacle + beyond * step, 0.0)
-            place(many, wanted, lead, config=self.config, force_n=limit_n)
+            place(many, np.maximum(obstacle + beyond * step, 0.0), lead, config=self.config, force_n=limit_n)
         turn(many, np.tile(sides(turns), len(grid)), periods=left, force_n=limit_n)
         retract(many, back * step, config=self.config, force_n=limit_n)
         return self._push(waypoint).run(many, left - TURN_PERIODS, push_lead)
 
     def _push(self, waypoint: float, *, strict: bool = False) -> Push:
-        return Push(self.route, self._navigation, self.config, waypoint, strict)
+        return Push(self.route, self._navigation, self.config, waypoint, strict, rests=self._goes_ahead)
 
     def _follow(self, pushed: Pushed, share: float, waypoint: float, *, turns: int) -> bool:
         """Let the course do what the best trial of a manoeuvre did; return whether any passes within a share of force.
@@ -320,7 +345,8 @@ class Search:
         if not self.config.manoeuvres.together or self._slack <= _SLACK_MM or waypoint >= self.route.target.abscissa:
             return
         kept, passed = course.kept(), self._here()
-        back = course.control(*(Move(device, -speed) for device in range(course.devices)))
+        pulled = 1 if self._goes_ahead else course.devices
+        back = course.control(*(Move(device, -speed) for device in range(pulled)))
         while self._slack > _TAUT_MM and self._here() > passed - _COMES_MM and course.lengths.min() > 1.0:
             course.move(back)
         if self._here() < passed - _LEAVES_MM:
@@ -390,6 +416,49 @@ class Search:
             course.weight = passed / passed.sum()
         return won and len(course.rows) > kept.periods
 
+    def _ahead(self, waypoint: float, kept: Kept, halt: Halt) -> bool:
+        """Bring the wire of a soft pair on ahead of its catheter; return whether it comes forward.
+
+        Its motions are drawn from where it lay, then from where a straight push has loaded it. A catheter that comes
+        after supports it.
+        """
+        course, route, config, loaded = self._course, self.route, self.config, self._course.kept()
+        course.restore(kept)
+        begun = self._here()
+        for begin in (kept, loaded) if halt == "stalled" and self._goes_ahead else (kept,):
+            course.restore(begin)
+            here = self._here()
+            goal = min(route.next_waypoint(here), here + _LOOKOUT_MM)
+            rounds = min(config.rounds, self._left // config.round_periods)
+            controls, _ = self._population.find(course, goal, rounds=rounds, spare_share=SPARE_SHARE)
+            for control in controls:
+                course.move(control[None])
+            self._pull_taut(waypoint)
+            if self._here() >= begun + _GAIN_MM:
+                return True
+        return self._goes_ahead and self._supported(kept)
+
+    def _supported(self, kept: Kept) -> bool:
+        """Let the catheter follow over the resting wire, which it then supports; return whether it comes along."""
+        course, config = self._course, self.config
+        course.restore(kept)
+        begun, here, first_mm = self._catheter_at(), self._here(), float(course.inserted(CATHETER)[0])
+        for _ in range(min(self._left, round(config.manoeuvres.longest_s / DECISION_PERIOD_S))):
+            inserted = float(course.inserted(CATHETER)[0])
+            left = float(course.inserted(WIRE)[0]) - config.manoeuvres.behind_mm - inserted
+            folds = inserted - first_mm - (self._catheter_at() - begun) > _SLACK_MM
+            if left <= REST_MM or folds or course.still[0]:
+                break
+            speed = min(config.speed_mm_s, left / DECISION_PERIOD_S)
+            course.still |= course.move(course.control(Move(CATHETER, speed)), force_n=self._navigation.force_limit_n)
+        course.still[:] = False
+        return self._catheter_at() >= begun + _COMES_ALONG_MM and self._here() >= here - _LEAVES_MM
+
+    def _catheter_at(self) -> float:
+        """Return how far along the route the catheter's tip lies, mm."""
+        tips = self._course.tips[:, CATHETER]
+        return float(self._course.mean(self.route.progress(tips))[0])
+
     @property
     def _left(self) -> int:
         """Decision periods that the course may still take."""
@@ -397,7 +466,7 @@ class Search:
 
     def _here(self) -> float:
         """Return how far along the route the devices have come, mm."""
-        return float(self._course.mean(self.route.progress(self._course.foremost))[0])
+        return float(self._course.progress(self.route)[0])
 
     @property
     def _slack(self) -> float:

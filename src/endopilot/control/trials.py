@@ -16,6 +16,7 @@ from endopilot.devices.stack import Stack
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState, Step
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.route import Route
 from endopilot.types import Anatomy, TipProjection
 
 Control = Float[np.ndarray, "trials devices 2"]
@@ -67,10 +68,15 @@ class Period(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """Where trials were: their state, and how many periods they had done."""
+    """Where trials were: their state, and what they had done, period by period."""
 
     state: SimulatorState
-    periods: int
+    rows: list[Period]
+
+    @property
+    def periods(self) -> int:
+        """How many periods they had done."""
+        return len(self.rows)
 
 
 class Trials:
@@ -181,6 +187,10 @@ class Trials:
         """Inserted length of each trial's foremost device, mm."""
         return self.mean(self.lengths.max(axis=1))
 
+    def progress(self, route: Route) -> Float[np.ndarray, "trials"]:
+        """Return how far along a route each trial's foremost device has come, mm."""
+        return self.mean(route.progress(self.foremost))
+
     def mean(self, values: Float[np.ndarray, "worlds"] | Bool[np.ndarray, "worlds"]) -> Float[np.ndarray, "trials"]:
         """Return the mean over the wires, by weight."""
         return self.weight @ values.reshape(self.wires, -1)
@@ -243,13 +253,13 @@ class Trials:
 
     def kept(self) -> Kept:
         """Return where they are."""
-        return Kept(self.simulator.state, len(self.rows))
+        return Kept(self.simulator.state, list(self.rows))
 
     def restore(self, kept: Kept) -> None:
-        """Put them back to where they were, and forget what they have done since."""
+        """Put them to where they were; what they have done since is forgotten."""
         self.simulator.set_state(kept.state)
         self.still[:], self._seen = False, None
-        del self.rows[kept.periods :]
+        self.rows = list(kept.rows)
 
     def as_course(self, *, reached: float, ostium_mm: float, settled: Sequence[int] | None) -> Course:
         """Return what the first trial has done as a course.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -64,6 +64,16 @@ class Route:
             waypoints=np.append(beyond, target.abscissa),
         )
 
+    def beyond_carinas(self) -> Route:
+        """Return the route with waypoints that lie beyond the carinas of its forks, as far as its branches reach.
+
+        Where a branch leaves obliquely from one as wide, a tip beside its line may still lie in the other lumen.
+        """
+        ends = np.append(self.junctions[1:] - ENTERED_MM, self.target.abscissa)[: len(self.junctions)]
+        carinas = [_carina(self.anatomy.tree, branch) for branch in self.branches[1 : len(self.junctions) + 1]]
+        deeper = np.where(np.array(carinas) < ends, np.maximum(self.waypoints[:-1], carinas), self.waypoints[:-1])
+        return replace(self, waypoints=np.append(deeper, self.target.abscissa))
+
     @cached_property
     def leaves_at(self) -> Float[np.ndarray, "branches"]:
         """Abscissa at which the path to each branch of the tree leaves the route; infinite for those on it."""
@@ -106,6 +116,13 @@ class Route:
         """Return whether a wire may fold in the lumen up to an abscissa, mm, and yet come forward (`WIDE_MM`)."""
         return self.width_mm(end) > WIDE_MM
 
+    @cached_property
+    def narrow_from(self) -> float:
+        """Abscissa from which on the lumen is nowhere wide up to the target, mm."""
+        before = self.line.abscissa <= self.target.abscissa
+        wide = self.line.abscissa[before & (2 * self.line.radius > WIDE_MM)]
+        return float(wide.max(initial=0.0))
+
     def radius(self, abscissa: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Return the lumen radius along the route, mm."""
         return np.interp(abscissa, self.line.abscissa, self.line.radius)
@@ -118,16 +135,29 @@ def _left_backwards(tree: VesselTree, branch: int) -> float:
     branch would seem to lie deep in it.
     """
     parent, own = tree.branches[branch].parent, tree.branches[branch].centerline
-    beside = [parent, *(other for other in tree.children(parent) if other != branch)]
-    points = np.concatenate([tree.branches[other].centerline.points for other in beside])
-    radius = np.concatenate([tree.branches[other].centerline.radius for other in beside])
-    gap = np.linalg.norm(own.points[:, None] - points, axis=2) - radius
-    out = int(np.argmax(np.append(gap.min(axis=1) > 0, True)))
+    out = int(np.argmax(np.append(_gap_beside(tree, branch) > 0, True)))
     if not 0 < out < len(own.points):
         return 0.0
     before = tree.branches[parent].centerline.points
     into, onto = before[-1] - before[-2], own.points[out] - own.points[out - 1]
     return float(own.abscissa[out]) if into @ onto < 0 else 0.0
+
+
+def _carina(tree: VesselTree, branch: int) -> float:
+    """Return where the lumen of a branch parts from the vessels beside it, mm; infinite if it does not."""
+    own = tree.branches[branch].centerline
+    parts = np.flatnonzero(_gap_beside(tree, branch) > own.radius)
+    return float(own.abscissa[parts[0]]) if len(parts) else np.inf
+
+
+def _gap_beside(tree: VesselTree, branch: int) -> Float[np.ndarray, "points"]:
+    """Return how far the points of a branch's line lie from the walls of its parent and of what else leaves it, mm."""
+    parent = tree.branches[branch].parent
+    beside = [parent, *(other for other in tree.children(parent) if other != branch)]
+    points = np.concatenate([tree.branches[other].centerline.points for other in beside])
+    radius = np.concatenate([tree.branches[other].centerline.radius for other in beside])
+    gap = np.linalg.norm(tree.branches[branch].centerline.points[:, None] - points, axis=2) - radius
+    return np.asarray(gap.min(axis=1))
 
 
 def check_passable(route: Route, device: Device) -> None:
