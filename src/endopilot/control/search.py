@@ -66,9 +66,11 @@ _SLACK_MM, _TAUT_MM, _COMES_MM, _LEAVES_MM = 25.0, 8.0, 3.0, 10.0
 the tip comes along by the third. Where it then slides back by more than the last, they stay as they were."""
 _BEHIND_WIDTHS = 2
 """Soft devices may slide out of a branch from so many widths of the lumen beyond its fork."""
-_GAIN_MM, _COMES_ALONG_MM = 3.0, 10.0
-"""What is drawn for soft devices is a step if they come this much forward, mm; a catheter that comes this much along
-the wire supports it."""
+_GAIN_MM = 3.0
+"""What is drawn for devices that move together is a step if they come this much forward, mm."""
+_COMES_ALONG_MM, _FOLDS_MM = 10.0, 40.0
+"""A catheter that comes this much along its wire supports it, mm; it has folded where it is pushed so much farther than
+it comes."""
 _OFTEN = 6
 """A course that has passed places this many times as often as there are is at an end."""
 _REPEATED = 3
@@ -98,7 +100,12 @@ class Search:
             InputError: there is more than one catheter.
         """
         check_devices(navigation)
-        self._navigation, self.route, self.config, self._soft = navigation, route, config, config.manoeuvres.together
+        self._navigation, self.route, self.config, self._together = (
+            navigation,
+            route,
+            config,
+            config.manoeuvres.together,
+        )
         self._alone, wide = not navigation.catheters, route.is_wide(route.target.abscissa)
         self._repertoire = Repertoire.of(navigation.catheters, config, wide=wide)
         trials_of = partial(Trials.of, navigation, belief.kinds, like=belief.simulator)
@@ -111,7 +118,7 @@ class Search:
     @property
     def draws(self) -> bool:
         """Whether it draws at random, so that another search from the same belief may find another course."""
-        return self._alone or self._soft
+        return self._alone or self._together
 
     def find(
         self,
@@ -178,13 +185,13 @@ class Search:
         while out and self._here() > self._behind_mm and course.lengths[:, WIRE].min() > 1.0 and self._left > 0:
             course.move(course.control(Move(WIRE, -self.config.speed_mm_s)))
         begun = self._here()
-        places = places_of(self.route, begun, alone=self._alone, together=self._soft)
+        places = places_of(self.route, begun, alone=self._alone, together=self._together)
         while len(course.rows) < self._periods:
             here = self._here()
             if advance is not None:
                 advance(max(here - reported, 0.0))
                 reported = max(here, reported)
-            self._goes_ahead = self._soft and not self._navigation.arriving and here >= self.route.narrow_from
+            self._goes_ahead = self._together and not self._navigation.arriving and here >= self.route.narrow_from
             waypoint, kept, self._tried = next_place(places, here, alone=self._alone), course.kept(), {}
             halt = self._straight(waypoint)
             if halt is None:
@@ -197,8 +204,10 @@ class Search:
                 if len(settled) > _OFTEN * len(places):  # it goes to and fro about a place
                     self._halted("stalled", waypoint)
                     break
-            elif self._soft and self._ahead(waypoint, kept, halt):
+            elif self._together and self._ahead(waypoint, kept, halt):
                 settled.append(len(course.rows) - 1)
+                if np.isfinite(horizon_mm):
+                    break
             elif any(self._turned(grid, share, waypoint, kept) for share, grid in self._repertoire.ways):
                 self._pull_taut(waypoint)
                 settled.append(len(course.rows) - 1)
@@ -417,10 +426,10 @@ class Search:
         return won and len(course.rows) > kept.periods
 
     def _ahead(self, waypoint: float, kept: Kept, halt: Halt) -> bool:
-        """Bring the wire of a soft pair on ahead of its catheter; return whether it comes forward.
+        """Bring devices that move together on otherwise than straight; return whether they come forward.
 
-        Its motions are drawn from where it lay, then from where a straight push has loaded it. A catheter that comes
-        after supports it.
+        Motions are drawn: from where the devices lay, then from where the straight push has loaded the wire. Else the
+        catheter follows a wire that goes ahead.
         """
         course, route, config, loaded = self._course, self.route, self.config, self._course.kept()
         course.restore(kept)
@@ -436,17 +445,17 @@ class Search:
             self._pull_taut(waypoint)
             if self._here() >= begun + _GAIN_MM:
                 return True
-        return self._goes_ahead and self._supported(kept)
+        course.restore(kept)
+        return self._goes_ahead and self._supported()
 
-    def _supported(self, kept: Kept) -> bool:
+    def _supported(self) -> bool:
         """Let the catheter follow over the resting wire, which it then supports; return whether it comes along."""
         course, config = self._course, self.config
-        course.restore(kept)
         begun, here, first_mm = self._catheter_at(), self._here(), float(course.inserted(CATHETER)[0])
         for _ in range(min(self._left, round(config.manoeuvres.longest_s / DECISION_PERIOD_S))):
             inserted = float(course.inserted(CATHETER)[0])
             left = float(course.inserted(WIRE)[0]) - config.manoeuvres.behind_mm - inserted
-            folds = inserted - first_mm - (self._catheter_at() - begun) > _SLACK_MM
+            folds = inserted - first_mm - (self._catheter_at() - begun) > _FOLDS_MM
             if left <= REST_MM or folds or course.still[0]:
                 break
             speed = min(config.speed_mm_s, left / DECISION_PERIOD_S)
