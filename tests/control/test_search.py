@@ -11,7 +11,7 @@ from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.agent import AgentPolicy, OpenLoopPolicy, OraclePolicy
 from endopilot.control.agent_config import AgentConfig
 from endopilot.control.course import Course
-from endopilot.control.manoeuvre import Grid
+from endopilot.control.manoeuvre import STRAIGHT, Grid
 from endopilot.control.push import Push, Pushed
 from endopilot.control.search import Search
 from endopilot.control.search_config import ManoeuvreConfig
@@ -228,15 +228,18 @@ def test_where_there_is_little_time_slow_trials_are_given_up(hurried, monkeypatc
 
 def test_where_there_is_little_time_loops_are_the_last_resort(hurried, monkeypatch) -> None:
     straight, config = hurried
-    tried = []
+    tried, push_on = [], Search._try
 
-    def nothing_passes(search: Search, grid: Grid, _: float) -> Pushed:
+    def nothing_passes(search: Search, grid: Grid, waypoint: float) -> Pushed:
+        if grid == STRAIGHT:
+            return push_on(search, grid, waypoint)
         tried.append(grid)
         many = search._many.count
         none = np.zeros(many)
         return Pushed([], none.astype(int), none > 0, none, none, none, ["off"] * many)
 
     monkeypatch.setattr(Search, "_try", nothing_passes)
+    monkeypatch.setattr(Search, "_ahead", lambda *_: False)
     assert search_straight(straight, config).reached == 1.0 and not tried
     monkeypatch.setattr("endopilot.control.search.LOOPS_MM", -1000.0)
     assert search_straight(straight, config).reached == 1.0 and tried

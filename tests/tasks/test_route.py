@@ -78,6 +78,34 @@ def test_the_waypoint_of_a_branch_that_leaves_backwards_lies_outside_its_parent(
     assert route.waypoints[0] - 20.0 == pytest.approx(beyond_mm, abs=0.6)
 
 
+@pytest.mark.parametrize("short", [False, True])
+def test_beyond_the_carina_of_a_fork_the_lumina_have_parted(fork, short):
+    """A branch of radius 0.8 mm leaves one of 1 mm at 60°: they part where s sin 60° - 1 = 0.8, 2.1 mm from the fork.
+
+    One whose radius is 3 mm, 4 / sin 60° = 4.6 mm from it; no waypoint lies beyond a target that is nearer.
+    """
+    axis = np.arange(0.0, 81.0)[:, None] * np.array([0.0, 0.0, 0.5])
+    side = axis[40] + np.arange(0.0, 61.0)[:, None] * 0.5 * np.array([np.sin(np.pi / 3), 0.0, np.cos(np.pi / 3)])
+    for radius, carina_mm in ((0.8, 1.8 / np.sin(np.pi / 3)), (3.0, 4.0 / np.sin(np.pi / 3))):
+        tree = tree_of((axis[:41], 1.0, -1), (axis[40:], 1.0, 0), (side, radius, 0))
+        given = Route.to(replace(fork, tree=tree), Target(branch=2, abscissa=23.0 if short else 40.0))
+        beyond = given.beyond_carinas()
+        deepest = given.waypoints[0] if short and carina_mm > 3.0 else max(given.waypoints[0], 20.0 + carina_mm)
+        assert beyond.waypoints[0] == pytest.approx(deepest, abs=0.5) and beyond.waypoints[-1] == given.waypoints[-1]
+        assert np.array_equal(beyond.junctions, given.junctions)
+
+
+@pytest.mark.parametrize(("wide_mm", "narrow_from_mm"), [((0.0, 10.0), 10.0), ((35.0, 40.0), 0.0)])
+def test_the_lumen_is_narrow_behind_its_last_wide_place(fork, wide_mm, narrow_from_mm):
+    """More than 16 mm are wide; what lies beyond the target does not count."""
+    tree = tree_of((np.arange(0.0, 81.0)[:, None] * np.array([0.0, 0.0, 0.5]), 2.0, -1))
+    line = tree.branches[0].centerline
+    wide = (line.abscissa >= wide_mm[0]) & (line.abscissa <= wide_mm[1])
+    line = replace(line, radius=np.where(wide, 8.5, 2.0))
+    tree = replace(tree, branches=(replace(tree.branches[0], centerline=line),))
+    assert Route.to(replace(fork, tree=tree), Target(branch=0, abscissa=30.0)).narrow_from == narrow_from_mm
+
+
 def named(fork):
     branches = [
         Branch(branch.centerline, branch.parent, np.full(len(branch.section), index))

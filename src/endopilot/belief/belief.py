@@ -409,7 +409,7 @@ class Belief:
         best = self.best
         return bool((self.error[best] <= self._allowed(self._error_sd[best])).all())
 
-    def _allowed(self, sd_mm: Errors) -> Errors:
+    def _allowed(self, sd_mm: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
         """Return the errors that a wire may have which explains a measurement, mm, given its standard deviations."""
         config = self.config
         across_mm = max(config.lost_across_mm, config.lost_across_radii * float(self.tip.radius[self.best]))

@@ -71,6 +71,8 @@ _GAIN_MM = 3.0
 _COMES_ALONG_MM, _FOLDS_MM = 10.0, 40.0
 """A catheter that comes this much along its wire supports it, mm; it has folded where it is pushed so much farther than
 it comes."""
+_RETREAT_MM = 10.0, 40.0
+"""A wire that goes ahead and is stuck is pulled back by between these two, mm."""
 _OFTEN = 6
 """A course that has passed places this many times as often as there are is at an end."""
 _REPEATED = 3
@@ -112,8 +114,9 @@ class Search:
         self._course, self._many = trials_of(count=1), trials_of(count=self._repertoire.trials)
         self._few = self._course if self._alone else trials_of(count=len(self._repertoire.leads))
         drawn = self._many if self._alone else trials_of(count=config.candidates)
-        self._population = Population(navigation, route, drawn, config, np.random.default_rng([seed, 0x5EA]))
-        self.halt = ""
+        self._random = np.random.default_rng([seed, 0x5EA])
+        self._population = Population(navigation, route, drawn, config, self._random)
+        self.halt, self._periods, self._goes_ahead = "", _ENDLESS, False
 
     @property
     def draws(self) -> bool:
@@ -208,6 +211,10 @@ class Search:
                 settled.append(len(course.rows) - 1)
                 if np.isfinite(horizon_mm):
                     break
+            elif self._goes_ahead and np.isfinite(horizon_mm):
+                self._halted(halt, waypoint)
+                self._retreat(kept)
+                break
             elif any(self._turned(grid, share, waypoint, kept) for share, grid in self._repertoire.ways):
                 self._pull_taut(waypoint)
                 settled.append(len(course.rows) - 1)
@@ -354,9 +361,12 @@ class Search:
         if not self.config.manoeuvres.together or self._slack <= _SLACK_MM or waypoint >= self.route.target.abscissa:
             return
         kept, passed = course.kept(), self._here()
-        pulled = 1 if self._goes_ahead else course.devices
+        leads = self._goes_ahead and self._lead_mm > 0
+        pulled = 1 if leads else course.devices
         back = course.control(*(Move(device, -speed) for device in range(pulled)))
         while self._slack > _TAUT_MM and self._here() > passed - _COMES_MM and course.lengths.min() > 1.0:
+            if leads and self._lead_mm <= 0:
+                break
             course.move(back)
         if self._here() < passed - _LEAVES_MM:
             course.restore(kept)
@@ -454,7 +464,7 @@ class Search:
         begun, here, first_mm = self._catheter_at(), self._here(), float(course.inserted(CATHETER)[0])
         for _ in range(min(self._left, round(config.manoeuvres.longest_s / DECISION_PERIOD_S))):
             inserted = float(course.inserted(CATHETER)[0])
-            left = float(course.inserted(WIRE)[0]) - config.manoeuvres.behind_mm - inserted
+            left = self._lead_mm - config.manoeuvres.behind_mm
             folds = inserted - first_mm - (self._catheter_at() - begun) > _FOLDS_MM
             if left <= REST_MM or folds or course.still[0]:
                 break
@@ -462,6 +472,20 @@ class Search:
             course.still |= course.move(course.control(Move(CATHETER, speed)), force_n=self._navigation.force_limit_n)
         course.still[:] = False
         return self._catheter_at() >= begun + _COMES_ALONG_MM and self._here() >= here - _LEAVES_MM
+
+    def _retreat(self, kept: Kept) -> None:
+        """Pull a wire that goes ahead back from where it is stuck, for another search to begin there."""
+        course = self._course
+        course.restore(kept)
+        left_mm = self._random.uniform(*_RETREAT_MM)
+        while left_mm > 0 and self._lead_mm > 0 and self._left > 0:
+            course.move(course.control(Move(WIRE, -min(self.config.speed_mm_s, left_mm / DECISION_PERIOD_S))))
+            left_mm -= self.config.speed_mm_s * DECISION_PERIOD_S
+
+    @property
+    def _lead_mm(self) -> float:
+        """How much deeper the wire is inserted than its catheter, mm."""
+        return float((self._course.inserted(WIRE) - self._course.inserted(CATHETER))[0])
 
     def _catheter_at(self) -> float:
         """Return how far along the route the catheter's tip lies, mm."""
