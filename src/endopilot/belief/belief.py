@@ -418,8 +418,8 @@ class Belief:
     def seek(self, measured: TipMeasurement) -> bool:
         """Look for devices that explain a measurement which none of the members does; return whether there are.
 
-        Copies of the likeliest devices are moved to and fro. All members become the one that is found, with the ostium
-        that each has.
+        Copies of the likeliest devices are moved to and fro. All members become the nearest that is found, with the
+        ostium that each has, also where it does not explain the measurement: the next may be found from there.
         """
         if self.config.copies == 0 or len(self.kinds) > 1:
             return False
@@ -429,13 +429,11 @@ class Belief:
             return (error / self._allowed(_sds(axes, measured))).max(axis=1)
 
         best = self._copies.seek(self.best, self.simulator, misfit)
-        if best > 1:
-            return False
         self.simulator.copy_worlds(np.full(len(self.members), self._copies.at), of=self._copies.simulator)
         self.tip, self._score = self.simulator.project()[:, 0], np.zeros(len(self.members))
         self.error, axes = self.errors(measured.position)
         self._error_sd = _sds(axes, measured)
-        return True
+        return best <= 1
 
     @cached_property
     def _copies(self) -> MovedCopies:

@@ -20,7 +20,7 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S
 from endopilot.types import Anatomy
 
-_ROUNDS, _PERIODS = 4, 2
+_ROUNDS, _PERIODS = 4, 3
 """Rounds, each from the nearest copy of the last, and decision periods that drives go away in each and come back."""
 _NEAR_ENOUGH = 0.5
 """Misfit below which no further round is needed."""
@@ -76,7 +76,7 @@ class MovedCopies:
         copies.copy_worlds(np.full(count, member), of=of)
         best = np.inf
         for number in range(_ROUNDS):
-            control = self._draw(1.0 / (1 + number))
+            control = self._draw()
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # one that fails is not chosen
                 for direction in (1.0, -1.0):
@@ -91,11 +91,12 @@ class MovedCopies:
                 copies.copy_worlds(np.full(count, self.at))
         return best
 
-    def _draw(self, share: float) -> Float[np.ndarray, "copies devices 2"]:
-        """Draw a control for each copy, up to a share of the fastest; the first copy stays where it is."""
+    def _draw(self) -> Float[np.ndarray, "copies devices 2"]:
+        """Draw a control for each copy: the next ones go ever farther, and the first stays where it is."""
         random, (count, devices) = self._random, (self.simulator.worlds, self.simulator.devices)
+        share = np.arange(count) / count
         control = np.zeros((count, devices, 2))
-        control[..., 0] = share * self._fastest * random.uniform(-1.0, 1.0, (count, devices))
+        control[..., 0] = share[:, None] * self._fastest * random.uniform(-1.0, 1.0, (count, devices))
         control[:, 1:, 0] *= random.random((count, devices - 1)) > _REST_SHARE
         control[:, 0, 1] = share * _TURN_RAD_S * random.uniform(-1.0, 1.0, count)
         control[0] = 0.0

@@ -34,6 +34,8 @@ _WIRE_CREEP_MM_S = 2.0
 """Fastest translation of a wire that should have arrived, and that X-ray shows beside its target, mm/s."""
 _CLEAR_MM = 4.0
 """A wire that is lost is pulled back by this much at least before it is looked at again, mm."""
+_SEEKS = 6
+"""Exposures at which other simulated devices are sought before lost ones are pulled back."""
 _HARDER = 1.1
 """Another course is searched where the drive pushes this many times harder than the last one was searched for."""
 _CREEP_MM_S, _CREEP_PERIODS = 1.0, 6
@@ -83,7 +85,8 @@ class _PlanningPolicy:
         self._follower = self._new_follower()
         self._back_mm, self._measured = np.inf, None
         self._lost = self._began = self._arrived = self._shows = False
-        self._crept, self.plans, self._failed, self.planning_s = 0, 0, 0, 0.0
+        self._rested = self._crept = self.plans = self._failed = 0
+        self.planning_s = 0.0
 
     def decide(self, observation: Observation) -> Decision:
         """Follow the course, search another one, or pull back, as the module describes."""
@@ -92,6 +95,7 @@ class _PlanningPolicy:
         if observation.tip is None and self.belief.drives.proximal[0, 0] <= self.navigation.start_inserted_length_mm:
             self._lost = False  # back where it began, the wire lies as it did, unseen in its catheter
         self._shows = False
+        self._rested = self._rested if self._lost else 0
         wanted = self._pull_back() if self._lost else self._go_on(observation)
         self.belief.drives.sent(wanted)
         ends = self._failed >= self.config.tries and self._follower.course is None and not self._lost
@@ -182,11 +186,17 @@ class _PlanningPolicy:
         return bool(drives.proximal[0, 0] - self.config.search.speed_mm_s * DECISION_PERIOD_S <= self._back_mm)
 
     def _pull_back(self) -> Proximals:
-        """Return the velocities that pull the wire back, and each catheter that the wire's tip is in."""
-        inserted = self.belief.drives.proximal[:, 0].tolist()
-        return self._follower.move(
-            [-self.config.search.speed_mm_s if inserted[0] <= each else 0.0 for each in inserted]
-        )
+        """Return the velocities that pull the wire back, and each catheter that the wire's tip is in.
+
+        Soft devices fall back by themselves if only one of them is pulled, so both are. They rest first, as long as
+        other simulated ones are sought that explain the image.
+        """
+        config, inserted = self.config.search, self.belief.drives.proximal[:, 0].tolist()
+        self._rested += 1
+        if self.config.belief.copies and self._rested <= _SEEKS:
+            return self._follower.move([0.0 for _ in inserted])
+        pulled = [config.manoeuvres.together or inserted[0] <= each for each in inserted]
+        return self._follower.move([-config.speed_mm_s if each else 0.0 for each in pulled])
 
     def _go_on(self, observation: Observation) -> Proximals:
         """Return the velocities that lead to the next place of the course."""

@@ -66,13 +66,15 @@ _SLACK_MM, _TAUT_MM, _COMES_MM, _LEAVES_MM = 25.0, 8.0, 3.0, 10.0
 the tip comes along by the third. Where it then slides back by more than the last, they stay as they were."""
 _BEHIND_WIDTHS = 2
 """Soft devices may slide out of a branch from so many widths of the lumen beyond its fork."""
-_GAIN_MM = 3.0
-"""What is drawn for devices that move together is a step if they come this much forward, mm."""
+_GAIN_MM, _LOOSE_MM = 3.0, 60.0
+"""What devices that move together do is a step if they come this much forward, mm, and have no more slack than this."""
 _COMES_ALONG_MM, _FOLDS_MM = 10.0, 40.0
 """A catheter that comes this much along its wire supports it, mm; it has folded where it is pushed so much farther than
 it comes."""
-_RETREAT_MM = 10.0, 40.0
-"""A wire that goes ahead and is stuck is pulled back by between these two, mm."""
+_LONGER = 10
+"""Times the given time after which a plan for devices that move together is given up."""
+_RETREAT_MM, _COMES_TOO = (10.0, 40.0), 0.5
+"""A wire that goes ahead and is stuck is pulled back by between these two, mm; its catheter with this probability."""
 _OFTEN = 6
 """A course that has passed places this many times as often as there are is at an end."""
 _REPEATED = 3
@@ -182,7 +184,7 @@ class Search:
         course.put(source, belief.simulator, weight)
         self._behind_mm = self._before_fork()
         self.halt, self._at_fork = "", False
-        self._periods = max(1, int(seconds / DECISION_PERIOD_S)) if self.draws else _ENDLESS
+        self._periods = self._most_periods(seconds, horizon_mm)
         if angle:
             turn(course, np.array([angle]), periods=self._periods)
         while out and self._here() > self._behind_mm and course.lengths[:, WIRE].min() > 1.0 and self._left > 0:
@@ -235,6 +237,16 @@ class Search:
             ostium_mm=float(belief.ostium_mm[source[0]]),
             settled=None if self._alone else settled,
         )
+
+    def _most_periods(self, seconds: float, horizon_mm: float) -> int:
+        """Return how many decision periods a course may take in some time, s.
+
+        With a catheter a course to the target may take longer: whoever plans is told how long.
+        """
+        periods = max(1, int(seconds / DECISION_PERIOD_S))
+        if self._alone or np.isfinite(horizon_mm):
+            return periods
+        return _LONGER * periods if self._together else _ENDLESS
 
     def manoeuvre_cost(self, pushed: Pushed) -> Each:
         """Return what each trial of a manoeuvre costs, by which those that pass are compared: its largest force, N.
@@ -438,25 +450,33 @@ class Search:
     def _ahead(self, waypoint: float, kept: Kept, halt: Halt) -> bool:
         """Bring devices that move together on otherwise than straight; return whether they come forward.
 
-        Motions are drawn: from where the devices lay, then from where the straight push has loaded the wire. Else the
-        catheter follows a wire that goes ahead.
+        A wire that goes ahead may stay where a straight push has brought it. Else motions are drawn: from where the
+        devices lay, then from where the push has loaded the wire. Else the catheter follows it.
         """
-        course, route, config, loaded = self._course, self.route, self.config, self._course.kept()
+        course, loaded = self._course, self._course.kept()
         course.restore(kept)
-        begun = self._here()
-        for begin in (kept, loaded) if halt == "stalled" and self._goes_ahead else (kept,):
+        begun, begins = self._here(), [kept]
+        if self._goes_ahead and halt == "stalled":
+            course.restore(loaded)
+            if self._comes_on(waypoint, begun):
+                return True
+            begins.append(loaded)
+        for begin in begins:
             course.restore(begin)
             here = self._here()
-            goal = min(route.next_waypoint(here), here + _LOOKOUT_MM)
-            rounds = min(config.rounds, self._left // config.round_periods)
-            controls, _ = self._population.find(course, goal, rounds=rounds, spare_share=SPARE_SHARE)
-            for control in controls:
+            goal = min(self.route.next_waypoint(here), here + _LOOKOUT_MM)
+            rounds = min(self.config.rounds, self._left // self.config.round_periods)
+            for control in self._population.find(course, goal, rounds=rounds, spare_share=SPARE_SHARE)[0]:
                 course.move(control[None])
-            self._pull_taut(waypoint)
-            if self._here() >= begun + _GAIN_MM:
+            if self._comes_on(waypoint, begun):
                 return True
         course.restore(kept)
         return self._goes_ahead and self._supported()
+
+    def _comes_on(self, waypoint: float, begun: float) -> bool:
+        """Pull devices taut; return whether they have then come forward from a place, mm, without lying in loops."""
+        self._pull_taut(waypoint)
+        return self._here() >= begun + _GAIN_MM and self._slack <= _LOOSE_MM
 
     def _supported(self) -> bool:
         """Let the catheter follow over the resting wire, which it then supports; return whether it comes along."""
@@ -474,13 +494,20 @@ class Search:
         return self._catheter_at() >= begun + _COMES_ALONG_MM and self._here() >= here - _LEAVES_MM
 
     def _retreat(self, kept: Kept) -> None:
-        """Pull a wire that goes ahead back from where it is stuck, for another search to begin there."""
-        course = self._course
+        """Pull a wire that goes ahead back from where it is stuck, for another search to begin there.
+
+        Its catheter comes back too as often as not: its tip may lie beyond the fork that the wire has taken.
+        """
+        course, random = self._course, self._random
         course.restore(kept)
-        left_mm = self._random.uniform(*_RETREAT_MM)
-        while left_mm > 0 and self._lead_mm > 0 and self._left > 0:
-            course.move(course.control(Move(WIRE, -min(self.config.speed_mm_s, left_mm / DECISION_PERIOD_S))))
-            left_mm -= self.config.speed_mm_s * DECISION_PERIOD_S
+        wire_mm = random.uniform(*_RETREAT_MM)
+        catheter_mm = random.uniform(*_RETREAT_MM) if random.random() < _COMES_TOO else 0.0
+        periods = int(np.ceil(max(wire_mm, catheter_mm) / (self.config.speed_mm_s * DECISION_PERIOD_S)))
+        for _ in range(min(periods, self._left)):
+            if self._lead_mm <= 0 or course.lengths.min() < 1.0:
+                return
+            back_s = periods * DECISION_PERIOD_S
+            course.move(course.control(Move(WIRE, -wire_mm / back_s), Move(CATHETER, -catheter_mm / back_s)))
 
     @property
     def _lead_mm(self) -> float:
