@@ -500,14 +500,14 @@ class Search:
         """
         course, random = self._course, self._random
         course.restore(kept)
-        wire_mm = random.uniform(*_RETREAT_MM)
-        catheter_mm = random.uniform(*_RETREAT_MM) if random.random() < _COMES_TOO else 0.0
+        leads, wire_mm = self._lead_mm > 0, random.uniform(*_RETREAT_MM)
+        catheter_mm = random.uniform(*_RETREAT_MM) if random.random() < _COMES_TOO or not leads else 0.0
         periods = int(np.ceil(max(wire_mm, catheter_mm) / (self.config.speed_mm_s * DECISION_PERIOD_S)))
+        back = [-mm / (periods * DECISION_PERIOD_S) for mm in (wire_mm, catheter_mm)]
         for _ in range(min(periods, self._left)):
-            if self._lead_mm <= 0 or course.lengths.min() < 1.0:
+            if course.lengths.min() < 1.0 or (leads and self._lead_mm <= 0):
                 return
-            back_s = periods * DECISION_PERIOD_S
-            course.move(course.control(Move(WIRE, -wire_mm / back_s), Move(CATHETER, -catheter_mm / back_s)))
+            course.move(course.control(Move(WIRE, back[0]), Move(CATHETER, back[1])))
 
     @property
     def _lead_mm(self) -> float:
