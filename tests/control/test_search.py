@@ -15,6 +15,7 @@ from endopilot.control.manoeuvre import STRAIGHT, Grid
 from endopilot.control.push import Push, Pushed
 from endopilot.control.search import Search
 from endopilot.control.search_config import ManoeuvreConfig
+from endopilot.control.together import Together
 from endopilot.control.trials import CATHETER, WIRE, Move
 from endopilot.devices.catheter import read_catheter
 from endopilot.errors import InputError
@@ -239,7 +240,7 @@ def test_where_there_is_little_time_loops_are_the_last_resort(hurried, monkeypat
         return Pushed([], none.astype(int), none > 0, none, none, none, ["off"] * many)
 
     monkeypatch.setattr(Search, "_try", nothing_passes)
-    monkeypatch.setattr(Search, "_ahead", lambda *_: False)
+    monkeypatch.setattr(Together, "bring_on", lambda *_: False)
     assert search_straight(straight, config).reached == 1.0 and not tried
     monkeypatch.setattr("endopilot.control.search.LOOPS_MM", -1000.0)
     assert search_straight(straight, config).reached == 1.0 and tried
@@ -258,11 +259,11 @@ def test_where_there_is_little_time_slack_is_pulled_out_unless_the_tip_leaves(
     course.move(course.control(Move(WIRE, 30.0), Move(CATHETER, 50.0)))
     inserted = float(course.lengths.max())
 
-    def here(_: Search) -> float:
+    def here(_: Together) -> float:
         pulled = inserted - float(course.lengths.max())
         return inserted - 30.0 - 20.0 * max(pulled - (30.0 - stays_mm), 0.0)
 
-    monkeypatch.setattr(Search, "_here", here)
-    one._pull_taut(waypoint=5.0)
-    assert one._slack == pytest.approx(slack_mm, abs=config.search.speed_mm_s * DECISION_PERIOD_S)
+    monkeypatch.setattr(Together, "here", property(here))
+    one._together.pull_taut(waypoint=5.0)
+    assert one._together.slack_mm == pytest.approx(slack_mm, abs=config.search.speed_mm_s * DECISION_PERIOD_S)
     assert (len(course.rows) == 1) == (stays_mm == 30.0)

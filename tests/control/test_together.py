@@ -1,4 +1,4 @@
-"""Wire and catheter that move together where time is short: what is drawn, what goes ahead, and how far courses lead."""
+"""Wire and catheter that move together where time is short: what is drawn, who goes ahead, how far courses lead."""
 
 from __future__ import annotations
 
@@ -72,10 +72,11 @@ def test_a_catheter_that_rests_lets_its_wire_go_all_the_way_alone(pair) -> None:
 
 def test_a_catheter_follows_over_the_resting_wire(pair) -> None:
     search, _ = begin(pair)
-    assert not search._supported()  # it is 6 mm behind the wire already
+    search._together.most_periods = 100
+    assert not search._together.support()  # it is 6 mm behind the wire already
     search._course.move(search._course.control(Move(WIRE, 40.0)))
     wire_mm = float(search._course.inserted(WIRE)[0])
-    assert search._supported()
+    assert search._together.support()
     assert search._course.inserted(WIRE)[0] == pytest.approx(wire_mm, abs=1e-9)
     assert search._course.inserted(CATHETER)[0] == pytest.approx(wire_mm - 10.0, abs=0.2)
 

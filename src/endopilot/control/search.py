@@ -32,7 +32,6 @@ from endopilot.control.places import next_place, places_of
 from endopilot.control.population import Population
 from endopilot.control.push import (
     LOOPS_MM,
-    REST_MM,
     TURN_PERIODS,
     Each,
     Halt,
@@ -44,7 +43,8 @@ from endopilot.control.push import (
     turn,
 )
 from endopilot.control.search_config import SearchConfig
-from endopilot.control.trials import CATHETER, STALL_PERIODS, WIRE, Kept, Move, Trials
+from endopilot.control.together import Together
+from endopilot.control.trials import STALL_PERIODS, WIRE, Kept, Move, Trials
 from endopilot.errors import InputError
 from endopilot.progress import Advance
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
@@ -61,20 +61,10 @@ _TURNS = (0.0, np.pi)
 _GENTLE_SHARE, _LOOP_SHARE, _LOOP_MM_S = 0.1, 1e-4, 5.0
 """Share of the force limit below which devices in a wide lumen hardly press, what a millimetre in loops costs, and how
 many of these a second is worth, mm/s."""
-_SLACK_MM, _TAUT_MM, _COMES_MM, _LEAVES_MM = 25.0, 8.0, 3.0, 10.0
-"""Soft devices with more slack than the first of these are pulled back, mm, until they have no more than the second, or
-the tip comes along by the third. Where it then slides back by more than the last, they stay as they were."""
 _BEHIND_WIDTHS = 2
 """Soft devices may slide out of a branch from so many widths of the lumen beyond its fork."""
-_GAIN_MM, _LOOSE_MM = 3.0, 60.0
-"""What devices that move together do is a step if they come this much forward, mm, and have no more slack than this."""
-_COMES_ALONG_MM, _FOLDS_MM = 10.0, 40.0
-"""A catheter that comes this much along its wire supports it, mm; it has folded where it is pushed so much farther than
-it comes."""
 _LONGER = 10
 """Times the given time after which a plan for devices that move together is given up."""
-_RETREAT_MM, _COMES_TOO = (10.0, 40.0), 0.5
-"""A wire that goes ahead and is stuck is pulled back by between these two, mm; its catheter with this probability."""
 _OFTEN = 6
 """A course that has passed places this many times as often as there are is at an end."""
 _REPEATED = 3
@@ -104,26 +94,22 @@ class Search:
             InputError: there is more than one catheter.
         """
         check_devices(navigation)
-        self._navigation, self.route, self.config, self._together = (
-            navigation,
-            route,
-            config,
-            config.manoeuvres.together,
-        )
+        self._navigation, self.route, self.config = navigation, route, config
         self._alone, wide = not navigation.catheters, route.is_wide(route.target.abscissa)
         self._repertoire = Repertoire.of(navigation.catheters, config, wide=wide)
         trials_of = partial(Trials.of, navigation, belief.kinds, like=belief.simulator)
         self._course, self._many = trials_of(count=1), trials_of(count=self._repertoire.trials)
         self._few = self._course if self._alone else trials_of(count=len(self._repertoire.leads))
         drawn = self._many if self._alone else trials_of(count=config.candidates)
-        self._random = np.random.default_rng([seed, 0x5EA])
-        self._population = Population(navigation, route, drawn, config, self._random)
-        self.halt, self._periods, self._goes_ahead = "", _ENDLESS, False
+        random = np.random.default_rng([seed, 0x5EA])
+        self._population = Population(navigation, route, drawn, config, random)
+        self._together = Together(navigation, route, self._course, self._population, config, random)
+        self.halt = ""
 
     @property
     def draws(self) -> bool:
         """Whether it draws at random, so that another search from the same belief may find another course."""
-        return self._alone or self._together
+        return self._alone or self.config.manoeuvres.together
 
     def find(
         self,
@@ -180,27 +166,29 @@ class Search:
             out: whether a wire alone is first pulled back to before the last fork that it has passed.
         """
         course, reported, settled = self._course, 0.0, []
+        pair, together = self._together, self.config.manoeuvres.together
         source, weight = belief.likeliest()
         course.put(source, belief.simulator, weight)
         self._behind_mm = self._before_fork()
         self.halt, self._at_fork = "", False
-        self._periods = self._most_periods(seconds, horizon_mm)
+        most_periods = self._together.most_periods = self._most_periods(seconds, horizon_mm)
         if angle:
-            turn(course, np.array([angle]), periods=self._periods)
-        while out and self._here() > self._behind_mm and course.lengths[:, WIRE].min() > 1.0 and self._left > 0:
+            turn(course, np.array([angle]), periods=most_periods)
+        while out and self._here > self._behind_mm and course.lengths[:, WIRE].min() > 1.0 and self._left > 0:
             course.move(course.control(Move(WIRE, -self.config.speed_mm_s)))
-        begun = self._here()
-        places = places_of(self.route, begun, alone=self._alone, together=self._together)
-        while len(course.rows) < self._periods:
-            here = self._here()
+        begun = self._here
+        places = places_of(self.route, begun, alone=self._alone, together=together)
+        while len(course.rows) < most_periods:
+            here = self._here
             if advance is not None:
                 advance(max(here - reported, 0.0))
                 reported = max(here, reported)
-            self._goes_ahead = self._together and not self._navigation.arriving and here >= self.route.narrow_from
+            pair.set_out()
             waypoint, kept, self._tried = next_place(places, here, alone=self._alone), course.kept(), {}
             halt = self._straight(waypoint)
             if halt is None:
-                self._pull_taut(waypoint)
+                if together:
+                    pair.pull_taut(waypoint)
                 settled.append(len(course.rows) - 1)
                 if self._reached() > 0.5:
                     break
@@ -209,23 +197,24 @@ class Search:
                 if len(settled) > _OFTEN * len(places):  # it goes to and fro about a place
                     self._halted("stalled", waypoint)
                     break
-            elif self._together and self._ahead(waypoint, kept, halt):
+            elif together and pair.bring_on(waypoint, kept, halt):
                 settled.append(len(course.rows) - 1)
                 if np.isfinite(horizon_mm):
                     break
-            elif self._goes_ahead and np.isfinite(horizon_mm):
+            elif pair.ahead and np.isfinite(horizon_mm):
                 self._halted(halt, waypoint)
-                self._retreat(kept)
+                pair.retreat(kept)
                 break
             elif any(self._turned(grid, share, waypoint, kept) for share, grid in self._repertoire.ways):
-                self._pull_taut(waypoint)
+                if together:
+                    pair.pull_taut(waypoint)
                 settled.append(len(course.rows) - 1)
             elif self._alone and self._drawn(waypoint, kept):
                 settled.append(len(course.rows) - 1)
             else:
                 self._halted(halt, waypoint)
                 break
-            if self._here() >= begun + horizon_mm:
+            if self._here >= begun + horizon_mm:
                 break
         else:
             self._halted("late", 0.0)
@@ -246,7 +235,7 @@ class Search:
         periods = max(1, int(seconds / DECISION_PERIOD_S))
         if self._alone or np.isfinite(horizon_mm):
             return periods
-        return _LONGER * periods if self._together else _ENDLESS
+        return _LONGER * periods if self.config.manoeuvres.together else _ENDLESS
 
     def manoeuvre_cost(self, pushed: Pushed) -> Each:
         """Return what each trial of a manoeuvre costs, by which those that pass are compared: its largest force, N.
@@ -262,7 +251,7 @@ class Search:
 
     def _straight(self, waypoint: float) -> Halt | None:
         """Push straight on past a place; return why not, or None if the course has passed it."""
-        course, push = self._course, self._push(waypoint, strict=self._alone or self._goes_ahead)
+        course, push = self._course, self._push(waypoint, strict=self._alone or self._together.ahead)
         if push.arrived(course)[0]:
             return None
         if push.strict:
@@ -329,7 +318,7 @@ class Search:
         return self._push(waypoint).run(many, left - TURN_PERIODS, push_lead)
 
     def _push(self, waypoint: float, *, strict: bool = False) -> Push:
-        return Push(self.route, self._navigation, self.config, waypoint, strict, rests=self._goes_ahead)
+        return Push(self.route, self._navigation, self.config, waypoint, strict, rests=self._together.ahead)
 
     def _follow(self, pushed: Pushed, share: float, waypoint: float, *, turns: int) -> bool:
         """Let the course do what the best trial of a manoeuvre did; return whether any passes within a share of force.
@@ -362,26 +351,7 @@ class Search:
         limit_n = share * self._navigation.force_limit_n
         if not self.config.manoeuvres.together or share >= 1.0:
             return limit_n, np.inf
-        return limit_n, max(self._slack, 0.0) + LOOPS_MM
-
-    def _pull_taut(self, waypoint: float) -> None:
-        """Pull soft devices back that have passed a place with slack: what lies in loops comes out, and the tip stays.
-
-        A device in loops presses forward with EI / 2R² as it unbends, R being the radius of the wide lumen.
-        """
-        course, speed = self._course, self.config.speed_mm_s
-        if not self.config.manoeuvres.together or self._slack <= _SLACK_MM or waypoint >= self.route.target.abscissa:
-            return
-        kept, passed = course.kept(), self._here()
-        leads = self._goes_ahead and self._lead_mm > 0
-        pulled = 1 if leads else course.devices
-        back = course.control(*(Move(device, -speed) for device in range(pulled)))
-        while self._slack > _TAUT_MM and self._here() > passed - _COMES_MM and course.lengths.min() > 1.0:
-            if leads and self._lead_mm <= 0:
-                break
-            course.move(back)
-        if self._here() < passed - _LEAVES_MM:
-            course.restore(kept)
+        return limit_n, max(self._together.slack_mm, 0.0) + LOOPS_MM
 
     def _obstacle(self, waypoint: float) -> tuple[float, float]:
         """Return what lies in the way of a place, and the steps in which devices are placed about it, mm.
@@ -392,7 +362,7 @@ class Search:
         near = float(route.junctions[route.junctions < waypoint].max(initial=0.0))
         width = 2 * float(route.radius(np.array([near]))[0])
         behind = width * (_BEHIND_WIDTHS if self.config.manoeuvres.together else 1)
-        obstacle = min(near, self._hard) if near > max(self._here() - behind, 0.0) else self._hard
+        obstacle = min(near, self._hard) if near > max(self._here - behind, 0.0) else self._hard
         return obstacle, stand_off(route, obstacle, self.config.lead_mm)
 
     def _approach(self, waypoint: float) -> None:
@@ -407,7 +377,7 @@ class Search:
             begin = float(before[-1]) - stand_off(route, float(before[-1]), self.config.lead_mm)
         begin = min(begin, self._hard - self.config.lead_mm)
         for _ in range(self._left):
-            here, on_route = self._here(), course.all(route.off_route(course.foremost) == 0)[0]
+            here, on_route = self._here, course.all(route.off_route(course.foremost) == 0)[0]
             rests = len(course.rows) >= STALL_PERIODS and course.stalled(lambda tip: tip.abscissa, STALL_PERIODS - 1)
             if not on_route and course.lengths[:, WIRE].min() > 1.0:
                 course.move(course.control(Move(WIRE, -speed)))
@@ -424,7 +394,7 @@ class Search:
         route = self.route
         if not (self._alone and route.is_wide(route.target.abscissa)):
             return 0.0
-        fork = float(route.junctions[route.junctions < self._here()].max(initial=0.0))
+        fork = float(route.junctions[route.junctions < self._here].max(initial=0.0))
         return fork - stand_off(route, fork, self.config.lead_mm) if fork else 0.0
 
     def _drawn(self, waypoint: float, kept: Kept) -> bool:
@@ -435,7 +405,7 @@ class Search:
         course, route, config = self._course, self.route, self.config
         course.restore(kept)
         self._approach(waypoint)
-        here = self._here()
+        here = self._here
         lookout = max(_LOOKOUT_MM, _LOOKOUT_RADII * float(route.radius(np.array([here]))[0]))
         waypoint = min(route.next_waypoint(here), here + lookout)
         rounds = min(config.rounds, self._left // config.round_periods)
@@ -447,91 +417,15 @@ class Search:
             course.weight = passed / passed.sum()
         return won and len(course.rows) > kept.periods
 
-    def _ahead(self, waypoint: float, kept: Kept, halt: Halt) -> bool:
-        """Bring devices that move together on otherwise than straight; return whether they come forward.
-
-        A wire that goes ahead may stay where a straight push has brought it. Else motions are drawn: from where the
-        devices lay, then from where the push has loaded the wire. Else the catheter follows it.
-        """
-        course, loaded = self._course, self._course.kept()
-        course.restore(kept)
-        begun, begins = self._here(), [kept]
-        if self._goes_ahead and halt == "stalled":
-            course.restore(loaded)
-            if self._comes_on(waypoint, begun):
-                return True
-            begins.append(loaded)
-        for begin in begins:
-            course.restore(begin)
-            here = self._here()
-            goal = min(self.route.next_waypoint(here), here + _LOOKOUT_MM)
-            rounds = min(self.config.rounds, self._left // self.config.round_periods)
-            for control in self._population.find(course, goal, rounds=rounds, spare_share=SPARE_SHARE)[0]:
-                course.move(control[None])
-            if self._comes_on(waypoint, begun):
-                return True
-        course.restore(kept)
-        return self._goes_ahead and self._supported()
-
-    def _comes_on(self, waypoint: float, begun: float) -> bool:
-        """Pull devices taut; return whether they have then come forward from a place, mm, without lying in loops."""
-        self._pull_taut(waypoint)
-        return self._here() >= begun + _GAIN_MM and self._slack <= _LOOSE_MM
-
-    def _supported(self) -> bool:
-        """Let the catheter follow over the resting wire, which it then supports; return whether it comes along."""
-        course, config = self._course, self.config
-        begun, here, first_mm = self._catheter_at(), self._here(), float(course.inserted(CATHETER)[0])
-        for _ in range(min(self._left, round(config.manoeuvres.longest_s / DECISION_PERIOD_S))):
-            inserted = float(course.inserted(CATHETER)[0])
-            left = self._lead_mm - config.manoeuvres.behind_mm
-            folds = inserted - first_mm - (self._catheter_at() - begun) > _FOLDS_MM
-            if left <= REST_MM or folds or course.still[0]:
-                break
-            speed = min(config.speed_mm_s, left / DECISION_PERIOD_S)
-            course.still |= course.move(course.control(Move(CATHETER, speed)), force_n=self._navigation.force_limit_n)
-        course.still[:] = False
-        return self._catheter_at() >= begun + _COMES_ALONG_MM and self._here() >= here - _LEAVES_MM
-
-    def _retreat(self, kept: Kept) -> None:
-        """Pull a wire that goes ahead back from where it is stuck, for another search to begin there.
-
-        Its catheter comes back too as often as not: its tip may lie beyond the fork that the wire has taken.
-        """
-        course, random = self._course, self._random
-        course.restore(kept)
-        leads, wire_mm = self._lead_mm > 0, random.uniform(*_RETREAT_MM)
-        catheter_mm = random.uniform(*_RETREAT_MM) if random.random() < _COMES_TOO or not leads else 0.0
-        periods = int(np.ceil(max(wire_mm, catheter_mm) / (self.config.speed_mm_s * DECISION_PERIOD_S)))
-        back = [-mm / (periods * DECISION_PERIOD_S) for mm in (wire_mm, catheter_mm)]
-        for _ in range(min(periods, self._left)):
-            if course.lengths.min() < 1.0 or (leads and self._lead_mm <= 0):
-                return
-            course.move(course.control(Move(WIRE, back[0]), Move(CATHETER, back[1])))
-
-    @property
-    def _lead_mm(self) -> float:
-        """How much deeper the wire is inserted than its catheter, mm."""
-        return float((self._course.inserted(WIRE) - self._course.inserted(CATHETER))[0])
-
-    def _catheter_at(self) -> float:
-        """Return how far along the route the catheter's tip lies, mm."""
-        tips = self._course.tips[:, CATHETER]
-        return float(self._course.mean(self.route.progress(tips))[0])
-
     @property
     def _left(self) -> int:
         """Decision periods that the course may still take."""
-        return self._periods - len(self._course.rows)
-
-    def _here(self) -> float:
-        """Return how far along the route the devices have come, mm."""
-        return float(self._course.progress(self.route)[0])
+        return self._together.left
 
     @property
-    def _slack(self) -> float:
-        """How much deeper than that the foremost of them is inserted, mm: what lies in loops."""
-        return float(self._course.deepest[0]) - self._here()
+    def _here(self) -> float:
+        """How far along the route the devices have come, mm."""
+        return self._together.here
 
     def _reached(self) -> float:
         return float(self._course.mean(self._navigation.reached(self._course.tips))[0])
