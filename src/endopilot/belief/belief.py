@@ -437,8 +437,14 @@ class Belief:
 
     @cached_property
     def _copies(self) -> MovedCopies:
-        motion, simulator = self.navigation.known_motion, self.simulator
-        return MovedCopies(self.kinds[0], self.config.copies, motion=motion, config=self._core, sharing=simulator)
+        return MovedCopies(
+            self.kinds[0],
+            self.config.copies,
+            limits=self._limits,
+            motion=self.navigation.known_motion,
+            config=self._core,
+            sharing=self.simulator,
+        )
 
     def play_spread(self) -> Float[np.ndarray, "2"]:
         """Return the standard deviations of (Δtip, γtip) that the plays of the wire's drive make, mm."""

@@ -8,11 +8,12 @@ devices may.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
 
+from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Stack
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
@@ -46,6 +47,7 @@ class MovedCopies:
         kind: tuple[Anatomy, Stack],
         count: int,
         *,
+        limits: Sequence[DriveLimits],
         motion: Motion | None,
         config: SimulatorConfig,
         sharing: Simulator,
@@ -55,13 +57,14 @@ class MovedCopies:
         Args:
             kind: vessel and devices.
             count: number of copies.
+            limits: of the drive of each device.
             motion: of the vessel, as it is known.
             config: settings of the rod core.
             sharing: simulator of the same vessel.
         """
         anatomy, stack = kind
         self.simulator = Simulator(anatomy, stack, worlds=count, motion=motion, config=config, sharing=[sharing])
-        self._fastest = np.array([device.max_velocity_mm_s for device in stack.devices])
+        self._limits = list(limits)
         self._random, self.at = np.random.default_rng(0xC0B1), 0
 
     def seek(self, member: int, of: Simulator, misfit: Misfit) -> float:
@@ -94,10 +97,11 @@ class MovedCopies:
     def _draw(self) -> Float[np.ndarray, "copies devices 2"]:
         """Draw a control for each copy: the next ones go ever farther, and the first stays where it is."""
         random, (count, devices) = self._random, (self.simulator.worlds, self.simulator.devices)
-        share = np.arange(count) / count
-        control = np.zeros((count, devices, 2))
-        control[..., 0] = share[:, None] * self._fastest * random.uniform(-1.0, 1.0, (count, devices))
-        control[:, 1:, 0] *= random.random((count, devices - 1)) > _REST_SHARE
-        control[:, 0, 1] = share * _TURN_RAD_S * random.uniform(-1.0, 1.0, count)
-        control[0] = 0.0
+        share, drawn = np.arange(count)[:, None, None] / count, random.uniform(-1.0, 1.0, (count, devices, 2))
+        control = share * drawn * [limits.fastest for limits in self._limits]
+        control[:, 1:] *= random.random((count, devices - 1, 1)) > _REST_SHARE
+        control[..., 1] = np.clip(control[..., 1], -_TURN_RAD_S, _TURN_RAD_S)
+        lengths = self.simulator.at_drive[..., 0]
+        for device, limits in enumerate(self._limits):
+            control[:, device] = limits.clip(control[:, device], lengths[:, device], _PERIODS * DECISION_PERIOD_S)
         return control
