@@ -212,6 +212,8 @@ def main() -> None:
     parser.add_argument("--output", type=Path)
     parser.add_argument("--score", type=Path)
     asked = parser.parse_args()
+    if asked.output and not asked.tasks:
+        parser.error("--output: what learned one task in one patient has no tasks to be scored on; give --tasks too")
     torch.set_num_threads(1)
     if asked.score:
         for name, safe, success, count, exposures in score(asked.score):

@@ -82,12 +82,18 @@ def scores(folder: Path, version: LadderVersion, mark: str) -> list[str]:
 
 def _kept(mark: str) -> dict[str, dict[str, str]]:
     """Return the columns that stand in the page between marks of some name."""
-    text = (DOCS / PAGE).read_text(encoding="utf-8").split(f"<!-- {mark}:begin -->")[1].split(f"<!-- {mark}:end -->")[0]
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
+    rows = _rows(mark)
     if not rows:
         return {}
-    head, body = rows[0][1:], rows[2:]
+    head, body = rows[0][1:], rows[1:]
     return {policy: {row[0]: row[1 + place] for row in body} for place, policy in enumerate(head)}
+
+
+def _rows(mark: str) -> list[tuple[str, ...]]:
+    """Return the rows of the table that stands in the page between marks of some name, its head first."""
+    text = (DOCS / PAGE).read_text(encoding="utf-8").split(f"<!-- {mark}:begin -->")[1].split(f"<!-- {mark}:end -->")[0]
+    rows = [tuple(cell.strip() for cell in line.strip("|").split("|")) for line in text.splitlines() if line[:1] == "|"]
+    return [row for row in rows if set(row[0]) != {"-"}]
 
 
 def mismatch(folder: Path) -> list[str]:
@@ -104,10 +110,12 @@ def mismatch(folder: Path) -> list[str]:
 
 
 def benchmark(folder: Path) -> list[str]:
-    """Return the table of a public benchmark's tasks: what its paper reports, and what each run in a folder reached."""
+    """Return the table of a public benchmark's tasks: what its paper reports, and what each run in a folder reached.
+
+    What is not in the folder keeps its row as the page has it.
+    """
     head = ("task", "controller", "world", "within 5 mm, %", "exposures", "force, N", "planning, s", "episodes")
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    lines += ["| " + " | ".join(row) + " |" for row in _PUBLISHED]
+    rows = {row[:3]: row for row in [*_PUBLISHED, *_rows("benchmark")[1:]]}
     for path in sorted(folder.glob("*/ladder.json")):
         content = json.loads(path.read_text(encoding="utf-8"))
         (row,) = content["scores"]
@@ -116,8 +124,9 @@ def benchmark(folder: Path) -> list[str]:
         cells = (row["task"], f"`{content['policy']}`", content["world"]["name"].rpartition("/")[2])
         cells += (f"{100 * row['near']:.0f}", f"{row['exposures']:g}", f"{row['peak_force_n']:.3g}")
         cells += (f"{row['planning_s']:.0f}, at most {max(planning):.0f}", str(len(done)))
-        lines.append("| " + " | ".join(cells) + " |")
-    return lines
+        rows[cells[:3]] = cells
+    lines = ["| " + " | ".join(cells) + " |" for cells in (head, *rows.values())]
+    return [lines[0], "|" + "---|" * len(head), *lines[1:]]
 
 
 def main() -> None:

@@ -86,3 +86,10 @@ def test_saved_policies_are_scored_again(learner, fork, wire, monkeypatch, name,
     ((said, safe, success, count, exposures),) = learner["score"](EXAMPLE.parent / "policies" / f"{name}.pt")
     assert (said, count) == ("ahead", 2) and 0 < safe <= success <= 2
     assert (exposures > 1) == looks and (exposures == 0) != looks
+
+
+def test_a_policy_without_tasks_is_not_saved(learner, monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr("sys.argv", ["recurrent_ppo.py", "--output", str(tmp_path / "policy.pt"), "--minutes", "0"])
+    with pytest.raises(SystemExit) as ended:
+        learner["main"]()
+    assert ended.value.code == 2 and "--output: " in capsys.readouterr().err and not list(tmp_path.iterdir())
