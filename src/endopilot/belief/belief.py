@@ -418,8 +418,8 @@ class Belief:
     def seek(self, measured: TipMeasurement) -> bool:
         """Look for devices that explain a measurement which none of the members does; return whether there are.
 
-        Copies of the likeliest devices are moved to and fro. All members become the nearest that is found, with the
-        ostium that each has, also where it does not explain the measurement: the next may be found from there.
+        Copies of the likeliest devices are moved to and fro. All members become the nearest of them, with the ostium
+        that each has, also where it is nearer but does not explain the measurement: one may be found from there.
         """
         if self.config.copies == 0 or len(self.kinds) > 1:
             return False
@@ -428,12 +428,14 @@ class Belief:
             error, axes = self.errors(measured.position, simulator)
             return (error / self._allowed(_sds(axes, measured))).max(axis=1)
 
-        best = self._copies.seek(self.best, self.simulator, misfit)
+        before, nearest = float(misfit(self.simulator)[self.best]), self._copies.seek(self.best, self.simulator, misfit)
+        if nearest >= before:
+            return False
         self.simulator.copy_worlds(np.full(len(self.members), self._copies.at), of=self._copies.simulator)
         self.tip, self._score = self.simulator.project()[:, 0], np.zeros(len(self.members))
         self.error, axes = self.errors(measured.position)
         self._error_sd = _sds(axes, measured)
-        return best <= 1
+        return self.explains
 
     @cached_property
     def _copies(self) -> MovedCopies:

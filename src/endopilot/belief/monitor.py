@@ -141,7 +141,7 @@ class Monitor:
             self.past.exposures[period] = exposure
             self.belief.weigh(seen)
             self.sought = not self.belief.explains and self.belief.seek(seen)
-            self.lost = not (self.sought or self.belief.explains)
+            self.lost = not self.belief.explains
             self._innovations.alarm |= self.lost and self._tests
             self._since += 1
             if self.alarm and self._finds_motion():

@@ -157,6 +157,8 @@ class _PlanningPolicy:
     def _update(self, measured: TipMeasurement) -> None:
         """Weight the simulated wires by a measurement, and note whether all are wrong."""
         self.belief.weigh(measured)
+        if not self.belief.explains and self.belief.seek(measured):
+            self._follower.begin(None)
         self._located(measured, lost=not self.belief.explains)
 
     def _located(self, measured: TipMeasurement, *, lost: bool) -> None:
@@ -356,7 +358,7 @@ class AgentPolicy(_PlanningPolicy):
             self.belief = monitor.belief
             self._begin_anew()
         self._limit_load()
-        if monitor.sought:  # the devices lie otherwise than the course was searched for
+        if monitor.sought:  # they lie otherwise than the course was searched for
             self._follower.begin(None)
         if monitor.seen is not None:
             self._located(monitor.seen, lost=monitor.lost)

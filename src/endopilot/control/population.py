@@ -1,4 +1,4 @@
-"""A population of wires that draw their motions at random until one passes a place: `Population`.
+"""A population of devices that draw their motions at random until one passes a place: `Population`.
 
 Every round each candidate draws a constant control for a second. Those nearest to the place, with the cost of what they
 did, are kept and copied over the others: a beam search with random moves.
@@ -23,12 +23,15 @@ _LEAST_SHARE = 0.5
 """No attempt accepts a motion that fewer of the wires follow, by weight."""
 _FAILED_MM_S = 1e3
 """Cost of a wire whose simulation has failed, mm/s."""
+_RESTS, _FOLLOWS = 0.4, 0.3
+"""Shares of the candidates in which a catheter rests, and in which it advances by itself; in the others it goes along
+with the wire."""
 _OFF_ROUTE = 0.5
 """Cost of each mm that a tip lies off the route, mm."""
 
 
 class Population:
-    """Candidates of a wire; a catheter around it rests."""
+    """Candidates of a wire, alone or with a catheter around it that rests, follows or goes along."""
 
     def __init__(
         self,
@@ -120,10 +123,10 @@ class Population:
             back = random.random(count) < 0.45
             speed = np.where(back, random.uniform(-0.8, 0.0, count), random.uniform(0.1, 0.8, count))
         drawn = self._trials.control(Move(WIRE, np.clip(speed, -1.0, 1.0) * config.speed_mm_s, turn))
-        if drawn.shape[1] > 1:
-            follows = random.random(count)
-            follow = np.where(follows < 0.4, 0.0, np.where(follows < 0.7, random.uniform(0.0, 1.0, count), speed))
-            drawn[:, CATHETER, 0] = np.clip(follow, -1.0, 1.0) * config.speed_mm_s
+        if self._trials.devices > 1:
+            way = random.random(count)
+            alike = np.where(way < _RESTS + _FOLLOWS, random.uniform(0.0, 1.0, count), speed)
+            drawn[:, CATHETER, 0] = np.where(way < _RESTS, 0.0, np.clip(alike, -1.0, 1.0)) * config.speed_mm_s
         same = (random.random(count) < 0.2) & (number > 1)
         drawn[same] = last[same]
         return drawn

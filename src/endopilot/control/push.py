@@ -44,6 +44,8 @@ _SLACK_MM = 40.0
 """A wire that was pushed this far and did not come forward folds, mm; in a wide lumen see `SLACK_WIDTHS`."""
 LOOPS_MM = 120.0
 """The same of soft devices that move together: what they lay into loops in a wide lumen holds what comes after, mm."""
+_LOOSER_MM = 60.0
+"""A wire that goes ahead of a resting catheter is pushed on until it lies in loops by so much more, mm."""
 _AT_MM, REST_MM = 1.0, 0.1
 """A catheter this near to its place is there, mm; what is this near to its goal rests."""
 _LATE = 2
@@ -174,6 +176,7 @@ class Push:
         passed, been = np.zeros(trials.count, dtype=bool), np.zeros(trials.simulator.worlds, dtype=bool)
         progress = farthest = trials.progress(self.route)
         inserted_there, follower = trials.deepest, _Follower(self, trials, lead)
+        most_mm = trials.deepest - progress + _LOOSER_MM if self.strict and not alone else np.inf
         beyond = progress > self.waypoint
         waits = alone and not self.strict and self.route.is_wide(self.waypoint)
         slack_mm = SLACK_WIDTHS * self.route.width_mm(self.waypoint) if waits else _SLACK_MM
@@ -218,7 +221,7 @@ class Push:
                 missed = progress >= self.waypoint + _BEYOND_MM
                 stop(missed & (not self.strict and not self.spreads(trials)), "off")
             stop(self._off(trials, off_mm), "off")
-            stop(inserted - inserted_there > slack_mm, "stalled")
+            stop((inserted - inserted_there > slack_mm) | (inserted - progress > most_mm), "stalled")
         if not alone:
             passed = self.arrived(trials) & ~trials.still
         trials.still[:] = False
