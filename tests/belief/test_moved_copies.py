@@ -45,7 +45,7 @@ def seen_of(belief: Belief) -> TipMeasurement:
 
 
 def gone_and_come_back(navigation: Navigation) -> TipMeasurement:
-    """Return where a tip is seen whose drive pulled it out of a branch, turned, and came back: into the other branch."""
+    """Return where a tip is seen whose drive pulled it out of a branch, turned, and came back: into another branch."""
     belief = Belief(navigation, MEMBERS, CONFIG)
     for back in (0.25, 0.5, 0.75, 1.0, 0.75, 0.5, 0.25, 0.0):
         belief.follow(((25.0 - 8.0 * back, 1.5 + 1.5 * back),))

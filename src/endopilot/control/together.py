@@ -113,8 +113,8 @@ class Together:
     def bring_on(self, waypoint: float, kept: Kept, halt: Halt) -> bool:
         """Bring the devices on otherwise than straight; return whether they come forward.
 
-        A wire that goes ahead may stay where a straight push has brought it. Else motions are drawn: from where the
-        devices lay, then from where the push has loaded the wire. Else the catheter follows it.
+        Motions are drawn: from where the devices lay, then from where a straight push has loaded a wire that goes
+        ahead. Else this may stay where the push has brought it; else its catheter follows.
 
         Args:
             waypoint: the place that is to be passed, mm.
@@ -123,19 +123,18 @@ class Together:
         """
         course, loaded = self._course, self._course.kept()
         course.restore(kept)
-        begun, begins = self.here, [kept]
-        if self.ahead and halt == "stalled":
-            course.restore(loaded)
-            if self._comes_on(waypoint, begun):
-                return True
-            begins.append(loaded)
-        for begin in begins:
+        begun, presses_on = self.here, self.ahead and halt == "stalled"
+        for begin in (kept, loaded) if presses_on else (kept,):
             course.restore(begin)
             here = self.here
             goal = min(self._route.next_waypoint(here), here + _LOOKOUT_MM)
             rounds = min(self._config.rounds, self.left // self._config.round_periods)
             for control in self._population.find(course, goal, rounds=rounds, spare_share=SPARE_SHARE)[0]:
                 course.move(control[None])
+            if self._comes_on(waypoint, begun):
+                return True
+        if presses_on:
+            course.restore(loaded)
             if self._comes_on(waypoint, begun):
                 return True
         course.restore(kept)
