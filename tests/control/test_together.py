@@ -143,3 +143,17 @@ def test_a_pair_that_moves_together_is_searched_for_step_by_step(pair) -> None:
     assert slow.horizon_mm is None and slow.belief.copies == 0 and slow.losses == 4
     assert hurried.horizon_mm == 60.0 and hurried.belief.copies > 0
     assert hurried.tries == hurried.losses == 20 and hurried.most_exposures == 100
+
+
+def test_a_stuck_wire_is_pulled_back_and_its_catheter_only_where_it_is_in_the_way(pair, monkeypatch) -> None:
+    """The catheter's tip is in the way in a branch that is not on the route, or where the wire's lies in it."""
+    search, _ = begin(pair)
+    devices, course = search._together, search._course
+    devices.most_periods = 100
+    course.move(course.control(Move(WIRE, 40.0), Move(CATHETER, 20.0)))
+    kept, before = course.kept(), [float(course.inserted(device)[0]) for device in (WIRE, CATHETER)]
+    for off_mm in (0.0, 5.0):
+        monkeypatch.setattr(Route, "off_route", lambda _, tip, off_mm=off_mm: np.full(tip.abscissa.shape, off_mm))
+        devices.retreat(kept)
+        back = [was - float(course.inserted(device)[0]) for device, was in zip((WIRE, CATHETER), before, strict=True)]
+        assert back[0] > 5.0 and (back[1] > 0) == (off_mm > 0)

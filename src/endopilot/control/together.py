@@ -26,8 +26,8 @@ _GAIN_MM, _LOOSE_MM = 3.0, 60.0
 _COMES_ALONG_MM, _FOLDS_MM = 10.0, 40.0
 """A catheter that comes this much along its wire supports it, mm; it has folded where it is pushed so much farther than
 it comes."""
-_RETREAT_MM, _COMES_TOO = (10.0, 40.0), 0.5
-"""A wire that is stuck is pulled back by between these two, mm; its catheter with this probability."""
+_RETREAT_MM = 10.0, 40.0
+"""A wire that is stuck is pulled back by between these two, mm."""
 
 
 class Together:
@@ -157,17 +157,18 @@ class Together:
             speed = min(config.speed_mm_s, left_mm / DECISION_PERIOD_S)
             course.still |= course.move(course.control(Move(CATHETER, speed)), force_n=self._navigation.force_limit_n)
         course.still[:] = False
-        return self.catheter_at >= begun + _COMES_ALONG_MM and self.here >= here - _LEAVES_MM
+        return self.catheter_at >= begun + _COMES_ALONG_MM and self.here >= here - _COMES_MM
 
     def retreat(self, kept: Kept) -> None:
         """Pull a wire that goes ahead back from where it is stuck, for another search to begin there.
 
-        Its catheter comes back too as often as not: its tip may lie beyond the fork that the wire has taken.
+        Its catheter comes back too where its tip lies beyond a fork at which the wire has left it.
         """
         course, random = self._course, self._random
         course.restore(kept)
+        astray = bool((self._route.off_route(course.tips[:, CATHETER]) > 0).any())
         leads, wire_mm = self.lead_mm > 0, random.uniform(*_RETREAT_MM)
-        catheter_mm = random.uniform(*_RETREAT_MM) if random.random() < _COMES_TOO or not leads else 0.0
+        catheter_mm = random.uniform(*_RETREAT_MM) if astray or not leads else 0.0
         periods = int(np.ceil(max(wire_mm, catheter_mm) / (self._config.speed_mm_s * DECISION_PERIOD_S)))
         back = [-mm / (periods * DECISION_PERIOD_S) for mm in (wire_mm, catheter_mm)]
         for _ in range(min(periods, self.left)):
