@@ -366,7 +366,7 @@ def test_a_search_begins_farther_before_a_wide_junction(side_branch, monkeypatch
         policy.start(side_branch, 0)
         one = policy._search
         one._course.put(np.zeros(1, dtype=int), policy.belief.simulator, np.ones(1))
-        one._periods, one._hard = 20, np.inf
+        one._together.most_periods, one._hard = 20, np.inf
         one._approach(22.5)
         begun.append(float(one._course.foremost.abscissa[0]))
     assert begun == pytest.approx([16.0, 12.0], abs=1.1)
