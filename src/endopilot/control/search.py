@@ -100,7 +100,7 @@ class Search:
         trials_of = partial(Trials.of, navigation, belief.kinds, like=belief.simulator)
         self._course, self._many = trials_of(count=1), trials_of(count=self._repertoire.trials)
         self._few = self._course if self._alone else trials_of(count=len(self._repertoire.leads))
-        drawn = self._many if self._alone else trials_of(count=config.candidates)
+        drawn = trials_of(count=config.candidates) if config.manoeuvres.together else self._many
         random = np.random.default_rng([seed, 0x5EA])
         self._population = Population(navigation, route, drawn, config, random)
         self._together = Together(navigation, route, self._course, self._population, config, random)
@@ -171,7 +171,7 @@ class Search:
         course.put(source, belief.simulator, weight)
         self._behind_mm = self._before_fork()
         self.halt, self._at_fork = "", False
-        most_periods = self._together.most_periods = self._most_periods(seconds, horizon_mm)
+        most_periods = pair.most_periods = self._most_periods(seconds, horizon_mm)
         if angle:
             turn(course, np.array([angle]), periods=most_periods)
         while out and self._here > self._behind_mm and course.lengths[:, WIRE].min() > 1.0 and self._left > 0:

@@ -53,8 +53,7 @@ class Route:
         beyond = np.array([line.abscissa[0] + line.radius[0] + BEYOND_MM for line in starts[: len(junctions)]])
         left = [_left_backwards(tree, branch) for branch in branches[1 : len(junctions) + 1]]
         beyond = np.maximum(beyond, np.array(left) + BEYOND_MM)
-        ends = np.append(junctions[1:] - ENTERED_MM, target.abscissa)[: len(junctions)]  # of a branch shorter than that
-        beyond = np.minimum(beyond, ends)
+        beyond = np.minimum(beyond, _branch_ends(junctions, target))
         return Route(
             anatomy=anatomy,
             target=target,
@@ -69,7 +68,7 @@ class Route:
 
         Where a branch leaves obliquely from one as wide, a tip beside its line may still lie in the other lumen.
         """
-        ends = np.append(self.junctions[1:] - ENTERED_MM, self.target.abscissa)[: len(self.junctions)]
+        ends = _branch_ends(self.junctions, self.target)
         carinas = [_carina(self.anatomy.tree, branch) for branch in self.branches[1 : len(self.junctions) + 1]]
         deeper = np.where(np.array(carinas) < ends, np.maximum(self.waypoints[:-1], carinas), self.waypoints[:-1])
         return replace(self, waypoints=np.append(deeper, self.target.abscissa))
@@ -126,6 +125,11 @@ class Route:
     def radius(self, abscissa: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Return the lumen radius along the route, mm."""
         return np.interp(abscissa, self.line.abscissa, self.line.radius)
+
+
+def _branch_ends(junctions: Float[np.ndarray, "j"], target: Target) -> Float[np.ndarray, "j"]:
+    """Return the abscissa before which the waypoint of each branch lies, mm: its end, or the target."""
+    return np.append(junctions[1:] - ENTERED_MM, target.abscissa)[: len(junctions)]
 
 
 def _left_backwards(tree: VesselTree, branch: int) -> float:
