@@ -10,9 +10,10 @@ import pytest
 from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.agent import AgentPolicy
 from endopilot.control.agent_config import AgentConfig
+from endopilot.control.constant_motions import ConstantMotions
 from endopilot.control.places import next_place, places_of
 from endopilot.control.population import Population
-from endopilot.control.push import ALL_ALONG_MM, Push
+from endopilot.control.push import Push
 from endopilot.control.search import Search
 from endopilot.control.trials import CATHETER, WIRE, Move, Trials
 from endopilot.devices.catheter import read_catheter
@@ -58,59 +59,48 @@ def test_the_wire_goes_ahead_where_the_lumen_is_narrow_and_its_tip_is_to_arrive(
     assert course.reached == 1.0 and course.control[:, CATHETER, 0].max() > 0
 
 
-def test_a_catheter_that_rests_lets_its_wire_go_all_the_way_alone(pair) -> None:
-    """Else it follows to 10 mm behind the wire's tip as soon as that is past the place."""
-    ends = []
-    for rests in (False, True):
-        search, _ = begin(pair)
-        push = Push(search.route, pair, search.config, 28.0, rests=rests)
-        push.run(search._course, 40, np.array([ALL_ALONG_MM]))
-        ends.append([search._course.inserted(device)[0] for device in (WIRE, CATHETER)])
-    assert ends[0][0] > 28.0 and ends[1][0] > 28.0
-    assert ends[0][1] == pytest.approx(ends[0][0] - 10.0, abs=0.2) and ends[1][1] == 0.0
-
-
-def test_a_catheter_follows_over_the_resting_wire(pair) -> None:
-    search, _ = begin(pair)
-    search._together.most_periods = 100
-    assert not search._together.support()  # it is 6 mm behind the wire already
-    search._course.move(search._course.control(Move(WIRE, 40.0)))
-    wire_mm = float(search._course.inserted(WIRE)[0])
-    assert search._together.support()
-    assert search._course.inserted(WIRE)[0] == pytest.approx(wire_mm, abs=1e-9)
-    assert search._course.inserted(CATHETER)[0] == pytest.approx(wire_mm - 10.0, abs=0.2)
-
-
-def test_motions_of_both_devices_are_drawn_where_a_straight_push_fails(pair, monkeypatch) -> None:
+def test_a_wire_is_turned_on_where_a_straight_push_fails(pair) -> None:
     """From a start that looks away from it, the wire does not enter the side branch as it is pushed."""
-    side = replace(pair, target=Target(branch=2, abscissa=30.0), seconds=8.0)
-    search, belief = begin(replace(side, start_rotation_rad=np.pi))
-    drawn, find = [], Population.find
+    side = replace(pair, target=Target(branch=2, abscissa=30.0), start_rotation_rad=np.pi)
+    search, belief = begin(side)
+    assert not Push(search.route, side, search.config, 22.5).run(search._course, 40).passed[0]
+    course = search.find(belief, seconds=60.0)
+    assert course.reached == 1.0 and search.halt == ""
+    assert np.abs(course.control[:, WIRE, 1]).max() > 0
+
+
+def test_motions_of_both_devices_are_drawn_where_turning_does_not_help(pair, monkeypatch) -> None:
+    """Where the wire goes ahead its catheter rests then; else that is moved too."""
+    monkeypatch.setattr(ConstantMotions, "best", lambda *_: (np.zeros((4, 2, 2)), -np.inf))
+    found, find = [], Population.find
 
     def note(*given, **named):
-        drawn.append(find(*given, **named))
-        return drawn[-1]
+        found.append((named["rests"], *find(*given, **named)))
+        return found[-1][1:]
 
     monkeypatch.setattr(Population, "find", note)
-    course = search.find(belief, seconds=60.0, horizon_mm=100.0)
-    assert drawn and course.reached <= 0.5 and search.halt == ""  # it ends with what was drawn, and nothing failed
-    assert np.array_equal(course.control[-len(drawn[-1][0]) :], drawn[-1][0])
-    moved = np.concatenate([controls for controls, _ in drawn])
-    assert np.abs(moved[:, WIRE, 1]).max() > 0
-    draws = search._population._draw(np.zeros((8, 2, 2)), 2, 0)
-    assert (draws[:, CATHETER, 0] != 0).any() and (draws[:, CATHETER, 0] == 0).any()
-    assert not draws[:, CATHETER, 1].any()
+    side = replace(pair, target=Target(branch=2, abscissa=30.0), start_rotation_rad=np.pi)
+    for arrives, rests in (("wire", True), ("catheter", False)):
+        search, belief = begin(replace(side, arrives=arrives))
+        course = search.find(belief, seconds=60.0, horizon_mm=100.0)
+        assert found and all(each[0] == rests for each in found)
+        if search.halt == "":
+            assert np.array_equal(course.control[-len(found[-1][1]) :], found[-1][1])
+        draws = search._population._draw(np.zeros((8, 2, 2)), 2, 0)
+        assert (draws[:, CATHETER, 0] != 0).any() == (not rests) and not draws[:, CATHETER, 1].any()
+        found.clear()
 
 
 def test_a_course_ends_beyond_its_horizon_and_is_no_failure(pair) -> None:
-    search, belief = begin(pair)
+    late = replace(pair, arrives="catheter", seconds=12.0)
+    search, belief = begin(late)
     places = places_of(search.route, 6.0, alone=False, together=True)
     course = search.find(belief, seconds=30.0, horizon_mm=5.0)
     assert len(places) > 1 and course.reached == 0.0 and search.halt == ""
     assert 11.0 <= course.tip.abscissa[-1, 0] < places[-1]
-    policy = AgentPolicy(replace(AgentConfig.of(pair), belief=BELIEF, horizon_mm=5.0, tries=1))
+    policy = AgentPolicy(replace(AgentConfig.of(late), belief=BELIEF, horizon_mm=5.0, tries=1))
     core = SimulatorConfig(element_mm=2.0, time_step_s=0.1, threads=1)
-    record = NavigationLoop(pair, policy, config=LoopConfig(simulator=core), seed=2).run()
+    record = NavigationLoop(late, policy, config=LoopConfig(simulator=core), seed=2).run()
     assert record.reason == "reached" and policy.plans > 1
 
 

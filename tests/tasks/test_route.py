@@ -103,7 +103,7 @@ def test_the_lumen_is_narrow_behind_its_last_wide_place(fork, wide_mm, narrow_fr
     wide = (line.abscissa >= wide_mm[0]) & (line.abscissa <= wide_mm[1])
     line = replace(line, radius=np.where(wide, 8.5, 2.0))
     tree = replace(tree, branches=(replace(tree.branches[0], centerline=line),))
-    assert Route.to(replace(fork, tree=tree), Target(branch=0, abscissa=30.0)).narrow_from == narrow_from_mm
+    assert Route.to(replace(fork, tree=tree), Target(branch=0, abscissa=30.0)).narrow_from() == narrow_from_mm
 
 
 def named(fork):
@@ -154,3 +154,16 @@ def test_a_lumen_narrower_than_the_wire_hides_what_lies_behind_it(fork, wire):
         check_passable(Route.to(anatomy, Target(branch=2, abscissa=35.0)), wire)
     check_passable(Route.to(anatomy, Target(branch=2, abscissa=at - 1.0)), wire)
     check_passable(Route.to(anatomy, Target(branch=1, abscissa=35.0)), wire)
+
+
+def test_a_bend_begins_where_the_line_turns(fork) -> None:
+    """A quarter of a circle of 10 mm behind 20 mm that are straight; smoothing over 1 mm spreads where it begins."""
+    angle = np.linspace(0.0, np.pi / 2, 200)[1:]
+    straight = np.column_stack([np.zeros(200), np.zeros(200), np.linspace(0.0, 20.0, 200)])
+    bend = np.column_stack([10 * (1 - np.cos(angle)), np.zeros(199), 20 + 10 * np.sin(angle)])
+    tree = tree_of((np.concatenate([straight, bend]), 1.0, -1))
+    route = Route.to(replace(fork, tree=tree), Target(branch=0, abscissa=35.0))
+    assert route.bends_from(0.0, 12.0) == pytest.approx(20.0, abs=2.0)
+    assert route.bends_from(0.0, 8.0) == route.bends_from(34.0, 5.0) == 35.0  # the target: no bend is as tight
+    assert route.bends_from(25.0, 12.0) == 25.0
+    assert route.narrow_from(1.9) == pytest.approx(35.0, abs=0.3) and route.narrow_from(2.1) == 0.0

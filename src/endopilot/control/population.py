@@ -53,8 +53,11 @@ class Population:
         self._navigation, self._route, self._trials = navigation, route, trials
         self._config, self._random = config, random
         self._wire_radius = navigation.device.tip_radius_mm
+        self._rests = False
 
-    def find(self, one: Trials, waypoint: float, *, rounds: int, spare_share: float) -> tuple[Controls, bool]:
+    def find(
+        self, one: Trials, waypoint: float, *, rounds: int, spare_share: float, rests: bool = False
+    ) -> tuple[Controls, bool]:
         """Find controls that bring most wires past a place; return the best, and whether they do.
 
         Every attempt begins from the same state, so that what is found holds no motion of a failed one.
@@ -64,7 +67,9 @@ class Population:
             waypoint: that is to be passed, mm.
             rounds: of each attempt at most.
             spare_share: share of the force limit that the first attempts stay within; the last leave nothing to spare.
+            rests: whether a catheter rests.
         """
+        self._rests = rests
         attempts, nearest, best = self._config.attempts, np.inf, np.zeros((0, one.devices, 2))
         for attempt in range(attempts):
             share = spare_share if 2 * attempt < attempts else 1.0
@@ -123,7 +128,7 @@ class Population:
             back = random.random(count) < 0.45
             speed = np.where(back, random.uniform(-0.8, 0.0, count), random.uniform(0.1, 0.8, count))
         drawn = self._trials.control(Move(WIRE, np.clip(speed, -1.0, 1.0) * config.speed_mm_s, turn))
-        if self._trials.devices > 1:
+        if self._trials.devices > 1 and not self._rests:
             way = random.random(count)
             alike = np.where(way < _RESTS + _FOLLOWS, random.uniform(0.0, 1.0, count), speed)
             drawn[:, CATHETER, 0] = np.where(way < _RESTS, 0.0, np.clip(alike, -1.0, 1.0)) * config.speed_mm_s

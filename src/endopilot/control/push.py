@@ -44,8 +44,6 @@ _SLACK_MM = 40.0
 """A wire that was pushed this far and did not come forward folds, mm; in a wide lumen see `SLACK_WIDTHS`."""
 LOOPS_MM = 120.0
 """The same of soft devices that move together: what they lay into loops in a wide lumen holds what comes after, mm."""
-_LOOSER_MM = 60.0
-"""A wire that goes ahead of a resting catheter is pushed on until it lies in loops by so much more, mm."""
 _AT_MM, REST_MM = 1.0, 0.1
 """A catheter this near to its place is there, mm; what is this near to its goal rests."""
 _LATE = 2
@@ -141,9 +139,7 @@ class Push:
         navigation: with the force limit, at which a trial is given up.
         config: speed, and how catheters follow.
         waypoint: the place, mm; the target's own ends the push there.
-        strict: whether a wire alone is given up at the first sign that it will not pass, since there are other ways;
-            and one of a soft pair as soon as it folds.
-        rests: whether a catheter rests while its wire goes all the way.
+        strict: whether a wire alone is given up at the first sign that it will not pass, since there are other ways.
     """
 
     route: Route
@@ -151,7 +147,6 @@ class Push:
     config: SearchConfig
     waypoint: float
     strict: bool = False
-    rests: bool = False
 
     @property
     def last(self) -> bool:
@@ -176,18 +171,17 @@ class Push:
         passed, been = np.zeros(trials.count, dtype=bool), np.zeros(trials.simulator.worlds, dtype=bool)
         progress = farthest = trials.progress(self.route)
         inserted_there, follower = trials.deepest, _Follower(self, trials, lead)
-        most_mm = trials.deepest - progress + _LOOSER_MM if self.strict and not alone else np.inf
         beyond = progress > self.waypoint
         waits = alone and not self.strict and self.route.is_wide(self.waypoint)
         slack_mm = SLACK_WIDTHS * self.route.width_mm(self.waypoint) if waits else _SLACK_MM
-        slack_mm = LOOPS_MM if self.config.manoeuvres.together and not (alone or self.strict) else slack_mm
+        slack_mm = LOOPS_MM if self.config.manoeuvres.together and not alone else slack_mm
         off_mm, longest, force_n = self._limits(trials, waits)
 
         def stop(which: Bool[np.ndarray, "trials"], why: Halt) -> None:
             halt[which & ~trials.still] = why
             trials.still |= which
 
-        if self.strict and alone:
+        if self.strict:
             stop(self._off(trials, off_mm), "off")
         longest, hurries = begun + min(periods, longest), self.config.manoeuvres.together
         while len(trials.rows) < longest:
@@ -221,7 +215,7 @@ class Push:
                 missed = progress >= self.waypoint + _BEYOND_MM
                 stop(missed & (not self.strict and not self.spreads(trials)), "off")
             stop(self._off(trials, off_mm), "off")
-            stop((inserted - inserted_there > slack_mm) | (inserted - progress > most_mm), "stalled")
+            stop(inserted - inserted_there > slack_mm, "stalled")
         if not alone:
             passed = self.arrived(trials) & ~trials.still
         trials.still[:] = False
@@ -254,7 +248,7 @@ class Push:
     def _limits(self, trials: Trials, waits: bool) -> tuple[float, int, float]:
         """Return how far in a wrong branch (mm), after how many periods, and at what force (N) a trial is given up."""
         limit_n, config = self.navigation.force_limit_n, self.config
-        if self.strict and trials.devices == 1:
+        if self.strict:
             return 0.0, sys.maxsize, config.cost.forbidden_share * limit_n
         if trials.devices == 1:
             before = self.route.junctions[self.route.junctions < self.waypoint]
@@ -279,8 +273,6 @@ class _Follower:
         self._lead = np.full(trials.count, ALL_ALONG_MM) if lead is None else lead
         self._follows = np.zeros(trials.count, dtype=bool)
         self._behind = np.minimum(self._lead, push.config.manoeuvres.behind_mm)
-        if push.rests:
-            self._behind[self._lead == ALL_ALONG_MM] = np.inf
 
     def control(self, progress: Each) -> Control:
         """Return what drives wires on, and catheters once they follow, from how far along the route they are, mm."""

@@ -25,6 +25,7 @@ from itertools import product
 import numpy as np
 
 from endopilot.belief.belief import Belief
+from endopilot.control.constant_motions import ConstantMotions
 from endopilot.control.course import Course
 from endopilot.control.halt import SPARE_SHARE, describe_halt, near_fork
 from endopilot.control.manoeuvre import STRAIGHT, Grid, Repertoire, place, retract
@@ -103,7 +104,8 @@ class Search:
         drawn = trials_of(count=config.candidates) if config.manoeuvres.together else self._many
         random = np.random.default_rng([seed, 0x5EA])
         self._population = Population(navigation, route, drawn, config, random)
-        self._together = Together(navigation, route, self._course, self._population, config, random)
+        motions = ConstantMotions(navigation, route, drawn, config, random)
+        self._together = Together(navigation, route, self._course, self._population, motions, config, random)
         self.halt = ""
 
     @property
@@ -185,6 +187,15 @@ class Search:
                 reported = max(here, reported)
             pair.set_out()
             waypoint, kept, self._tried = next_place(places, here, alone=self._alone), course.kept(), {}
+            if pair.ahead:
+                if not pair.turn_on():
+                    self._halted("stalled", waypoint)
+                    pair.retreat(kept)
+                    break
+                settled.append(len(course.rows) - 1)
+                if self._reached() > 0.5 or np.isfinite(horizon_mm):
+                    break
+                continue
             halt = self._straight(waypoint)
             if halt is None:
                 if together:
@@ -197,14 +208,10 @@ class Search:
                 if len(settled) > _OFTEN * len(places):  # it goes to and fro about a place
                     self._halted("stalled", waypoint)
                     break
-            elif together and pair.bring_on(waypoint, kept, halt):
+            elif together and pair.bring_on(waypoint, kept):
                 settled.append(len(course.rows) - 1)
                 if np.isfinite(horizon_mm):
                     break
-            elif pair.ahead and np.isfinite(horizon_mm):
-                self._halted(halt, waypoint)
-                pair.retreat(kept)
-                break
             elif any(self._turned(grid, share, waypoint, kept) for share, grid in self._repertoire.ways):
                 if together:
                     pair.pull_taut(waypoint)
@@ -251,7 +258,7 @@ class Search:
 
     def _straight(self, waypoint: float) -> Halt | None:
         """Push straight on past a place; return why not, or None if the course has passed it."""
-        course, push = self._course, self._push(waypoint, strict=self._alone or self._together.ahead)
+        course, push = self._course, self._push(waypoint, strict=self._alone)
         if push.arrived(course)[0]:
             return None
         if push.strict:
@@ -318,7 +325,7 @@ class Search:
         return self._push(waypoint).run(many, left - TURN_PERIODS, push_lead)
 
     def _push(self, waypoint: float, *, strict: bool = False) -> Push:
-        return Push(self.route, self._navigation, self.config, waypoint, strict, rests=self._together.ahead)
+        return Push(self.route, self._navigation, self.config, waypoint, strict)
 
     def _follow(self, pushed: Pushed, share: float, waypoint: float, *, turns: int) -> bool:
         """Let the course do what the best trial of a manoeuvre did; return whether any passes within a share of force.

@@ -1,16 +1,18 @@
 """How a course brings on wire and catheter that move together where time is short: `Together`.
 
 Such devices are often so soft that they lie down in loops, press forward as these unbend, and slide back when they are
-pulled. In a narrow lumen the wire goes ahead while its catheter rests: so much less of what is pushed is stiff.
+pulled. In a narrow lumen the wire goes ahead, turned as it is pushed, while its catheter is held where the lumen is not
+wide: so much less of what is pushed is stiff, and no wire lies alone in a wide lumen.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from endopilot.control.constant_motions import ConstantMotions
+from endopilot.control.course import Controls
 from endopilot.control.halt import SPARE_SHARE
 from endopilot.control.population import Population
-from endopilot.control.push import REST_MM, Halt
 from endopilot.control.search_config import SearchConfig
 from endopilot.control.trials import CATHETER, WIRE, Kept, Move, Trials
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
@@ -23,15 +25,20 @@ _SLACK_MM, _TAUT_MM, _COMES_MM, _LEAVES_MM = 25.0, 8.0, 3.0, 10.0
 tip comes along by the third. Where it then slides back by more than the last, they stay as they were."""
 _GAIN_MM, _LOOSE_MM = 3.0, 60.0
 """A motion is a step if the devices come this much forward, mm, and then have no more slack than this."""
-_COMES_ALONG_MM, _FOLDS_MM = 10.0, 40.0
-"""A catheter that comes this much along its wire supports it, mm; it has folded where it is pushed so much farther than
-it comes."""
+_NEARER = 0.5
+"""Nearer to the target than that, a motion is a step if it halves the distance that is left."""
+_HELD_MM, _TIGHT_MM = 9.0, 6.5
+"""A catheter is held beyond where the lumen is wider than the first of these, mm: there a wire alone folds before it is
+pushed through a bend. One of radius R takes EI / 2R² of push, and a loop as wide as the lumen no more. It is held
+before the first bend of a smaller radius than the second, mm, which pushes it back with as much of its own EI."""
+_BEFORE_MM = 5.0
+"""So far before that bend, mm."""
 _RETREAT_MM = 10.0, 40.0
 """A wire that is stuck is pulled back by between these two, mm."""
 
 
 class Together:
-    """What the course of a wire and its catheter does where a straight push fails.
+    """What the course of a wire and its catheter does where a straight push fails, and in a narrow lumen.
 
     Attributes:
         ahead: whether the wire goes ahead of its catheter now, in a narrow lumen to which its own tip is to go.
@@ -44,6 +51,7 @@ class Together:
         route: Route,
         course: Trials,
         population: Population,
+        motions: ConstantMotions,
         config: SearchConfig,
         random: np.random.Generator,
     ) -> None:
@@ -53,18 +61,20 @@ class Together:
             navigation: with the force limit.
             route: to its target.
             course: the devices.
-            population: by which motions are drawn.
+            population: by which motions are drawn one after another.
+            motions: by which motions are drawn that stay the same.
             config: settings of the search.
             random: what is drawn from.
         """
         self._navigation, self._route, self._course = navigation, route, course
-        self._population, self._config, self._random = population, config, random
+        self._population, self._motions, self._config, self._random = population, motions, config, random
+        self._held_at = route.bends_from(route.narrow_from(_HELD_MM), _TIGHT_MM) - _BEFORE_MM
         self.ahead, self.most_periods = False, 0
 
     def set_out(self) -> None:
         """Note whether the wire goes ahead from where the devices are."""
         soft = self._config.manoeuvres.together and not self._navigation.arriving
-        self.ahead = soft and self.here >= self._route.narrow_from
+        self.ahead = soft and self.here >= self._route.narrow_from()
 
     @property
     def here(self) -> float:
@@ -101,63 +111,53 @@ class Together:
         if self.slack_mm <= _SLACK_MM or waypoint >= self._route.target.abscissa:
             return
         kept, passed = course.kept(), self.here
-        leads = self.ahead and self.lead_mm > 0
-        back = course.control(*(Move(device, -speed) for device in range(1 if leads else course.devices)))
+        back = course.control(*(Move(device, -speed) for device in range(course.devices)))
         while self.slack_mm > _TAUT_MM and self.here > passed - _COMES_MM and course.lengths.min() > 1.0:
-            if leads and self.lead_mm <= 0:
-                break
             course.move(back)
         if self.here < passed - _LEAVES_MM:
             course.restore(kept)
 
-    def bring_on(self, waypoint: float, kept: Kept, halt: Halt) -> bool:
-        """Bring the devices on otherwise than straight; return whether they come forward.
+    def turn_on(self) -> bool:
+        """Turn a wire that goes ahead on, or bring its catheter to where it is held; return whether either comes on.
 
-        Motions are drawn: from where the devices lay, then from where a straight push has loaded a wire that goes
-        ahead. Else this may stay where the push has brought it; else its catheter follows.
+        Where turning does not help, motions are drawn.
+        """
+        begun, left_mm = self.here, abs(self._route.target.abscissa - self.here)
+        controls, gain_mm = self._motions.best(self._course, self._held_at)
+        if gain_mm >= min(_GAIN_MM, _NEARER * left_mm):
+            self._follow(controls)
+            return True
+        return self._draw(begun)
+
+    def bring_on(self, waypoint: float, kept: Kept) -> bool:
+        """Bring devices past a place by motions that are drawn; return whether they come forward.
 
         Args:
-            waypoint: the place that is to be passed, mm.
-            kept: where the devices lay.
-            halt: how the straight push ended, with which the course ends.
+            waypoint: the place, mm.
+            kept: where the devices lay before a straight push.
         """
-        course, loaded = self._course, self._course.kept()
-        course.restore(kept)
-        begun, presses_on = self.here, self.ahead and halt == "stalled"
-        for begin in (kept, loaded) if presses_on else (kept,):
-            course.restore(begin)
-            here = self.here
-            goal = min(self._route.next_waypoint(here), here + _LOOKOUT_MM)
-            rounds = min(self._config.rounds, self.left // self._config.round_periods)
-            for control in self._population.find(course, goal, rounds=rounds, spare_share=SPARE_SHARE)[0]:
-                course.move(control[None])
-            if self._comes_on(waypoint, begun):
-                return True
-        if presses_on:
-            course.restore(loaded)
-            if self._comes_on(waypoint, begun):
-                return True
-        course.restore(kept)
-        return self.ahead and self.support()
-
-    def _comes_on(self, waypoint: float, begun: float) -> bool:
-        """Pull devices taut; return whether they have then come forward from a place, mm, without lying in loops."""
+        self._course.restore(kept)
+        begun = self.here
+        if not self._draw(begun):
+            return False
         self.pull_taut(waypoint)
+        return self.here >= begun + _GAIN_MM
+
+    def _draw(self, begun: float) -> bool:
+        """Draw motions that lead on from a place, mm; return whether the devices come forward without many loops."""
+        goal = min(self._route.next_waypoint(begun), begun + _LOOKOUT_MM)
+        rounds = min(self._config.rounds, self.left // self._config.round_periods)
+        course, share = self._course, SPARE_SHARE
+        self._follow(self._population.find(course, goal, rounds=rounds, spare_share=share, rests=self.ahead)[0])
         return self.here >= begun + _GAIN_MM and self.slack_mm <= _LOOSE_MM
 
-    def support(self) -> bool:
-        """Let the catheter follow over the resting wire, which it then supports; return whether it comes along."""
-        course, config = self._course, self._config
-        begun, here, first_mm = self.catheter_at, self.here, float(course.inserted(CATHETER)[0])
-        for _ in range(min(self.left, round(config.manoeuvres.longest_s / DECISION_PERIOD_S))):
-            left_mm = self.lead_mm - config.manoeuvres.behind_mm
-            pushed_mm = float(course.inserted(CATHETER)[0]) - first_mm
-            if left_mm <= REST_MM or pushed_mm - (self.catheter_at - begun) > _FOLDS_MM or course.still[0]:
-                break
-            speed = min(config.speed_mm_s, left_mm / DECISION_PERIOD_S)
-            course.still |= course.move(course.control(Move(CATHETER, speed)), force_n=self._navigation.force_limit_n)
-        course.still[:] = False
-        return self.catheter_at >= begun + _COMES_ALONG_MM and self.here >= here - _COMES_MM
+    def _follow(self, controls: Controls) -> None:
+        """Let the devices do what was found, until they are at the target."""
+        course, navigation = self._course, self._navigation
+        for control in controls[: self.left]:
+            course.move(control[None])
+            if course.all(navigation.reached(course.tips))[0]:
+                return
 
     def retreat(self, kept: Kept) -> None:
         """Pull a wire that goes ahead back from where it is stuck, for another search to begin there.
@@ -172,6 +172,6 @@ class Together:
         periods = int(np.ceil(max(wire_mm, catheter_mm) / (self._config.speed_mm_s * DECISION_PERIOD_S)))
         back = [-mm / (periods * DECISION_PERIOD_S) for mm in (wire_mm, catheter_mm)]
         for _ in range(min(periods, self.left)):
-            if course.lengths.min() < 1.0 or (leads and self.lead_mm <= 0):
+            if course.lengths.min() < 1.0 or self.slack_mm < -_TAUT_MM or (leads and self.lead_mm <= 0):
                 return
             course.move(course.control(Move(WIRE, back[0]), Move(CATHETER, back[1])))

@@ -18,6 +18,8 @@ BEYOND_MM = 1.5
 """A waypoint lies this far beyond the wall of the parent, on the centerline of the branch that leaves it, mm."""
 ENTERED_MM = 1.0
 """A tip this far beyond a waypoint has entered the branch, mm."""
+_EVERY_MM = 0.5
+"""Distance of the points at which bends are measured, mm."""
 NEAR_MM = 1.5
 """A tip this near to the target, in its branch, has arrived, mm: half a millimetre before it counts as reached."""
 
@@ -115,12 +117,32 @@ class Route:
         """Return whether a wire may fold in the lumen up to an abscissa, mm, and yet come forward (`WIDE_MM`)."""
         return self.width_mm(end) > WIDE_MM
 
-    @cached_property
-    def narrow_from(self) -> float:
-        """Abscissa from which on the lumen is nowhere wide up to the target, mm."""
+    def narrow_from(self, width_mm: float = WIDE_MM) -> float:
+        """Return the abscissa from which on the lumen is nowhere wider than that up to the target, mm."""
         before = self.line.abscissa <= self.target.abscissa
-        wide = self.line.abscissa[before & (2 * self.line.radius > WIDE_MM)]
+        wide = self.line.abscissa[before & (2 * self.line.radius > width_mm)]
         return float(wide.max(initial=0.0))
+
+    def bends_from(self, begin_mm: float, radius_mm: float) -> float:
+        """Return the first place beyond another at which the route bends with less than a radius, mm; else the target.
+
+        Bends are those of the line smoothed over the lumen's radius: a device need not follow narrower turns.
+        """
+        at = np.arange(begin_mm, self.target.abscissa, _EVERY_MM)
+        tight = at[np.interp(at, *self._curvature) > 1 / radius_mm]
+        return float(tight[0]) if len(tight) else self.target.abscissa
+
+    @cached_property
+    def _curvature(self) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+        """Abscissae along the route, mm, and the curvature of its smoothed line there, 1/mm."""
+        at = np.arange(self.line.abscissa[0], self.line.abscissa[-1], _EVERY_MM)
+        points = np.column_stack([np.interp(at, self.line.abscissa, axis) for axis in self.line.points.T])
+        weight = np.exp(-(((at[:, None] - at) / self.radius(at)[:, None]) ** 2) / 2)
+        smooth = weight @ points / weight.sum(axis=1, keepdims=True)
+        along = np.gradient(smooth, axis=0)
+        step = np.linalg.norm(along, axis=1)
+        turn = np.gradient(along / step[:, None], axis=0)
+        return at, np.linalg.norm(turn, axis=1) / step
 
     def radius(self, abscissa: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Return the lumen radius along the route, mm."""

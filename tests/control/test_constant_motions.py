@@ -1,0 +1,101 @@
+"""Motions that stay the same for some seconds: which are drawn, what they are judged by, and when they end."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from endopilot.belief.belief import Belief, BeliefConfig
+from endopilot.control.agent_config import AgentConfig
+from endopilot.control.constant_motions import ConstantMotions
+from endopilot.control.trials import CATHETER, WIRE, Control, Move, Trials
+from endopilot.devices.catheter import read_catheter
+from endopilot.simulation.world import World
+from endopilot.tasks.navigation import Navigation, Target
+from endopilot.tasks.route import Route
+
+BELIEF = BeliefConfig(members=1, stiffness_levels=1, element_mm=2.0, time_step_s=0.1)
+
+
+@pytest.fixture(scope="module")
+def pair(fork, wire) -> Navigation:
+    """Return a navigation of a pair to a place straight ahead."""
+    return Navigation(
+        anatomy=fork,
+        device=wire,
+        target=Target(branch=1, abscissa=34.0),
+        catheters=(read_catheter("microcatheter-1.7f"),),
+        start_inserted_length_mm=6.0,
+        seconds=8.0,
+        force_limit_n=0.3,
+    )
+
+
+def begin(navigation: Navigation, candidates: int = 16) -> tuple[ConstantMotions, Trials]:
+    """Return candidates, and the devices where the navigation begins."""
+    belief = Belief(navigation, [World()], BELIEF)
+    one, many = (Trials.of(navigation, belief.kinds, count, like=belief.simulator) for count in (1, candidates))
+    one.put(np.array([0]), belief.simulator, np.ones(1))
+    route, config = Route.to(navigation.anatomy, navigation.target), AgentConfig.of(navigation).search
+    return ConstantMotions(navigation, route, many, config, np.random.default_rng(0)), one
+
+
+def only(motions: ConstantMotions, *controls: list[list[float]], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let candidates draw some controls alone."""
+
+    def draw(_: ConstantMotions) -> Control:
+        return np.resize(np.array(controls), (motions._trials.count, 2, 2))
+
+    monkeypatch.setattr(ConstantMotions, "_draw", draw)
+
+
+def test_a_motion_ends_where_it_arrives(pair, monkeypatch) -> None:
+    motions, one = begin(pair)
+    one.move(one.control(Move(WIRE, 40.0)))  # 26 mm
+    only(motions, [[0.5, 0.0], [0.0, 0.0]], [[7.0, 0.0], [0.0, 0.0]], monkeypatch=monkeypatch)
+    controls, gain_mm = motions.best(one, 0.0)
+    assert controls[0, WIRE, 0] == 7.0 and len(controls) < 4 and gain_mm == np.inf
+    for number, control in enumerate(controls):
+        assert not one.all(pair.reached(one.tips))[0], number
+        one.move(control[None])
+    assert one.all(pair.reached(one.tips))[0]
+
+
+def test_the_catheter_is_worth_half_until_it_is_in_its_place(pair, monkeypatch) -> None:
+    motions, one = begin(pair)
+    one.move(one.control(Move(WIRE, 60.0)))
+    only(motions, [[0.0, 0.0], [2.0, 0.0]], monkeypatch=monkeypatch)
+    controls, gain_mm = motions.best(one, 30.0)
+    assert controls.shape == (4, 2, 2) and gain_mm == pytest.approx(0.5 * 8.0, abs=0.3)  # 4 s of 2 mm/s
+    assert motions.best(one, 4.0)[1] == pytest.approx(0.5 * 4.0, abs=0.3)
+    assert abs(motions.best(one, -22.0)[1]) < 0.3  # it is there, and 30 mm deeper is as good
+    assert motions.best(one, -30.0)[1] == pytest.approx(-0.5 * 8.0, abs=0.3)
+
+
+def test_devices_that_press_on_are_best(pair, monkeypatch) -> None:
+    """What lies in loops costs 0.1 a mm, and 0.4 more beyond 40 mm; less than 10 mm of slack costs 0.2."""
+    motions, one = begin(pair)
+    only(motions, [[2.0, 0.0], [0.0, 0.0]], monkeypatch=monkeypatch)
+    for progress_mm, cost in ((16.0, -0.2), (-14.0, 0.1), (-44.0, 0.5)):
+        monkeypatch.setattr(Route, "progress", lambda _, tip, at=progress_mm: np.full(tip.abscissa.shape, at))
+        assert motions.best(one, -100.0)[1] == pytest.approx(-cost * 8.0, abs=0.05)
+
+
+def test_none_is_taken_that_presses_too_hard(pair, monkeypatch) -> None:
+    motions, one = begin(replace(pair, force_limit_n=1e-9))
+    only(motions, [[5.0, 0.0], [0.0, 0.0]], monkeypatch=monkeypatch)
+    assert motions.best(one, 0.0)[1] == -np.inf
+
+
+def test_what_was_best_is_tried_again_and_so_is_a_straight_push(pair) -> None:
+    motions, one = begin(pair, candidates=400)
+    best = motions.best(one, 0.0)[0][0]
+    drawn = motions._draw()
+    assert np.array_equal(drawn[0], best)
+    assert np.array_equal(drawn[1], [[motions._config.speed_mm_s, 0.0], [0.0, 0.0]])
+    rests, along = (drawn[2:, CATHETER] == 0).all(axis=1), drawn[2:, CATHETER, 0] == drawn[2:, WIRE, 0]
+    assert 0.4 < rests.mean() < 0.65 and 0.2 < (along & ~rests).mean() < 0.35
+    assert (drawn[:, WIRE, 1] > 0).any() and (drawn[:, WIRE, 1] < 0).any() and (drawn[:, WIRE, 0] < 0).any()
+    assert np.abs(drawn[..., 1]).max() <= motions._trials.fastest[1]
