@@ -55,7 +55,7 @@ def test_a_motion_ends_where_it_arrives(pair, monkeypatch) -> None:
     motions, one = begin(pair)
     one.move(one.control(Move(WIRE, 40.0)))  # 26 mm
     only(motions, [[0.5, 0.0], [0.0, 0.0]], [[7.0, 0.0], [0.0, 0.0]], monkeypatch=monkeypatch)
-    controls, gain_mm = motions.best(one, 0.0)
+    controls, gain_mm = motions.best(one, 0.0, -np.inf)
     assert controls[0, WIRE, 0] == 7.0 and len(controls) < 4 and gain_mm == np.inf
     for number, control in enumerate(controls):
         assert not one.all(pair.reached(one.tips))[0], number
@@ -67,11 +67,11 @@ def test_the_catheter_is_worth_half_until_it_is_in_its_place(pair, monkeypatch) 
     motions, one = begin(pair)
     one.move(one.control(Move(WIRE, 60.0)))
     only(motions, [[0.0, 0.0], [2.0, 0.0]], monkeypatch=monkeypatch)
-    controls, gain_mm = motions.best(one, 30.0)
+    controls, gain_mm = motions.best(one, 30.0, -np.inf)
     assert controls.shape == (4, 2, 2) and gain_mm == pytest.approx(0.5 * 8.0, abs=0.3)  # 4 s of 2 mm/s
-    assert motions.best(one, 4.0)[1] == pytest.approx(0.5 * 4.0, abs=0.3)
-    assert abs(motions.best(one, -22.0)[1]) < 0.3  # it is there, and 30 mm deeper is as good
-    assert motions.best(one, -30.0)[1] == pytest.approx(-0.5 * 8.0, abs=0.3)
+    assert motions.best(one, 4.0, -np.inf)[1] == pytest.approx(0.5 * 4.0, abs=0.3)
+    assert abs(motions.best(one, -22.0, -np.inf)[1]) < 0.3  # it is there, and 30 mm deeper is as good
+    assert motions.best(one, -30.0, -np.inf)[1] == pytest.approx(-0.5 * 8.0, abs=0.3)
 
 
 def test_devices_that_press_on_are_best(pair, monkeypatch) -> None:
@@ -80,18 +80,18 @@ def test_devices_that_press_on_are_best(pair, monkeypatch) -> None:
     only(motions, [[2.0, 0.0], [0.0, 0.0]], monkeypatch=monkeypatch)
     for progress_mm, cost in ((16.0, -0.2), (-14.0, 0.1), (-44.0, 0.5)):
         monkeypatch.setattr(Route, "progress", lambda _, tip, at=progress_mm: np.full(tip.abscissa.shape, at))
-        assert motions.best(one, -100.0)[1] == pytest.approx(-cost * 8.0, abs=0.05)
+        assert motions.best(one, -100.0, -np.inf)[1] == pytest.approx(-cost * 8.0, abs=0.05)
 
 
 def test_none_is_taken_that_presses_too_hard(pair, monkeypatch) -> None:
     motions, one = begin(replace(pair, force_limit_n=1e-9))
     only(motions, [[5.0, 0.0], [0.0, 0.0]], monkeypatch=monkeypatch)
-    assert motions.best(one, 0.0)[1] == -np.inf
+    assert motions.best(one, 0.0, -np.inf)[1] == -np.inf
 
 
 def test_what_was_best_is_tried_again_and_so_is_a_straight_push(pair) -> None:
     motions, one = begin(pair, candidates=400)
-    best = motions.best(one, 0.0)[0][0]
+    best = motions.best(one, 0.0, -np.inf)[0][0]
     drawn = motions._draw()
     assert np.array_equal(drawn[0], best)
     assert np.array_equal(drawn[1], [[motions._config.speed_mm_s, 0.0], [0.0, 0.0]])

@@ -7,6 +7,8 @@ of it: six times as much for 12 mm and 5 mm of radius. So devices that are too s
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 from jaxtyping import Float
 
@@ -17,8 +19,9 @@ from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.route import Route
 
 Each = Float[np.ndarray, "candidates"]
-_LOOK_PERIODS, _KEPT_PERIODS = 8, 4
-"""Decision periods over which candidates are compared, and of these the ones that the best of them keeps."""
+_LOOK_PERIODS, _KEPT_PERIODS, _LOOKS = 8, 4, 2
+"""Decision periods over which candidates are compared, those of them that the best keeps, and how many times as long
+they are compared where none comes forward."""
 _SPEEDS = (-0.5, -0.25, 0.0, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0)
 """Translations that are drawn, as shares of the speed of a straight push."""
 _TURNS = (-1.0, -1.0, -0.5, 0.0, 0.5, 1.0, 1.0)
@@ -64,26 +67,32 @@ class ConstantMotions:
         self._last = np.zeros((trials.devices, 2))
         self._free_mm = config.manoeuvres.behind_mm + navigation.device.tip_bend_length_mm
 
-    def best(self, one: Trials, held_at: float) -> tuple[Controls, float]:
+    def best(self, one: Trials, held_at: float, least_mm: float) -> tuple[Controls, float]:
         """Return the best of the motions that were drawn, and how far it brings the devices on, mm.
+
+        Where none brings them on they go on for as long again: slack has to be laid down before it presses on.
 
         Args:
             one: the devices, where all candidates begin.
             held_at: where along the route the catheter's tip is to be held, mm.
+            least_mm: a motion that brings them on so far will do, mm.
         """
         trials, before = self._trials.copy_of(one), float(self._come(one, held_at)[0])
         control = trials.possible(self._draw(), alike=True, periods=_LOOK_PERIODS)
-        gentle, arrives = np.ones(trials.count, dtype=bool), np.full(trials.count, _LOOK_PERIODS + 1)
-        for period in range(_LOOK_PERIODS):
-            gentle &= ~trials.move(control, force_n=self._navigation.force_limit_n)
-            there = gentle & trials.all(self._navigation.reached(trials.tips))
-            arrives[there & ~trials.still] = period + 1
-            trials.still |= there
-        gain = np.where(gentle, self._come(trials, held_at) - before, -np.inf)
-        chosen, periods = int(np.argmax(gain)), _KEPT_PERIODS
-        if arrives.min() <= _LOOK_PERIODS:
+        gentle, arrives = np.ones(trials.count, dtype=bool), np.full(trials.count, sys.maxsize)
+        gain, kept = np.zeros(trials.count), 0
+        while kept == 0 or (kept < _LOOKS * _KEPT_PERIODS and gain.max() < least_mm):
+            kept += _KEPT_PERIODS
+            for _ in range(_LOOK_PERIODS):
+                gentle &= ~trials.move(control, force_n=self._navigation.force_limit_n)
+                there = gentle & ~trials.still & trials.all(self._navigation.reached(trials.tips))
+                arrives[there] = len(trials.rows)
+                trials.still |= there
+            gain = np.where(gentle, self._come(trials, held_at) - before, -np.inf)
+            gain[arrives < sys.maxsize] = np.inf
+        chosen, periods = int(np.argmax(gain)), kept
+        if gain[chosen] == np.inf:
             chosen, periods = int(np.argmin(arrives)), int(arrives.min())
-            gain[chosen] = np.inf
         self._last = control[chosen]
         return np.repeat(self._last[None], periods, axis=0), float(gain[chosen])
 

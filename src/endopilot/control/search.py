@@ -187,16 +187,7 @@ class Search:
                 reported = max(here, reported)
             pair.set_out()
             waypoint, kept, self._tried = next_place(places, here, alone=self._alone), course.kept(), {}
-            if pair.ahead:
-                if not pair.turn_on():
-                    self._halted("stalled", waypoint)
-                    pair.retreat(kept)
-                    break
-                settled.append(len(course.rows) - 1)
-                if self._reached() > 0.5 or np.isfinite(horizon_mm):
-                    break
-                continue
-            halt = self._straight(waypoint)
+            halt = "stalled" if pair.ahead else self._straight(waypoint)
             if halt is None:
                 if together:
                     pair.pull_taut(waypoint)
@@ -210,8 +201,12 @@ class Search:
                     break
             elif together and pair.bring_on(waypoint, kept):
                 settled.append(len(course.rows) - 1)
-                if np.isfinite(horizon_mm):
+                if np.isfinite(horizon_mm) or self._reached() > 0.5:
                     break
+            elif pair.ahead:
+                self._halted(halt, waypoint)
+                pair.retreat(kept)
+                break
             elif any(self._turned(grid, share, waypoint, kept) for share, grid in self._repertoire.ways):
                 if together:
                     pair.pull_taut(waypoint)

@@ -26,7 +26,7 @@ tip comes along by the third. Where it then slides back by more than the last, t
 _GAIN_MM, _LOOSE_MM = 3.0, 60.0
 """A motion is a step if the devices come this much forward, mm, and then have no more slack than this."""
 _NEARER = 0.5
-"""Nearer to the target than that, a motion is a step if it halves the distance that is left."""
+"""Near to the target a motion is a step if it makes the distance that is left so many times as long."""
 _HELD_MM, _TIGHT_MM = 9.0, 6.5
 """A catheter is held beyond where the lumen is wider than the first of these, mm: there a wire alone folds before it is
 pushed through a bend. One of radius R takes EI / 2R² of push, and a loop as wide as the lumen no more. It is held
@@ -38,7 +38,7 @@ _RETREAT_MM = 10.0, 40.0
 
 
 class Together:
-    """What the course of a wire and its catheter does where a straight push fails, and in a narrow lumen.
+    """What the course of a wire and its catheter does where a straight push fails, and in narrow lumens.
 
     Attributes:
         ahead: whether the wire goes ahead of its catheter now, in a narrow lumen to which its own tip is to go.
@@ -92,12 +92,6 @@ class Together:
         return float((self._course.inserted(WIRE) - self._course.inserted(CATHETER))[0])
 
     @property
-    def catheter_at(self) -> float:
-        """How far along the route the catheter's tip lies, mm."""
-        tips = self._course.tips[:, CATHETER]
-        return float(self._course.mean(self._route.progress(tips))[0])
-
-    @property
     def left(self) -> int:
         """Decision periods that the course may still take."""
         return self.most_periods - len(self._course.rows)
@@ -117,39 +111,36 @@ class Together:
         if self.here < passed - _LEAVES_MM:
             course.restore(kept)
 
-    def turn_on(self) -> bool:
-        """Turn a wire that goes ahead on, or bring its catheter to where it is held; return whether either comes on.
-
-        Where turning does not help, motions are drawn.
-        """
-        begun, left_mm = self.here, abs(self._route.target.abscissa - self.here)
-        controls, gain_mm = self._motions.best(self._course, self._held_at)
-        if gain_mm >= min(_GAIN_MM, _NEARER * left_mm):
-            self._follow(controls)
-            return True
-        return self._draw(begun)
-
     def bring_on(self, waypoint: float, kept: Kept) -> bool:
-        """Bring devices past a place by motions that are drawn; return whether they come forward.
+        """Bring devices on from where they lay, straight pushes aside; return whether they come forward.
+
+        A wire that goes ahead is turned on, and its catheter brought to where it is held. Where that does not help, and
+        in wide lumens, motions are drawn.
 
         Args:
-            waypoint: the place, mm.
-            kept: where the devices lay before a straight push.
+            waypoint: the place that is to be passed, mm.
+            kept: where the devices lay.
         """
         self._course.restore(kept)
         begun = self.here
-        if not self._draw(begun):
-            return False
-        self.pull_taut(waypoint)
-        return self.here >= begun + _GAIN_MM
-
-    def _draw(self, begun: float) -> bool:
-        """Draw motions that lead on from a place, mm; return whether the devices come forward without many loops."""
+        if self.ahead:
+            controls, gain_mm = self._motions.best(self._course, self._held_at, self._step_mm(begun))
+            if gain_mm >= self._step_mm(begun):
+                self._follow(controls)
+                return True
         goal = min(self._route.next_waypoint(begun), begun + _LOOKOUT_MM)
         rounds = min(self._config.rounds, self.left // self._config.round_periods)
         course, share = self._course, SPARE_SHARE
         self._follow(self._population.find(course, goal, rounds=rounds, spare_share=share, rests=self.ahead)[0])
-        return self.here >= begun + _GAIN_MM and self.slack_mm <= _LOOSE_MM
+        if self.here < begun + self._step_mm(begun) or self.slack_mm > _LOOSE_MM:
+            return False
+        if not self.ahead:
+            self.pull_taut(waypoint)
+        return self.here >= begun + self._step_mm(begun)
+
+    def _step_mm(self, here: float) -> float:
+        """Return how far devices have to come forward in a step, mm: half the distance to the target, near to it."""
+        return min(_GAIN_MM, _NEARER * abs(self._route.target.abscissa - here))
 
     def _follow(self, controls: Controls) -> None:
         """Let the devices do what was found, until they are at the target."""
