@@ -83,6 +83,17 @@ def test_devices_that_press_on_are_best(pair, monkeypatch) -> None:
         assert motions.best(one, -100.0, -np.inf)[1] == pytest.approx(-cost * 8.0, abs=0.05)
 
 
+def test_motions_go_on_for_as_long_again_where_none_comes_forward(pair, monkeypatch) -> None:
+    """The tip is held until 10 mm were pushed, for 5 s, and then comes forward by 10 mm."""
+    motions, one = begin(pair)
+    only(motions, [[2.0, 0.0], [0.0, 0.0]], monkeypatch=monkeypatch)
+    monkeypatch.setattr(Route, "progress", lambda _, tip: np.where(tip.abscissa > 16.0, 16.0, 6.0))
+    for least_mm, periods, comes_mm in ((-np.inf, 4, 0.0), (3.0, 8, 10.0)):
+        controls, gain_mm = motions.best(one, -100.0, least_mm)
+        assert len(controls) == periods
+        assert (gain_mm > 3.0) == (comes_mm > 0)
+
+
 def test_none_is_taken_that_presses_too_hard(pair, monkeypatch) -> None:
     motions, one = begin(replace(pair, force_limit_n=1e-9))
     only(motions, [[5.0, 0.0], [0.0, 0.0]], monkeypatch=monkeypatch)

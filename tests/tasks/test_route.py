@@ -166,4 +166,6 @@ def test_a_bend_begins_where_the_line_turns(fork) -> None:
     assert route.bends_from(0.0, 12.0) == pytest.approx(20.0, abs=2.0)
     assert route.bends_from(0.0, 8.0) == route.bends_from(34.0, 5.0) == 35.0  # the target: no bend is as tight
     assert route.bends_from(25.0, 12.0) == 25.0
+    assert route.outer_mm(50.0) == pytest.approx(np.pi / 2, rel=0.05)  # r times the angle
+    assert route.outer_mm(15.0) == pytest.approx(0.0, abs=1e-3)
     assert route.narrow_from(1.9) == pytest.approx(35.0, abs=0.3) and route.narrow_from(2.1) == 0.0

@@ -39,7 +39,8 @@ _SLACK_MM, _TAUT_COST, _SLACK_COST = 10.0, 0.2, 0.1
 """Devices with so much slack press on, mm; what a millimetre less costs, since taut ones have to be pushed first, and
 what one more costs, mm of the route."""
 _LOOPS_MM, _LOOPS_COST = 40.0, 0.4
-"""Beyond so much slack a millimetre costs so much more, mm: what lies in loops presses on no longer."""
+"""Beyond so much slack, mm, or where devices lie on the outer walls of a wide lumen all along, a millimetre costs so much
+more: what is pushed then is laid into loops."""
 
 
 class ConstantMotions:
@@ -65,6 +66,7 @@ class ConstantMotions:
         self._navigation, self._route, self._trials = navigation, route, trials
         self._config, self._random = config, random
         self._last = np.zeros((trials.devices, 2))
+        self._loops_mm = max(route.outer_mm(route.narrow_from()), _LOOPS_MM)
         self._free_mm = config.manoeuvres.behind_mm + navigation.device.tip_bend_length_mm
 
     def best(self, one: Trials, held_at: float, least_mm: float) -> tuple[Controls, float]:
@@ -127,5 +129,5 @@ class ConstantMotions:
         wire = wire - 2 * np.maximum(wire - target, 0.0)
         slack = trials.deepest - trials.progress(self._route)
         taut = _TAUT_COST * np.maximum(_SLACK_MM - slack, 0.0)
-        loose = _SLACK_COST * np.maximum(slack - _SLACK_MM, 0.0) + _LOOPS_COST * np.maximum(slack - _LOOPS_MM, 0.0)
+        loose = _SLACK_COST * np.maximum(slack - _SLACK_MM, 0.0) + _LOOPS_COST * np.maximum(slack - self._loops_mm, 0.0)
         return wire + _CATHETER_GAIN * catheter - taut - loose

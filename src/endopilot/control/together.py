@@ -23,8 +23,10 @@ _LOOKOUT_MM = 12.0
 _SLACK_MM, _TAUT_MM, _COMES_MM, _LEAVES_MM = 25.0, 8.0, 3.0, 10.0
 """Devices with more slack than the first of these are pulled back, mm, until they have no more than the second, or the
 tip comes along by the third. Where it then slides back by more than the last, they stay as they were."""
-_GAIN_MM, _LOOSE_MM = 3.0, 60.0
-"""A motion is a step if the devices come this much forward, mm, and then have no more slack than this."""
+_GAIN_MM = 3.0
+"""A motion is a step if the devices come this much forward, mm, and do not lie in loops then."""
+_LOOSE_MM = 60.0
+"""Devices lie in loops with more slack than this, mm, or than the outer walls of a wide lumen take."""
 _NEARER = 0.5
 """Near to the target a motion is a step if it makes the distance that is left so many times as long."""
 _HELD_MM, _TIGHT_MM = 9.0, 6.5
@@ -69,6 +71,7 @@ class Together:
         self._navigation, self._route, self._course = navigation, route, course
         self._population, self._motions, self._config, self._random = population, motions, config, random
         self._held_at = route.bends_from(route.narrow_from(_HELD_MM), _TIGHT_MM) - _BEFORE_MM
+        self._loose_mm = max(route.outer_mm(route.narrow_from()), _LOOSE_MM)
         self.ahead, self.most_periods = False, 0
 
     def set_out(self) -> None:
@@ -132,7 +135,7 @@ class Together:
         rounds = min(self._config.rounds, self.left // self._config.round_periods)
         course, share = self._course, SPARE_SHARE
         self._follow(self._population.find(course, goal, rounds=rounds, spare_share=share, rests=self.ahead)[0])
-        if self.here < begun + self._step_mm(begun) or self.slack_mm > _LOOSE_MM:
+        if self.here < begun + self._step_mm(begun) or self.slack_mm > self._loose_mm:
             return False
         if not self.ahead:
             self.pull_taut(waypoint)

@@ -132,6 +132,14 @@ class Route:
         tight = at[np.interp(at, *self._curvature) > 1 / radius_mm]
         return float(tight[0]) if len(tight) else self.target.abscissa
 
+    def outer_mm(self, end: float) -> float:
+        """Return how much longer the way along the outer walls of bends is than the line up to an abscissa, mm.
+
+        That is the integral of r κ, with the lumen's radius r and the curvature κ; a wall turns about no less than r.
+        """
+        at, curvature = self._curvature
+        return float(np.minimum(self.radius(at) * curvature, 1.0)[at < end].sum() * _EVERY_MM)
+
     @cached_property
     def _curvature(self) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
         """Abscissae along the route, mm, and the curvature of its smoothed line there, 1/mm."""
