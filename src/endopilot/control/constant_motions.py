@@ -33,14 +33,14 @@ _DEEPER_MM = 30.0
 _RESTS, _ALONG = 0.5, 0.25
 """Shares of the candidates in which the catheter rests, and in which it is pushed and pulled as the wire is: what lies
 in loops where it is around the wire holds back its tip too."""
-_CATHETER_GAIN = 0.5
+_CATHETER_GAIN = 0.2
 """What a millimetre is worth by which the catheter comes nearer to its place, mm of the route."""
 _SLACK_MM, _TAUT_COST, _SLACK_COST = 10.0, 0.2, 0.1
 """Devices with so much slack press on, mm; what a millimetre less costs, since taut ones have to be pushed first, and
 what one more costs, mm of the route."""
 _LOOPS_MM, _LOOPS_COST = 40.0, 0.4
-"""Beyond so much slack, mm, or where devices lie on the outer walls of a wide lumen all along, a millimetre costs so much
-more: what is pushed then is laid into loops."""
+"""Beyond so much slack, mm, and beyond what the outer walls of a wide lumen take, a millimetre costs so much more: what
+is pushed then is laid into loops."""
 
 
 class ConstantMotions:
@@ -86,7 +86,7 @@ class ConstantMotions:
         while kept == 0 or (kept < _LOOKS * _KEPT_PERIODS and gain.max() < least_mm):
             kept += _KEPT_PERIODS
             for _ in range(_LOOK_PERIODS):
-                gentle &= ~trials.move(control, force_n=self._navigation.force_limit_n)
+                gentle &= ~trials.move(self._unless_full(control), force_n=self._navigation.force_limit_n)
                 there = gentle & ~trials.still & trials.all(self._navigation.reached(trials.tips))
                 arrives[there] = len(trials.rows)
                 trials.still |= there
@@ -96,7 +96,17 @@ class ConstantMotions:
         if gain[chosen] == np.inf:
             chosen, periods = int(np.argmin(arrives)), int(arrives.min())
         self._last = control[chosen]
-        return np.repeat(self._last[None], periods, axis=0), float(gain[chosen])
+        return np.array([row.control[chosen] for row in trials.rows[:periods]]), float(gain[chosen])
+
+    def _unless_full(self, control: Control) -> Control:
+        """Return a control that does not push devices whose loops are full: they come forward as they unbend."""
+        full = self._slack(self._trials) > self._loops_mm
+        made = control.copy()
+        made[full, :, 0] = np.minimum(made[full, :, 0], 0.0)
+        return made
+
+    def _slack(self, trials: Trials) -> Each:
+        return trials.deepest - trials.progress(self._route)
 
     def _draw(self) -> Control:
         """Draw a motion for each candidate; the first goes on as was best before, the second is pushed straight."""
@@ -127,7 +137,7 @@ class ConstantMotions:
         deeper = np.maximum(catheter - held_at - _DEEPER_MM, 0.0)
         catheter = np.minimum(np.minimum(catheter, held_at), wire - self._free_mm) - deeper
         wire = wire - 2 * np.maximum(wire - target, 0.0)
-        slack = trials.deepest - trials.progress(self._route)
+        slack = self._slack(trials)
         taut = _TAUT_COST * np.maximum(_SLACK_MM - slack, 0.0)
         loose = _SLACK_COST * np.maximum(slack - _SLACK_MM, 0.0) + _LOOPS_COST * np.maximum(slack - self._loops_mm, 0.0)
         return wire + _CATHETER_GAIN * catheter - taut - loose
