@@ -19,9 +19,8 @@ from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.route import Route
 
 Each = Float[np.ndarray, "candidates"]
-_LOOK_PERIODS, _KEPT_PERIODS, _LOOKS = 8, 4, 2
-"""Decision periods over which candidates are compared, those of them that the best keeps, and how many times as long
-they are compared where none comes forward."""
+_LOOK_PERIODS, _KEPT_PERIODS = 8, 4
+"""Decision periods over which candidates are compared, once or twice, and those of them that the best keeps."""
 _SPEEDS = (-0.5, -0.25, 0.0, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0)
 """Translations that are drawn, as shares of the speed of a straight push."""
 _TURNS = (-1.0, -1.0, -0.5, 0.0, 0.5, 1.0, 1.0)
@@ -33,7 +32,7 @@ _DEEPER_MM = 30.0
 _RESTS, _ALONG = 0.5, 0.25
 """Shares of the candidates in which the catheter rests, and in which it is pushed and pulled as the wire is: what lies
 in loops where it is around the wire holds back its tip too."""
-_CATHETER_GAIN = 0.2
+_CATHETER_GAIN = 0.5
 """What a millimetre is worth by which the catheter comes nearer to its place, mm of the route."""
 _SLACK_MM, _TAUT_COST, _SLACK_COST = 10.0, 0.2, 0.1
 """Devices with so much slack press on, mm; what a millimetre less costs, since taut ones have to be pushed first, and
@@ -72,26 +71,30 @@ class ConstantMotions:
     def best(self, one: Trials, held_at: float, least_mm: float) -> tuple[Controls, float]:
         """Return the best of the motions that were drawn, and how far it brings the devices on, mm.
 
-        Where none brings them on they go on for as long again: slack has to be laid down before it presses on.
+        Where none brings them on they go on for as long again, and the wire's tip alone counts: slack has to be laid
+        down before it presses on, and takes the catheter's tip back.
 
         Args:
             one: the devices, where all candidates begin.
             held_at: where along the route the catheter's tip is to be held, mm.
             least_mm: a motion that brings them on so far will do, mm.
         """
-        trials, before = self._trials.copy_of(one), float(self._come(one, held_at)[0])
+        trials, limit_n = self._trials.copy_of(one), self._navigation.force_limit_n
         control = trials.possible(self._draw(), alike=True, periods=_LOOK_PERIODS)
         gentle, arrives = np.ones(trials.count, dtype=bool), np.full(trials.count, sys.maxsize)
         gain, kept = np.zeros(trials.count), 0
-        while kept == 0 or (kept < _LOOKS * _KEPT_PERIODS and gain.max() < least_mm):
+        for catheter_gain in (_CATHETER_GAIN, 0.0):
             kept += _KEPT_PERIODS
             for _ in range(_LOOK_PERIODS):
-                gentle &= ~trials.move(self._unless_full(control), force_n=self._navigation.force_limit_n)
+                gentle &= ~trials.move(self._unless_full(control) if catheter_gain == 0 else control, force_n=limit_n)
                 there = gentle & ~trials.still & trials.all(self._navigation.reached(trials.tips))
                 arrives[there] = len(trials.rows)
                 trials.still |= there
-            gain = np.where(gentle, self._come(trials, held_at) - before, -np.inf)
+            come = self._come(trials, held_at, catheter_gain) - float(self._come(one, held_at, catheter_gain)[0])
+            gain = np.where(gentle, come, -np.inf)
             gain[arrives < sys.maxsize] = np.inf
+            if gain.max() >= least_mm:
+                break
         chosen, periods = int(np.argmax(gain)), kept
         if gain[chosen] == np.inf:
             chosen, periods = int(np.argmin(arrives)), int(arrives.min())
@@ -126,7 +129,7 @@ class ConstantMotions:
         control[0], control[1] = self._last, [[fast, 0.0], [0.0, 0.0]]
         return control
 
-    def _come(self, trials: Trials, held_at: float) -> Each:
+    def _come(self, trials: Trials, held_at: float, catheter_gain: float) -> Each:
         """Return how far along the route candidates have come, mm, less by how far off it or past the target they are.
 
         Loops make it less, and a catheter that is not yet where it is to be held, behind the bent tip of the wire.
@@ -140,4 +143,4 @@ class ConstantMotions:
         slack = self._slack(trials)
         taut = _TAUT_COST * np.maximum(_SLACK_MM - slack, 0.0)
         loose = _SLACK_COST * np.maximum(slack - _SLACK_MM, 0.0) + _LOOPS_COST * np.maximum(slack - self._loops_mm, 0.0)
-        return wire + _CATHETER_GAIN * catheter - taut - loose
+        return wire + catheter_gain * catheter - taut - loose
