@@ -94,6 +94,23 @@ def test_motions_go_on_for_as_long_again_where_none_comes_forward(pair, monkeypa
         assert (gain_mm > 3.0) == (comes_mm > 0)
 
 
+def test_in_the_second_look_the_wire_counts_alone_and_full_loops_are_not_pushed(pair, monkeypatch) -> None:
+    motions, one = begin(pair)
+    one.move(one.control(Move(WIRE, 60.0)))
+    only(motions, [[0.0, 0.0], [2.0, 0.0]], monkeypatch=monkeypatch)
+    assert motions.best(one, 30.0, 3.0)[1] > 3.0  # half of 8 mm
+    assert abs(motions.best(one, 30.0, 5.0)[1]) < 0.3
+    motions, one = begin(pair)
+    only(motions, [[-2.0, 0.0], [0.0, 0.0]], [[2.0, 0.0], [0.0, 0.0]], monkeypatch=monkeypatch)
+    monkeypatch.setattr(Route, "progress", lambda _, tip: np.full(tip.abscissa.shape, -44.0))
+    motions._trials.copy_of(one)
+    made = motions._unless_full(motions._draw())
+    assert made[0, WIRE, 0] == -2.0 and made[1, WIRE, 0] == 0.0
+    only(motions, [[2.0, 0.0], [0.0, 0.0]], monkeypatch=monkeypatch)
+    pushed = [motions.best(one, -100.0, least_mm)[1] for least_mm in (-np.inf, 3.0)]
+    assert pushed[0] == pytest.approx(pushed[1], abs=0.05) and pushed[0] < -1.0
+
+
 def test_none_is_taken_that_presses_too_hard(pair, monkeypatch) -> None:
     motions, one = begin(replace(pair, force_limit_n=1e-9))
     only(motions, [[5.0, 0.0], [0.0, 0.0]], monkeypatch=monkeypatch)
