@@ -8,6 +8,7 @@ of it: six times as much for 12 mm and 5 mm of radius. So devices that are too s
 from __future__ import annotations
 
 import sys
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -65,8 +66,12 @@ class ConstantMotions:
         self._navigation, self._route, self._trials = navigation, route, trials
         self._config, self._random = config, random
         self._last = np.zeros((trials.devices, 2))
-        self._loops_mm = max(route.outer_mm(route.narrow_from()), _LOOPS_MM)
         self._free_mm = config.manoeuvres.behind_mm + navigation.device.tip_bend_length_mm
+
+    @cached_property
+    def _loops_mm(self) -> float:
+        """Slack beyond which devices are laid into loops, mm."""
+        return max(self._route.outer_mm(self._route.narrow_from()), _LOOPS_MM)
 
     def best(self, one: Trials, held_at: float, least_mm: float) -> tuple[Controls, float]:
         """Return the best of the motions that were drawn, and how far it brings the devices on, mm.

@@ -7,6 +7,8 @@ wide: so much less of what is pushed is stiff, and no wire lies alone in a wide 
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 
 from endopilot.control.constant_motions import ConstantMotions
@@ -70,9 +72,17 @@ class Together:
         """
         self._navigation, self._route, self._course = navigation, route, course
         self._population, self._motions, self._config, self._random = population, motions, config, random
-        self._held_at = route.bends_from(route.narrow_from(_HELD_MM), _TIGHT_MM) - _BEFORE_MM
-        self._loose_mm = max(route.outer_mm(route.narrow_from()), _LOOSE_MM)
         self.ahead, self.most_periods = False, 0
+
+    @cached_property
+    def _held_at(self) -> float:
+        """How far along the route the catheter's tip is held, mm."""
+        return self._route.bends_from(self._route.narrow_from(_HELD_MM), _TIGHT_MM) - _BEFORE_MM
+
+    @cached_property
+    def _loose_mm(self) -> float:
+        """Slack with which devices lie in loops, mm."""
+        return max(self._route.outer_mm(self._route.narrow_from()), _LOOSE_MM)
 
     def set_out(self) -> None:
         """Note whether the wire goes ahead from where the devices are."""
