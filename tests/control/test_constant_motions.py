@@ -11,26 +11,11 @@ from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.agent_config import AgentConfig
 from endopilot.control.constant_motions import ConstantMotions
 from endopilot.control.trials import CATHETER, WIRE, Control, Move, Trials
-from endopilot.devices.catheter import read_catheter
 from endopilot.simulation.world import World
-from endopilot.tasks.navigation import Navigation, Target
+from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.route import Route
 
 BELIEF = BeliefConfig(members=1, stiffness_levels=1, element_mm=2.0, time_step_s=0.1)
-
-
-@pytest.fixture(scope="module")
-def pair(fork, wire) -> Navigation:
-    """Return a navigation of a pair to a place straight ahead."""
-    return Navigation(
-        anatomy=fork,
-        device=wire,
-        target=Target(branch=1, abscissa=34.0),
-        catheters=(read_catheter("microcatheter-1.7f"),),
-        start_inserted_length_mm=6.0,
-        seconds=8.0,
-        force_limit_n=0.3,
-    )
 
 
 def begin(navigation: Navigation, candidates: int = 16) -> tuple[ConstantMotions, Trials]:

@@ -16,7 +16,6 @@ from endopilot.control.population import Population
 from endopilot.control.push import Push
 from endopilot.control.search import Search
 from endopilot.control.trials import CATHETER, WIRE, Move, Trials
-from endopilot.devices.catheter import read_catheter
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.world import World
@@ -24,20 +23,6 @@ from endopilot.tasks.navigation import Navigation, Target
 from endopilot.tasks.route import Route
 
 BELIEF = BeliefConfig(members=2, stiffness_levels=1, element_mm=2.0, time_step_s=0.1)
-
-
-@pytest.fixture(scope="module")
-def pair(fork, wire) -> Navigation:
-    """Return a navigation of a pair that has too little time to move in turn, to a place straight ahead."""
-    return Navigation(
-        anatomy=fork,
-        device=wire,
-        target=Target(branch=1, abscissa=34.0),
-        catheters=(read_catheter("microcatheter-1.7f"),),
-        start_inserted_length_mm=6.0,
-        seconds=8.0,
-        force_limit_n=0.3,
-    )
 
 
 def begin(navigation: Navigation, **manoeuvres: object) -> tuple[Search, Belief]:
