@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import gc
 import locale
+from dataclasses import replace
 from unittest.mock import patch
 
+import numpy as np
 import pytest
 
 from missing_libraries import missing_library
@@ -157,6 +159,29 @@ def wire():
     from endopilot.devices.device import read_wire
 
     return read_wire("workhorse-014")
+
+
+@pytest.fixture(scope="session")
+def shaped(wire):
+    """Return the workhorse wire with a tip of 70° over 4 mm."""
+    return replace(wire.with_tip(bend_rad=np.deg2rad(70.0), stiffness_factor=1.0), tip_bend_length_mm=4.0)
+
+
+@pytest.fixture(scope="session")
+def side_branch(fork, shaped):
+    """Return a navigation of that wire into the side branch."""
+    from endopilot.tasks.navigation import Navigation, Target
+
+    return Navigation(anatomy=fork, device=shaped, target=Target(branch=2, abscissa=33.0), seconds=40.0)
+
+
+@pytest.fixture(scope="session")
+def with_play():
+    """Return a robot whose encoders do not see a play of 2.6 mm and 0.9 turn; a seed draws both, ± 15 %."""
+    from endopilot.devices.robot import DriveConfig, RobotConfig
+
+    wire = DriveConfig(play_mm=2.6, play_rad=2 * np.pi * 0.9, play_sd_share=0.15)
+    return RobotConfig(encoders_at="motor", wire=wire)
 
 
 @pytest.fixture(scope="session")

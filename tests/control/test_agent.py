@@ -1,4 +1,4 @@
-"""The search for a path in the rod core, the belief as an ensemble, and the policies made of both."""
+"""The policies that plan in the rod core: how they arrive, look, lose the wire, and give up."""
 
 from __future__ import annotations
 
@@ -12,28 +12,18 @@ from hypothesis import strategies as st
 
 from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import Calibration
-from endopilot.belief.belief import Belief, BeliefConfig
-from endopilot.belief.loads import LoadRatio
 from endopilot.belief.watch import MISMATCH
-from endopilot.control import push
 from endopilot.control.agent import AgentPolicy, OpenLoopPolicy, OraclePolicy
-from endopilot.control.agent_config import CALIBRATIONS, AgentConfig
+from endopilot.control.agent_config import CALIBRATIONS
 from endopilot.control.course import Course
-from endopilot.control.halt import describe_halt
-from endopilot.control.search import Search
-from endopilot.control.trials import Period, drive_period
 from endopilot.devices.drive_limits import DriveLimits
-from endopilot.devices.robot import DriveConfig, RobotConfig
-from endopilot.navigation.loop import LoopConfig, NavigationLoop, start_world
+from endopilot.devices.robot import RobotConfig
+from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Decision, Hand, Observation, Policy
-from endopilot.simulation.motion import motion_named
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation, Target
-from endopilot.tasks.route import Route
 from endopilot.types import TipProjection
-from endopilot.xray.fluoroscope import TipMeasurement
-
-QUICK = AgentConfig(belief=BeliefConfig(members=6, time_step_s=0.05))
+from toy_belief import QUICK, measured
 
 
 class Forward:
@@ -44,16 +34,6 @@ class Forward:
 
     def decide(self, observation: Observation) -> Decision:
         return Decision(((6.0, 0.0),))
-
-
-@pytest.fixture(scope="module")
-def shaped(wire):
-    return replace(wire.with_tip(bend_rad=np.deg2rad(70.0), stiffness_factor=1.0), tip_bend_length_mm=4.0)
-
-
-@pytest.fixture(scope="module")
-def side_branch(fork, shaped) -> Navigation:
-    return Navigation(anatomy=fork, device=shaped, target=Target(branch=2, abscissa=33.0), seconds=40.0)
 
 
 def test_the_oracle_gets_into_a_side_branch_that_pushing_misses(side_branch) -> None:
@@ -86,23 +66,6 @@ def test_the_agent_takes_no_more_exposures_than_it_may(side_branch) -> None:
     assert bound.gives_up == "2 exposures did not suffice; AgentConfig.most_exposures allows more"
 
 
-@pytest.mark.parametrize("known", ["still", "both"])
-def test_a_course_is_what_the_simulator_does_under_its_controls(side_branch, known) -> None:
-    side_branch = replace(side_branch, known_motion=motion_named(known))
-    policy = OraclePolicy(config=QUICK)
-    policy.start(side_branch, 0)
-    course = policy.find_course(side_branch.seconds)
-    assert course.reached == 1.0
-    moved = side_branch.start_inserted_length_mm + 0.5 * np.cumsum(course.control[:, 0, 0])
-    assert np.allclose(course.proximal[:, 0, 0], moved, atol=1e-9)
-    simulator = Belief(side_branch, [World()], QUICK.belief).simulator
-    for k in range(len(course.control)):
-        looks = [simulator.step(course.control[k], 0.1) for _ in range(5)]
-        assert simulator.project().abscissa[0, 0] == course.tip.abscissa[k, 0]
-        assert course.force[k, 0] == max(look.contact_force_max[0] for look in looks)
-    assert side_branch.reached(simulator.project())[0]
-
-
 def test_the_agent_arrives_though_the_wire_is_another_than_believed(side_branch) -> None:
     truth = World(friction_factor=1.2, tip_stiffness_factor=0.8, ostium_mm=0.3)
     record = NavigationLoop(side_branch, AgentPolicy(QUICK), seed=2, world=truth).run()
@@ -116,13 +79,6 @@ def test_the_agent_arrives_though_the_wire_is_another_than_believed(side_branch)
         and not replace(record, half_width=0 * half).in_bands.any()
     )
     assert len(replace(record, half_width=None).in_bands) == 0
-
-
-@pytest.fixture(scope="module")
-def with_play() -> RobotConfig:
-    """Return a robot whose encoders do not see a play of 2.6 mm and 0.9 turn; a seed draws both, ± 15 %."""
-    wire = DriveConfig(play_mm=2.6, play_rad=2 * np.pi * 0.9, play_sd_share=0.15)
-    return RobotConfig(encoders_at="motor", wire=wire)
 
 
 def test_the_agent_arrives_though_encoders_sit_in_front_of_a_wide_play(side_branch, with_play) -> None:
@@ -150,76 +106,6 @@ def test_the_first_decision_goes_by_the_first_reading(side_branch) -> None:
     (velocity,) = policy.decide(Observation(0.0, ((2.3, 0.1),), None)).devices
     assert policy._follower.course is not None
     assert velocity == tuple(((policy._follower.course.proximal[0, 0] - [2.3, 0.1]) / 0.5).tolist())
-
-
-def test_an_exposure_says_how_a_wire_is_turned_that_its_encoder_does_not(side_branch, with_play) -> None:
-    """The real drive had all of its play before it, of which the belief knows nothing."""
-    belief = Belief(replace(side_branch, robot=with_play), [World()], QUICK.belief)
-    true = Belief(side_branch, [World()], QUICK.belief)
-    belief.follow(((12.6, 0.0),))
-    true.follow(((10.0, 0.0),))  # the play was ahead
-    belief.weigh(measured(true, 0))
-    belief.follow(((12.6, 5.0),))
-    true.follow(((10.0, 1.5),))
-    unsure = belief.drives.sd[0].copy()
-    for _ in range(3):
-        belief.weigh(measured(true, 0))
-    assert unsure[1] > 1.0 and belief.drives.sd[0, 1] < 0.4
-    np.testing.assert_allclose(belief.drives.proximal[0], [10.0, 1.5], atol=0.35)
-    np.testing.assert_allclose(belief.simulator.proximal[0, 0], [10.0, 1.5], atol=0.35)  # and there its wires are
-    assert belief.play_spread()[0] == belief.drives.sd[0, 0]
-
-
-def measured(belief: Belief, member: int) -> TipMeasurement:
-    tip = belief.tip
-    return TipMeasurement(
-        position=belief.simulator.position[member, 0],
-        abscissa=float(tip.abscissa[member]),
-        offset=float(tip.offset[member]),
-        branch=int(tip.branch[member]),
-    )
-
-
-def test_measurements_weigh_the_member_that_they_are_of(side_branch) -> None:
-    config = BeliefConfig(members=6, time_step_s=0.05, ostium_spread_mm=2.0)
-    belief = Belief(side_branch, Belief.around(config), config)
-    assert len(belief.kinds) == 3 and np.ptp(belief.ostium_mm) > 1.0
-    assert np.allclose(belief.weight, 1 / 6)
-    wide = belief.tip_spread()
-    for k in range(4):
-        belief.follow(((4.0 + 2.0 * k, 0.0),))
-        assert np.allclose(belief.simulator.inserted_length[:, 0] - belief.ostium_mm, 4.0 + 2.0 * k)
-        belief.weigh(measured(belief, 4))
-    assert belief.weight.argmax() == 4 and belief.weight[4] > 0.5
-    assert belief.tip_spread()[0] < 0.8 * wide[0]
-    best, share = belief.likeliest()
-    assert 4 in best and share.sum() == pytest.approx(1.0) and best[share.argmax()] == 4
-
-
-def test_simulated_wires_slide_in_a_vessel_that_beats_as_far_as_that_is_known(side_branch) -> None:
-    """One is as the real wire, and driven likewise."""
-    beat, same = motion_named("heartbeat"), [World()]
-    true = start_world(side_branch, World(), QUICK.belief.core, motion=beat)
-    knows, knows_not = (Belief(replace(side_branch, known_motion=known), same, QUICK.belief) for known in (beat, None))
-    errors = []
-    for _ in range(8):
-        true.step([[6.0, 0.0]], 0.5)
-        for belief in (knows, knows_not):
-            belief.follow(((float(true.inserted_length[0, 0]), 0.0),))
-        errors.append(
-            [float(abs(belief.tip.abscissa - true.project().abscissa[:, 0])[0]) for belief in (knows, knows_not)]
-        )
-    assert np.max(errors, axis=0)[0] < 0.01
-    assert np.max(errors, axis=0)[1] > 0.3
-
-
-def test_an_unsure_measurement_weighs_little(side_branch) -> None:
-    """The scales of the weights are no smaller than the standard deviations that the detector states."""
-    config = BeliefConfig(members=6, time_step_s=0.05, ostium_spread_mm=2.0)
-    sure, unsure = (Belief(side_branch, Belief.around(config), config) for _ in range(2))
-    sure.weigh(replace(measured(sure, 4), covariance=1e-4 * np.eye(3)))
-    unsure.weigh(replace(measured(unsure, 4), covariance=2500.0 * np.eye(3)))
-    assert np.ptp(sure.weight) > 0.1 > 0.01 > np.ptp(unsure.weight)
 
 
 def test_a_tip_that_no_wire_explains_is_pulled_back_under_xray(side_branch) -> None:
@@ -348,30 +234,6 @@ def test_whatever_the_model_returns_a_drive_takes_what_is_finite_and_within_limi
         assert (np.abs(taken) <= [shaped.max_velocity_mm_s, shaped.max_rotation_rad_s]).all()
 
 
-@pytest.mark.timeout(60)
-def test_a_search_ends_though_pushing_seems_to_arrive_and_the_target_is_not_reached(side_branch, monkeypatch) -> None:
-    monkeypatch.setattr(Search, "_straight", lambda *_: None)
-    policy = OraclePolicy(config=QUICK)
-    policy.start(side_branch, 0)
-    course = policy.find_course(5.0)
-    assert course.reached == 0.0 and len(course.control) == 10
-
-
-def test_a_search_begins_farther_before_a_wide_junction(side_branch, monkeypatch) -> None:
-    """The junction is at 20 mm in a vessel of 1 mm: 4 mm before it, or as many radii as a mouth needs."""
-    begun = []
-    for radii in (1.4, 8.0):
-        monkeypatch.setattr(push, "_MOUTH_RADII", radii)
-        policy = OraclePolicy(config=QUICK)
-        policy.start(side_branch, 0)
-        one = policy._search
-        one._course.put(np.zeros(1, dtype=int), policy.belief.simulator, np.ones(1))
-        one._together.most_periods, one._hard = 20, np.inf
-        one._approach(22.5)
-        begun.append(float(one._course.foremost.abscissa[0]))
-    assert begun == pytest.approx([16.0, 12.0], abs=1.1)
-
-
 def test_an_agent_tells_what_it_believes_and_goes_on_after_hands(side_branch) -> None:
     loop = NavigationLoop(side_branch, AgentPolicy(QUICK), seed=2)
     for _ in range(4):
@@ -396,18 +258,6 @@ def test_an_agent_tells_what_it_believes_and_goes_on_after_hands(side_branch) ->
     assert len(bands) > 5 and (bands > 0).all()
 
 
-def test_no_attempt_wins_without_a_wire_that_arrives(side_branch) -> None:
-    """However many attempts were made, a path that no wire follows into the branch is none."""
-    policy = OraclePolicy(config=QUICK)
-    straight = replace(side_branch.device, tip_bend_rad=0.0, tip_bend_length_mm=0.0)
-    policy.start(replace(side_branch, device=straight), 0)
-    one = policy._search
-    one._course.put(np.zeros(1, dtype=int), policy.belief.simulator, np.ones(1))
-    for attempt in (0, 5, 9):
-        _, _, won = one._population.attempt(one._course, 22.5, 2, attempt, 0.9)
-        assert not won
-
-
 def test_an_agent_gives_up_early_and_names_the_fork(side_branch) -> None:
     straight = replace(side_branch.device, tip_bend_rad=0.0, tip_bend_length_mm=0.0)
     config = replace(QUICK, search=replace(QUICK.search, attempts=1, rounds=2), tries=2)
@@ -416,41 +266,6 @@ def test_an_agent_gives_up_early_and_names_the_fork(side_branch) -> None:
     assert record.seconds < 0.5 * side_branch.seconds
     assert "at the fork into section vessel (branch 2) at 20.0 mm" in record.gives_up
     assert "tip of 0/0 does not enter" in record.gives_up and "--tip" in record.gives_up
-
-
-def test_advice_names_a_tip_at_forks_alone(side_branch) -> None:
-    """A wire that meets its limits where no branch leaves does not need a larger bend."""
-    route = Route.to(side_branch.anatomy, side_branch.target)
-    for halt, words in (("slipped", "drive slips.*0.5 N"), ("pressed", "0.5 N on the wall"), ("stalled", "folds")):
-        said = describe_halt(halt, 9.0, route, side_branch)
-        assert "at 9 mm, where no branch leaves" in said and re.search(words, said)
-        assert "does not enter" not in said
-    assert "40 s are over" in describe_halt("late", 9.0, route, side_branch)
-    assert "does not enter" in describe_halt("off", 20.5, route, side_branch)
-
-
-def test_a_search_takes_no_path_that_presses_harder_than_the_limit(side_branch) -> None:
-    """Under a limit below what the branch takes there is no path, and no part of one that breaks the limit."""
-    policy = OraclePolicy(config=QUICK)
-    policy.start(side_branch, 0)
-    needed = float(policy.find_course(20.0).force.max())
-    tight = replace(side_branch, force_limit_n=0.25 * needed)
-    policy.start(tight, 0)
-    course = policy.find_course(20.0)
-    assert course.reached == 0.0 and course.force.max(initial=0.0) <= tight.force_limit_n
-    assert "on the wall; give a larger force_limit_n" in policy.halt
-
-
-def test_a_force_that_a_snap_ends_within_a_period_counts(side_branch) -> None:
-    """Where the tip slips, the wall bears more before than at the end of the period."""
-    policy = OraclePolicy(config=QUICK)
-    policy.start(side_branch, 0)
-    simulator, ends = policy.belief.simulator, []
-    for _ in range(10):
-        peak = drive_period(simulator, np.array([[8.0, 0.0]])).contact_force_max[0]
-        ends.append((peak, simulator.contacts.max()))
-    peaks, last = np.array(ends).T
-    assert (peaks >= last).all() and (peaks > 2 * last).any()
 
 
 def nowhere_to_go() -> Course:
@@ -489,25 +304,6 @@ def test_a_wire_beside_its_target_gets_another_course(side_branch) -> None:
         assert (policy._follower.course is None) == goes_on
 
 
-def test_a_course_may_begin_with_a_turn(side_branch) -> None:
-    policy = OraclePolicy(config=QUICK)
-    policy.start(side_branch, 0)
-    course = policy._search.find_turned(policy.belief, np.pi, seconds=20.0)
-    assert course.proximal[1, 0, 1] - side_branch.start_rotation_rad == pytest.approx(np.pi)
-    assert (course.control[:2, 0, 0] == 0.0).all() and course.reached == 1.0
-
-
-def test_a_path_that_does_not_arrive_ends_before_it_presses_too_hard(side_branch) -> None:
-    policy = OraclePolicy(config=QUICK)
-    policy.start(side_branch, 0)
-    one, tip = policy._search, policy.belief.tip
-    for share in (0.5, 1.0, 1.5, 0.5):
-        force = np.array([share * side_branch.force_limit_n])
-        one._course.rows.append(Period(np.zeros((1, 1, 2)), np.zeros((1, 1, 2)), tip, force))
-    one._cut_hard()
-    assert len(one._course.rows) == 2
-
-
 def test_a_course_is_searched_again_where_the_drive_pushes_harder_than_simulated(side_branch) -> None:
     """Walls press harder by as much as the drive pushes harder: a fourth of the limit leaves no way, as above."""
     policy = AgentPolicy(config=QUICK)
@@ -542,20 +338,3 @@ def test_failed_searches_are_forgotten_where_the_drive_pushes_harder(side_branch
         policy.monitor._loads.take(9.0, 0.2, speed_mm_s=5.0, valve=(0.0, 0.0))
     policy.decide(Observation(0.5, at_start, None))
     assert policy.plans == plans + 1 and policy.halt
-
-
-def test_the_load_ratio_is_the_one_that_the_forces_have() -> None:
-    """Σ read · predicted / Σ predicted² of force less the valve's, less 0.25; what is slow or weak does not count."""
-    valve = (0.05, 0.002)
-    loads = LoadRatio()
-    assert loads.value == 1.0
-    for force_n in np.linspace(0.1, 0.3, 60):
-        loads.take(1.5 * force_n + 0.05 + 0.002 * 5.0, force_n, speed_mm_s=5.0, valve=valve)
-    assert loads.value == pytest.approx(1.25, abs=0.02)
-    before = loads.value
-    loads.take(9.0, 0.01, speed_mm_s=5.0, valve=valve)
-    loads.take(9.0, 0.2, speed_mm_s=-5.0, valve=valve)
-    assert loads.value == before
-    for _ in range(50):
-        loads.take(0.1, 0.2, speed_mm_s=5.0, valve=valve)
-    assert loads.value == 1.0  # less force than predicted allows no more

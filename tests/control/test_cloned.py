@@ -22,11 +22,6 @@ from endopilot.types import Anatomy, Branch
 NODES = np.array([[0.4, 1.6, 16.0], [0.1, 0.6, 14.5], [0.0, 0.1, 12.0], [0.0, 0.0, 6.0], [0.0, 0.0, 0.0]])
 
 
-@pytest.fixture(scope="module")
-def shaped(wire):
-    return replace(wire.with_tip(bend_rad=np.deg2rad(70.0), stiffness_factor=1.0), tip_bend_length_mm=4.0)
-
-
 def moved(anatomy: Anatomy, linear: np.ndarray) -> Anatomy:
     """Return an anatomy whose centerlines are moved by a linear map."""
 
