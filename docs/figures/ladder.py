@@ -3,20 +3,24 @@
 FOLDER, runs/ladder if not given, holds what `endopilot ladder` made of each policy in the newest version and, with
 `--version coaxial`, of those that drive a catheter. MISMATCH, runs/ladder-mismatch if not given, holds what it made
 with `--mismatch 0.2`. STEVE, runs/steve if not given, holds what it made of the tasks of a public benchmark, a folder
-for each. A folder that is not there leaves its table as it is.
+for each; what it tells of DualDeviceNav's arteries is read where its tasks lie. A folder that is not there leaves its
+table as it is.
 """
 
 from __future__ import annotations
 
 import json
 import sys
+from collections import defaultdict
+from operator import itemgetter
 from pathlib import Path
+from statistics import median
 
 sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
 
 from benchmarks.figures import DOCS, fill
 from endopilot.ladder.mismatch import title_of
-from endopilot.tasks.task import NEWEST, LadderVersion, list_tasks
+from endopilot.tasks.task import NEWEST, LadderVersion, find_task, list_tasks
 
 ROOT = Path(__file__).parents[2]
 PAGE = "evidence/ladder.md"
@@ -27,6 +31,13 @@ _PUBLISHED = (
     ("dualdevicenav", "learned, best", "theirs", "40", "all frames", "–", "none", "100"),
 )
 """Success of the controllers that were trained for the benchmark (Karstensen et al., arXiv 2410.01956)."""
+_ARTERIES = {
+    "G4.3": "left common carotid",
+    "G4.4": "left vertebral",
+    "G6.2": "right carotid",
+    "G7.2": "right vertebral",
+}
+"""Sections of DualDeviceNav's tree in which its targets lie."""
 
 
 def tasks() -> list[str]:
@@ -129,6 +140,34 @@ def benchmark(folder: Path) -> list[str]:
     return [lines[0], "|" + "---|" * len(head), *lines[1:]]
 
 
+def arteries(folder: Path) -> list[str] | None:
+    """Return the table of DualDeviceNav's arteries: how deep their targets lie, what was reached, and medians.
+
+    None if no run in the folder is of its tasks, or these do not lie where that run was begun.
+    """
+    for path in sorted(folder.glob("*/ladder.json")):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["scores"][0]["task"] != "dualdevicenav" or not Path(content["ladder"]).is_dir():
+            continue
+        task, found = find_task("dualdevicenav", version=content["ladder"]), defaultdict(list)
+        for each in sorted((path.parent / "dualdevicenav").glob("*.json")):
+            navigation = task.ladder_navigation(int(each.stem))
+            tree, target = navigation.anatomy.tree, navigation.target
+            section = tree.section_names[tree.branches[target.branch].section[-1]]
+            found[_ARTERIES[section]].append((target.abscissa, json.loads(each.read_text(encoding="utf-8"))))
+        head = ("artery", "targets, mm", "within 5 mm", "by both rules", "time, s", "exposures", "planning, s")
+        lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+        for artery, done in sorted(found.items()):
+            depths, results = zip(*sorted(done, key=itemgetter(0)), strict=True)
+            cells = [artery, ", ".join(f"{depth:.0f}" for depth in depths)]
+            cells += [f"{sum(each[rule] for each in results)} of {len(results)}" for rule in ("near", "success")]
+            medians = [median(each[name] for each in results) for name in ("seconds", "exposures", "planning_s")]
+            cells += [f"{each:.0f}" for each in medians]
+            lines.append("| " + " | ".join(cells) + " |")
+        return lines
+    return None
+
+
 def main() -> None:
     """Fill the page."""
     given = [Path(argument) for argument in sys.argv[1:]]
@@ -144,6 +183,8 @@ def main() -> None:
         fill(PAGE, "mismatch", mismatch(mismatched))
     if steve.is_dir():
         fill(PAGE, "benchmark", benchmark(steve))
+        if (table := arteries(steve)) is not None:
+            fill(PAGE, "arteries", table)
 
 
 if __name__ == "__main__":
