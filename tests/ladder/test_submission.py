@@ -190,12 +190,12 @@ def test_another_task_s_name_is_refused(changed):
 def test_other_versions_are_stated(changed):
     def older(content):
         content["versions"] |= {"endopilot": "0.0.1", "numpy": "1.0"}
-        content["core"] = "another"
+        content["core"], content["blas"] = "another", "a third"
 
     found = changed(older)
     assert found.difference is None
     assert [remark.split(",")[0] for remark in found.remarks] == [
-        "made with endopilot 0.0.1", "made with numpy 1.0", "made with core another",
+        "made with endopilot 0.0.1", "made with numpy 1.0", "made with core another", "made with blas a third",
     ]  # fmt: skip
 
 

@@ -15,6 +15,8 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Literal
 
+from threadpoolctl import threadpool_info
+
 from endopilot import __version__, _core
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
@@ -79,6 +81,7 @@ class Submission:
         origin: package and version that it comes from, or its file and the SHA-256 of that.
         versions: of endopilot, Python and libraries.
         core: processor level that the rod core was built for.
+        blas: kernel of linear algebra of numpy and SciPy, such as openblas Haswell; none in older files.
         tasks: name of each task and the SHA-256 of its definition with its device.
         navigations: by the task's name, in the order of the task's patients.
         scores: what `endopilot.ladder.scores.score` makes of them.
@@ -92,6 +95,7 @@ class Submission:
     origin: str
     versions: dict[str, str | None]
     core: str
+    blas: str | None = None
     tasks: dict[str, str]
     navigations: dict[str, tuple[NavigationEntry, ...]]
     scores: tuple[dict[str, Any], ...]
@@ -121,6 +125,16 @@ class SubmissionCheck:
     navigations: int
     difference: str | None
     remarks: tuple[str, ...]
+
+
+def blas_kernel() -> str | None:
+    """Return which kernel of linear algebra numpy and SciPy run here, such as openblas Haswell; None if it is not told.
+
+    Vessels differ by it in their last bits, and so does what is driven in them.
+    """
+    loaded = [each for each in threadpool_info() if each["user_api"] == "blas"]
+    kernels = {f"{each['internal_api']} {each.get('architecture', '')}".strip() for each in loaded}
+    return ", ".join(sorted(kernels)) or None
 
 
 def task_digest(task: Task) -> str:
@@ -168,6 +182,7 @@ def write_submission(
         origin=POLICIES.origin(policy),
         versions=manifest(config=None)["versions"],
         core=_core.LEVEL,
+        blas=blas_kernel(),
         tasks={name: task_digest(find_task(name, version=version)) for name in results},
         navigations={
             name: tuple(NavigationEntry(**{key: value for key, value in one.items() if key in known}) for one in done)
@@ -326,8 +341,8 @@ def _difference(given: Mapping[str, Any], again: Mapping[str, Any]) -> str | Non
 
 def _remarks(submission: Submission) -> tuple[str, ...]:
     """Return in what this installation differs from the one that made the file."""
-    here = {**manifest(config=None)["versions"], "core": _core.LEVEL}
-    made = {**submission.versions, "core": submission.core}
+    here = {**manifest(config=None)["versions"], "core": _core.LEVEL, "blas": blas_kernel()}
+    made = {**submission.versions, "core": submission.core, "blas": submission.blas}
     return tuple(
         f"made with {name} {made.get(name)}, checked with {value}"
         for name, value in here.items()
