@@ -140,11 +140,10 @@ def stands() -> str:
         ),
         (
             "tasks of others",
-            "stEVE_bench, within 5 mm: "
-            + "; ".join(
-                f"{task} {_of_ours(row)}, its learned controller {theirs[task][2]} %" for task, row in ours.items()
-            ),
-            "with devices as stiff as a hospital's",
+            "stEVE_bench, within 5 mm, in our simulator: "
+            + ", ".join(f"{task} {_of_ours(row)}" for task, row in ours.items())
+            + f"; learned controllers in its own {' and '.join(theirs[task][2] for task in ours)} %",
+            "in its simulator; with hospital devices",
             [("ladder", "#tasks-of-a-public-benchmark")],
         ),
         (
@@ -173,7 +172,7 @@ def stands() -> str:
 
 def _of_ours(row: list[str]) -> str:
     """Return the agent's share of a benchmark's row, in words."""
-    return f"{row[2]} %" if row else "not measured yet"
+    return f"{row[2]} % of {row[-1]}" if row else "not measured yet"
 
 
 def _path(name: str) -> Path:

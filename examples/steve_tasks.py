@@ -106,7 +106,9 @@ def convert(episodes: Path, folder: Path) -> list[str]:
     """Write anatomies, wire and task of a file of episodes of ArchVariety into a folder, and return the seeds."""
     with np.load(episodes) as content:
         arrays = {name: np.asarray(content[name], dtype=float) for name in content.files}
-    seeds = sorted({name.partition("_")[0] for name in arrays})
+    seeds = sorted({name.partition("_")[0] for name in arrays if name.endswith("_target_mm")})
+    if not seeds:
+        raise endopilot.InputError(f"{episodes}: holds no array SSS_target_mm; give episodes of ArchVariety")
     for seed in seeds:
         lines = {name: line for name, line in arrays.items() if name.startswith(f"{seed}_branch_")}
         source = Polylines(
@@ -201,12 +203,25 @@ def made_up(path: Path) -> None:
 
 
 def main() -> None:
-    if len(sys.argv) > 2:
-        source, folder = Path(sys.argv[1]), Path(sys.argv[2])
-        curves = source.is_dir()
-        made = convert_curves(source, folder, *map(int, sys.argv[3:])) if curves else convert(source, folder)
-        print(f"{len(made)} {'targets' if curves else 'episodes'}")
+    given = sys.argv[1:]
+    if not given:
+        convert_made_up()
         return
+    try:
+        if len(given) not in (2, 3) or not all(seed.isdecimal() for seed in given[2:]):
+            raise endopilot.InputError("usage: steve_tasks.py EPISODES.npz|CURVES FOLDER [SEED]")
+        source, folder = Path(given[0]), Path(given[1])
+        curves = source.is_dir()
+        if not curves and not (source.is_file() and source.suffix == ".npz"):
+            raise endopilot.InputError(f"{source}: is no file of episodes (.npz) and no folder of curves")
+        made = convert_curves(source, folder, *map(int, given[2:])) if curves else convert(source, folder)
+    except (endopilot.InputError, OSError) as error:
+        print(f"steve_tasks.py: {error}", file=sys.stderr)
+        sys.exit(2)
+    print(f"{len(made)} {'targets' if curves else 'episodes'}")
+
+
+def convert_made_up() -> None:
     with tempfile.TemporaryDirectory() as folder:
         made_up(Path(folder) / "episodes.npz")
         convert(Path(folder) / "episodes.npz", Path(folder) / "steve")

@@ -199,6 +199,38 @@ def test_other_versions_are_stated(changed):
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("change", "kernel", "confirmed"),
+    [
+        ({"path_ratio": 1e-7}, "another", True),
+        ({"path_ratio": 1e-7}, None, True),  # older files name none
+        ({"path_ratio": 1e-7}, "this", False),
+        ({"path_ratio": 2e-3}, "another", False),
+        ({"peak_force_n": 2e-3}, "another", False),
+        ({"exposures": 1.0}, "another", False),
+    ],
+)
+def test_with_another_kernel_figures_agree_but_for_rounding(changed, change, kernel, confirmed):
+    def alter(content):
+        first = _first(content)
+        for name, share in change.items():
+            first[name] = type(first[name])(first[name] * (1 + share))
+        content["blas"] = submission.blas_kernel() if kernel == "this" else kernel
+
+    found = changed(alter)
+    assert found.difference is not None and found.confirmed == confirmed
+
+
+def test_scores_that_do_not_follow_are_not_confirmed_with_another_kernel(changed):
+    def alter(content):
+        content["blas"] = "another"
+        _first(content)["path_ratio"] *= 1 + 1e-7
+        content["scores"][0]["exposures"] += 1
+
+    found = changed(alter)
+    assert found.difference.startswith("scores, ") and not found.confirmed
+
+
 def test_a_policy_of_one_s_own_climbs_and_its_submission_is_confirmed(tmp_path, monkeypatch, capsys):
     (tmp_path / "hurried.py").write_text(_POLICY)
     monkeypatch.chdir(tmp_path)

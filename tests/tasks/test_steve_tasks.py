@@ -32,6 +32,32 @@ def test_a_made_up_arch_becomes_a_task_with_the_benchmarks_wire(tmp_path):
     np.testing.assert_allclose(navigation.target.position(navigation.anatomy), [32, 0, 74], atol=0.5)
 
 
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["none.npz", "x"], "none.npz: is no file of episodes (.npz) and no folder of curves"),
+        (["README.md", "x"], "README.md: is no file of episodes"),
+        ([".", "x"], "holds no curves"),
+        (["other.npz", "x"], "other.npz: holds no array SSS_target_mm"),
+        (["episodes.npz"], "usage: steve_tasks.py EPISODES.npz|CURVES FOLDER [SEED]"),
+        (["episodes.npz", "x", "seed"], "usage: "),
+    ],
+)
+def test_bad_input_is_one_line_and_writes_nothing(given, said, tmp_path, monkeypatch, capsys):
+    from steve_tasks import made_up, main  # pyright: ignore[reportMissingImports]
+
+    monkeypatch.chdir(tmp_path)
+    made_up(Path("episodes.npz"))
+    np.savez("other.npz", allow_pickle=False, lines=np.zeros(3))
+    Path("README.md").write_text("read me")
+    monkeypatch.setattr(sys, "argv", ["steve_tasks.py", *given])
+    with pytest.raises(SystemExit) as leaving:
+        main()
+    line = capsys.readouterr().err
+    assert leaving.value.code == 2 and line.startswith("steve_tasks.py: ") and said in line and line.count("\n") == 1
+    assert not Path("x").exists()
+
+
 @pytest.mark.skipif(not EPISODES.exists(), reason="the benchmark's episodes are not at hand")
 def test_every_target_of_the_benchmark_lies_on_a_centerline(tmp_path):
     from steve_tasks import convert  # pyright: ignore[reportMissingImports]

@@ -30,7 +30,8 @@ def command(
             differ by it from what the policy is given, one after another and together. The scores of each case are
             printed instead of the ladder's.
         check: a submission.json. Its recorded controls are driven again, without the policy, and its scores confirmed
-            to the bit; exit code 1 if one differs. No policy climbs then.
+            to the bit, or but for rounding with another kernel of linear algebra; exit code 1 if one differs. No
+            policy climbs then.
         dataset: folder of a LeRobot data set of the navigations, with X-ray images, their recordings being driven again
             (docs/concepts/dataset.md).
         page: write index.html with pictures and replays; --no-page leaves it out.
@@ -60,10 +61,9 @@ def _confirmed(file: Path, dataset: Path | None) -> Answer:
     from endopilot.ladder.submission import check_submission
 
     checked = check_submission(file)
-    confirmed = checked.difference is None
-    if confirmed and dataset is not None:
+    if checked.confirmed and dataset is not None:
         _write_dataset(file, dataset)
-    return Answer({"confirmed": confirmed} | asdict(checked), passed=confirmed)
+    return Answer({"confirmed": checked.confirmed} | asdict(checked), passed=checked.confirmed)
 
 
 def _write_dataset(file: Path, dataset: Path) -> None:

@@ -7,6 +7,7 @@ every recording through the same robot and simulator, without the policy, and co
 from __future__ import annotations
 
 import hashlib
+import math
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -32,6 +33,8 @@ from endopilot.simulation.world import World
 from endopilot.tasks.task import LadderVersion, Task, find_task, list_tasks
 
 SUBMISSION_FILE = "submission.json"
+_ROUNDING = 1e-3
+"""Figures that differ by no larger share agree but for rounding: 1e-7 of a path, 1e-4 of a force on a node are seen."""
 MOST_PATIENTS = 100
 """Patients of each task, at most: their seeds are distinct up to there (`navigation_seed`)."""
 
@@ -117,6 +120,7 @@ class SubmissionCheck:
         origin: where the policy comes from, as the file says.
         navigations: their number.
         difference: the first that differs from the file, in words; None where all scores are confirmed to the bit.
+        rounded: whether all figures agree but for rounding, in an installation with another kernel of linear algebra.
         remarks: in what this installation differs from the one that made the file.
     """
 
@@ -124,7 +128,13 @@ class SubmissionCheck:
     origin: str
     navigations: int
     difference: str | None
+    rounded: bool
     remarks: tuple[str, ...]
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether the scores are what the recordings give: to the bit, or, with another kernel, but for rounding."""
+        return self.difference is None or self.rounded
 
 
 def blas_kernel() -> str | None:
@@ -210,6 +220,9 @@ def read_submission(path: str | Path) -> Submission:
 def check_submission(path: str | Path) -> SubmissionCheck:
     """Drive all recordings of a submission file again, without the policy, and compare every figure to the bit.
 
+    With another kernel of linear algebra vessels differ in their last bits, and so does what is driven in them. Figures
+    that agree but for rounding are told from others there.
+
     Args:
         path: the file.
 
@@ -218,12 +231,13 @@ def check_submission(path: str | Path) -> SubmissionCheck:
     """
     submission = read_submission(path)
     with tempfile.TemporaryDirectory(prefix="endopilot-") as folder:
-        difference = _first_difference(submission, Path(folder))
+        difference, rounding = _first_difference(submission, Path(folder))
     return SubmissionCheck(
         policy=submission.policy,
         origin=submission.origin,
         navigations=sum(map(len, submission.navigations.values())),
         difference=difference,
+        rounded=difference is not None and rounding and submission.blas != blas_kernel(),
         remarks=_remarks(submission),
     )
 
@@ -246,6 +260,11 @@ def _refuse_another_ladder(path: Path, submission: Submission) -> None:
         raise InputError(f"{path}: navigations: {counts}; each task needs the same first 1 to {known} patients")
     for name, entries in submission.navigations.items():
         if submission.tasks[name] != task_digest(tasks[name]):
+            if isinstance(submission.version, str) and Path(submission.version).is_dir():
+                raise InputError(
+                    f"{path}: task {name!r} of {submission.version} is another than the file was made with: its "
+                    "definition, a device or an anatomy has changed; check it with the folder as it was"
+                )
             raise InputError(
                 f"{path}: task {name!r} is not the one of endopilot {__version__}; the file was made with endopilot "
                 f"{submission.versions.get('endopilot')}, check it with that"
@@ -255,8 +274,8 @@ def _refuse_another_ladder(path: Path, submission: Submission) -> None:
                 raise InputError(f"{path}: task {name}, patient {place}: seed {entry.seed}; the ladder's is {seed}")
 
 
-def _first_difference(submission: Submission, folder: Path) -> str | None:
-    """Return where the file first differs from its recordings driven again, in words."""
+def _first_difference(submission: Submission, folder: Path) -> tuple[str | None, bool]:
+    """Return where the file first differs from its recordings driven again, in words, and whether by rounding alone."""
     entries = {
         folder / name / f"{place:02d}.json": entry
         for name, done in sorted(
@@ -268,13 +287,15 @@ def _first_difference(submission: Submission, folder: Path) -> str | None:
         write_json(path, entry.recording)
     again = partial(_repeat, version=submission.version, robot=submission.robot, world=submission.world)
     bad = each(f"Checking {submission.policy}", list(entries), again)
-    differing = []
+    differing, rounding = [], True
     for path, entry in entries.items():
-        remark = str(bad[path]) if path in bad else _difference(entry.figures(), read_json(path))
+        again = {} if path in bad else read_json(path)
+        remark = str(bad[path]) if path in bad else _difference(entry.figures(), again)
         if remark is not None:
             differing.append(f"task {path.parent.name}, patient {int(path.stem)}: {remark}")
-    if differing:
-        return f"{differing[0]} ({len(differing)} of {len(entries)} navigations differ)"
+            rounding = rounding and _agree(entry.figures(), again)
+    if differing and not rounding:
+        return f"{differing[0]} ({len(differing)} of {len(entries)} navigations differ)", False
     results = {
         name: [read_json(folder / name / f"{place:02d}.json") for place in range(len(done))]
         for name, done in submission.navigations.items()
@@ -282,9 +303,11 @@ def _first_difference(submission: Submission, folder: Path) -> str | None:
     rows = score([task for task in list_tasks(submission.version) if task.name in results], results)
     for given, again in zip_longest(submission.scores, rows, fillvalue={}):
         remark = _difference(given, again)
-        if remark is not None:
-            return f"scores, {again.get('task') or given.get('task')}: {remark}"
-    return None
+        if remark is not None and not (differing and _agree(given, again)):
+            return f"scores, {again.get('task') or given.get('task')}: {remark}", False
+    if differing:
+        return f"{differing[0]} ({len(differing)} of {len(entries)} navigations differ)", True
+    return None, False
 
 
 def recorded_navigation(path: Path, name: str | None, place: int) -> tuple[Task, int, Recording]:
@@ -337,6 +360,16 @@ def _difference(given: Mapping[str, Any], again: Mapping[str, Any]) -> str | Non
         if before != now:
             return f"{name} is {before} in the file and {now} when driven again"
     return None
+
+
+def _agree(given: Mapping[str, Any], again: Mapping[str, Any]) -> bool:
+    """Return whether figures agree but for rounding; the hash of what is driven does not count."""
+    names = {*given, *again} - {"sha256"}
+    if not all(name in given and name in again for name in names):
+        return False
+    floats = {name for name in names if isinstance(given[name], float) and isinstance(again[name], float)}
+    close = all(math.isclose(given[name], again[name], rel_tol=_ROUNDING) for name in floats)
+    return close and all(json_text(given[name]) == json_text(again[name]) for name in names - floats)
 
 
 def _remarks(submission: Submission) -> tuple[str, ...]:
