@@ -141,15 +141,18 @@ def lines_from_tips(
     ]
 
 
-def shown_part(nodes: Float[np.ndarray, "n 3"], deepest_mm: float) -> Float[np.ndarray, "shown 3"]:
-    """Return what pictures show of a line: from its tip to `SHOWN_BEHIND_MM` behind the ostium, LPS mm.
+def shown_part(
+    nodes: Float[np.ndarray, "n 3"], deepest_mm: float, behind_mm: float = SHOWN_BEHIND_MM
+) -> Float[np.ndarray, "shown 3"]:
+    """Return what pictures show of a line: from its tip to a little behind the ostium, LPS mm.
 
     Args:
         nodes: of the line, from the foremost tip on, LPS mm; NaN beyond its end.
         deepest_mm: inserted length of the device with that tip.
+        behind_mm: how much of it is shown behind the ostium, mm.
     """
     nodes = nodes[np.isfinite(nodes).all(axis=1)]
-    return nodes[length_along(nodes) <= deepest_mm + SHOWN_BEHIND_MM]
+    return nodes[length_along(nodes) <= deepest_mm + behind_mm]
 
 
 def _at(nodes: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n"], at_mm: float) -> Float[np.ndarray, "3"]:

@@ -16,8 +16,11 @@ _MARGIN = 10
 _WHITE, _VESSEL, _TARGET = (255, 255, 255), (226, 205, 205), (213, 94, 0)
 _DEVICES = ((0, 114, 178), (25, 181, 200), (142, 108, 240))
 """Of the wire and of the catheters around it, from the inside out."""
-_TARGET_PX, _DEVICE_PX = 4.0, (1.0, 1.9, 2.8)
-"""Radii of the dot and the lines, pixels."""
+_TIP = (0, 0, 0)
+_TARGET_PX, _DEVICE_PX, _TIP_PX = 4.0, (1.0, 1.9, 2.8), 2.0
+"""Radii of the target's dot, the lines, and the dot of the foremost tip, pixels."""
+_BEHIND_MM = 2.0
+"""So much of the devices is shown behind the ostium, mm."""
 
 
 class Picture:
@@ -39,9 +42,11 @@ class Picture:
     def of(self, simulator: Simulator, world: int) -> UInt8[np.ndarray, "256 256 3"]:
         """Return the picture of a world as it is now, red, green and blue."""
         picture, inserted = self._still.copy(), simulator.inserted_length[world]
-        lines = lines_from_tips(shown_part(simulator.position[world], float(inserted.max())), inserted)
+        nodes = shown_part(simulator.position[world], float(inserted.max()), _BEHIND_MM)
+        lines = lines_from_tips(nodes, inserted)
         for line, radius, color in reversed(list(zip(lines, _DEVICE_PX, _DEVICES, strict=False))):
             self._draw(picture, line, np.full(len(line), radius), color)
+        self._draw(picture, nodes[:1], np.array([_TIP_PX]), _TIP)
         return picture
 
     def _draw(
