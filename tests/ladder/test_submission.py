@@ -205,8 +205,8 @@ def test_other_versions_are_stated(changed):
         ({"path_ratio": 1e-7}, "another", True),
         ({"path_ratio": 1e-7}, None, True),  # older files name none
         ({"path_ratio": 1e-7}, "this", False),
-        ({"path_ratio": 2e-3}, "another", False),
-        ({"peak_force_n": 2e-3}, "another", False),
+        ({"path_ratio": 0.06}, "another", False),
+        ({"peak_force_n": 0.06}, "another", False),
         ({"exposures": 1.0}, "another", False),
     ],
 )

@@ -8,6 +8,7 @@ of it: six times as much for 12 mm and 5 mm of radius. So devices that are too s
 from __future__ import annotations
 
 import sys
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -38,8 +39,8 @@ _SLACK_MM, _TAUT_COST, _SLACK_COST = 10.0, 0.2, 0.1
 """Devices with so much slack press on, mm; what a millimetre less costs, since taut ones have to be pushed first, and
 what one more costs, mm of the route."""
 _LOOPS_MM, _LOOPS_COST = 40.0, 0.4
-"""Beyond so much slack, mm, and beyond what the outer walls take up to where the devices are, a millimetre costs so
-much more: what is pushed then is laid into loops."""
+"""Beyond so much slack, mm, and beyond what the outer walls of a wide lumen take, a millimetre costs so much more: what
+is pushed then is laid into loops."""
 
 
 class ConstantMotions:
@@ -67,10 +68,14 @@ class ConstantMotions:
         self._last = np.zeros((trials.devices, 2))
         self._free_mm = config.manoeuvres.behind_mm + navigation.device.tip_bend_length_mm
 
+    @cached_property
+    def _loops_mm(self) -> float:
+        """Slack beyond which devices are laid into loops, mm."""
+        return max(self._route.outer_mm(self._route.narrow_from()), _LOOPS_MM)
+
     def best(self, one: Trials, held_at: float, least_mm: float) -> tuple[Controls, float]:
         """Return the best of the motions that were drawn, and how far it brings the devices on, mm.
 
-        Slack that a motion lays down costs; slack that it takes out earns nothing, since it has to be laid down again.
         Where none brings them on they go on for as long again, and the wire's tip alone counts: slack has to be laid
         down before it presses on, and takes the catheter's tip back.
 
@@ -80,21 +85,18 @@ class ConstantMotions:
             least_mm: a motion that brings them on so far will do, mm.
         """
         trials, limit_n = self._trials.copy_of(one), self._navigation.force_limit_n
-        loops_mm = max(self._route.outer_mm(float(one.progress(self._route)[0])), _LOOPS_MM)
         control = trials.possible(self._draw(), alike=True, periods=_LOOK_PERIODS)
         gentle, arrives = np.ones(trials.count, dtype=bool), np.full(trials.count, sys.maxsize)
         gain, kept = np.zeros(trials.count), 0
         for catheter_gain in (_CATHETER_GAIN, 0.0):
             kept += _KEPT_PERIODS
             for _ in range(_LOOK_PERIODS):
-                made = control if catheter_gain else self._unless_full(control, loops_mm)
-                gentle &= ~trials.move(made, force_n=limit_n)
+                gentle &= ~trials.move(self._unless_full(control) if catheter_gain == 0 else control, force_n=limit_n)
                 there = gentle & ~trials.still & trials.all(self._navigation.reached(trials.tips))
                 arrives[there] = len(trials.rows)
                 trials.still |= there
-            comes = self._advance(trials, held_at, catheter_gain) - self._advance(one, held_at, catheter_gain)
-            costs = self._cost(trials, loops_mm) - self._cost(one, loops_mm)
-            gain = np.where(gentle, comes - np.maximum(costs, 0.0), -np.inf)
+            come = self._come(trials, held_at, catheter_gain) - float(self._come(one, held_at, catheter_gain)[0])
+            gain = np.where(gentle, come, -np.inf)
             gain[arrives < sys.maxsize] = np.inf
             if gain.max() >= least_mm:
                 break
@@ -104,9 +106,9 @@ class ConstantMotions:
         self._last = control[chosen]
         return np.array([row.control[chosen] for row in trials.rows[:periods]]), float(gain[chosen])
 
-    def _unless_full(self, control: Control, loops_mm: float) -> Control:
+    def _unless_full(self, control: Control) -> Control:
         """Return a control that does not push devices whose loops are full: they come forward as they unbend."""
-        full = self._slack(self._trials) > loops_mm
+        full = self._slack(self._trials) > self._loops_mm
         made = control.copy()
         made[full, :, 0] = np.minimum(made[full, :, 0], 0.0)
         return made
@@ -132,10 +134,10 @@ class ConstantMotions:
         control[0], control[1] = self._last, [[fast, 0.0], [0.0, 0.0]]
         return control
 
-    def _advance(self, trials: Trials, held_at: float, catheter_gain: float) -> Each:
+    def _come(self, trials: Trials, held_at: float, catheter_gain: float) -> Each:
         """Return how far along the route candidates have come, mm, less by how far off it or past the target they are.
 
-        A catheter counts that is not yet where it is to be held, behind the bent tip of the wire.
+        Loops make it less, and a catheter that is not yet where it is to be held, behind the bent tip of the wire.
         """
         tips, target = trials.tips, self._route.target.abscissa
         along = self._route.progress(tips) - self._route.off_route(tips)
@@ -143,11 +145,7 @@ class ConstantMotions:
         deeper = np.maximum(catheter - held_at - _DEEPER_MM, 0.0)
         catheter = np.minimum(np.minimum(catheter, held_at), wire - self._free_mm) - deeper
         wire = wire - 2 * np.maximum(wire - target, 0.0)
-        return wire + catheter_gain * catheter
-
-    def _cost(self, trials: Trials, loops_mm: float) -> Each:
-        """Return what slack costs candidates, mm of the route."""
         slack = self._slack(trials)
         taut = _TAUT_COST * np.maximum(_SLACK_MM - slack, 0.0)
-        loose = _SLACK_COST * np.maximum(slack - _SLACK_MM, 0.0) + _LOOPS_COST * np.maximum(slack - loops_mm, 0.0)
-        return taut + loose
+        loose = _SLACK_COST * np.maximum(slack - _SLACK_MM, 0.0) + _LOOPS_COST * np.maximum(slack - self._loops_mm, 0.0)
+        return wire + catheter_gain * catheter - taut - loose

@@ -33,8 +33,9 @@ from endopilot.simulation.world import World
 from endopilot.tasks.task import LadderVersion, Task, find_task, list_tasks
 
 SUBMISSION_FILE = "submission.json"
-_ROUNDING = 1e-3
-"""Figures that differ by no larger share agree but for rounding: 1e-7 of a path, 1e-4 of a force on a node are seen."""
+_ROUNDING = 0.05
+"""Figures that differ by no larger share agree but for rounding. In 232 navigations with another kernel the largest
+force differed by 1e-8 in the median and by 3.4 % at most, where a tip snaps otherwise, and paths by 0.07 %."""
 MOST_PATIENTS = 100
 """Patients of each task, at most: their seeds are distinct up to there (`navigation_seed`)."""
 
