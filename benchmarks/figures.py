@@ -131,6 +131,14 @@ def made_on() -> str:
     return f"Made on {date.today()}, {processor_name()}."
 
 
+def markdown_table(head: Iterable[object], rows: Iterable[Iterable[object]]) -> list[str]:
+    """Return the lines of a table of the documentation."""
+    titles = [str(cell) for cell in head]
+    lines = [titles, *([str(cell) for cell in row] for row in rows)]
+    first, *others = ["| " + " | ".join(line) + " |" for line in lines]
+    return [first, "|" + "---|" * len(titles), *others]
+
+
 def fill(page: str, mark: str, lines: str | Iterable[str], *, dated: bool = True) -> None:
     """Write lines between the marks of some name in a page of the documentation.
 

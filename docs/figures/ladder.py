@@ -18,7 +18,7 @@ from statistics import median
 
 sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
 
-from benchmarks.figures import DOCS, fill
+from benchmarks.figures import DOCS, fill, markdown_table
 from endopilot.ladder.mismatch import title_of
 from endopilot.tasks.task import NEWEST, LadderVersion, find_task, list_tasks
 
@@ -42,25 +42,23 @@ _ARTERIES = {
 
 def tasks() -> list[str]:
     """Return the table of the tasks."""
-    lines = ["| level | task | what | atlas | wire, tip | time, s | patients |", "|---|---|---|---|---|---|---|"]
+    head, rows = ("level", "task", "what", "atlas", "wire, tip", "time, s", "patients"), []
     for task in list_tasks():
         tip = f"{task.device}, {task.tip_bend_deg:g}° over {task.tip_bend_mm:g} mm"
         what = f"{task.title}: {task.depth_mm:g} mm into {task.section}"
-        row = (task.level, task.name, what, task.vessel, tip, f"{task.seconds:g}", task.chosen_for)
-        lines.append("| " + " | ".join(str(cell) for cell in row) + " |")
-    return lines
+        rows.append((task.level, task.name, what, task.vessel, tip, f"{task.seconds:g}", task.chosen_for))
+    return markdown_table(head, rows)
 
 
 def coaxial_tasks() -> list[str]:
     """Return the table of the tasks of wire and catheter."""
-    head = ("level", "task", "what", "atlas", "wire, catheter", "time, s", "limit, N", "patients")
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    head, rows = ("level", "task", "what", "atlas", "wire, catheter", "time, s", "limit, N", "patients"), []
     for task in list_tasks("coaxial"):
         tip = f"{task.device}, {task.tip_bend_deg:g}° over {task.tip_bend_mm:g} mm; {task.catheter}"
         what = f"{task.title}: {task.depth_mm:g} mm into {task.section}"
-        row = (task.level, task.name, what, task.vessel, tip, f"{task.seconds:g}", task.force_limit_n, task.chosen_for)
-        lines.append("| " + " | ".join(str(cell) for cell in row) + " |")
-    return lines
+        numbers = (f"{task.seconds:g}", task.force_limit_n)
+        rows.append((task.level, task.name, what, task.vessel, tip, *numbers, task.chosen_for))
+    return markdown_table(head, rows)
 
 
 def scores(folder: Path, version: LadderVersion, mark: str) -> list[str]:
@@ -83,12 +81,8 @@ def scores(folder: Path, version: LadderVersion, mark: str) -> list[str]:
     names = [task.name for task in list_tasks(version)] + sums
     names += [*(title for title, _ in _MEANS), _MISSED, "patients a task"]
     policies = sorted(columns)
-    lines = ["| task | " + " | ".join(policies) + " |", "|---|" + "---|" * len(policies)]
-    for name in names:
-        cells = [columns[policy].get(name, "–") for policy in policies]
-        if set(cells) != {"–"}:
-            lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return lines
+    rows = [(name, *(columns[policy].get(name, "–") for policy in policies)) for name in names]
+    return markdown_table(("task", *policies), (row for row in rows if set(row[1:]) != {"–"}))
 
 
 def _kept(mark: str) -> dict[str, dict[str, str]]:
@@ -111,13 +105,13 @@ def mismatch(folder: Path) -> list[str]:
     """Return a table of scores under model mismatch: safe success, in brackets success, %, and exposures."""
     done = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*/mismatch.json"))]
     names = [name for content in done for name in (f"`{content['policy']}`, safe success", "exposures")]
-    lines = ["| mismatch | " + " | ".join(names) + " |", "|---|" + "---|" * len(names)]
+    lines = []
     for rows in zip(*(content["cases"] for content in done), strict=True):
         cells = [title_of(rows[0]["case"], done[0]["mismatch"])]
         for row in rows:
             cells += [f"{100 * row['safe_success']:.0f} ({100 * row['success']:.0f})", f"{row['exposures']:g}"]
-        lines.append("| " + " | ".join(cells) + " |")
-    return lines
+        lines.append(cells)
+    return markdown_table(("mismatch", *names), lines)
 
 
 def benchmark(folder: Path) -> list[str]:
@@ -136,36 +130,30 @@ def benchmark(folder: Path) -> list[str]:
         cells += (f"{100 * row['near']:.0f}", f"{row['exposures']:g}", f"{row['peak_force_n']:.3g}")
         cells += (f"{row['planning_s']:.0f}, at most {max(planning):.0f}", str(len(done)))
         rows[cells[:3]] = cells
-    lines = ["| " + " | ".join(cells) + " |" for cells in (head, *rows.values())]
-    return [lines[0], "|" + "---|" * len(head), *lines[1:]]
+    return markdown_table(head, rows.values())
 
 
-def arteries(folder: Path) -> list[str] | None:
+def arteries(results: Path, version: LadderVersion) -> list[str]:
     """Return the table of DualDeviceNav's arteries: how deep their targets lie, what was reached, and medians.
 
-    None if no run in the folder is of its tasks, or these do not lie where that run was begun.
+    Args:
+        results: folder of the navigations' results.
+        version: folder of the tasks.
     """
-    for path in sorted(folder.glob("*/ladder.json")):
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if content["scores"][0]["task"] != "dualdevicenav" or not Path(content["ladder"]).is_dir():
-            continue
-        task, found = find_task("dualdevicenav", version=content["ladder"]), defaultdict(list)
-        for each in sorted((path.parent / "dualdevicenav").glob("*.json")):
-            navigation = task.ladder_navigation(int(each.stem))
-            tree, target = navigation.anatomy.tree, navigation.target
-            section = tree.section_names[tree.branches[target.branch].section[-1]]
-            found[_ARTERIES[section]].append((target.abscissa, json.loads(each.read_text(encoding="utf-8"))))
-        head = ("artery", "targets, mm", "within 5 mm", "by both rules", "time, s", "exposures", "planning, s")
-        lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-        for artery, done in sorted(found.items()):
-            depths, results = zip(*sorted(done, key=itemgetter(0)), strict=True)
-            cells = [artery, ", ".join(f"{depth:.0f}" for depth in depths)]
-            cells += [f"{sum(each[rule] for each in results)} of {len(results)}" for rule in ("near", "success")]
-            medians = [median(each[name] for each in results) for name in ("seconds", "exposures", "planning_s")]
-            cells += [f"{each:.0f}" for each in medians]
-            lines.append("| " + " | ".join(cells) + " |")
-        return lines
-    return None
+    task, found = find_task("dualdevicenav", version=version), defaultdict(list)
+    for path in sorted(results.glob("*.json")):
+        navigation = task.ladder_navigation(int(path.stem))
+        tree, target = navigation.anatomy.tree, navigation.target
+        section = tree.section_names[tree.branches[target.branch].section[-1]]
+        found[_ARTERIES[section]].append((target.abscissa, json.loads(path.read_text(encoding="utf-8"))))
+    rows = []
+    for artery, done in sorted(found.items()):
+        depths, scored = zip(*sorted(done, key=itemgetter(0)), strict=True)
+        reached = [f"{sum(each[rule] for each in scored)} of {len(scored)}" for rule in ("near", "success")]
+        medians = [f"{median(each[name] for each in scored):.0f}" for name in ("seconds", "exposures", "planning_s")]
+        rows.append((artery, ", ".join(f"{depth:.0f}" for depth in depths), *reached, *medians))
+    head = ("artery", "targets, mm", "within 5 mm", "by both rules", "time, s", "exposures", "planning, s")
+    return markdown_table(head, rows)
 
 
 def main() -> None:
@@ -183,8 +171,10 @@ def main() -> None:
         fill(PAGE, "mismatch", mismatch(mismatched))
     if steve.is_dir():
         fill(PAGE, "benchmark", benchmark(steve))
-        if (table := arteries(steve)) is not None:
-            fill(PAGE, "arteries", table)
+    for results in sorted(steve.glob("*/dualdevicenav")):
+        version = json.loads((results.parent / "ladder.json").read_text(encoding="utf-8"))["ladder"]
+        if Path(version).is_dir():
+            fill(PAGE, "arteries", arteries(results, version))
 
 
 if __name__ == "__main__":

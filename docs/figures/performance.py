@@ -13,7 +13,7 @@ from typing import Any
 
 sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
 
-from benchmarks.figures import fill
+from benchmarks.figures import fill, markdown_table
 from endopilot.simulation.config import PRESETS
 
 ROOT = Path(__file__).parents[2]
@@ -47,11 +47,9 @@ def bench(*subject: str) -> Any:
     return json.loads(output(sys.executable, "-m", "benchmarks", *subject, "--json"))
 
 
-def table(rows: list[dict[str, Any]]) -> str:
+def table(rows: list[dict[str, Any]]) -> list[str]:
     """Return rows as a Markdown table."""
-    lines = ["| " + " | ".join(rows[0]) + " |", "|" + "---|" * len(rows[0])]
-    lines += ["| " + " | ".join(str(value) for value in row.values()) + " |" for row in rows]
-    return "\n".join(lines)
+    return markdown_table(rows[0], (row.values() for row in rows))
 
 
 def main() -> None:

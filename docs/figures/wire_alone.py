@@ -12,7 +12,7 @@ from typing import Any
 
 sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
 
-from benchmarks.figures import fill
+from benchmarks.figures import fill, markdown_table
 from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import attempt, navigation_seed
 from endopilot.ladder.scores import score_navigations
@@ -38,19 +38,18 @@ def paths_of(folder: Path, policy: str, task: Task, patients: int) -> list[Path]
 
 def table(folder: Path, patients: int) -> list[str]:
     """Return the table: safe success, and in brackets success, %."""
-    policies = (*SIMPLE, PLANS)
-    lines = ["| task | " + " | ".join(f"`{policy}`" for policy in policies) + " |", "|---|" + "---|" * len(policies)]
+    policies, rows = (*SIMPLE, PLANS), []
     together: dict[str, list[dict[str, Any]]] = {policy: [] for policy in policies}
     for task in list_tasks("coaxial"):
         results = {
             policy: [read_json(path) for path in paths_of(folder, policy, task, patients)] for policy in policies
         }
-        lines.append(f"| {task.name} | " + " | ".join(cell(results[policy]) for policy in policies) + " |")
+        rows.append((task.name, *(cell(results[policy]) for policy in policies)))
         for policy in policies:
             together[policy] += results[policy]
-    lines.append("| all coaxial | " + " | ".join(cell(together[policy]) for policy in policies) + " |")
+    rows.append(("all coaxial", *(cell(together[policy]) for policy in policies)))
     counts = [len(together[policy]) // len(list_tasks("coaxial")) for policy in policies]
-    return [*lines, "| patients a task | " + " | ".join(map(str, counts)) + " |"]
+    return markdown_table(("task", *(f"`{policy}`" for policy in policies)), [*rows, ("patients a task", *counts)])
 
 
 def cell(results: list[dict[str, Any]]) -> str:
