@@ -14,7 +14,7 @@ from endopilot.env.vector import NavigateVectorEnv
 from endopilot.errors import InputError
 from endopilot.tasks.task import in_catheter, reference_navigation
 
-WIRE, CATHETER, TARGET, TIP, VESSEL = (0, 114, 178), (25, 181, 200), (213, 94, 0), (0, 0, 0), (226, 205, 205)
+WIRE, CATHETER, TARGET, TIP = (0, 114, 178), (25, 181, 200), (213, 94, 0), (0, 0, 0)
 
 
 def pixels(picture: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
@@ -44,14 +44,18 @@ def test_the_wire_is_where_it_was_pushed(shown):
     across, up = tree.widest_axes()
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     tip = (env.simulator.tip_position[0, 0] - middle) * 236 / np.ptp(points, axis=0).max()
+    from_tip = pixels(after, WIRE) + 0.5 - (128 - tip[up], 128 + tip[across])
+    assert np.linalg.norm(from_tip, axis=1).min() < 3.5  # it ends under the dot, 2 pixels in radius
     dot = pixels(after, TIP)
     assert 8 < len(dot) < 20 and np.abs(dot.mean(axis=0) + 0.5 - (128 - tip[up], 128 + tip[across])).max() < 1.0
 
 
 def test_what_lies_outside_the_vessel_is_left_out(shown):
     """Before it is pushed some mm of the wire are shown, and not what lies in the guiding catheter behind them."""
-    px_per_mm = 236 / max(np.ptp(pixels(shown[1], VESSEL), axis=0))
-    assert len(pixels(shown[1], WIRE)) < 4 * 10 * max(px_per_mm, 2.0)
+    navigation = reference_navigation()
+    points = np.concatenate([branch.centerline.points for branch in navigation.anatomy.tree.branches])
+    shown_px = (navigation.start_inserted_length_mm + 2.0) * 236 / np.ptp(points, axis=0).max()
+    assert len(pixels(shown[1], WIRE)) < 4 * (shown_px + 2)  # a line 3 pixels wide, aslant
 
 
 def test_the_target_is_a_dot(shown):
