@@ -59,12 +59,12 @@ CTA := runs/cta-thorax
 cta: $(INSTALLED)
 	mkdir -p $(CTA)
 	volume=$$($(BIN)/endopilot sample cta-thorax) && \
-	$(BIN)/endopilot segment $$volume --method aorta --seeds 2 -143 543 2 -184 657 -o $(CTA)/mask.nii.gz \
+	$(BIN)/endopilot segment $$volume --method aorta --seeds 2 -143 543 2 -184 657 -o $(CTA)/mask.nii.gz --overwrite \
 	  --reference $$(dirname $$volume)/seg_aorta.nii.gz --picture $(CTA)/mask.png --json > $(CTA)/segment.json
 	$(BIN)/endopilot anatomy $(CTA)/mask.nii.gz --vessel generic -o $(CTA)/anatomy
 	$(BIN)/endopilot navigate $(CTA)/anatomy --target G6.1 --device j-035 --force-limit-n 0.7 -o $(CTA)/navigation
 	$(BIN)/endopilot simulate $(CTA)/anatomy --controls $(CTA)/navigation/trajectory.npz \
-	  -o $(CTA)/rollout.csv --picture $(CTA)/wire.png --json > $(CTA)/simulate.json
+	  -o $(CTA)/rollout.csv --picture $(CTA)/wire.png --overwrite --json > $(CTA)/simulate.json
 
 readme: $(INSTALLED)
 	$(BIN)/python docs/readme.py

@@ -10,6 +10,7 @@ import json
 import os
 import platform
 import re
+import resource
 import shutil
 import subprocess
 import zlib
@@ -30,6 +31,8 @@ from endopilot import __version__
 from endopilot.errors import InputError
 
 _MIB = 2**20
+RECORD_FILE = "run.json"
+"""Says which run a folder belongs to."""
 _LARGEST_JSON, _LARGEST_YAML = 512 * _MIB, _MIB // 4
 """Bytes of a file that is read whole: recordings of long navigations have some MiB, settings some KiB."""
 _MOST_NODES = 100_000
@@ -47,6 +50,12 @@ _OF_THE_PATH = (
     *(errno.ENOTEMPTY, errno.ELOOP, errno.ENAMETOOLONG, errno.EINVAL, errno.EIO, errno.EBUSY),
 )
 """Errors that another path mends."""
+_FULL = re.compile("no space left|disk quota exceeded|disk is full|file too large", re.IGNORECASE)
+"""How libraries say it in exceptions of their own."""
+_LEAST_FREE = 64 * 1024
+"""A disk with fewer free bytes than a page of some file systems takes is full, whatever a library says."""
+PARTIAL = ".part-"
+"""What the names of files begin with that are not whole yet."""
 
 
 @contextmanager
@@ -59,26 +68,82 @@ def writing(path: Path) -> Iterator[Path]:
     Raises:
         InputError: the folder cannot be written, or the disk is full.
     """
-    path = Path(path)
+    with _temporary(Path(path)) as partial:
+        yield partial
+        partial.replace(path)
+
+
+@contextmanager
+def writing_folder(folder: Path, record: str) -> Iterator[Path]:
+    """Yield a temporary folder whose files go into `folder` when the block ends without an error, `record` last.
+
+    Readers know by `record` that a folder is whole: it is not there while others are replaced. What else lies in
+    `folder` stays as it is.
+
+    Raises:
+        InputError: the folder cannot be written, or holds other things and not all of these files, and no run's record.
+    """
+    folder = Path(folder).resolve()  # a link stays
+    with _temporary(folder) as partial:
+        partial.mkdir()
+        yield partial
+        if not folder.exists():
+            partial.replace(folder)
+            return
+        missing = sorted(path.name for path in partial.iterdir() if not (folder / path.name).exists())
+        if missing and not is_empty(folder) and not (folder / RECORD_FILE).exists():
+            raise InputError(f"{folder}: is not empty and holds no {missing[0]}; choose another folder")
+        (folder / record).unlink(missing_ok=True)
+        for path in sorted(partial.iterdir(), key=lambda path: path.name == record):
+            path.replace(folder / path.name)
+
+
+@contextmanager
+def _temporary(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path`, which is gone when the block ends, and say why it cannot be written."""
     if path.name in ("", ".."):
         raise InputError(f"{path}: is no name of a file; choose another output")
-    partial = path.with_name(f".part-{os.getpid()}-{path.name}")
+    partial = path.with_name(f"{PARTIAL}{os.getpid()}-{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
-        partial.replace(path)
-    except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise InputError(f"{path}: the disk is full; free some space and run the same command again") from error
-        if error.errno in _OF_THE_PATH:
-            raise InputError(f"{path}: cannot be written ({error.strerror}); choose another output") from error
-        raise
+    except InputError as error:
+        raise InputError(str(error).replace(str(partial), str(path))) from error
+    except Exception as error:
+        if (problem := _problem(partial, error)) is None:
+            raise
+        raise InputError(f"{path}: {problem}") from error
     finally:
         with suppress(OSError):
             if partial.is_dir():
                 shutil.rmtree(partial, ignore_errors=True)
             else:
                 partial.unlink(missing_ok=True)
+
+
+def is_empty(folder: Path) -> bool:
+    """Return whether a folder holds nothing but the record of the run that it belongs to, and half-written files."""
+    return all(path.name == RECORD_FILE or path.name.startswith(PARTIAL) for path in folder.iterdir())
+
+
+def _problem(partial: Path, error: Exception) -> str | None:
+    """Return why a file could not be written and what mends it; None where the error has another reason."""
+    number = error.errno if isinstance(error, OSError) else None
+    if number in _OF_THE_PATH:
+        return f"cannot be written ({os.strerror(number)}); choose another output"
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+    sizes = [path.stat().st_size for path in (partial, *partial.rglob("*")) if path.is_file()]
+    if number == errno.EFBIG or (0 <= limit <= max(sizes, default=-1)):
+        return "is larger than files may be here (ulimit -f); raise the limit, or ask for less"
+    try:
+        free = shutil.disk_usage(next(parent for parent in partial.parents if parent.is_dir())).free
+    except OSError:
+        free = _LEAST_FREE
+    if number in (errno.ENOSPC, errno.EDQUOT) or free < _LEAST_FREE or _FULL.search(str(error)):
+        return "the disk is full; free some space and run the same command again"
+    if isinstance(error, UnicodeEncodeError):
+        return "its name holds bytes that are no UTF-8; choose another output"
+    return f"cannot be written ({error}); choose another output" if isinstance(error, OSError) else None
 
 
 def json_text(content: Any, *, indented: bool = True) -> str:

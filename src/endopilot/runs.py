@@ -1,18 +1,23 @@
-"""Run folders: which run a folder belongs to (`claim`), and what is still missing in it (`make_missing`)."""
+"""What a command may write: folders that it claims (`claim`), new files (`check_new`), and what is still missing.
+
+A command replaces what the same command wrote from the same inputs and settings, as a folder's `run.json` tells, and a
+file only where `--overwrite` says so. It writes to no folder in which other things lie, and never over its own input.
+"""
 
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from endopilot.errors import InputError
-from endopilot.files import json_text, read_json, write_json
+from endopilot.files import PARTIAL, RECORD_FILE, is_empty, json_text, read_json, write_json
 from endopilot.parallel import Workers, each
 
-RECORD_FILE = "run.json"
 _LONGEST_VALUE = 60
 
 
@@ -41,16 +46,66 @@ def claim(folder: Path, command: str, **identity: Any) -> None:
         if change is None:
             remove_partial_files(folder)
             return
-        if any(_results(folder)):
+        if not is_empty(folder):
             name, then, value = change
             raise InputError(
                 f"{folder}: was begun with {name} = {_short(then)}, now it is {_short(value)}; "
                 "choose another folder, or remove this one"
             )
-    elif folder.is_dir() and any(_results(folder)):
+    elif folder.is_dir() and not is_empty(folder):
         raise InputError(f"{folder}: is not empty and holds no {RECORD_FILE}; choose another folder")
     write_json(record, now)
     remove_partial_files(folder)
+
+
+@contextmanager
+def claiming(folder: Path, command: str, **identity: Any) -> Iterator[None]:
+    """Claim a folder for the block that makes its results; one that fails with none leaves no folder that it made."""
+    folder, new = Path(folder), not Path(folder).exists()
+    claim(folder, command, **identity)
+    try:
+        yield
+    except BaseException:
+        if is_empty(folder):
+            (folder / RECORD_FILE).unlink(missing_ok=True)
+            if new:
+                folder.rmdir()
+        raise
+
+
+def check_new(path: Path, inputs: Sequence[Path] = (), *, overwrite: bool = False) -> None:
+    """Refuse to write a file over another, before the work is done.
+
+    Args:
+        path: of the file.
+        inputs: files and folders that the command reads.
+        overwrite: the user lets the command replace a file that is none of `inputs`.
+
+    Raises:
+        InputError: a file lies there already.
+    """
+    if path.is_dir() or not os.path.lexists(path):
+        return
+    if not overwrite:
+        raise InputError(f"{path}: is there already; choose another name, or --overwrite to replace it")
+    for source in inputs:
+        if path.resolve().is_relative_to(source.resolve()):
+            raise InputError(f"{path}: is of the input, {source}; choose another name")
+
+
+def check_outside(folder: Path, inputs: Sequence[Path]) -> None:
+    """Refuse an output folder in which an input lies.
+
+    Args:
+        folder: of the results.
+        inputs: files and folders that the command reads.
+
+    Raises:
+        InputError: one of them lies in it, or is it.
+    """
+    for source in inputs:
+        if source.resolve().is_relative_to(folder.resolve()):
+            raise InputError(f"{source}: lies in the output, {folder}; choose another output folder")
 
 
 def make_missing(title: str, paths: Sequence[Path], make: Callable[[Path], None], pool: Workers | None = None) -> None:
@@ -80,14 +135,9 @@ def _changes(before: Any, now: Any, name: str = "") -> Iterator[tuple[str, Any, 
         yield name or "its record", before, now
 
 
-def _results(folder: Path) -> Iterator[Path]:
-    """Yield what stands in a folder beside the record and half-written files."""
-    return (path for path in folder.iterdir() if path.name != RECORD_FILE and not path.name.startswith(".part-"))
-
-
 def remove_partial_files(folder: Path) -> None:
     """Remove the half-written files that a process which was killed left in a folder."""
-    for path in list(folder.rglob(".part-*")):
+    for path in list(folder.rglob(f"{PARTIAL}[0-9]*-*")):
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
         else:

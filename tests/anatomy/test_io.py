@@ -94,7 +94,7 @@ def test_writing_again_replaces_an_anatomy_but_nothing_else(anatomy, tmp_path):
     other = tmp_path / "other"
     other.mkdir()
     (other / "thesis.txt").write_text("dear")
-    with pytest.raises(InputError, match="not an anatomy"):
+    with pytest.raises(InputError, match=r"other: is not empty and holds no anatomy\.json"):
         write_anatomy(anatomy, output=other)
     assert (other / "thesis.txt").read_text() == "dear"
 

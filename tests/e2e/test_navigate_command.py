@@ -153,7 +153,7 @@ def test_a_guiding_catheter_that_leans_is_seen_and_written(patient, capsys, tmp_
     assert f"15° off its given axis; X-ray shows it to {unseen_deg:.1f}°" in page
     again = ("--controls", folder / "trajectory.npz", "-o", tmp_path / "again.csv")
     run(capsys, "simulate", folder / "anatomy", *again)
-    assert "of another vessel" in refused(capsys, "simulate", patient, *again)
+    assert "of another vessel" in refused(capsys, "simulate", patient, *again, "--overwrite")
     table, wire = pd.read_csv(folder / "navigation.csv"), pd.read_csv(tmp_path / "again.csv")
     np.testing.assert_allclose(wire["tip_z_mm"].to_numpy()[9::10], table["tip_z_mm"].to_numpy()[1:], atol=1e-9)
 

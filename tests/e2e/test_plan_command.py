@@ -67,6 +67,7 @@ def test_xray_is_foreseen_along_a_plan(patient, tmp_path, capsys):
     shutil.copytree(run_path(Path("pretrained")), tmp_path / "unsure")
     bands = read_json(tmp_path / "unsure" / "xray.json")
     write_json(tmp_path / "unsure" / "xray.json", bands | {"scale": 1000 * bands["scale"]})
+    plan = (*plan[:-1], tmp_path / "by-network")
     by_network = run(capsys, *plan, "--method", "mppi", "--model", tmp_path / "unsure", "--seconds", "10")
     assert by_network["method"] == "mppi" and by_network["xray_due_s"][:2] == [1.5, 3.0]  # as often as it may
 

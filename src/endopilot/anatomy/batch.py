@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 
-from endopilot import files
+from endopilot import __version__, files
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import write_anatomy
 from endopilot.anatomy.read_source import MASK_SUFFIXES, SURFACE_SUFFIXES, read_source
+from endopilot.anatomy.sources import AnatomySource
 from endopilot.errors import InputError
 from endopilot.parallel import each
+from endopilot.runs import claim, claiming
 
 
 def extract_all(
@@ -32,11 +35,14 @@ def extract_all(
         The folders that were made, and of every rejected file what was wrong with it.
 
     Raises:
-        InputError: two patients would have the same name, one ostium is given for all, or no file was any good.
+        InputError: two patients would have the same name, one ostium is given for all, no file was any good, or the
+            folder belongs to another run.
     """
     if config.ostium_mm is not None and len(sources) > 1:
         raise InputError(f"ostium_mm={config.ostium_mm}: cannot serve {len(sources)} patients; make them one by one")
     folders = {source: output / name for source, name in zip(sources, _names(sources), strict=True)}
+    identity = {"sources": list(folders), "label": label, "config": config, "version": __version__}
+    claim(output, "endopilot anatomy", **identity)
     bad = each("Anatomies", list(sources), partial(_make, folders=folders, label=label, config=config))
     rejected = {str(source): str(bad[source]) for source in sources if source in bad}
     if len(rejected) == len(sources):
@@ -47,9 +53,18 @@ def extract_all(
     return [folders[source] for source in sources if source not in bad], rejected
 
 
+def claim_anatomy(
+    folder: Path, content: AnatomySource, *, label: int | str | None, name: str | None, config: AnatomyConfig
+) -> AbstractContextManager[None]:
+    """Return the claim of a folder by the anatomy of a source, see `runs.claiming`."""
+    made_from = {"source": content.sha256, "label": label, "name": name, "config": config}
+    return claiming(folder, "endopilot anatomy", **made_from, version=__version__)
+
+
 def _make(source: Path, *, folders: dict[Path, Path], label: int | str | None, config: AnatomyConfig) -> None:
-    folder = folders[source]
-    write_anatomy(extract_anatomy(read_source(source, label=label), name=folder.name, config=config), output=folder)
+    folder, content = folders[source], read_source(source, label=label)
+    with claim_anatomy(folder, content, label=label, name=folder.name, config=config):
+        write_anatomy(extract_anatomy(content, name=folder.name, config=config), output=folder)
 
 
 def _names(sources: Sequence[Path]) -> list[str]:

@@ -17,7 +17,6 @@ recorded controls mean the same in them.
 from __future__ import annotations
 
 import itertools
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +35,7 @@ _CENTERLINE, _LUMEN, _RECORD = "centerline.vtp", "lumen.nrrd", "anatomy.json"
 
 
 def write_anatomy(anatomy: Anatomy, *, output: str | Path) -> None:
-    """Write an anatomy as a folder, whole or not at all; an anatomy that stands there already is replaced.
+    """Write an anatomy as a folder, whole or not at all; an anatomy in it is replaced, and what else it holds stays.
 
     Args:
         anatomy: the vessel.
@@ -45,11 +44,7 @@ def write_anatomy(anatomy: Anatomy, *, output: str | Path) -> None:
     Raises:
         InputError: the folder cannot be written, or holds something that is not an anatomy.
     """
-    folder = Path(output)
-    if folder.exists() and not (folder.is_dir() and ((folder / _RECORD).exists() or not any(folder.iterdir()))):
-        raise InputError(f"{folder}: exists and is not an anatomy; choose another output folder")
-    with files.writing(folder) as partial:
-        partial.mkdir()
+    with files.writing_folder(Path(output), _RECORD) as partial:
         _write_tree(anatomy.tree, partial / _CENTERLINE)
         _write_distance_map(anatomy.distance_map, partial / _LUMEN)
         record = {
@@ -68,8 +63,6 @@ def write_anatomy(anatomy: Anatomy, *, output: str | Path) -> None:
             "provenance": anatomy.provenance,
         }
         (partial / _RECORD).write_text(files.json_text(record) + "\n", encoding="utf-8")
-        if folder.exists():
-            shutil.rmtree(folder)
 
 
 def read_anatomy(folder: str | Path) -> Anatomy:

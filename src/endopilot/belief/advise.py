@@ -8,15 +8,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from endopilot import __version__
 from endopilot.belief import monitoring
 from endopilot.belief.bands import CALIBRATION_FILE, Calibration, check_enough
 from endopilot.belief.monitoring import AdviseConfig, Monitored
 from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.errors import InputError
-from endopilot.files import manifest, write_json, writing
-from endopilot.models.config import PRETRAINED, WINDOW, read_run
+from endopilot.files import manifest, sha256, write_json, writing
+from endopilot.models.config import PRETRAINED, WINDOW, read_run, run_path
 from endopilot.models.provenance import check_wire
 from endopilot.progress import progress
+from endopilot.runs import claim
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -65,6 +67,9 @@ def advise(
     splits = [episodes.of_split(name) for name in ("train", "calibrate", "test")]
     check_enough(len(set(splits[1].anatomy)), config.adviser.level)
     others = [_other(run, folder, splits[:2]) for folder in also_test]
+    inputs = {"run": sha256(run_path(run) / "manifest.json"), "dataset": episodes.manifest["key"]}
+    inputs |= {"also_test": [other.manifest["key"] for other in others]}
+    claim(output, "endopilot advise", inputs=inputs, config=config, version=__version__)
     fitted = monitoring.monitor(predictor, splits[0], config, samples=WINDOW)
     own, test = (monitoring.monitor(predictor, split, config) for split in splits[1:])
     check_enough(len(set(own.episodes.anatomy)), config.adviser.level)

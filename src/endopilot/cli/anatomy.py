@@ -7,13 +7,14 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from endopilot.anatomy.batch import extract_all
+from endopilot.anatomy.batch import claim_anatomy, extract_all
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import write_anatomy
 from endopilot.anatomy.read_source import read_source
 from endopilot.cli.arguments import Existing, Figures, OutputFolder, Picture, existing
 from endopilot.errors import InputError
 from endopilot.imaging.volume import read_volume
+from endopilot.runs import check_outside
 from endopilot.types import Anatomy
 
 
@@ -46,6 +47,7 @@ def command(
     """
     if not sources:
         raise InputError("no file was given; name a mask, a surface or a centerline")
+    check_outside(output, sources)
     if len(sources) > 1:
         for option, value in (("name", name), ("picture", picture), ("ct", ct)):
             if value is not None:
@@ -59,8 +61,9 @@ def command(
     volume = None if ct is None else read_volume(ct)
     source = next(iter(sources))
     content = read_source(existing(source), label=label)
-    anatomy = extract_anatomy(content, name=name or output.resolve().name, config=config)
-    write_anatomy(anatomy, output=output)
+    with claim_anatomy(output, content, label=label, name=name, config=config):
+        anatomy = extract_anatomy(content, name=name or output.resolve().name, config=config)
+        write_anatomy(anatomy, output=output)
     figures = {"anatomy": output, **describe(anatomy)}
     if picture is not None:
         from endopilot.anatomy.anatomy_picture import draw_anatomy  # matplotlib is slow to import

@@ -57,10 +57,11 @@ class ListenConfig:
 MUST_EXIST = "must exist"
 Existing = Annotated[Path, MUST_EXIST]
 """A file or folder that must be there when the command begins."""
-Picture = Annotated[Path, AfterValidator(_named_png)]
+IS_FOLDER, IS_FILE = "folder that is written", "file that is written"
+Picture = Annotated[Path, AfterValidator(_named_png), IS_FILE]
 """A picture to be written."""
-OutputFolder = Annotated[Path, arg(aliases=("-o",), metavar="DIR")]
-OutputFile = Annotated[Path, arg(aliases=("-o",), metavar="FILE")]
+OutputFolder = Annotated[Path, arg(aliases=("-o",), metavar="DIR"), IS_FOLDER]
+OutputFile = Annotated[Path, arg(aliases=("-o",), metavar="FILE"), IS_FILE]
 
 
 @dataclass(frozen=True)

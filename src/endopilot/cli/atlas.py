@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from endopilot import __version__
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_atlas
 from endopilot.cli.arguments import Figures, OutputFolder
 from endopilot.progress import progress
+from endopilot.runs import claiming
 
 
 def command(
@@ -22,7 +24,9 @@ def command(
     rows = []
     with progress("Synthetic patients", config.count) as advance:
         for anatomy in make_atlas(config=config):
-            write_anatomy(anatomy, output=output / anatomy.name)
+            identity = {"patient": anatomy.identity, "version": __version__}
+            with claiming(output / anatomy.name, "endopilot atlas", **identity):
+                write_anatomy(anatomy, output=output / anatomy.name)
             path = anatomy.tree.longest_path()
             rows.append(
                 {

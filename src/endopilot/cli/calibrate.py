@@ -17,6 +17,7 @@ from endopilot.files import input_hash, manifest, write_json
 from endopilot.robot.calibrate import CalibrateConfig, RobotCalibration, calibrate
 from endopilot.robot.log import read_log
 from endopilot.robot.replay import summary
+from endopilot.runs import check_new
 
 _BY = "endopilot calibrate"
 
@@ -29,6 +30,7 @@ def command(
     output: OutputFile,
     device: str = "workhorse-014",
     robot: str = "assumed",
+    overwrite: bool = False,
     config: CalibrateConfig = CalibrateConfig(),
 ) -> Answer:
     """Find gain, lag, plays, tip shape, friction and stiffness of a robot and its wire, each with an interval.
@@ -43,8 +45,11 @@ def command(
         output: robot.yaml; beside it robot.device.yaml, the wire, and robot.json, all intervals.
         device: name of a device (`endopilot devices`) or a YAML file, as the wire is known.
         robot: name of a robot or a YAML file, as the robot is known.
+        overwrite: replace files that lie where this command writes.
         config: how logs are fitted.
     """
+    for path in (_beside(output), output.with_suffix(".json")):
+        check_new(path, (*logs, anatomy), overwrite=overwrite)
     read, patient = [read_log(path) for path in logs], read_anatomy(anatomy)
     found = calibrate(read, patient, read_wire(device), robot=read_robot(robot), config=config)
     names = ", ".join(log.name for log in read)

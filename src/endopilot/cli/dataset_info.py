@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from tyro.conf import Positional
 
+from endopilot import __version__
 from endopilot.cli.arguments import Existing, Figures, OutputFolder
+from endopilot.runs import claim
 
 
 def command(
@@ -22,5 +24,7 @@ def command(
     from endopilot.dataset.info import describe_dataset, draw_pictures  # an extra brings their libraries
 
     description = describe_dataset(dataset)
+    if output is not None:
+        claim(output, "endopilot dataset-info", figures=description.figures, version=__version__)
     pictures = [] if output is None else draw_pictures(description, output)
     return description.figures | ({"pictures": pictures} if pictures else {})

@@ -26,14 +26,16 @@ import docstring_parser
 import tyro
 from tyro.conf import Positional
 
-from endopilot.cli.arguments import MUST_EXIST, existing, show_answer
+from endopilot.cli.arguments import IS_FILE, IS_FOLDER, MUST_EXIST, existing, show_answer
 from endopilot.errors import InputError
+from endopilot.runs import check_new, check_outside
 from endopilot.settings import Within, is_settings, read_settings, settings
 
 LISTED_AT_MOST = 10
 LISTED: Mapping[str, str] = MappingProxyType(
     {
         "run": "output target device method vessel seeds sequences seconds training_seconds json",
+        "segment": "output method vessel seeds series phase reference picture json",
         "anatomy": "output vessel ostium_mm label name scale catheter_radius_mm picture ct json",
         "phantom": "output seed in_plane_mm slice_mm lumen_hu noise_hu calcium stents motion_mm json",
         "simulate": "output device catheter controls sequences seconds seed motion picture json",
@@ -45,11 +47,14 @@ LISTED: Mapping[str, str] = MappingProxyType(
         "xray": "output show view_deg zoom device inserted_length_mm catheter catheter_inserted_length_mm ct json",
         "locate": "camera output picture landmark_mm landmark_px registration_sd_mm travel_mm stiff_mm json",
         "angiograms": "output device catheter cines seconds seed drive motion dose json",
+        "calibrate": "anatomy output device robot given episodes wires seed json",
         "advise": "output also_test xray level wall_ratio abscissa_mm missed ostium_mm seed json",
         "cockpit": "device catheter robot task world replay resume output browser port",
     }
 )
 """What `--help` lists of commands that have more than `LISTED_AT_MOST` flags: those that are set most often."""
+_EVERYWHERE = {"json": "print the figures as JSON.", "overwrite": "replace files that lie where this command writes."}
+"""Options that commands have without naming them."""
 _WORDS = {bool: "", int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
 _POSITIONAL = get_args(Positional[Any])[1]
 
@@ -129,6 +134,8 @@ class Command:
         self._required = [one.name for one in self._parameters.values() if one.default is one.empty]
         own = {one.name: (hints[one.name], one.default) for one in self._parameters.values()}
         own |= {one: (own[one][0] | None, None) for one in self._required}
+        if any(IS_FILE in _notes(kind) for kind, _ in own.values()):
+            own |= {"overwrite": (bool, False)}
         own |= {"json": (bool, False)} if self._answers else {}
         self._own = tuple(own)
         content = {"__annotations__": {one: kind for one, (kind, _) in own.items()}}
@@ -147,7 +154,7 @@ class Command:
         Args:
             values: what they are set to, an instance of `settings`; the defaults if not given.
         """
-        meanings = _meanings(self._config) | {"json": "print the figures as JSON."}
+        meanings = _meanings(self._config) | _EVERYWHERE
         meanings |= {one.arg_name: _line(one.description) for one in self._text.params}
         found = _options(self.defaults if values is None else values, meanings, self._required)
         tree = {one.name: one for one in found}
@@ -186,11 +193,17 @@ class Command:
         return values
 
     def _called(self, values: Any) -> Any:
-        """Return what the function returns."""
+        """Return what the function returns, once its inputs are there and nothing lies in the way of its outputs."""
+        paths: dict[str, list[Path]] = {MUST_EXIST: [], IS_FOLDER: [], IS_FILE: []}
         for one in self.options(values):
-            if MUST_EXIST in _notes(one.kind):
-                for path in one.value if isinstance(one.value, tuple) else (one.value,) if one.value else ():
-                    existing(path)
+            for note in _notes(one.kind):
+                if one.value and isinstance(note, str) and note in paths:
+                    paths[note] += one.value if isinstance(one.value, tuple) else (one.value,)
+        inputs = [existing(path) for path in paths[MUST_EXIST]]
+        for folder in paths[IS_FOLDER]:
+            check_outside(folder, inputs)
+        for file in paths[IS_FILE]:
+            check_new(file, inputs, overwrite=values.overwrite)
         given = {name: getattr(values, name) for name in self._parameters}
         places = [given.pop(name) for name, one in self._parameters.items() if one.kind is one.POSITIONAL_ONLY]
         if self._config is not NoneType:

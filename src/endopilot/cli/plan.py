@@ -6,12 +6,17 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+from endopilot import __version__
+from endopilot.anatomy.io import read_anatomy
 from endopilot.cli.arguments import Existing, Figures, OutputFolder
 from endopilot.control.plan import plan
 from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import write_plan
 from endopilot.control.plan_xray import plan_xray, read_calibration
 from endopilot.devices.stack import Stack
+from endopilot.files import input_hash
+from endopilot.models.config import run_path
+from endopilot.runs import claiming
 
 
 def command(
@@ -46,5 +51,8 @@ def command(
     if xray:
         read_calibration(config.method, model, 1 + len(catheter))  # refused before the search, which takes its time
     stack = Stack.of(device or "workhorse-014", *catheter) if device or catheter else None
-    found = plan(anatomy, target, device=stack, model=model, config=config)
-    return write_plan(found, output=output, xray=plan_xray(found) if xray else None)
+    patient, asked = read_anatomy(anatomy), {"target": target, "device": stack, "config": config, "xray": xray}
+    weights = {} if model is None else input_hash(run_path(model), [*run_path(model).glob("*.safetensors")])
+    with claiming(output, "endopilot plan", anatomy=patient.identity, model=weights, **asked, version=__version__):
+        found = plan(patient, target, device=stack, model=model, config=config)
+        return write_plan(found, output=output, xray=plan_xray(found) if xray else None)

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 from tyro.conf import Positional
 
+from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cli.arguments import Existing, Figures, OutputFolder
 from endopilot.devices.device import read_wire
@@ -17,6 +18,7 @@ from endopilot.files import input_hash, manifest, write_json, writing
 from endopilot.plotting import png
 from endopilot.robot.log import read_log
 from endopilot.robot.replay import EpisodeReplay, ReplayConfig, replay_log, summary
+from endopilot.runs import claim
 
 
 def command(
@@ -44,9 +46,10 @@ def command(
     """
     from endopilot.report.replay_figure import replay_figure  # matplotlib is slow to import
 
-    patient, read = read_anatomy(anatomy), read_log(log)
-    found = replay_log([read], patient, Stack(read_wire(device)), robot=read_robot(robot), config=config)
-    output.mkdir(parents=True, exist_ok=True)
+    patient, read, wire, drives = read_anatomy(anatomy), read_log(log), read_wire(device), read_robot(robot)
+    inputs = input_hash(log) | input_hash(anatomy)
+    claim(output, "endopilot replay", inputs=inputs, device=wire, robot=drives, config=config, version=__version__)
+    found = replay_log([read], patient, Stack(wire), robot=drives, config=config)
     figures = summary(found)
     title = f"{read.name} beside {device}, robot {Path(robot).name}"
     with writing(output / "replay.png") as partial:
@@ -56,7 +59,6 @@ def command(
     with writing(output / "errors.csv") as partial:
         rows = [{"episode": each.number, **{f"{k}_mm": v for k, v in each.errors.items()}} for each in found]
         pd.DataFrame(rows).to_csv(partial, index=False)
-    inputs = input_hash(log) | input_hash(anatomy)
     write_json(output / "manifest.json", manifest(config=config, inputs=inputs, figures=figures))
     return figures
 

@@ -11,7 +11,7 @@ import numpy as np
 from tyro.conf import Positional
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.cli.arguments import Existing, Figures, OutputFile
+from endopilot.cli.arguments import Existing, Figures, OutputFile, Picture
 from endopilot.control.plan_file import read_plan
 from endopilot.dataset.navigations import simulate_navigations
 from endopilot.devices.stack import Stack
@@ -53,7 +53,7 @@ def command(
     motion: MotionName = "still",
     motion_seed: Seed | None = None,
     shape: bool = False,
-    picture: Path | None = None,
+    picture: Picture | None = None,
     random: RandomConfig = RandomConfig(),
     config: SimulatorConfig = SimulatorConfig(),
 ) -> Figures:

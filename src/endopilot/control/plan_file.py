@@ -26,7 +26,6 @@ those from the translation to the tip in space, of the catheter.
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -42,7 +41,7 @@ from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
-from endopilot.files import json_text, manifest, read_json, reading, sha256, writing
+from endopilot.files import json_text, manifest, read_json, reading, sha256, writing_folder
 from endopilot.settings import from_record
 from endopilot.simulation.signals import table_columns
 from endopilot.simulation.trajectory_file import TRAJECTORY, read_trajectory
@@ -53,7 +52,7 @@ _TABLE, _RECORD, PICTURE = "plan.csv", "manifest.json", "plan.png"
 
 
 def write_plan(plan: Plan, *, output: str | Path, xray: PlannedXray | None = None) -> dict[str, Any]:
-    """Write a plan as a folder, whole or not at all; a plan that stands there already is replaced. Return its figures.
+    """Write a plan as a folder, whole or not at all; a plan in it is replaced. Return its figures.
 
     Args:
         plan: the plan.
@@ -66,8 +65,6 @@ def write_plan(plan: Plan, *, output: str | Path, xray: PlannedXray | None = Non
     from endopilot.control.plan_picture import draw_plan  # matplotlib is slow to import
 
     folder = Path(output)
-    if folder.exists() and not (folder.is_dir() and ((folder / _TABLE).exists() or not any(folder.iterdir()))):
-        raise InputError(f"{folder}: exists and is not a plan; choose another output folder")
     navigation = plan.navigation
     figures = {
         "method": plan.config.method,
@@ -88,8 +85,7 @@ def write_plan(plan: Plan, *, output: str | Path, xray: PlannedXray | None = Non
     }
     if xray is not None:
         figures["xray_due_s"] = (DECISION_PERIOD_S * (1 + np.flatnonzero(xray.exposure))).tolist()
-    with writing(folder) as partial:
-        partial.mkdir()
+    with writing_folder(folder, _RECORD) as partial:
         _table(plan, xray).to_csv(partial / _TABLE, index=False)
         columns = {"desired": plan.desired[None], "predicted": plan.predicted[None]}
         about = {"target": asdict(navigation.target), "method": plan.config.method}
@@ -115,8 +111,6 @@ def write_plan(plan: Plan, *, output: str | Path, xray: PlannedXray | None = Non
             **figures,
         )
         (partial / _RECORD).write_text(json_text(record) + "\n", encoding="utf-8")
-        if folder.exists():
-            shutil.rmtree(folder)
     return {"plan": str(folder), **figures}
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from endopilot import __version__
 from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.devices.robot import read_robot
 from endopilot.errors import InputError
@@ -29,6 +30,7 @@ from endopilot.files import manifest, sha256, write_json
 from endopilot.models.config import PRETRAINED, read_run, run_path
 from endopilot.models.provenance import trained_patients
 from endopilot.progress import progress
+from endopilot.runs import claim
 from endopilot.settings import Count, Seed, settings
 
 
@@ -75,7 +77,8 @@ def evaluate(
 
     Raises:
         InputError: the run, its dataset or one of its anatomies is missing or damaged, nothing was held out, the
-            dataset was made with another wire, another seed was trained on other patients, or there is no such robot.
+            dataset was made with another wire, another seed was trained on other patients, there is no such robot, or
+            the output belongs to another run.
     """
     with extra_named("evaluate"):
         from endopilot.evaluation.protocols import count_steps, run_protocols  # brings torch, slow to import
@@ -91,6 +94,11 @@ def evaluate(
     for other in other_seeds:
         if trained_patients(other, read_run(other), whole) != known:
             raise InputError(f"{other}: was trained on other patients than {run_folder}; give runs of one training")
+    weights = {path.name: sha256(path) for path in sorted(run_path(run_folder).glob("*.safetensors"))}
+    inputs = weights | {"dataset": whole.manifest["key"]}
+    made_from = inputs | {"run": sha256(run_path(run_folder) / "manifest.json")}
+    about = {"robot": robot, "other_seeds": other_seeds, "config": config, "version": __version__}
+    claim(output, "endopilot evaluate", inputs=made_from, **about)
     predictor, others = load_model(run_folder), [load_model(other) for other in other_seeds]
     held_out, training = _parted(whole, known)
     if not held_out:
@@ -114,8 +122,7 @@ def evaluate(
         "manifest": manifest(
             config=config,
             seed=config.seed,
-            inputs={path.name: sha256(path) for path in sorted(run_path(run_folder).glob("*.safetensors"))}
-            | {"dataset": whole.manifest["key"]},
+            inputs=inputs,
             wall_seconds=time.perf_counter() - start,
         ),
     }

@@ -1,0 +1,163 @@
+"""What a command may write: nothing of the user's is replaced, and what does not arrive whole is not there."""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import refused, run
+
+from endopilot.anatomy.io import write_anatomy
+from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.imaging.volume import write_mask
+from endopilot.types import LumenMask, Volume
+
+SHORT = ("--sequences", "2", "--seconds", "2")
+
+
+@pytest.fixture(scope="module")
+def patient(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("patient") / "cerebral"
+    write_anatomy(make_patient(AtlasConfig(vessel="cerebral", seed=2), 0), output=folder)
+    return folder
+
+
+@pytest.fixture
+def mask(tmp_path) -> Path:
+    return straight_mask(tmp_path / "scans" / "m.nii.gz", radius=4.0)
+
+
+def straight_mask(path: Path, radius: float) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    across = np.indices((60, 24, 24))[1:] - 11.5
+    voxels = np.hypot(*across) < radius
+    voxels[:2] = voxels[-2:] = False
+    write_mask(LumenMask(Volume(voxels, np.ones(3), np.zeros(3), np.eye(3)), None), path, manifest={})
+    return path
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_an_output_in_which_an_input_lies_is_refused_and_all_of_it_stays(mask, patient, capsys, tmp_path):
+    (mask.parent / "thesis.txt").write_text("dear")
+    before = content(mask.parent)
+    inner = tmp_path / "scans" / "deeper"
+    shutil.copytree(mask.parent, inner)
+    for sources in ([mask], [mask, inner / mask.name]):
+        assert "lies in the output" in refused(capsys, "anatomy", *sources, "-o", mask.parent)
+    assert "lies in the output" in refused(capsys, "navigate", patient, "--target", "M1", "-o", patient)
+    shutil.rmtree(inner)
+    assert content(mask.parent) == before
+
+
+@pytest.mark.parametrize("words", ["anatomy MASK", "anatomy MASK MASK2", "plan PATIENT --target M1", "train DATA"])
+def test_a_folder_of_other_things_is_refused_and_all_of_it_stays(mask, patient, capsys, tmp_path, words):
+    names = {"MASK": mask, "MASK2": straight_mask(tmp_path / "more" / "n.nrrd", 5.0), "PATIENT": patient}
+    names["DATA"] = tmp_path / "data"
+    if "DATA" in words:
+        run(capsys, "dataset", patient, "-o", names["DATA"], *SHORT, "--anatomy-shares", "1", "0", "0")
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    (theirs / "manifest.json").write_text("{}")
+    line = refused(capsys, *(names.get(word, word) for word in words.split()), "-o", theirs)
+    assert "is not empty and holds no run.json" in line
+    assert content(theirs) == {"manifest.json": b"{}"}
+
+
+def test_a_finished_anatomy_is_made_again_from_the_same_mask_alone(mask, capsys, tmp_path):
+    folder, wider = tmp_path / "patient", straight_mask(tmp_path / "wider.nrrd", 6.0)
+    run(capsys, "anatomy", mask, "-o", folder)
+    (folder / "plan").mkdir()
+    (folder / "plan" / "mine.txt").write_text("kept")
+    before = content(folder)
+    assert "was begun with source" in refused(capsys, "anatomy", wider, "-o", folder)
+    line = refused(capsys, "anatomy", mask, "-o", folder, "--minimum-branch-length-mm", "9")
+    assert "minimum_branch_length_mm = 4.0, now it is 9.0" in line
+    assert content(folder) == before
+    run(capsys, "anatomy", mask, "-o", folder)
+    assert content(folder) == before
+
+
+def test_a_plan_is_made_again_for_the_same_target_alone(patient, capsys, tmp_path):
+    folder = tmp_path / "plan"
+    run(capsys, "plan", patient, "--target", "ICA", "-o", folder)
+    (folder / "notes.txt").write_text("kept")
+    before = content(folder)
+    assert "was begun with target = ICA" in refused(capsys, "plan", patient, "--target", "M1", "-o", folder)
+    assert content(folder) == before
+    run(capsys, "plan", patient, "--target", "ICA", "-o", folder)
+    assert (folder / "notes.txt").read_text() == "kept"
+
+
+def test_a_file_is_replaced_only_where_the_user_says_so_and_never_one_of_the_input(patient, capsys, tmp_path):
+    table, before = tmp_path / "rollout.csv", content(patient)
+    table.write_text("theirs")
+    simulate = ("simulate", patient, "-o", table, *SHORT)
+    assert "rollout.csv: is there already" in refused(capsys, *simulate)
+    assert table.read_text() == "theirs"
+    run(capsys, *simulate, "--overwrite")
+    assert table.read_text().startswith("world")
+    picture = tmp_path / "picture.png"
+    picture.write_text("theirs")
+    assert "picture.png: is there already" in refused(capsys, *simulate[:3], tmp_path / "b.csv", "--picture", picture)
+    for also in ((), ("--overwrite",)):
+        assert "lumen.nrrd" in refused(capsys, "phantom", patient, "-o", patient / "lumen.nrrd", *also)
+    assert content(patient) == before
+
+
+def test_an_output_that_is_a_link_leads_where_it_points(mask, capsys, tmp_path):
+    real = tmp_path / "real"
+    real.mkdir()
+    (tmp_path / "link").symlink_to(real)
+    (tmp_path / "nowhere").symlink_to(tmp_path / "gone")
+    run(capsys, "anatomy", mask, "-o", tmp_path / "link")
+    run(capsys, "anatomy", mask, "-o", tmp_path / "link")
+    assert (tmp_path / "link").is_symlink() and (real / "anatomy.json").exists()
+    assert "nowhere" in refused(capsys, "anatomy", mask, "-o", tmp_path / "nowhere")
+
+
+def test_a_failing_command_leaves_no_folder_behind(capsys, tmp_path):
+    straight_mask(tmp_path / "thin.nrrd", 0.6)
+    refused(capsys, "anatomy", tmp_path / "thin.nrrd", "-o", tmp_path / "patient", "--ostium-mm", "90", "0", "0")
+    assert not (tmp_path / "patient").exists()
+
+
+LIMIT = 5_000
+"""Bytes that a file may have: fewer than any of these results have, and more than the record of a run."""
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "anatomy MASK -o OUT",
+        "atlas --vessel portal -o OUT",
+        "phantom PATIENT --in-plane-mm 1 --slice-mm 2 -o OUT",
+        "plan PATIENT --target ICA -o OUT",
+        "simulate PATIENT --sequences 4 --seconds 10 --shape -o OUT.npz",
+        "xray PATIENT -o OUT.png",
+    ],
+)
+def test_what_does_not_fit_is_told_in_one_line_and_is_not_there(words, mask, patient, tmp_path):
+    names = {"MASK": str(mask), "PATIENT": str(patient)}
+    out, suffixes = tmp_path / "out" / "it", ("", ".nii.gz", ".nrrd", ".npz", ".png")
+    names |= {f"OUT{suffix}": f"{out}{suffix}" for suffix in suffixes}
+    ended = subprocess.run(
+        [sys.executable, "-m", "endopilot.cli", *(names.get(word, word) for word in words.split())],
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (LIMIT, LIMIT)),
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+        check=False,
+    )
+    lines = [line for line in ended.stderr.splitlines() if ": done in" not in line]
+    assert ended.returncode == 2 and len(lines) == 1 and "ulimit -f" in lines[0], ended.stderr
+    assert str(out) in lines[0]
+    assert not [path for path in out.parent.rglob("*") if path.is_file()]
