@@ -123,7 +123,7 @@ def make_missing(title: str, paths: Sequence[Path], make: Callable[[Path], None]
     bad = each(title, [path for path in paths if not path.exists()], make, pool)
     if bad:
         path, error = next(iter(bad.items()))
-        raise InputError(f"{path}: {error}")
+        raise error if str(error).startswith(str(path)) else InputError(f"{path}: {error}")
 
 
 def _changes(before: Any, now: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
