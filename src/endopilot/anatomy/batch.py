@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from endopilot import files
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
@@ -15,7 +16,12 @@ from endopilot.parallel import each
 
 
 def extract_all(
-    sources: Sequence[Path], output: Path, *, label: int | str | None = None, config: AnatomyConfig
+    sources: Sequence[Path],
+    output: Path,
+    *,
+    label: int | str | None = None,
+    threshold: float | None = None,
+    config: AnatomyConfig,
 ) -> tuple[list[Path], dict[str, str]]:
     """Make one anatomy a file, each in a folder of its own, on as many processes as there are cores.
 
@@ -26,6 +32,7 @@ def extract_all(
         sources: masks, surfaces or centerlines.
         output: folder that takes one anatomy folder a patient.
         label: number or name of the segment that is the lumen, where masks have several.
+        threshold: of masks of grey levels, the value at the wall.
         config: how to make them all.
 
     Returns:
@@ -37,7 +44,8 @@ def extract_all(
     if config.ostium_mm is not None and len(sources) > 1:
         raise InputError(f"ostium_mm={config.ostium_mm}: cannot serve {len(sources)} patients; make them one by one")
     folders = {source: output / name for source, name in zip(sources, _names(sources), strict=True)}
-    bad = each("Anatomies", list(sources), partial(_make, folders=folders, label=label, config=config))
+    make = partial(_make, folders=folders, config=config, reading={"label": label, "threshold": threshold})
+    bad = each("Anatomies", list(sources), make)
     rejected = {str(source): str(bad[source]) for source in sources if source in bad}
     if len(rejected) == len(sources):
         raise InputError(
@@ -47,9 +55,9 @@ def extract_all(
     return [folders[source] for source in sources if source not in bad], rejected
 
 
-def _make(source: Path, *, folders: dict[Path, Path], label: int | str | None, config: AnatomyConfig) -> None:
+def _make(source: Path, *, folders: dict[Path, Path], reading: dict[str, Any], config: AnatomyConfig) -> None:
     folder = folders[source]
-    write_anatomy(extract_anatomy(read_source(source, label=label), name=folder.name, config=config), output=folder)
+    write_anatomy(extract_anatomy(read_source(source, **reading), name=folder.name, config=config), output=folder)
 
 
 def _names(sources: Sequence[Path]) -> list[str]:

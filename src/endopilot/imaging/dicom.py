@@ -7,10 +7,12 @@ does not come back from some damaged files.
 
 from __future__ import annotations
 
+import os
+import re
 import warnings
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +26,7 @@ from pydicom.uid import UID, AllTransferSyntaxes
 
 from endopilot.errors import InputError
 from endopilot.imaging.dicom_phases import PHASE_TAGS, choose_phase, slices_text
-from endopilot.imaging.geometry import Fields, Geometry, geometry, plane
+from endopilot.imaging.geometry import Geometry, plane, slice_grid
 from endopilot.progress import progress
 from endopilot.types import Volume
 
@@ -63,15 +65,14 @@ _DECODED = (*_UNCOMPRESSED, _DEFLATED, *_ENCAPSULATED)
 _PIXELS_BEGIN = (b"\xe0\x7f\x10\x00OB\0\0\xff\xff\xff\xff", b"\xe0\x7f\x10\x00OW\0\0\xff\xff\xff\xff")
 _PIXELS_END = b"\xfe\xff\xdd\xe0\0\0\0\0"
 
-_SPACING_TOLERANCE = 0.05
-"""Slice distances may differ from their median by this share: positions are written with few digits."""
+_PREAMBLE = 128
+_MOST_NAMED = 10
 _FEWEST_SLICES = 4
 _HU_TYPES = ("", "HU")
 _PERHAPS_HU_TYPES = ("US", "HU_MOD")
 """RescaleType of HU that the scanner modified, and of converters that leave the type open (unspecified)."""
 _AIR_HU = -1024.0
 """What pixels are given that lie outside the scanned circle (PixelPaddingValue)."""
-_FIELDS = Fields("ImageOrientationPatient and ImagePositionPatient", "PixelSpacing", "ImagePositionPatient")
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,13 +130,13 @@ def read_series(path: Path, series: str | None, phase: str | None = None) -> Vol
         InputError: there is no image or more than one series, or the series is no plain CT volume.
     """
     folder = path if path.is_dir() else path.parent
-    slices = _read_headers(sorted(file for file in (folder.rglob("*") if path == folder else folder.iterdir())))
+    slices, left_out = _read_headers(_files(folder, deep=path == folder))
     if not slices:
         raise InputError(f"{path}: no DICOM image here; give the folder that holds the slices of a CT series")
     if path != folder:
         slices = [slice_ for slice_ in slices if slice_.series_uid == _series_of(path, slices)]
     chosen = _choose(slices, series, folder)
-    notes = _check_slices(chosen, folder)
+    notes = [*_check_slices(chosen, folder), *left_out]
     first = chosen[0]
     axes, normal = plane(first.orientation, first.spacing_mm, path=first.path)
     of_phase, phase_notes = choose_phase(
@@ -147,36 +148,80 @@ def read_series(path: Path, series: str | None, phase: str | None = None) -> Vol
     )
     ordered, place = _geometry([chosen[index] for index in of_phase], axes, normal, folder)
     voxels, pixel_notes = _read_pixels(ordered)
-    return Volume(
-        voxels,
-        place.spacing_mm,
-        place.origin_mm,
-        place.direction,
-        tuple(f"{folder.name}: {note}" for note in (*notes, *phase_notes, *pixel_notes)) + place.notes,
-        tuple(sorted(slice_.path for slice_ in ordered)),
-    )
+    volume = place.volume(voxels, tuple(sorted(slice_.path for slice_ in ordered)))
+    said = tuple(f"{folder.name}: {note}" for note in (*notes, *phase_notes, *pixel_notes))
+    return replace(volume, notes=(*said, *volume.notes))
 
 
-def _read_headers(files: Sequence[Path]) -> list[_Slice]:
-    """Return the headers of DICOM images, other files and scout views left out."""
-    found = []
+def _files(folder: Path, *, deep: bool) -> list[Path]:
+    """Return all that lies in a folder, and in its subfolders if `deep`: links to folders are not followed.
+
+    Raises:
+        InputError: a folder may not be read.
+    """
+
+    def refuse(error: OSError) -> None:
+        raise InputError(f"{error.filename}: may not be read ({error.strerror}); ask for access to it") from error
+
+    found: list[Path] = []
+    for parent, folders, names in os.walk(folder, onerror=refuse):
+        links = (name for name in folders if Path(parent, name).is_symlink())
+        found += [Path(parent, name) for name in (*names, *links)]
+        if not deep:
+            break
+    return sorted(found)
+
+
+def _read_headers(files: Sequence[Path]) -> tuple[list[_Slice], list[str]]:
+    """Return the headers of DICOM images, scout views left out, and what is to be noted of other files.
+
+    Among the other files may be slices whose content is lost: what is named as the slices are and is no text is
+    refused, and so is what says of itself that it is an image.
+    """
+    found, others = [], []
     # pydicom's warnings quote header values; none may reach a log.
     with progress("Reading DICOM headers", len(files)) as advance, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for file in files:
             advance()
-            if not file.is_file():
-                continue
             try:
+                if not file.is_file():
+                    raise InvalidDicomError
                 header = pydicom.dcmread(file, stop_before_pixels=True, specific_tags=list(_TAGS))
-                if "Rows" in header and "LOCALIZER" not in (header.get("ImageType") or ()):
+                if "Rows" not in header:
+                    if "Image Storage" in UID(header.file_meta.get("MediaStorageSOPClassUID", "Image Storage")).name:
+                        raise EOFError("cut short")
+                    others.append((file, False))
+                elif "LOCALIZER" not in (header.get("ImageType") or ()):
                     found.append(_slice(file, header))
             except InvalidDicomError:
-                continue
+                others.append((file, _is_no_text(file)))
+            except PermissionError as error:
+                raise InputError(f"{file}: may not be read ({error.strerror}); ask for access to it") from error
             except Exception:
                 # pydicom's message may quote the header, so it is not passed on.
                 raise InputError(f"{file}: its DICOM header is damaged; copy or export the series again") from None
-    return found
+    suffixes = {_kind_of_suffix(slice_.path) for slice_ in found}
+    for file, perhaps_slice in others:
+        if perhaps_slice and _kind_of_suffix(file) in suffixes:
+            raise InputError(
+                f"{file}: is named as the slices beside it are, but is no DICOM file (empty, cut short, without "
+                "preamble, or a broken link); copy or export it again, or move it away"
+            )
+    names = [file.name for file, _ in others]
+    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    return found, [f"no DICOM image and left out: {', '.join(names[:_MOST_NAMED])}{more}"] if names else []
+
+
+def _is_no_text(file: Path) -> bool:
+    """Return whether a file that is no DICOM may be the rest of one: it is empty, not there, or holds zero bytes."""
+    content = file.open("rb").read(_PREAMBLE + 4) if file.is_file() else b""
+    return not content or b"\0" in content
+
+
+def _kind_of_suffix(file: Path) -> str:
+    """Return a file's suffix, its digits alike, as they are the last part of a UID; hidden files have names alone."""
+    return file.name if file.name.startswith(".") else re.sub(r"\d+", "0", file.suffix.lower())
 
 
 def _slice(file: Path, header: Dataset) -> _Slice:
@@ -315,10 +360,9 @@ def _geometry(
     """Return slices in order, and where they lie (DICOM PS3.3 C.7.6.2.1.1); gaps are refused."""
     positions = np.array([slice_.position for slice_ in slices])
     order = np.argsort(positions @ normal, kind="stable")
-    positions = positions[order]
-    steps = np.diff(positions @ normal)
+    steps = np.diff(positions[order] @ normal)
     usual = float(np.median(steps))
-    gaps = np.flatnonzero(np.abs(steps - usual) > _SPACING_TOLERANCE * usual)
+    gaps = np.flatnonzero(np.round(steps / usual) > 1)
     if gaps.size:
         first = gaps[0]
         count = "1 irregular slice distance" if gaps.size == 1 else f"{gaps.size} irregular slice distances"
@@ -326,16 +370,8 @@ def _geometry(
             f"{folder}: {count}, the first {steps[first]:.2f} mm instead of {usual:.2f} mm after slice {first + 1}: "
             "slices are missing; export the whole series again"
         )
-    travel = (positions[-1] - positions[0]) / (len(slices) - 1)
-    step = float(np.linalg.norm(travel))
-    place = geometry(
-        np.column_stack([axes, travel / step]),
-        np.array([*slices[0].spacing_mm[::-1], step]),
-        positions[0],
-        (slices[0].size[1], slices[0].size[0], len(slices)),
-        path=folder,
-        fields=_FIELDS,
-    )
+    one = slices[0]
+    place = slice_grid(positions[order], np.arange(len(slices)), axes, one.spacing_mm, one.size, path=folder)
     return [slices[i] for i in order], place
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.errors import InputError
+from endopilot.imaging.geometry import farthest_apart_mm
 from endopilot.imaging.overlap import mask_like
 from endopilot.imaging.volume import read_volume, write_volume
 from endopilot.progress import progress
@@ -68,8 +69,11 @@ def segment_by_program(
             raise InputError(f"{program} wrote a {answer} that is no volume; {mend}") from error
     inside = _labelled(found, label, program)
     on_grid = Volume(inside, found.spacing_mm, found.origin_mm, found.direction)
-    if found.voxels.shape != volume.voxels.shape or not np.allclose(found.origin_mm, volume.origin_mm, atol=1e-2):
+    size = volume.voxels.shape[::-1]
+    if inside.shape != volume.voxels.shape or farthest_apart_mm(found, volume, size) > volume.spacing_mm.min() / 2:
         inside = mask_like(LumenMask(on_grid), volume)
+        if not inside.any():
+            raise InputError(f"{program} wrote a mask that lies outside the CT; {mend}")
     on_ct = Volume(inside, volume.spacing_mm, volume.origin_mm, volume.direction)
     return LumenMask(on_ct, warnings=found.notes)
 

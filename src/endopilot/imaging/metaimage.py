@@ -15,8 +15,8 @@ from jaxtyping import Float
 
 from endopilot.errors import InputError
 from endopilot.imaging.geometry import Fields, Geometry, converted, geometry
+from endopilot.imaging.segments import ImageFile
 from endopilot.imaging.voxels import Encoding, read_detached_voxels, read_voxels
-from endopilot.types import Volume
 
 _LONGEST_LINE = 1 << 16
 _MOST_LINES = 1000
@@ -44,7 +44,7 @@ _FROM = ("RL", "AP", "IS")
 """Letters of `AnatomicalOrientation` along x, y and z of LPS: where an axis along it begins, and one against it."""
 
 
-def read_metaimage(path: Path) -> Volume:
+def read_metaimage(path: Path) -> ImageFile:
     """Read a MetaImage file.
 
     Raises:
@@ -61,7 +61,7 @@ def read_metaimage(path: Path) -> Volume:
         else:
             voxels, others = read_detached_voxels(source, encoding, size[::-1], header=path)
             files = (path, *others)
-    return Volume(voxels, place.spacing_mm, place.origin_mm, place.direction, place.notes, files)
+    return ImageFile(place.volume(voxels, files), voxels[None])
 
 
 def _header(stream: BufferedIOBase, path: Path) -> dict[str, str]:

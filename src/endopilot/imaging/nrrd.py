@@ -7,7 +7,7 @@ layers where segments overlap; its header names each segment's layer and value.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import replace
 from io import BufferedIOBase
 from pathlib import Path
 
@@ -15,10 +15,9 @@ import numpy as np
 from jaxtyping import Shaped
 
 from endopilot.errors import InputError
-from endopilot.imaging.geometry import Fields, Geometry, converted, geometry_of_steps
-from endopilot.imaging.segments import Segment
+from endopilot.imaging.geometry import Fields, Geometry, converted, geometry, parted
+from endopilot.imaging.segments import ImageFile, Segment
 from endopilot.imaging.voxels import Encoding, read_detached_voxels, read_voxels
-from endopilot.types import Volume
 
 _LONGEST_HEADER = 1 << 20
 _TO_LPS = {"right": -1.0, "left": 1.0, "anterior": -1.0, "posterior": 1.0, "superior": 1.0, "inferior": -1.0}
@@ -50,27 +49,7 @@ _SYNONYMS = {"datafile": "data file", "lineskip": "line skip", "byteskip": "byte
 _FIELDS = Fields("space directions", "space directions", "space origin")
 
 
-@dataclass(frozen=True, eq=False)
-class NrrdImage:
-    """What an NRRD file holds.
-
-    Attributes:
-        volume: the voxels, of the first layer where there are several.
-        layers: all voxels, layer first: one for a plain volume.
-        segments: of a segmentation, where the header names them.
-    """
-
-    volume: Volume
-    layers: Shaped[np.ndarray, "layers nz ny nx"]
-    segments: tuple[Segment, ...]
-
-
-def plain(volume: Volume) -> NrrdImage:
-    """Return a volume as a file of one layer whose segments have no names."""
-    return NrrdImage(volume, volume.voxels[None], ())
-
-
-def read_nrrd(path: Path) -> NrrdImage:
+def read_nrrd(path: Path) -> ImageFile:
     """Read an NRRD file.
 
     Raises:
@@ -78,8 +57,9 @@ def read_nrrd(path: Path) -> NrrdImage:
     """
     with path.open("rb") as stream:
         fields, keys = _header(stream, path)
-        sizes, domain = _axes(fields, path)
-        place = _geometry(fields, domain, tuple(sizes[axis] for axis in domain), path)
+        sizes, vectors = _axes(fields, path)
+        domain = [axis for axis, vector in enumerate(vectors) if vector is not None]
+        place = _geometry(fields, vectors, tuple(sizes[axis] for axis in domain), path)
         segments = _segments(keys, path)
         extra = [axis for axis in range(len(sizes)) if axis not in domain]
         count = int(np.prod([sizes[axis] for axis in extra], dtype=float))
@@ -92,8 +72,7 @@ def read_nrrd(path: Path) -> NrrdImage:
     # The first axis of the file is the fastest, and so the last of the array.
     order = [len(sizes) - 1 - axis for axis in (*extra, *reversed(domain))]
     layers = values.transpose(order).reshape(count, *(sizes[axis] for axis in reversed(domain)))
-    volume = Volume(layers[0], place.spacing_mm, place.origin_mm, place.direction, place.notes, files)
-    return NrrdImage(volume, layers, segments)
+    return ImageFile(place.volume(layers[0], files), layers, segments)
 
 
 def _header(stream: BufferedIOBase, path: Path) -> tuple[dict[str, str], dict[str, str]]:
@@ -127,8 +106,8 @@ def _header(stream: BufferedIOBase, path: Path) -> tuple[dict[str, str], dict[st
     return fields, keys
 
 
-def _axes(fields: dict[str, str], path: Path) -> tuple[list[int], list[int]]:
-    """Return the size of every axis, and which three of them run through space."""
+def _axes(fields: dict[str, str], path: Path) -> tuple[list[int], list[list[float] | None]]:
+    """Return the size of every axis and the step along each, None but for three that run through space."""
     try:
         sizes = [int(word) for word in fields.get("sizes", "").split()]
         dimension = int(fields.get("dimension", ""))
@@ -138,22 +117,15 @@ def _axes(fields: dict[str, str], path: Path) -> tuple[list[int], list[int]]:
         raise InputError(f"{path}: its dimension and sizes describe no image; export it again")
     if "space" not in fields:
         raise InputError(f"{path}: has no orientation (no space in its header); export it with its space directions")
-    vectors = _vectors(fields, len(sizes), path)
-    domain = [axis for axis, vector in enumerate(vectors) if vector is not None]
-    if len(domain) != 3:
-        shape = "×".join(map(str, sizes))
-        raise InputError(f"{path}: {shape} voxels with {len(domain)} axes in space are no volume; give a 3-D volume")
-    return sizes, domain
-
-
-def _vectors(fields: dict[str, str], count: int, path: Path) -> list[list[float] | None]:
-    """Return the step along each axis of the file, None for one that does not run through space."""
     text = fields.get("space directions", "")
     words = re.findall(r"none|\([^()]*\)", text)
     vectors = [None if word == "none" else _vector(word, "space directions", path) for word in words]
-    if len(words) != count or re.sub(r"none|\([^()]*\)", "", text).strip():
+    if len(words) != len(sizes) or re.sub(r"none|\([^()]*\)", "", text).strip():
         raise InputError(f"{path}: space directions {text[:80]!r} are not one vector an axis; export it again")
-    return vectors
+    if (count := len(words) - vectors.count(None)) != 3:
+        shape = "×".join(map(str, sizes))
+        raise InputError(f"{path}: {shape} voxels with {count} axes in space are no volume; give a 3-D volume")
+    return sizes, vectors
 
 
 def _vector(text: str, field: str, path: Path) -> list[float]:
@@ -171,25 +143,24 @@ def _kinds(fields: dict[str, str], axes: list[int]) -> list[str]:
     return [kinds[axis].lower() for axis in axes if axis < len(kinds)]
 
 
-def _geometry(fields: dict[str, str], domain: list[int], size: tuple[int, ...], path: Path) -> Geometry:
+def _geometry(fields: dict[str, str], vectors: list[list[float] | None], size: tuple[int, ...], path: Path) -> Geometry:
     to_lps = _to_lps(fields["space"], path)
     if "space origin" not in fields:
         raise InputError(f"{path}: has no place (no space origin in its header); export it with its space origin")
     origin = np.array(_vector(fields["space origin"], "space origin", path))
-    vectors = _vectors(fields, len(fields["sizes"].split()), path)
-    steps = np.array([vectors[axis] for axis in domain], dtype=float).T
+    steps = np.array([vector for vector in vectors if vector is not None]).T
     units = set(re.findall(r'"([^"]*)"', fields.get("space units", ""))) - {""} or {"mm"}
     if len(units) > 1 or ("space units" in fields and '"' not in fields["space units"]):
         raise InputError(f"{path}: space units {fields['space units'][:60]!r} are not one unit; export it in mm")
     lengths = np.linalg.norm(steps, axis=0)
     factor, notes = converted(units.pop(), lengths, path=path, field="space units")
     spacings = fields.get("spacings", "").split()
-    given = [word for axis, word in enumerate(spacings) if axis in domain and word.lower() != "nan"]
+    given = [word for word, vector in zip(spacings, vectors, strict=False) if vector and word.lower() != "nan"]
     if given and not _same(given, lengths):
         raise InputError(f"{path}: spacings {' '.join(given)} contradict space directions; export it again")
     steps, origin = to_lps[:, None] * steps * factor, to_lps * origin * factor
-    place = geometry_of_steps(steps, origin, (size[0], size[1], size[2]), path=path, fields=_FIELDS)
-    return Geometry(place.spacing_mm, place.origin_mm, place.direction, (*notes, *place.notes))
+    place = geometry(*parted(steps), origin, (size[0], size[1], size[2]), path=path, fields=_FIELDS)
+    return replace(place, notes=(*notes, *place.notes))
 
 
 def _same(words: list[str], lengths: np.ndarray) -> bool:

@@ -12,6 +12,7 @@ from pydantic import model_validator
 
 from endopilot.errors import InputError
 from endopilot.imaging.contrast import refuse_other_units, refuse_without_contrast
+from endopilot.imaging.geometry import farthest_apart_mm
 from endopilot.imaging.volume import read_volume
 from endopilot.plugins import Registry
 from endopilot.settings import Finite, settings
@@ -131,6 +132,20 @@ def _refuse_no_mask(mask: object, volume: Volume, name: str) -> None:
             f"method: {name!r} returned {voxels.dtype} voxels of shape {voxels.shape}; return bool voxels on the "
             f"volume's grid, {volume.voxels.shape}"
         )
+    apart = farthest_apart_mm(mask.volume, volume, voxels.shape[::-1])
+    if not apart < volume.spacing_mm.min() / 2:  # nor NaN
+        raise InputError(
+            f"method: {name!r} returned a mask on another grid, up to {apart:.3g} mm from the volume's; return it with "
+            "the volume's spacing_mm, origin_mm and direction"
+        )
+    if (ostium := mask.ostium) is not None:
+        values = np.concatenate([np.ravel(ostium.position), np.ravel(ostium.direction)]).astype(float)
+        if len(values) != 6 or not np.isfinite(values).all() or not values[3:].any():
+            shown = " ".join(f"{value:g}" for value in values)
+            raise InputError(
+                f"method: {name!r} returned an ostium of position and direction {shown}; return three finite numbers "
+                "each, or ostium=None"
+            )
 
 
 def _refuse_seeds_outside(volume: Volume, config: SegmentConfig) -> None:

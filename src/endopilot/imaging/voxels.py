@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BufferedIOBase
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from jaxtyping import Shaped
@@ -28,26 +28,10 @@ _GZIP = b"\x1f\x8b"
 
 
 def opened(path: Path) -> BufferedIOBase:
-    """Open a file that may be packed by gzip, whatever its name says.
-
-    Raises:
-        InputError: it may not be read.
-    """
-    try:
-        with path.open("rb") as stream:
-            packed = stream.read(2) == _GZIP
-        return gzip.open(path, "rb") if packed else path.open("rb")
-    except OSError as error:
-        unreadable(path, error)
-
-
-def unreadable(path: Path, error: OSError) -> NoReturn:
-    """Say why the system does not read a file.
-
-    Raises:
-        InputError: always.
-    """
-    raise InputError(f"{path}: cannot be read ({error.strerror or 'damaged'}); check the path") from error
+    """Open a file that may be packed by gzip, whatever its name says."""
+    with path.open("rb") as stream:
+        packed = stream.read(2) == _GZIP
+    return gzip.open(path, "rb") if packed else path.open("rb")
 
 
 @dataclass(frozen=True)
