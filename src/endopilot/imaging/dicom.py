@@ -47,6 +47,7 @@ _TAGS = (
     "RescaleSlope",
     "RescaleIntercept",
     "RescaleType",
+    "LossyImageCompression",
     "PhotometricInterpretation",
     "PixelRepresentation",
     "PixelPaddingValue",
@@ -59,6 +60,7 @@ _UNCOMPRESSED = ("1.2.840.10008.1.2", "1.2.840.10008.1.2.1", "1.2.840.10008.1.2.
 _DEFLATED = "1.2.840.10008.1.2.1.99"
 _RLE = "1.2.840.10008.1.2.5"
 _ENCAPSULATED = (_RLE, *(f"1.2.840.10008.1.2.4.{number}" for number in (50, 51, 57, 70, 80, 81, 90, 91)))
+_LOSSY = tuple(f"1.2.840.10008.1.2.4.{number}" for number in (50, 51, 81))
 _DECODED = (*_UNCOMPRESSED, _DEFLATED, *_ENCAPSULATED)
 
 # Encapsulated pixels begin and end with these bytes (PS3.5 A.4).
@@ -85,6 +87,7 @@ class _Slice:
         series_number: SeriesNumber.
         modality: Modality.
         transfer_syntax: UID of the encoding.
+        lossy: whether the pixels are no longer those of the scanner.
         size: Rows, Columns.
         bytes_per_value: of the stored pixels.
         samples: values a pixel.
@@ -104,6 +107,7 @@ class _Slice:
     series_number: int | None
     modality: str
     transfer_syntax: str
+    lossy: bool
     size: tuple[int, int]
     bytes_per_value: int
     samples: int
@@ -189,7 +193,8 @@ def _read_headers(files: Sequence[Path]) -> tuple[list[_Slice], list[str]]:
                     raise InvalidDicomError
                 header = pydicom.dcmread(file, stop_before_pixels=True, specific_tags=list(_TAGS))
                 if "Rows" not in header:
-                    if "Image Storage" in UID(header.file_meta.get("MediaStorageSOPClassUID", "Image Storage")).name:
+                    meta = header.file_meta
+                    if "TransferSyntaxUID" not in meta or "Image Storage" in meta.MediaStorageSOPClassUID.name:
                         raise EOFError("cut short")
                     others.append((file, False))
                 elif "LOCALIZER" not in (header.get("ImageType") or ()):
@@ -232,12 +237,14 @@ def _slice(file: Path, header: Dataset) -> _Slice:
         return tuple(float(x) for x in np.atleast_1d(value)) if value not in (None, "") else ()
 
     number = header.get("SeriesNumber")
+    syntax = str(header.file_meta.get("TransferSyntaxUID", _UNCOMPRESSED[0]))
     return _Slice(
         path=file,
         series_uid=str(header.get("SeriesInstanceUID", "")),
         series_number=None if number is None else int(number),
         modality=str(header.get("Modality") or "CT"),
-        transfer_syntax=str(header.file_meta.get("TransferSyntaxUID", _UNCOMPRESSED[0])),
+        transfer_syntax=syntax,
+        lossy=syntax in _LOSSY or header.get("LossyImageCompression") == "01",
         size=(int(header.Rows), int(header.Columns)),
         bytes_per_value=int(header.get("BitsAllocated") or 16) // 8,
         samples=int(header.get("SamplesPerPixel") or 1),
@@ -351,7 +358,10 @@ def _check_slices(slices: Sequence[_Slice], folder: Path) -> list[str]:
         if np.ptp(np.array(values, dtype=float), axis=0).max() > 1e-3:
             raise InputError(f"{folder}: {tag} differ between slices; give a folder with one volume alone")
     open_types = sorted({slice_.rescale_type for slice_ in slices} & set(_PERHAPS_HU_TYPES))
-    return [f"RescaleType {', '.join(open_types)} was taken as HU"] if open_types else []
+    notes = [f"RescaleType {', '.join(open_types)} was taken as HU"] if open_types else []
+    if lossy := next((slice_ for slice_ in slices if slice_.lossy), None):
+        notes.append(f"compressed with loss ({_syntax_name(lossy.transfer_syntax)}): HU are not those of the scanner")
+    return notes
 
 
 def _geometry(
@@ -394,8 +404,9 @@ def _read_pixels(slices: Sequence[_Slice]) -> tuple[np.ndarray, list[str]]:
             except Exception:
                 # The decoder's message may quote the header, so it is not passed on.
                 raise InputError(
-                    f"{slice_.path}: its pixels cannot be decoded (truncated or damaged); "
-                    "copy or export the series again"
+                    f"{slice_.path}: its pixels cannot be decoded (truncated or damaged "
+                    f"{_syntax_name(slice_.transfer_syntax)}); copy or export the series again, or decompress it "
+                    "(gdcmconv --raw)"
                 ) from None
             padded += _pad(slice_, plane)
             advance()
