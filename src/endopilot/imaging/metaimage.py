@@ -16,7 +16,7 @@ from jaxtyping import Float
 from endopilot.errors import InputError
 from endopilot.imaging.geometry import Fields, Geometry, converted, geometry
 from endopilot.imaging.segments import ImageFile
-from endopilot.imaging.voxels import Encoding, read_detached_voxels, read_voxels
+from endopilot.imaging.voxels import Encoding, read_voxels_beside
 
 _LONGEST_LINE = 1 << 16
 _MOST_LINES = 1000
@@ -56,11 +56,8 @@ def read_metaimage(path: Path) -> ImageFile:
         place = _geometry(fields, size, path)
         encoding = _encoding(fields, path)
         source = fields["ElementDataFile"]
-        if source.split("\n")[0].upper() == "LOCAL":
-            voxels, files = read_voxels(stream, encoding, size[::-1], path=path), (path,)
-        else:
-            voxels, others = read_detached_voxels(source, encoding, size[::-1], header=path)
-            files = (path, *others)
+        beside = None if source.upper() == "LOCAL" else source
+        voxels, files = read_voxels_beside(beside, stream, encoding, size[::-1], header=path)
     return ImageFile(place.volume(voxels, files), voxels[None])
 
 

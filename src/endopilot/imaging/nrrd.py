@@ -17,7 +17,7 @@ from jaxtyping import Shaped
 from endopilot.errors import InputError
 from endopilot.imaging.geometry import Fields, Geometry, converted, geometry, parted
 from endopilot.imaging.segments import ImageFile, Segment
-from endopilot.imaging.voxels import Encoding, read_detached_voxels, read_voxels
+from endopilot.imaging.voxels import Encoding, read_voxels_beside
 
 _LONGEST_HEADER = 1 << 20
 _TO_LPS = {"right": -1.0, "left": 1.0, "anterior": -1.0, "posterior": 1.0, "superior": 1.0, "inferior": -1.0}
@@ -197,10 +197,7 @@ def _values(
         raise InputError(f"{path}: endian {endian!r} is neither little nor big; export it again")
     dtype = np.dtype((">" if endian == "big" else "<") + _TYPES[kind])
     encoding = Encoding(dtype, packing, _skip(fields, "line skip", 0, path), _skip(fields, "byte skip", -1, path))
-    if "data file" in fields:
-        values, files = read_detached_voxels(fields["data file"], encoding, sizes[::-1], header=path)
-        return values, (path, *files)
-    return read_voxels(stream, encoding, sizes[::-1], path=path), (path,)
+    return read_voxels_beside(fields.get("data file"), stream, encoding, sizes[::-1], header=path)
 
 
 def _skip(fields: dict[str, str], name: str, least: int, path: Path) -> int:
