@@ -13,7 +13,7 @@ from scipy import ndimage
 from endopilot.errors import place_text
 from endopilot.imaging.contour import CALCIUM
 from endopilot.imaging.grid import connected_components, distance_to_outside
-from endopilot.imaging.openings import box_around, openings
+from endopilot.imaging.ostium import box_around, openings
 from endopilot.lines import length_along
 from endopilot.types import Volume
 

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 
 from endopilot.errors import InputError
 from endopilot.imaging.geometry import farthest_apart_mm
-from endopilot.imaging.overlap import mask_like
+from endopilot.imaging.grid import mask_like
 from endopilot.imaging.volume import read_volume, write_volume
 from endopilot.progress import progress
 from endopilot.types import Insertion, LumenMask, Volume

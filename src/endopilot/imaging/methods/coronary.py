@@ -30,11 +30,9 @@ from endopilot.imaging.grid import (
     interpolate_like,
     resample,
 )
-from endopilot.imaging.openings import TO_WALL_MM, box_around, openings, opens_into
-from endopilot.imaging.ostium import find_ostium
+from endopilot.imaging.ostium import TO_WALL_MM, box_around, find_ostium, openings, opens_into
 from endopilot.imaging.segment import SegmentConfig
-from endopilot.imaging.vessel_tracking import track_tree
-from endopilot.imaging.vesselness import vesselness
+from endopilot.imaging.vessel_tracking import track_tree, vesselness
 from endopilot.lines import length_along
 from endopilot.progress import progress
 from endopilot.types import Insertion, LumenMask, Volume
