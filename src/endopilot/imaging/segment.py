@@ -28,8 +28,8 @@ METHODS = Registry(
     shipped={
         "aorta": "endopilot.imaging.methods.aorta:segment_lumen",
         "coronary": "endopilot.imaging.methods.coronary:segment_lumen",
-        "nnunet": "endopilot.imaging.methods.nnunet:METHOD",
-        "totalsegmentator": "endopilot.imaging.methods.totalsegmentator:METHOD",
+        "nnunet": "endopilot.imaging.methods.programs:NNUNET",
+        "totalsegmentator": "endopilot.imaging.methods.programs:TOTALSEGMENTATOR",
     },
     group="endopilot.segmentation",
 )

@@ -1,6 +1,9 @@
-"""Segmentation by another program, run as a subprocess with the weights that its user has.
+"""Segmentation by another program, run as a subprocess with the weights and the licence that its user has.
 
 The program gets the CT in a temporary folder, as a file with no header but its geometry, and writes its labels there.
+TotalSegmentator (https://github.com/wasserth/TotalSegmentator): its task `coronary_arteries` needs a licence of the
+user's own; `--options task=total structure=aorta` does not. nnU-Net v2 (https://github.com/MIC-DKFZ/nnUNet): the user's
+own trained model.
 """
 
 from __future__ import annotations
@@ -15,9 +18,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.errors import InputError
+from endopilot.files import read_json
 from endopilot.imaging.geometry import farthest_apart_mm
 from endopilot.imaging.grid import mask_like
-from endopilot.imaging.volume import read_volume, write_volume
+from endopilot.imaging.segment import SegmentationMethod, SegmentConfig
+from endopilot.imaging.volume import SUFFIXES, read_volume, write_volume
 from endopilot.progress import progress
 from endopilot.types import Insertion, LumenMask, Volume
 
@@ -26,6 +31,74 @@ _SEED_MM = 5.0
 _MOUTH_MM = 8.0
 """The vessel's direction at the first seed is that to the middle of the lumen within this distance."""
 _LONGEST_MESSAGE = 200
+_TOTALSEGMENTATOR = {"task": "coronary_arteries", "structure": "", "device": ""}
+"""Task (`-ta`); structure whose mask is taken, by default the task's name; device (`-d`): gpu, cpu, gpu:1."""
+_NNUNET = {"model": "", "device": "", "label": ""}
+"""Folder of the trained model, with dataset.json and fold_0, fold_1, …; device: cuda, cpu, mps; label of the lumen."""
+
+
+def by_totalsegmentator(volume: Volume, config: SegmentConfig) -> LumenMask:
+    """Return the mask of one structure as TotalSegmentator finds it; the first seed, if any, is the ostium.
+
+    Raises:
+        InputError: TotalSegmentator is missing, fails, or writes no or an empty mask.
+    """
+    settings = config.settings(_TOTALSEGMENTATOR)
+    task = settings["task"]
+    structure = settings["structure"] or task
+    chosen = ["--roi_subset", structure] if task == "total" else []
+    device = ["--device", settings["device"]] if settings["device"] else []
+    mask = segment_by_program(
+        volume,
+        lambda source, target: [
+            *("TotalSegmentator", "-i", str(source / "ct.nii.gz"), "-o", str(target), "--task", task),
+            *chosen,
+            *device,
+            "--quiet",
+        ],
+        given="ct.nii.gz",
+        answer=f"{structure}.nii.gz",
+        mend="install TotalSegmentator in an environment of its own, with the task's weights and licence, and see that "
+        f"`TotalSegmentator -i ct.nii.gz -o out --task {task}` runs",
+    )
+    return LumenMask(mask.volume, ostium_at_seeds(mask, config.seeds))
+
+
+def by_nnunet(volume: Volume, config: SegmentConfig) -> LumenMask:
+    """Return the lumen as a trained nnU-Net finds it, all folds of it together; the first seed, if any, is the ostium.
+
+    Raises:
+        InputError: no or an unfit model is given, nnU-Net is missing, fails, or writes no or an empty mask.
+    """
+    settings = config.settings(_NNUNET)
+    model, label = Path(settings["model"]), settings["label"]
+    folds = sorted(folder.name.removeprefix("fold_") for folder in model.glob("fold_*")) if settings["model"] else []
+    if not folds or not (model / "dataset.json").is_file():
+        raise InputError(
+            f"options: model={settings['model']!r} holds no trained nnU-Net; give --options model=FOLDER, that with "
+            "dataset.json and fold_0, such as …/nnUNetTrainer__nnUNetPlans__3d_fullres"
+        )
+    if label and not label.isdecimal():
+        raise InputError(f"options: label={label!r} is no whole number; give the label of the lumen")
+    content = read_json(model / "dataset.json")
+    suffix = content.get("file_ending", ".nii.gz") if isinstance(content, dict) else ""
+    if suffix not in SUFFIXES:
+        raise InputError(f"{model}/dataset.json: file_ending {suffix!r} is unknown; known are {' '.join(SUFFIXES)}")
+    mask = segment_by_program(
+        volume,
+        lambda source, target: [
+            *("nnUNetv2_predict_from_modelfolder", "-i", str(source), "-o", str(target), "-m", str(model)),
+            *("-f", *folds),
+            *(("-device", settings["device"]) if settings["device"] else ()),
+            "--disable_progress_bar",
+        ],
+        given=f"ct_0000{suffix}",
+        answer=f"ct{suffix}",
+        label=int(label) if label else None,
+        mend="install nnunetv2 in an environment of its own, and see that `nnUNetv2_predict_from_modelfolder -m "
+        f"{model}` runs; without a GPU, give --options device=cpu",
+    )
+    return LumenMask(mask.volume, ostium_at_seeds(mask, config.seeds))
 
 
 def segment_by_program(
@@ -130,3 +203,8 @@ def _labelled(found: Volume, label: int | None, program: str) -> Bool[np.ndarray
     if label is not None and label not in labels:
         raise InputError(f"{program} marked {listed}, and no voxel with label {label}; choose with --options label=")
     return found.voxels == (labels[0] if label is None else label)
+
+
+TOTALSEGMENTATOR = SegmentationMethod(segment_lumen=by_totalsegmentator, options=_TOTALSEGMENTATOR)
+NNUNET = SegmentationMethod(segment_lumen=by_nnunet, options=_NNUNET, blood_pools=False)
+"""A model may be trained on any part of the body: a CT of the head holds no aorta and no heart chamber."""
