@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from endopilot.errors import place_text
+from endopilot.imaging.aortic_root import box_around, openings
 from endopilot.imaging.contour import CALCIUM
 from endopilot.imaging.grid import connected_components, distance_to_outside
-from endopilot.imaging.ostium import box_around, openings
 from endopilot.lines import length_along
 from endopilot.types import Volume
 

@@ -20,10 +20,9 @@ from endopilot.files import json_text, read_json, sha256, writing
 from endopilot.imaging import dicom_seg
 from endopilot.imaging.geometry import farthest_apart_mm
 from endopilot.imaging.grid import to_image
-from endopilot.imaging.metaimage import read_metaimage
 from endopilot.imaging.nifti import read_nifti
-from endopilot.imaging.nrrd import read_nrrd
 from endopilot.imaging.segments import ImageFile, inside_segment
+from endopilot.imaging.text_headers import read_metaimage, read_nrrd
 from endopilot.imaging.voxels import compact
 from endopilot.types import Insertion, LumenMask, Volume
 

@@ -17,7 +17,15 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from endopilot.errors import InputError
-from endopilot.imaging.aortic_root import AorticRoot, find_aortic_roots
+from endopilot.imaging.aortic_root import (
+    TO_WALL_MM,
+    AorticRoot,
+    box_around,
+    find_aortic_roots,
+    find_ostium,
+    openings,
+    opens_into,
+)
 from endopilot.imaging.contour import lumen_at_half_height
 from endopilot.imaging.coronary_doubts import FoundTree, Scan, coronary_doubts
 from endopilot.imaging.grid import (
@@ -28,7 +36,6 @@ from endopilot.imaging.grid import (
     interpolate_like,
     resample,
 )
-from endopilot.imaging.ostium import TO_WALL_MM, box_around, find_ostium, openings, opens_into
 from endopilot.imaging.segment import SegmentConfig
 from endopilot.imaging.vessel_tracking import track_tree, vesselness
 from endopilot.lines import length_along
