@@ -318,7 +318,7 @@ def test_files_that_are_no_slices_are_noted_by_name(series):
     (series / "DICOMDIR").write_bytes(_without_pixels(series, "1.2.840.10008.1.3.10"))
     (series / "elsewhere").symlink_to(series.parent)
     (note,) = read_volume(series).notes
-    assert note == "series: no DICOM image and left out: .DS_Store, DICOMDIR, elsewhere, readme, viewer.exe"
+    assert note == "series: without an image and left out: .DS_Store, DICOMDIR, elsewhere, readme, viewer.exe"
 
 
 def _without_pixels(folder, kind):

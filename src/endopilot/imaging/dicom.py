@@ -123,7 +123,8 @@ def read_series(path: Path, series: str | None, phase: str | None = None) -> Vol
     folder = path if path.is_dir() else path.parent
     slices, left_out = _read_headers(_files(folder, deep=path == folder))
     if not slices:
-        raise InputError(f"{path}: no DICOM image here; give the folder that holds the slices of a CT series")
+        said = f" ({left_out[0]})" if left_out else ""
+        raise InputError(f"{path}: no DICOM image here{said}; give the folder that holds the slices of a CT series")
     if path != folder:
         of_file = next((slice_.series[1] for slice_ in slices if slice_.path == path), None)
         if of_file is None:
@@ -205,7 +206,7 @@ def _read_headers(files: Sequence[Path]) -> tuple[list[_Slice], list[str]]:
             )
     names = [file.name for file, _ in others]
     more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
-    return found, [f"no DICOM image and left out: {', '.join(names[:_MOST_NAMED])}{more}"] if names else []
+    return found, [f"without an image and left out: {', '.join(names[:_MOST_NAMED])}{more}"] if names else []
 
 
 def _is_no_text(file: Path) -> bool:

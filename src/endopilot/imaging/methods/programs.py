@@ -12,10 +12,11 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from endopilot.errors import InputError
 from endopilot.files import read_json
@@ -48,8 +49,9 @@ def by_totalsegmentator(volume: Volume, config: SegmentConfig) -> LumenMask:
     structure = settings["structure"] or task
     chosen = ["--roi_subset", structure] if task == "total" else []
     device = ["--device", settings["device"]] if settings["device"] else []
-    mask = segment_by_program(
+    return segment_by_program(
         volume,
+        config.seeds,
         lambda source, target: [
             *("TotalSegmentator", "-i", str(source / "ct.nii.gz"), "-o", str(target), "--task", task),
             *chosen,
@@ -61,7 +63,6 @@ def by_totalsegmentator(volume: Volume, config: SegmentConfig) -> LumenMask:
         mend="install TotalSegmentator in an environment of its own, with the task's weights and licence, and see that "
         f"`TotalSegmentator -i ct.nii.gz -o out --task {task}` runs",
     )
-    return LumenMask(mask.volume, ostium_at_seeds(mask, config.seeds))
 
 
 def by_nnunet(volume: Volume, config: SegmentConfig) -> LumenMask:
@@ -84,8 +85,9 @@ def by_nnunet(volume: Volume, config: SegmentConfig) -> LumenMask:
     suffix = content.get("file_ending", ".nii.gz") if isinstance(content, dict) else ""
     if suffix not in SUFFIXES:
         raise InputError(f"{model}/dataset.json: file_ending {suffix!r} is unknown; known are {' '.join(SUFFIXES)}")
-    mask = segment_by_program(
+    return segment_by_program(
         volume,
+        config.seeds,
         lambda source, target: [
             *("nnUNetv2_predict_from_modelfolder", "-i", str(source), "-o", str(target), "-m", str(model)),
             *("-f", *folds),
@@ -98,11 +100,11 @@ def by_nnunet(volume: Volume, config: SegmentConfig) -> LumenMask:
         mend="install nnunetv2 in an environment of its own, and see that `nnUNetv2_predict_from_modelfolder -m "
         f"{model}` runs; without a GPU, give --options device=cpu",
     )
-    return LumenMask(mask.volume, ostium_at_seeds(mask, config.seeds))
 
 
 def segment_by_program(
     volume: Volume,
+    seeds: Sequence[tuple[float, float, float]],
     arguments: Callable[[Path, Path], Sequence[str]],
     *,
     given: str,
@@ -110,10 +112,11 @@ def segment_by_program(
     label: int | None = None,
     mend: str,
 ) -> LumenMask:
-    """Return the lumen that a program finds in a volume.
+    """Return the lumen that a program finds in a volume; the ostium is at the first seed.
 
     Args:
         volume: CT in HU.
+        seeds: points in the lumen, LPS mm; none where the ostium is not known.
         arguments: program and arguments, from the folder that holds the CT and the folder for its answer.
         given: name of the CT's file.
         answer: name of the file that the program is to write.
@@ -121,7 +124,8 @@ def segment_by_program(
         mend: what to do where the program is missing or fails.
 
     Raises:
-        InputError: the program is not there, fails, writes no such file, or marks nothing.
+        InputError: the program is not there, fails, writes no such file, or marks nothing in the CT; or a seed lies
+            farther than 5 mm from the lumen.
     """
     with tempfile.TemporaryDirectory(prefix="endopilot-") as temporary:
         source, target = Path(temporary) / "ct", Path(temporary) / "answer"
@@ -141,39 +145,28 @@ def segment_by_program(
         except InputError as error:
             raise InputError(f"{program} wrote a {answer} that is no volume; {mend}") from error
     inside = _labelled(found, label, program)
-    on_grid = Volume(inside, found.spacing_mm, found.origin_mm, found.direction)
     size = volume.voxels.shape[::-1]
     if inside.shape != volume.voxels.shape or farthest_apart_mm(found, volume, size) > volume.spacing_mm.min() / 2:
-        inside = mask_like(LumenMask(on_grid), volume)
+        inside = mask_like(LumenMask(replace(found, voxels=inside)), volume)
         if not inside.any():
             raise InputError(f"{program} wrote a mask that lies outside the CT; {mend}")
-    on_ct = Volume(inside, volume.spacing_mm, volume.origin_mm, volume.direction)
-    return LumenMask(on_ct, warnings=found.notes)
+    on_ct = replace(volume, voxels=inside)
+    return LumenMask(on_ct, _ostium_at_seeds(on_ct, seeds) if seeds else None, warnings=found.notes)
 
 
-def ostium_at_seeds(mask: LumenMask, seeds: Sequence[tuple[float, float, float]]) -> Insertion | None:
-    """Return the ostium at the first seed, with the direction into the lumen; None without seeds.
-
-    Raises:
-        InputError: a seed lies farther than 5 mm from the lumen.
-    """
-    if not seeds:
-        return None
-    points = mask.volume.index_to_world(np.argwhere(mask.volume.voxels)[:, ::-1].astype(float))
+def _ostium_at_seeds(lumen: Volume, seeds: Sequence[tuple[float, float, float]]) -> Insertion:
+    """Return the ostium at the first seed, with the direction into the lumen."""
+    points = lumen.index_to_world(np.argwhere(lumen.voxels)[:, ::-1].astype(float))
     for seed in seeds:
         gap = float(np.linalg.norm(points - np.array(seed), axis=1).min())
         if gap > _SEED_MM:
             raise InputError(
                 f"seeds: the lumen found is {gap:.0f} mm from {tuple(seed)}; move the seed into it (LPS mm)"
             )
-    return Insertion(np.array(seeds[0], dtype=float), _inward(points, np.array(seeds[0], dtype=float)))
-
-
-def _inward(points: Float[np.ndarray, "n 3"], place: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    near = points[np.linalg.norm(points - place, axis=1) < _MOUTH_MM]
-    inward = near.mean(axis=0) - place
+    place = np.array(seeds[0], dtype=float)
+    inward = points[np.linalg.norm(points - place, axis=1) < _MOUTH_MM].mean(axis=0) - place
     length = float(np.linalg.norm(inward))
-    return inward / length if length > 1e-6 else np.array([0.0, 0.0, -1.0])
+    return Insertion(place, inward / length if length > 1e-6 else np.array([0.0, 0.0, -1.0]))
 
 
 def _run(command: Sequence[str], mend: str) -> None:
