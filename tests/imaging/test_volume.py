@@ -264,6 +264,11 @@ def test_what_is_no_mask_is_refused(tmp_path):
     for name, expected in {"empty": "mask is empty", "ct": "are no mask", "probability": "are no mask"}.items():
         with pytest.raises(InputError, match=expected):
             read_mask(tmp_path / f"{name}.nii.gz")
+    noise = np.random.default_rng(0).normal(0, 30, (5, 6, 7)).astype(np.int16)
+    sitk.WriteImage(_image(noise), tmp_path / "noise.nii.gz")
+    for label in (None, 1):
+        with pytest.raises(InputError, match=r"are no mask of labels: a CT is segmented first"):
+            read_mask(tmp_path / "noise.nii.gz", label=label)
     with pytest.raises(InputError, match="no such file"):
         read_mask(tmp_path / "nowhere.nii.gz")
 

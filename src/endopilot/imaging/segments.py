@@ -136,7 +136,7 @@ def _shown(number: int, name: str) -> str:
 
 
 def _values(layer: Shaped[np.ndarray, "nz ny nx"], asked: bool, path: Path) -> list[int]:
-    """Return the values but 0 of a label image, after making sure that it is one; what is asked for need not be."""
+    """Return the values but 0 of a label image, after making sure that it is one; of a CT none can be asked for."""
     if not np.isfinite(layer).all():
         raise InputError(f"{path}: some voxels are not finite numbers; write it again with 0 in their place")
     low, high = float(layer.min()), float(layer.max())
@@ -149,7 +149,7 @@ def _values(layer: Shaped[np.ndarray, "nz ny nx"], asked: bool, path: Path) -> l
             values, counts = np.unique(layer, return_counts=True)
         counts = counts[values != 0]
         values = values[values != 0]
-        several = len(values) > 1 and not asked
+        several = len(values) > 1 and (not asked or low < 0)
         if not (several and _is_grey(layer, float(values[counts.argmax()]))) and (high > 0 or not len(values)):
             return [int(value) for value in values]
     ct = "a CT is segmented first (`endopilot segment`); " if low < 0 or high > _MOST_OF_BYTE else ""
