@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.imaging.overlap import compare_masks, mask_like
+from endopilot.imaging.grid import compare_masks, mask_like
 from endopilot.imaging.overlay_picture import draw_overlay
 from endopilot.imaging.sample import fetch_sample
 from endopilot.imaging.segment import SegmentConfig, segment

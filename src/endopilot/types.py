@@ -29,6 +29,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
+from endopilot.errors import InputError
+
 if TYPE_CHECKING:  # slow to import
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -106,6 +108,18 @@ class LumenMask:
     ostium: Insertion | None = None
     method: str = "given"
     warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse what is no volume and no insertion, and name the constructors."""
+        if not isinstance(self.volume, Volume):
+            raise InputError(
+                f"LumenMask: volume is {type(self.volume).__name__}; give LumenMask(Volume(voxels, spacing_mm, "
+                "origin_mm, direction))"
+            )
+        if not isinstance(self.ostium, Insertion | None):
+            raise InputError(
+                f"LumenMask: ostium is {type(self.ostium).__name__}; give ostium=Insertion(position, direction)"
+            )
 
 
 @dataclass(frozen=True, eq=False)

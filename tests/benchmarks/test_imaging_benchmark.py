@@ -14,7 +14,7 @@ from benchmarks.imaging.segmentation import BARS, ImagingBenchConfig, bench_imag
 from endopilot import runs
 from endopilot.atlas.atlas import make_patient
 from endopilot.errors import InputError
-from endopilot.imaging.overlap import mask_like
+from endopilot.imaging.grid import mask_like
 from endopilot.runs import claim
 from endopilot.types import LumenMask, Volume
 

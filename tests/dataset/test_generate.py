@@ -149,22 +149,32 @@ def test_a_finished_dataset_is_left_alone(tmp_path):
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "d").rglob("*")} == before
 
 
-def test_a_lost_file_is_made_again(tmp_path):
+@pytest.mark.parametrize("name", ["data/chunk-000/file-001.parquet", "meta/episodes/chunk-000/file-000.parquet"])
+@pytest.mark.parametrize("left", ["nothing", "empty", "one byte less", "50 bytes less", "half"])
+def test_a_lost_or_cut_file_is_made_again(tmp_path, name, left):
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4, sequences_per_file=2)
-    before = data_hashes(tmp_path / "d")
-    (tmp_path / "d/data/chunk-000/file-001.parquet").unlink()
-    with pytest.raises(InputError, match=r"file-001\.parquet: missing"):
+    before, file = data_hashes(tmp_path / "d"), tmp_path / "d" / name
+    content = file.read_bytes()
+    if left == "nothing":
+        file.unlink()
+    else:
+        kept = {"empty": 0, "one byte less": -1, "50 bytes less": -50, "half": len(content) // 2}[left]
+        file.write_bytes(content[:kept])
+    with pytest.raises(InputError, match=rf"{file.name}: (missing|damaged)"):
         read_dataset(tmp_path / "d")
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4, sequences_per_file=2)
-    assert data_hashes(tmp_path / "d") == before
+    assert data_hashes(tmp_path / "d") == before and file.read_bytes() == content
 
 
+@pytest.mark.parametrize("cut", [None, 50])
 @pytest.mark.parametrize("name", ["info.json", "stats.json", "tasks.parquet"])
-def test_a_lost_description_is_made_again(tmp_path, name):
+def test_a_lost_or_cut_description_is_made_again(tmp_path, name, cut):
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
     before = (tmp_path / "d/meta" / name).read_bytes()
     (tmp_path / "d/meta" / name).unlink()
-    if name == "info.json":
+    if cut:
+        (tmp_path / "d/meta" / name).write_bytes(before[:-cut])
+    elif name == "info.json":
         with pytest.raises(InputError, match=r"info\.json: missing"):
             read_dataset(tmp_path / "d")
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4)

@@ -139,6 +139,8 @@ LIMIT = 5_000
     [
         "anatomy MASK -o OUT",
         "atlas --vessel portal -o OUT",
+        "phantom PATIENT --in-plane-mm 1 --slice-mm 2 -o OUT.nii.gz",
+        "phantom PATIENT --in-plane-mm 1 --slice-mm 2 -o OUT.nrrd",
         "phantom PATIENT --in-plane-mm 1 --slice-mm 2 -o OUT",
         "plan PATIENT --target ICA -o OUT",
         "simulate PATIENT --sequences 4 --seconds 10 --shape -o OUT.npz",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from endopilot.errors import InputError
-from endopilot.imaging.contrast import refuse_without_contrast
+from endopilot.imaging.segment import refuse_without_contrast
 from endopilot.imaging.volume import read_volume
 from endopilot.types import Volume
 

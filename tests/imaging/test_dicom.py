@@ -2,14 +2,16 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import shutil
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pydicom
 import pytest
 import SimpleITK as sitk
-from pydicom.uid import DeflatedExplicitVRLittleEndian, JPEGLSLossless, RLELossless
+from pydicom.uid import DeflatedExplicitVRLittleEndian, JPEGLSLossless, JPEGLSNearLossless, RLELossless
 from scipy.spatial.transform import Rotation
 
 from dicom_by_itk import write_dicom
@@ -287,3 +289,108 @@ def test_a_series_is_not_written_over(series):
     with pytest.raises(InputError, match="there already"):
         write_volume(_oblique_ct(), series)
     assert sorted(series.iterdir()) == before
+
+
+@pytest.mark.parametrize("names", ["slice-{:04d}.dcm", "IM{:03d}", "1.2.840.{}"])
+@pytest.mark.parametrize("which", [0, -1], ids=["first", "last"])
+def test_a_slice_at_an_end_that_is_lost_is_refused_by_name(series, names, which):
+    """Neither a gap nor a step shows that an outermost slice is missing."""
+    for number, file in enumerate(sorted(series.iterdir())):
+        file.rename(series / names.format(number))
+    file = sorted(series.iterdir())[which]
+    whole = file.read_bytes()
+    pixels = len(whole) - 7 * 8 * 2
+    for content in (b"", whole[:100], whole[132:], *(whole[:length] for length in range(132, pixels + 50, 23))):
+        file.write_bytes(content)
+        with pytest.raises(InputError, match=rf"{file.name}: ") as caught:
+            read_volume(series)
+        _assert_no_identifier(str(caught.value))
+    file.unlink()
+    file.symlink_to(series / "gone")
+    with pytest.raises(InputError, match=rf"{file.name}: is named as the slices beside it are, but is no DICOM file"):
+        read_volume(series)
+
+
+def test_files_that_are_no_slices_are_noted_by_name(series):
+    (series / "readme").write_text("not a slice")
+    (series / "viewer.exe").write_bytes(bytes(300))
+    (series / ".DS_Store").write_bytes(bytes(300))
+    (series / "DICOMDIR").write_bytes(_without_pixels(series, "1.2.840.10008.1.3.10"))
+    (series / "elsewhere").symlink_to(series.parent)
+    (note,) = read_volume(series).notes
+    assert note == "series: without an image and left out: .DS_Store, DICOMDIR, elsewhere, readme, viewer.exe"
+
+
+def _without_pixels(folder, kind):
+    slice_ = pydicom.dcmread(next(folder.glob("*.dcm")))
+    for tag in ("Rows", "Columns", "PixelData"):
+        delattr(slice_, tag)
+    slice_.SOPClassUID = slice_.file_meta.MediaStorageSOPClassUID = kind
+    slice_.save_as(folder / "other", enforce_file_format=True)
+    content = (folder / "other").read_bytes()
+    (folder / "other").unlink()
+    return content
+
+
+def test_a_subfolder_that_may_not_be_read_is_refused(series, monkeypatch):
+    (series / "end").mkdir()
+    max(series.glob("*.dcm")).rename(series / "end" / "last.dcm")
+    scan = os.scandir
+
+    def closed(path):
+        if str(path).endswith("end"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return scan(path)
+
+    monkeypatch.setattr(os, "scandir", closed)
+    with pytest.raises(InputError, match=r"end: may not be read \(Permission denied\); ask for access"):
+        read_volume(series)
+
+
+@pytest.mark.parametrize(("drift", "sideways"), [(0.03, 0.0), (-0.02, 0.0), (0.0, 0.3)])
+def test_the_place_of_a_slice_is_bounded_and_not_the_step_to_it(tmp_path, drift, sideways):
+    """Steps that grow by 3 % after the middle put it 0.3 mm, two fifths of a step, off; each step is within 5 %."""
+    ct = Volume(np.zeros((60, 5, 5), np.int16), np.array([1.0, 1.0, 0.75]), np.zeros(3), np.eye(3))
+    write_volume(ct, tmp_path / "ct")
+    assert read_volume(tmp_path / "ct").voxels.shape == (60, 5, 5)
+    for k, file in enumerate(sorted((tmp_path / "ct").iterdir())):
+        _move(file, [sideways if k == 20 else 0.0, 0.0, 0.75 * drift * max(k - 30, 0)])
+    with pytest.raises(InputError, match=r"not evenly spaced: slice \d+ lies 0\.\d+ mm from where even steps of 0\.7"):
+        read_volume(tmp_path / "ct")
+
+
+def test_positions_of_few_digits_are_read(tmp_path):
+    ct = Volume(np.zeros((40, 5, 5), np.int16), np.array([1.0, 1.0, 0.625]), np.zeros(3), np.eye(3))
+    write_volume(ct, tmp_path / "ct")
+    for k, file in enumerate(sorted((tmp_path / "ct").iterdir())):
+        _move(file, [0.0, 0.0, round(0.625 * k, 2) - 0.625 * k])
+    assert read_volume(tmp_path / "ct").spacing_mm[2] == pytest.approx(0.625, abs=1e-3)
+
+
+def test_pixels_compressed_with_loss_are_read_and_noted(tmp_path):
+    jpeg_ls = pytest.importorskip("jpeg_ls", reason="pyjpegls, which highdicom brings, writes JPEG-LS")
+    ct = Volume(np.tile(_oblique_ct().voxels, (1, 4, 4)), np.array([0.4, 0.4, 0.5]), np.zeros(3), np.eye(3))
+    write_volume(ct, tmp_path / "ct")
+    for file in (tmp_path / "ct").iterdir():
+        slice_ = pydicom.dcmread(file)
+        rows, columns = slice_.pixel_array.shape
+        stored = (slice_.pixel_array + 1024).astype(np.uint16).tobytes()
+        packed = jpeg_ls.encode_buffer(stored, rows, columns, 1, 12, lossy_error=3)
+        slice_.file_meta.TransferSyntaxUID = JPEGLSNearLossless
+        slice_.PixelRepresentation, slice_.BitsStored, slice_.HighBit, slice_.RescaleIntercept = 0, 12, 11, -1024
+        slice_.PixelData = pydicom.encaps.encapsulate([bytes(packed)])
+        slice_["PixelData"].is_undefined_length = True
+        slice_.save_as(file)
+    volume = read_volume(tmp_path / "ct")
+    assert 0 < np.abs(volume.voxels.astype(int) - ct.voxels).max() <= 3
+    assert volume.notes == (
+        "ct: compressed with loss (JPEG-LS Lossy (Near-Lossless) Image Compression): HU are not those of the scanner",
+    )
+
+
+def test_a_slice_that_does_not_arrive_whole_is_refused_and_leaves_nothing(tmp_path, monkeypatch):
+    write = Path.write_bytes
+    monkeypatch.setattr(Path, "write_bytes", lambda path, content: write(path, content[:-20]))
+    with pytest.raises(InputError, match="was not written whole"):
+        write_volume(_oblique_ct(), tmp_path / "ct")
+    assert not list(tmp_path.iterdir())

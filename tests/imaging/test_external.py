@@ -142,6 +142,30 @@ def test_a_program_that_does_not_answer_is_reported_in_one_line(program, ct, tex
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("factor", [1.15, 0.9])
+def test_an_answer_with_other_voxels_of_the_same_number_is_put_where_it_lies(program, ct, factor):
+    change = f"(1, mask.GetOrigin(), [{factor} * step for step in mask.GetSpacing()], mask.GetDirection())"
+    text = _TOTALSEGMENTATOR.format(device="gpu", above=200)
+    text = text.replace(
+        "sitk.WriteImage(ct > 200",
+        f"mask = ct > 200\nsitk.WriteImage(sitk.Resample(mask, mask.GetSize(), sitk.Transform(), *{change})",
+    )
+    program("TotalSegmentator", text)
+    found = segment(ct, config=SegmentConfig(method="totalsegmentator")).volume.voxels
+    k, j, i = np.indices(found.shape)
+    held = (np.stack([i, j, k]) < factor * (np.array([29, 29, 39])[:, None, None, None] - 1)).all(axis=0)
+    overlap = 2 * (found & (ct.voxels > 200) & held).sum() / ((found & held).sum() + (ct.voxels > 200)[held].sum())
+    assert overlap > 0.95
+
+
+def test_an_answer_beside_the_ct_is_refused(program, ct):
+    text = _TOTALSEGMENTATOR.format(device="gpu", above=200)
+    text = text.replace("sitk.WriteImage(ct >", "ct.SetOrigin([900.0, 0.0, 0.0])\nsitk.WriteImage(ct >")
+    program("TotalSegmentator", text)
+    with pytest.raises(InputError, match="TotalSegmentator wrote a mask that lies outside the CT"):
+        segment(ct, config=SegmentConfig(method="totalsegmentator"))
+
+
 def test_the_program_gets_nothing_but_geometry_and_hu(program, ct, tmp_path):
     program("TotalSegmentator", f"import shutil, sys; shutil.copy(sys.argv[2], {str(tmp_path / 'got.nii.gz')!r})")
     with pytest.raises(InputError, match="wrote nothing"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from shapes import empty_grid, positions
 
-from endopilot.imaging.ostium import find_ostium
+from endopilot.imaging.aortic_root import find_ostium
 
 AORTA_MM, ARTERY_MM, LENGTH_MM = 14.0, 2.8, 20.0
 

@@ -44,15 +44,9 @@ def index(tmp_path, monkeypatch):
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Index)
     Thread(target=server.serve_forever, daemon=True).start()
-    wanted = samples._Sample(
-        f"http://127.0.0.1:{server.server_port}/package-1.tar.gz",
-        _sha256(state["archive"]),
-        "Apache-2.0",
-        "a CT",
-        {"ct.nii.gz": _sha256(b"the CT")},
-        {"ct.nii.gz": "package-1/tests/ct.nii.gz"},
-    )
-    monkeypatch.setattr(samples, "_SAMPLES", {"cta-thorax": wanted})
+    monkeypatch.setattr(samples, "_URL", f"http://127.0.0.1:{server.server_port}/package-1.tar.gz")
+    monkeypatch.setattr(samples, "_SHA256", _sha256(state["archive"]))
+    monkeypatch.setattr(samples, "_FILES", {"ct.nii.gz": ("package-1/tests/ct.nii.gz", _sha256(b"the CT"))})
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     yield state
     server.shutdown()

@@ -32,6 +32,24 @@ def voxels(volume, config):
 def coarse(volume, config):
     return LumenMask(Volume(volume.voxels[::2] > 200, volume.spacing_mm, volume.origin_mm, volume.direction))
 
+def moved(volume, config):
+    return LumenMask(Volume(volume.voxels > 200, volume.spacing_mm, volume.origin_mm + 3.0, volume.direction))
+
+def coarser(volume, config):
+    return LumenMask(Volume(volume.voxels > 200, 1.2 * volume.spacing_mm, volume.origin_mm, volume.direction))
+
+def turned(volume, config):
+    turn = np.diag([-1.0, -1.0, 1.0])
+    return LumenMask(Volume(volume.voxels > 200, volume.spacing_mm, volume.origin_mm, volume.direction @ turn))
+
+def lost(volume, config):
+    nowhere = Insertion(np.array([0.0, np.nan, 0.0]), np.array([0.0, 0.0, 1.0]))
+    return LumenMask(Volume(volume.voxels > 200, volume.spacing_mm, volume.origin_mm, volume.direction), nowhere)
+
+def flat(volume, config):
+    nowhere = Insertion(np.zeros(3), np.zeros(3))
+    return LumenMask(Volume(volume.voxels > 200, volume.spacing_mm, volume.origin_mm, volume.direction), nowhere)
+
 words = "no method"
 """
 PLAIN = "plain_method:plain"
@@ -74,6 +92,11 @@ def test_a_method_of_one_s_own_segments_from_a_file_beside_the_user(plain_method
     [
         ("voxels", "returned ndarray; return a LumenMask"),
         ("coarse", r"returned bool voxels of shape \(15, 30, 30\); return bool voxels on the volume's grid"),
+        ("moved", r"'plain_method:moved' returned a mask on another grid, up to 5.2 mm from the volume's"),
+        ("coarser", "returned a mask on another grid"),
+        ("turned", "returned a mask on another grid"),
+        ("lost", r"'plain_method:lost' returned an ostium of position and direction 0 nan 0 0 0 1"),
+        ("flat", "returned an ostium of position and direction 0 0 0 0 0 0"),
         ("words", "is no function and no SegmentationMethod"),
         ("missing", "plain_method.py holds no missing"),
     ],

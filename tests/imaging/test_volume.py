@@ -2,13 +2,17 @@ from __future__ import annotations
 
 import gzip
 import json
+import struct
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 import SimpleITK as sitk
 
+from endopilot.anatomy.read_source import read_source
 from endopilot.errors import InputError
-from endopilot.imaging.volume import read_mask, read_volume, write_mask, write_volume
+from endopilot.imaging.volume import check_output, read_mask, read_volume, write_mask, write_volume
 from endopilot.types import Insertion, LumenMask, Volume
 
 
@@ -133,6 +137,35 @@ def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+_ON_A_FULL_DISK = """
+import resource, sys
+import numpy as np
+from pathlib import Path
+from endopilot.errors import InputError
+from endopilot.imaging.volume import write_mask, write_volume
+from endopilot.types import LumenMask, Volume
+noise = np.random.default_rng(0).integers(0, 2, (40, 60, 70)) > 0
+volume = Volume(noise, np.ones(3), np.zeros(3), np.eye(3))
+resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))
+for name in sys.argv[2:]:
+    path = Path(sys.argv[1]) / name
+    for write in (write_volume, lambda volume, path: write_mask(LumenMask(volume), path, manifest={})):
+        try:
+            write(volume, path)
+        except InputError as error:
+            assert "disk is not full" in str(error), error
+        else:
+            raise SystemExit(f"{name} was written whole to a disk that has no room for it")
+"""
+
+
+def test_a_file_that_does_not_arrive_whole_is_refused_and_leaves_nothing(tmp_path):
+    """ITK's writer of NIfTI reports nothing on a full disk: half a file was left, and the command ended well."""
+    names = ["v.nii", "v.nii.gz", "v.nrrd", "v.mha"]
+    subprocess.run([sys.executable, "-c", _ON_A_FULL_DISK, str(tmp_path), *names], check=True)
+    assert not list(tmp_path.iterdir())
+
+
 def _mask() -> LumenMask:
     ramp = _oblique_volume()
     inside = Volume(ramp.voxels > np.median(ramp.voxels), ramp.spacing_mm, ramp.origin_mm, ramp.direction)
@@ -158,6 +191,51 @@ def test_a_mask_without_sidecar_or_with_a_stranger_beside_it_has_no_ostium(tmp_p
     assert read_mask(tmp_path / "rca.nrrd").ostium is None
     (tmp_path / "rca.json").write_text('{"Modality": "CT"}')
     assert read_mask(tmp_path / "rca.nrrd").method == "given"
+
+
+def test_the_sidecar_of_another_mask_is_not_taken_and_a_warning_says_so(tmp_path):
+    mask = _mask()
+    write_mask(mask, tmp_path / "v.nii.gz", manifest={})
+    write_volume(mask.volume, tmp_path / "v.nrrd")
+    other = read_mask(tmp_path / "v.nrrd")
+    assert other.ostium is None and other.method == "given"
+    (told,) = other.warnings
+    assert "v.json is the record of v.nii.gz, and was left out for v.nrrd" in told
+    assert "--ostium-mm 1 2 3" in told
+    # the same file with other voxels
+    changed = mask.volume.voxels.copy()
+    changed[0, 0, 0] ^= True
+    write_volume(Volume(changed, *_grid(mask.volume)), tmp_path / "v.nii.gz")
+    changed_mask = read_mask(tmp_path / "v.nii.gz")
+    assert changed_mask.ostium is None and "of v.nii.gz before it was changed" in changed_mask.warnings[0]
+    # one of a version that did not name the mask
+    content = json.loads((tmp_path / "v.json").read_text())
+    del content["mask"]
+    (tmp_path / "v.json").write_text(json.dumps(content))
+    assert "of a mask that it does not name" in read_mask(tmp_path / "v.nrrd").warnings[0]
+
+
+def test_a_json_of_another_kind_is_not_replaced(tmp_path):
+    own = tmp_path / "v.json"
+    for content in ('{"Modality": "CT"}', "[1, 2", '{"ostium": null}'):
+        own.write_text(content)
+        for write in (
+            lambda path: check_output(path, mask=True),
+            lambda path: write_mask(_mask(), path, manifest={}),
+        ):
+            with pytest.raises(InputError, match=r"v\.json: is there already and is not the record of v\.nrrd"):
+                write(tmp_path / "v.nrrd")
+        assert own.read_text() == content
+    own.unlink()
+    write_mask(_mask(), tmp_path / "v.nrrd", manifest={"run": 1})
+    write_mask(_mask(), tmp_path / "v.nrrd", manifest={"run": 2})
+    assert json.loads(own.read_text())["manifest"] == {"run": 2}
+    with pytest.raises(InputError, match=r"not the record of v\.mha"):
+        check_output(tmp_path / "v.mha", mask=True)
+
+
+def _grid(volume: Volume) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return volume.spacing_mm, volume.origin_mm, volume.direction
 
 
 def test_a_broken_sidecar_is_refused(tmp_path):
@@ -186,5 +264,126 @@ def test_what_is_no_mask_is_refused(tmp_path):
     for name, expected in {"empty": "mask is empty", "ct": "are no mask", "probability": "are no mask"}.items():
         with pytest.raises(InputError, match=expected):
             read_mask(tmp_path / f"{name}.nii.gz")
+    noise = np.random.default_rng(0).normal(0, 30, (5, 6, 7)).astype(np.int16)
+    sitk.WriteImage(_image(noise), tmp_path / "noise.nii.gz")
+    for label in (None, 1):
+        with pytest.raises(InputError, match=r"are no mask of labels: a CT is segmented first"):
+            read_mask(tmp_path / "noise.nii.gz", label=label)
     with pytest.raises(InputError, match="no such file"):
         read_mask(tmp_path / "nowhere.nii.gz")
+
+
+def _depth() -> np.ndarray:
+    """Return the depth inside a bent tube of 2.3 mm radius, on voxels of 0.6 mm, mm; negative outside."""
+    k, j, i = np.indices((50, 34, 30)) * 0.6
+    return 2.3 - np.hypot(j - 10.0 - 2.0 * np.sin(k / 5.0), i - 9.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "threshold", "said"),
+    [
+        (lambda depth: 1 / (1 + np.exp(-4 * depth)), 0.5, "probabilities or a mask resampled"),
+        (lambda depth: np.round(200 * np.clip(depth / 0.6 + 0.5, 0, 1)).astype(np.uint8), 100, "resampled"),
+        (lambda depth: np.round(3000 * np.clip(depth / 0.6 + 0.5, 0, 1)).astype(np.int16), 1500, "a CT is segmented"),
+        (lambda depth: np.clip(depth / 0.6 + 0.5, 0, 1).astype(np.float32), 0.5, "resampled"),
+        (lambda depth: depth, 0, "signed distances or level sets"),
+        (lambda depth: -depth.astype(np.float32), 0, "signed distances or level sets"),
+        (lambda depth: np.round(100 * depth).astype(np.int16), 0, "signed distances or level sets"),
+    ],
+    ids=["probability", "resampled", "large numbers", "share", "distance", "level set", "whole distance"],
+)
+def test_a_grey_mask_is_named_with_the_threshold_that_takes_it(tmp_path, make, threshold, said):
+    depth = _depth()
+    write_volume(Volume(make(depth), np.full(3, 0.6), np.zeros(3), np.eye(3)), tmp_path / "grey.nrrd")
+    with pytest.raises(InputError, match=rf"are no mask.*{said}.*threshold={threshold} \(--threshold {threshold}\)"):
+        read_mask(tmp_path / "grey.nrrd")
+    mask = read_mask(tmp_path / "grey.nrrd", threshold=float(threshold))
+    wrong = mask.volume.voxels != (depth > 0)
+    assert not wrong[np.abs(depth) > 0.01].any()
+    source = read_source(tmp_path / "grey.nrrd", threshold=float(threshold)).content
+    assert isinstance(source, LumenMask)
+    np.testing.assert_array_equal(source.volume.voxels, mask.volume.voxels)
+    for bad in (1e9, -1e9, float("nan")):
+        with pytest.raises(InputError, match="give one between"):
+            read_mask(tmp_path / "grey.nrrd", threshold=bad)
+    with pytest.raises(InputError, match="give either"):
+        read_mask(tmp_path / "grey.nrrd", threshold=float(threshold), label=1)
+
+
+def test_a_threshold_is_for_masks_alone(tmp_path):
+    (tmp_path / "wall.stl").write_text("solid")
+    with pytest.raises(InputError, match=r"--threshold 0\.5 was given, but only masks have thresholds"):
+        read_source(tmp_path / "wall.stl", threshold=0.5)
+
+
+@pytest.mark.parametrize("top", [1, 255, 420])
+@pytest.mark.parametrize("dtype", [np.uint16, np.int64, np.float32, np.float64])
+def test_a_mask_of_one_value_is_taken_whatever_its_type(tmp_path, top, dtype):
+    inside = _depth() > 0
+    write_volume(Volume((inside * top).astype(dtype), np.ones(3), np.zeros(3), np.eye(3)), tmp_path / "m.mha")
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.mha").volume.voxels, inside)
+
+
+def test_label_maps_are_not_taken_for_grey_masks(tmp_path):
+    depth = _depth()
+    slices = 1 + np.indices(depth.shape)[0] // 5
+    for labels in (np.where(depth > 0, slices, 0), np.where(depth > 0, 2, np.where(depth > -1.2, 1, 0))):
+        labels[0, 0, 0] = -1  # what a network was to ignore
+        write_volume(Volume(labels.astype(np.int16), np.ones(3), np.zeros(3), np.eye(3)), tmp_path / "labels.nrrd")
+        with pytest.raises(InputError, match=r"labels \(-1, 1, 2"):
+            read_mask(tmp_path / "labels.nrrd")
+        np.testing.assert_array_equal(read_mask(tmp_path / "labels.nrrd", label=2).volume.voxels, labels == 2)
+
+
+def _with_extensions(path, *extensions: tuple[int, bytes], order: str = "<") -> None:
+    """Write labels 7 and 51 as NIfTI-1 with header extensions, each of a kind and a content."""
+    labels = np.zeros((5, 6, 7), np.uint8)
+    labels[1:3], labels[3:] = 7, 51
+    parts = [struct.pack(f"{order}2i", len(content) + 8, kind) + content for kind, content in extensions]
+    header = bytearray(348)
+    struct.pack_into(f"{order}i", header, 0, 348)
+    struct.pack_into(f"{order}8h", header, 40, 3, 7, 6, 5, 1, 1, 1, 1)
+    struct.pack_into(f"{order}2h", header, 70, 2, 8)
+    struct.pack_into(f"{order}4f", header, 76, 1, 1, 1, 1)
+    struct.pack_into(f"{order}2f", header, 108, 352 + sum(map(len, parts)), 1)
+    header[123] = 2
+    struct.pack_into(f"{order}h", header, 254, 1)
+    struct.pack_into(f"{order}12f", header, 280, *np.eye(3, 4).ravel())
+    header[344:348] = b"n+1\0"
+    path.write_bytes(bytes(header) + b"\1\0\0\0" + b"".join(parts) + labels.tobytes())
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_the_names_of_labels_in_a_nifti_extension_are_read(tmp_path, order):
+    names = b'<CaretExtension><VolumeInformation><LabelTable><Label Red="1" Key="7">left &amp; right</Label>'
+    names += b'<Label Key="51"><![CDATA[heart]]></Label><Label Key="9">absent</Label></LabelTable></VolumeInformation>'
+    names += b"</CaretExtension>\0\0\0\0"
+    _with_extensions(tmp_path / "a.nii", (4, b"x" * 24), (30, names), order=order)
+    with pytest.raises(InputError, match=r"2 labels \(7 \(left & right\), 51 \(heart\)\)"):
+        read_mask(tmp_path / "a.nii")
+    assert read_mask(tmp_path / "a.nii", label="Heart").volume.voxels.sum() == 84
+    for content in (b"<Label Key='7'>no end", b"<a><Label Key='x'>seven</Label></a>", b"\xff" * 16):
+        _with_extensions(tmp_path / "b.nii", (30, content), order=order)
+        assert read_mask(tmp_path / "b.nii", label=51).volume.voxels.sum() == 84
+
+
+_OF_ARRAYS = """
+import numpy as np
+from endopilot.errors import InputError
+from endopilot.types import LumenMask, Volume
+volume = Volume(np.ones((4, 5, 6), dtype=bool), np.ones(3), np.zeros(3), np.eye(3))
+for arguments in ((volume.voxels, np.eye(4)), (volume, (1.0, 2.0, 3.0))):
+    try:
+        LumenMask(*arguments)
+    except InputError as error:
+        print(error)
+"""
+
+
+def test_a_lumen_mask_of_arrays_names_the_constructors():
+    """In a process of its own: while tests run, annotations are checked before the constructor is."""
+    said = subprocess.run([sys.executable, "-c", _OF_ARRAYS], check=True, capture_output=True, text=True).stdout
+    assert said.splitlines() == [
+        "LumenMask: volume is ndarray; give LumenMask(Volume(voxels, spacing_mm, origin_mm, direction))",
+        "LumenMask: ostium is tuple; give ostium=Insertion(position, direction)",
+    ]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from endopilot import __version__, files
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
@@ -18,7 +19,12 @@ from endopilot.runs import claim, claiming
 
 
 def extract_all(
-    sources: Sequence[Path], output: Path, *, label: int | str | None = None, config: AnatomyConfig
+    sources: Sequence[Path],
+    output: Path,
+    *,
+    label: int | str | None = None,
+    threshold: float | None = None,
+    config: AnatomyConfig,
 ) -> tuple[list[Path], dict[str, str]]:
     """Make one anatomy a file, each in a folder of its own, on as many processes as there are cores.
 
@@ -29,6 +35,7 @@ def extract_all(
         sources: masks, surfaces or centerlines.
         output: folder that takes one anatomy folder a patient.
         label: number or name of the segment that is the lumen, where masks have several.
+        threshold: of masks of grey levels, the value at the wall.
         config: how to make them all.
 
     Returns:
@@ -41,9 +48,9 @@ def extract_all(
     if config.ostium_mm is not None and len(sources) > 1:
         raise InputError(f"ostium_mm={config.ostium_mm}: cannot serve {len(sources)} patients; make them one by one")
     folders = {source: output / name for source, name in zip(sources, _names(sources), strict=True)}
-    identity = {"sources": list(folders), "label": label, "config": config, "version": __version__}
-    claim(output, "endopilot anatomy", **identity)
-    bad = each("Anatomies", list(sources), partial(_make, folders=folders, label=label, config=config))
+    reading = {"label": label, "threshold": threshold}
+    claim(output, "endopilot anatomy", sources=list(folders), **reading, config=config, version=__version__)
+    bad = each("Anatomies", list(sources), partial(_make, folders=folders, reading=reading, config=config))
     rejected = {str(source): str(bad[source]) for source in sources if source in bad}
     if len(rejected) == len(sources):
         raise InputError(
@@ -54,16 +61,16 @@ def extract_all(
 
 
 def claim_anatomy(
-    folder: Path, content: AnatomySource, *, label: int | str | None, name: str | None, config: AnatomyConfig
+    folder: Path, content: AnatomySource, *, name: str | None, config: AnatomyConfig, **reading: Any
 ) -> AbstractContextManager[None]:
-    """Return the claim of a folder by the anatomy of a source, see `runs.claiming`."""
-    made_from = {"source": content.sha256, "label": label, "name": name, "config": config}
-    return claiming(folder, "endopilot anatomy", **made_from, version=__version__)
+    """Return the claim of a folder by the anatomy of a source that was read so, see `runs.claiming`."""
+    made_from = {"source": content.sha256, "name": name, "config": config}
+    return claiming(folder, "endopilot anatomy", **made_from, **reading, version=__version__)
 
 
-def _make(source: Path, *, folders: dict[Path, Path], label: int | str | None, config: AnatomyConfig) -> None:
-    folder, content = folders[source], read_source(source, label=label)
-    with claim_anatomy(folder, content, label=label, name=folder.name, config=config):
+def _make(source: Path, *, folders: dict[Path, Path], reading: dict[str, Any], config: AnatomyConfig) -> None:
+    folder, content = folders[source], read_source(source, **reading)
+    with claim_anatomy(folder, content, name=folder.name, config=config, **reading):
         write_anatomy(extract_anatomy(content, name=folder.name, config=config), output=folder)
 
 

@@ -83,6 +83,7 @@ def extract_anatomy(
     *,
     name: str | None = None,
     label: int | str | None = None,
+    threshold: float | None = None,
     config: AnatomyConfig | None = None,
 ) -> Anatomy:
     """Make an anatomy: centerline tree with section labels, distance map with guiding catheter, insertion.
@@ -91,6 +92,7 @@ def extract_anatomy(
         source: a file with a mask, a surface or centerlines, as `read_source` reads it; or what was read or made.
         name: short name of the patient; that of the file, or "patient", if not given.
         label: number or name of the segment that is the lumen, where a mask file has several.
+        threshold: of a mask file of grey levels, the value at the wall.
         config: how to make it.
 
     Raises:
@@ -99,7 +101,7 @@ def extract_anatomy(
     """
     config = config or AnatomyConfig()
     if isinstance(source, str | Path):
-        source = read_source(source, label=label)
+        source = read_source(source, label=label, threshold=threshold)
     wrapped = source if isinstance(source, AnatomySource) else AnatomySource(source)
     wrapped = transformed(wrapped, scale=config.scale, coordinates=config.coordinates)
     name = name or wrapped.file.partition(".")[0] or "patient"

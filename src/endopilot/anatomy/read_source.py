@@ -15,7 +15,7 @@ MASK_SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd", ".dcm")
 SURFACE_SUFFIXES = (".stl", ".obj", ".ply", ".vtp", ".vtk")
 
 
-def read_source(path: str | Path, *, label: int | str | None = None) -> AnatomySource:
+def read_source(path: str | Path, *, label: int | str | None = None, threshold: float | None = None) -> AnatomySource:
     """Read a vessel from a mask, a surface or centerlines; the kind follows from the file.
 
     Args:
@@ -23,6 +23,7 @@ def read_source(path: str | Path, *, label: int | str | None = None) -> AnatomyS
             radii, as VMTK writes it, or a Slicer markups curve `.mrk.json` with a radius measurement); or the folder
             of a patient's markups curves, which are the lines of one tree.
         label: number or name of the segment that is the lumen, where a mask has several.
+        threshold: of a mask of grey levels, the value at the wall.
 
     Raises:
         InputError: the file is missing, damaged, empty, of an unknown kind, or a centerline without radii.
@@ -31,14 +32,15 @@ def read_source(path: str | Path, *, label: int | str | None = None) -> AnatomyS
     if not path.is_file() and not path.is_dir():
         raise InputError(f"{path}: no such file; give a mask, a surface or a centerline")
     lower = path.name.lower()
-    if label is not None and not lower.endswith(MASK_SUFFIXES):
-        raise InputError(f"{path}: --label {label} was given, but only masks have labels; leave the option out")
+    for option, value in (("label", label), ("threshold", threshold)):
+        if value is not None and not lower.endswith(MASK_SUFFIXES):
+            raise InputError(f"{path}: --{option} {value} was given, but only masks have {option}s; leave it out")
     if path.is_dir():
         return _read_curves(path)
     if lower.endswith(MASK_SUFFIXES):
         from endopilot.imaging.volume import read_mask  # slow to import
 
-        source = AnatomySource(read_mask(path, label=label), coordinates="lps")
+        source = AnatomySource(read_mask(path, label=label, threshold=threshold), coordinates="lps")
     elif lower.endswith(".json"):
         source = read_markups(path)
     elif lower.endswith(SURFACE_SUFFIXES):

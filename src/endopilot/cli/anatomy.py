@@ -25,6 +25,7 @@ def command(
     output: OutputFolder,
     name: str | None = None,
     label: str | None = None,
+    threshold: float | None = None,
     picture: Picture | None = None,
     ct: Existing | None = None,
     config: AnatomyConfig = AnatomyConfig(),
@@ -41,6 +42,7 @@ def command(
         output: folder of the anatomy; for several files, the folder that takes one of each.
         name: name of the patient in datasets and reports; the folder's name by default.
         label: number or name of the segment to take, where a mask holds several.
+        threshold: value at the wall of a mask of grey levels: probabilities, a resampled mask, a signed distance.
         picture: PNG of the tree by section and by radius, its longest path straightened, and cross-sections.
         ct: CT angiogram in HU, shown behind the walls in the picture.
         config: how to extract.
@@ -52,7 +54,7 @@ def command(
         for option, value in (("name", name), ("picture", picture), ("ct", ct)):
             if value is not None:
                 raise InputError(f"--{option} {value}: serves one patient, and {len(sources)} are given; leave it out")
-        made, rejected = extract_all(sources, output, label=label, config=config)
+        made, rejected = extract_all(sources, output, label=label, threshold=threshold, config=config)
         for reason in rejected.values():
             print(f"endopilot anatomy: rejected: {reason}", file=sys.stderr)
         return {"anatomies": made, "rejected": rejected}
@@ -60,8 +62,9 @@ def command(
         raise InputError(f"--ct {ct}: is only shown in a picture; give --picture FILE.png too")
     volume = None if ct is None else read_volume(ct)
     source = next(iter(sources))
-    content = read_source(existing(source), label=label)
-    with claim_anatomy(output, content, label=label, name=name, config=config):
+    reading = {"label": label, "threshold": threshold}
+    content = read_source(existing(source), **reading)
+    with claim_anatomy(output, content, name=name, config=config, **reading):
         anatomy = extract_anatomy(content, name=name or output.resolve().name, config=config)
         write_anatomy(anatomy, output=output)
     figures = {"anatomy": output, **describe(anatomy)}

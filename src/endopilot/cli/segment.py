@@ -8,7 +8,7 @@ from tyro.conf import Positional
 
 from endopilot.cli.arguments import Existing, Figures, OutputFile, Picture
 from endopilot.files import input_hash, manifest
-from endopilot.imaging.overlap import compare_masks
+from endopilot.imaging.grid import compare_masks
 from endopilot.imaging.segment import SegmentConfig, segment
 from endopilot.imaging.volume import check_output, read_mask, read_volume, write_mask
 

@@ -16,6 +16,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
+
 from endopilot.dataset import parquet, schema
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.layout import Block, Layout, make_layout
@@ -24,6 +27,7 @@ from endopilot.dataset.workers import run_locally, run_on_cluster, write_timed
 from endopilot.devices.device import Wire
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
+from endopilot.errors import InputError
 from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.progress import progress
 from endopilot.runs import claim, remove_partial_files
@@ -77,7 +81,8 @@ def generate_dataset(
     if _is_finished(layout, blocks):
         return
     (layout.context.output / schema.MANIFEST_PATH).unlink(missing_ok=True)
-    missing = [block for block in blocks if not schema.paths_of_file(layout.context.output, block.number)[0].exists()]
+    paths = {block.number: schema.paths_of_file(layout.context.output, block.number) for block in blocks}
+    missing = [block for block in blocks if not all(map(_is_whole, paths[block.number]))]
     samples, to_do = (sum(len(block.sequences) for block in some) * config.samples for some in (blocks, missing))
     with progress("Simulating navigations", total=samples) as advance:
         advance(samples - to_do)
@@ -126,11 +131,19 @@ def read_work(output: Path) -> dict[str, Any]:
 
 
 def _is_finished(layout: Layout, blocks: Sequence[Block]) -> bool:
-    """Return whether the manifest, which is written last, and all other files are there."""
+    """Return whether the manifest, which is written last, and all other files are there to their ends."""
     output = layout.context.output
     files = [file for block in blocks for file in schema.paths_of_file(output, block.number)]
     described = (schema.INFO_PATH, schema.STATS_PATH, schema.TASKS_PATH, schema.MANIFEST_PATH)
-    return all(file.exists() for file in (*files, *(output / name for name in described)))
+    return all(map(_is_whole, (*files, *(output / name for name in described))))
+
+
+def _is_whole(file: Path) -> bool:
+    """Return whether a file of a dataset is there to its end, where JSON closes and Parquet has its schema."""
+    try:
+        return bool(pq.read_metadata(file) if file.suffix == ".parquet" else read_json(file))
+    except (pa.ArrowInvalid, OSError, InputError):
+        return False
 
 
 def describe(layout: Layout, blocks: Sequence[Block]) -> None:

@@ -1,16 +1,21 @@
-"""Finding the ascending aorta in a cardiac CT angiogram: the largest round bright disc that goes on slice by slice."""
+"""The aortic root of a cardiac CT angiogram, where vessels open into it, and where a coronary artery leaves it.
+
+The ascending aorta is the largest round bright disc that goes on slice by slice.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
+from scipy.spatial import KDTree
 
 from endopilot.errors import InputError
-from endopilot.imaging.grid import LEAST_BLOOD_HU
-from endopilot.types import Volume
+from endopilot.imaging.grid import LEAST_BLOOD_HU, connected_components, distance_to_outside
+from endopilot.lines import length_along
+from endopilot.types import Insertion, Volume
 
 _LEVELS_HU = (180.0, 230.0, 290.0, 360.0)
 """Thresholds tried one after another: at one of them the aorta stands apart from its neighbours."""
@@ -25,6 +30,28 @@ _MOST_ROOTS = 3
 _DIRECTIONS = 32
 _BRIGHTEST_HU = 600.0
 """Undiluted contrast in the superior vena cava is brighter than this, and no more likely to be the aorta."""
+_BALL_MM = 7.0
+"""Ball that opens the aorta: its surface goes on under the artery's mouth."""
+_BOX_MM = 18.0
+"""Half the edge of the box around the artery's beginning that is looked at, mm."""
+_SECTIONS_MM = np.arange(1.0, 6.01, 0.5)
+"""Heights above the aortic wall at which the artery's middle is measured, mm."""
+_FITTED = 8
+"""So many of the lowest sections carry the parabola that goes on to the wall."""
+_NEAR_MM = 4.5
+"""Blood farther than this from the tracked path is not this artery's."""
+_MOUTH_MM = 3.0
+"""Nearer than this to the artery's axis, the opened aorta bulges into the mouth."""
+_WALL_MM = 3.0
+"""Width of the wall around the mouth from which the wall without the mouth is estimated, mm."""
+_FEWEST_OF_WALL = 100
+"""With fewer voxels of wall around the mouth, the wall is not estimated."""
+_DEEPEST_MM = 1.0
+"""A ball that opens the aorta bulges no deeper into a mouth: its cap of 3.5 mm radius is 0.9 mm high."""
+TO_WALL_MM = 3.5
+"""Vesselness fades where an artery opens into the aorta: a tree starts within this distance of the wall."""
+_OPENING_MM = 5.0
+"""Blood that joins a vessel to the aorta is looked for this far around the vessel's voxel nearest the wall."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,3 +186,175 @@ def _best_chain(slices: list[list[_Disc]]) -> list[_Disc]:
         best = max([best, *grown], key=_weight)
         tails = grown
     return best
+
+
+@dataclass(frozen=True, eq=False)
+class Opening:
+    """Where a vessel comes to the aortic wall.
+
+    Attributes:
+        voxel: the vessel's voxel nearest the wall (k, j, i).
+        vessel: number of the connected vessel among all.
+    """
+
+    voxel: Int[np.ndarray, "3"]
+    vessel: int
+
+
+def box_around(index: np.ndarray, margin: np.ndarray, shape: tuple[int, ...]) -> tuple[slice, ...]:
+    """Return the slices (k, j, i) around some voxel indices with a margin, clipped to the volume."""
+    low = np.maximum(np.floor(index.min(axis=0) - margin).astype(int), 0)
+    high = np.minimum(np.ceil(index.max(axis=0) + margin).astype(int) + 1, shape)
+    return tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+
+
+def opens_into(
+    hu: Float[np.ndarray, "nz ny nx"],
+    blood_hu: float,
+    aorta: Bool[np.ndarray, "nz ny nx"],
+    vessel: Bool[np.ndarray, "nz ny nx"],
+    start: Int[np.ndarray, "3"],
+    spacing_mm: float,
+) -> bool:
+    """Return whether blood joins a vessel to the aorta around the vessel's voxel nearest to it."""
+    box = box_around(start[None], np.full(3, _OPENING_MM / spacing_mm), vessel.shape)
+    blood = hu[box] > blood_hu
+    label = connected_components(blood)
+    return bool(np.intersect1d(label[vessel[box] & blood], label[aorta[box] & blood]).size)
+
+
+def openings(
+    hu: Float[np.ndarray, "nz ny nx"],
+    blood_hu: float,
+    aorta: Bool[np.ndarray, "nz ny nx"],
+    vessels: Int[np.ndarray, "nz ny nx"],
+    spacing_mm: float,
+) -> list[Opening]:
+    """Return all places where blood joins a vessel to the aorta; `vessels` numbers connected vessels, 0 is none."""
+    if not aorta.any():
+        return []
+    box = box_around(np.argwhere(aorta), np.full(3, TO_WALL_MM / spacing_mm + 1), aorta.shape)
+    gap = distance_to_outside(~aorta[box], spacing_mm)
+    patches = connected_components((gap <= TO_WALL_MM) & (vessels[box] > 0), corners=True)
+    corner = np.array([part.start for part in box])
+    found = []
+    for patch in range(1, int(patches.max()) + 1):
+        voxels = np.argwhere(patches == patch)
+        nearest = voxels[gap[tuple(voxels.T)].argmin()] + corner
+        number = int(vessels[tuple(nearest)])
+        if opens_into(hu, blood_hu, aorta, vessels == number, nearest, spacing_mm):
+            found.append(Opening(nearest, number))
+    return found
+
+
+def find_ostium(
+    path: Float[np.ndarray, "n 3"],
+    blood: Bool[np.ndarray, "nz ny nx"],
+    aorta: Bool[np.ndarray, "nz ny nx"],
+    grid: Volume,
+) -> tuple[Insertion, Float[np.ndarray, "m 3"]]:
+    """Return the ostium, and the path begun anew from there.
+
+    The artery's middle is the centroid of its blood at several heights above the aortic wall; a parabola through the
+    lowest of them is carried on to the wall. Where the artery leaves at a slant, the tracked path begins at its edge,
+    and the blood near the path is more of one side than of the other: a second round looks around the parabola.
+
+    Args:
+        path: LPS mm, the first point within a few mm of the aortic wall, or anywhere if no aorta is near.
+        blood: voxels above half the lumen's HU.
+        aorta: voxels of the aorta, roughly.
+        grid: the isotropic grid of both masks.
+    """
+    spacing = float(grid.spacing_mm[0])
+    half = round(_BOX_MM / spacing)
+    centre = np.round(grid.world_to_index(path[0])).astype(int)[::-1]
+    corner = np.clip(centre - half, 0, None)
+    box = tuple(slice(a, b) for a, b in zip(corner, centre + half + 1, strict=True))
+    deep = (distance_to_outside(blood[box], spacing) >= _BALL_MM) & aorta[box]
+    if not deep.any():
+        return Insertion(path[0], _heading(path)), path
+    height = distance_to_outside(~deep, spacing) - _BALL_MM
+    ostium = Insertion(path[0], _heading(path))
+    for _ in range(2):
+        middles = _middles(path, blood[box], height, corner, grid)
+        if len(middles) < 3:
+            break
+        heights = np.array(sorted(middles))[:_FITTED]
+        points = np.array([middles[h] for h in heights])
+        fit = np.polynomial.Polynomial.fit
+        curves = [fit(heights, points[:, axis], 2 if len(heights) >= 5 else 1) for axis in range(3)]
+        wall = _height_of_wall(np.array([curve(0.0) for curve in curves]), height, corner, grid)
+        position = np.array([curve(wall) for curve in curves])
+        slope = np.array([curve.deriv()(0.5) for curve in curves])
+        beginning = np.array([[curve(h) for curve in curves] for h in np.arange(wall, heights[-1] + 0.01, 0.25)])
+        kept = np.linalg.norm(path - position, axis=1) > np.linalg.norm(beginning[-1] - position) + 1.0
+        first = int(np.argmax(kept)) if kept.any() else len(path) - 1
+        path = np.concatenate([beginning, path[first:]])
+        ostium = Insertion(position, slope / np.linalg.norm(slope))
+    return ostium, path
+
+
+def _height_of_wall(
+    mouth: Float[np.ndarray, "3"], height: Float[np.ndarray, "nz ny nx"], corner: np.ndarray, grid: Volume
+) -> float:
+    """Return where the aortic wall goes on under the artery's mouth, mm of height: below 0, as the ball bulges in.
+
+    A quadric through the wall around the mouth estimates it; outliers, such as another vessel's mouth, are left out.
+    """
+    spacing = float(grid.spacing_mm[0])
+    near = np.argwhere(np.abs(height) < 0.8 * spacing)
+    offset = grid.index_to_world((near + corner)[:, ::-1].astype(float)) - mouth
+    close = np.linalg.norm(offset, axis=1) < _MOUTH_MM + _WALL_MM
+    offset, level = offset[close], height[tuple(near[close].T)]
+    if len(offset) == 0:
+        return 0.0
+    slope = [values[tuple(near[close].T)] for values in np.gradient(height)]
+    outward = np.array([values.mean() for values in slope])[::-1]
+    outward = grid.direction @ outward / max(float(np.linalg.norm(outward)), 1e-9)
+    above = offset @ outward
+    u, v = (offset @ axis for axis in np.linalg.svd(outward[None])[2][1:])
+    around = np.hypot(u, v) > _MOUTH_MM
+    if around.sum() < _FEWEST_OF_WALL:
+        return 0.0
+    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)[around]
+    place = (above - level)[around]
+    found = np.linalg.lstsq(terms, place, rcond=None)[0]
+    for _ in range(2):
+        error = np.abs(place - terms @ found)
+        kept = error <= max(2.5 * float(np.median(error)), 0.2)
+        found = np.linalg.lstsq(terms[kept], place[kept], rcond=None)[0]
+    return float(np.clip(found[0], -_DEEPEST_MM, 0.0))
+
+
+def _middles(
+    path: np.ndarray, blood: np.ndarray, height: np.ndarray, corner: np.ndarray, grid: Volume
+) -> dict[float, Float[np.ndarray, "3"]]:
+    """Return the centroid of the artery's blood by height above the wall, mm, from the wall to where it is lost."""
+    along = length_along(path)
+    near = path[along < 12.0]
+    back = near[0] - np.arange(0.5, 4.0, 0.5)[:, None] * _heading(path)
+    outside = blood & (height > _SECTIONS_MM[0] - 0.5)
+    label = connected_components(outside)
+    at = np.round(grid.world_to_index(near)).astype(int)[:, ::-1] - corner
+    at = at[np.all((at >= 0) & (at < blood.shape), axis=1)]
+    names = label[tuple(at.T)]
+    if not (names > 0).any():
+        return {}
+    voxels = np.argwhere(label == np.bincount(names[names > 0]).argmax())
+    points = grid.index_to_world((voxels + corner)[:, ::-1].astype(float))
+    distance, _ = KDTree(np.concatenate([back, near])).query(points)
+    points, level = points[distance < _NEAR_MM], height[tuple(voxels[distance < _NEAR_MM].T)]
+    middles = {}
+    for h in _SECTIONS_MM:
+        section = points[np.abs(level - h) < 0.5]
+        if len(section) < 8:
+            break
+        middles[float(h)] = section.mean(axis=0)
+    return middles
+
+
+def _heading(path: np.ndarray) -> Float[np.ndarray, "3"]:
+    """Return the unit direction of the first millimetres of a path."""
+    smooth = ndimage.gaussian_filter1d(path, 3.0, axis=0, mode="nearest")
+    step = smooth[min(8, len(path) - 1)] - smooth[0]
+    return step / max(float(np.linalg.norm(step)), 1e-9)

@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from endopilot.errors import place_text
+from endopilot.imaging.aortic_root import box_around, openings
 from endopilot.imaging.contour import CALCIUM
 from endopilot.imaging.grid import connected_components, distance_to_outside
-from endopilot.imaging.openings import box_around, openings
 from endopilot.lines import length_along
 from endopilot.types import Volume
 
@@ -61,21 +61,44 @@ _BEYOND_MM = 10.0
 """The mask of a thin distal end may be this much shorter than its path."""
 _FILLED_MM = 2.0
 """Calcium or metal so near to where the mask ends fills the vessel."""
+_WALL_HU = 50.0
+"""The aortic wall."""
 
 
 @dataclass(frozen=True, eq=False)
-class FoundTree:
-    """A coronary tree as it was found, on the grid of the vessels.
+class Scan:
+    """What is known of the scan on the grid of the vessels.
+
+    Attributes:
+        grid: CT in HU.
+        hu: the same, lightly smoothed.
+        lumen_hu: HU of contrast-filled lumen.
+        pools: aorta, chambers, great vessels.
+        vessels: voxels of thin vessels.
+        response: vesselness.
+    """
+
+    grid: Volume
+    hu: Float[np.ndarray, "nz ny nx"]
+    lumen_hu: float
+    pools: Bool[np.ndarray, "nz ny nx"]
+    vessels: Bool[np.ndarray, "nz ny nx"]
+    response: Float[np.ndarray, "nz ny nx"]
+
+    @property
+    def blood_hu(self) -> float:
+        """HU midway between the aortic wall and lumen: what is brighter is blood."""
+        return 0.5 * (self.lumen_hu + _WALL_HU)
+
+
+@dataclass(frozen=True, eq=False)
+class FoundTree(Scan):
+    """A coronary tree as it was found in a scan.
 
     Attributes:
         volume: CT in HU, as it was given.
-        grid: the same on the grid.
-        hu: the same, lightly smoothed.
-        lumen_hu: HU of contrast-filled lumen.
-        blood_hu: HU midway between aortic wall and lumen.
-        vessels: voxels of thin vessels.
-        aorta: voxels of the aorta; none if it is not in the volume.
-        tree: those of the vessels that are the tree.
+        aorta: voxels of the aorta on that grid; none if it is not in the volume.
+        tree: those of the scan's vessels that are the tree.
         ostium: LPS mm.
         paths: from the ostium to every distal end, each from where it leaves those before it, LPS mm.
         radius: radius at the points of each path, mm.
@@ -83,11 +106,6 @@ class FoundTree:
     """
 
     volume: Volume
-    grid: Volume
-    hu: Float[np.ndarray, "nz ny nx"]
-    lumen_hu: float
-    blood_hu: float
-    vessels: Bool[np.ndarray, "nz ny nx"]
     aorta: Bool[np.ndarray, "nz ny nx"]
     tree: Bool[np.ndarray, "nz ny nx"]
     ostium: Float[np.ndarray, "3"]

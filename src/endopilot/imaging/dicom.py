@@ -7,10 +7,12 @@ does not come back from some damaged files.
 
 from __future__ import annotations
 
+import os
+import re
 import warnings
-from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,32 +26,20 @@ from pydicom.uid import UID, AllTransferSyntaxes
 
 from endopilot.errors import InputError
 from endopilot.imaging.dicom_phases import PHASE_TAGS, choose_phase, slices_text
-from endopilot.imaging.geometry import Fields, Geometry, geometry, plane
+from endopilot.imaging.geometry import Geometry, plane, slice_grid
 from endopilot.progress import progress
 from endopilot.types import Volume
 
 # What geometry and decoding need; no tag here names a patient, a place or a day.
-_TAGS = (
-    "SeriesInstanceUID",
-    "SeriesNumber",
-    "Modality",
-    "ImageType",
-    "SamplesPerPixel",
-    "NumberOfFrames",
-    "Rows",
-    "Columns",
-    "BitsAllocated",
-    "PixelSpacing",
-    "ImagePositionPatient",
-    "ImageOrientationPatient",
-    "RescaleSlope",
-    "RescaleIntercept",
-    "RescaleType",
-    "PhotometricInterpretation",
-    "PixelRepresentation",
-    "PixelPaddingValue",
-    "PixelPaddingRangeLimit",
+_NUMBERS = (
+    *("SeriesNumber", "SamplesPerPixel", "NumberOfFrames", "Rows", "Columns", "BitsAllocated", "PixelRepresentation"),
+    *("PixelSpacing", "ImagePositionPatient", "ImageOrientationPatient", "RescaleSlope", "RescaleIntercept"),
+    *("PixelPaddingValue", "PixelPaddingRangeLimit"),
     *PHASE_TAGS,
+)
+_WORDS = (
+    *("SeriesInstanceUID", "Modality", "ImageType", "RescaleType", "PhotometricInterpretation"),
+    "LossyImageCompression",
 )
 
 # Transfer syntaxes that are decoded: uncompressed, deflated, RLE, JPEG, JPEG-LS, JPEG 2000.
@@ -57,64 +47,66 @@ _UNCOMPRESSED = ("1.2.840.10008.1.2", "1.2.840.10008.1.2.1", "1.2.840.10008.1.2.
 _DEFLATED = "1.2.840.10008.1.2.1.99"
 _RLE = "1.2.840.10008.1.2.5"
 _ENCAPSULATED = (_RLE, *(f"1.2.840.10008.1.2.4.{number}" for number in (50, 51, 57, 70, 80, 81, 90, 91)))
+_LOSSY = tuple(f"1.2.840.10008.1.2.4.{number}" for number in (50, 51, 81))
 _DECODED = (*_UNCOMPRESSED, _DEFLATED, *_ENCAPSULATED)
 
 # Encapsulated pixels begin and end with these bytes (PS3.5 A.4).
 _PIXELS_BEGIN = (b"\xe0\x7f\x10\x00OB\0\0\xff\xff\xff\xff", b"\xe0\x7f\x10\x00OW\0\0\xff\xff\xff\xff")
 _PIXELS_END = b"\xfe\xff\xdd\xe0\0\0\0\0"
 
-_SPACING_TOLERANCE = 0.05
-"""Slice distances may differ from their median by this share: positions are written with few digits."""
+_PREAMBLE = 128
+_MOST_NAMED = 10
 _FEWEST_SLICES = 4
 _HU_TYPES = ("", "HU")
 _PERHAPS_HU_TYPES = ("US", "HU_MOD")
 """RescaleType of HU that the scanner modified, and of converters that leave the type open (unspecified)."""
 _AIR_HU = -1024.0
 """What pixels are given that lie outside the scanned circle (PixelPaddingValue)."""
-_FIELDS = Fields("ImageOrientationPatient and ImagePositionPatient", "PixelSpacing", "ImagePositionPatient")
 
 
 @dataclass(frozen=True, eq=False)
 class _Slice:
-    """The geometry in the header of one file, without identifiers; None and empty where a field is absent.
+    """What the header of one file says of its image, without identifiers.
 
     Attributes:
         path: the file.
-        series_uid: SeriesInstanceUID.
-        series_number: SeriesNumber.
-        modality: Modality.
         transfer_syntax: UID of the encoding.
-        size: Rows, Columns.
-        bytes_per_value: of the stored pixels.
-        samples: values a pixel.
-        frames: images in the file.
-        rescale: RescaleSlope, RescaleIntercept.
-        rescale_type: RescaleType.
-        photometric: PhotometricInterpretation.
-        padding: lowest and highest stored value of pixels that show nothing (PixelPaddingValue).
-        phase: of each field of `PHASE_TAGS`, its value.
-        spacing_mm: PixelSpacing: between rows, between columns.
-        position: ImagePositionPatient, LPS mm.
-        orientation: ImageOrientationPatient.
+        numbers: values of each of `_NUMBERS`; none where the header has none.
+        words: text of each of `_WORDS`, in capitals; empty where the header has none.
     """
 
     path: Path
-    series_uid: str
-    series_number: int | None
-    modality: str
     transfer_syntax: str
-    size: tuple[int, int]
-    bytes_per_value: int
-    samples: int
-    frames: int
-    rescale: tuple[float, ...]
-    rescale_type: str
-    photometric: str
-    padding: tuple[float, ...]
-    phase: dict[str, float | None]
-    spacing_mm: tuple[float, ...]
-    position: tuple[float, ...]
-    orientation: tuple[float, ...]
+    numbers: dict[str, tuple[float, ...]]
+    words: dict[str, str]
+
+    def whole(self, name: str, absent: int) -> int:
+        """Return the first value of one of `_NUMBERS`."""
+        return int(self.numbers[name][0]) if self.numbers[name] else absent
+
+    @property
+    def series(self) -> tuple[int, str]:
+        """SeriesNumber, 0 where it is absent, and SeriesInstanceUID."""
+        return self.whole("SeriesNumber", 0), self.words["SeriesInstanceUID"]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Rows, Columns."""
+        return self.whole("Rows", 0), self.whole("Columns", 0)
+
+    @property
+    def rescale(self) -> tuple[float, ...]:
+        """RescaleSlope, RescaleIntercept."""
+        return self.numbers["RescaleSlope"][:1] + self.numbers["RescaleIntercept"][:1]
+
+    @property
+    def padding(self) -> tuple[float, ...]:
+        """Lowest and highest stored value of pixels that show nothing, as signed as the pixels are."""
+        given = self.numbers["PixelPaddingValue"][:1]
+        bits, signed = self.whole("BitsAllocated", 16), self.whole("PixelRepresentation", 0) == 1
+        given += self.numbers["PixelPaddingRangeLimit"][:1] if given else ()
+        stored = sorted(value - 2.0**bits if signed and value >= 2.0 ** (bits - 1) else value for value in given)
+        return (stored[0], stored[-1]) if stored else ()
 
 
 def read_series(path: Path, series: str | None, phase: str | None = None) -> Volume:
@@ -129,125 +121,136 @@ def read_series(path: Path, series: str | None, phase: str | None = None) -> Vol
         InputError: there is no image or more than one series, or the series is no plain CT volume.
     """
     folder = path if path.is_dir() else path.parent
-    slices = _read_headers(sorted(file for file in (folder.rglob("*") if path == folder else folder.iterdir())))
+    slices, left_out = _read_headers(_files(folder, deep=path == folder))
     if not slices:
-        raise InputError(f"{path}: no DICOM image here; give the folder that holds the slices of a CT series")
+        said = f" ({left_out[0]})" if left_out else ""
+        raise InputError(f"{path}: no DICOM image here{said}; give the folder that holds the slices of a CT series")
     if path != folder:
-        slices = [slice_ for slice_ in slices if slice_.series_uid == _series_of(path, slices)]
+        of_file = next((slice_.series[1] for slice_ in slices if slice_.path == path), None)
+        if of_file is None:
+            raise InputError(f"{path}: a DICOM file without an axial image; give a folder of CT slices")
+        slices = [slice_ for slice_ in slices if slice_.series[1] == of_file]
     chosen = _choose(slices, series, folder)
-    notes = _check_slices(chosen, folder)
+    notes = [*_check_slices(chosen, folder), *left_out]
     first = chosen[0]
-    axes, normal = plane(first.orientation, first.spacing_mm, path=first.path)
+    axes, normal = plane(first.numbers["ImageOrientationPatient"], first.numbers["PixelSpacing"], path=first.path)
     of_phase, phase_notes = choose_phase(
-        {tag: [slice_.phase[tag] for slice_ in chosen] for tag in PHASE_TAGS},
-        np.array([slice_.position for slice_ in chosen]) @ normal,
+        {tag: [next(iter(slice_.numbers[tag]), None) for slice_ in chosen] for tag in PHASE_TAGS},
+        np.array([slice_.numbers["ImagePositionPatient"] for slice_ in chosen]) @ normal,
         phase,
         folder,
         named=next((index for index, slice_ in enumerate(chosen) if slice_.path == path), None),
     )
     ordered, place = _geometry([chosen[index] for index in of_phase], axes, normal, folder)
     voxels, pixel_notes = _read_pixels(ordered)
-    return Volume(
-        voxels,
-        place.spacing_mm,
-        place.origin_mm,
-        place.direction,
-        tuple(f"{folder.name}: {note}" for note in (*notes, *phase_notes, *pixel_notes)) + place.notes,
-        tuple(sorted(slice_.path for slice_ in ordered)),
-    )
+    volume = place.volume(voxels, tuple(sorted(slice_.path for slice_ in ordered)))
+    said = tuple(f"{folder.name}: {note}" for note in (*notes, *phase_notes, *pixel_notes))
+    return replace(volume, notes=(*said, *volume.notes))
 
 
-def _read_headers(files: Sequence[Path]) -> list[_Slice]:
-    """Return the headers of DICOM images, other files and scout views left out."""
-    found = []
+def _files(folder: Path, *, deep: bool) -> list[Path]:
+    """Return all that lies in a folder, and in its subfolders if `deep`: links to folders are not followed.
+
+    Raises:
+        InputError: a folder may not be read.
+    """
+
+    def refuse(error: OSError) -> None:
+        raise InputError(f"{error.filename}: may not be read ({error.strerror}); ask for access to it") from error
+
+    found: list[Path] = []
+    for parent, folders, names in os.walk(folder, onerror=refuse):
+        links = (name for name in folders if Path(parent, name).is_symlink())
+        found += [Path(parent, name) for name in (*names, *links)]
+        if not deep:
+            break
+    return sorted(found)
+
+
+def _read_headers(files: Sequence[Path]) -> tuple[list[_Slice], list[str]]:
+    """Return the headers of DICOM images, scout views left out, and what is to be noted of other files.
+
+    Among the other files may be slices whose content is lost: what is named as the slices are and is no text is
+    refused, and so is what says of itself that it is an image.
+    """
+    found, others = [], []
     # pydicom's warnings quote header values; none may reach a log.
     with progress("Reading DICOM headers", len(files)) as advance, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for file in files:
             advance()
-            if not file.is_file():
-                continue
             try:
-                header = pydicom.dcmread(file, stop_before_pixels=True, specific_tags=list(_TAGS))
-                if "Rows" in header and "LOCALIZER" not in (header.get("ImageType") or ()):
+                if not file.is_file():
+                    raise InvalidDicomError
+                header = pydicom.dcmread(file, stop_before_pixels=True, specific_tags=[*_NUMBERS, *_WORDS])
+                if "Rows" not in header:
+                    meta = header.file_meta
+                    if "TransferSyntaxUID" not in meta or "Image Storage" in meta.MediaStorageSOPClassUID.name:
+                        raise EOFError("cut short")
+                    others.append((file, False))
+                elif "LOCALIZER" not in (header.get("ImageType") or ()):
                     found.append(_slice(file, header))
             except InvalidDicomError:
-                continue
+                others.append((file, _is_no_text(file)))
+            except PermissionError as error:
+                raise InputError(f"{file}: may not be read ({error.strerror}); ask for access to it") from error
             except Exception:
                 # pydicom's message may quote the header, so it is not passed on.
                 raise InputError(f"{file}: its DICOM header is damaged; copy or export the series again") from None
-    return found
+    suffixes = {_kind_of_suffix(slice_.path) for slice_ in found}
+    for file, perhaps_slice in others:
+        if perhaps_slice and _kind_of_suffix(file) in suffixes:
+            raise InputError(
+                f"{file}: is named as the slices beside it are, but is no DICOM file (empty, cut short, without "
+                "preamble, or a broken link); copy or export it again, or move it away"
+            )
+    names = [file.name for file, _ in others]
+    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    return found, [f"without an image and left out: {', '.join(names[:_MOST_NAMED])}{more}"] if names else []
+
+
+def _is_no_text(file: Path) -> bool:
+    """Return whether a file that is no DICOM may be the rest of one: it is empty, not there, or holds zero bytes."""
+    content = file.open("rb").read(_PREAMBLE + 4) if file.is_file() else b""
+    return not content or b"\0" in content
+
+
+def _kind_of_suffix(file: Path) -> str:
+    """Return a file's suffix, its digits alike, as they are the last part of a UID; hidden files have names alone."""
+    return file.name if file.name.startswith(".") else re.sub(r"\d+", "0", file.suffix.lower())
 
 
 def _slice(file: Path, header: Dataset) -> _Slice:
     """Take what is needed out of a header; any error means that it is damaged."""
-
-    def numbers(tag: str) -> tuple[float, ...]:
-        value = header.get(tag)
-        return tuple(float(x) for x in np.atleast_1d(value)) if value not in (None, "") else ()
-
-    number = header.get("SeriesNumber")
+    present = {tag: header[tag].value for tag in (*_NUMBERS, *_WORDS) if header.get(tag) not in (None, "")}
     return _Slice(
-        path=file,
-        series_uid=str(header.get("SeriesInstanceUID", "")),
-        series_number=None if number is None else int(number),
-        modality=str(header.get("Modality") or "CT"),
-        transfer_syntax=str(header.file_meta.get("TransferSyntaxUID", _UNCOMPRESSED[0])),
-        size=(int(header.Rows), int(header.Columns)),
-        bytes_per_value=int(header.get("BitsAllocated") or 16) // 8,
-        samples=int(header.get("SamplesPerPixel") or 1),
-        frames=int(header.get("NumberOfFrames") or 1),
-        rescale=numbers("RescaleSlope")[:1] + numbers("RescaleIntercept")[:1],
-        rescale_type=str(header.get("RescaleType") or "").strip().upper(),
-        photometric=str(header.get("PhotometricInterpretation") or "").strip().upper(),
-        padding=_padding(header, numbers),
-        phase={tag: next(iter(numbers(tag)), None) for tag in PHASE_TAGS},
-        spacing_mm=numbers("PixelSpacing"),
-        position=numbers("ImagePositionPatient"),
-        orientation=numbers("ImageOrientationPatient"),
+        file,
+        str(header.file_meta.get("TransferSyntaxUID", _UNCOMPRESSED[0])),
+        {tag: tuple(float(x) for x in np.atleast_1d(present.get(tag, ()))) for tag in _NUMBERS},
+        {tag: str(present.get(tag, "")).strip().upper() for tag in _WORDS},
     )
-
-
-def _padding(header: Dataset, numbers: Callable[[str], tuple[float, ...]]) -> tuple[float, ...]:
-    """Return the stored values of pixels that show nothing, as signed as the pixels are."""
-    given = numbers("PixelPaddingValue")[:1] + numbers("PixelPaddingRangeLimit")[:1]
-    if not numbers("PixelPaddingValue"):
-        return ()
-    bits = int(header.get("BitsAllocated") or 16)
-    signed = int(header.get("PixelRepresentation") or 0) == 1
-    stored = sorted(value - 2.0**bits if signed and value >= 2.0 ** (bits - 1) else value for value in given)
-    return stored[0], stored[-1]
-
-
-def _series_of(path: Path, slices: Sequence[_Slice]) -> str:
-    for slice_ in slices:
-        if slice_.path == path:
-            return slice_.series_uid
-    raise InputError(f"{path}: a DICOM file without an axial image; give a folder of CT slices")
 
 
 def _choose(slices: Sequence[_Slice], series: str | None, folder: Path) -> list[_Slice]:
     """Return the slices of the one series there is, or of the one asked for."""
-    by_uid: defaultdict[str, list[_Slice]] = defaultdict(list)
+    groups_by: defaultdict[str, list[_Slice]] = defaultdict(list)
     for slice_ in slices:
-        by_uid[slice_.series_uid].append(slice_)
-    groups = sorted(by_uid.values(), key=lambda group: (group[0].series_number or 0, group[0].series_uid))
+        groups_by[slice_.series[1]].append(slice_)
+    groups = sorted(groups_by.values(), key=lambda group: group[0].series)
     if series is None and len(groups) == 1:
         return groups[0]
     # Names of our own: a series' description is free text, and may name the patient.
-    numbers = Counter(group[0].series_number for group in groups)
+    numbers = [group[0].series[0] for group in groups]
     names = [
-        str(group[0].series_number)
-        if group[0].series_number is not None and numbers[group[0].series_number] == 1
-        else f"{group[0].series_number or 0}.{ordinal}"
-        for ordinal, group in enumerate(groups, start=1)
+        str(number) if number and numbers.count(number) == 1 else f"{number}.{ordinal}"
+        for ordinal, number in enumerate(numbers, start=1)
     ]
     for name, group in zip(names, groups, strict=True):
-        if series in (name, group[0].series_uid):
+        if series in (name, group[0].series[1]):
             return group
     listed = "; ".join(
-        f"{name}: {group[0].modality}, {slices_text(len(group))} of {group[0].size[1]}×{group[0].size[0]}"
-        for name, group in zip(names, groups, strict=True)
+        f"{name}: {group[0].words['Modality'] or 'CT'}, {slices_text(len(group))} of {'×'.join(map(str, size[::-1]))}"
+        for name, group, size in zip(names, groups, (group[0].size for group in groups), strict=True)
     )
     if series is None:
         raise InputError(
@@ -265,11 +268,11 @@ def _check_slices(slices: Sequence[_Slice], folder: Path) -> list[str]:
     """Refuse a series that is no CT of plain single-frame slices that can be decoded; return what is to be noted."""
     for slice_ in slices:
         path = slice_.path
-        if slice_.modality != "CT":
-            raise InputError(f"{folder}: modality {slice_.modality}; HU are needed, give a CT series")
-        if slice_.samples != 1:
+        if slice_.words["Modality"] not in ("", "CT"):
+            raise InputError(f"{folder}: modality {slice_.words['Modality']}; HU are needed, give a CT series")
+        if slice_.whole("SamplesPerPixel", 1) != 1:
             raise InputError(f"{path}: a colour image (RGB); give the grey-level CT series")
-        if slice_.frames != 1:
+        if slice_.whole("NumberOfFrames", 1) != 1:
             raise InputError(f"{path}: a multi-frame file; export one file a slice, or NIfTI")
         if slice_.transfer_syntax not in _DECODED:
             raise InputError(
@@ -277,48 +280,52 @@ def _check_slices(slices: Sequence[_Slice], folder: Path) -> list[str]:
                 "decompress the series (gdcmconv --raw) or export it uncompressed"
             )
         for tag, value, count in (
-            ("ImagePositionPatient", slice_.position, 3),
-            ("ImageOrientationPatient", slice_.orientation, 6),
-            ("PixelSpacing", slice_.spacing_mm, 2),
+            ("Rows and Columns", slice_.numbers["Rows"] + slice_.numbers["Columns"], 2),
+            ("ImagePositionPatient", slice_.numbers["ImagePositionPatient"], 3),
+            ("ImageOrientationPatient", slice_.numbers["ImageOrientationPatient"], 6),
+            ("PixelSpacing", slice_.numbers["PixelSpacing"], 2),
             ("RescaleSlope and RescaleIntercept", slice_.rescale, 2),
         ):
             if len(value) != count or not np.isfinite(value).all():
                 raise InputError(f"{path}: no {tag} in its header; export the series again with its complete header")
         if slice_.rescale[0] == 0:
             raise InputError(f"{path}: RescaleSlope is 0, which leaves no HU; export the series again")
-        if slice_.rescale_type not in (*_HU_TYPES, *_PERHAPS_HU_TYPES):
+        if slice_.words["RescaleType"] not in (*_HU_TYPES, *_PERHAPS_HU_TYPES):
             raise InputError(f"{path}: RescaleType is not HU; give the CT series in HU, not one computed from it")
-        if slice_.photometric == "MONOCHROME1":
+        if slice_.words["PhotometricInterpretation"] == "MONOCHROME1":
             raise InputError(
                 f"{path}: PhotometricInterpretation MONOCHROME1 (white is low): some programs invert such values, "
                 "others do not; export the series as MONOCHROME2"
             )
-        needed = slice_.size[0] * slice_.size[1] * slice_.bytes_per_value
+        needed = slice_.size[0] * slice_.size[1] * slice_.whole("BitsAllocated", 16) // 8
         if slice_.transfer_syntax in _UNCOMPRESSED and path.stat().st_size < needed:
             raise InputError(f"{path}: truncated, its pixels are incomplete; copy or export the series again")
     if len(slices) < _FEWEST_SLICES:
         raise InputError(f"{folder}: only {slices_text(len(slices))}; give a series of at least {_FEWEST_SLICES}")
     for tag, values in (
         ("Rows and Columns", [slice_.size for slice_ in slices]),
-        ("PixelSpacing", [slice_.spacing_mm for slice_ in slices]),
-        ("ImageOrientationPatient", [slice_.orientation for slice_ in slices]),
+        *((tag, [slice_.numbers[tag] for slice_ in slices]) for tag in ("PixelSpacing", "ImageOrientationPatient")),
     ):
         if np.ptp(np.array(values, dtype=float), axis=0).max() > 1e-3:
             raise InputError(f"{folder}: {tag} differ between slices; give a folder with one volume alone")
-    open_types = sorted({slice_.rescale_type for slice_ in slices} & set(_PERHAPS_HU_TYPES))
-    return [f"RescaleType {', '.join(open_types)} was taken as HU"] if open_types else []
+    open_types = sorted({slice_.words["RescaleType"] for slice_ in slices} & set(_PERHAPS_HU_TYPES))
+    notes = [f"RescaleType {', '.join(open_types)} was taken as HU"] if open_types else []
+    lossy = [s for s in slices if s.transfer_syntax in _LOSSY or s.words["LossyImageCompression"] == "01"]
+    if lossy:
+        name = _syntax_name(lossy[0].transfer_syntax)
+        notes.append(f"compressed with loss ({name}): HU are not those of the scanner")
+    return notes
 
 
 def _geometry(
     slices: Sequence[_Slice], axes: Float[np.ndarray, "3 2"], normal: Float[np.ndarray, "3"], folder: Path
 ) -> tuple[list[_Slice], Geometry]:
     """Return slices in order, and where they lie (DICOM PS3.3 C.7.6.2.1.1); gaps are refused."""
-    positions = np.array([slice_.position for slice_ in slices])
+    positions = np.array([slice_.numbers["ImagePositionPatient"] for slice_ in slices])
     order = np.argsort(positions @ normal, kind="stable")
-    positions = positions[order]
-    steps = np.diff(positions @ normal)
+    steps = np.diff(positions[order] @ normal)
     usual = float(np.median(steps))
-    gaps = np.flatnonzero(np.abs(steps - usual) > _SPACING_TOLERANCE * usual)
+    gaps = np.flatnonzero(np.round(steps / usual) > 1)
     if gaps.size:
         first = gaps[0]
         count = "1 irregular slice distance" if gaps.size == 1 else f"{gaps.size} irregular slice distances"
@@ -326,16 +333,8 @@ def _geometry(
             f"{folder}: {count}, the first {steps[first]:.2f} mm instead of {usual:.2f} mm after slice {first + 1}: "
             "slices are missing; export the whole series again"
         )
-    travel = (positions[-1] - positions[0]) / (len(slices) - 1)
-    step = float(np.linalg.norm(travel))
-    place = geometry(
-        np.column_stack([axes, travel / step]),
-        np.array([*slices[0].spacing_mm[::-1], step]),
-        positions[0],
-        (slices[0].size[1], slices[0].size[0], len(slices)),
-        path=folder,
-        fields=_FIELDS,
-    )
+    spacing, size = slices[0].numbers["PixelSpacing"], slices[0].size
+    place = slice_grid(positions[order], np.arange(len(slices)), axes, spacing, size, path=folder)
     return [slices[i] for i in order], place
 
 
@@ -358,8 +357,9 @@ def _read_pixels(slices: Sequence[_Slice]) -> tuple[np.ndarray, list[str]]:
             except Exception:
                 # The decoder's message may quote the header, so it is not passed on.
                 raise InputError(
-                    f"{slice_.path}: its pixels cannot be decoded (truncated or damaged); "
-                    "copy or export the series again"
+                    f"{slice_.path}: its pixels cannot be decoded (truncated or damaged "
+                    f"{_syntax_name(slice_.transfer_syntax)}); copy or export the series again, or decompress it "
+                    "(gdcmconv --raw)"
                 ) from None
             padded += _pad(slice_, plane)
             advance()

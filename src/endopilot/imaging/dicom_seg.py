@@ -8,18 +8,16 @@ from __future__ import annotations
 
 import importlib
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Integer
+from jaxtyping import Bool, Float, Integer
 
 from endopilot import __version__
 from endopilot.errors import InputError
-from endopilot.files import writing
-from endopilot.imaging.geometry import Fields, Geometry, geometry, plane
+from endopilot.imaging.geometry import plane, slice_grid
 from endopilot.imaging.segments import Segment, choose
 from endopilot.types import LumenMask, Volume
 
@@ -29,27 +27,6 @@ if TYPE_CHECKING:
 SUFFIX = ".dcm"
 _SAME_MM = 1e-3
 """Frames nearer to each other than this are of one slice."""
-_SPACING_TOLERANCE = 0.05
-"""Distances of frames may err by this share of the step: positions are written with few digits."""
-
-
-@dataclass(frozen=True)
-class _Frame:
-    """What the header says of one frame.
-
-    Attributes:
-        number: ReferencedSegmentNumber; 0 in a label map.
-        position: ImagePositionPatient, LPS mm.
-        orientation: ImageOrientationPatient.
-        spacing_mm: PixelSpacing: between rows, between columns.
-        step_mm: SpacingBetweenSlices; 0 where it is absent.
-    """
-
-    number: int
-    position: tuple[float, ...]
-    orientation: tuple[float, ...]
-    spacing_mm: tuple[float, ...]
-    step_mm: float
 
 
 def need_highdicom(path: Path) -> Any:
@@ -75,7 +52,7 @@ def write_seg(mask: LumenMask, path: Path) -> None:
     hd = need_highdicom(path)
     from pydicom.sr.codedict import codes
 
-    from endopilot.imaging.dicom_write import slice_headers  # pydicom comes with an extra
+    from endopilot.imaging.dicom_write import save, slice_headers  # pydicom comes with an extra
 
     volume = mask.volume
     header = slice_headers(volume)[0]
@@ -112,8 +89,7 @@ def write_seg(mask: LumenMask, path: Path) -> None:
     # highdicom needs a source image; there is none that may be named.
     del content.ReferencedSeriesSequence
     del content.SourceImageSequence
-    with writing(path) as partial:
-        content.save_as(partial)
+    save(content, path)
 
 
 def read_seg(path: Path, label: int | str | None = None) -> Volume:
@@ -134,109 +110,96 @@ def read_seg(path: Path, label: int | str | None = None) -> Volume:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they quote header values
             content = pydicom.dcmread(path)
-            frames = _frames(content)
+            numbers, positions, orientation, spacing, step = _frames(content)
             names = {int(s.SegmentNumber): str(s.get("SegmentLabel", "")) for s in content.SegmentSequence}
             kind = str(content.SegmentationType)
-            pixels = content.pixel_array.reshape(len(frames), int(content.Rows), int(content.Columns))
+            pixels = content.pixel_array.reshape(len(numbers), int(content.Rows), int(content.Columns))
             half = (int(content.MaximumFractionalValue) + 1) // 2 if kind == "FRACTIONAL" else 1
     except Exception:
         # The message may quote the header, so it is not passed on.
         raise InputError(
             f"{path}: cannot be read as a DICOM-SEG of parallel, evenly spaced slices; export the mask as .nii.gz"
         ) from None
-    place, size_k, slots = _grid(frames, pixels.shape[1:], path)
-    present = _present(pixels, half, frames, kind)
+    axes, normal = plane(orientation, spacing, path=path)
+    slots = _slots(positions @ normal, step, path)
+    place = slice_grid(positions, slots, axes, spacing, pixels.shape[1:], path=path)
+    present = _present(pixels, half, numbers, kind)
     if not present:
         raise InputError(f"{path}: the mask is empty; segment the vessel again or give another file")
     numbered = [(number, Segment(names.get(number, ""), 0, number)) for number in sorted(present)]
     # Names are free text, as a series' description is, and may name the patient: they are compared, not shown.
     chosen = choose(numbered, label, path, show_names=False).value
-    inside: Bool[np.ndarray, "nz ny nx"] = np.zeros((size_k, *pixels.shape[1:]), dtype=bool)
-    for slot, frame, pixel in zip(slots, frames, pixels, strict=True):
+    inside: Bool[np.ndarray, "nz ny nx"] = np.zeros((slots.max() + 1, *pixels.shape[1:]), dtype=bool)
+    for slot, number, pixel in zip(slots, numbers, pixels, strict=True):
         if kind == "LABELMAP":
             inside[slot] |= pixel == chosen
-        elif frame.number == chosen:
+        elif number == chosen:
             inside[slot] |= pixel >= half
-    notes = place.notes
     if kind == "FRACTIONAL":
-        notes += (f"{path.name}: a fractional segment; voxels that it fills by half or more were taken",)
-    return Volume(inside, place.spacing_mm, place.origin_mm, place.direction, notes, (path,))
+        note = f"{path.name}: a fractional segment; voxels that it fills by half or more were taken"
+        place = replace(place, notes=(*place.notes, note))
+    return place.volume(inside, (path,))
 
 
-def _frames(content: Dataset) -> list[_Frame]:
-    """Return the geometry of every frame; any error means that the object is none that can be read."""
+def _frames(content: Dataset) -> tuple[list[int], np.ndarray, tuple[float, ...], tuple[float, ...], float]:
+    """Return the geometry of all frames; any error means that the object is none that can be read.
+
+    Returns:
+        Of each frame ReferencedSegmentNumber (0 in a label map) and ImagePositionPatient, LPS mm; of all
+        ImageOrientationPatient, PixelSpacing, and SpacingBetweenSlices (0 where it is absent), mm.
+    """
     shared = content.SharedFunctionalGroupsSequence[0]
 
     def item(frame: Dataset, name: str) -> Dataset:
         return (frame if name in frame else shared)[name].value[0]
 
-    frames = []
+    numbers: list[int] = []
+    positions, planes = [], set()
     for frame in content.PerFrameFunctionalGroupsSequence:
         identified = "SegmentIdentificationSequence" in frame or "SegmentIdentificationSequence" in shared
+        numbers.append(int(item(frame, "SegmentIdentificationSequence").ReferencedSegmentNumber) if identified else 0)
+        positions.append([float(x) for x in item(frame, "PlanePositionSequence").ImagePositionPatient])
         measures = item(frame, "PixelMeasuresSequence")
-        frames.append(
-            _Frame(
-                number=int(item(frame, "SegmentIdentificationSequence").ReferencedSegmentNumber) if identified else 0,
-                position=tuple(float(x) for x in item(frame, "PlanePositionSequence").ImagePositionPatient),
-                orientation=tuple(float(x) for x in item(frame, "PlaneOrientationSequence").ImageOrientationPatient),
-                spacing_mm=tuple(float(x) for x in measures.PixelSpacing),
-                step_mm=float(measures.get("SpacingBetweenSlices") or 0.0),
-            )
-        )
-    if not frames or {len(frame.position) for frame in frames} != {3} or len(frames[0].orientation) != 6:
-        raise ValueError("no frames with a place")
-    places = {(frame.number, frame.position) for frame in frames}
-    if not np.isfinite([frame.position for frame in frames]).all() or len(places) < len(frames):
+        orientation = item(frame, "PlaneOrientationSequence").ImageOrientationPatient
+        step = float(measures.get("SpacingBetweenSlices") or 0.0)
+        planes.add((*map(float, orientation), *map(float, measures.PixelSpacing), step))
+    (common,) = planes  # more are frames of several grids
+    places = np.array(positions).reshape(len(numbers), 3)
+    if len(common) != 9 or not np.isfinite(places).all() or len({*zip(numbers, *places.T, strict=True)}) < len(places):
         raise ValueError("several frames at one place, or none")
-    if len(frames[0].spacing_mm) != 2 or len({(frame.orientation, frame.spacing_mm) for frame in frames}) != 1:
-        raise ValueError("frames of several grids")
-    return frames
+    return numbers, places, common[:6], common[6:8], common[8]
 
 
-def _grid(
-    frames: Sequence[_Frame], size: tuple[int, ...], path: Path
-) -> tuple[Geometry, int, Integer[np.ndarray, "frames"]]:
-    """Return where the voxels lie, the number of slices, and the slice of each frame; empty slices may be left out.
+def _slots(heights: Float[np.ndarray, "frames"], step_mm: float, path: Path) -> Integer[np.ndarray, "frames"]:
+    """Return the slice of each frame from its height along the normal, mm; empty slices may be left out.
+
+    Args:
+        heights: along the slices' normal, mm.
+        step_mm: SpacingBetweenSlices; 0 where it is absent: then the least distance is the step.
+        path: the file, for messages.
 
     Raises:
-        InputError: frames are not at whole numbers of steps from the first.
+        InputError: all frames are of one slice, or at multiples of the step.
     """
-    first = frames[0]
-    axes, normal = plane(first.orientation, first.spacing_mm, path=path)
-    positions = np.array([frame.position for frame in frames])
-    heights = positions @ normal
     order = np.argsort(heights, kind="stable")
     begins = np.diff(heights[order], prepend=-np.inf) > _SAME_MM
     place_of = (np.cumsum(begins) - 1)[np.argsort(order)]
     distances = np.diff(heights[order][begins])
     if not distances.size:
         raise InputError(f"{path}: all frames are of one slice; give a mask of a volume")
-    # Without SpacingBetweenSlices, the least distance is the step.
-    step = first.step_mm or float(distances.min())
-    steps = np.round(distances / step)
-    if np.abs(distances / step - steps).max() > _SPACING_TOLERANCE or steps.min() < 1:
+    steps = np.round(distances / (step_mm or distances.min())).astype(int)
+    if steps.min() < 1:
         raise InputError(f"{path}: ImagePositionPatient of its frames are not evenly spaced; export it as .nii.gz")
-    slots = np.concatenate([[0], np.cumsum(steps)]).astype(int)
-    along_k = (positions[heights.argmax()] - positions[heights.argmin()]) / slots[-1]
-    length = float(np.linalg.norm(along_k))
-    place = geometry(
-        np.column_stack([axes, along_k / length]),
-        np.array([first.spacing_mm[1], first.spacing_mm[0], length]),
-        positions[heights.argmin()],
-        (size[1], size[0], int(slots[-1]) + 1),
-        path=path,
-        fields=Fields("ImageOrientationPatient and ImagePositionPatient", "PixelSpacing", "ImagePositionPatient"),
-    )
-    if (multiple := int(np.gcd.reduce(steps.astype(int)))) > 1:
+    if (multiple := int(np.gcd.reduce(steps))) > 1:
         raise InputError(
-            f"{path}: SpacingBetweenSlices is {first.step_mm:g} mm, but all frames lie {multiple} times as far apart; "
+            f"{path}: SpacingBetweenSlices is {step_mm:g} mm, but all frames lie {multiple} times as far apart; "
             "export it as .nii.gz"
         )
-    return place, int(slots[-1]) + 1, slots[place_of]
+    return np.concatenate([[0], np.cumsum(steps)])[place_of]
 
 
-def _present(pixels: np.ndarray, half: int, frames: Sequence[_Frame], kind: str) -> set[int]:
+def _present(pixels: np.ndarray, half: int, numbers: list[int], kind: str) -> set[int]:
     """Return the numbers of the segments that hold a voxel."""
     if kind == "LABELMAP":
         return {int(number) for number in np.unique(pixels) if number > 0}
-    return {frame.number for frame, pixel in zip(frames, pixels, strict=True) if pixel.max() >= half}
+    return {number for number, pixel in zip(numbers, pixels, strict=True) if pixel.max() >= half}

@@ -7,6 +7,7 @@ highdicom writes no CT images but needs the same header for a mask: pydicom make
 from __future__ import annotations
 
 import hashlib
+import io
 from pathlib import Path
 
 import numpy as np
@@ -45,8 +46,21 @@ def write_series(volume: Volume, folder: Path) -> None:
         partial.mkdir()
         for k, (header, plane) in enumerate(zip(slice_headers(volume), voxels, strict=True)):
             header.PixelData = plane.tobytes()
-            header.save_as(partial / f"slice-{k:04d}.dcm", enforce_file_format=True)
+            save(header, partial / f"slice-{k:04d}.dcm")
             advance()
+
+
+def save(content: Dataset, path: Path) -> None:
+    """Write a DICOM file, and compare what has arrived byte by byte.
+
+    Raises:
+        InputError: other bytes have arrived.
+    """
+    stream = io.BytesIO()
+    content.save_as(stream, enforce_file_format=True)
+    path.write_bytes(stream.getvalue())
+    if path.read_bytes() != stream.getvalue():
+        raise InputError(f"{path}: was not written whole; see that the folder is writable and the disk is not full")
 
 
 def slice_headers(volume: Volume) -> list[Dataset]:

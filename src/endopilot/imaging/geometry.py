@@ -9,16 +9,19 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int, Shaped
 
 from endopilot.errors import InputError
+from endopilot.types import Volume
 
 AXES_TOLERANCE = 1e-2
 """Cosine between two axes, and share by which a unit vector's length may err, below which axes are straightened."""
+_PLACE_TOLERANCE = 0.05
+"""A slice may lie off its place by this share of the step: positions are written with few digits."""
 _ROUNDING = 1e-5
 """What single precision and six decimals leave: it moves no voxel by more than some micrometres, and is not noted."""
 
@@ -59,6 +62,10 @@ class Geometry:
     origin_mm: Float[np.ndarray, "3"]
     direction: Float[np.ndarray, "3 3"]
     notes: tuple[str, ...]
+
+    def volume(self, voxels: Shaped[np.ndarray, "nz ny nx"], files: tuple[Path, ...]) -> Volume:
+        """Return voxels at this place, read from `files`."""
+        return Volume(voxels, self.spacing_mm, self.origin_mm, self.direction, self.notes, files)
 
 
 def geometry(
@@ -109,39 +116,30 @@ def geometry(
         return Geometry(spacing_mm, origin_mm, straight, ())
     last = np.array(size, dtype=float) - 1.0
     origin = origin_mm + (direction - straight) @ (spacing_mm * last / 2.0)
-    corners = np.array(list(itertools.product(*((0.0, end) for end in last)))) * spacing_mm
-    moved = float(np.linalg.norm(origin_mm - origin + corners @ (direction - straight).T, axis=1).max())
+    straightened = Geometry(spacing_mm, origin, straight, ())
+    moved = farthest_apart_mm(Geometry(spacing_mm, origin_mm, direction, ()), straightened, size)
     note = (
         f"{path.name}: the axes in {fields.direction} are off unit vectors at right angles by {error:.2g}; they were "
         f"straightened, which moved voxels by up to {moved:.2g} mm"
     )
-    return Geometry(spacing_mm, origin, straight, (note,))
+    return replace(straightened, notes=(note,))
 
 
-def geometry_of_steps(
-    steps_mm: Float[np.ndarray, "3 3"],
-    origin_mm: Float[np.ndarray, "3"],
-    size: tuple[int, int, int],
-    *,
-    path: Path,
-    fields: Fields,
-) -> Geometry:
-    """Return the geometry of an image whose header gives the steps from voxel to voxel, as `geometry` does.
+def parted(steps_mm: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+    """Return the directions and the lengths of steps from voxel to voxel, the columns of a header's matrix.
 
-    Args:
-        steps_mm: columns are the steps along i, j and k, LPS mm.
-        origin_mm: centre of the first voxel, LPS mm.
-        size: number of voxels along i, j and k.
-        path: the file, for messages.
-        fields: what its format calls these, for messages.
-
-    Raises:
-        InputError: as `geometry`.
+    A step without length, or one that is not finite, is left as it is, for `geometry` to refuse.
     """
-    spacing = np.linalg.norm(steps_mm, axis=0)
+    lengths = np.linalg.norm(steps_mm, axis=0)
     with np.errstate(invalid="ignore"):
-        direction = np.where(spacing > 0, steps_mm / np.where(spacing > 0, spacing, 1.0), steps_mm)
-    return geometry(direction, spacing, origin_mm, size, path=path, fields=fields)
+        return steps_mm / np.where(lengths > 0, lengths, 1.0), lengths
+
+
+def farthest_apart_mm(one: Geometry | Volume, other: Geometry | Volume, size: Sequence[int]) -> float:
+    """Return how far two grids of one size (along i, j and k) put the same voxel apart at most, mm."""
+    corners = np.array(list(itertools.product(*((0.0, extent - 1.0) for extent in size))))
+    first, second = (g.origin_mm + (corners * g.spacing_mm) @ g.direction.T for g in (one, other))
+    return float(np.linalg.norm(first - second, axis=1).max())
 
 
 def plane(
@@ -164,6 +162,51 @@ def plane(
     sizes, fields = np.array([*spacing_mm[::-1], 1.0]), Fields("ImageOrientationPatient", "PixelSpacing", "")
     geometry(np.column_stack([axes, normal]), sizes, np.zeros(3), (1, 1, 1), path=path, fields=fields)
     return axes, normal
+
+
+def slice_grid(
+    positions: Float[np.ndarray, "n 3"],
+    slots: Int[np.ndarray, "n"],
+    axes: Float[np.ndarray, "3 2"],
+    spacing_mm: Sequence[float],
+    size: tuple[int, int],
+    *,
+    path: Path,
+) -> Geometry:
+    """Return where the voxels of parallel slices lie (DICOM PS3.3 C.7.6.2.1.1).
+
+    Not the step from slice to slice is bounded, whose errors add up, but how far each slice lies from its place in the
+    even grid from the first to the last, along the slice too.
+
+    Args:
+        positions: ImagePositionPatient of each slice, LPS mm.
+        slots: number of each slice, from 0; several images may be of one slice, and slices may be left out.
+        axes: directions of i and j.
+        spacing_mm: PixelSpacing: between rows, between columns, mm.
+        size: Rows, Columns.
+        path: the file or folder, for messages.
+
+    Raises:
+        InputError: a slice lies elsewhere than even steps put it, or slices are stacked along a slant.
+    """
+    first, last = positions[slots.argmin()], positions[slots.argmax()]
+    travel = (last - first) / slots.max()
+    step = float(np.linalg.norm(travel))
+    off = np.linalg.norm(positions - first - slots[:, None] * travel, axis=1)
+    if off.max() > _PLACE_TOLERANCE * step:
+        worst = int(off.argmax())
+        raise InputError(
+            f"{path}: ImagePositionPatient are not evenly spaced: slice {slots[worst] + 1} lies {off[worst]:.2f} mm "
+            f"from where even steps of {step:.2f} mm put it; export the series again, or resample it to even steps"
+        )
+    return geometry(
+        np.column_stack([axes, travel / step]),
+        np.array([*spacing_mm[::-1], step]),
+        first,
+        (size[1], size[0], int(slots.max()) + 1),
+        path=path,
+        fields=Fields("ImageOrientationPatient and ImagePositionPatient", "PixelSpacing", "ImagePositionPatient"),
+    )
 
 
 def converted(unit: str, sizes: Float[np.ndarray, "3"], *, path: Path, field: str) -> tuple[float, tuple[str, ...]]:

@@ -1,15 +1,19 @@
-"""Volumes on other grids, the passage to SimpleITK's images and back, and distances and components on a grid."""
+"""Volumes on other grids, the passage to SimpleITK's images and back, distances and components on a grid,
+and how far two masks of one vessel agree: `compare_masks`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import SimpleITK as sitk
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from endopilot.types import Volume
+from endopilot.errors import InputError
+from endopilot.types import LumenMask, Volume
 
 LEAST_BLOOD_HU = 130.0
 """Without contrast, blood measures 30-60 HU; below this value no method here can separate lumen from wall."""
@@ -65,11 +69,7 @@ def resample(volume: Volume, spacing_mm: float) -> Volume:
 def interpolate_like(volume: Volume, like: Volume, outside: float) -> Float[np.ndarray, "nz ny nx"]:
     """Return a volume's values at the voxels of another, interpolated linearly, `outside` beyond its edge."""
     image = sitk.Cast(to_image(volume), sitk.sitkFloat32)
-    reference = sitk.Image([int(n) for n in like.voxels.shape[::-1]], sitk.sitkUInt8)
-    reference.SetSpacing(like.spacing_mm.tolist())
-    reference.SetOrigin(like.origin_mm.tolist())
-    reference.SetDirection(like.direction.ravel().tolist())
-    return sitk.GetArrayFromImage(sitk.Resample(image, reference, sitk.Transform(), sitk.sitkLinear, outside))
+    return sitk.GetArrayFromImage(sitk.Resample(image, to_image(like), sitk.Transform(), sitk.sitkLinear, outside))
 
 
 def distance_to_outside(
@@ -131,3 +131,45 @@ def connected_components(mask: Bool[np.ndarray, "nz ny nx"], *, corners: bool = 
     """
     structure = ndimage.generate_binary_structure(3, 3 if corners else 1)
     return ndimage.label(mask, structure)[0]  # pyright: ignore[reportIndexIssue]
+
+
+@dataclass(frozen=True)
+class MaskOverlap:
+    """Agreement of a mask with a reference, on the mask's grid.
+
+    Attributes:
+        dice: 2 |both| / (|mask| + |reference|).
+        share_inside_reference: share of the mask that lies in the reference.
+        cut_off_ml: volume of the reference that the mask lacks, ml.
+        beyond_ml: volume of the mask outside the reference, ml.
+    """
+
+    dice: float
+    share_inside_reference: float
+    cut_off_ml: float
+    beyond_ml: float
+
+
+def compare_masks(mask: LumenMask, reference: LumenMask) -> MaskOverlap:
+    """Return how far a mask agrees with a reference on any grid.
+
+    Raises:
+        InputError: the reference is empty, or lies wholly outside the mask's volume.
+    """
+    ours, theirs = mask.volume.voxels, mask_like(reference, mask.volume)
+    if not theirs.any():
+        raise InputError("reference: has no voxel set inside the volume; give a mask of the same scan")
+    ml = float(mask.volume.spacing_mm.prod()) / 1000
+    both = float((ours & theirs).sum())
+    return MaskOverlap(
+        dice=2 * both / float(ours.sum() + theirs.sum()),
+        share_inside_reference=both / float(ours.sum()),
+        cut_off_ml=float((theirs & ~ours).sum()) * ml,
+        beyond_ml=float((ours & ~theirs).sum()) * ml,
+    )
+
+
+def mask_like(mask: LumenMask, like: Volume) -> Bool[np.ndarray, "nz ny nx"]:
+    """Return a mask at the voxels of a volume on any grid."""
+    values = replace(mask.volume, voxels=mask.volume.voxels.astype(np.float32))
+    return interpolate_like(values, like, outside=0.0) > 0.5

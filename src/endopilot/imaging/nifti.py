@@ -8,17 +8,19 @@ from __future__ import annotations
 import itertools
 import struct
 import zlib
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
-from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from endopilot.errors import InputError
-from endopilot.imaging.geometry import Fields, Geometry, converted, geometry, geometry_of_steps, lengths_text
+from endopilot.imaging.geometry import Fields, Geometry, converted, farthest_apart_mm, geometry, lengths_text, parted
+from endopilot.imaging.segments import ImageFile, Segment
 from endopilot.imaging.voxels import Encoding, opened, read_voxels, rescaled
-from endopilot.types import Volume
 
 _SPACING_TOLERANCE = 0.01
 """Voxel sizes that a header gives twice may differ by this share: they are written with few digits."""
@@ -26,6 +28,9 @@ _RAS_TO_LPS = np.array([-1.0, -1.0, 1.0])
 _SCANNER = 1
 """Code of a transform to the scanner's anatomical coordinates."""
 _LARGEST_OFFSET = 1 << 40
+_LONGEST_EXTENSION = 1 << 24
+_XML_EXTENSION = 30
+"""Code of an extension of Caret, whose XML may name labels (NIFTI_ECODE_CARET in nifti1_io.h)."""
 _UNITS = {0: "mm", 1: "m", 2: "mm", 3: "µm"}
 _INTENTS = (0, 1001, 1002, 1003)
 """What a grey-level image or a mask may be meant as: nothing, an estimate, labels, or names of regions."""
@@ -77,35 +82,20 @@ _TYPES = {
 """Grey levels, by their code `datatype`."""
 
 
-@dataclass(frozen=True)
-class _Header:
-    """The fields of a header that matter here, as stored.
-
-    Attributes:
-        size: of the header, bytes: 348 or 540.
-        order: "<" or ">", the byte order.
-        fields: values by name.
-    """
-
-    size: int
-    order: str
-    fields: dict[str, tuple[Any, ...]]
-
-    def __getitem__(self, name: str) -> tuple[Any, ...]:
-        return self.fields[name]
-
-
-def read_nifti(path: Path) -> Volume:
-    """Read a NIfTI file (.nii, .nii.gz), its voxels as the rescale makes them.
+def read_nifti(path: Path) -> ImageFile:
+    """Read a NIfTI file (.nii, .nii.gz), its voxels as the rescale makes them, and the names of its labels.
 
     Raises:
         InputError: the file is damaged, holds no three-dimensional grey levels, or does not say where they are.
     """
+    stream = opened(path)
     try:
-        with opened(path) as stream:
+        with stream:
             header = _header(stream.read(540), path)
-            size, dtype = _size(header, path), _type(header, path)
-            stream.seek(_offset(header, path))
+            size, dtype, offset = _size(header, path), _type(header, path), _offset(header, path)
+            stream.seek(header["size"])
+            segments = _named_labels(stream.read(min(offset - header["size"], _LONGEST_EXTENSION)), header["order"])
+            stream.seek(offset)
             stored = read_voxels(stream, Encoding(dtype), size[::-1], path=path)
     except (EOFError, OSError, zlib.error):
         raise InputError(f"{path}: truncated or damaged; copy or export it again") from None
@@ -114,11 +104,11 @@ def read_nifti(path: Path) -> Volume:
     if not np.isfinite([slope, intercept]).all():
         raise InputError(f"{path}: scl_slope {slope:g} and scl_inter {intercept:g} are not finite; export it again")
     values = rescaled(stored, float(slope), float(intercept)) if slope else stored  # a slope of 0 means none
-    return Volume(values, place.spacing_mm, place.origin_mm, place.direction, place.notes, (path,))
+    return ImageFile(place.volume(values, (path,)), values[None], segments)
 
 
-def _header(content: bytes, path: Path) -> _Header:
-    """Return the fields of a header, after making sure that it is one of a single file."""
+def _header(content: bytes, path: Path) -> dict[str, Any]:
+    """Return the fields of a header, its size and its byte order, after making sure that it is one of a single file."""
     for order, size in itertools.product("<>", _HEADERS):
         if content[:4] == struct.pack(f"{order}i", size):
             break
@@ -126,16 +116,19 @@ def _header(content: bytes, path: Path) -> _Header:
         raise InputError(f"{path}: its content does not match its suffix, or its header is damaged; export it again")
     if len(content) < size:
         raise InputError(f"{path}: truncated or damaged (its header is incomplete); copy or export it again")
-    fields = {name: struct.unpack_from(order + kind, content, at) for name, (kind, at) in _HEADERS[size].items()}
-    (magic,) = fields["magic"]
+    fields: dict[str, Any] = {"size": size, "order": order}
+    for name, (kind, at) in _HEADERS[size].items():
+        values = struct.unpack_from(order + kind, content, at)
+        fields[name] = values if values[1:] else next(iter(values))
+    magic = fields["magic"]
     if magic[:3] in (b"ni1", b"ni2"):
         raise InputError(f"{path}: magic {magic!r}: its voxels are in a file of their own (.img); save it as .nii.gz")
     if magic != (b"n+1\0" if size == 348 else b"n+2\0"):
         raise InputError(f"{path}: magic {magic!r} is not that of NIfTI (Analyze has no orientation); export it again")
-    return _Header(size, order, fields)
+    return fields
 
 
-def _size(header: _Header, path: Path) -> tuple[int, int, int]:
+def _size(header: dict[str, Any], path: Path) -> tuple[int, int, int]:
     """Return the numbers of voxels along i, j and k."""
     count, *extents = header["dim"]
     if not 1 <= count <= 7 or min(extents[:count]) < 1:
@@ -145,36 +138,52 @@ def _size(header: _Header, path: Path) -> tuple[int, int, int]:
     if any(extent > 1 for extent in extents[3:]):
         shape = "×".join(map(str, extents))
         raise InputError(f"{path}: {count}-D ({shape}); give a single 3-D volume, such as one cardiac phase")
-    (intent,) = header["intent_code"]
-    if intent not in _INTENTS:
-        raise InputError(f"{path}: intent_code {intent} is neither that of grey levels nor of labels; export it again")
+    if header["intent_code"] not in _INTENTS:
+        raise InputError(
+            f"{path}: intent_code {header['intent_code']} is neither that of grey levels nor of labels; export it again"
+        )
     return extents[0], extents[1], extents[2]
 
 
-def _type(header: _Header, path: Path) -> np.dtype:
-    (code,), (bits,) = header["datatype"], header["bitpix"]
+def _type(header: dict[str, Any], path: Path) -> np.dtype:
+    code, bits = header["datatype"], header["bitpix"]
     if code in (128, 2304):
         raise InputError(f"{path}: several values in every voxel (colour); give a grey-level volume")
     if code not in _TYPES:
         raise InputError(f"{path}: datatype {code} holds no grey levels; export it as int16 or float32")
-    dtype = np.dtype(header.order + _TYPES[code])
+    dtype = np.dtype(header["order"] + _TYPES[code])
     if bits != 8 * dtype.itemsize:
         raise InputError(f"{path}: datatype {code} and bitpix {bits} contradict each other; export it again")
     return dtype
 
 
-def _offset(header: _Header, path: Path) -> int:
+def _offset(header: dict[str, Any], path: Path) -> int:
     """Return where the voxels begin: behind the header and the four bytes that say whether it is extended."""
-    (offset,) = header["vox_offset"]
-    if not np.isfinite(offset) or offset != int(offset) or not header.size + 4 <= offset < _LARGEST_OFFSET:
+    offset, least = header["vox_offset"], header["size"] + 4
+    if not np.isfinite(offset) or offset != int(offset) or not least <= offset < _LARGEST_OFFSET:
         raise InputError(
-            f"{path}: vox_offset {offset:g}: voxels begin behind the header, at {header.size + 4} or later; "
-            "export it again"
+            f"{path}: vox_offset {offset:g}: voxels begin behind the header, at {least} or later; export it again"
         )
     return int(offset)
 
 
-def _geometry(header: _Header, size: tuple[int, int, int], path: Path) -> Geometry:
+def _named_labels(content: bytes, order: str) -> tuple[Segment, ...]:
+    """Return the names in a header's extensions, as TotalSegmentator and Connectome Workbench write them.
+
+    An extension is its size, its kind and its content; names are XML: `<Label Key="52"><![CDATA[aorta]]></Label>`.
+    """
+    at = 4 if content[:1] not in (b"", b"\0") else len(content)
+    while at + 8 <= len(content):
+        size, kind = struct.unpack_from(f"{order}2i", content, at)
+        if kind == _XML_EXTENSION:
+            with suppress(ElementTree.ParseError, ValueError):
+                labels = ElementTree.fromstring(content[at + 8 : at + size].strip(b"\0 \r\n")).iter("Label")
+                return tuple(Segment(label.text or "", 0, int(label.get("Key", ""))) for label in labels)
+        at += max(size, 8)
+    return ()
+
+
+def _geometry(header: dict[str, Any], size: tuple[int, int, int], path: Path) -> Geometry:
     """Return where the voxels lie, by sform or qform."""
     qform_code, sform_code = header["codes"]
     if max(qform_code, sform_code) <= 0:
@@ -182,8 +191,8 @@ def _geometry(header: _Header, size: tuple[int, int, int], path: Path) -> Geomet
     sizes = np.array(header["pixdim"][1:4], dtype=float)
     if not np.isfinite(sizes).all():
         raise InputError(f"{path}: pixdim holds {sizes}, which is not finite; export it again")
-    unit = _UNITS.get(header["xyzt_units"][0] & 7, "")
-    factor, notes = converted(unit, sizes, path=path, field=f"xyzt_units {header['xyzt_units'][0]}")
+    unit = _UNITS.get(header["xyzt_units"] & 7, "")
+    factor, notes = converted(unit, sizes, path=path, field=f"xyzt_units {header['xyzt_units']}")
     first, other = ("qform", "sform") if sform_code <= 0 or qform_code == _SCANNER != sform_code else ("sform", "qform")
     forms = {"sform": _sform, "qform": _qform}
     chosen = forms[first](header, size, path, factor)
@@ -200,10 +209,10 @@ def _geometry(header: _Header, size: tuple[int, int, int], path: Path) -> Geomet
     return replace(chosen, notes=(*notes, *chosen.notes))
 
 
-def _sform(header: _Header, size: tuple[int, int, int], path: Path, factor: float) -> Geometry:
+def _sform(header: dict[str, Any], size: tuple[int, int, int], path: Path, factor: float) -> Geometry:
     rows = np.array(header["srow"], dtype=float).reshape(3, 4) * _RAS_TO_LPS[:, None] * factor
-    fields = Fields("srow_x, srow_y and srow_z", "srow_x, srow_y and srow_z", "srow_x, srow_y and srow_z")
-    place = geometry_of_steps(rows[:, :3], rows[:, 3], size, path=path, fields=fields)
+    fields = Fields(*["srow_x, srow_y and srow_z"] * 3)
+    place = geometry(*parted(rows[:, :3]), rows[:, 3], size, path=path, fields=fields)
     pixdim = np.abs(header["pixdim"][1:4]) * factor
     if not np.allclose(place.spacing_mm, pixdim, rtol=_SPACING_TOLERANCE):
         raise InputError(
@@ -213,20 +222,13 @@ def _sform(header: _Header, size: tuple[int, int, int], path: Path, factor: floa
     return place
 
 
-def _qform(header: _Header, size: tuple[int, int, int], path: Path, factor: float) -> Geometry:
+def _qform(header: dict[str, Any], size: tuple[int, int, int], path: Path, factor: float) -> Geometry:
     b, c, d = (float(value) for value in header["quatern"][:3])
     offset = np.array(header["quatern"][3:], dtype=float)
     if not np.isfinite([b, c, d]).all() or b * b + c * c + d * d > 1.01:
         raise InputError(f"{path}: quatern_b, _c and _d ({b:g}, {c:g}, {d:g}) are no unit quaternion; export it again")
     a = np.sqrt(max(1.0 - (b * b + c * c + d * d), 0.0))
-    a, b, c, d = np.array([a, b, c, d]) / np.linalg.norm([a, b, c, d])
-    turn = np.array(
-        [
-            [a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)],
-            [2 * (b * c + a * d), a * a + c * c - b * b - d * d, 2 * (c * d - a * b)],
-            [2 * (b * d - a * c), 2 * (c * d + a * b), a * a + d * d - c * c - b * b],
-        ]
-    )
+    turn = Rotation.from_quat([b, c, d, a]).as_matrix()
     turn[:, 2] *= -1.0 if header["pixdim"][0] < 0 else 1.0
     sizes = np.array(header["pixdim"][1:4], dtype=float) * factor
     fields = Fields("quatern_b, quatern_c and quatern_d", "pixdim", "qoffset")
@@ -234,15 +236,14 @@ def _qform(header: _Header, size: tuple[int, int, int], path: Path, factor: floa
 
 
 def _agreement(
-    chosen: Geometry, other: Geometry, size: tuple[int, int, int], header: _Header, path: Path
+    chosen: Geometry, other: Geometry, size: tuple[int, int, int], header: dict[str, Any], path: Path
 ) -> tuple[str, ...]:
     """Say so where sform and qform put a corner of the volume half a voxel apart or more.
 
     Raises:
         InputError: they do, and not exactly one of them is in the scanner's coordinates.
     """
-    corners = np.array(list(itertools.product(*((0.0, extent - 1.0) for extent in size))))
-    apart = float(np.linalg.norm(_placed(chosen, corners) - _placed(other, corners), axis=1).max())
+    apart = farthest_apart_mm(chosen, other, size)
     if apart < chosen.spacing_mm.min() / 2.0:
         return ()
     codes = "qform_code {} and sform_code {}".format(*header["codes"])
@@ -256,7 +257,3 @@ def _agreement(
         f"{path.name}: sform and qform place voxels up to {apart:.3g} mm apart; {form} was taken, which {codes} say "
         "is in the scanner's coordinates",
     )
-
-
-def _placed(place: Geometry, index: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    return place.origin_mm + (index * place.spacing_mm) @ place.direction.T

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.files import writing
-from endopilot.imaging.overlap import mask_like
+from endopilot.imaging.grid import mask_like
 from endopilot.types import LumenMask, Volume
 
 _WINDOW_HU = (-150.0, 650.0)

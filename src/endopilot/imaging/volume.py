@@ -16,13 +16,13 @@ import numpy as np
 import SimpleITK as sitk
 
 from endopilot.errors import InputError
-from endopilot.files import read_json, write_json, writing
+from endopilot.files import json_text, read_json, sha256, writing
 from endopilot.imaging import dicom_seg
+from endopilot.imaging.geometry import farthest_apart_mm
 from endopilot.imaging.grid import to_image
-from endopilot.imaging.metaimage import read_metaimage
 from endopilot.imaging.nifti import read_nifti
-from endopilot.imaging.nrrd import NrrdImage, plain, read_nrrd
-from endopilot.imaging.segments import inside_segment
+from endopilot.imaging.segments import ImageFile, inside_segment
+from endopilot.imaging.text_headers import read_metaimage, read_nrrd
 from endopilot.imaging.voxels import compact
 from endopilot.types import Insertion, LumenMask, Volume
 
@@ -54,7 +54,7 @@ def read_volume(path: str | Path, *, series: str | None = None, phase: str | Non
             three-dimensional volume (several series or phases, missing slices, gantry tilt, 4-D, RGB).
     """
     path = Path(path)
-    if not path.exists():
+    if not path.is_file() and not path.is_dir():
         raise InputError(f"{path}: no such file or folder; check the path")
     try:
         if path.is_dir() or (_suffix(path) is None and _is_dicom(path)):
@@ -90,9 +90,15 @@ def check_output(path: str | Path, *, mask: bool = False) -> None:
         mask: it is a mask; a volume may go to a folder of DICOM slices too, a mask to a DICOM-SEG object.
 
     Raises:
-        InputError: the suffix is unknown, the folder holds something, or highdicom is absent.
+        InputError: the suffix is unknown, the folder holds something, highdicom is absent, or the JSON file beside a
+            mask would replace one that is not this mask's.
     """
     path = Path(path)
+    if mask and (sidecar := _sidecar(path)).exists() and _mask_of(sidecar).get("name") != path.name:
+        raise InputError(
+            f"{sidecar}: is there already and is not the record of {path.name}, which would replace it; choose another "
+            "name, or move it away"
+        )
     if mask and path.suffix.lower() == dicom_seg.SUFFIX:
         dicom_seg.need_highdicom(path)
     elif not mask and path.suffix == "":
@@ -123,21 +129,34 @@ def write_volume(volume: Volume, path: str | Path) -> None:
         write_series(volume, path)
         return
     with writing(path) as partial:
-        try:
-            # Level 1 costs a few percent in size and saves most of the time.
-            sitk.WriteImage(to_image(volume), partial, useCompression=path.suffix != ".nii", compressionLevel=1)
-        except RuntimeError as error:
-            raise InputError(
-                f"{path}: cannot be written; see that the folder is writable and the disk is not full"
-            ) from error
+        _write_file(volume, partial)
 
 
-def read_mask(path: str | Path, *, label: int | str | None = None) -> LumenMask:
-    """Read the mask of one vessel, with its ostium where `write_mask` left a sidecar JSON beside it.
+def _write_file(volume: Volume, partial: Path) -> None:
+    """Write a volume to a temporary file, and read it again: ITK does not tell all that goes wrong.
+
+    Raises:
+        OSError: what the file holds is not the volume, as on a full disk.
+    """
+    try:
+        # Level 1 costs a few percent in size and saves most of the time.
+        sitk.WriteImage(to_image(volume), partial, useCompression=partial.suffix != ".nii", compressionLevel=1)
+        again = _decoded(partial).volume
+    except (RuntimeError, InputError) as error:
+        raise OSError("its writer failed") from error
+    near = farthest_apart_mm(again, volume, volume.voxels.shape[::-1]) < volume.spacing_mm.min() / 2
+    if not near or not np.array_equal(again.voxels, volume.voxels, equal_nan=True):
+        raise OSError("what was written is not the volume")
+
+
+def read_mask(path: str | Path, *, label: int | str | None = None, threshold: float | None = None) -> LumenMask:
+    """Read the mask of one vessel, with its ostium where `write_mask` left a sidecar JSON of this very file beside it.
 
     Args:
-        path: a NIfTI, NRRD or MHA file of whole numbers, 0 outside, or a DICOM-SEG object.
+        path: a NIfTI, NRRD or MHA file of whole numbers, 0 outside, or of grey levels; or a DICOM-SEG object.
         label: number or name of the segment to take where the file holds several; segments may overlap.
+        threshold: of grey levels (probabilities, a resampled mask, a signed distance), the value at the wall; the
+            volume's border is outside.
 
     Returns:
         The mask; its ostium is None where no sidecar holds it. Its warnings are those of the sidecar, and what
@@ -147,20 +166,25 @@ def read_mask(path: str | Path, *, label: int | str | None = None) -> LumenMask:
         InputError: the file is missing, damaged or no mask, the label is not in it, or nothing is inside.
     """
     path = Path(path)
-    if not path.exists():
+    if not path.is_file() and not path.is_dir():
         raise InputError(f"{path}: no such file; check the path")
     if path.suffix.lower() == dicom_seg.SUFFIX:
+        if threshold is not None:
+            raise InputError(f"{path}: threshold={threshold:g}: DICOM-SEG holds no grey levels; leave the option out")
         volume = dicom_seg.read_seg(path, label)
     else:
         image = _read_file(path)
-        volume = replace(image.volume, voxels=inside_segment(image.layers, image.segments, label, path))
-    sidecar = _sidecar(path)
-    ostium, method, warnings = _read_sidecar(sidecar) if sidecar.exists() else (None, "given", ())
+        inside, notes = inside_segment(image, label, threshold, path)
+        volume = replace(image.volume, voxels=inside, notes=(*image.volume.notes, *notes))
+    ostium, method, warnings = _read_sidecar(path)
     return LumenMask(volume, ostium, method, (*volume.notes, *warnings))
 
 
 def write_mask(mask: LumenMask, path: str | Path, *, manifest: Mapping[str, Any]) -> None:
     """Write a mask, and beside it `<stem>.json` with its ostium, method and warnings and the manifest of the run.
+
+    The JSON file holds the mask's name and SHA-256, so that no other mask is taken for it. Either both are written or
+    none.
 
     Args:
         mask: the mask.
@@ -168,24 +192,25 @@ def write_mask(mask: LumenMask, path: str | Path, *, manifest: Mapping[str, Any]
         manifest: the record of the run, as `endopilot.files.manifest` makes it.
 
     Raises:
-        InputError: the suffix is unknown, highdicom is absent, the folder cannot be written, or the disk is full.
+        InputError: the suffix is unknown, highdicom is absent, the folder cannot be written, the disk is full, or the
+            JSON file beside it is another's.
     """
     path = Path(path)
     check_output(path, mask=True)
-    if path.suffix.lower() == dicom_seg.SUFFIX:
-        dicom_seg.write_seg(mask, path)
-    else:
-        write_volume(mask.volume, path)
     ostium = mask.ostium
-    write_json(
-        _sidecar(path),
-        {
+    with writing(_sidecar(path)) as record, writing(path) as partial:
+        if path.suffix.lower() == dicom_seg.SUFFIX:
+            dicom_seg.write_seg(mask, partial)
+        else:
+            _write_file(mask.volume, partial, path)
+        content = {
+            "mask": {"name": path.name, "sha256": sha256(partial)},
             "ostium": ostium and {"position_mm": ostium.position, "direction": ostium.direction},
             "method": mask.method,
             "warnings": list(mask.warnings),
             "manifest": dict(manifest),
-        },
-    )
+        }
+        record.write_text(json_text(content) + "\n", encoding="utf-8")
 
 
 def _suffix(path: Path) -> str | None:
@@ -199,18 +224,10 @@ def _sidecar(path: Path) -> Path:
     return path.with_name(path.name[: len(path.name) - len(suffix)] + ".json")
 
 
-def _read_file(path: Path) -> NrrdImage:
+def _read_file(path: Path) -> ImageFile:
     """Read one file by its suffix, refusing what is not a scalar volume."""
-    suffix = None if path.is_dir() else _suffix(path)
     try:
-        if suffix in (".nrrd", ".nhdr"):
-            image = read_nrrd(path)
-        elif suffix in (".mha", ".mhd"):
-            image = plain(read_metaimage(path))
-        elif suffix in (".nii", ".nii.gz"):
-            image = plain(read_nifti(path))
-        else:
-            raise InputError(f"{path}: unknown format; give one of {', '.join(SUFFIXES)}, or a folder of DICOM slices")
+        image = _decoded(path)
     except OSError as error:
         raise InputError(f"{path}: may not be read ({error.strerror}); ask for access to it") from error
     shape = image.volume.voxels.shape[::-1]
@@ -221,24 +238,62 @@ def _read_file(path: Path) -> NrrdImage:
     return image
 
 
-def _read_sidecar(path: Path) -> tuple[Insertion | None, str, tuple[str, ...]]:
-    """Return ostium, method and warnings from a sidecar; JSON files that others put beside a mask have none."""
-    content = read_json(path)
+def _decoded(path: Path) -> ImageFile:
+    suffix = None if path.is_dir() else _suffix(path)
+    if suffix is None:
+        raise InputError(
+            f"{path}: unknown format; give one of {', '.join(SUFFIXES)}, or a folder of DICOM slices (3D Slicer opens "
+            "most others and saves them as .nrrd)"
+        )
+    return {".nrrd": read_nrrd, ".nhdr": read_nrrd, ".mha": read_metaimage, ".mhd": read_metaimage}.get(
+        suffix, read_nifti
+    )(path)
+
+
+def _mask_of(sidecar: Path) -> dict[str, Any]:
+    """Return name and SHA-256 of the mask that a sidecar is of; nothing where it is another's JSON file."""
+    try:
+        of = read_json(sidecar, keys=("mask", "ostium"))["mask"]
+    except InputError:
+        return {}
+    return of if isinstance(of, dict) else {}
+
+
+def _read_sidecar(mask: Path) -> tuple[Insertion | None, str, tuple[str, ...]]:
+    """Return ostium, method and warnings from the sidecar of a mask; JSON files that others put beside it have none.
+
+    An ostium in another vessel is plausible and wrong: where the sidecar is not of this very file, or does not say of
+    which, the ostium is not taken, and a warning gives it.
+    """
+    path = _sidecar(mask)
+    content = read_json(path) if path.exists() else None
     if not isinstance(content, dict) or "ostium" not in content:
         return None, "given", ()
     ostium, method, warnings = content["ostium"], str(content.get("method", "given")), content.get("warnings", [])
     if not isinstance(warnings, list) or not all(isinstance(warning, str) for warning in warnings):
         raise InputError(f"{path}: warnings is no list of sentences; make the mask again")
-    if ostium is None:
-        return None, method, tuple(warnings)
+    if ostium is not None:
+        ostium = _insertion(ostium, path)
+    of = _mask_of(path)
+    if of.get("sha256") == sha256(mask):
+        return ostium, method, tuple(warnings)
+    name = of.get("name")
+    whose = f"{name} before it was changed" if name == mask.name else name or "a mask that it does not name"
+    given = (
+        "" if ostium is None else "; if its ostium is right, give --ostium-mm {:g} {:g} {:g}".format(*ostium.position)
+    )
+    return None, "given", (f"{path.name} is the record of {whose}, and was left out for {mask.name}{given}",)
+
+
+def _insertion(given: Any, path: Path) -> Insertion:
+    """Return the ostium of a sidecar."""
     try:
-        position = np.array(ostium["position_mm"], dtype=float)
-        direction = np.array(ostium["direction"], dtype=float)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: ostium needs position_mm and direction, three numbers each") from error
-    length = np.linalg.norm(direction)
+        position, direction = (np.array(given[name], dtype=float) for name in ("position_mm", "direction"))
+    except (KeyError, TypeError, ValueError):
+        position = direction = np.zeros(0)
+    length = float(np.linalg.norm(direction))
     if position.shape != (3,) or direction.shape != (3,) or not np.isfinite(position).all() or not 0 < length < np.inf:
         raise InputError(
             f"{path}: ostium needs position_mm and direction, three finite numbers each, direction not zero"
         )
-    return Insertion(position, direction / length), method, tuple(warnings)
+    return Insertion(position, direction / length)

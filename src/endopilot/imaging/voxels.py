@@ -14,40 +14,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BufferedIOBase
 from pathlib import Path
-from typing import Any, NoReturn
 
 import numpy as np
 from jaxtyping import Shaped
 
 from endopilot.errors import InputError
 
-_MOST_INFLATED = {"raw": 1, "gzip": 1100, "gzip, opened": 1100, "zlib": 1100, "bzip2": 50_000}
-"""How many bytes a packed one stands for at most; a header that asks for more is wrong, and nothing is allocated."""
 _MOST_FILES = 100_000
 _GZIP = b"\x1f\x8b"
 
 
 def opened(path: Path) -> BufferedIOBase:
-    """Open a file that may be packed by gzip, whatever its name says.
-
-    Raises:
-        InputError: it may not be read.
-    """
-    try:
-        with path.open("rb") as stream:
-            packed = stream.read(2) == _GZIP
-        return gzip.open(path, "rb") if packed else path.open("rb")
-    except OSError as error:
-        unreadable(path, error)
-
-
-def unreadable(path: Path, error: OSError) -> NoReturn:
-    """Say why the system does not read a file.
-
-    Raises:
-        InputError: always.
-    """
-    raise InputError(f"{path}: cannot be read ({error.strerror or 'damaged'}); check the path") from error
+    """Open a file that may be packed by gzip, whatever its name says."""
+    with path.open("rb") as stream:
+        packed = stream.read(2) == _GZIP
+    return gzip.open(path, "rb") if packed else path.open("rb")
 
 
 @dataclass(frozen=True)
@@ -82,27 +63,55 @@ def read_voxels(
         InputError: there are fewer or more bytes than the shape needs, or they are damaged.
     """
     dtype, count = encoding.dtype, math.prod(int(extent) for extent in shape)
+    size, skipped = count * dtype.itemsize, encoding.skipped_bytes
     try:
         for _ in range(encoding.skipped_lines):
             stream.readline()
         if encoding.packing == "ascii":
-            stream.read(encoding.skipped_bytes)
+            stream.read(skipped)
             return _numbers(stream.read(), dtype, count, path).reshape(tuple(shape))
-        content = _unpacked(stream, count * dtype.itemsize, encoding, path)
+        content = memoryview(_unpacked(stream, encoding.packing, -1 if skipped < 0 else skipped + size + 1))
     except (EOFError, OSError, ValueError, OverflowError, MemoryError, zlib.error):
         raise InputError(f"{path}: truncated or damaged (its voxels); copy or export it again") from None
-    values = np.frombuffer(content, dtype=dtype).reshape(tuple(shape))
-    return values if dtype.isnative else values.astype(dtype.newbyteorder("="))
+    content = content[max(len(content) - size, 0) if skipped < 0 else skipped :]
+    if len(content) < size:
+        raise InputError(f"{path}: truncated or damaged (its voxels are incomplete); copy or export it again")
+    if len(content) > size:
+        raise InputError(
+            f"{path}: holds more than the {size} bytes of voxels that its header describes; export it again"
+        )
+    return np.frombuffer(content, dtype=dtype).reshape(tuple(shape)).astype(dtype.newbyteorder("="))
 
 
-def read_detached_voxels(
-    spec: str, encoding: Encoding, shape: Sequence[int], *, header: Path
+def _unpacked(stream: BufferedIOBase, packing: str, most: int) -> bytes | bytearray:
+    """Return the rest of a stream, unpacked, or its first `most` bytes: a header's size alone allocates nothing.
+
+    Raises:
+        EOFError: what is packed is cut short.
+    """
+    if packing == "raw":
+        return stream.read(most)
+    packed, content = stream.read(), bytearray()
+    while packed and len(content) < most:  # gzip's members follow one another
+        # 32: a header of gzip or of zlib
+        unpacker = bz2.BZ2Decompressor() if packing == "bzip2" else zlib.decompressobj(zlib.MAX_WBITS | 32)
+        content += unpacker.decompress(packed, most - len(content))
+        if not unpacker.eof and len(content) < most:
+            raise EOFError("cut short")
+        packed = unpacker.unused_data.lstrip(b"\0")
+    return content
+
+
+def read_voxels_beside(
+    spec: str | None, stream: BufferedIOBase, encoding: Encoding, shape: Sequence[int], *, header: Path
 ) -> tuple[Shaped[np.ndarray, "..."], tuple[Path, ...]]:
-    """Return the array in files beside a header, and these files.
+    """Return the array of a text header, which follows there or is in files beside it, and all files.
 
     Args:
         spec: what NRRD and MetaImage write: a name; a pattern such as `slice%03d.raw 1 300 1`; or LIST and names, one
-            a line. Names are relative to the header; of several files each holds the same share of the array.
+            a line. Names are relative to the header; of several files each holds the same share of the array. None
+            where the array follows.
+        stream: of the header, at its end.
         encoding: how each file stores its voxels.
         shape: of the array; the last axis is the fastest.
         header: the file that names them.
@@ -110,8 +119,18 @@ def read_detached_voxels(
     Raises:
         InputError: a file is missing or damaged, or the number of files is wrong.
     """
-    files = _detached_files(spec, header)
-    count = math.prod(int(extent) for extent in shape)
+    if spec is None:
+        return read_voxels(stream, encoding, shape, path=header), (header,)
+    first, *others = spec.split("\n")
+    words, names = first.split(), others
+    try:
+        if words[:1] != ["LIST"]:
+            low, high, step = (int(word) for word in words[1:4]) if "%" in first else (0, 0, 1)
+            numbers = range(low, high + 1, step)[:_MOST_FILES]
+            names = [words[0] % number for number in numbers] if "%" in first else [first]
+    except (TypeError, ValueError):
+        raise InputError(f"{header}: {first[:60]!r} names no files of voxels; export it as one file") from None
+    files, count = [header.parent / name for name in names], math.prod(int(extent) for extent in shape)
     if not files or count % len(files):
         shown = "×".join(map(str, shape[::-1]))
         raise InputError(f"{header}: names {len(files)} files for {shown} voxels; export it again")
@@ -120,56 +139,9 @@ def read_detached_voxels(
         raise InputError(f"{header}: the file of voxels that it names is missing ({missing.name}); put it beside it")
     parts = []
     for file in files:
-        with file.open("rb") as stream:
-            parts.append(read_voxels(stream, encoding, (count // len(files),), path=file))
-    return (parts[0] if len(parts) == 1 else np.concatenate(parts)).reshape(tuple(shape)), files
-
-
-def _detached_files(spec: str, header: Path) -> tuple[Path, ...]:
-    first, *others = spec.split("\n")
-    words = first.split()
-    if words[:1] == ["LIST"]:
-        return tuple(header.parent / name for name in others)
-    if "%" not in first:
-        return (header.parent / first,)
-    try:
-        low, high, step = (int(word) for word in words[1:4])
-        return tuple(header.parent / (words[0] % number) for number in range(low, high + 1, step)[:_MOST_FILES])
-    except (TypeError, ValueError):
-        raise InputError(f"{header}: {first[:60]!r} names no files of voxels; export it as one file") from None
-
-
-def _unpacked(stream: BufferedIOBase, size: int, encoding: Encoding, path: Path) -> bytearray:
-    """Return `size` bytes, after making sure that they are all."""
-    packing = encoding.packing
-    if packing == "raw" and isinstance(stream, gzip.GzipFile):
-        packing = "gzip, opened"
-    if size > path.stat().st_size * _MOST_INFLATED[packing]:
-        raise InputError(f"{path}: truncated or damaged (its voxels are incomplete); copy or export it again")
-    if packing == "zlib":
-        unpacker = zlib.decompressobj()
-        content = bytearray(unpacker.decompress(stream.read(), size + 1))
-        found, whole = len(content), unpacker.eof
-    else:
-        source: Any = {"gzip": lambda: gzip.GzipFile(fileobj=stream), "bzip2": lambda: bz2.BZ2File(stream)}.get(
-            packing, lambda: stream
-        )()
-        if encoding.skipped_bytes < 0:
-            source.seek(max(path.stat().st_size - size, 0))
-        else:
-            source.read(encoding.skipped_bytes)
-        content = bytearray(size)
-        view, found = memoryview(content), 0
-        while found < size and (count := source.readinto(view[found:])):
-            found += count
-        whole = not source.read(1)  # gzip compares its checksum at the end
-    if found < size:
-        raise InputError(f"{path}: truncated or damaged (its voxels are incomplete); copy or export it again")
-    if found > size or not whole:
-        raise InputError(
-            f"{path}: holds more than the {size} bytes of voxels that its header describes; export it again"
-        )
-    return content
+        with file.open("rb") as content:
+            parts.append(read_voxels(content, encoding, (count // len(files),), path=file))
+    return np.concatenate(parts).reshape(tuple(shape)), (header, *files)
 
 
 def _numbers(content: bytes, dtype: np.dtype, count: int, path: Path) -> np.ndarray:

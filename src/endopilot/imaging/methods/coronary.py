@@ -11,17 +11,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import KDTree
 
 from endopilot.errors import InputError
-from endopilot.imaging.aortic_root import AorticRoot, find_aortic_roots
+from endopilot.imaging.aortic_root import (
+    TO_WALL_MM,
+    AorticRoot,
+    box_around,
+    find_aortic_roots,
+    find_ostium,
+    openings,
+    opens_into,
+)
 from endopilot.imaging.contour import lumen_at_half_height
-from endopilot.imaging.coronary_doubts import FoundTree, coronary_doubts
+from endopilot.imaging.coronary_doubts import FoundTree, Scan, coronary_doubts
 from endopilot.imaging.grid import (
     LEAST_BLOOD_HU,
     connected_components,
@@ -30,11 +36,8 @@ from endopilot.imaging.grid import (
     interpolate_like,
     resample,
 )
-from endopilot.imaging.openings import TO_WALL_MM, box_around, openings, opens_into
-from endopilot.imaging.ostium import find_ostium
 from endopilot.imaging.segment import SegmentConfig
-from endopilot.imaging.vessel_tracking import track_tree
-from endopilot.imaging.vesselness import vesselness
+from endopilot.imaging.vessel_tracking import track_tree, vesselness
 from endopilot.lines import length_along
 from endopilot.progress import progress
 from endopilot.types import Insertion, LumenMask, Volume
@@ -69,8 +72,6 @@ _LEAST_TREE_MM3 = 250.0
 """A smaller connected vessel is no coronary tree: 50 mm of 2.5 mm width hold as much."""
 _RIVAL_SHARE = 0.85
 """What is dimmer than this share of the aorta's blood is no second candidate for it."""
-_WALL_HU = 50.0
-"""The aortic wall."""
 COARSEST_MM = 1.25
 """Longest edge of voxels in which a coronary artery of 2 mm still shows."""
 
@@ -85,32 +86,6 @@ _OSTIUM_REACH_MM = 8.0
 _SIDE = {"rca": (-0.64, -0.77), "lca": (0.77, 0.64)}
 """Direction (x, y) from the aorta's axis to each ostium: the right one lies to the front and right, the left one to the
 left and back."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Scan:
-    """What is known of the scan on the grid of the vessels.
-
-    Attributes:
-        grid: CT in HU.
-        hu: the same, lightly smoothed.
-        lumen_hu: HU of contrast-filled lumen.
-        pools: aorta, chambers, great vessels.
-        vessels: voxels of thin vessels.
-        response: vesselness.
-    """
-
-    grid: Volume
-    hu: Float[np.ndarray, "nz ny nx"]
-    lumen_hu: float
-    pools: Bool[np.ndarray, "nz ny nx"]
-    vessels: Bool[np.ndarray, "nz ny nx"]
-    response: Float[np.ndarray, "nz ny nx"]
-
-    @property
-    def blood_hu(self) -> float:
-        """HU midway between the aortic wall and lumen: what is brighter is blood."""
-        return 0.5 * (self.lumen_hu + _WALL_HU)
 
 
 def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
@@ -148,20 +123,8 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
         ostium, paths[0] = find_ostium(paths[0], blood, aorta, scan.grid)
         radius = _rough_radius(paths, scan)
         mask = _refine(volume, scan, paths, radius, ostium)
-        found = FoundTree(
-            volume=volume,
-            grid=grid,
-            hu=scan.hu,
-            lumen_hu=scan.lumen_hu,
-            blood_hu=scan.blood_hu,
-            vessels=scan.vessels,
-            aorta=aorta,
-            tree=tree,
-            ostium=ostium.position,
-            paths=paths,
-            radius=radius,
-            lumen=mask,
-        )
+        seen = {"volume": volume, "aorta": aorta, "tree": tree, "ostium": ostium.position}
+        found = FoundTree(**vars(scan), **seen, paths=paths, radius=radius, lumen=mask)
         warnings = coronary_doubts(found, config.vessel)
         if not config.seeds:
             warnings = (*_rival_aortas(scan, aorta, roots, config.vessel, tree, start), *warnings)
@@ -193,7 +156,7 @@ def _hu_at(volume: Volume, seed: tuple[float, float, float]) -> float:
     return found
 
 
-def _find_vessels(grid: Volume, lumen_hu: float) -> _Scan:
+def _find_vessels(grid: Volume, lumen_hu: float) -> Scan:
     """Tell blood pools and thin vessels apart."""
     hu = np.asarray(ndimage.gaussian_filter(grid.voxels, 0.35 / _GRID_MM, truncate=3.0))
     body = resample(grid, _BODY_GRID_MM)
@@ -211,7 +174,7 @@ def _find_vessels(grid: Volume, lumen_hu: float) -> _Scan:
     )
     # Short shapeless gaps, such as at a bifurcation, are bridged through bright voxels.
     vessels = thin & dilated(response > _RESPONSE, round(_GAP_MM / _GRID_MM / 2))
-    return _Scan(grid, hu, lumen_hu, pools, vessels, response)
+    return Scan(grid, hu, lumen_hu, pools, vessels, response)
 
 
 def _pools(body: Volume, level_hu: float, grid: Volume) -> Bool[np.ndarray, "nz ny nx"]:
@@ -241,7 +204,7 @@ def _inside(distance: Float[np.ndarray, "k j i"], body: Volume, grid: Volume) ->
     return interpolate_like(Volume(distance, body.spacing_mm, body.origin_mm, body.direction), grid, outside=1.0) <= 0
 
 
-def _aorta(scan: _Scan, root: AorticRoot) -> Bool[np.ndarray, "nz ny nx"]:
+def _aorta(scan: Scan, root: AorticRoot) -> Bool[np.ndarray, "nz ny nx"]:
     """Return the pool voxels around the aorta's axis."""
     reach = 1.15 * root.radius + 1.0
     box = box_around(
@@ -255,7 +218,7 @@ def _aorta(scan: _Scan, root: AorticRoot) -> Bool[np.ndarray, "nz ny nx"]:
     return aorta
 
 
-_Tree = tuple[_Scan, Bool[np.ndarray, "nz ny nx"], Bool[np.ndarray, "nz ny nx"], Int[np.ndarray, "3"]]
+_Tree = tuple[Scan, Bool[np.ndarray, "nz ny nx"], Bool[np.ndarray, "nz ny nx"], Int[np.ndarray, "3"]]
 """The scan, the aorta in it, the connected vessel wanted, and its voxel nearest the aortic wall."""
 
 
@@ -287,7 +250,7 @@ def _unseeded_tree(grid: Volume, roots: list[AorticRoot], vessel: str) -> _Tree:
 
 
 def _rival_aortas(
-    scan: _Scan, aorta: np.ndarray, roots: list[AorticRoot], vessel: str, tree: np.ndarray, start: np.ndarray
+    scan: Scan, aorta: np.ndarray, roots: list[AorticRoot], vessel: str, tree: np.ndarray, start: np.ndarray
 ) -> list[str]:
     """Tell what else may be the ascending aorta, since such an artery opens into it too, or into none visibly."""
     doubts = []
@@ -311,7 +274,7 @@ def _rival_aortas(
 
 
 def _tree_at_seed(
-    scan: _Scan, aorta: np.ndarray, seed: tuple[float, float, float]
+    scan: Scan, aorta: np.ndarray, seed: tuple[float, float, float]
 ) -> tuple[Bool[np.ndarray, "nz ny nx"], Int[np.ndarray, "3"]]:
     """Return the connected vessel at a seed, and where it begins: at the aortic wall, if the seed is near, or there."""
     at = _vessel_near(scan, scan.vessels, seed)
@@ -326,7 +289,7 @@ def _tree_at_seed(
 
 
 def _tree_at_aorta(
-    scan: _Scan, root: AorticRoot, aorta: np.ndarray, vessel: str
+    scan: Scan, root: AorticRoot, aorta: np.ndarray, vessel: str
 ) -> tuple[Bool[np.ndarray, "nz ny nx"], Int[np.ndarray, "3"]] | None:
     """Return the connected vessel that belongs to the ostium wanted, and its voxel nearest the aortic wall, if any."""
     label = connected_components(scan.vessels, corners=True)
@@ -347,7 +310,7 @@ def _tree_at_aorta(
     return label == best, start
 
 
-def _on_side(scan: _Scan, root: AorticRoot, voxels: Int[np.ndarray, "n 3"], vessel: str) -> Bool[np.ndarray, "n"]:
+def _on_side(scan: Scan, root: AorticRoot, voxels: Int[np.ndarray, "n 3"], vessel: str) -> Bool[np.ndarray, "n"]:
     """Return which voxels at the aorta's wall are where the wanted artery's ostium may be."""
     points = scan.grid.index_to_world(voxels[:, ::-1].astype(float))
     disc = np.abs(root.centres[:, 2] - points[:, 2, None]).argmin(axis=1)
@@ -355,7 +318,7 @@ def _on_side(scan: _Scan, root: AorticRoot, voxels: Int[np.ndarray, "n 3"], vess
     return (points[:, 2] >= root.centres[0, 2]) & (outward > 0)  # what comes to a chamber below is no ostium
 
 
-def _vessel_near(scan: _Scan, vessels: np.ndarray, seed: tuple[float, float, float]) -> Int[np.ndarray, "3"]:
+def _vessel_near(scan: Scan, vessels: np.ndarray, seed: tuple[float, float, float]) -> Int[np.ndarray, "3"]:
     """Return the vessel voxel nearest a seed."""
     voxels = np.argwhere(vessels)
     if len(voxels) == 0:
@@ -370,7 +333,7 @@ def _vessel_near(scan: _Scan, vessels: np.ndarray, seed: tuple[float, float, flo
 
 
 def _refine(
-    volume: Volume, scan: _Scan, lines: list[np.ndarray], radius: list[np.ndarray], ostium: Insertion
+    volume: Volume, scan: Scan, lines: list[np.ndarray], radius: list[np.ndarray], ostium: Insertion
 ) -> Bool[np.ndarray, "nz ny nx"]:
     """Return the lumen around the paths on the volume's own grid, cut at the ostium."""
     points = np.concatenate(lines)
@@ -400,7 +363,7 @@ def _cut(excluded: np.ndarray, crop: Volume, ostium: Insertion) -> None:
     excluded[box] = np.where(near, offset @ ostium.direction < 0, excluded[box])
 
 
-def _rough_radius(lines: list[np.ndarray], scan: _Scan) -> list[Float[np.ndarray, "_"]]:
+def _rough_radius(lines: list[np.ndarray], scan: Scan) -> list[Float[np.ndarray, "_"]]:
     """Return the lumen radius along each path, mm, from the distance to voxels below half height."""
     index = np.round(scan.grid.world_to_index(np.concatenate(lines))).astype(int)[:, ::-1]
     box = box_around(index, np.full(3, (_WIDEST_MM + 1.0) / _GRID_MM), scan.hu.shape)

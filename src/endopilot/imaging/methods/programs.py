@@ -1,0 +1,203 @@
+"""Segmentation by another program, run as a subprocess with the weights and the licence that its user has.
+
+The program gets the CT in a temporary folder, as a file with no header but its geometry, and writes its labels there.
+TotalSegmentator (https://github.com/wasserth/TotalSegmentator): its task `coronary_arteries` needs a licence of the
+user's own; `--options task=total structure=aorta` does not. nnU-Net v2 (https://github.com/MIC-DKFZ/nnUNet): the user's
+own trained model.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool
+
+from endopilot.errors import InputError
+from endopilot.files import read_json
+from endopilot.imaging.geometry import farthest_apart_mm
+from endopilot.imaging.grid import mask_like
+from endopilot.imaging.segment import SegmentationMethod, SegmentConfig
+from endopilot.imaging.volume import SUFFIXES, read_volume, write_volume
+from endopilot.progress import progress
+from endopilot.types import Insertion, LumenMask, Volume
+
+_SEED_MM = 5.0
+"""A seed belongs to the lumen within this distance."""
+_MOUTH_MM = 8.0
+"""The vessel's direction at the first seed is that to the middle of the lumen within this distance."""
+_LONGEST_MESSAGE = 200
+_TOTALSEGMENTATOR = {"task": "coronary_arteries", "structure": "", "device": ""}
+"""Task (`-ta`); structure whose mask is taken, by default the task's name; device (`-d`): gpu, cpu, gpu:1."""
+_NNUNET = {"model": "", "device": "", "label": ""}
+"""Folder of the trained model, with dataset.json and fold_0, fold_1, …; device: cuda, cpu, mps; label of the lumen."""
+
+
+def by_totalsegmentator(volume: Volume, config: SegmentConfig) -> LumenMask:
+    """Return the mask of one structure as TotalSegmentator finds it; the first seed, if any, is the ostium.
+
+    Raises:
+        InputError: TotalSegmentator is missing, fails, or writes no or an empty mask.
+    """
+    settings = config.settings(_TOTALSEGMENTATOR)
+    task = settings["task"]
+    structure = settings["structure"] or task
+    chosen = ["--roi_subset", structure] if task == "total" else []
+    device = ["--device", settings["device"]] if settings["device"] else []
+    return segment_by_program(
+        volume,
+        config.seeds,
+        lambda source, target: [
+            *("TotalSegmentator", "-i", str(source / "ct.nii.gz"), "-o", str(target), "--task", task),
+            *chosen,
+            *device,
+            "--quiet",
+        ],
+        given="ct.nii.gz",
+        answer=f"{structure}.nii.gz",
+        mend="install TotalSegmentator in an environment of its own, with the task's weights and licence, and see that "
+        f"`TotalSegmentator -i ct.nii.gz -o out --task {task}` runs",
+    )
+
+
+def by_nnunet(volume: Volume, config: SegmentConfig) -> LumenMask:
+    """Return the lumen as a trained nnU-Net finds it, all folds of it together; the first seed, if any, is the ostium.
+
+    Raises:
+        InputError: no or an unfit model is given, nnU-Net is missing, fails, or writes no or an empty mask.
+    """
+    settings = config.settings(_NNUNET)
+    model, label = Path(settings["model"]), settings["label"]
+    folds = sorted(folder.name.removeprefix("fold_") for folder in model.glob("fold_*")) if settings["model"] else []
+    if not folds or not (model / "dataset.json").is_file():
+        raise InputError(
+            f"options: model={settings['model']!r} holds no trained nnU-Net; give --options model=FOLDER, that with "
+            "dataset.json and fold_0, such as …/nnUNetTrainer__nnUNetPlans__3d_fullres"
+        )
+    if label and not label.isdecimal():
+        raise InputError(f"options: label={label!r} is no whole number; give the label of the lumen")
+    content = read_json(model / "dataset.json")
+    suffix = content.get("file_ending", ".nii.gz") if isinstance(content, dict) else ""
+    if suffix not in SUFFIXES:
+        raise InputError(f"{model}/dataset.json: file_ending {suffix!r} is unknown; known are {' '.join(SUFFIXES)}")
+    return segment_by_program(
+        volume,
+        config.seeds,
+        lambda source, target: [
+            *("nnUNetv2_predict_from_modelfolder", "-i", str(source), "-o", str(target), "-m", str(model)),
+            *("-f", *folds),
+            *(("-device", settings["device"]) if settings["device"] else ()),
+            "--disable_progress_bar",
+        ],
+        given=f"ct_0000{suffix}",
+        answer=f"ct{suffix}",
+        label=int(label) if label else None,
+        mend="install nnunetv2 in an environment of its own, and see that `nnUNetv2_predict_from_modelfolder -m "
+        f"{model}` runs; without a GPU, give --options device=cpu",
+    )
+
+
+def segment_by_program(
+    volume: Volume,
+    seeds: Sequence[tuple[float, float, float]],
+    arguments: Callable[[Path, Path], Sequence[str]],
+    *,
+    given: str,
+    answer: str,
+    label: int | None = None,
+    mend: str,
+) -> LumenMask:
+    """Return the lumen that a program finds in a volume; the ostium is at the first seed.
+
+    Args:
+        volume: CT in HU.
+        seeds: points in the lumen, LPS mm; none where the ostium is not known.
+        arguments: program and arguments, from the folder that holds the CT and the folder for its answer.
+        given: name of the CT's file.
+        answer: name of the file that the program is to write.
+        label: value of the lumen where the answer holds several.
+        mend: what to do where the program is missing or fails.
+
+    Raises:
+        InputError: the program is not there, fails, writes no such file, or marks nothing in the CT; or a seed lies
+            farther than 5 mm from the lumen.
+    """
+    with tempfile.TemporaryDirectory(prefix="endopilot-") as temporary:
+        source, target = Path(temporary) / "ct", Path(temporary) / "answer"
+        target.mkdir()
+        write_volume(volume, source / given)
+        command = list(arguments(source, target))
+        program = Path(command[0]).name
+        with progress(f"Running {program}", 1) as advance:
+            _run(command, mend)
+            advance()
+        file = target / answer
+        if not file.exists():
+            written = ", ".join(sorted(path.name for path in target.rglob("*") if path.is_file())[:10]) or "nothing"
+            raise InputError(f"{program} wrote no {answer} (it wrote {written}); {mend}")
+        try:
+            found = read_volume(file)
+        except InputError as error:
+            raise InputError(f"{program} wrote a {answer} that is no volume; {mend}") from error
+    inside = _labelled(found, label, program)
+    size = volume.voxels.shape[::-1]
+    if inside.shape != volume.voxels.shape or farthest_apart_mm(found, volume, size) > volume.spacing_mm.min() / 2:
+        inside = mask_like(LumenMask(replace(found, voxels=inside)), volume)
+        if not inside.any():
+            raise InputError(f"{program} wrote a mask that lies outside the CT; {mend}")
+    on_ct = replace(volume, voxels=inside)
+    return LumenMask(on_ct, _ostium_at_seeds(on_ct, seeds) if seeds else None, warnings=found.notes)
+
+
+def _ostium_at_seeds(lumen: Volume, seeds: Sequence[tuple[float, float, float]]) -> Insertion:
+    """Return the ostium at the first seed, with the direction into the lumen."""
+    points = lumen.index_to_world(np.argwhere(lumen.voxels)[:, ::-1].astype(float))
+    for seed in seeds:
+        gap = float(np.linalg.norm(points - np.array(seed), axis=1).min())
+        if gap > _SEED_MM:
+            raise InputError(
+                f"seeds: the lumen found is {gap:.0f} mm from {tuple(seed)}; move the seed into it (LPS mm)"
+            )
+    place = np.array(seeds[0], dtype=float)
+    inward = points[np.linalg.norm(points - place, axis=1) < _MOUTH_MM].mean(axis=0) - place
+    length = float(np.linalg.norm(inward))
+    return Insertion(place, inward / length if length > 1e-6 else np.array([0.0, 0.0, -1.0]))
+
+
+def _run(command: Sequence[str], mend: str) -> None:
+    """Run a program and wait for it; its output is reported only if it fails."""
+    program = Path(command[0]).name
+    if shutil.which(command[0]) is None:
+        raise InputError(f"the program {program} is not on the PATH; {mend}")
+    try:
+        answer = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace", check=False
+        )
+    except OSError as error:
+        raise InputError(f"{program} cannot be run ({error.strerror}); {mend}") from error
+    if answer.returncode != 0:
+        lines = [line.strip() for line in (answer.stderr + "\n" + answer.stdout).splitlines() if line.strip()]
+        said = [line for line in lines if "error" in line.lower()] or lines or ["nothing"]
+        raise InputError(f"{program} failed with exit code {answer.returncode}: {said[-1][:_LONGEST_MESSAGE]}; {mend}")
+
+
+def _labelled(found: Volume, label: int | None, program: str) -> Bool[np.ndarray, "nz ny nx"]:
+    labels = np.unique(found.voxels[found.voxels > 0]).astype(int)
+    if len(labels) == 0:
+        raise InputError(f"{program} found no lumen in this CT; try another method, or seeds with --method coronary")
+    listed = ", ".join(map(str, labels[:20]))
+    if label is None and len(labels) > 1:
+        raise InputError(f"{program} marked {len(labels)} labels ({listed}); choose one with --options label=NUMBER")
+    if label is not None and label not in labels:
+        raise InputError(f"{program} marked {listed}, and no voxel with label {label}; choose with --options label=")
+    return found.voxels == (labels[0] if label is None else label)
+
+
+TOTALSEGMENTATOR = SegmentationMethod(segment_lumen=by_totalsegmentator, options=_TOTALSEGMENTATOR)
+NNUNET = SegmentationMethod(segment_lumen=by_nnunet, options=_NNUNET, blood_pools=False)
+"""A model may be trained on any part of the body: a CT of the head holds no aorta and no heart chamber."""

@@ -1,0 +1,378 @@
+"""Images with a text header: NRRD (.nrrd, .nhdr), 3D Slicer's segmentations (.seg.nrrd), MetaImage (.mha, .mhd).
+
+NRRD: https://teem.sourceforge.net/nrrd/format.html. A segmentation of Slicer is one label image, or several in layers
+where segments overlap; its header names each segment's layer and value.
+
+MetaImage: https://itk.org/Wiki/MetaIO/Documentation. `AnatomicalOrientation` repeats in words what `TransformMatrix`
+says in numbers, in ITK's way: RAI are axes that run from right, anterior and inferior, which is LPS.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from io import BufferedIOBase
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Shaped
+
+from endopilot.errors import InputError
+from endopilot.imaging.geometry import Fields, Geometry, converted, geometry, parted
+from endopilot.imaging.segments import ImageFile, Segment
+from endopilot.imaging.voxels import Encoding, read_voxels_beside
+
+_LONGEST_HEADER = 1 << 20
+_TO_LPS = {"right": -1.0, "left": 1.0, "anterior": -1.0, "posterior": 1.0, "superior": 1.0, "inferior": -1.0}
+_LETTERS = {word[0]: word for word in _TO_LPS}
+_WORLD_AXES = (("right", "left"), ("anterior", "posterior"), ("inferior", "superior"))
+
+_NRRD_TYPES = {
+    **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
+    **dict.fromkeys(("uchar", "unsigned char", "uint8", "uint8_t"), "u1"),
+    **dict.fromkeys(("short", "short int", "signed short", "signed short int", "int16", "int16_t"), "i2"),
+    **dict.fromkeys(("ushort", "unsigned short", "unsigned short int", "uint16", "uint16_t"), "u2"),
+    **dict.fromkeys(("int", "signed int", "int32", "int32_t"), "i4"),
+    **dict.fromkeys(("uint", "unsigned int", "uint32", "uint32_t"), "u4"),
+    **dict.fromkeys(
+        ("longlong", "long long", "long long int", "signed long long", "signed long long int", "int64", "int64_t"),
+        "i8",
+    ),
+    **dict.fromkeys(("ulonglong", "unsigned long long", "unsigned long long int", "uint64", "uint64_t"), "u8"),
+    "float": "f4",
+    "double": "f8",
+}
+_PACKINGS = {
+    **dict.fromkeys(("raw",), "raw"),
+    **dict.fromkeys(("gzip", "gz"), "gzip"),
+    **dict.fromkeys(("bzip2", "bz2"), "bzip2"),
+    **dict.fromkeys(("txt", "text", "ascii"), "ascii"),
+}
+_NRRD_SYNONYMS = {"datafile": "data file", "lineskip": "line skip", "byteskip": "byte skip"}
+_NRRD_FIELDS = Fields("space directions", "space directions", "space origin")
+
+_LONGEST_LINE = 1 << 16
+_MOST_LINES = 1000
+_META_TYPES = {
+    "MET_CHAR": "i1",
+    "MET_UCHAR": "u1",
+    "MET_SHORT": "i2",
+    "MET_USHORT": "u2",
+    "MET_INT": "i4",
+    "MET_UINT": "u4",
+    "MET_LONG": "i4",
+    "MET_ULONG": "u4",
+    "MET_LONG_LONG": "i8",
+    "MET_ULONG_LONG": "u8",
+    "MET_FLOAT": "f4",
+    "MET_DOUBLE": "f8",
+}
+_META_SYNONYMS = {
+    **dict.fromkeys(("Orientation", "Rotation"), "TransformMatrix"),
+    **dict.fromkeys(("Origin", "Position"), "Offset"),
+    "ElementByteOrderMSB": "BinaryDataByteOrderMSB",
+}
+_META_FIELDS = Fields("TransformMatrix", "ElementSpacing", "Offset")
+_FROM = ("RL", "AP", "IS")
+"""Letters of `AnatomicalOrientation` along x, y and z of LPS: where an axis along it begins, and one against it."""
+
+
+def read_nrrd(path: Path) -> ImageFile:
+    """Read an NRRD file.
+
+    Raises:
+        InputError: the file is damaged, holds no grey levels or labels, or does not say where they are.
+    """
+    with path.open("rb") as stream:
+        fields, keys = _nrrd_header(stream, path)
+        sizes, vectors = _axes(fields, path)
+        domain = [axis for axis, vector in enumerate(vectors) if vector is not None]
+        place = _nrrd_geometry(fields, vectors, tuple(sizes[axis] for axis in domain), path)
+        segments = _segments(keys, path)
+        extra = [axis for axis in range(len(sizes)) if axis not in domain]
+        count = int(np.prod([sizes[axis] for axis in extra], dtype=float))
+        if count > 1 and not segments:
+            shape = "×".join(map(str, sizes))
+            if len(extra) > 1 or _kinds(fields, extra)[:1] in (["list"], ["time"]):
+                raise InputError(f"{path}: {len(sizes)}-D ({shape}); give one 3-D volume, such as one cardiac phase")
+            raise InputError(f"{path}: {count} values in every voxel (colour or vectors); give a grey-level volume")
+        values, files = _values(fields, sizes, stream, path)
+    # The first axis of the file is the fastest, and so the last of the array.
+    order = [len(sizes) - 1 - axis for axis in (*extra, *reversed(domain))]
+    layers = values.transpose(order).reshape(count, *(sizes[axis] for axis in reversed(domain)))
+    return ImageFile(place.volume(layers[0], files), layers, segments)
+
+
+def _nrrd_header(stream: BufferedIOBase, path: Path) -> tuple[dict[str, str], dict[str, str]]:
+    """Return fields and keys of a header, and leave the stream at the byte after its empty line."""
+    if not re.fullmatch(rb"NRRD000[1-5]\r?\n", stream.readline(12)):
+        raise InputError(f"{path}: its content does not match its suffix, or its header is damaged; export it again")
+    fields: dict[str, str] = {}
+    keys: dict[str, str] = {}
+    while line := stream.readline(_LONGEST_HEADER):
+        text = line.decode("utf-8", errors="replace").rstrip("\r\n")
+        if not text:
+            return fields, keys
+        if text.startswith("#"):
+            continue
+        key, sign, value = text.partition(":=")
+        field, colon, description = text.partition(": ")
+        if sign and len(key) < len(field):
+            keys[key] = value
+            continue
+        name = field.strip().lower()
+        name = _NRRD_SYNONYMS.get(name, name)
+        if not colon or not name or name in fields:
+            raise InputError(f"{path}: its header is damaged ({text[:60]!r} is no field of its own); export it again")
+        fields[name] = description.strip()
+        if name == "data file" and fields[name].split()[:1] == ["LIST"]:
+            rest = stream.read(_LONGEST_HEADER).decode("utf-8", errors="replace").split("\n")
+            fields[name] += "\n" + "\n".join(part.strip() for part in rest if part.strip())
+            return fields, keys
+    if "data file" not in fields:
+        raise InputError(f"{path}: truncated or damaged (its header does not end); copy or export it again")
+    return fields, keys
+
+
+def _axes(fields: dict[str, str], path: Path) -> tuple[list[int], list[Float[np.ndarray, "3"] | None]]:
+    """Return the size of every axis and the step along each, None but for three that run through space."""
+    try:
+        sizes = [int(word) for word in fields.get("sizes", "").split()]
+        dimension = int(fields.get("dimension", ""))
+    except ValueError:
+        sizes, dimension = [], 0
+    if not sizes or dimension != len(sizes) or min(sizes) < 1:
+        raise InputError(f"{path}: its dimension and sizes describe no image; export it again")
+    if "space" not in fields:
+        raise InputError(f"{path}: has no orientation (no space in its header); export it with its space directions")
+    text = fields.get("space directions", "")
+    words = re.findall(r"none|\([^()]*\)", text)
+    vectors = [None if word == "none" else _vector(word, "space directions", path) for word in words]
+    if len(words) != len(sizes) or re.sub(r"none|\([^()]*\)", "", text).strip():
+        raise InputError(f"{path}: space directions {text[:80]!r} are not one vector an axis; export it again")
+    if (count := len(words) - sum(vector is None for vector in vectors)) != 3:
+        shape = "×".join(map(str, sizes))
+        raise InputError(f"{path}: {shape} voxels with {count} axes in space are no volume; give a 3-D volume")
+    return sizes, vectors
+
+
+def _kinds(fields: dict[str, str], axes: list[int]) -> list[str]:
+    kinds = fields.get("kinds", "").split()
+    return [kinds[axis].lower() for axis in axes if axis < len(kinds)]
+
+
+def _nrrd_geometry(
+    fields: dict[str, str], vectors: list[Float[np.ndarray, "3"] | None], size: tuple[int, ...], path: Path
+) -> Geometry:
+    to_lps = _to_lps(fields["space"], path)
+    if "space origin" not in fields:
+        raise InputError(f"{path}: has no place (no space origin in its header); export it with its space origin")
+    origin = _vector(fields["space origin"], "space origin", path)
+    steps = np.array([vector for vector in vectors if vector is not None]).T
+    units = set(re.findall(r'"([^"]*)"', fields.get("space units", ""))) - {""} or {"mm"}
+    if len(units) > 1 or ("space units" in fields and '"' not in fields["space units"]):
+        raise InputError(f"{path}: space units {fields['space units'][:60]!r} are not one unit; export it in mm")
+    lengths = np.linalg.norm(steps, axis=0)
+    factor, notes = converted(units.pop(), lengths, path=path, field="space units")
+    along = zip(fields.get("spacings", "").split(), vectors, strict=False)
+    given = [word for word, vector in along if vector is not None and word.lower() != "nan"]
+    if given and not np.allclose(_numbers(given, 3, "spacings", path), lengths, rtol=1e-2):
+        raise InputError(f"{path}: spacings {' '.join(given)} contradict space directions; export it again")
+    steps, origin = to_lps[:, None] * steps * factor, to_lps * origin * factor
+    place = geometry(*parted(steps), origin, (size[0], size[1], size[2]), path=path, fields=_NRRD_FIELDS)
+    return replace(place, notes=(*notes, *place.notes))
+
+
+def _to_lps(space: str, path: Path) -> np.ndarray:
+    """Return the signs that take the file's world axes to LPS."""
+    words = space.strip().lower().split("-")
+    if len(words) == 1 and len(words[0]) == 3:
+        words = [_LETTERS.get(letter, "") for letter in words[0]]
+    if len(words) != 3 or any(word not in pair for word, pair in zip(words, _WORLD_AXES, strict=True)):
+        raise InputError(
+            f"{path}: space {space[:40]!r} does not say where the patient's left, back and head are; export it in "
+            "left-posterior-superior"
+        )
+    return np.array([_TO_LPS[word] for word in words])
+
+
+def _values(
+    fields: dict[str, str], sizes: list[int], stream: BufferedIOBase, path: Path
+) -> tuple[Shaped[np.ndarray, "..."], tuple[Path, ...]]:
+    """Return the voxels, the slowest axis first, and the files that they are from."""
+    kind, packing = fields.get("type", "").lower(), _PACKINGS.get(fields.get("encoding", "").lower())
+    if kind not in _NRRD_TYPES:
+        raise InputError(f"{path}: type {kind!r} holds no grey levels; export it as short or float")
+    if packing is None:
+        raise InputError(f"{path}: encoding {fields.get('encoding', '')!r} is not read; export it as raw or gzip")
+    endian = fields.get("endian", "").lower()
+    if endian not in ("little", "big") and _NRRD_TYPES[kind][1] != "1" and packing != "ascii":
+        raise InputError(f"{path}: endian {endian!r} is neither little nor big; export it again")
+    dtype = np.dtype((">" if endian == "big" else "<") + _NRRD_TYPES[kind])
+    encoding = Encoding(dtype, packing, _skip(fields, "line skip", 0, path), _skip(fields, "byte skip", -1, path))
+    return read_voxels_beside(fields.get("data file"), stream, encoding, sizes[::-1], header=path)
+
+
+def _skip(fields: dict[str, str], name: str, least: int, path: Path) -> int:
+    text = fields.get(name, "0")
+    if not re.fullmatch(r"-?\d{1,12}", text) or int(text) < least:
+        raise InputError(f"{path}: {name} {text[:20]!r} is no whole number from {least}; export it again")
+    return int(text)
+
+
+def _segments(keys: dict[str, str], path: Path) -> tuple[Segment, ...]:
+    """Return the segments that 3D Slicer names in a header; before layers, each had a layer of its own."""
+    numbers = sorted({int(found[1]) for key in keys if (found := re.match(r"Segment(\d{1,6})_(?:ID|Name)$", key))})
+    segments = []
+    for place, number in enumerate(numbers):
+        value, layer = (keys.get(f"Segment{number}_{part}", "") for part in ("LabelValue", "Layer"))
+        if not re.fullmatch(r"\d{0,9}", value) or not re.fullmatch(r"\d{0,9}", layer):
+            raise InputError(f"{path}: Segment{number} has no whole numbers as LabelValue and Layer; export it again")
+        name = keys.get(f"Segment{number}_Name") or keys.get(f"Segment{number}_ID", "")
+        plain = not value and not layer
+        segments.append(Segment(name, place if plain else int(layer or 0), int(value or 1)))
+    return tuple(segments)
+
+
+def read_metaimage(path: Path) -> ImageFile:
+    """Read a MetaImage file.
+
+    Raises:
+        InputError: the file is damaged, holds no grey levels or labels, or does not say where they are.
+    """
+    with path.open("rb") as stream:
+        fields = _meta_header(stream, path)
+        size = _meta_size(fields, path)
+        place = _meta_geometry(fields, size, path)
+        encoding = _meta_encoding(fields, path)
+        source = fields["ElementDataFile"]
+        beside = None if source.upper() == "LOCAL" else source
+        voxels, files = read_voxels_beside(beside, stream, encoding, size[::-1], header=path)
+    return ImageFile(place.volume(voxels, files), voxels[None])
+
+
+def _meta_header(stream: BufferedIOBase, path: Path) -> dict[str, str]:
+    """Return the fields of a header, and leave the stream at the byte after it."""
+    fields: dict[str, str] = {}
+    for _ in range(_MOST_LINES):
+        line = stream.readline(_LONGEST_LINE)
+        name, sign, value = line.decode("utf-8", errors="replace").partition("=")
+        name = _META_SYNONYMS.get(name.strip(), name.strip())
+        if line and not line.strip():
+            continue
+        if not fields and not (sign and name.isidentifier()):
+            raise InputError(
+                f"{path}: its content does not match its suffix, or its header is damaged; export it again"
+            )
+        if not sign or not name or name in fields:
+            raise InputError(f"{path}: its header is damaged ({name[:40]!r} is no field of its own); export it again")
+        fields[name] = value.strip()
+        if name == "ElementDataFile":
+            if fields[name].split()[:1] == ["LIST"]:
+                rest = stream.read().decode("utf-8", errors="replace").split("\n")
+                fields[name] = "LIST\n" + "\n".join(part.strip() for part in rest if part.strip())
+            return fields
+    raise InputError(f"{path}: truncated or damaged (its header does not end); copy or export it again")
+
+
+def _meta_size(fields: dict[str, str], path: Path) -> tuple[int, int, int]:
+    """Return the numbers of voxels along i, j and k."""
+    try:
+        extents = [int(word) for word in fields.get("DimSize", "").split()]
+        count, channels = int(fields.get("NDims", "")), int(fields.get("ElementNumberOfChannels", "1"))
+    except ValueError:
+        extents, count, channels = [], 0, 1
+    if not extents or count != len(extents) or min(extents) < 1:
+        raise InputError(f"{path}: its NDims and DimSize describe no image; export it again")
+    if channels != 1:
+        raise InputError(f"{path}: {channels} values in every voxel (colour or vectors); give a grey-level volume")
+    shape = "×".join(map(str, extents))
+    if any(extent > 1 for extent in extents[3:]):
+        raise InputError(f"{path}: {count}-D ({shape}); give a single 3-D volume, such as one cardiac phase")
+    if count < 3:
+        raise InputError(f"{path}: {shape} voxels are no volume; give a 3-D volume")
+    return extents[0], extents[1], extents[2]
+
+
+def _meta_encoding(fields: dict[str, str], path: Path) -> Encoding:
+    kind = fields.get("ElementType", "")
+    if kind not in _META_TYPES:
+        raise InputError(f"{path}: ElementType {kind[:40]!r} holds no grey levels; export it as MET_SHORT or MET_FLOAT")
+    binary, packed = _truth(fields, "BinaryData", True, path), _truth(fields, "CompressedData", False, path)
+    big = _truth(fields, "BinaryDataByteOrderMSB", False, path)
+    packing = "ascii" if not binary else "zlib" if packed else "raw"
+    return Encoding(
+        np.dtype((">" if big else "<") + _META_TYPES[kind]),
+        packing,
+        skipped_bytes=_skip(fields, "HeaderSize", -1, path),
+    )
+
+
+def _truth(fields: dict[str, str], name: str, default: bool, path: Path) -> bool:
+    text = fields.get(name, str(default))
+    if text[:1].upper() not in ("T", "F", "1", "0"):
+        raise InputError(f"{path}: {name} {text[:20]!r} is neither True nor False; export it again")
+    return text[:1].upper() in ("T", "1")
+
+
+def _meta_geometry(fields: dict[str, str], size: tuple[int, int, int], path: Path) -> Geometry:
+    count = int(fields["NDims"])
+    if "ElementSpacing" not in fields:
+        raise InputError(f"{path}: has no ElementSpacing, so that its voxels have no size; export it again")
+    spacing = _named_numbers(fields, "ElementSpacing", count, path)[:3]
+    factor, notes = converted(fields.get("DistanceUnits", "mm"), spacing, path=path, field="DistanceUnits")
+    sizes = _named_numbers(fields, "ElementSize", count, path)[:3] if "ElementSize" in fields else spacing
+    if not np.allclose(sizes, spacing, rtol=1e-2):
+        notes += (f"{path.name}: ElementSize differs from ElementSpacing; voxels lie where ElementSpacing puts them",)
+    origin = np.zeros(3)
+    if "Offset" in fields:
+        origin = _named_numbers(fields, "Offset", count, path)[:3]
+    else:
+        notes += (f"{path.name}: has no Offset; its first voxel was put at 0 0 0",)
+    words = fields.get("AnatomicalOrientation", "").strip().upper()
+    named = _named_axes(words)
+    if "TransformMatrix" in fields:
+        # Its rows are the directions of i, j and k.
+        direction = _named_numbers(fields, "TransformMatrix", count * count, path).reshape(count, count)[:3, :3].T
+    elif named is not None:
+        direction = named
+        notes += (f"{path.name}: has no TransformMatrix; its axes are those of AnatomicalOrientation {words}",)
+    else:
+        direction = np.eye(3)
+        notes += (f"{path.name}: has no TransformMatrix; its axes were taken as left, posterior and superior",)
+    place = geometry(direction, spacing * factor, origin * factor, size, path=path, fields=_META_FIELDS)
+    if named is not None and np.any(np.sum(named * place.direction, axis=0) < 0.5):
+        notes += (
+            f"{path.name}: AnatomicalOrientation {words} contradicts TransformMatrix; voxels lie where TransformMatrix "
+            "puts them",
+        )
+    return replace(place, notes=(*notes, *place.notes))
+
+
+def _named_axes(words: str) -> Float[np.ndarray, "3 3"] | None:
+    """Return the axes that three letters name, as columns; None where they name none."""
+    axes = np.zeros((3, 3))
+    for column, letter in enumerate(words[:3]):
+        for row, pair in enumerate(_FROM):
+            if letter in pair:
+                axes[row, column] = 1.0 if letter == pair[0] else -1.0
+    return axes if len(words) == 3 and abs(np.linalg.det(axes)) > 0.5 else None
+
+
+def _numbers(words: Sequence[str], count: int, field: str, path: Path) -> Float[np.ndarray, "_"]:
+    try:
+        numbers = np.array(words, dtype=float)
+    except ValueError:
+        numbers = np.array([])
+    if len(numbers) != count:
+        raise InputError(f"{path}: {field} {' '.join(words)[:80]!r} is not {count} numbers; export it again")
+    return numbers
+
+
+def _named_numbers(fields: dict[str, str], name: str, count: int, path: Path) -> Float[np.ndarray, "_"]:
+    return _numbers(fields[name].split(), count, name, path)
+
+
+def _vector(text: str, field: str, path: Path) -> Float[np.ndarray, "3"]:
+    return _numbers(text.strip().removeprefix("(").removesuffix(")").split(","), 3, field, path)
