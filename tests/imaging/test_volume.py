@@ -132,7 +132,7 @@ def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch):
         raise RuntimeError("disk full")
 
     monkeypatch.setattr(sitk, "WriteImage", fail)
-    with pytest.raises(InputError, match="disk is not full"):
+    with pytest.raises(InputError, match=r"ct\.nii\.gz: cannot be written"):
         write_volume(_oblique_volume(), tmp_path / "ct.nii.gz")
     assert not list(tmp_path.iterdir())
 
@@ -153,7 +153,7 @@ for name in sys.argv[2:]:
         try:
             write(volume, path)
         except InputError as error:
-            assert "disk is not full" in str(error), error
+            assert "ulimit -f" in str(error), error
         else:
             raise SystemExit(f"{name} was written whole to a disk that has no room for it")
 """

@@ -202,7 +202,7 @@ def write_mask(mask: LumenMask, path: str | Path, *, manifest: Mapping[str, Any]
         if path.suffix.lower() == dicom_seg.SUFFIX:
             dicom_seg.write_seg(mask, partial)
         else:
-            _write_file(mask.volume, partial, path)
+            _write_file(mask.volume, partial)
         content = {
             "mask": {"name": path.name, "sha256": sha256(partial)},
             "ostium": ostium and {"position_mm": ostium.position, "direction": ostium.direction},
