@@ -28,6 +28,7 @@ from tyro.conf import Positional
 
 from endopilot.cli.arguments import MUST_EXIST, existing, show_answer
 from endopilot.errors import InputError
+from endopilot.files import regular
 from endopilot.settings import Within, is_settings, read_settings, settings
 
 LISTED_AT_MOST = 10
@@ -187,10 +188,11 @@ class Command:
 
     def _called(self, values: Any) -> Any:
         """Return what the function returns."""
-        for one in self.options(values):
-            if MUST_EXIST in _notes(one.kind):
-                for path in one.value if isinstance(one.value, tuple) else (one.value,) if one.value else ():
-                    existing(path)
+        for one in itertools.chain.from_iterable(option.leaves() for option in self.options(values)):
+            check = existing if MUST_EXIST in _notes(one.kind) else regular
+            for path in one.value if isinstance(one.value, tuple) else (one.value,):
+                if isinstance(path, str | Path):
+                    check(Path(path))
         given = {name: getattr(values, name) for name in self._parameters}
         places = [given.pop(name) for name, one in self._parameters.items() if one.kind is one.POSITIONAL_ONLY]
         if self._config is not NoneType:

@@ -5,6 +5,7 @@ Whatever happens, a command ends in one line on standard error, and its exit cod
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import errno
 import logging
@@ -17,9 +18,10 @@ import threading
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
+from types import FrameType
 from typing import Any
 
-from endopilot.errors import InputError, Remark, Stopped
+from endopilot.errors import STOPPING, InputError, Remark, Stopped, stop, stop_soon
 from endopilot.extras import what_is_missing
 
 EXIT_BAD_INPUT = 2
@@ -89,16 +91,19 @@ def own_streams() -> None:
 
 
 def leave(code: int) -> None:
-    """End the process, at once if it was stopped: threads that still work are not waited for."""
-    if code in (EXIT_INTERRUPTED, 128 + signal.SIGTERM):
-        sys.stdout.flush()
+    """End the process, at once if it was stopped or a signal still comes: threads that work are not waited for."""
+    for number in STOPPING:
+        signal.signal(number, lambda *_: os._exit(code))  # the result is there
+        atexit.register(signal.signal, number, signal.SIG_IGN)
+    sys.stdout.flush()
+    if code in [128 + number for number in STOPPING]:
         os._exit(code)
     sys.exit(code)
 
 
 def one_line(text: str) -> str:
-    """Return a text with its line breaks and other control characters escaped."""
-    return re.sub(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]", lambda found: ascii(found[0])[1:-1], text.strip())
+    """Return a text with its line breaks, other control characters, and bytes that are no UTF-8 escaped."""
+    return re.sub(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]", lambda found: ascii(found[0])[1:-1], text.strip())
 
 
 def _say(name: str, line: str, code: int) -> int:
@@ -156,25 +161,26 @@ def _signals() -> Iterator[list[int]]:
     last = threading.Timer(TO_END_S, lambda: os._exit(128 + arrived[0]))
     last.daemon = True
 
-    def stop(number: int, _frame: object) -> None:
+    def arrive(number: int, frame: FrameType | None) -> None:
         if not arrived:
             arrived.append(number)
             last.start()
-            raise Stopped(128 + number)
+        stop(number, frame)
 
     def swallowed(found: Any) -> None:
         """Stop again where the first time fell into a destructor or a callback, which cannot raise."""
         if isinstance(found.exc_value, Stopped):
-            number = arrived.pop()
-            threading.Timer(0.1, os.kill, (os.getpid(), number)).start()
+            stop_soon(arrived[0])
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, arrive) for number in STOPPING}
     hook, sys.unraisablehook = sys.unraisablehook, swallowed
     try:
         yield arrived
     finally:
         last.cancel()
-        if not arrived:
+        if arrived:
+            signal.setitimer(signal.ITIMER_REAL, 0)  # of `stop_soon`; the work has ended
+        else:
             for number, handler in before.items():
                 signal.signal(number, handler)
         sys.unraisablehook = hook

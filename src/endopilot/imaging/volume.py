@@ -16,7 +16,7 @@ import numpy as np
 import SimpleITK as sitk
 
 from endopilot.errors import InputError
-from endopilot.files import read_json, write_json, writing
+from endopilot.files import read_json, regular, write_json, writing
 from endopilot.imaging import dicom_seg
 from endopilot.imaging.grid import to_image
 from endopilot.imaging.metaimage import read_metaimage
@@ -53,7 +53,7 @@ def read_volume(path: str | Path, *, series: str | None = None, phase: str | Non
         InputError: the path is missing, is of an unknown format or damaged, or holds anything but one plain
             three-dimensional volume (several series or phases, missing slices, gantry tilt, 4-D, RGB).
     """
-    path = Path(path)
+    path = regular(path)
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; check the path")
     try:
@@ -146,7 +146,7 @@ def read_mask(path: str | Path, *, label: int | str | None = None) -> LumenMask:
     Raises:
         InputError: the file is missing, damaged or no mask, the label is not in it, or nothing is inside.
     """
-    path = Path(path)
+    path = regular(path)
     if not path.exists():
         raise InputError(f"{path}: no such file; check the path")
     if path.suffix.lower() == dicom_seg.SUFFIX:
