@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -80,6 +81,11 @@ print(*codes)
 """
 
 
+def made_of(cause: BaseException, error: BaseException) -> BaseException:
+    error.__cause__ = cause
+    return error
+
+
 def raising(error: BaseException):
     def work() -> None:
         raise error
@@ -94,6 +100,15 @@ def raising(error: BaseException):
         (MemoryError("Unable to allocate 14.6 TiB for an array"), 2, "14.6 TiB of memory are asked for"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: 12 bytes"), 2, "memory is used up"),
         (ValueError("Maximum allowed size exceeded"), 2, "memory is used up"),
+        (ImportError("libvtkCommonCore.so: failed to map segment from shared object"), 2, "memory is used up"),
+        (RuntimeError("can't start new thread"), 2, "memory is used up"),
+        (OSError(12, "Cannot allocate memory"), 2, "memory is used up"),
+        (Exception("Unknown error: Failed to launch worker thread: Resource temporarily unavailable"), 2, "memory is"),
+        (
+            made_of(MemoryError("std::bad_alloc"), InputError("a.nrrd: damaged; export it again")),
+            2,
+            "memory is used up",
+        ),
         (OSError(28, "No space left on device", "x"), 2, "the disk is full"),
         (IsADirectoryError(21, "Is a directory", "x.csv"), 2, "x.csv: Is a directory; check the path"),
         (ModuleNotFoundError("no distributed", name="distributed"), 2, r"pip install 'endopilot[cluster]'"),
@@ -166,6 +181,18 @@ def test_a_signal_leaves_no_process_and_no_half_written_file(tmp_path, number, g
             return
         time.sleep(0.05)
     raise AssertionError("a process is left")
+
+
+@pytest.mark.parametrize("mib", [48, 130, 260, 420, 900, 1030])
+def test_a_limit_of_memory_ends_in_one_line(tmp_path, mib):
+    def limited() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (mib << 20, mib << 20))
+
+    command = [sys.executable, "-m", "endopilot.cli", "phantom", "patient", "-o", "ct.nrrd"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, preexec_fn=limited, timeout=60)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done
+    if mib < 1024:
+        assert done.stderr.startswith("endopilot phantom: memory: limited to ") and "raise the limit" in done.stderr
 
 
 @pytest.mark.timeout(30)  # a FIFO that is opened hangs

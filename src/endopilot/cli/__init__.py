@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             own_streams()
             gc.disable()  # until the command is imported, which leaves no garbage
         code = carry_out(name, functools.partial(_work, name, arguments))
-    except Stopped as stopped:
+    except Stopped as stopped:  # before the command has begun
         print("endopilot: interrupted", file=sys.stderr)
         os._exit(int(str(stopped.code)))
     leave(code) if is_process else sys.exit(code)
@@ -110,6 +110,9 @@ def _work(name: str, arguments: Sequence[str]) -> None:
         if any("\ud800" <= letter <= "\udfff" for letter in word):  # so Python has bytes that are no UTF-8
             raise InputError(f"{word}: the name is not UTF-8; rename it, and give the new name")
     if name:
+        from endopilot.cli.process import check_memory_limit
+
+        check_memory_limit()
         command = command_of(name)
         if not gc.isenabled():
             gc.freeze()  # what is imported stays, and need not be gone through again and again

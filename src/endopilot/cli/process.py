@@ -11,6 +11,7 @@ import errno
 import logging
 import os
 import re
+import resource
 import signal
 import sys
 import tempfile
@@ -30,10 +31,15 @@ EXIT_INTERRUPTED = 128 + signal.SIGINT
 EXIT_UNREAD = 141
 TO_END_S = 10.0
 """Time in which a command that is stopped tidies up, s; then it leaves."""
+LEAST_MEMORY = 2**30
+"""Address space, bytes, that the libraries of a command take: `endopilot anatomy` of the smallest mask maps 1.0 GB. In
+less, OpenBLAS hangs or ends the process while it is loaded."""
 _OUT_OF_MEMORY = re.compile(
-    "out of memory|allocate memory|bad.?alloc(ation)?|maximum allowed (size|dimension) exceeded", re.IGNORECASE
+    "out of memory|allocate memory|bad.?alloc(ation)?|maximum allowed (size|dimension) exceeded|failed to map segment"
+    "|can't start new thread|launch worker thread|NULL without setting an exception",
+    re.IGNORECASE,
 )
-"""How libraries say it in exceptions of several kinds."""
+"""How libraries, the loader of libraries and Python say it in exceptions of several kinds."""
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -51,8 +57,25 @@ def carry_out(name: str, work: Callable[[], object]) -> int:
         except BaseException as error:
             if arrived:  # whatever a library that was interrupted made of it
                 return _say(name, "interrupted" if arrived[0] == signal.SIGINT else "terminated", 128 + arrived[0])
-            return _end(name, error)
+            try:
+                return _end(name, error)
+            except MemoryError as again:
+                return _end(name, again)
         return code
+
+
+def check_memory_limit() -> None:
+    """Check, before libraries are loaded, that the shell leaves this process the memory for them (`ulimit -v`).
+
+    Raises:
+        InputError: it does not.
+    """
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if 0 <= limit < LEAST_MEMORY:
+        raise InputError(
+            f"memory: limited to {limit / 2**30:.2g} GiB by `ulimit -v`, and the libraries alone take "
+            f"{LEAST_MEMORY / 2**30:g} GiB; raise the limit"
+        )
 
 
 def _code_of(work: Callable[[], object]) -> int:
@@ -114,6 +137,10 @@ def _say(name: str, line: str, code: int) -> int:
 def _end(name: str, error: BaseException) -> int:
     """Say in one line why a command ends by an exception, and return the exit code."""
     text = " ".join(str(error).split())
+    if _for_want_of_memory(error):
+        size = re.search(r"allocate ([\d.]+ \w+)", text)
+        what = f"{size[1]} of memory are asked for" if size else "the memory is used up"
+        return _say(name, f"{what}, more than there is; ask for less at once: fewer, shorter or coarser", 2)
     if isinstance(error, InputError):
         return _say(name, str(error), EXIT_BAD_INPUT)
     if isinstance(error, ModuleNotFoundError) and (missing := what_is_missing(error)) is not None:
@@ -123,10 +150,6 @@ def _end(name: str, error: BaseException) -> int:
     if isinstance(error, BrokenPipeError):  # the reader has closed the output, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to flush into
         return EXIT_UNREAD
-    if isinstance(error, MemoryError) or _OUT_OF_MEMORY.search(text):
-        size = re.search(r"allocate ([\d.]+ \w+)", text)
-        what = f"{size[1]} of memory are asked for" if size else "the memory is used up"
-        return _say(name, f"{what}, more than there is; ask for less at once: fewer, shorter or coarser", 2)
     if isinstance(error, RuntimeError) and text.startswith("Symlink loop"):  # as pathlib has it
         return _say(name, f"{text}; check the path", EXIT_BAD_INPUT)
     if isinstance(error, OSError) and error.errno in _FULL:
@@ -139,6 +162,17 @@ def _end(name: str, error: BaseException) -> int:
     return _say(
         name, f"a defect of endopilot ({described(error)}); please report it with {_record(error)}", EXIT_DEFECT
     )
+
+
+def _for_want_of_memory(error: BaseException | None) -> bool:
+    """Return whether memory was used up, whatever was made of that on the way."""
+    while error is not None:
+        if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+            return True
+        if not isinstance(error, InputError) and _OUT_OF_MEMORY.search(str(error)):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _record(error: BaseException) -> str:
