@@ -54,6 +54,12 @@ class Remark(UserWarning):
     """A warning of endopilot about a result, in one line: the command line shows it, and no library's warnings."""
 
 
+def box_text(points: Iterable[Iterable[float]]) -> str:
+    """Return the box around positions in mm as messages and notes write it."""
+    spans = (f"{min(along):.0f} to {max(along):.0f}" for along in zip(*points, strict=True))
+    return ", ".join(f"{axis} {span}" for axis, span in zip("xyz", spans, strict=True)) + " mm"
+
+
 def place_text(point: Iterable[float]) -> str:
     """Return a position in mm as messages and notes write it."""
     return "(" + ", ".join(f"{value:.1f}" for value in point) + ") mm"

@@ -219,7 +219,7 @@ def test_what_is_no_file_is_refused(capsys, tmp_path, monkeypatch, given):
             main(arguments)
         said = f"endopilot {arguments[0]}: {odd}: is a FIFO, a socket or a device; give a file or a folder\n"
         assert capsys.readouterr() == ("", said)
-    assert sorted(os.listdir()) == sorted([odd, "patient"])
+    assert {path.name for path in Path().iterdir()} == {odd, "patient"}
 
 
 @pytest.mark.timeout(30)
@@ -238,7 +238,7 @@ def test_a_name_that_is_not_utf_8_is_refused_in_one_line(tmp_path):
         done = subprocess.run([sys.executable, "-m", "endopilot.cli", *arguments], cwd=tmp_path, capture_output=True)
         assert done.returncode == 2 and done.stdout == b"" and done.stderr.count(b"\n") == 1
         assert b": the name is not UTF-8; rename it" in done.stderr
-    assert os.listdir(os.fsencode(tmp_path)) == [name]
+    assert [os.fsencode(path.name) for path in tmp_path.iterdir()] == [name]
 
 
 def test_our_remarks_are_shown_and_warnings_of_libraries_are_not(capsys):

@@ -216,7 +216,11 @@ class Command:
                 shape = make_dataclass("Arguments", parts, kw_only=True)
                 given = tyro.cli(shape, prog=self.name, args=rest, add_help=False)
         except SystemExit:
-            raise InputError(f"{_first_line(said.getvalue())}; `{self.name} --help` lists the options") from None
+            line = _first_line(said.getvalue())
+            if found := re.match(r"Error parsing (.+?): .*\b(int|float)\b.*: ('.*')$", line):
+                kind = "whole number" if found[2] == "int" else "number"
+                raise InputError(f"{found[1]}: {found[3]}; give a {kind}") from None
+            raise InputError(f"{line}; `{self.name} --help` lists the options") from None
         return _with(start, given)
 
     def help(self, *, everything: bool) -> str:
@@ -327,7 +331,8 @@ def _taken(words: list[str], flag: str) -> str | None:
 def _first_line(box: str) -> str:
     """Return what tyro's box of several lines says of bad arguments, in one line: its first part, without the help."""
     lines = [line.strip("│╭╮╰╯─\n") for line in box.splitlines()[1:]]
-    first = list(itertools.takewhile(lambda line: line.strip(" ─"), lines))
+    lines = itertools.dropwhile(lambda line: not line.strip(" ─-"), lines)  # dashes where the terminal has no lines
+    first = list(itertools.takewhile(lambda line: line.strip(" ─-"), lines))
     return re.sub(r"\.$", "", " ".join(line.strip() for line in first if not line.startswith(" " * 6)))
 
 

@@ -26,7 +26,7 @@ from endopilot.extras import extra_named
 from endopilot.models.config import read_run
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.progress import progress
-from endopilot.settings import from_record
+from endopilot.settings import from_record, public
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
@@ -38,6 +38,7 @@ _TRIALS = 3
 """Searches at most: a path that does not hold in the rod core at its own settings is searched again there."""
 
 
+@public
 def plan(
     anatomy: Anatomy | str | Path,
     target: str,

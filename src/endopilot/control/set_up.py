@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from endopilot.anatomy.catheter_axis import turned_axis, with_axis
 from endopilot.control.reach import ROTATIONS, Fork, forks, rotations_that_enter
-from endopilot.devices.device import Wire, lateral_reach
+from endopilot.devices.device import Wire
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.route import Route
@@ -82,7 +82,7 @@ def choose_tip(navigation: Navigation, *, tip: str = "auto", catheter_tilt_deg: 
     if steep_deg > _COAXIAL_DEG and catheter_tilt_deg > 0:
         tilt_deg = min(catheter_tilt_deg, steep_deg)
         navigation = replace(given, anatomy=with_axis(given.anatomy, _towards(route, tilt_deg)))
-        turned_for = f"the route leaves its axis by {steep_deg:.0f} degrees"
+        turned_for = f"the route leaves its axis by {steep_deg:.0f}°"
     best, counts = _choose(navigation, devices)
     made, refused = replace(navigation, device=devices[best]), _refused(places, counts[best])
     if refused is not None and catheter_tilt_deg > 0 and _near_catheter(route, counts[best]):
@@ -92,12 +92,12 @@ def choose_tip(navigation: Navigation, *, tip: str = "auto", catheter_tilt_deg: 
             if _merit(after[other]) > _merit(counts[best]):
                 best, counts, tilt_deg = other, after, catheter_tilt_deg
                 made = replace(turned, device=devices[best])
-                turned_for = f"with its given axis no tip enters {refused}"
+                turned_for = f"along its given axis no tip enters {_into(refused)}"
             if _suffices(counts[best]):
                 break
     why = _why(made.device, places, counts, best)
     if tilt_deg:
-        why += f"; the catheter is turned by {tilt_deg:.3g} degrees, for {turned_for}"
+        why += f"; the catheter is turned by {tilt_deg:.3g}°: {turned_for}"
     return TipChoice(made, tilt_deg, places, counts[best], why)
 
 
@@ -186,17 +186,17 @@ def _refused(places: tuple[Fork, ...], count: Count) -> Fork | None:
 
 def _why(device: Wire, places: tuple[Fork, ...], counts: dict[int, Count], best: int) -> str:
     """Return why a tip was taken of those that were tried, the wire's own or the only one first."""
-    shape = f"tip {tip_name(device)} (reach {lateral_reach(device.tip_bend_rad, device.tip_bend_length_mm):.1f} mm)"
+    shape = f"the tip ({np.degrees(device.tip_bend_rad):.3g}° over {device.tip_bend_length_mm:.3g} mm)"
     if not places:
         return f"{shape}: the route has no fork"
-    refused = _refused(places, counts[best])
-    if refused is not None:
-        which = "does not enter" if len(counts) == 1 else f"as the other {len(counts) - 1} tried, does not enter"
-        return f"{shape}, {which} {refused}, where a wire has {refused.width_mm:.1f} mm"
     hardest = int(np.argmin(counts[best]))
-    why = f"{shape} enters every fork of the route; the hardest, {places[hardest]}, "
-    why += f"where a wire has {places[hardest].width_mm:.1f} mm, by {counts[best][hardest]} of {ROTATIONS} rotations"
-    if best:
-        first = int(np.argmin(counts[0]))
-        why += f"; the wire's own tip enters {places[first]} by {counts[0][first]}"
-    return why
+    others = "" if len(counts) == 1 else f", as from the other {len(counts) - 1} tips tried"
+    if not counts[best][hardest]:
+        return f"{shape} enters {_into(places[hardest])} from none of {ROTATIONS} rotations{others}"
+    why = f"{shape} enters {_into(places[hardest])} from {counts[best][hardest]} of {ROTATIONS} rotations"
+    return f"{why}; as delivered from {int(counts[0][hardest]) or 'none'}" if best else why
+
+
+def _into(fork: Fork) -> str:
+    """Return what a fork leads into: a section's number alone would be taken for a count."""
+    return f"section {fork.section}" if fork.section.isdigit() else fork.section

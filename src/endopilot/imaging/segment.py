@@ -14,7 +14,7 @@ from endopilot.errors import InputError
 from endopilot.imaging.contrast import refuse_other_units, refuse_without_contrast
 from endopilot.imaging.volume import read_volume
 from endopilot.plugins import Registry
-from endopilot.settings import Finite, settings
+from endopilot.settings import Finite, public, settings
 from endopilot.types import Insertion, LumenMask, Volume
 
 METHODS = Registry(
@@ -88,6 +88,7 @@ def _method(name: str) -> SegmentationMethod:
     raise InputError(f"method: {name!r} is no function and no SegmentationMethod; name one")
 
 
+@public
 def segment(volume: Volume | str | Path, *, config: SegmentConfig | None = None) -> LumenMask:
     """Segment the lumen of one vessel tree from a CT angiogram.
 

@@ -24,6 +24,7 @@ from endopilot.imaging.nifti import read_nifti
 from endopilot.imaging.nrrd import NrrdImage, plain, read_nrrd
 from endopilot.imaging.segments import inside_segment
 from endopilot.imaging.voxels import compact
+from endopilot.settings import public
 from endopilot.types import Insertion, LumenMask, Volume
 
 SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha")
@@ -37,6 +38,7 @@ _SMALLEST_SIZE = 4
 """Fewer voxels than this along an axis are no volume: a slice, or a scout view."""
 
 
+@public
 def read_volume(path: str | Path, *, series: str | None = None, phase: str | None = None) -> Volume:
     """Read a CT volume in HU.
 

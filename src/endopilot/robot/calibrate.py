@@ -35,7 +35,7 @@ from endopilot.robot.replay import (
     replay_prepared,
     usable_episodes,
 )
-from endopilot.settings import OpenShare, Seed, Within, settings
+from endopilot.settings import OpenShare, Seed, Within, public, settings
 from endopilot.types import Anatomy
 
 DRIVE = MappingProxyType({"gain_translation": (0.8, 1.25), "play_mm": (0.0, 6.0), "latency_s": (0.0, 0.5)})
@@ -102,6 +102,7 @@ class RobotCalibration:
     replays: list[EpisodeReplay]
 
 
+@public
 def calibrate(
     logs: Sequence[RobotLog],
     anatomy: Anatomy,

@@ -31,7 +31,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.devices.stack import column_prefixes
-from endopilot.errors import InputError
+from endopilot.errors import InputError, box_text
 from endopilot.files import writing
 from endopilot.simulation.csv_file import Columns, read_columns
 from endopilot.types import VesselTree
@@ -91,10 +91,28 @@ class RobotLog:
         return self.used & (np.isfinite(self.tip).all(axis=1) | np.isfinite(self.pixel).all(axis=1))
 
     def in_vessel(self, tree: VesselTree) -> RobotLog:
-        """Return the log with the tip of each pixel where its ray passes nearest to a vessel's centerlines."""
-        if self.camera is None:
-            return self
-        return replace(self, tip=points_in_vessel(self.camera, self.pixel, tree))
+        """Return the log with the tip of each pixel where its ray passes nearest to a vessel's centerlines.
+
+        Raises:
+            InputError: more of the tips lie beside the vessel's box, by more than its width, than not.
+        """
+        points = np.concatenate([branch.centerline.points for branch in tree.branches])
+        width = 2 * max(float(branch.centerline.radius.max()) for branch in tree.branches)
+
+        def beside(tips: Float[np.ndarray, "n 3"]) -> bool:
+            out = (tips < points.min(axis=0) - width) | (tips > points.max(axis=0) + width)
+            return bool(out.any(axis=1).sum() * 2 > len(tips))
+
+        tip = self.tip if self.camera is None else points_in_vessel(self.camera, self.pixel, tree)
+        if beside(tip[self.seen]):
+            mend = "give the anatomy that the wire was driven through, and tips in its coordinates, LPS mm"
+            if self.camera is not None:
+                mend = f"give the anatomy that it was driven through, and its {CAMERA_FILE}"
+                if not beside(points_in_vessel(self.camera, self.pixel[self.seen, ::-1], tree)):
+                    mend = "with columns and rows exchanged they are there: exchange tip_column_px and tip_row_px"
+            seen = f"tips were seen at {box_text(tip[self.seen])}, and the vessel is at {box_text(points)}"
+            raise InputError(f"{self.name}: {seen}; {mend}")
+        return replace(self, tip=tip)
 
     def episodes(self) -> Iterator[RobotLog]:
         """Yield each episode as a log of its own, in the order of time."""

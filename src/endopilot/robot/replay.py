@@ -22,7 +22,7 @@ from endopilot.errors import InputError
 from endopilot.robot.candidates import LEAST_EPISODES, UNKNOWN_SHARE, Candidates
 from endopilot.robot.course import STARTS, Courses
 from endopilot.robot.log import RobotLog
-from endopilot.settings import OpenShare, Within, settings
+from endopilot.settings import OpenShare, Within, public, settings
 from endopilot.simulation.config import PRESETS, SimulatorConfig
 from endopilot.simulation.robots import in_grip
 from endopilot.simulation.simulator import Simulator
@@ -142,6 +142,7 @@ def _first_row(log: RobotLog) -> int:
     return int(commands[max(0, np.searchsorted(commands, first, side="right") - 1)]) if len(commands) else 0
 
 
+@public
 def replay_log(
     logs: Sequence[RobotLog],
     anatomy: Anatomy,

@@ -28,6 +28,7 @@ from endopilot.devices.transmission import Transmission
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.files import json_text, regular, writing
+from endopilot.settings import public
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion, place
 from endopilot.simulation.set_up import SimulationSetUp
@@ -106,6 +107,7 @@ def write_trajectory(trajectory: Trajectory, path: Path) -> None:
                 np.savez_compressed(stream, about=np.array(_about(trajectory, arrays)), **arrays)  # pyright: ignore[reportArgumentType]
 
 
+@public
 def read_trajectory(path: str | Path, *, anatomy: Anatomy | Sequence[Anatomy] | None = None) -> Trajectory:
     """Read a trajectory from an .npz file.
 
