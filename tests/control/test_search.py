@@ -11,11 +11,10 @@ from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.agent import AgentPolicy, OpenLoopPolicy, OraclePolicy
 from endopilot.control.agent_config import AgentConfig
 from endopilot.control.course import Course
-from endopilot.control.manoeuvre import STRAIGHT, Grid
 from endopilot.control.push import Push, Pushed
 from endopilot.control.search import Search
 from endopilot.control.search_config import ManoeuvreConfig
-from endopilot.control.together import Together
+from endopilot.control.together import STRAIGHT, Grid, Together
 from endopilot.control.trials import CATHETER, WIRE, Move
 from endopilot.devices.catheter import read_catheter
 from endopilot.errors import InputError

@@ -13,8 +13,7 @@ from hypothesis import strategies as some
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import RobotConfig, read_robot
-from endopilot.devices.stack import Stack
-from endopilot.devices.transmission import Transmission
+from endopilot.devices.stack import Stack, Transmission
 from endopilot.errors import InputError
 from endopilot.navigation.loop import start_world
 from endopilot.robot.remote import RemoteRobot

@@ -17,7 +17,7 @@ from pydantic import model_validator
 
 from endopilot.devices.device import Device
 from endopilot.devices.device_files import named_file
-from endopilot.devices.transmission import Transmission
+from endopilot.devices.stack import Transmission
 from endopilot.files import write_yaml
 from endopilot.settings import NonNegative, Positive, Within, public, read_settings, settings
 

@@ -24,8 +24,7 @@ from endopilot.devices.stack import Stack
 from endopilot.errors import InputError, Remark
 from endopilot.progress import Advance, progress
 from endopilot.robot.candidates import LEAST_EPISODES, Candidates, Estimate, estimates, search
-from endopilot.robot.course import STARTS, Courses
-from endopilot.robot.log import RobotLog
+from endopilot.robot.log import STARTS, Courses, RobotLog
 from endopilot.robot.replay import (
     FAR_MM,
     EpisodeReplay,

@@ -50,9 +50,10 @@ class RemoteRobot:
         """
         context = tls_context(Path(certificates), of_drive=False)
         self._where, self._lock = f"{host}:{port}", threading.RLock()
-        self._held, self._lost, self.status = b"", "", "stopped:start"
+        self._lost, self.status = "", "stopped:start"
         self._ticket, self._wanted, self._closing = "", (0.0, 0.0), threading.Event()
         self._socket = self._connect(host, port, context, Path(certificates))
+        self._lines = self._socket.makefile("rb")
         try:
             self.limits = self._greet(Path(certificates))
             self.arm()
@@ -218,12 +219,7 @@ class RemoteRobot:
 
     def _line(self) -> str:
         """Return the next line, without its newline."""
-        until = time.monotonic() + ANSWER_S
-        while b"\n" not in self._held:
-            self._socket.settimeout(max(until - time.monotonic(), 1e-3))
-            data = self._socket.recv(4096)
-            if not data or len(self._held) > LONGEST_LINE:
-                raise ConnectionError("closed by the drive" if not data else "its line is too long")
-            self._held += data
-        line, _, self._held = self._held.partition(b"\n")
-        return line.decode("ascii", "replace")
+        line = self._lines.readline(LONGEST_LINE)
+        if not line.endswith(b"\n"):
+            raise ConnectionError("closed by the drive" if len(line) < LONGEST_LINE else "its line is too long")
+        return line[:-1].decode("ascii", "replace")

@@ -23,8 +23,7 @@ import numpy as np
 
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire
-from endopilot.devices.stack import Stack
-from endopilot.devices.transmission import Transmission
+from endopilot.devices.stack import Stack, Transmission
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.files import json_text, regular, writing
