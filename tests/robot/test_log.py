@@ -115,6 +115,7 @@ def test_a_table_that_is_no_log_is_refused(tmp_path, text, line) -> None:
 def test_a_table_on_its_side_is_refused(tmp_path, separator) -> None:
     rows = [line.split(",") for line in "time_s,translation_mm\n0,0.5\n0.1,1\n0.2,1.5".splitlines()]
     text = "\n".join(separator.join(column) for column in zip(*rows, strict=True))
+    text = text if separator == "," else text.replace(".", ",")
     assert refused(tmp_path, text) == "log.csv: row 1 holds one name and then numbers; exchange rows and columns"
 
 
