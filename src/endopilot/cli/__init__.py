@@ -70,8 +70,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             gc.disable()  # until the command is imported, which leaves no garbage
         code = carry_out(name, functools.partial(_work, name, arguments))
     except Stopped as stopped:  # before the command has begun
-        print("endopilot: interrupted", file=sys.stderr)
-        os._exit(int(str(stopped.code)))
+        code = int(str(stopped.code))
+        print(f"endopilot: {'interrupted' if code == 128 + signal.SIGINT else 'terminated'}", file=sys.stderr)
+        os._exit(code)
     leave(code) if is_process else sys.exit(code)
 
 
