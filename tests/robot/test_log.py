@@ -128,7 +128,10 @@ def test_a_log_of_another_vessel_is_refused_and_exchanged_pixels_are_told(tmp_pa
     path = written(tmp_path, "\n".join(["time_s,translation_mm,tip_x_mm,tip_y_mm,tip_z_mm", *lines]), camera=False)
     log = read_log(path)
     assert log.in_vessel(fork.tree).tip.shape == (len(points), 3)
-    with pytest.raises(InputError, match=r"^log: tips were seen at x .*, and the vessel is at x .*; give the anatomy"):
+    with pytest.raises(
+        InputError,
+        match=r"^log: tips were seen at x .*, half of them 45 mm or more from the vessel at x .*; give the anatomy",
+    ):
         dataclasses.replace(log, tip=log.tip + np.array([0.0, 45.0, 0.0])).in_vessel(fork.tree)
     pixel = camera.project(points)
     seen = dataclasses.replace(log, tip=np.full_like(log.tip, np.nan), pixel=pixel, camera=camera)

@@ -55,8 +55,9 @@ def carry_out(name: str, work: Callable[[], object]) -> int:
             code = _code_of(work)
             sys.stdout.flush()
         except BaseException as error:
-            if arrived:  # whatever a library that was interrupted made of it
-                return _say(name, "interrupted" if arrived[0] == signal.SIGINT else "terminated", 128 + arrived[0])
+            if arrived or isinstance(error, Stopped):  # whatever a library that was interrupted made of it
+                code = 128 + arrived[0] if arrived else int(str(error.args[0]))  # it came before the block began
+                return _say(name, "interrupted" if code == EXIT_INTERRUPTED else "terminated", code)
             try:
                 return _end(name, error)
             except MemoryError as again:
