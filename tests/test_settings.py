@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, asdict, fields, is_dataclass, replace
 from functools import partial
+from inspect import signature
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -350,3 +351,36 @@ def test_equality_can_be_by_identity() -> None:
         count: Count = 1
 
     assert Alone() != Alone()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("calibrate", "extract_anatomy", "locate", "make_phantom", "navigate", "plan"),
+        *("read_anatomy", "read_robot", "read_trajectory", "read_volume", "read_wire"),
+        *("replay_log", "segment", "simulate", "take_image", "write_anatomy"),
+    ],
+)
+def test_a_public_function_refuses_what_is_of_no_kind_that_it_takes(name: str) -> None:
+    function = getattr(endopilot, name)
+    needed = [one for one in signature(function).parameters.values() if one.default is one.empty]
+    places = [object() for one in needed if one.kind is not one.KEYWORD_ONLY]
+    named = {one.name: object() for one in needed if one.kind is one.KEYWORD_ONLY}
+    with pytest.raises(InputError, match=rf"^{needed[0].name}: of type object; give \w+"):
+        function(*places, **named)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: endopilot.extract_anatomy(np.ones((9, 9, 9))), r"source: of type ndarray; give .*LumenMask\(Volume\("),
+        (lambda: endopilot.navigate("patient", 2), "target: 2; give text, such as '2'"),
+        (lambda: endopilot.plan("patient", np.int64(7)), "target: 7; give text, such as '7'"),
+        (lambda: endopilot.plan("patient", "2", config={"seconds": 3}), "config: of type dict; give PlanConfig"),
+        (lambda: endopilot.take_image("patient"), "anatomy: 'patient'; give Anatomy .endopilot.read_anatomy, extract"),
+        (lambda: endopilot.read_trajectory("r.npz", anatomy="patient"), "anatomy: 'patient'; give Anatomy"),
+    ],
+)
+def test_what_a_public_function_takes_instead_is_told(call: Callable[[], Any], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        call()

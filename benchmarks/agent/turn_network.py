@@ -20,12 +20,11 @@ from endopilot.anatomy.catheter_axis import with_world_zero
 from endopilot.atlas.atlas import make_patient
 from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.cloned import NETWORK
-from endopilot.control.fork_view import FEATURES, ForkView
-from endopilot.control.halt import SPARE_SHARE
 from endopilot.control.push import Push, Pushed, sides, stand_off, turn
 from endopilot.control.search_config import SearchConfig
+from endopilot.control.set_up import SPARE_SHARE
 from endopilot.control.trials import WIRE, Move, Trials
-from endopilot.control.turn_network import AZIMUTH, TurnNetwork, fourier
+from endopilot.control.turn_network import AZIMUTH, FEATURES, ForkView, TurnNetwork, fourier
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.files import writing

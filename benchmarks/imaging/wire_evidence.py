@@ -12,12 +12,11 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.optimize import minimize
 
+from benchmarks.imaging.scenes import Scene, SceneConfig, draw_scenes
 from endopilot.files import write_json
 from endopilot.xray.absorbers import in_catheter
 from endopilot.xray.corridor import make_corridor
-from endopilot.xray.detector import TipDetector
-from endopilot.xray.ridge import PARAMETERS, RidgeEvidence, features, products
-from endopilot.xray.scenes import Scene, SceneConfig, draw_scenes
+from endopilot.xray.detector import PARAMETERS, RidgeEvidence, TipDetector, features, products
 
 SCENES = SceneConfig(patients=8, seed=9001)
 IMAGES, OFF_WIRE, STEP_MM = 10, 600, 0.25

@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks.figures import Bar, judged
+from benchmarks.imaging.scenes import Scene, SceneConfig, draw_scene
 from benchmarks.imaging.xray import SHOWN, Exposure, errors_of, summary
 from endopilot.anatomy.projection import project_tip
-from endopilot.angiograms.views import view_text
+from endopilot.angiograms.draw import view_text
 from endopilot.cli.arguments import OutputFolder
 from endopilot.files import read_json, write_json
 from endopilot.runs import claim
@@ -26,7 +27,6 @@ from endopilot.xray.detector import TipDetector
 from endopilot.xray.image import ImageConfig, Plane
 from endopilot.xray.projector import splat
 from endopilot.xray.registration import register
-from endopilot.xray.scenes import Scene, SceneConfig, draw_scene
 
 ANGLES = (((-30.0, 0.0), (60.0, 0.0)), ((-20.0, 25.0), (45.0, 20.0)), ((0.0, -30.0), (90.0, 0.0)))
 """Pairs of views of each patient, LAO (positive) or RAO and cranial (positive) or caudal, degrees."""

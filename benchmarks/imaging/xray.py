@@ -12,8 +12,9 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 
 from benchmarks.figures import Bar, judged
+from benchmarks.imaging.scenes import Scene, SceneConfig, Signal, draw_scenes
 from endopilot.anatomy.projection import project_tip
-from endopilot.angiograms.views import view_text
+from endopilot.angiograms.draw import view_text
 from endopilot.settings import Seed, Within, settings
 from endopilot.simulation.motion import draw_motion, published_mean
 from endopilot.xray.carm import Pose
@@ -22,7 +23,6 @@ from endopilot.xray.image import ImageConfig
 from endopilot.xray.motion_registration import motion_error_mm, register_motion, take_run
 from endopilot.xray.pose_refinement import PoseRefiner
 from endopilot.xray.registration import Registration, register, vessel_error_mm
-from endopilot.xray.scenes import Scene, SceneConfig, Signal, draw_scenes
 from endopilot.xray.tip_posterior import TipEstimate
 
 BARS = {

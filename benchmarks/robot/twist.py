@@ -23,8 +23,7 @@ from scipy.spatial import KDTree
 from endopilot.anatomy.io import read_anatomy
 from endopilot.devices.device import read_wire
 from endopilot.devices.robot import RobotConfig, read_robot
-from endopilot.devices.stack import Stack
-from endopilot.devices.transmission import Transmission
+from endopilot.devices.stack import Stack, Transmission
 from endopilot.errors import InputError
 from endopilot.robot.log import RobotLog, read_log
 from endopilot.robot.replay import EpisodeReplay, replay_log, usable_episodes

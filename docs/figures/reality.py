@@ -25,7 +25,7 @@ from benchmarks.figures import fill
 from endopilot.files import read_json
 from endopilot.plotting import BLACK, BLUE, GREY, STYLE, VERMILLION
 from endopilot.report.replay_figure import replay_figure
-from endopilot.robot.course import Courses
+from endopilot.robot.log import Courses
 from endopilot.robot.replay import (
     EpisodeReplay,
     Prepared,

@@ -11,18 +11,29 @@ One stage is one package with one entry function, and data flows one way:
 Units are mm, N, s, rad and HU; world coordinates are LPS mm throughout.
 """
 
-from typing import Any
-
-import lazy_loader
-
-from endopilot.extras import extra_named
+from functools import cache
 
 __version__ = "0.2.0"
 
-_import_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)  # the names stand in __init__.pyi
 
-
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Import a name of `__init__.pyi` from its module."""
+    from endopilot.extras import extra_named
+
+    import_name, _, names = _stub()
+    if name == "__all__":
+        return names
     with extra_named(f"endopilot.{name}"):
-        return _import_name(name)
+        return import_name(name)
+
+
+def __dir__() -> list[str]:
+    return _stub()[1]()
+
+
+@cache
+def _stub():
+    """Return how the names of `__init__.pyi` are imported, `dir` of this module, and the names."""
+    import lazy_loader  # reads the stub, which takes as long as all else of `endopilot --help`
+
+    return lazy_loader.attach_stub(__name__, __file__)

@@ -10,8 +10,7 @@ from .angiograms.make import make_angiograms as make_angiograms
 from .atlas.atlas import AtlasConfig as AtlasConfig
 from .atlas.atlas import make_atlas as make_atlas
 from .belief.bands import Calibration as Calibration
-from .cockpit.episode import write_session_episode as write_session_episode
-from .control.cost import Cost as Cost
+from .cockpit.recording import write_session_episode as write_session_episode
 from .control.navigate import NavigateConfig as NavigateConfig
 from .control.navigate import PatientNavigation as PatientNavigation
 from .control.navigate import SetUp as SetUp
@@ -23,6 +22,7 @@ from .control.plan_config import SampleConfig as SampleConfig
 from .control.plan_xray import PlannedXray as PlannedXray
 from .control.plan_xray import plan_xray as plan_xray
 from .control.reach import Fork as Fork
+from .control.search_config import Cost as Cost
 from .control.set_up import TipChoice as TipChoice
 from .dataset.config import DatasetConfig as DatasetConfig
 from .dataset.generate import generate_dataset as generate_dataset
@@ -40,7 +40,7 @@ from .devices.robot import DriveConfig as DriveConfig
 from .devices.robot import RobotConfig as RobotConfig
 from .devices.robot import read_robot as read_robot
 from .devices.stack import Stack as Stack
-from .devices.transmission import Transmission as Transmission
+from .devices.stack import Transmission as Transmission
 from .devices.write import write_device as write_device
 from .env.episodes import NavigationState as NavigationState
 from .env.single import NavigateEnv as NavigateEnv

@@ -12,6 +12,7 @@ import platform
 import re
 import resource
 import shutil
+import stat
 import subprocess
 import zlib
 from collections import Counter
@@ -146,6 +147,18 @@ def _problem(partial: Path, error: Exception) -> str | None:
     return f"cannot be written ({error}); choose another output" if isinstance(error, OSError) else None
 
 
+def regular(path: str | Path) -> Path:
+    """Return a path, whose reader finds out whether something lies there, if that is a file or a folder.
+
+    Raises:
+        InputError: it is a FIFO, a socket or a device, which may have no end.
+    """
+    with suppress(OSError, ValueError):  # missing, or no path at all
+        if stat.S_IFMT(Path(path).stat().st_mode) not in (stat.S_IFREG, stat.S_IFDIR):
+            raise InputError(f"{path}: is a FIFO, a socket or a device; give a file or a folder")
+    return Path(path)
+
+
 def json_text(content: Any, *, indented: bool = True) -> str:
     """Return `content` as JSON, indented or in one line. Dataclasses, paths and numpy values are understood."""
     return json.dumps(content, indent=2 if indented else None, default=_jsonable, ensure_ascii=False)
@@ -194,7 +207,7 @@ def read_text(path: Path, *, what: str = "text file", largest: int = _LARGEST_YA
         InputError: the file is missing, cannot be read, is too large, or is no text.
     """
     try:
-        with Path(path).open("rb") as stream:
+        with regular(path).open("rb") as stream:
             content = stream.read(largest + 1)
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; check the path") from error
@@ -289,7 +302,7 @@ def reading(path: Path, mend: str) -> Iterator[None]:
 
 def sha256(path: Path) -> str:
     """Return the SHA-256 of a file, as hexadecimal digits."""
-    with Path(path).open("rb") as stream:
+    with regular(path).open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 

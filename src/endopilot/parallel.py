@@ -15,7 +15,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, TypeVar
 
-from endopilot.errors import InputError, Stopped
+from endopilot.errors import InputError, Stopped, stop
 from endopilot.progress import progress, silence
 
 T = TypeVar("T")
@@ -120,7 +120,7 @@ def _follow() -> None:
     silence()
     gc.disable()  # until the first piece of work is imported, which leaves no garbage
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _leave)
+    signal.signal(signal.SIGTERM, stop)
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -142,8 +142,3 @@ def _work(work: Callable[..., T], *args: Any, **kwargs: Any) -> T:
         return work(*args, **kwargs)
     except Stopped as stopped:
         os._exit(stopped.code if isinstance(stopped.code, int) else 1)
-
-
-def _leave(number: int, _frame: object) -> None:
-    signal.signal(number, signal.SIG_IGN)
-    raise Stopped(128 + number)

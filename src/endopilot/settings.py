@@ -13,14 +13,29 @@ is a `pydantic.model_validator(mode="after")` that raises `ValueError("field: va
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
+import inspect
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from functools import wraps
+from functools import cache, wraps
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, cast, dataclass_transform, get_args, get_origin, overload
+from types import NoneType, UnionType
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    TypeVar,
+    Union,
+    cast,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+    overload,
+)  # fmt: skip
 
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, GetCoreSchemaHandler, StringConstraints, ValidationError
@@ -310,3 +325,60 @@ def _bound(value: Number) -> str:
 
 def _without_numpy(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
+
+
+_MADE_BY = {
+    "Anatomy": " (endopilot.read_anatomy, extract_anatomy)",
+    "LumenMask": "(Volume(voxels, spacing_mm, origin_mm, direction))",
+    "Volume": " (endopilot.read_volume)",
+    "Wire": " (endopilot.read_wire)",
+}
+"""What makes an object where its constructor's name does not say so."""
+
+
+def public(function: Callable[..., T]) -> Callable[..., T]:
+    """Make a function check the kinds of its arguments by their annotations, before it does anything.
+
+    Lists of numbers become arrays, and NumPy's numbers plain ones. What an annotation says of shapes is not checked.
+
+    Raises:
+        InputError: an argument is of no kind that is taken; the line says which are, and what makes them.
+    """
+    signature, hints_of = inspect.signature(function), cache(get_type_hints)
+
+    @wraps(function)
+    def checked(*given: Any, **named: Any) -> T:
+        bound, hints = signature.bind(*given, **named), hints_of(function)
+        for name, value in bound.arguments.items():
+            bound.arguments[name] = _of_kind(name, value, hints[name]) if name in hints else value
+        return function(*bound.args, **bound.kwargs)
+
+    return checked
+
+
+def _of_kind(name: str, value: Any, hint: Any) -> Any:
+    """Return an argument as one of the kinds that its annotation names."""
+    value, words = _without_numpy(value), []
+    kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    for kind in (get_args(each)[0] if get_origin(each) is Annotated else each for each in kinds):
+        cls = get_origin(kind) or kind
+        if cls is Literal:
+            fits, said = value in get_args(kind), f"one of {', '.join(map(repr, get_args(kind)))}"
+        elif hasattr(kind, "array_type"):  # as jaxtyping has it
+            if isinstance(value, list | tuple):
+                with contextlib.suppress(ValueError, TypeError):
+                    return np.array(value, dtype=float)
+            fits, said = isinstance(value, np.ndarray), f"an array of {kind.dim_str}"
+        else:
+            wanted = (int, float) if cls is float else cls
+            is_text = cls is Sequence and isinstance(value, str)
+            fits = not isinstance(cls, type) or (isinstance(value, wanted) and not is_text)
+            said = {str: "text", Path: "a path", float: "a number"}.get(cls, getattr(cls, "__name__", str(cls)))
+            said += f" of {getattr(get_args(kind)[0], '__name__', get_args(kind)[0])}" if cls is Sequence else ""
+            said += _MADE_BY.get(said, "")
+        if fits:
+            return value
+        words += [] if cls is NoneType else [said]
+    shown = repr(value) if isinstance(value, str | int | float) else f"of type {type(value).__name__}"
+    example = f", such as {str(value)!r}" if isinstance(value, int) and words == ["text"] else ""
+    raise InputError(f"{name}: {shown}; give {' or '.join(words)}{example}")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from endopilot.belief.drives import Drives, Motion
-from endopilot.devices.play import through_play
+from endopilot.devices.drive_motion import through_play
 from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.tasks.navigation import DECISION_PERIOD_S
 

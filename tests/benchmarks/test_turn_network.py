@@ -9,8 +9,7 @@ import pytest
 
 from benchmarks.agent import turn_network
 from benchmarks.agent.turn_network import TURNS, Forks, fit
-from endopilot.control.fork_view import FEATURES, ForkView
-from endopilot.control.turn_network import AZIMUTH
+from endopilot.control.turn_network import AZIMUTH, FEATURES, ForkView
 from endopilot.tasks.navigation import Navigation, Target
 
 pytest.importorskip("torch")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.imaging.scenes import SceneConfig, draw_scenes
 from benchmarks.imaging.wires import Search, figures_of
 from benchmarks.imaging.xray import BARS, Exposure, _figures
 from endopilot.errors import InputError
-from endopilot.xray.scenes import SceneConfig, draw_scenes
 
 
 def exposure(**changes) -> Exposure:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from endopilot import cli
-from endopilot.cli import COMMANDS, main
+from endopilot.cli import COMMANDS, main, process
 from endopilot.cli.arguments import show
 
 
@@ -37,7 +38,8 @@ def assert_one_line(result: subprocess.CompletedProcess[str], *fragments: str) -
 
 
 def test_the_overview_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
-    main([])
+    with pytest.raises(SystemExit, match="0"):
+        main([])
     printed = capsys.readouterr().out
     for name, summary in COMMANDS.items():
         assert name in printed
@@ -60,9 +62,10 @@ def test_a_command_works_with_garbage_collected_though_it_is_imported_without(mo
         return SimpleNamespace(run=lambda _: seen.append(gc.isenabled()))
 
     monkeypatch.setattr(cli, "command_of", imported)
-    monkeypatch.setattr(cli, "own_streams", lambda: None)
-    monkeypatch.setattr(cli, "leave", lambda code: seen.append(code))
+    monkeypatch.setattr(process, "own_streams", lambda: None)
+    monkeypatch.setattr(process, "leave", lambda code: seen.append(code))
     monkeypatch.setattr(gc, "freeze", lambda: None)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
     monkeypatch.setattr(sys, "argv", ["endopilot", "info"])
     main()
     assert seen == [False, True, 0]

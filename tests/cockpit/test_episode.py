@@ -20,7 +20,7 @@ def drive(session, seconds, translation, rotation):
 
 
 def test_an_episode_holds_the_wire_as_it_was(session, tmp_path):
-    from endopilot.cockpit.episode import write_session_episode
+    from endopilot.cockpit.recording import write_session_episode
     from endopilot.dataset.loader import read_dataset
 
     session.handle(Target(type="target", branch=0, abscissa=14.0), 0.0)
@@ -40,7 +40,7 @@ def test_an_episode_holds_the_wire_as_it_was(session, tmp_path):
 
 
 def test_a_session_without_a_sample_is_refused(session, tmp_path):
-    from endopilot.cockpit.episode import write_session_episode
+    from endopilot.cockpit.recording import write_session_episode
 
     drive(session, 0.3, 5.0, 0.0)
     session.close()

@@ -139,7 +139,7 @@ def test_a_session_replays_to_the_bit_and_goes_on(session, tmp_path):
 
 def test_a_session_becomes_an_episode_of_both(session, tmp_path):
     pytest.importorskip("pyarrow", reason="the extra `learn` is not installed")
-    from endopilot.cockpit.episode import write_session_episode
+    from endopilot.cockpit.recording import write_session_episode
     from endopilot.dataset.loader import read_dataset
 
     run(session, 1.0, message=both((12.0, 2.0), (8.0, 1.0)))

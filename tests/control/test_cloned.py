@@ -9,8 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from endopilot.control.cloned import NETWORK, ClonedPolicy
-from endopilot.control.fork_view import FEATURES, ForkView
-from endopilot.control.turn_network import AZIMUTH, TurnNetwork, fourier
+from endopilot.control.turn_network import AZIMUTH, FEATURES, ForkView, TurnNetwork, fourier
 from endopilot.devices.catheter import read_catheter
 from endopilot.errors import InputError
 from endopilot.navigation.loop import NavigationLoop

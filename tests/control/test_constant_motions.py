@@ -9,7 +9,7 @@ import pytest
 
 from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.agent_config import AgentConfig
-from endopilot.control.constant_motions import ConstantMotions
+from endopilot.control.population import ConstantMotions
 from endopilot.control.trials import CATHETER, WIRE, Control, Move, Trials
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation

@@ -13,11 +13,10 @@ from hypothesis import strategies as st
 from endopilot.anatomy.io import read_anatomy
 from endopilot.control import network_plan
 from endopilot.control import plan as plan_module
-from endopilot.control.cost import Cost
-from endopilot.control.desired import read_tips
-from endopilot.control.plan import plan, within_limits
+from endopilot.control.plan import plan, read_tips, within_limits
 from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan
+from endopilot.control.search_config import Cost
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -78,7 +79,10 @@ def test_a_tip_is_chosen_that_enters(wide, wire) -> None:
     made = choice.navigation
     assert choice.refused is None and choice.tilt_deg == 0.0 and made.anatomy is wide.anatomy
     assert lateral_reach(made.device.tip_bend_rad, made.device.tip_bend_length_mm) > 1.2
-    assert choice.tip in choice.why and "own tip enters the fork into section" in choice.why
+    angle_deg, length_mm = choice.tip.split("/")
+    section, entering = choice.forks[0].section, choice.entering[0]
+    tip = f"the tip ({angle_deg}° over {length_mm} mm) enters {section} from {entering} of 24 rotations"
+    assert re.fullmatch(re.escape(tip) + r"; as delivered from (none|\d+)", choice.why)
     assert rotations_that_enter(made, made.device)[0] == choice.entering[0] > 0
     straight = choose_tip(replace(wide, target=Target(branch=1, abscissa=33.0)))
     assert straight.tip == "45/3" and straight.navigation.device == wire  # its own tip suffices and is kept
@@ -88,7 +92,8 @@ def test_a_fixed_tip_is_kept_and_the_fork_that_refuses_it_is_named(wide) -> None
     choice = choose_tip(wide, tip="45/3", catheter_tilt_deg=0.0)
     assert choice.tip == "45/3"
     assert choice.refused is not None and choice.refused.branch == 2
-    assert f"does not enter {choice.refused}" in choice.why and "at 20.0 mm" in choice.why
+    section = choice.refused.section
+    assert choice.why == f"the tip (45° over 3 mm) enters {section} from none of 24 rotations"
 
 
 @pytest.mark.parametrize(("off_deg", "turned_deg"), [(80.0, 30.0), (30.0, 0.0)])
@@ -100,7 +105,7 @@ def test_a_catheter_is_turned_towards_a_route_that_leaves_its_axis_steeply(wide,
     onwards = choice.navigation.anatomy.insertion.direction[2]  # the vessel goes along z
     assert choice.tilt_deg == turned_deg
     assert np.degrees(np.arccos(onwards)) == pytest.approx(off_deg - turned_deg, abs=1.0)
-    assert ("the route leaves its axis by 80 degrees" in choice.why) == (turned_deg > 0)
+    assert ("the route leaves its axis by 80°" in choice.why) == (turned_deg > 0)
     assert choose_tip(steep, catheter_tilt_deg=0.0).navigation.anatomy is steep.anatomy
 
 

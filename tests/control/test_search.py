@@ -11,11 +11,10 @@ from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.agent import AgentPolicy, OpenLoopPolicy, OraclePolicy
 from endopilot.control.agent_config import AgentConfig
 from endopilot.control.course import Course
-from endopilot.control.manoeuvre import STRAIGHT, Grid
 from endopilot.control.push import Push, Pushed
 from endopilot.control.search import Search
 from endopilot.control.search_config import ManoeuvreConfig
-from endopilot.control.together import Together
+from endopilot.control.together import STRAIGHT, Grid, Together
 from endopilot.control.trials import CATHETER, WIRE, Move
 from endopilot.devices.catheter import read_catheter
 from endopilot.errors import InputError
@@ -96,7 +95,7 @@ def test_the_controls_of_a_course_lead_where_it_says(side_branch, found) -> None
 
 
 def test_a_wire_that_leads_by_little_ends_little_beyond_the_target(side_branch, monkeypatch) -> None:
-    monkeypatch.setattr("endopilot.control.manoeuvre._LEADS_MM", (3.0,))
+    monkeypatch.setattr("endopilot.control.together._LEADS_MM", (3.0,))
     _, _, course = search(side_branch)
     assert course.reached == 1.0
     assert course.tip.abscissa[-1, 0] - side_branch.target.abscissa == pytest.approx(3.0, abs=2.0)
@@ -208,7 +207,7 @@ def search_straight(navigation: Navigation, config: AgentConfig) -> Course:
 
 
 def test_where_there_is_little_time_wire_and_catheter_move_together_and_faster(hurried, monkeypatch) -> None:
-    monkeypatch.setattr("endopilot.control.manoeuvre._LEADS_MM", (2.0,))
+    monkeypatch.setattr("endopilot.control.together._LEADS_MM", (2.0,))
     straight, config = hurried
     assert config.search.manoeuvres.together and config.search.speed_mm_s == pytest.approx(4 * 18.0 / 6.0)
     slow, fast = (search_straight(straight, each) for each in (agent_config(straight), config))
@@ -218,7 +217,7 @@ def test_where_there_is_little_time_wire_and_catheter_move_together_and_faster(h
 
 
 def test_where_there_is_little_time_slow_trials_are_given_up(hurried, monkeypatch) -> None:
-    monkeypatch.setattr("endopilot.control.manoeuvre._LEADS_MM", (2.0, 1000.0))
+    monkeypatch.setattr("endopilot.control.together._LEADS_MM", (2.0, 1000.0))
     monkeypatch.setattr("endopilot.control.push._LATE", 1)
     straight, config = hurried
     pushes, run = [], Push.run

@@ -11,8 +11,8 @@ import pytest
 from endopilot.belief.belief import Belief
 from endopilot.control import push
 from endopilot.control.agent import OraclePolicy
-from endopilot.control.halt import describe_halt
 from endopilot.control.search import Search
+from endopilot.control.set_up import describe_halt
 from endopilot.control.trials import Period, drive_period
 from endopilot.simulation.motion import motion_named
 from endopilot.simulation.world import World

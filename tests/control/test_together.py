@@ -10,9 +10,8 @@ import pytest
 from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.agent import AgentPolicy
 from endopilot.control.agent_config import AgentConfig
-from endopilot.control.constant_motions import ConstantMotions
-from endopilot.control.places import next_place, places_of
-from endopilot.control.population import Population
+from endopilot.control.course import next_place, places_of
+from endopilot.control.population import ConstantMotions, Population
 from endopilot.control.push import Push
 from endopilot.control.search import Search
 from endopilot.control.trials import CATHETER, WIRE, Move, Trials

@@ -12,10 +12,10 @@ from endopilot.anatomy.sources import Polylines
 from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.agent import AgentPolicy
 from endopilot.control.agent_config import IN_WIDE_LUMEN, AgentConfig
-from endopilot.control.manoeuvre import Repertoire
 from endopilot.control.push import Pushed
 from endopilot.control.search import Search
 from endopilot.control.search_config import SearchConfig
+from endopilot.control.together import Repertoire
 from endopilot.control.trials import WIRE, Move, Period, Trials
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire

@@ -31,7 +31,7 @@ def slowly(*args, **kwargs):
     return toy_navigation.toy_simulate(*args, **kwargs)
 if __name__ == "__main__":
     from distributed.cli.dask_worker import main
-    with patch("endopilot.dataset.block.simulate_navigations", toy_navigation.toy_navigate(slowly)):
+    with patch("endopilot.dataset.workers.simulate_navigations", toy_navigation.toy_navigate(slowly)):
         main([sys.argv[1], "--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", sys.argv[2]])
 """
 

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as some
 
-from endopilot.devices.play import through_play
+from endopilot.devices.drive_motion import through_play
 
 
 @given(some.lists(some.floats(-5, 5), max_size=12), some.floats(0.0, 3.0), some.floats(-1.0, 1.0))

@@ -9,7 +9,7 @@ import pytest
 
 from endopilot.devices.device import read_wire
 from endopilot.devices.robot import DriveConfig, RobotConfig, list_robots, read_robot
-from endopilot.devices.transmission import Transmission
+from endopilot.devices.stack import Transmission
 from endopilot.errors import InputError
 
 

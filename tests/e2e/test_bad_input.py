@@ -151,3 +151,27 @@ def test_the_cockpits_catheters(patient, tmp_path, capsys):
     assert brought.endswith("catheter: a replay, a task and a session have theirs; leave it out")
     assert "follow" in refused(capsys, "cockpit", "--task", "nonesuch", *recordings)
     assert not (tmp_path / "recordings").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (
+            "plan mask.nrrd --target 4",
+            "mask.nrrd: is a file; make an anatomy of it first: `endopilot anatomy mask.nrrd",
+        ),
+        ("navigate mask.nrrd --target 4", "mask.nrrd: is a file; make an anatomy of it first"),
+        ("simulate mask.nrrd", "mask.nrrd: is a file; make an anatomy of it first"),
+        ("anatomy {patient}", "{patient}: is an anatomy already; give it to the next command"),
+        ("simulate {patient} --seed abc", "--seed: 'abc'; give a whole number"),
+        ("simulate {patient} --sequences 2.5", "--sequences: '2.5'; give a whole number"),
+        ("phantom {patient} --slice-mm thin", "--slice-mm: 'thin'; give a number"),
+        ("simulate {patient} --controls aside.csv", "aside.csv: row 1 holds one name and then numbers; exchange rows"),
+    ],
+)
+def test_what_is_given_in_the_wrong_place_is_told(patient, tmp_path, capsys, monkeypatch, command, said):
+    monkeypatch.chdir(tmp_path)
+    Path("mask.nrrd").write_bytes(b"")
+    Path("aside.csv").write_text("time_s,0.5,1.0\ntranslation_mm_s,1,2\nrotation_rad_s,0,0\n")
+    words = [word.format(patient=patient) for word in command.split()]
+    assert said.format(patient=patient) in refused(capsys, *words, "-o", tmp_path / "out.csv")

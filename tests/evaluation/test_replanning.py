@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from endopilot.dataset.loader import read_dataset
-from endopilot.evaluation.replanning import EXPOSURE_PERIOD_S, exposures, replanned
+from endopilot.evaluation.protocols import EXPOSURE_PERIOD_S, exposures, replanned
 from endopilot.evaluation.replay import Recorded, replay
 from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import OpenLoop, begin_after, given_states

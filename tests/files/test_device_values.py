@@ -44,11 +44,20 @@ def refused(tmp_path: Path, content: Any) -> str:
         ("push_limit_n", 51, "51 gf is 0.5001 N"),
         ("pull_limit_n", 500, "500 gf is 4.903 N"),
         ("torque_limit_n_mm", 5e-4, "0.0005 N·m is 0.5 N·mm"),
+        ("torque_limit_n_mm", 4000, "4000 mN·mm is 4 N·mm"),
     ],
 )
 def test_a_number_in_another_unit_is_answered_with_that_unit(tmp_path, name, value, meant) -> None:
     line = refused(tmp_path, wire(**{name: value}))
     assert line.startswith(SOURCED.format(name=name, value=value)) and f"({meant}" in line
+
+
+@pytest.mark.parametrize("value", [50, 400, 900])
+def test_a_torque_that_the_wire_cannot_bear_is_refused_with_its_unit(tmp_path, value) -> None:
+    line = refused(tmp_path, wire(torque_limit_n_mm=value))
+    assert line.startswith(f"torque_limit_n_mm: {value} N·mm shears off 0.3") and line.endswith(
+        f"({value} mN·mm is {value / 1000:g} N·mm)"
+    )
 
 
 def test_stiffness_in_square_metres_is_answered_in_square_millimetres(tmp_path) -> None:

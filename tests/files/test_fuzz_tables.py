@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from endopilot.control.desired import read_tips
+from endopilot.control.plan import read_tips
 from endopilot.errors import InputError
 from endopilot.simulation.controls import PERIODS_S, ScriptedControls, read_controls_csv
 

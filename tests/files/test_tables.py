@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from endopilot.control.desired import read_tips
+from endopilot.control.plan import read_tips
 from endopilot.errors import InputError, Remark
 from endopilot.simulation.controls import ScriptedControls, read_controls_csv
 

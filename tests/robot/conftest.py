@@ -9,7 +9,7 @@ import subprocess
 import pytest
 
 from endopilot.errors import InputError
-from endopilot.robot.drive_protocol import tls_context
+from endopilot.robot.drive import tls_context
 
 
 @pytest.fixture(scope="session")

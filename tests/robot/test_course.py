@@ -5,8 +5,7 @@ import pytest
 
 from benchmarks.robot.synthetic import PERIOD_S, drawn, logged_and_true
 from endopilot.devices.robot import DriveConfig
-from endopilot.robot.course import Courses
-from endopilot.robot.log import RobotLog
+from endopilot.robot.log import Courses, RobotLog
 
 
 def log_of(positions, *, period_s=0.1, seen_every=1) -> RobotLog:

@@ -11,8 +11,7 @@ from hypothesis import strategies as some
 
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import DriveConfig, RobotConfig
-from endopilot.robot.drive import Drive
-from endopilot.robot.drive_protocol import LONGEST_LINE, SILENCE_S, number
+from endopilot.robot.drive import LONGEST_LINE, SILENCE_S, Drive, number
 
 LIMITS = DriveLimits(max_velocity_mm_s=40.0, max_rotation_rad_s=12.0, travel_mm=(0.0, 100.0))
 QUIET = RobotConfig(latency_s=0.0, wire=DriveConfig(encoder_sd_mm=0.0, encoder_sd_rad=0.0))

@@ -15,8 +15,7 @@ import pytest
 from test_drive_process import CLIENT, HOST, running
 
 from endopilot.devices.robot import RobotConfig
-from endopilot.robot.drive import LASTS_S
-from endopilot.robot.drive_protocol import BRAKING_S, LONGEST_LINE, tls_context
+from endopilot.robot.drive import BRAKING_S, LASTS_S, LONGEST_LINE, tls_context
 from endopilot.robot.remote import RemoteRobot
 
 SPEED = 20.0

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from endopilot.errors import InputError
-from endopilot.robot import remote
-from endopilot.robot.drive_protocol import tls_context
+from endopilot.robot.drive import tls_context
 from endopilot.robot.remote import RemoteRobot
 from endopilot.robot.robot import Robot
 
@@ -28,8 +27,6 @@ from pathlib import Path
 from endopilot.robot.remote import RemoteRobot
 robot = RemoteRobot("127.0.0.1", int(sys.argv[1]), Path(sys.argv[2]))
 while True:
-    if robot.status != "armed":
-        robot.arm()  # a machine under load may itself keep silent for too long
     robot.command(((10.0, 0.0),))
     print(robot.proximal_state().devices[0][0], flush=True)
     time.sleep(0.05)
@@ -92,28 +89,46 @@ def test_it_stops_when_its_client_is_killed(drive, certificates) -> None:
         assert moved(robot, 0.7) < 0.2
 
 
-def test_it_stops_when_its_client_falls_silent_and_goes_on_when_armed(drive, certificates, monkeypatch) -> None:
-    process, port = drive
-    monkeypatch.setattr(remote, "REPEAT_S", 1e6)  # the thread that repeats commands hangs
+def test_it_stops_200_ms_after_the_last_call_and_goes_on_at_the_next(drive, certificates) -> None:
+    _, port = drive
     with RemoteRobot(HOST, port, certificates) as robot:
         assert isinstance(robot, Robot)
-        robot.command(((10.0, 1.0),))
-        wait_for(process, ": silence;")
-        robot.command(((10.0, 1.0),))
-        assert robot.status == "stopped:silence"
-        robot.arm()
+        for speed in (10.0, -10.0, 10.0):
+            before = robot.proximal_state()
+            robot.command(((speed, 1.0),))
+            while robot.status == "armed":  # the caller looks on, and commands nothing more
+                time.sleep(0.01)
+                stopped = robot.proximal_state()
+            assert robot.status == "stopped:silence"
+            time.sleep(0.2)
+            way = robot.proximal_state().devices[0][0] - before.devices[0][0]
+            assert 0.3 < way * np.sign(speed) < 10.0 * 0.2 + 0.2  # the encoder's noise is 0.02 mm
+            assert abs(robot.proximal_state().devices[0][0] - stopped.devices[0][0]) < 10.0 * 0.05 + 0.1
         robot.command(((np.nan, 1.0),))
         assert robot.status in OBEYED  # what is sent is finite: the wire stands still
         robot.command(((1e9, -1e9),))
         assert robot.status in OBEYED
+        # after a stop that the caller asked for, with or without silence before, it must be armed
+        for wait_s in (0.0, 0.4):
+            time.sleep(wait_s)
+            robot.stop()
+            robot.command(((10.0, 0.0),))
+            assert robot.status == "stopped:asked"
+            robot.arm()
+            robot.command(((10.0, 0.0),))
+            assert robot.status in OBEYED
 
 
-def test_a_controller_that_hangs_stops_it(drive, certificates, monkeypatch) -> None:
+def test_a_command_is_held_while_its_caller_waits(drive, certificates) -> None:
     process, port = drive
-    monkeypatch.setattr(remote, "HOLD_S", 0.3)
     with RemoteRobot(HOST, port, certificates) as robot:
-        robot.command(((5.0, 0.0),))
-        wait_for(process, ": silence;")  # commands are repeated for a while, and then no more
+        before = robot.proximal_state()
+        robot.command(((10.0, 0.0),))
+        robot.run(1.0)
+        after = robot.proximal_state()
+        assert robot.status in OBEYED
+        assert after.devices[0][0] - before.devices[0][0] > 5.0  # 10 mm on a machine that is not under load
+        wait_for(process, ": silence;")
 
 
 def test_a_drive_that_was_held_up_stops_and_arming_alone_does_not_move_it(drive, certificates) -> None:
@@ -129,7 +144,8 @@ def test_a_drive_that_was_held_up_stops_and_arming_alone_does_not_move_it(drive,
                 wait_for(process, ": silence;")
             else:
                 robot.stop()
-            robot.arm()  # within the time for which the last command is held
+            robot.arm()
+            robot.run(0.2)
             time.sleep(0.2)
             assert moved(robot, 0.3) < 0.2
 
@@ -153,7 +169,7 @@ def test_any_thread_may_call_it(drive, certificates) -> None:
         for thread in threads:
             thread.join()
     assert not failures
-    assert not robot._repeater.is_alive()
+    assert not robot._living.is_alive()
     for call_again in (robot.arm, robot.stop, robot.proximal_state, lambda: robot.command(((1.0, 0.0),)), robot.arm):
         with pytest.raises(InputError, match="it was closed"):
             call_again()

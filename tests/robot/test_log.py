@@ -111,6 +111,35 @@ def test_a_table_that_is_no_log_is_refused(tmp_path, text, line) -> None:
         assert refused(tmp_path, text) == line
 
 
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_a_table_on_its_side_is_refused(tmp_path, separator) -> None:
+    rows = [line.split(",") for line in "time_s,translation_mm\n0,0.5\n0.1,1\n0.2,1.5".splitlines()]
+    text = "\n".join(separator.join(column) for column in zip(*rows, strict=True))
+    text = text if separator == "," else text.replace(".", ",")
+    assert refused(tmp_path, text) == "log.csv: row 1 holds one name and then numbers; exchange rows and columns"
+
+
+def test_a_log_of_another_vessel_is_refused_and_exchanged_pixels_are_told(tmp_path, fork) -> None:
+    points = np.concatenate([branch.centerline.points for branch in fork.tree.branches])[::40]
+    camera = PlanarCamera(
+        mm_per_pixel=0.1, origin_mm=(-10.0, 0.0, 150.0), columns=(1.0, 0.0, 0.0), rows=(0.0, 0.0, -1.0)
+    )
+    lines = [f"{0.1 * k:.1f},{k},{point[0]},{point[1]},{point[2]}" for k, point in enumerate(points)]
+    path = written(tmp_path, "\n".join(["time_s,translation_mm,tip_x_mm,tip_y_mm,tip_z_mm", *lines]), camera=False)
+    log = read_log(path)
+    assert log.in_vessel(fork.tree).tip.shape == (len(points), 3)
+    with pytest.raises(
+        InputError,
+        match=r"^log: tips were seen at x .*, half of them 45 mm or more from the vessel at x .*; give the anatomy",
+    ):
+        dataclasses.replace(log, tip=log.tip + np.array([0.0, 45.0, 0.0])).in_vessel(fork.tree)
+    pixel = camera.project(points)
+    seen = dataclasses.replace(log, tip=np.full_like(log.tip, np.nan), pixel=pixel, camera=camera)
+    np.testing.assert_allclose(seen.in_vessel(fork.tree).tip, points, atol=1.5)
+    with pytest.raises(InputError, match="exchange tip_column_px and tip_row_px"):
+        dataclasses.replace(seen, pixel=pixel[:, ::-1]).in_vessel(fork.tree)
+
+
 def test_pixels_need_a_camera(tmp_path) -> None:
     line = refused(tmp_path, LOG, camera=False)
     assert line.startswith("log.csv: tip_column_px: pixels need camera.yaml beside the log; write mm_per_pixel")

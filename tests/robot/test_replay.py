@@ -9,7 +9,7 @@ from benchmarks.robot.synthetic import drawn, logged_and_true
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
-from endopilot.robot.course import Courses
+from endopilot.robot.log import Courses
 from endopilot.robot.replay import ReplayConfig, replay_log, summary, usable_episodes
 from endopilot.xray.camera import PlanarCamera
 
@@ -83,7 +83,7 @@ def test_a_log_without_tips_is_refused(fork, wire, log) -> None:
 @pytest.mark.parametrize(("moved", "scale"), [((300.0, 0.0, 0.0), 1.0), ((0.0, 0.0, 0.0), 1000.0)])
 def test_tips_of_another_frame_or_unit_are_refused(fork, wire, log, moved, scale) -> None:
     elsewhere = dataclasses.replace(log, tip=scale * log.tip + np.array(moved))
-    with pytest.raises(InputError, match=r"^synthetic: half of the tips lie \d+ mm or more from"):
+    with pytest.raises(InputError, match=r"^synthetic: tips were seen at x .*, half of them \d+ mm or more from"):
         replay_log([elsewhere], fork, Stack(wire), robot=RobotConfig(), config=FEW)
 
 

@@ -13,8 +13,7 @@ from hypothesis import strategies as some
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import RobotConfig, read_robot
-from endopilot.devices.stack import Stack
-from endopilot.devices.transmission import Transmission
+from endopilot.devices.stack import Stack, Transmission
 from endopilot.errors import InputError
 from endopilot.navigation.loop import start_world
 from endopilot.robot.remote import RemoteRobot
@@ -45,13 +44,13 @@ def test_a_command_is_finite_and_within_limits_whatever_is_asked(translation, ro
 @given(some.lists(some.tuples(some.floats(), some.floats()), min_size=1, max_size=4))
 def test_what_is_sent_to_a_drive_is_finite_and_within_its_limits(orders) -> None:
     robot, sent = object.__new__(RemoteRobot), []
-    robot._lock, robot._ticket, robot._ticket_time = threading.RLock(), "ticket", np.inf
-    robot.limits, robot._ask = LIMITS, lambda verb, ticket, *arguments: sent.append((verb, *arguments))
+    robot._lock, robot._ticket, robot.status = threading.RLock(), "ticket", "armed"
+    robot.limits, robot._ask = LIMITS, lambda verb, *words: sent.append((verb, *words[1:]))
     for translation, rotation in orders:
         (taken,) = robot.command(((translation, rotation),))
         assert taken == LIMITS.safe(translation, rotation)
-    assert [verb for verb, *_ in sent] == ["MOVE"] * len(orders)
-    numbers = np.array([[float(number) for number in numbers] for _, *numbers in sent])
+    assert [verb for verb, *_ in sent] == ["STATE", "MOVE"] * len(orders)
+    numbers = np.array([[float(number) for number in numbers] for _, *numbers in sent[1::2]])
     assert np.isfinite(numbers).all() and (np.abs(numbers) <= [40.0, 12.0]).all()
 
 

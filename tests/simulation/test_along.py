@@ -13,9 +13,9 @@ from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core_state import CONTACTS, LIMIT, NODE, NORMAL_FORCE, OFFSET, POSITION, nodes_of, with_nodes
+from endopilot.simulation.groups import factor_at
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.vessel_wall import factor_at
 
 WIRE = read_wire("workhorse-014")
 CORE = SimulatorConfig(time_step_s=0.05, element_mm=1.5, threads=1, tolerance_mm=1e-6)

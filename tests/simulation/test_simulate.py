@@ -250,3 +250,16 @@ for control, others in (
     assert lines[3].startswith("friction: shape (2, 2); give (2,)")
     assert "need" in lines[4] and lines[4].endswith("simulate fewer at once")
     assert len(lines) == 5
+
+
+def test_a_list_and_the_name_of_a_motion_are_taken(anatomy: Anatomy) -> None:
+    from endopilot.simulation.motion import motion_named
+
+    control = [[[5.0, 0.5], [6.0, -0.5]]]
+    named = simulate(anatomy, DEVICE, control, initial=[[8, 0]], motion="breathing")
+    made = simulate(
+        anatomy, DEVICE, np.array(control), initial=np.array([[8.0, 0.0]]), motion=motion_named("breathing")
+    )
+    same(named, made, slice(None))
+    with pytest.raises(InputError, match="motion: 'loud'; give Motion or one of 'still', 'breathing'"):
+        simulate(anatomy, DEVICE, control, motion="loud")

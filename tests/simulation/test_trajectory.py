@@ -17,7 +17,7 @@ from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
-from endopilot.simulation.recorder import Recorder
+from endopilot.simulation.robots import Recorder
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.simulation.trajectory_file import read_trajectory, write_trajectory
 from endopilot.types import Anatomy, TipProjection

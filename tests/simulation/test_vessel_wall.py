@@ -15,8 +15,8 @@ from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import make_lumen
+from endopilot.simulation.groups import FINE_MM, make_wall
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.vessel_wall import FINE_MM, make_wall
 from endopilot.types import Anatomy, DistanceMap
 from toy_fork import SPACING_MM, make_fork
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -169,3 +170,21 @@ def test_a_bend_begins_where_the_line_turns(fork) -> None:
     assert route.outer_mm(50.0) == pytest.approx(np.pi / 2, rel=0.05)  # r times the angle
     assert route.outer_mm(15.0) == pytest.approx(0.0, abs=1e-3)
     assert route.narrow_from(1.9) == pytest.approx(35.0, abs=0.3) and route.narrow_from(2.1) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("target", "mend"),
+    [
+        ("0.3 0 31.9", "write it as 0.3,0,31.9"),
+        ("0.3; 0; 31.9", "write it as 0.3,0,31.9"),
+        ("[0.3\t-0\t31.9]", "write it as 0.3,-0,31.9"),
+        ("0.3,31.9", "these are 2 numbers"),
+        ("1,2,3,4", "these are 4 numbers"),
+        ("0,3;0;31,9", "these are 5 numbers"),
+    ],
+)
+def test_a_point_that_is_written_otherwise_is_told(anatomy, target, mend) -> None:
+    with pytest.raises(InputError, match=re.escape(f"a point is X,Y,Z in LPS mm, three numbers with commas: {mend}")):
+        find_target(anatomy.tree, target)
+    x, y, z = anatomy.tree.branches[0].centerline.points[3]
+    assert find_target(anatomy.tree, f"({x}, {y}, {z})") == find_target(anatomy.tree, f"{x},{y},{z}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import matplotlib.image
 import numpy as np
@@ -10,7 +11,8 @@ import pytest
 
 from endopilot.anatomy.io import write_anatomy
 from endopilot.cli import main
-from endopilot.errors import InputError
+from endopilot.errors import InputError, Remark
+from endopilot.types import Volume
 from endopilot.xray.image import XrayImager
 from endopilot.xray.take_image import TakeImageConfig, take_image
 
@@ -43,6 +45,19 @@ def test_dsa_and_roadmap_show_the_vessel_and_take_two_frames(fork):
     assert darker(roadmap, *place) < darker(plain, *place) - 10
     assert (dsa.frames, roadmap.frames) == (2, 2)
     assert dsa.air_kerma_ugy == pytest.approx(2 * plain.air_kerma_ugy)
+
+
+@pytest.mark.parametrize("shift_mm", [(-250.0, 0.0, 0.0), (0.0, 0.0, 90.0), (0.0, -33.0, 33.0)])
+def test_a_ct_of_another_place_is_refused_with_both_boxes(fork, shift_mm):
+    points = np.concatenate([branch.centerline.points for branch in fork.tree.branches])
+    low, high = points.min(axis=0) - 5.0, points.max(axis=0) + 5.0
+    voxels = np.full(np.ceil((high - low) / 2.0).astype(int)[::-1] + 1, 40, dtype=np.int16)
+    there = Volume(voxels, np.full(3, 2.0), low, np.eye(3))
+    XrayImager(fork, "workhorse-014", ct=there)
+    with pytest.raises(InputError, match=r"^ct: the CT spans x .* mm; .*% of the vessel .* \(x .*\) lies outside"):
+        XrayImager(fork, "workhorse-014", ct=replace(there, origin_mm=low + shift_mm))
+    with pytest.warns(Remark, match=r"[1-4]?\d% of the vessel"):
+        XrayImager(fork, "workhorse-014", ct=replace(there, voxels=voxels[3:], origin_mm=low + np.array([0, 0, 8.5])))
 
 
 def test_the_command_writes_the_image(fork, tmp_path, capsys):

@@ -36,7 +36,7 @@ from endopilot.anatomy.units import SMALLEST_RADIUS_MM, check_unit
 from endopilot.errors import InputError, place_text
 from endopilot.imaging.grid import connected_components
 from endopilot.progress import progress
-from endopilot.settings import Finite, Within, settings
+from endopilot.settings import Finite, Within, public, settings
 from endopilot.types import Anatomy, DistanceMap, Insertion, LumenMask, VesselTree
 
 CORONARY_RADIUS_MM = 1.6
@@ -78,6 +78,7 @@ class AnatomyConfig:
     refused."""
 
 
+@public
 def extract_anatomy(
     source: str | Path | AnatomySource | LumenMask | Surface | Polylines | VesselTree,
     *,

@@ -25,6 +25,7 @@ import numpy as np
 from endopilot import files
 from endopilot.anatomy import mesh_process
 from endopilot.errors import InputError
+from endopilot.settings import public
 from endopilot.types import Anatomy, Branch, Centerline, DistanceMap, Insertion, VesselTree
 
 SCHEMA_VERSION = 2
@@ -34,6 +35,7 @@ _SPACE = "left-posterior-superior"
 _CENTERLINE, _LUMEN, _RECORD = "centerline.vtp", "lumen.nrrd", "anatomy.json"
 
 
+@public
 def write_anatomy(anatomy: Anatomy, *, output: str | Path) -> None:
     """Write an anatomy as a folder, whole or not at all; an anatomy in it is replaced, and what else it holds stays.
 
@@ -65,6 +67,7 @@ def write_anatomy(anatomy: Anatomy, *, output: str | Path) -> None:
         (partial / _RECORD).write_text(files.json_text(record) + "\n", encoding="utf-8")
 
 
+@public
 def read_anatomy(folder: str | Path) -> Anatomy:
     """Read an anatomy that `write_anatomy` wrote.
 
@@ -72,6 +75,8 @@ def read_anatomy(folder: str | Path) -> Anatomy:
         InputError: the folder or one of its files is missing, damaged or of another version.
     """
     folder = Path(folder)
+    if folder.is_file():
+        raise InputError(f"{folder}: is a file; make an anatomy of it first: `endopilot anatomy {folder} -o FOLDER`")
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give an anatomy made by `endopilot anatomy` or `endopilot atlas`")
     if not (folder / _RECORD).exists():

@@ -62,6 +62,8 @@ def _read_curves(folder: Path) -> AnatomySource:
     """
     entries = sorted(folder.iterdir())
     curves = [path for path in entries if path.name.lower().endswith(".mrk.json")]
+    if (folder / "anatomy.json").exists():
+        raise InputError(f"{folder}: is an anatomy already; give it to the next command, such as `endopilot simulate`")
     if not curves:
         raise InputError(f"{folder}: holds no curves (.mrk.json); give a file or a folder of curves")
     read = [read_markups(path) for path in curves]

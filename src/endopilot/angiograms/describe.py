@@ -11,9 +11,9 @@ import numpy as np
 from PIL import Image
 
 from endopilot.angiograms.coco import coco
+from endopilot.angiograms.draw import view_text
 from endopilot.angiograms.layout import CARD_FILE, MANIFEST_FILE, SAMPLES_FILE, Layout
 from endopilot.angiograms.masks import CLASSES
-from endopilot.angiograms.views import view_text
 from endopilot.angiograms.write import COCO_FILE, RECORD_FILE
 from endopilot.dataset.splits import SPLITS
 from endopilot.files import manifest, read_json, write_json, writing

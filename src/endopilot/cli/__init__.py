@@ -5,17 +5,18 @@ Only the command that is called is imported, so that `endopilot --help` and `end
 
 from __future__ import annotations
 
-import difflib
 import functools
 import gc
 import importlib
+import os
+import signal
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from endopilot import __version__
-from endopilot.cli.process import EXIT_BAD_INPUT, carry_out, leave, own_streams
+from endopilot.errors import STOPPING, InputError, Stopped, stop
 
+TYPE_CHECKING = False  # typing is slow to import: until the handlers of signals stand, Ctrl-C gives a traceback
 if TYPE_CHECKING:
     from endopilot.cli.options import Command
 
@@ -58,22 +59,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     is_process = arguments is None
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    name = arguments[0] if arguments else "--help"
-    if name in ("-h", "--help"):
-        print(overview())
-    elif name == "--version":
-        print(f"endopilot {__version__}")
-    elif name in COMMANDS:
+    try:
+        for number in STOPPING if is_process else ():
+            signal.signal(number, stop)
+        from endopilot.cli.process import carry_out, leave, own_streams  # slow to import: a signal may come before
+
+        name = arguments[0] if arguments and arguments[0] in COMMANDS else ""
         if is_process:
             own_streams()
             gc.disable()  # until the command is imported, which leaves no garbage
-        code = carry_out(name, functools.partial(_work, name, arguments[1:]))
-        leave(code) if is_process else sys.exit(code)
-    else:
-        near = difflib.get_close_matches(name, COMMANDS, n=1)
-        hint = f"did you mean '{near[0]}'?" if near else "`endopilot --help` lists the commands."
-        print(f"endopilot: there is no command '{name}'; {hint}", file=sys.stderr)
-        sys.exit(EXIT_BAD_INPUT)
+        code = carry_out(name, functools.partial(_work, name, arguments))
+    except Stopped as stopped:  # before the command has begun
+        code = int(str(stopped.code))
+        print(f"endopilot: {'interrupted' if code == 128 + signal.SIGINT else 'terminated'}", file=sys.stderr)
+        os._exit(code)
+    leave(code) if is_process else sys.exit(code)
 
 
 def module_of(name: str) -> str:
@@ -106,9 +106,26 @@ def overview() -> str:
 
 
 def _work(name: str, arguments: Sequence[str]) -> None:
-    """Read a command's arguments and do its work."""
-    command = command_of(name)
-    if not gc.isenabled():
-        gc.freeze()  # what is imported stays, and need not be gone through again and again
-        gc.enable()
-    command.run(arguments)
+    """Read the arguments and do what they ask for."""
+    for word in arguments:
+        if any("\ud800" <= letter <= "\udfff" for letter in word):  # so Python has bytes that are no UTF-8
+            raise InputError(f"{word}: the name is not UTF-8; rename it, and give the new name")
+    if name:
+        from endopilot.cli.process import check_memory_limit
+
+        check_memory_limit()
+        command = command_of(name)
+        if not gc.isenabled():
+            gc.freeze()  # what is imported stays, and need not be gone through again and again
+            gc.enable()
+        command.run(arguments[1:])
+    elif not arguments or arguments[0] in ("-h", "--help"):
+        print(overview())
+    elif arguments[0] == "--version":
+        print(f"endopilot {__version__}")
+    else:
+        import difflib
+
+        near = difflib.get_close_matches(arguments[0], COMMANDS, n=1)
+        hint = f"did you mean '{near[0]}'?" if near else "`endopilot --help` lists the commands."
+        raise InputError(f"there is no command '{arguments[0]}'; {hint}")

@@ -13,6 +13,7 @@ from endopilot.anatomy.io import write_anatomy
 from endopilot.anatomy.read_source import read_source
 from endopilot.cli.arguments import Existing, Figures, OutputFolder, Picture, existing
 from endopilot.errors import InputError
+from endopilot.imaging.grid import check_covers
 from endopilot.imaging.volume import read_volume
 from endopilot.runs import check_outside
 from endopilot.types import Anatomy
@@ -66,6 +67,8 @@ def command(
     content = read_source(existing(source), **reading)
     with claim_anatomy(output, content, name=name, config=config, **reading):
         anatomy = extract_anatomy(content, name=name or output.resolve().name, config=config)
+        if volume is not None:
+            check_covers(volume, anatomy)
         write_anatomy(anatomy, output=output)
     figures = {"anatomy": output, **describe(anatomy)}
     if picture is not None:

@@ -17,7 +17,7 @@ from tyro.conf import arg
 
 from endopilot.cli.process import one_line
 from endopilot.errors import InputError
-from endopilot.files import json_text
+from endopilot.files import json_text, regular
 from endopilot.settings import Text, Within, settings
 
 EXIT_FAILED = 1
@@ -25,16 +25,16 @@ Figures = Mapping[str, Any] | Sequence[Mapping[str, Any]]
 
 
 def existing(path: Path) -> Path:
-    """Return `path` if it is there.
+    """Return `path` if a file or a folder is there.
 
     Raises:
-        InputError: there is no such file or folder, or it may not be looked at.
+        InputError: there is none, or it may not be looked at.
     """
     try:
         path.stat()
     except OSError as error:
         raise InputError(f"{path}: {(error.strerror or str(error)).lower()}; check the path") from error
-    return path
+    return regular(path)
 
 
 def _named_png(path: Path) -> Path:

@@ -82,7 +82,7 @@ def command(
 
 
 def _write_episode(session: Path | None, output: Path) -> None:
-    from endopilot.cockpit.episode import write_session_episode
+    from endopilot.cockpit.recording import write_session_episode
 
     if session is None:
         raise InputError("episode: names no session; give --replay SESSION too")

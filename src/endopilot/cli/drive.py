@@ -12,8 +12,7 @@ from endopilot.cli.arguments import ListenConfig
 from endopilot.devices.device import read_wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import ASSUMED, read_robot
-from endopilot.robot.drive import Drive
-from endopilot.robot.drive_protocol import tls_context
+from endopilot.robot.drive import Drive, tls_context
 from endopilot.robot.drive_server import serve
 from endopilot.settings import Finite
 

@@ -28,6 +28,7 @@ from tyro.conf import Positional
 
 from endopilot.cli.arguments import IS_FILE, IS_FOLDER, MUST_EXIST, existing, show_answer
 from endopilot.errors import InputError
+from endopilot.files import regular
 from endopilot.runs import check_new, check_outside
 from endopilot.settings import Within, is_settings, read_settings, settings
 
@@ -195,10 +196,12 @@ class Command:
     def _called(self, values: Any) -> Any:
         """Return what the function returns, once its inputs are there and nothing lies in the way of its outputs."""
         paths: dict[str, list[Path]] = {MUST_EXIST: [], IS_FOLDER: [], IS_FILE: []}
-        for one in self.options(values):
-            for note in _notes(one.kind):
-                if one.value and isinstance(note, str) and note in paths:
-                    paths[note] += one.value if isinstance(one.value, tuple) else (one.value,)
+        for one in itertools.chain.from_iterable(option.leaves() for option in self.options(values)):
+            for path in one.value if isinstance(one.value, tuple) else (one.value,):
+                if isinstance(path, str | Path):
+                    regular(path)
+                    for note in (note for note in _notes(one.kind) if isinstance(note, str) and note in paths):
+                        paths[note].append(Path(path))
         inputs = [existing(path) for path in paths[MUST_EXIST]]
         for folder in paths[IS_FOLDER]:
             check_outside(folder, inputs)
@@ -227,7 +230,11 @@ class Command:
                 shape = make_dataclass("Arguments", parts, kw_only=True)
                 given = tyro.cli(shape, prog=self.name, args=rest, add_help=False)
         except SystemExit:
-            raise InputError(f"{_first_line(said.getvalue())}; `{self.name} --help` lists the options") from None
+            line = _first_line(said.getvalue())
+            if found := re.match(r"Error parsing (.+?): .*\b(int|float)\b.*: ('.*')$", line):
+                kind = "whole number" if found[2] == "int" else "number"
+                raise InputError(f"{found[1]}: {found[3]}; give a {kind}") from None
+            raise InputError(f"{line}; `{self.name} --help` lists the options") from None
         return _with(start, given)
 
     def help(self, *, everything: bool) -> str:
@@ -338,7 +345,8 @@ def _taken(words: list[str], flag: str) -> str | None:
 def _first_line(box: str) -> str:
     """Return what tyro's box of several lines says of bad arguments, in one line: its first part, without the help."""
     lines = [line.strip("│╭╮╰╯─\n") for line in box.splitlines()[1:]]
-    first = list(itertools.takewhile(lambda line: line.strip(" ─"), lines))
+    lines = itertools.dropwhile(lambda line: not line.strip(" ─-"), lines)  # dashes where the terminal has no lines
+    first = list(itertools.takewhile(lambda line: line.strip(" ─-"), lines))
     return re.sub(r"\.$", "", " ".join(line.strip() for line in first if not line.startswith(" " * 6)))
 
 

@@ -5,11 +5,13 @@ Whatever happens, a command ends in one line on standard error, and its exit cod
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import errno
 import logging
 import os
 import re
+import resource
 import signal
 import sys
 import tempfile
@@ -17,9 +19,10 @@ import threading
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
+from types import FrameType
 from typing import Any
 
-from endopilot.errors import InputError, Remark, Stopped
+from endopilot.errors import STOPPING, InputError, Remark, Stopped, stop, stop_soon
 from endopilot.extras import what_is_missing
 
 EXIT_BAD_INPUT = 2
@@ -28,10 +31,15 @@ EXIT_INTERRUPTED = 128 + signal.SIGINT
 EXIT_UNREAD = 141
 TO_END_S = 10.0
 """Time in which a command that is stopped tidies up, s; then it leaves."""
+LEAST_MEMORY = 2**30
+"""Address space, bytes, that the libraries of a command take: `endopilot anatomy` of the smallest mask maps 1.0 GB. In
+less, OpenBLAS hangs or ends the process while it is loaded."""
 _OUT_OF_MEMORY = re.compile(
-    "out of memory|allocate memory|bad.?alloc(ation)?|maximum allowed (size|dimension) exceeded", re.IGNORECASE
+    "out of memory|allocate memory|bad.?alloc(ation)?|maximum allowed (size|dimension) exceeded|failed to map segment"
+    "|can't start new thread|launch worker thread|NULL without setting an exception",
+    re.IGNORECASE,
 )
-"""How libraries say it in exceptions of several kinds."""
+"""How libraries, the loader of libraries and Python say it in exceptions of several kinds."""
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -47,10 +55,28 @@ def carry_out(name: str, work: Callable[[], object]) -> int:
             code = _code_of(work)
             sys.stdout.flush()
         except BaseException as error:
-            if arrived:  # whatever a library that was interrupted made of it
-                return _say(name, "interrupted" if arrived[0] == signal.SIGINT else "terminated", 128 + arrived[0])
-            return _end(name, error)
+            if arrived or isinstance(error, Stopped):  # whatever a library that was interrupted made of it
+                code = 128 + arrived[0] if arrived else int(str(error.args[0]))  # it came before the block began
+                return _say(name, "interrupted" if code == EXIT_INTERRUPTED else "terminated", code)
+            try:
+                return _end(name, error)
+            except MemoryError as again:
+                return _end(name, again)
         return code
+
+
+def check_memory_limit() -> None:
+    """Check, before libraries are loaded, that the shell leaves this process the memory for them (`ulimit -v`).
+
+    Raises:
+        InputError: it does not.
+    """
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if 0 <= limit < LEAST_MEMORY:
+        raise InputError(
+            f"memory: limited to {limit / 2**30:.2g} GiB by `ulimit -v`, and the libraries alone take "
+            f"{LEAST_MEMORY / 2**30:g} GiB; raise the limit"
+        )
 
 
 def _code_of(work: Callable[[], object]) -> int:
@@ -89,16 +115,19 @@ def own_streams() -> None:
 
 
 def leave(code: int) -> None:
-    """End the process, at once if it was stopped: threads that still work are not waited for."""
-    if code in (EXIT_INTERRUPTED, 128 + signal.SIGTERM):
-        sys.stdout.flush()
+    """End the process, at once if it was stopped or a signal still comes: threads that work are not waited for."""
+    for number in STOPPING:
+        signal.signal(number, lambda *_: os._exit(code))  # the result is there
+        atexit.register(signal.signal, number, signal.SIG_IGN)
+    sys.stdout.flush()
+    if code in [128 + number for number in STOPPING]:
         os._exit(code)
     sys.exit(code)
 
 
 def one_line(text: str) -> str:
-    """Return a text with its line breaks and other control characters escaped."""
-    return re.sub(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]", lambda found: ascii(found[0])[1:-1], text.strip())
+    """Return a text with its line breaks, other control characters, and bytes that are no UTF-8 escaped."""
+    return re.sub(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]", lambda found: ascii(found[0])[1:-1], text.strip())
 
 
 def _say(name: str, line: str, code: int) -> int:
@@ -109,6 +138,10 @@ def _say(name: str, line: str, code: int) -> int:
 def _end(name: str, error: BaseException) -> int:
     """Say in one line why a command ends by an exception, and return the exit code."""
     text = " ".join(str(error).split())
+    if _for_want_of_memory(error):
+        size = re.search(r"allocate ([\d.]+ \w+)", text)
+        what = f"{size[1]} of memory are asked for" if size else "the memory is used up"
+        return _say(name, f"{what}, more than there is; ask for less at once: fewer, shorter or coarser", 2)
     if isinstance(error, InputError):
         return _say(name, str(error), EXIT_BAD_INPUT)
     if isinstance(error, ModuleNotFoundError) and (missing := what_is_missing(error)) is not None:
@@ -118,10 +151,6 @@ def _end(name: str, error: BaseException) -> int:
     if isinstance(error, BrokenPipeError):  # the reader has closed the output, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to flush into
         return EXIT_UNREAD
-    if isinstance(error, MemoryError) or _OUT_OF_MEMORY.search(text):
-        size = re.search(r"allocate ([\d.]+ \w+)", text)
-        what = f"{size[1]} of memory are asked for" if size else "the memory is used up"
-        return _say(name, f"{what}, more than there is; ask for less at once: fewer, shorter or coarser", 2)
     if isinstance(error, RuntimeError) and text.startswith("Symlink loop"):  # as pathlib has it
         return _say(name, f"{text}; check the path", EXIT_BAD_INPUT)
     if isinstance(error, OSError) and error.errno in _FULL:
@@ -134,6 +163,17 @@ def _end(name: str, error: BaseException) -> int:
     return _say(
         name, f"a defect of endopilot ({described(error)}); please report it with {_record(error)}", EXIT_DEFECT
     )
+
+
+def _for_want_of_memory(error: BaseException | None) -> bool:
+    """Return whether memory was used up, whatever was made of that on the way."""
+    while error is not None:
+        if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+            return True
+        if not isinstance(error, InputError) and _OUT_OF_MEMORY.search(str(error)):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _record(error: BaseException) -> str:
@@ -156,25 +196,26 @@ def _signals() -> Iterator[list[int]]:
     last = threading.Timer(TO_END_S, lambda: os._exit(128 + arrived[0]))
     last.daemon = True
 
-    def stop(number: int, _frame: object) -> None:
+    def arrive(number: int, frame: FrameType | None) -> None:
         if not arrived:
             arrived.append(number)
             last.start()
-            raise Stopped(128 + number)
+        stop(number, frame)
 
     def swallowed(found: Any) -> None:
         """Stop again where the first time fell into a destructor or a callback, which cannot raise."""
         if isinstance(found.exc_value, Stopped):
-            number = arrived.pop()
-            threading.Timer(0.1, os.kill, (os.getpid(), number)).start()
+            stop_soon(arrived[0])
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, arrive) for number in STOPPING}
     hook, sys.unraisablehook = sys.unraisablehook, swallowed
     try:
         yield arrived
     finally:
         last.cancel()
-        if not arrived:
+        if arrived:
+            signal.setitimer(signal.ITIMER_REAL, 0)  # of `stop_soon`; the work has ended
+        else:
             for number, handler in before.items():
                 signal.signal(number, handler)
         sys.unraisablehook = hook

@@ -27,7 +27,7 @@ from endopilot.navigation.policies import POLICIES, make_policy
 from endopilot.navigation.policy import Believer, Led, Observation, Policy
 from endopilot.navigation.record import NavigationRecord
 from endopilot.progress import progress
-from endopilot.settings import Finite, Positive, Seconds, Seed, Text, Within, settings
+from endopilot.settings import Finite, Positive, Seconds, Seed, Text, Within, public, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion, MotionName, motion_named, published_mean
 from endopilot.simulation.trajectory import Trajectory
@@ -150,6 +150,7 @@ class PatientNavigation:
     planning_s: float | None
 
 
+@public
 def navigate(
     anatomy: Anatomy | str | Path,
     target: str,

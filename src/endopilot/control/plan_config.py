@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.control.cost import Cost
 from endopilot.control.course import Controls
+from endopilot.control.search_config import Cost
 from endopilot.control.set_up import TILT_DEG
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.settings import Finite, Positive, Seconds, Seed, Text, Within, settings

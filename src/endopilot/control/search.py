@@ -25,12 +25,8 @@ from itertools import product
 import numpy as np
 
 from endopilot.belief.belief import Belief
-from endopilot.control.constant_motions import ConstantMotions
-from endopilot.control.course import Course
-from endopilot.control.halt import SPARE_SHARE, describe_halt, near_fork
-from endopilot.control.manoeuvre import STRAIGHT, Grid, Repertoire, place, retract
-from endopilot.control.places import next_place, places_of
-from endopilot.control.population import Population
+from endopilot.control.course import Course, next_place, places_of
+from endopilot.control.population import ConstantMotions, Population
 from endopilot.control.push import (
     LOOPS_MM,
     TURN_PERIODS,
@@ -44,7 +40,8 @@ from endopilot.control.push import (
     turn,
 )
 from endopilot.control.search_config import SearchConfig
-from endopilot.control.together import Together
+from endopilot.control.set_up import SPARE_SHARE, describe_halt, near_fork
+from endopilot.control.together import STRAIGHT, Grid, Repertoire, Together, place, retract
 from endopilot.control.trials import STALL_PERIODS, WIRE, Kept, Move, Trials
 from endopilot.errors import InputError
 from endopilot.progress import Advance

@@ -3,6 +3,8 @@
 Of the tips that a hand can give the wire, the one of least lateral reach is taken that enters every fork of the route
 with a quarter of all rotations; else the one that enters the hardest fork with most. The guiding catheter is turned too
 where none enters a fork near the ostium, and where the route leaves its axis steeply.
+
+`describe_halt` says why a search ended before the target.
 """
 
 from __future__ import annotations
@@ -13,11 +15,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from endopilot.anatomy.catheter_axis import turned_axis, with_axis
+from endopilot.control.push import Halt
 from endopilot.control.reach import ROTATIONS, Fork, forks, rotations_that_enter
-from endopilot.devices.device import Wire, lateral_reach
+from endopilot.devices.device import Wire
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import Navigation
-from endopilot.tasks.route import Route
+from endopilot.tasks.route import BEYOND_MM, Route
 
 SHAPES = ((45.0, 3.0), (60.0, 4.0), (75.0, 5.0), (90.0, 6.5), (90.0, 8.0), (90.0, 10.0))
 """Tips that are tried, angle in degrees and length in mm: from the usual one to the largest that a hand bends."""
@@ -82,7 +85,7 @@ def choose_tip(navigation: Navigation, *, tip: str = "auto", catheter_tilt_deg: 
     if steep_deg > _COAXIAL_DEG and catheter_tilt_deg > 0:
         tilt_deg = min(catheter_tilt_deg, steep_deg)
         navigation = replace(given, anatomy=with_axis(given.anatomy, _towards(route, tilt_deg)))
-        turned_for = f"the route leaves its axis by {steep_deg:.0f} degrees"
+        turned_for = f"the route leaves its axis by {steep_deg:.0f}°"
     best, counts = _choose(navigation, devices)
     made, refused = replace(navigation, device=devices[best]), _refused(places, counts[best])
     if refused is not None and catheter_tilt_deg > 0 and _near_catheter(route, counts[best]):
@@ -92,12 +95,12 @@ def choose_tip(navigation: Navigation, *, tip: str = "auto", catheter_tilt_deg: 
             if _merit(after[other]) > _merit(counts[best]):
                 best, counts, tilt_deg = other, after, catheter_tilt_deg
                 made = replace(turned, device=devices[best])
-                turned_for = f"with its given axis no tip enters {refused}"
+                turned_for = f"along its given axis no tip enters {_into(refused)}"
             if _suffices(counts[best]):
                 break
     why = _why(made.device, places, counts, best)
     if tilt_deg:
-        why += f"; the catheter is turned by {tilt_deg:.3g} degrees, for {turned_for}"
+        why += f"; the catheter is turned by {tilt_deg:.3g}°: {turned_for}"
     return TipChoice(made, tilt_deg, places, counts[best], why)
 
 
@@ -186,17 +189,64 @@ def _refused(places: tuple[Fork, ...], count: Count) -> Fork | None:
 
 def _why(device: Wire, places: tuple[Fork, ...], counts: dict[int, Count], best: int) -> str:
     """Return why a tip was taken of those that were tried, the wire's own or the only one first."""
-    shape = f"tip {tip_name(device)} (reach {lateral_reach(device.tip_bend_rad, device.tip_bend_length_mm):.1f} mm)"
+    shape = f"the tip ({np.degrees(device.tip_bend_rad):.3g}° over {device.tip_bend_length_mm:.3g} mm)"
     if not places:
         return f"{shape}: the route has no fork"
-    refused = _refused(places, counts[best])
-    if refused is not None:
-        which = "does not enter" if len(counts) == 1 else f"as the other {len(counts) - 1} tried, does not enter"
-        return f"{shape}, {which} {refused}, where a wire has {refused.width_mm:.1f} mm"
     hardest = int(np.argmin(counts[best]))
-    why = f"{shape} enters every fork of the route; the hardest, {places[hardest]}, "
-    why += f"where a wire has {places[hardest].width_mm:.1f} mm, by {counts[best][hardest]} of {ROTATIONS} rotations"
-    if best:
-        first = int(np.argmin(counts[0]))
-        why += f"; the wire's own tip enters {places[first]} by {counts[0][first]}"
-    return why
+    others = "" if len(counts) == 1 else f", as from the other {len(counts) - 1} tips tried"
+    if not counts[best][hardest]:
+        return f"{shape} enters {_into(places[hardest])} from none of {ROTATIONS} rotations{others}"
+    why = f"{shape} enters {_into(places[hardest])} from {counts[best][hardest]} of {ROTATIONS} rotations"
+    return f"{why}; as delivered from {int(counts[0][hardest]) or 'none'}" if best else why
+
+
+def _into(fork: Fork) -> str:
+    """Return what a fork leads into: a section's number alone would be taken for a count."""
+    return f"section {fork.section}" if fork.section.isdigit() else fork.section
+
+
+SPARE_SHARE = 0.9
+"""Share of the force limit that a path is followed under: what is uncertain takes the rest."""
+
+
+def near_fork(at_mm: float, route: Route, navigation: Navigation) -> Fork | None:
+    """Return the fork of the route that a tip which came to an abscissa (mm) is at, or None."""
+    device = navigation.device
+    for fork in forks(route, device):
+        radius = 0.5 * (fork.width_mm + device.diameter_mm)
+        if abs(at_mm - fork.abscissa) <= radius + BEYOND_MM + 1.0:
+            return fork
+    return None
+
+
+def describe_halt(halt: Halt, at_mm: float, route: Route, navigation: Navigation) -> str:
+    """Return where and why no path goes on, and what may help, as a part of a sentence.
+
+    Args:
+        halt: what a straight push met.
+        at_mm: how far along the route it came, mm.
+        route: to the target.
+        navigation: with the wire and the limits.
+    """
+    device = navigation.device
+    if halt == "late":
+        return f"the {navigation.seconds:g} s are over; give more seconds"
+    if navigation.catheters:
+        return f"no manoeuvre leads past {at_mm:.0f} mm; give another catheter, wire or tip"
+    near = near_fork(at_mm, route, navigation)
+    where = f"at {near}" if near else f"at {at_mm:.0f} mm, where no branch leaves,"
+    if halt == "pressed":
+        limit = (
+            f"{where} it cannot go on with less than {SPARE_SHARE:.0%} of the limit of {navigation.force_limit_n:.2g} N"
+        )
+        return f"{limit} on the wall; give a larger force_limit_n or a softer wire"
+    if halt == "slipped":
+        return (
+            f"{where} the drive slips, which pushes {device.name} with no more than {device.push_limit_n:g} N; "
+            "give a wire of less friction or a drive of a larger push_limit_n"
+        )
+    if near:
+        tip = f"{where}, which its tip of {tip_name(device)} does not enter"
+        return f"{tip}; give another tip (--tip), or let the catheter be turned (--catheter-tilt-deg)"
+    folds = f"{where} the wire is pushed and its tip does not come forward: it folds in a bend"
+    return f"{folds}; give another tip (--tip) or a stiffer wire"

@@ -3,6 +3,10 @@
 It is given a fork as `ForkView` has it, and returns how likely the wire passes into the route's branch when its tip
 points to each side: a Fourier series of the azimuth, so that turning the fork turns the answer. `python -m benchmarks
 turn-network` trains it by what became of trials in the rod core.
+
+Its input is a fork as the tip meets it, `ForkView`. The frame of a place of the route has the tangent of the route
+there, the side to which the route goes on from there, and the normal of both. So a network is given the same numbers
+wherever in the body the fork lies.
 """
 
 from __future__ import annotations
@@ -13,9 +17,118 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.control.fork_view import ForkView
+from endopilot.devices.device import Wire, lateral_reach
 from endopilot.errors import InputError
 from endopilot.files import writing
+from endopilot.tasks.route import Route
+from endopilot.types import Centerline
+
+_ROUTE_MM = np.array([-15.0, -10.0, -6.0, -3.0, 0.0, 2.0, 4.0, 7.0, 11.0, 16.0])
+_OTHER_MM = np.array([2.0, 4.0, 7.0, 11.0])
+"""Places of the route, from the place on, and of the branch that is not taken, mm: points and radii there are given."""
+_OFF_AXIS_MM = 8.0
+"""How far from the place the route's side is looked for, mm."""
+_TIP_MM = 10.0
+"""Length of wire that the direction of its tip is compared with, mm."""
+_SCALE_MM, _RADIUS_MM = 10.0, 2.0
+"""Units of lengths and of radii."""
+FEATURES = 4 * len(_ROUTE_MM) + 4 * len(_OTHER_MM) + 11
+
+
+@dataclass(frozen=True)
+class ForkView:
+    """What a network is given of a fork and the wire before it.
+
+    Attributes:
+        features: geometry and wire, without units; of these a turn of the wire changes a little where its tip and its
+            shaft lie.
+        azimuth: to which side of the route's the wire's tip points, rad.
+    """
+
+    features: Float[np.ndarray, "features"]
+    azimuth: float
+
+    @staticmethod
+    def of(route: Route, at_mm: float, nodes: Float[np.ndarray, "nodes 3"], device: Wire) -> ForkView:
+        """Return what is seen of a place of a route.
+
+        Args:
+            route: to the target.
+            at_mm: abscissa of the place, mm.
+            nodes: of the wire, its tip first, LPS mm.
+            device: the wire.
+        """
+        here = route.position(at_mm)
+        axes = _axes(route, at_mm)
+        ahead = _sampled(route.line, at_mm + _ROUTE_MM, here, axes)
+        other = _other(route, at_mm)
+        beside = (
+            np.zeros(4 * len(_OTHER_MM))
+            if other is None
+            else _sampled(other, other.abscissa[0] + _OTHER_MM, here, axes)
+        )
+        away = np.linalg.norm(nodes - nodes[0], axis=1)
+        second, behind, further = (
+            nodes[int(np.argmax(away >= min(share * _TIP_MM, away[-1])))] for share in (0.15, 1.0, 1.6)
+        )
+        tip, shaft = nodes[0] - second, behind - further
+        across = (tip / max(np.linalg.norm(tip), 1e-9) - shaft / max(np.linalg.norm(shaft), 1e-9)) @ axes.T
+        lean = shaft @ axes.T / max(np.linalg.norm(shaft), 1e-9)
+        place = (nodes[0] - here) @ axes.T / _SCALE_MM
+        wire = [
+            float(other is not None),
+            lateral_reach(device.tip_bend_rad, device.tip_bend_length_mm) / 5.0,
+            device.tip_bend_rad,
+            device.tip_bend_length_mm / _SCALE_MM,
+            float(np.hypot(across[1], across[2])),
+        ]
+        return ForkView(np.concatenate([ahead, beside, wire, lean, place]), float(np.arctan2(across[2], across[1])))
+
+    def mirrored(self) -> ForkView:
+        """Return the same in a mirror that holds tangent and side."""
+        features = self.features.copy()
+        count = len(_ROUTE_MM) + len(_OTHER_MM)
+        features[2 : 4 * count : 4] *= -1
+        features[4 * count + 5 + 2] *= -1
+        features[4 * count + 8 + 2] *= -1
+        return ForkView(features, -self.azimuth)
+
+
+def _axes(route: Route, at_mm: float) -> Float[np.ndarray, "3 3"]:
+    """Return tangent, side and normal of the route at a place."""
+    here, before, ahead = (route.position(at_mm + x) for x in (0.0, -2.0, _OFF_AXIS_MM))
+    tangent = here - before
+    if np.linalg.norm(tangent) < 1e-6:
+        tangent = route.position(at_mm + 2.0) - here
+    tangent = tangent / np.linalg.norm(tangent)
+    side = ahead - here - ((ahead - here) @ tangent) * tangent
+    if np.linalg.norm(side) < 1e-3:
+        side = np.cross(tangent, np.eye(3)[int(np.argmin(np.abs(tangent)))])
+    side = side / np.linalg.norm(side)
+    return np.array([tangent, side, np.cross(tangent, side)])
+
+
+def _other(route: Route, at_mm: float) -> Centerline | None:
+    """Return the widest branch that leaves the route at a place and is not taken; None where no branch leaves."""
+    if not len(route.junctions):
+        return None
+    at = int(np.argmin(np.abs(route.junctions - at_mm)))
+    if abs(route.junctions[at] - at_mm) > 1e-6:
+        return None
+    tree, taken = route.anatomy.tree, route.branches[at + 1]
+    others = [tree.branches[b].centerline for b in tree.children(route.branches[at]) if b != taken]
+    return max(others, key=lambda line: float(line.radius[len(line.radius) // 2]), default=None)
+
+
+def _sampled(line: Centerline, abscissa: np.ndarray, here: np.ndarray, axes: np.ndarray) -> Float[np.ndarray, "n"]:
+    """Return points of a line in a frame, and radii."""
+    points = np.stack([np.interp(abscissa, line.abscissa, axis) for axis in line.points.T], axis=-1)
+    beyond = np.minimum(abscissa - line.abscissa[0], 0.0)[:, None]
+    first = line.points[min(2, len(line.points) - 1)] - line.points[0]
+    points = points + beyond * first / max(np.linalg.norm(first), 1e-9)
+    radius = np.interp(abscissa, line.abscissa, line.radius)
+    return np.column_stack([(points - here) @ axes.T / _SCALE_MM, radius / _RADIUS_MM]).ravel()
+
 
 SIDES = 72
 """Azimuths for which it is asked, evenly from −π on."""

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from endopilot.dataset.block import store_block
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.draw import Draw
 from endopilot.dataset.generate import describe
 from endopilot.dataset.layout import make_layout
+from endopilot.dataset.workers import store_block
 from endopilot.devices.stack import Stack
 from endopilot.runs import claim
 from endopilot.simulation.trajectory import Trajectory

@@ -21,8 +21,7 @@ from endopilot.devices.stack import Stack
 from endopilot.simulation.checks import check_shape_memory
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.motion import Motion
-from endopilot.simulation.recorder import Recorder
-from endopilot.simulation.robots import Robots
+from endopilot.simulation.robots import Recorder, Robots
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
 from endopilot.simulation.trajectory import Trajectory

@@ -20,6 +20,7 @@ from endopilot.dataset.schema import (
     signal_columns,
 )
 from endopilot.errors import InputError
+from endopilot.files import regular
 from endopilot.progress import Advance
 from endopilot.simulation.config import Actuation
 from endopilot.simulation.trajectory import Trajectory
@@ -95,7 +96,7 @@ def read_table(path: Path, key: str) -> pa.Table:
         InputError: the file is missing or damaged, or belongs to another dataset or version.
     """
     try:
-        table = pq.ParquetFile(path).read()
+        table = pq.ParquetFile(regular(path)).read()
     except FileNotFoundError as error:
         raise InputError(f"{path}: missing from the dataset; run the same `endopilot dataset` command again") from error
     except (pa.ArrowInvalid, OSError) as error:

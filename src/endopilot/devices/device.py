@@ -38,7 +38,7 @@ from endopilot.devices.device_ranges import (
     check_tip,
 )
 from endopilot.errors import InputError
-from endopilot.settings import NonNegative, Positive, Text, Within, read_settings, settings
+from endopilot.settings import NonNegative, Positive, Text, Within, public, read_settings, settings
 from endopilot.types import Anatomy
 
 Value = TypeVar("Value")
@@ -251,6 +251,7 @@ class WireFile:
     tip_shaping: _Shaping | None = None
 
 
+@public
 def read_wire(name_or_path: str | Path) -> Wire:
     """Read a device by its name (`endopilot.devices.device_files`), or from a YAML file.
 

@@ -56,7 +56,7 @@ Rotation = Annotated[float, Within(0.05, 65, unit="rad/s", mistaken=(("°/s", ma
 Force = Annotated[float, Within(0.01, 50, unit="N", mistaken=_FORCES)]
 """Force at which a drive slips, N."""
 Torque = Annotated[
-    float, Within(1e-3, 1000, unit="N·mm", mistaken=(("N·m", 1000.0), ("N·µm", 0.001), ("gf·mm", GRAM_FORCE_N)))
+    float, Within(1e-3, 1000, unit="N·mm", mistaken=(("N·m", 1000.0), ("mN·mm", 0.001), ("gf·mm", GRAM_FORCE_N)))
 ]
 """Torque at which a drive slips, N·mm."""
 
@@ -73,6 +73,8 @@ _STIFFENING = 1e5
 """Largest ratio of EI along a device."""
 _LOAD_FACTOR = 10.0
 """Factor between a catalogue's tip load and that of the tip's EI: protocols differ, and 1 gf is 1/102 N."""
+_STRENGTH_MPA = 3000.0
+"""Tensile strength of the strongest steel wire, MPa: EN 10270-1 has up to 3000 for patented wire of 0.3 mm."""
 _LEAST_DEG = math.degrees(math.pi) / 57
 """A bend up to this, some 3.16 °, is one in rad: half a turn has π of them."""
 
@@ -92,6 +94,12 @@ def check_built(
         InputError: two of them contradict each other; the line names field, value and what to give.
     """
     _check_stiffness(device, bore_mm, catheter)
+    shears = _STRENGTH_MPA / math.sqrt(3) * math.pi / 16 * device.diameter_mm**3  # yields in shear by von Mises
+    if (torque := device.torque_limit_n_mm) > shears:
+        raise InputError(
+            f"torque_limit_n_mm: {torque:g} N·mm shears off {device.diameter_mm:g} mm of the strongest steel, at "
+            f"{shears:.3g} N·mm; give N·mm at which the drive slips ({torque:g} mN·mm is {torque / 1000:g} N·mm)"
+        )
     _check_bends("shape", [each for each in arcs if each[1]], device)
 
 

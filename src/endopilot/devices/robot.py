@@ -17,9 +17,9 @@ from pydantic import model_validator
 
 from endopilot.devices.device import Device
 from endopilot.devices.device_files import named_file
-from endopilot.devices.transmission import Transmission
+from endopilot.devices.stack import Transmission
 from endopilot.files import write_yaml
-from endopilot.settings import NonNegative, Positive, Within, read_settings, settings
+from endopilot.settings import NonNegative, Positive, Within, public, read_settings, settings
 
 ASSUMED, IDEAL = "assumed", "ideal"
 """Names of the robot whose numbers are assumptions, which is the default, and of the one that does as commanded."""
@@ -150,6 +150,7 @@ def list_robots() -> tuple[str, ...]:
     return (ASSUMED, *sorted(path.stem for path in _SHIPPED.glob("*.yaml")))
 
 
+@public
 def read_robot(name_or_path: str | Path) -> RobotConfig:
     """Read a robot by its name (`list_robots`), or from a YAML file.
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.errors import InputError
-from endopilot.files import reading, writing
+from endopilot.files import reading, regular, writing
 
 METRICS_FILE, RESULTS_FILE, FIGURES_FOLDER, REPORT_FILE = "metrics.json", "evaluation.npz", "figures", "report.html"
 """What an evaluation writes into its folder."""
@@ -151,6 +151,7 @@ def read_results(path: Path) -> dict[str, SplitResult]:
     Raises:
         InputError: the file is missing or damaged.
     """
+    path = regular(path)
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file.items())

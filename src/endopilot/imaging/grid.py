@@ -4,6 +4,7 @@ and how far two masks of one vessel agree: `compare_masks`.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -12,8 +13,8 @@ import SimpleITK as sitk
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from endopilot.errors import InputError
-from endopilot.types import LumenMask, Volume
+from endopilot.errors import InputError, Remark, box_text
+from endopilot.types import Anatomy, LumenMask, Volume
 
 LEAST_BLOOD_HU = 130.0
 """Without contrast, blood measures 30-60 HU; below this value no method here can separate lumen from wall."""
@@ -37,6 +38,25 @@ def from_image(image: sitk.Image) -> Volume:
         origin_mm=np.array(image.GetOrigin(), dtype=float),
         direction=np.array(image.GetDirection(), dtype=float).reshape(3, 3),
     )
+
+
+def check_covers(ct: Volume, anatomy: Anatomy) -> None:
+    """Check that a CT shows a vessel; what lies beyond its edges is said in a `Remark`.
+
+    Raises:
+        InputError: more of the vessel lies outside the CT than in it.
+    """
+    points = np.concatenate([branch.centerline.points for branch in anatomy.tree.branches])
+    shape = np.array(ct.voxels.shape[::-1])
+    index = ct.world_to_index(points)
+    outside = ((index < -1) | (index > shape)).any(axis=1).mean()  # a voxel beyond: a surface may end there
+    if outside:
+        corners = ct.index_to_world(np.indices((2, 2, 2)).reshape(3, -1).T * shape - 0.5)
+        where = f"{outside:.0%} of the vessel {anatomy.name} ({box_text(points)}) lies outside it"
+        said = f"{ct.files[0] if ct.files else 'ct'}: the CT spans {box_text(corners)}; {where}"
+        if outside > 0.5:
+            raise InputError(f"{said}; give the CT that the vessel was found in")
+        warnings.warn(said, Remark, stacklevel=3)
 
 
 def resample(volume: Volume, spacing_mm: float) -> Volume:

@@ -20,7 +20,7 @@ from endopilot.imaging.geometry import farthest_apart_mm
 from endopilot.imaging.grid import LEAST_BLOOD_HU
 from endopilot.imaging.volume import read_volume
 from endopilot.plugins import Registry
-from endopilot.settings import Finite, settings
+from endopilot.settings import Finite, public, settings
 from endopilot.types import Insertion, LumenMask, Volume
 
 METHODS = Registry(
@@ -106,6 +106,7 @@ def _method(name: str) -> SegmentationMethod:
     raise InputError(f"method: {name!r} is no function and no SegmentationMethod; name one")
 
 
+@public
 def segment(volume: Volume | str | Path, *, config: SegmentConfig | None = None) -> LumenMask:
     """Segment the lumen of one vessel tree from a CT angiogram.
 

@@ -16,7 +16,7 @@ import numpy as np
 import SimpleITK as sitk
 
 from endopilot.errors import InputError
-from endopilot.files import json_text, read_json, sha256, writing
+from endopilot.files import json_text, read_json, regular, sha256, writing
 from endopilot.imaging import dicom_seg
 from endopilot.imaging.geometry import farthest_apart_mm
 from endopilot.imaging.grid import to_image
@@ -24,6 +24,7 @@ from endopilot.imaging.nifti import read_nifti
 from endopilot.imaging.segments import ImageFile, inside_segment
 from endopilot.imaging.text_headers import read_metaimage, read_nrrd
 from endopilot.imaging.voxels import compact
+from endopilot.settings import public
 from endopilot.types import Insertion, LumenMask, Volume
 
 SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha")
@@ -37,6 +38,7 @@ _SMALLEST_SIZE = 4
 """Fewer voxels than this along an axis are no volume: a slice, or a scout view."""
 
 
+@public
 def read_volume(path: str | Path, *, series: str | None = None, phase: str | None = None) -> Volume:
     """Read a CT volume in HU.
 
@@ -53,8 +55,8 @@ def read_volume(path: str | Path, *, series: str | None = None, phase: str | Non
         InputError: the path is missing, is of an unknown format or damaged, or holds anything but one plain
             three-dimensional volume (several series or phases, missing slices, gantry tilt, 4-D, RGB).
     """
-    path = Path(path)
-    if not path.is_file() and not path.is_dir():
+    path = regular(path)
+    if not path.exists():
         raise InputError(f"{path}: no such file or folder; check the path")
     try:
         if path.is_dir() or (_suffix(path) is None and _is_dicom(path)):
@@ -165,8 +167,8 @@ def read_mask(path: str | Path, *, label: int | str | None = None, threshold: fl
     Raises:
         InputError: the file is missing, damaged or no mask, the label is not in it, or nothing is inside.
     """
-    path = Path(path)
-    if not path.is_file() and not path.is_dir():
+    path = regular(path)
+    if not path.exists():
         raise InputError(f"{path}: no such file; check the path")
     if path.suffix.lower() == dicom_seg.SUFFIX:
         if threshold is not None:

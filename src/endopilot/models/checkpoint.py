@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from endopilot.errors import InputError
-from endopilot.files import json_text, writing
+from endopilot.files import json_text, regular, writing
 from endopilot.models.causal import CAUSAL_NETWORKS, CausalNetwork
 from endopilot.models.config import CausalConfig, TransformerConfig
 from endopilot.models.transformer import NETWORKS, Network
@@ -77,7 +77,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     Raises:
         InputError: the file is missing, damaged or of another version.
     """
-    if not Path(path).exists():
+    if not regular(path).exists():
         raise InputError(f"{path}: no such checkpoint; train one with `endopilot train`")
     try:
         with safe_open(path, framework="pt") as stream:

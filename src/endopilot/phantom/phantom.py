@@ -19,7 +19,7 @@ from endopilot.phantom import chest
 from endopilot.phantom.metal import add_metal, leads, stents
 from endopilot.phantom.painter import COARSE_MM, SLAB, Grid, Painter, smooth_min, window
 from endopilot.phantom.scanner import misregister, scan, smear
-from endopilot.settings import Ascending, NonNegative, Share, Within, settings
+from endopilot.settings import Ascending, NonNegative, Share, Within, public, settings
 from endopilot.types import Anatomy, Centerline, Volume
 
 _REACH_MM = 5.0
@@ -87,6 +87,7 @@ class _Plaque:
     depth: Float32[np.ndarray, "nz ny nx"]
 
 
+@public
 def make_phantom(anatomy: Anatomy, *, config: PhantomConfig | None = None, seed: int = 0) -> Volume:
     """Return a synthetic CT angiogram of a right or left coronary anatomy, in HU.
 

@@ -24,8 +24,7 @@ from endopilot.devices.stack import Stack
 from endopilot.errors import InputError, Remark
 from endopilot.progress import Advance, progress
 from endopilot.robot.candidates import LEAST_EPISODES, Candidates, Estimate, estimates, search
-from endopilot.robot.course import STARTS, Courses
-from endopilot.robot.log import RobotLog
+from endopilot.robot.log import STARTS, Courses, RobotLog
 from endopilot.robot.replay import (
     FAR_MM,
     EpisodeReplay,
@@ -35,7 +34,7 @@ from endopilot.robot.replay import (
     replay_prepared,
     usable_episodes,
 )
-from endopilot.settings import OpenShare, Seed, Within, settings
+from endopilot.settings import OpenShare, Seed, Within, public, settings
 from endopilot.types import Anatomy
 
 DRIVE = MappingProxyType({"gain_translation": (0.8, 1.25), "play_mm": (0.0, 6.0), "latency_s": (0.0, 0.5)})
@@ -102,6 +101,7 @@ class RobotCalibration:
     replays: list[EpisodeReplay]
 
 
+@public
 def calibrate(
     logs: Sequence[RobotLog],
     anatomy: Anatomy,

@@ -14,8 +14,7 @@ import time
 from collections.abc import Callable
 
 from endopilot.errors import InputError
-from endopilot.robot.drive import Drive, Session
-from endopilot.robot.drive_protocol import PROTOCOL
+from endopilot.robot.drive import PROTOCOL, Drive
 from endopilot.robot.robot import CYCLE_S
 
 AUTHENTICATE_S = 2.0
@@ -25,9 +24,9 @@ GONE_S = 10.0
 MOST_WAITING = 8
 """Connections that may wait to be let in; one more is closed at once."""
 READ_BYTES = 1 << 12
-"""Bytes that are taken as one read; the socket brings up to 64 times as many at once."""
+"""Bytes that are taken as one read; twice as many may wait to be read."""
 MOST_UNREAD = 1 << 20
-"""Bytes of answers that may wait for a client to read them, or belong to what the socket brings at once."""
+"""Bytes of answers that may wait for a client to read them."""
 REFUSALS_S = 1.0
 """Time between two lines for people on connections that were refused, s."""
 
@@ -75,113 +74,77 @@ class _Door:
 
     def __init__(self, drive: Drive, context: ssl.SSLContext) -> None:
         self._drive, self._context = drive, context
-        self._waiting: set[asyncio.Task[None]] = set()
-        self._refused = -REFUSALS_S
+        self._clients: set[asyncio.Task[None]] = set()
+        self._waiting, self._refused = 0, -REFUSALS_S
 
     async def keep(self, listener: socket.socket) -> None:
         """Let them in for ever."""
-        loop = asyncio.get_running_loop()
         while True:
             try:
-                connection, address = await loop.sock_accept(listener)
+                connection, address = await asyncio.get_running_loop().sock_accept(listener)
             except OSError:  # too many open files: the connections that wait will end
                 await asyncio.sleep(CYCLE_S)
                 continue
-            if len(self._waiting) >= MOST_WAITING:
+            if self._waiting >= MOST_WAITING:
                 connection.close()
                 await asyncio.sleep(0)
                 continue
+            self._waiting += 1
             task = asyncio.create_task(self._admit(connection, address[0]))
-            self._waiting.add(task)
-            task.add_done_callback(self._waiting.discard)
+            self._clients.add(task)
+            task.add_done_callback(self._clients.discard)
 
     async def _admit(self, connection: socket.socket, address: str) -> None:
-        client = _Connection(self._drive)
+        reader = asyncio.StreamReader(limit=READ_BYTES)
         try:
-            await asyncio.get_running_loop().connect_accepted_socket(
-                lambda: client,
+            transport, _ = await asyncio.get_running_loop().connect_accepted_socket(
+                lambda: asyncio.StreamReaderProtocol(reader),
                 connection,
                 ssl=self._context,
                 ssl_handshake_timeout=AUTHENTICATE_S,
                 ssl_shutdown_timeout=AUTHENTICATE_S,
             )
         except OSError as error:
-            self._refuse(address, getattr(error, "verify_message", None) or getattr(error, "reason", None))
+            now = time.monotonic()
+            if now >= self._refused + REFUSALS_S:  # a line for each would be as many as a stranger likes
+                self._refused = now
+                why = getattr(error, "verify_message", None) or getattr(error, "reason", None) or "no TLS 1.3 handshake"
+                self._drive.news.append(f"refused a connection from {address}: {why.replace('_', ' ').lower()}")
             return
-        if not client.commands:
-            await client.gone.wait()
-
-    def _refuse(self, address: str, reason: str | None) -> None:
-        now = time.monotonic()
-        if now >= self._refused + REFUSALS_S:  # a line for each would be as many as a stranger likes
-            self._refused = now
-            why = (reason or "no TLS 1.3 handshake").replace("_", " ").lower()
-            self._drive.news.append(f"refused a connection from {address}: {why}")
-
-
-class _Connection(asyncio.Protocol):
-    """A client that showed its certificate.
-
-    Attributes:
-        gone: set once the connection is closed.
-    """
-
-    def __init__(self, drive: Drive) -> None:
-        self._drive = drive
-        self._session: Session | None = None
-        self._transport: asyncio.Transport | None = None
-        self._watch: asyncio.TimerHandle | None = None
-        self.gone = asyncio.Event()
-
-    @property
-    def commands(self) -> bool:
-        """Whether this client commands the drive."""
-        return self._session is not None
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        finally:
+            self._waiting -= 1
         assert isinstance(transport, asyncio.Transport)
-        self._transport, self._session = transport, self._drive.open()
-        if self._session is None:
+        if self._drive.owner is not None:
             transport.write(f"{PROTOCOL} BUSY\n".encode("ascii"))
             transport.close()
         else:
-            transport.write(self._drive.greeting.encode("ascii"))
-            self._expect()
+            await self._obey(reader, transport)
 
-    def data_received(self, data: bytes) -> None:
-        if self._session is None or self._transport is None:
-            return
-        written = 0
-        for begin in range(0, len(data), READ_BYTES):
-            answers = self._session.receive(data[begin : begin + READ_BYTES], time.monotonic())
-            self._transport.write(answers)
-            written += len(answers)
-            if self._session.closed:
-                self._abort("a line of it has no end")
-                return
-            if max(written, self._transport.get_write_buffer_size()) > MOST_UNREAD:
-                self._abort("it does not read the answers")
-                return
-        if written:
-            self._expect()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        if self._watch is not None:
-            self._watch.cancel()
-        if self._session is not None:
-            self._session.close(time.monotonic())
-        self.gone.set()
-
-    def _expect(self) -> None:
-        """Wait `GONE_S` for the next line."""
-        if self._watch is not None:
-            self._watch.cancel()
-        self._watch = asyncio.get_running_loop().call_later(GONE_S, self._abort, f"it was silent for {GONE_S:g} s")
-
-    def _abort(self, why: str) -> None:
-        """Close the connection at once; the drive stops."""
-        self._drive.news.append(f"the client is sent away: {why}")
-        if self._transport is not None:
-            self._transport.abort()
-        if self._session is not None:
-            self._session.close(time.monotonic())
+    async def _obey(self, reader: asyncio.StreamReader, transport: asyncio.Transport) -> None:
+        """Answer the lines of a client that showed its certificate, until it is gone; then the drive stops."""
+        session, why = self._drive.open(), ""
+        assert session is not None
+        transport.write(self._drive.greeting.encode("ascii"))
+        try:
+            while True:
+                async with asyncio.timeout(GONE_S):
+                    data = await reader.read(READ_BYTES)
+                if not data:
+                    break
+                transport.write(session.receive(data, time.monotonic()))
+                await asyncio.sleep(0)  # what a client sends at once holds nobody up
+                if session.closed:
+                    why = "a line of it has no end"
+                    break
+                if transport.get_write_buffer_size() > MOST_UNREAD:
+                    why = "it does not read the answers"
+                    break
+        except TimeoutError:
+            why = f"it was silent for {GONE_S:g} s"
+        except OSError:
+            pass  # the connection is lost
+        finally:
+            if why:
+                self._drive.news.append(f"the client is sent away: {why}")
+            transport.abort()
+            session.close(time.monotonic())

@@ -1,8 +1,8 @@
 """A robot at the other end of a TLS connection: the client of a drive.
 
-The drive stops where it hears no command for 0.2 s, and a controller decides every 0.5 s; so a thread repeats the last
-command in between. It does so for a while only: where the controller itself falls silent, so does the client, and the
-drive stops. After that the thread asks for the state alone.
+The drive stands still 200 ms after the caller's last command, whatever else this process does: a call alone moves the
+wire. A caller that thinks for longer finds a wire that has stopped, and its next command moves it again. `run` holds a
+command for longer, while the caller waits.
 """
 
 from __future__ import annotations
@@ -17,14 +17,13 @@ from types import TracebackType
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Proximals
 from endopilot.errors import InputError
-from endopilot.robot.drive_protocol import LONGEST_LINE, PROTOCOL, SILENCE_S, number, tls_context
+from endopilot.robot.drive import LONGEST_LINE, PROTOCOL, number, tls_context
 from endopilot.robot.robot import ProximalState
-from endopilot.tasks.navigation import DECISION_PERIOD_S
 
 REPEAT_S = 0.02
-"""Time between two repetitions of a command, s."""
-HOLD_S = 1.5 * DECISION_PERIOD_S
-"""Time for which a command is repeated, s."""
+"""Time between two repetitions of a command in `run`, s."""
+LIFE_S = 1.0
+"""Time between two signs of life to the drive, s: it sends a client away of which it hears nothing for 10 s."""
 ANSWER_S = 2.0
 """Time that the drive has to answer, s."""
 
@@ -51,18 +50,18 @@ class RemoteRobot:
         """
         context = tls_context(Path(certificates), of_drive=False)
         self._where, self._lock = f"{host}:{port}", threading.RLock()
-        self._held, self._lost, self.status = b"", "", "stopped:start"
-        self._ticket, self._ticket_time = "", 0.0
-        self._wanted, self._until, self._closing = (0.0, 0.0), 0.0, threading.Event()
+        self._lost, self.status = "", "stopped:start"
+        self._ticket, self._wanted, self._closing = "", (0.0, 0.0), threading.Event()
         self._socket = self._connect(host, port, context, Path(certificates))
+        self._lines = self._socket.makefile("rb")
         try:
             self.limits = self._greet(Path(certificates))
             self.arm()
         except BaseException:
             self._socket.close()
             raise
-        self._repeater = threading.Thread(target=self._repeat, daemon=True)
-        self._repeater.start()
+        self._living = threading.Thread(target=self._live, daemon=True)
+        self._living.start()
 
     def __enter__(self) -> RemoteRobot:
         """Return the robot; leaving the block stops it and closes the connection."""
@@ -73,16 +72,29 @@ class RemoteRobot:
         self.close()
 
     def command(self, devices: Proximals) -> Proximals:
-        """Move on for `HOLD_S` at most, and return what is made of it, as `Robot` says; the drive moves a wire alone.
+        """Move on for 200 ms at most, and return what is made of it, as `Robot` says; the drive moves a wire alone.
+
+        A drive that stopped because it heard no command in time is armed again; after any other stop `arm` must.
 
         Raises:
             InputError: the connection is lost.
         """
         translation, rotation = devices[0] if devices else (0.0, 0.0)
         with self._lock:
-            self._wanted, self._until = self.limits.safe(translation, rotation), time.monotonic() + HOLD_S
+            self._wanted = self.limits.safe(translation, rotation)
             self._move()
             return (self._wanted,)
+
+    def run(self, duration: float) -> None:
+        """Hold the last command for some time, s, at the end of which this returns.
+
+        Raises:
+            InputError: the connection is lost.
+        """
+        until = time.monotonic() + duration
+        while (left := until - time.monotonic()) > 0:
+            self._move()
+            time.sleep(min(REPEAT_S, left))
 
     def proximal_state(self) -> ProximalState:
         """Return what the drive measures now.
@@ -99,7 +111,7 @@ class RemoteRobot:
             InputError: the connection is lost.
         """
         with self._lock:
-            self._until = 0.0
+            self._wanted = (0.0, 0.0)
             self._ask("STATE")  # a stop that this client has not heard of made its ticket void
             self._ask("ARM", self._ticket)
 
@@ -110,7 +122,7 @@ class RemoteRobot:
             InputError: the connection is lost.
         """
         with self._lock:
-            self._until = 0.0
+            self._wanted = (0.0, 0.0)
             self._ask("STOP")
 
     def close(self) -> None:
@@ -118,8 +130,8 @@ class RemoteRobot:
         self._closing.set()
         with self._lock:
             self._lose("it was closed")
-        if threading.current_thread() is not self._repeater:
-            self._repeater.join()
+        if threading.current_thread() is not self._living:
+            self._living.join()
 
     def _connect(self, host: str, port: int, context: ssl.SSLContext, certificates: Path) -> ssl.SSLSocket:
         try:
@@ -163,27 +175,24 @@ class RemoteRobot:
         return DriveLimits(max_velocity_mm_s=speed, max_rotation_rad_s=spin, travel_mm=(low, high))
 
     def _move(self) -> None:
-        if time.monotonic() > self._ticket_time + SILENCE_S / 2:
-            self._ask("STATE")  # for a ticket that still counts
-        self._ask("MOVE", self._ticket, *(repr(value) for value in self._wanted))
+        with self._lock:
+            self._ask("STATE")  # for a new ticket
+            if self.status == "stopped:silence":
+                self._ask("ARM", self._ticket)
+            self._ask("MOVE", self._ticket, *(repr(value) for value in self._wanted))
 
-    def _repeat(self) -> None:
-        while not self._closing.wait(REPEAT_S):
-            with self._lock:
-                try:
-                    if time.monotonic() < self._until:
-                        self._move()
-                    else:
-                        self._ask("STATE")
-                except InputError:
-                    return  # the next call of the controller says so
+    def _live(self) -> None:
+        while not self._closing.wait(LIFE_S):
+            try:
+                self._ask("STATE")
+            except InputError:
+                return  # the next call of the controller says so
 
     def _ask(self, verb: str, *arguments: str) -> ProximalState:
         """Send a line and return what the drive answers; with the connection lost it stays so."""
         with self._lock:
             if self._lost:
                 raise self._gone()
-            asked = time.monotonic()
             try:
                 self._socket.settimeout(ANSWER_S)
                 self._socket.sendall(" ".join([verb, *arguments]).encode("ascii") + b"\n")
@@ -197,9 +206,7 @@ class RemoteRobot:
             except BaseException:  # Ctrl-C between question and answer: the next answer would be that of this question
                 self._lose("a question was interrupted")
                 raise
-            self.status, self._ticket, self._ticket_time = fields[6], fields[7], asked
-            if self.status != "armed":
-                self._until = 0.0
+            self.status, self._ticket = fields[6:]
             clock, inserted, rotation, force, torque = values
             return ProximalState(clock, ((inserted, rotation),), ((force, torque),))
 
@@ -212,12 +219,7 @@ class RemoteRobot:
 
     def _line(self) -> str:
         """Return the next line, without its newline."""
-        until = time.monotonic() + ANSWER_S
-        while b"\n" not in self._held:
-            self._socket.settimeout(max(until - time.monotonic(), 1e-3))
-            data = self._socket.recv(4096)
-            if not data or len(self._held) > LONGEST_LINE:
-                raise ConnectionError("closed by the drive" if not data else "its line is too long")
-            self._held += data
-        line, _, self._held = self._held.partition(b"\n")
-        return line.decode("ascii", "replace")
+        line = self._lines.readline(LONGEST_LINE)
+        if not line.endswith(b"\n"):
+            raise ConnectionError("closed by the drive" if len(line) < LONGEST_LINE else "its line is too long")
+        return line[:-1].decode("ascii", "replace")

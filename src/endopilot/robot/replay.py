@@ -20,9 +20,8 @@ from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.robot.candidates import LEAST_EPISODES, UNKNOWN_SHARE, Candidates
-from endopilot.robot.course import STARTS, Courses
-from endopilot.robot.log import RobotLog
-from endopilot.settings import OpenShare, Within, settings
+from endopilot.robot.log import STARTS, Courses, RobotLog
+from endopilot.settings import OpenShare, Within, public, settings
 from endopilot.simulation.config import PRESETS, SimulatorConfig
 from endopilot.simulation.robots import in_grip
 from endopilot.simulation.simulator import Simulator
@@ -37,8 +36,6 @@ _FADES = 0.15
 """Share of what is given over which a tip's weight falls by 1/e, when a world is chosen."""
 _TOGETHER = 8
 """Episodes that are simulated side by side, for as long as the longest of them takes."""
-_BESIDE_MM = 20.0
-"""Tips of which the middle one lies farther than this from all centerlines are of another frame, or unit, mm."""
 _TRAVEL_MM = 1000.0
 """A drive that goes farther in an episode than this and the vessel's length is logged in another unit, mm."""
 FAR_MM = 2.0
@@ -142,6 +139,7 @@ def _first_row(log: RobotLog) -> int:
     return int(commands[max(0, np.searchsorted(commands, first, side="right") - 1)]) if len(commands) else 0
 
 
+@public
 def replay_log(
     logs: Sequence[RobotLog],
     anatomy: Anatomy,
@@ -173,7 +171,7 @@ def prepare(logs: list[RobotLog], anatomy: Anatomy, given: float, robot: RobotCo
     """Project what was seen in episodes onto a vessel, once for many replays.
 
     Raises:
-        InputError: it was seen beside the vessel, or a drive goes too far: in another frame, or another unit.
+        InputError: a drive goes too far: in another unit.
     """
     longest_mm = float(anatomy.tree.longest_path().abscissa[-1])
     for log in logs:
@@ -184,17 +182,11 @@ def prepare(logs: list[RobotLog], anatomy: Anatomy, given: float, robot: RobotCo
             )
     courses, project = Courses.of(logs, robot.wire), TipProjector(anatomy.tree, anatomy.insertion)
     abscissa, branch = np.full(courses.seen.shape, np.nan), np.full(courses.seen.shape, -1.0)
-    share, off = np.zeros(courses.seen.shape, dtype=bool), []
+    share = np.zeros(courses.seen.shape, dtype=bool)
     for k, log in enumerate(logs):
         count, tip = int(log.seen.sum()), project(log.tip[log.seen])
         abscissa[k, :count], branch[k, :count] = tip.abscissa, tip.branch
-        off.append(tip.offset)
         share[k, : max(1, round(given * count))] = True
-    if (away := float(np.median(np.concatenate(off)))) > _BESIDE_MM:
-        raise InputError(
-            f"{logs[0].name}: half of the tips lie {away:.0f} mm or more from the nearest centerline of "
-            f"{anatomy.name}; give them in LPS mm of the CT that the vessel is from"
-        )
     return Prepared(logs, courses, anatomy, project, abscissa, branch, share & courses.seen)
 
 

@@ -12,8 +12,7 @@ from jaxtyping import Float
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Proximals
-from endopilot.simulation.recorder import Recorder
-from endopilot.simulation.robots import Robots
+from endopilot.simulation.robots import Recorder, Robots
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
 

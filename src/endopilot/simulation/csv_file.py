@@ -103,6 +103,12 @@ def _plain(name: str) -> str:
 
 def _header(path: Path, row: list[str], needed: Sequence[str], optional: Sequence[str]) -> list[str]:
     header = [_plain(name) for name in row]
+    if (
+        len(header) > 1
+        and not _NUMBER.fullmatch(header[0])
+        and all(_NUMBER.fullmatch(name.replace(",", ".")) for name in header[1:])
+    ):
+        raise InputError(f"{path}: row 1 holds one name and then numbers; exchange rows and columns")
     if all(_NUMBER.fullmatch(name) for name in header):
         raise InputError(f"{path}: row 1 holds numbers; give the columns' names there: {', '.join(needed)}")
     for name in needed:

@@ -9,8 +9,7 @@ from jaxtyping import Float
 
 from endopilot.progress import Advance
 from endopilot.simulation.core_state import CONTACTS, LIMIT, nodes_of, with_nodes
-from endopilot.simulation.groups import Group
-from endopilot.simulation.vessel_wall import factor_at
+from endopilot.simulation.groups import Group, factor_at
 
 _SUMMED = ("iterations", "node_iterations", "slip", "rotation_slip", "approach_slip")
 """What adds up over the steps of a sample; of all else the last step's counts."""

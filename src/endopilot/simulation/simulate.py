@@ -13,9 +13,10 @@ from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError, Remark
 from endopilot.progress import progress
+from endopilot.settings import public
 from endopilot.simulation.checks import check_control, check_memory, check_shape_memory, with_device_axis
 from endopilot.simulation.config import Actuation, SimulatorConfig
-from endopilot.simulation.motion import Motion
+from endopilot.simulation.motion import Motion, MotionName, motion_named
 from endopilot.simulation.set_up import SimulationSetUp
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.trajectory import Trajectory
@@ -48,6 +49,7 @@ class WallForceEvent:
     force_n: float
 
 
+@public
 def simulate(
     anatomy: Anatomy,
     device: Wire | Stack | str | Path,
@@ -56,7 +58,7 @@ def simulate(
     actuation: Actuation = "velocity",
     initial: Float[np.ndarray, "worlds ... 2"] | None = None,
     friction: Float[np.ndarray, "worlds ..."] | None = None,
-    motion: Motion | None = None,
+    motion: Motion | MotionName | None = None,
     config: SimulatorConfig | None = None,
     record_shape: bool = False,
     period_s: float = SAMPLE_PERIOD_S,
@@ -78,7 +80,7 @@ def simulate(
             The wire is pushed there from the ostium at `config.approach_velocity_mm_s`, with its catheters along with
             it, then rests for 0.5 s.
         friction: Coulomb friction coefficients on the wall; the devices' own if not given.
-        motion: how the vessel moves with time; it lies still if not given.
+        motion: how the vessel moves with time, or the name of a motion such as "breathing"; it lies still if not given.
         config: settings of the rod core.
         record_shape: record the positions of all nodes too.
         period_s: time that each control holds, and from one recorded sample to the next, s.
@@ -105,7 +107,7 @@ def simulate(
         initial=with_device_axis("initial", np.asarray(initial, dtype=float), (worlds, len(stack), 2)),
         friction=with_device_axis("friction", np.asarray(friction, dtype=float), (worlds, len(stack))),
         actuation=actuation,
-        motion=motion,
+        motion=motion_named(motion) if isinstance(motion, str) else motion,
         config=config or SimulatorConfig(),
     )
     trajectory = run_set_up(set_up, control, period_s=period_s, record_shape=record_shape)

@@ -22,6 +22,7 @@ from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.progress import Advance
+from endopilot.settings import public
 from endopilot.simulation.checks import ROUNDING_MM, check_control, check_memory, check_travel, with_device_axis
 from endopilot.simulation.config import FREE_BEHIND_MM, LANES, Actuation, SimulatorConfig
 from endopilot.simulation.friction_along import run_along
@@ -55,6 +56,7 @@ class Simulator(Readout):
         (4, 1, 3)
     """
 
+    @public
     def __init__(
         self,
         anatomy: Anatomy | Sequence[Anatomy],

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.errors import InputError
-from endopilot.files import writing
+from endopilot.files import regular, writing
 from endopilot.simulation.signals import SolvedOutputs, described
 
 FORMAT_VERSION = 4
@@ -75,7 +75,7 @@ class SimulatorState:
             InputError: the file is missing, is no saved state, or is one of another format version.
         """
         try:
-            with np.load(path, allow_pickle=False) as stored:
+            with np.load(regular(path), allow_pickle=False) as stored:
                 fingerprint = str(stored["fingerprint"])
                 version = int(stored["format_version"]) if "format_version" in stored else 0
                 names = sorted((name for name in stored.files if name.startswith("values_")), key=_number)

@@ -23,11 +23,11 @@ import numpy as np
 
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire
-from endopilot.devices.stack import Stack
-from endopilot.devices.transmission import Transmission
+from endopilot.devices.stack import Stack, Transmission
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
-from endopilot.files import json_text, writing
+from endopilot.files import json_text, regular, writing
+from endopilot.settings import public
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion, place
 from endopilot.simulation.set_up import SimulationSetUp
@@ -106,6 +106,7 @@ def write_trajectory(trajectory: Trajectory, path: Path) -> None:
                 np.savez_compressed(stream, about=np.array(_about(trajectory, arrays)), **arrays)  # pyright: ignore[reportArgumentType]
 
 
+@public
 def read_trajectory(path: str | Path, *, anatomy: Anatomy | Sequence[Anatomy] | None = None) -> Trajectory:
     """Read a trajectory from an .npz file.
 
@@ -117,7 +118,7 @@ def read_trajectory(path: str | Path, *, anatomy: Anatomy | Sequence[Anatomy] | 
         InputError: no such file, or one that is no trajectory, of another version, or of another vessel.
     """
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with np.load(regular(path), allow_pickle=False) as stored:
             about = json.loads(str(stored["about"]))
             arrays = {name: stored[name] for name in stored.files if name != "about"}
         if about.get("format") != _FORMAT:

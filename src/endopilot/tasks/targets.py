@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -44,9 +45,14 @@ def find_target(tree: VesselTree, place: Place, *, depth_mm: float | None = None
         return _nearest(tree, place, ",".join(f"{number:g}" for number in place))
     if not place.strip():
         raise InputError("target: is empty; give a section such as 4, or a point X,Y,Z in LPS mm")
+    place = place.strip(" ()[]")
     parts = place.split(",")
-    if len(parts) == 3:
+    if len(parts) == 3 and ";" not in place:
         return _nearest(tree, parts, place)
+    numbers = re.findall(r"[-+0-9.e]+", place)
+    if len(numbers) > 1 and not re.sub(r"[-+0-9.e,;\s]", "", place):
+        mend = f"write it as {','.join(numbers)}" if len(numbers) == 3 else f"these are {len(numbers)} numbers"
+        raise InputError(f"target: {place!r}; a point is X,Y,Z in LPS mm, three numbers with commas: {mend}")
     label = _section(tree, place)
     return _middle(tree, label) if depth_mm is None else _beyond(tree, label, depth_mm)
 

@@ -20,6 +20,7 @@ from scipy.ndimage import gaussian_filter, zoom
 
 from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
+from endopilot.imaging.grid import check_covers
 from endopilot.settings import Finite, Positive, Share, ShareBelowOne, Within, settings
 from endopilot.simulation.motion import place
 from endopilot.types import Anatomy, Volume
@@ -152,7 +153,12 @@ class XrayImager:
             device: the wire or its name, or the wire and its catheters.
             ct: of the patient, HU; 200 mm of water if not given. The blood in the vessel loses its contrast.
             config: detector and beam.
+
+        Raises:
+            InputError: the CT is of another place than the vessel.
         """
+        if ct is not None:
+            check_covers(ct, anatomy)
         self.anatomy, self.stack, self.config = anatomy, Stack.of(device), config or ImageConfig()
         self.isocenter = isocenter_of(anatomy)
         self.lumen_points, self._lumen_size = lumen_points(anatomy)

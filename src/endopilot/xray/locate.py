@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from endopilot.errors import InputError
 from endopilot.progress import progress
+from endopilot.settings import public
 from endopilot.types import Anatomy
 from endopilot.xray.camera import Camera
 from endopilot.xray.carm import View
@@ -13,6 +14,7 @@ from endopilot.xray.frames import DeviceFrame
 from endopilot.xray.tip_filter import LocateConfig, TipFilter, TipLocation
 
 
+@public
 def locate(
     anatomy: Anatomy,
     *,

@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 from endopilot.devices.stack import Stack, lines_from_tips
 from endopilot.errors import InputError
 from endopilot.files import png_image, writing
-from endopilot.settings import LONGEST_S, Finite, Positive, Seed, Share, Text, Within, settings
+from endopilot.settings import LONGEST_S, Finite, Positive, Seed, Share, Text, Within, public, settings
 from endopilot.simulation.motion import Motion, MotionName, motion_named, place, relative
 from endopilot.simulation.simulate import simulate
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Volume
@@ -95,6 +95,7 @@ class XrayImage:
             partial.write_bytes(png_image(self.grey))
 
 
+@public
 def take_image(anatomy: Anatomy, *, config: TakeImageConfig | None = None, ct: Volume | None = None) -> XrayImage:
     """Push a wire into a vessel, and take an X-ray image of it.
 

@@ -29,14 +29,15 @@ from endopilot.xray.line_observations import (
     Line,
     Observations,
     SeenLine,
+    VesselGrid,
     joined,
     line_observations,
+    make_grid,
     see,
     shown_by,
     tip_observations,
 )
 from endopilot.xray.tip_posterior import Status, around_mode
-from endopilot.xray.vessel_grid import VesselGrid, make_grid
 
 _STEP_MM = 1.0
 """Distance of the grid's places, mm."""
