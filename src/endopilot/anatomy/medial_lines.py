@@ -39,6 +39,7 @@ class MedialLines:
         clearance: distance to the mask's border, mm; half a voxel where it is one or two voxels thick.
         edges: pairs of neighbours that make a forest: of every loop the edge at its narrowest place is left out.
         closing: these left-out edges.
+        edges_mm: edges of the voxels along their own axes (z, y, x), mm.
     """
 
     index: Int[np.ndarray, "n 3"]
@@ -46,6 +47,12 @@ class MedialLines:
     clearance: Float[np.ndarray, "n"]
     edges: Int[np.ndarray, "m 2"]
     closing: Int[np.ndarray, "k 2"]
+    edges_mm: Float[np.ndarray, "3"]
+
+    @cached_property
+    def local(self) -> Float[np.ndarray, "n 3"]:
+        """Positions along the mask's own axes (z, y, x), mm."""
+        return self.index * self.edges_mm
 
     @cached_property
     def share_mm(self) -> Float[np.ndarray, "n"]:
@@ -78,6 +85,13 @@ class MedialLines:
                 behind[before[node]] += behind[node]
         return length, behind
 
+    def part(self, kept: Bool[np.ndarray, "n"], corner: Int[np.ndarray, "3"]) -> MedialLines:
+        """Return some of the points with what joins them, in a mask that begins at the voxel `corner` of this one."""
+        number = np.cumsum(kept) - 1
+        edges, closing = (number[pairs[kept[pairs].all(axis=1)]] for pairs in (self.edges, self.closing))
+        index = self.index[kept] - corner
+        return MedialLines(index, self.points[kept], self.clearance[kept], edges, closing, self.edges_mm)
+
     def way(self, one: int, two: int) -> list[int]:
         """Return the points of the only path between two points of a piece."""
         length, before = self._rooted
@@ -107,7 +121,8 @@ def thinned_lines(mask: Volume) -> MedialLines:
     clearance = _clearance(voxels, index, mask.spacing_mm)
     pairs = KDTree(index).query_pairs(_NEIGHBOURS_APART, output_type="ndarray").astype(np.int64).reshape(-1, 2)
     edges, closing = _widest_forest(pairs, clearance, np.linalg.norm(index[pairs[:, 0]] - index[pairs[:, 1]], axis=1))
-    return MedialLines(index, mask.index_to_world(index[:, ::-1].astype(float)), clearance, edges, closing)
+    points = mask.index_to_world(index[:, ::-1].astype(float))
+    return MedialLines(index, points, clearance, edges, closing, mask.spacing_mm[::-1])
 
 
 def traced_lines(mask: Volume) -> MedialLines:
@@ -124,7 +139,7 @@ def traced_lines(mask: Volume) -> MedialLines:
     places = np.concatenate(index)
     points = mask.index_to_world(places[:, ::-1].astype(float))
     joined = np.concatenate(edges)
-    return MedialLines(places, points, np.concatenate(clearance), joined, joined[:0])
+    return MedialLines(places, points, np.concatenate(clearance), joined, joined[:0], mask.spacing_mm[::-1])
 
 
 def _traced_piece(

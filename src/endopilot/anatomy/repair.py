@@ -5,16 +5,18 @@ Every repair returns remarks, which `extract_anatomy` writes into the provenance
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import binary_fill_holes, center_of_mass, distance_transform_edt, find_objects
+from scipy.ndimage import center_of_mass, distance_transform_edt, find_objects
 from scipy.spatial import KDTree
 
+from endopilot.anatomy.medial_lines import MedialLines, traced_lines
 from endopilot.anatomy.parent_vessel import COMPARABLE, Vessel, piece_on_side
 from endopilot.anatomy.surface import filled_box
-from endopilot.anatomy.topology import parted
+from endopilot.anatomy.topology import MOST_LISTED, SMALLEST_PIECE, Touch, parted, touch_remarks
 from endopilot.errors import InputError, place_text
 from endopilot.imaging.grid import connected_components
 from endopilot.types import Insertion, Volume
@@ -31,17 +33,73 @@ _DIRECTION_VOXELS = 12.0
 _ONWARDS = 0.5
 """Cosine of the largest angle between a piece and the gap that it is joined across."""
 
-SMALLEST_PIECE = 12
-"""A piece of fewer voxels is noise."""
-
 NOTED_MM = 5.0
 """What is left out or widened gets a remark of its own from this length; shorter pieces are summed up."""
 
-MOST_LISTED = 8
-"""As many pieces are listed one by one."""
+_MOST_JOINED = 200
+"""At most this many pieces of a mask are looked at as vessels or parts of them."""
 
-MOST_PIECES = 12
-"""At most this many pieces of a mask are looked at as coronary arteries or parts of them."""
+OTHER_SIDE = {"rca": "left coronary artery", "lca": "right coronary artery"}
+
+
+@dataclass(frozen=True, eq=False)
+class Lumen:
+    """One lumen of a mask, ready for its wall.
+
+    Attributes:
+        mask: its voxels.
+        lines: their middle.
+        before: middle of all that the file connects with it: what the tree should reach.
+        told: which points of `before` lie in another vessel that was parted from this one, and that a remark names.
+        notes: remarks on what was joined, parted and left out.
+    """
+
+    mask: Volume
+    lines: MedialLines
+    before: MedialLines
+    told: Bool[np.ndarray, "_"]
+    notes: list[str]
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """The pieces of a mask, without specks.
+
+    Attributes:
+        joined: voxels as they were read, and over gaps of a few voxels to what carries on.
+        before: their middle.
+        gaps: a voxel of what lies beyond each gap, and whether it was joined or runs alongside.
+        parted: the same, parted where it touches itself.
+        lines: the middle of that.
+        touches: what touches.
+        specks: what is no vessel.
+    """
+
+    joined: Volume
+    before: MedialLines
+    gaps: list[tuple[Int[np.ndarray, "3"], bool]]
+    parted: Volume
+    lines: MedialLines
+    touches: list[Touch]
+    specks: Bool[np.ndarray, "nz ny nx"]
+
+
+@lru_cache(maxsize=1)
+def pieces_of(mask: Volume) -> Pieces:
+    """Return the pieces of a mask that holds some; the last mask's are kept: several stages ask for them."""
+    box = filled_box(mask.voxels)
+    voxels = np.asarray(mask.voxels[box], dtype=bool)
+    origin = mask.index_to_world(np.array([part.start for part in box][::-1], dtype=float))
+    labels = connected_components(voxels, corners=True)
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    order = np.argsort(-sizes, kind="stable")[:_MOST_JOINED]
+    order = order[sizes[order] >= min(SMALLEST_PIECE, sizes.max())]
+    large = np.isin(np.arange(len(sizes)), order)[labels]
+    joined, gaps = _joined(large, labels, order)
+    read = replace(mask, voxels=joined, origin_mm=origin)
+    before = traced_lines(read)
+    return Pieces(read, before, gaps, *parted(read, before), voxels & ~large)
 
 
 def connected_mask(
@@ -50,11 +108,11 @@ def connected_mask(
     label: str,
     vessel: Vessel = "generic",
     other_ostium: Float[np.ndarray, "3"] | None = None,
-) -> tuple[Volume, list[str]]:
+) -> Lumen:
     """Return the one lumen at the ostium, or the largest: gaps of a few voxels bridged, cavities filled, blobs removed.
 
-    Loops of it and places where it touches itself are cut (`topology.parted`). Where a mask holds both coronary
-    arteries and no ostium is given, `vessel` decides by the patient's side.
+    Places where it touches itself are parted (`topology.parted`). Where a mask holds both coronary arteries and no
+    ostium is given, `vessel` decides by the patient's side.
 
     Args:
         mask: one or several lumens, and specks.
@@ -66,66 +124,58 @@ def connected_mask(
     Raises:
         InputError: the mask is empty, full, a solid block, noise, or touches nothing near the given ostium.
     """
-    box = filled_box(mask.voxels)
-    if box[0].stop == 0:
+    if not mask.voxels.any():
         raise InputError(f"{label}: the mask is empty; check the label or segment again")
     if mask.voxels.all():
         raise InputError(f"{label}: the mask is a solid block (every voxel belongs to it); segment the vessel alone")
-    corner = np.array([part.start for part in box])
-    voxels = np.asarray(mask.voxels[box], dtype=bool)
-    _refuse_blocks_and_noise(voxels, label)
-    cropped = replace(mask, voxels=voxels, origin_mm=mask.index_to_world(corner[::-1].astype(float)))
-    labels, sizes, main, others = _pieces(cropped, given, label, vessel)
-    own, piece = _cut_out(cropped, labels == main)
-    whole, remarks = parted(piece)
-    severed: set[int] = set()  # what was cut off must not be bridged again
-    if remarks:
-        cropped = replace(cropped, voxels=voxels.copy())
-        cropped.voxels[own] &= ~piece.voxels | whole.voxels
-        labels, sizes, main, others = _pieces(cropped, given, label, vessel)
-        severed = {int(number) for number in np.unique(labels[own][whole.voxels])}
-    result, count = labels == main, len(sizes) - 1
-    if count > 1:
-        pieces = [int(piece) for piece in np.argsort(-sizes)[: min(count, 200)] if piece != main]
-        foreign = _piece_at(cropped, labels, sizes, other_ostium)
-        near = [p for p in pieces if sizes[p] >= SMALLEST_PIECE and p not in (foreign, *severed)]
-        result, joined, beside = _bridged(result, labels, near)
-        if beside:
-            remarks.append(f"{beside} pieces that run alongside the lumen, not on from it, were not joined to it")
-        apart = [piece for piece in others if piece != foreign and not result[labels == piece].any()]
-        if apart:
-            remarks.append(other_pieces_text(vessel, len(apart)))
-        if joined:
-            remarks.append(f"{joined} gaps of up to {LARGEST_GAP_VOXELS:g} voxels bridged")
-        if foreign:
-            other = "left" if vessel == "rca" else "right"
-            remarks.append(f"the {other} coronary artery ({sizes[foreign]} voxels) is not part of this one")
-        remarks += _left_out(cropped, result, labels, sizes, foreign)
-    if result.sum() < SMALLEST_PIECE:
-        raise InputError(f"{label}: the lumen has only {int(result.sum())} voxels; check the label or segment again")
-    _, lumen = _cut_out(cropped, result)
-    closed = binary_fill_holes(lumen.voxels)
-    assert closed is not None
-    if closed.sum() > lumen.voxels.sum():
-        remarks.append(f"cavities of {int(closed.sum() - lumen.voxels.sum())} voxels filled")
-    return replace(lumen, voxels=closed), remarks
-
-
-def joined_mask(mask: Volume) -> Volume:
-    """Return a mask in which each of the largest pieces is joined to what carries it on; specks are left out."""
-    voxels = np.asarray(mask.voxels, dtype=bool)
-    labels = connected_components(voxels, corners=True)
+    _refuse_blocks_and_noise(np.asarray(mask.voxels[filled_box(mask.voxels)], dtype=bool), label)
+    whole = pieces_of(mask)
+    labels = connected_components(whole.parted.voxels, corners=True)
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
-    pieces = [int(piece) for piece in np.argsort(-sizes)[:MOST_PIECES] if sizes[piece] >= SMALLEST_PIECE]
-    result = np.zeros_like(voxels)
-    for piece in pieces:
-        own = labels == piece
-        if result[own].any():
-            continue
-        others = [other for other in pieces if other != piece and not result[labels == other].any()]
-        result |= _bridged(own, labels, others)[0]
-    return replace(mask, voxels=result)
+    if given is None:
+        main, others = _piece_on_side(whole.parted, labels, sizes, vessel)
+    else:
+        main, others = _nearest_piece(whole.parted, labels, sizes, given, label), []
+    if sizes[main] < SMALLEST_PIECE:
+        raise InputError(f"{label}: the lumen has only {sizes[main]} voxels; check the label or segment again")
+    result, read = labels == main, connected_components(whole.joined.voxels, corners=True)
+    own = read == read[result][0]  # all that the file connects with it
+    foreign = _piece_at(whole.parted, labels, sizes, other_ostium)
+    severed = np.setdiff1d(labels[own], [0, main])
+    remarks = touch_remarks([touch for touch in whole.touches if _holds(whole.joined, own, touch.place)])
+    joints = [joined for place, joined in whole.gaps if own[tuple(place)]]
+    if beside := joints.count(False):
+        remarks.append(f"{beside} pieces that run alongside the lumen, not on from it, were not joined to it")
+    if apart := np.setdiff1d(others, [foreign, *severed]).tolist():
+        remarks.append(other_pieces_text(vessel, len(apart)))
+    if joints.count(True):
+        remarks.append(f"{joints.count(True)} gaps of up to {LARGEST_GAP_VOXELS:g} voxels bridged")
+    if foreign:
+        remarks.append(f"the {OTHER_SIDE[vessel]} ({sizes[foreign]} voxels) is not part of this one")
+    remarks += _left_out(whole, result, labels, foreign, severed, vessel)
+    box = filled_box(result)
+    corner = np.array([part.start for part in box])
+    closed = _filled(result[box])
+    if closed.sum() > sizes[main]:
+        remarks.append(f"cavities of {int(closed.sum() - sizes[main])} voxels filled")
+    lumen = replace(mask, voxels=closed, origin_mm=whole.joined.index_to_world(corner[::-1].astype(float)))
+    lines = whole.lines.part(result[tuple(whole.lines.index.T)], corner)
+    before = whole.before.part(own[tuple(whole.before.index.T)], corner)
+    told = np.isin(labels[tuple((before.index + corner).T)], severed)
+    return Lumen(lumen, lines, before, told, remarks)
+
+
+def _holds(mask: Volume, voxels: Bool[np.ndarray, "nz ny nx"], place: Float[np.ndarray, "3"]) -> bool:
+    """Return whether some voxels lie at a place, LPS mm, or next to it."""
+    at = np.rint(mask.world_to_index(place)).astype(int)[::-1]
+    return bool(voxels[tuple(slice(max(0, i - 1), i + 2) for i in at)].any())
+
+
+def _filled(voxels: Bool[np.ndarray, "nz ny nx"]) -> Bool[np.ndarray, "nz ny nx"]:
+    """Return voxels with the cavities inside them."""
+    outside = connected_components(np.pad(~voxels, 1, constant_values=True))
+    return (outside != outside[0, 0, 0])[1:-1, 1:-1, 1:-1]
 
 
 def _refuse_blocks_and_noise(voxels: Bool[np.ndarray, "nz ny nx"], label: str) -> None:
@@ -154,25 +204,6 @@ def _nearest_piece(mask: Volume, labels: np.ndarray, sizes: np.ndarray, given: I
     return int(labels[tuple(index[gap.argmin()])])
 
 
-def _pieces(
-    mask: Volume, given: Insertion | None, label: str, vessel: Vessel
-) -> tuple[np.ndarray, np.ndarray, int, list[int]]:
-    """Return the connected pieces' labels and sizes, the wanted one, and others that are nearly as large."""
-    labels = connected_components(mask.voxels, corners=True)
-    sizes = np.bincount(labels.ravel())
-    sizes[0] = 0
-    if given is None:
-        return labels, sizes, *_piece_on_side(mask, labels, sizes, vessel)
-    return labels, sizes, _nearest_piece(mask, labels, sizes, given, label), []
-
-
-def _cut_out(mask: Volume, voxels: Bool[np.ndarray, "nz ny nx"]) -> tuple[tuple[slice, slice, slice], Volume]:
-    """Return the smallest box that holds some voxels of a mask, and these voxels alone as a mask of that box."""
-    box = filled_box(voxels)
-    corner = np.array([part.start for part in box][::-1], dtype=float)
-    return box, replace(mask, voxels=voxels[box], origin_mm=mask.index_to_world(corner))
-
-
 def _piece_at(mask: Volume, labels: np.ndarray, sizes: np.ndarray, place: Float[np.ndarray, "3"] | None) -> int:
     """Return the label of the piece at a place, 0 if there is none."""
     if place is None:
@@ -184,20 +215,29 @@ def _piece_at(mask: Volume, labels: np.ndarray, sizes: np.ndarray, place: Float[
 
 
 def _left_out(
-    mask: Volume, result: Bool[np.ndarray, "nz ny nx"], labels: np.ndarray, sizes: np.ndarray, foreign: int
+    whole: Pieces,
+    result: Bool[np.ndarray, "nz ny nx"],
+    labels: Int[np.ndarray, "nz ny nx"],
+    foreign: int,
+    severed: Int[np.ndarray, "_"],
+    vessel: Vessel,
 ) -> list[str]:
     """Say which pieces were left out and where they lie, since a real vessel may be lost with them.
 
     Args:
-        mask: all pieces.
+        whole: all pieces.
         result: the lumen.
         labels: number of each piece.
-        sizes: their voxels, by number.
-        foreign: number of a piece that belongs to another vessel, 0 if there is none.
+        foreign: number of the other coronary artery, 0 if it is not there or not known.
+        severed: numbers of those that touched the lumen and were parted from it.
+        vessel: which vessel is wanted.
     """
-    kept = np.isin(np.arange(len(sizes)), labels[result])
-    kept[[0, foreign]] = True
-    lost = np.flatnonzero(~kept)
+    mask, labels = (
+        whole.parted,
+        np.where(whole.specks, connected_components(whole.specks, corners=True) + labels.max(), labels),
+    )
+    sizes = np.bincount(labels.ravel())
+    lost = np.setdiff1d(np.flatnonzero(sizes), [0, labels[result][0], foreign])
     if len(lost) == 0:
         return []
     boxes = find_objects(labels)
@@ -209,14 +249,19 @@ def _left_out(
     for number in order[:MOST_LISTED]:
         if extent[number] < NOTED_MM:
             break
-        box = boxes[lost[number] - 1]
-        own = np.argwhere(labels[box] == lost[number]) + corners[number, :, 0]
+        piece = lost[number]
+        own = np.argwhere(labels[boxes[piece - 1]] == piece) + corners[number, :, 0]
         place = mask.index_to_world(own[:, ::-1].astype(float))
         gap = np.asarray(reach.query(place)[0])
+        at, apart = place_text(place[gap.argmin()]), "apart from the lumen"
+        begins = f"begins {gap.min():.1f} mm away at {at}"
+        kind = "a piece"
+        if piece in severed:
+            kind, apart, begins = "another vessel", "that touches this one", f"touches it at {at}"
+        elif sizes[piece] >= COMPARABLE * result.sum():
+            kind = "another vessel" if vessel == "generic" else f"another vessel, such as the {OTHER_SIDE[vessel]},"
         remarks.append(
-            f"a piece apart from the lumen left out ({sizes[lost[number]]} voxels): it is {extent[number]:.0f} mm long "
-            f"and begins {gap.min():.1f} mm away at {place_text(place[gap.argmin()])}; close the gap in the mask if it "
-            "belongs to the vessel"
+            f"{kind} {apart} left out ({sizes[piece]} voxels): it is {extent[number]:.0f} mm long and {begins}"
         )
     rest = order[len(remarks) :]
     if len(rest):
@@ -226,42 +271,53 @@ def _left_out(
     return remarks
 
 
-def _bridged(
-    result: Bool[np.ndarray, "nz ny nx"], labels: np.ndarray, pieces: list[int]
-) -> tuple[Bool[np.ndarray, "nz ny nx"], int, int]:
+def _joined(
+    voxels: Bool[np.ndarray, "nz ny nx"], labels: Int[np.ndarray, "nz ny nx"], order: Int[np.ndarray, "_"]
+) -> tuple[Bool[np.ndarray, "nz ny nx"], list[tuple[Int[np.ndarray, "3"], bool]]]:
     """Join pieces that lie within the largest gap by tubes as wide as the vessels at both ends.
 
-    Returns the lumen, how many pieces were joined, and how many are near enough but run alongside it: two vessels that
-    pass each other are not one.
+    Two vessels that pass each other are not one: a piece that runs alongside another is not joined to it.
+
+    Args:
+        voxels: the pieces.
+        labels: number of each.
+        order: these numbers, the largest piece first.
+
+    Returns:
+        The voxels, and for each gap a voxel at it and whether it was bridged.
     """
-    if not pieces:
-        return result, 0, 0
-    result, joined, beside = result.copy(), 0, 0
+    index = np.argwhere(voxels)
+    index = index[np.argsort(labels[tuple(index.T)], kind="stable")]
+    numbers, starts = np.unique(labels[tuple(index.T)], return_index=True)
+    members = dict(zip(numbers.tolist(), np.split(index, starts[1:]), strict=True))
+    left, gaps, result = order.tolist(), list[tuple[np.ndarray, bool]](), voxels.copy()
     clearance: np.ndarray | None = None  # where nothing is joined it is not needed
-    members = {piece: np.argwhere(labels == piece) for piece in pieces}
-    changed = True
-    while changed:
-        changed = False
-        here = np.argwhere(result)
-        reach = KDTree(here)
-        for piece in list(members):
-            gap, nearest = map(np.asarray, reach.query(members[piece], distance_upper_bound=LARGEST_GAP_VOXELS))
-            best = int(np.argmin(gap))
-            if not np.isfinite(gap[best]):
-                continue
-            start, own = here[nearest[best]], members.pop(piece)
-            end = own[best]
-            if not (_carries_on(here, start, end) or _carries_on(own, end, start)):
-                beside += 1
-                continue
-            if clearance is None:
-                clearance = np.asarray(distance_transform_edt(labels > 0))
-            width = min(_widest(clearance, start), _widest(clearance, end))
-            _draw_tube(result, start, end, width)
-            result |= labels == piece
-            joined += 1
-            changed = True
-    return result, joined, beside
+    while len(left) > 1:
+        here, asked = members[left.pop(0)], list(left)
+        while asked:
+            reach = KDTree(here)
+            found = [
+                (piece, *map(np.asarray, reach.query(members[piece], distance_upper_bound=LARGEST_GAP_VOXELS)))
+                for piece in asked
+            ]
+            found = [each for each in found if np.isfinite(each[1].min())]
+            if not found:
+                break
+            asked, grown = [piece for piece in asked if piece not in [each[0] for each in found]], False
+            for piece, gap, nearest in found:
+                best = int(gap.argmin())
+                start, end = here[nearest[best]], members[piece][best]
+                onwards = _carries_on(here, start, end) or _carries_on(members[piece], end, start)
+                gaps.append((start, onwards))
+                if onwards:
+                    clearance = np.asarray(distance_transform_edt(voxels)) if clearance is None else clearance
+                    _draw_tube(result, start, end, min(_widest(clearance, start), _widest(clearance, end)))
+                    left.remove(piece)
+                    members[piece], here = members[piece][:0], np.concatenate([here, members[piece]])
+                    grown = True
+            if not grown:
+                break
+    return result, gaps
 
 
 def _carries_on(voxels: Int[np.ndarray, "n 3"], end: Int[np.ndarray, "3"], beyond: Int[np.ndarray, "3"]) -> bool:
