@@ -9,7 +9,7 @@ import pytest
 from make_vessels import hairpin, length_of, line, lumen, tubes, with_voxels
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
-from endopilot.anatomy.topology import parted
+from endopilot.anatomy.topology import parted, touch_remarks
 from endopilot.errors import InputError
 from endopilot.types import Volume
 
@@ -52,9 +52,9 @@ def test_the_root_of_a_hairpin_is_its_wide_end_though_the_narrow_end_touches_it(
 
 def test_two_limbs_that_touch_over_their_length_are_parted():
     mask = tubes((hairpin(50, 3.4), 1.8), voxel_mm=(0.35, 0.35, 0.5))
-    whole, remarks = parted(mask)
+    whole, found, *_ = parted(mask)
     assert whole.voxels.sum() < mask.voxels.sum()
-    assert len(remarks) == 1 and "touch over" in remarks[0]
+    assert len(found) == 1 and "touch over" in touch_remarks(found)[0]
 
 
 @pytest.mark.parametrize("voxel_mm", VOXELS)

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import center_of_mass, distance_transform_edt, find_objects
 from scipy.spatial import KDTree
 
-from endopilot.anatomy.medial_lines import MedialLines, traced_lines
+from endopilot.anatomy.medial_lines import MedialLines
 from endopilot.anatomy.parent_vessel import COMPARABLE, Vessel, piece_on_side
 from endopilot.anatomy.surface import filled_box
 from endopilot.anatomy.topology import MOST_LISTED, SMALLEST_PIECE, Touch, parted, touch_remarks
@@ -67,21 +67,21 @@ class Pieces:
 
     Attributes:
         joined: voxels as they were read, and over gaps of a few voxels to what carries on.
-        before: their middle.
-        gaps: a voxel of what lies beyond each gap, and whether it was joined or runs alongside.
-        parted: the same, parted where it touches itself.
-        lines: the middle of that.
+        gaps: a voxel at each gap, and whether what lies beyond was joined or runs alongside.
+        specks: voxels that are no vessel.
+        parted: the joined voxels, parted where they touch.
         touches: what touches.
-        specks: what is no vessel.
+        before: middle of the joined voxels.
+        lines: middle of the parted ones.
     """
 
     joined: Volume
-    before: MedialLines
     gaps: list[tuple[Int[np.ndarray, "3"], bool]]
-    parted: Volume
-    lines: MedialLines
-    touches: list[Touch]
     specks: Bool[np.ndarray, "nz ny nx"]
+    parted: Volume
+    touches: list[Touch]
+    before: MedialLines
+    lines: MedialLines
 
 
 @lru_cache(maxsize=1)
@@ -98,8 +98,7 @@ def pieces_of(mask: Volume) -> Pieces:
     large = np.isin(np.arange(len(sizes)), order)[labels]
     joined, gaps = _joined(large, labels, order)
     read = replace(mask, voxels=joined, origin_mm=origin)
-    before = traced_lines(read)
-    return Pieces(read, before, gaps, *parted(read, before), voxels & ~large)
+    return Pieces(read, gaps, voxels & ~large, *parted(read))
 
 
 def connected_mask(
@@ -169,7 +168,7 @@ def connected_mask(
 def _holds(mask: Volume, voxels: Bool[np.ndarray, "nz ny nx"], place: Float[np.ndarray, "3"]) -> bool:
     """Return whether some voxels lie at a place, LPS mm, or next to it."""
     at = np.rint(mask.world_to_index(place)).astype(int)[::-1]
-    return bool(voxels[tuple(slice(max(0, i - 1), i + 2) for i in at)].any())
+    return bool(voxels[tuple(slice(max(0, i - 2), i + 3) for i in at)].any())
 
 
 def _filled(voxels: Bool[np.ndarray, "nz ny nx"]) -> Bool[np.ndarray, "nz ny nx"]:
@@ -259,7 +258,9 @@ def _left_out(
         if piece in severed:
             kind, apart, begins = "another vessel", "that touches this one", f"touches it at {at}"
         elif sizes[piece] >= COMPARABLE * result.sum():
-            kind = "another vessel" if vessel == "generic" else f"another vessel, such as the {OTHER_SIDE[vessel]},"
+            kind = "another vessel, " + (
+                f"perhaps the {OTHER_SIDE[vessel]}," if vessel in OTHER_SIDE else "or a part not connected in the file,"
+            )
         remarks.append(
             f"{kind} {apart} left out ({sizes[piece]} voxels): it is {extent[number]:.0f} mm long and {begins}"
         )

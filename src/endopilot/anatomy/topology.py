@@ -126,38 +126,36 @@ class _Ring:
     around_mm: float
 
 
-def parted(mask: Volume, before: MedialLines | None = None) -> tuple[Volume, MedialLines, list[Touch]]:
-    """Return the mask parted where it touches itself, its middle, and all places where it touches or closes a loop.
+def parted(mask: Volume) -> tuple[Volume, list[Touch], MedialLines, MedialLines]:
+    """Return the mask parted where it touches itself, all places where it touches or closes a loop, and its middle.
 
-    No part of a lumen loses its way to the rest, except one of two vessels that certainly only touch.
-
-    Args:
-        mask: one or several lumens.
-        before: its middle, traced, if that is known.
+    No part of a lumen loses its way to the rest, except one of two vessels that certainly only touch. The middle is
+    that of the mask as it was, and as it is.
     """
-    parting = _Parting(mask)
-    lines = thinned_lines(mask)
-    rings = _rings(lines, mask)
+    parting, opened = _Parting(mask), True
+    lines = before = traced_lines(mask)
     for _ in range(_ROUNDS):
+        result = replace(mask, voxels=parting.voxels)
+        thin = thinned_lines(result)  # has all loops, but not all ends
+        lines = lines if parting.voxels is parting.whole else traced_lines(result)
+        rings = _rings(thin, mask)
         long = [ring for ring in rings if ring.around_mm >= SHORTEST_LOOP_MM]
-        opened = sum([parting.crossing(each, lines, long) for each in _crossings(lines, long)])
-        opened = opened or sum([parting.ring(each, lines) for each in long])
+        crossings = itertools.chain(_crossings(thin, long), _crossings(lines, []))
+        opened = sum([parting.crossing(each, thin, long) for each in crossings])
+        opened = opened or sum([parting.ring(each, thin) for each in long])
         if not opened:
+            for ring in rings:
+                if ring.around_mm < SHORTEST_LOOP_MM:
+                    parting.say("hole", thin.local[ring.nodes[0]], ring.around_mm)
             break
-        lines = thinned_lines(replace(mask, voxels=parting.voxels))
-        rings = _rings(lines, mask)
-    for ring in rings:
-        if ring.around_mm < SHORTEST_LOOP_MM:
-            parting.say("hole", lines.local[ring.nodes[0]], ring.around_mm)
-    traced = before if before is not None and parting.voxels is parting.whole else None
     result = replace(mask, voxels=parting.voxels)
-    traced = traced or traced_lines(result)
-    aside = _without_sides(result, traced)
+    lines = traced_lines(result) if opened else lines
+    aside = _without_sides(result, lines)
     if aside is not None:
         result, touch = aside
-        traced = traced_lines(result)
+        lines = traced_lines(result)
         parting.found.append(touch)
-    return result, traced, parting.found
+    return result, parting.found, before, lines
 
 
 def touch_remarks(found: list[Touch]) -> list[str]:
@@ -193,20 +191,31 @@ class _Parting:
             return False
         rim = _rim(self.voxels, self.edges, crossing)
         trial = self.voxels & ~rim
+        one, two, whole = self._held(trial, crossing)
         kind: Kind = "perhaps"
-        if rim.any() and _are_apart(trial, self.edges, crossing):
-            if _count(trial) <= _count(self.voxels):
-                kind = "itself"
-            elif crossing.certain and _count(self.whole & ~rim) > _count(self.whole):
-                kind = "vessels"
-        reach = sum(crossing.radii)
+        if whole and one == two and _count(trial) <= _count(self.voxels) and _are_apart(trial, self.edges, crossing):
+            kind = "itself"
+        elif whole and one != two and crossing.certain:
+            one, two, _ = self._held(self.whole & ~rim, crossing)
+            kind = "vessels" if one != two else "perhaps"
         if kind == "perhaps" and not crossing.likely:
             return False
-        through = [r.around_mm for r in rings if cdist(lines.local[r.nodes], [crossing.place]).min() < reach]
-        self.say(kind, crossing.place, min(through, default=0.0) if kind == "itself" else 0.0)
+        near = np.linalg.norm(lines.local - crossing.place, axis=1) < 0.5 * min(crossing.radii)
+        neck = lines.local[near & (lines.clearance <= lines.clearance[near].min(initial=np.inf))]
+        place = neck.mean(axis=0) if len(neck) else crossing.place
+        reach = sum(crossing.radii)
+        through = [r.around_mm for r in rings if cdist(lines.local[r.nodes], [place]).min() < reach]
+        self.say(kind, place, min(through, default=0.0) if kind == "itself" else 0.0)
         if kind != "perhaps":
             self.voxels = trial
         return kind != "perhaps"
+
+    def _held(self, voxels: Bool[np.ndarray, "nz ny nx"], crossing: _Crossing) -> tuple[int, int, bool]:
+        """Return which pieces two lines lie in, and whether either lies in one piece from end to end."""
+        labels = connected_components(voxels, corners=True)
+        ends = np.array([line[at] for line in crossing.lines for at in (0, -1)])
+        one, other, two, last = (int(labels[tuple(at)]) for at in np.rint(ends / self.edges).astype(int))
+        return one, two, one == other > 0 and two == last > 0
 
     def ring(self, ring: _Ring, lines: MedialLines) -> bool:
         """Cut a loop at its narrowest place, if nothing is lost by it, and return whether that was done."""
@@ -377,7 +386,8 @@ def _rim(
         np.asarray(KDTree(line).query(local)[0]) - radius
         for line, radius in zip(crossing.lines, crossing.radii, strict=True)
     )
-    near = np.maximum(one, two) < 1.5 * float(edges.max())
+    gap = max(0.0, float(np.linalg.norm(np.subtract(*crossing.nearest))) - sum(crossing.radii))
+    near = np.maximum(one, two) < gap / 2 + 1.5 * float(edges.max())
     rim = _between(voxels[window], index, one <= two)
     rim[tuple(index[~near].T)] = False
     whole = np.zeros_like(voxels)
