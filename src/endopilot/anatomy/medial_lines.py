@@ -117,7 +117,11 @@ def thinned_lines(mask: Volume) -> MedialLines:
     from skimage.morphology import skeletonize
 
     voxels = np.asarray(mask.voxels, dtype=bool)
-    index = np.argwhere(skeletonize(voxels, method="lee"))
+    labels = connected_components(voxels, corners=True)
+    found = [np.empty((0, 3), int)]
+    for number, box in enumerate(find_objects(labels), start=1):
+        found.append(np.argwhere(skeletonize(labels[box] == number, method="lee")) + [part.start for part in box])
+    index = np.concatenate(found)
     clearance = _clearance(voxels, index, mask.spacing_mm)
     pairs = KDTree(index).query_pairs(_NEIGHBOURS_APART, output_type="ndarray").astype(np.int64).reshape(-1, 2)
     edges, closing = _widest_forest(pairs, clearance, np.linalg.norm(index[pairs[:, 0]] - index[pairs[:, 1]], axis=1))

@@ -200,9 +200,7 @@ class _Parting:
             kind = "vessels" if one != two else "perhaps"
         if kind == "perhaps" and not crossing.likely:
             return False
-        near = np.linalg.norm(lines.local - crossing.place, axis=1) < 0.5 * min(crossing.radii)
-        neck = lines.local[near & (lines.clearance <= lines.clearance[near].min(initial=np.inf))]
-        place = neck.mean(axis=0) if len(neck) else crossing.place
+        place = np.argwhere(rim).mean(axis=0) * self.edges if rim.any() else crossing.place
         reach = sum(crossing.radii)
         through = [r.around_mm for r in rings if cdist(lines.local[r.nodes], [place]).min() < reach]
         self.say(kind, place, min(through, default=0.0) if kind == "itself" else 0.0)
