@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import find_objects
+from scipy.ndimage import distance_transform_edt, find_objects
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 from scipy.spatial import KDTree
@@ -24,6 +24,7 @@ from endopilot.types import Volume
 _NEIGHBOURS_APART = 1.8
 """Voxels that share a corner lie this near each other, in voxels."""
 
+_NEAR_VOXELS = 5.0
 _FEWEST = 4
 _STUB_VOXELS, _SLENDER = 4.0, 1.5
 """A side branch of the middle reaches this far out of its parent: in voxels, and in its own radii."""
@@ -155,7 +156,7 @@ def _traced_piece(
     if len(index) < _FEWEST:
         return index[:1], clearance[:1], np.empty((0, 2), int)
     graph = lumen_graph(index[:, ::-1] * edges_mm, clearance, edges_mm, int(clearance.argmax()))
-    graph = lumen_graph(graph.points, graph.clearance, edges_mm, int(graph.length.argmax()))
+    graph = graph.rooted_at(int(graph.length.argmax()))
     paths = trace_branches(graph, minimum_length_mm=_STUB_VOXELS * float(edges_mm.max()), slenderness=_SLENDER)
     places = np.rint(graph.points / edges_mm).astype(int)[:, ::-1]
     nodes: list[int] = []
@@ -180,8 +181,16 @@ def _clearance(
     voxels: Bool[np.ndarray, "nz ny nx"], index: Int[np.ndarray, "n 3"], edges_mm: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "n"]:
     """Return the distance from voxels of a mask to its border, mm: half a voxel on the border itself."""
-    border = np.argwhere(_border(voxels)) * edges_mm[::-1]
-    return np.asarray(KDTree(border).query(index * edges_mm[::-1])[0]) + 0.5 * float(edges_mm.min())
+    border, edges = _border(voxels), edges_mm[::-1]
+    near = _NEAR_VOXELS * float(edges.max())
+    gap = np.asarray(KDTree(np.argwhere(border) * edges).query(index * edges, distance_upper_bound=near)[0])
+    deep = np.isinf(gap)
+    if deep.any():  # there a search takes long, and all their nearest places lie in a smaller box
+        reach = np.ceil(near / edges).astype(int) + 1
+        low, high = np.maximum(index[deep].min(axis=0) - reach, 0), index[deep].max(axis=0) + reach + 1
+        window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        gap[deep] = np.asarray(distance_transform_edt(~border[window], sampling=edges))[tuple((index[deep] - low).T)]
+    return gap + 0.5 * float(edges.min())
 
 
 def _border(voxels: Bool[np.ndarray, "nz ny nx"]) -> Bool[np.ndarray, "nz ny nx"]:
