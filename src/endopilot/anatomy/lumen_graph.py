@@ -57,14 +57,20 @@ class LumenGraph:
 
     def rooted_at(self, node: int) -> LumenGraph:
         """Return the same graph with the cheapest paths to another root; points that it does not reach are left out."""
-        cost, predecessor = dijkstra(self.costs, directed=False, indices=node, return_predecessors=True)
-        reached = np.isfinite(cost)
-        renumber = np.cumsum(reached) - 1
-        parent = predecessor[reached].astype(np.int64)
-        parent = np.where(parent >= 0, renumber[np.maximum(parent, 0)], -1)
-        points, length = self.points[reached], _length_to_root(self.points[reached], parent)
-        costs = self.costs if reached.all() else self.costs[reached][:, reached]
-        return LumenGraph(points, self.clearance[reached], parent, length, self.spacing_mm, costs)
+        return _rooted(self.points, self.clearance, self.spacing_mm, self.costs, node)
+
+
+def _rooted(
+    points: Float[np.ndarray, "n 3"], clearance: Float[np.ndarray, "n"], spacing_mm: float, costs: csr_matrix, node: int
+) -> LumenGraph:
+    cost, predecessor = dijkstra(costs, directed=False, indices=node, return_predecessors=True)
+    reached = np.isfinite(cost)
+    renumber = np.cumsum(reached) - 1
+    parent = predecessor[reached].astype(np.int64)
+    parent = np.where(parent >= 0, renumber[np.maximum(parent, 0)], -1)
+    kept = points[reached]
+    costs = costs if reached.all() else costs[reached][:, reached]
+    return LumenGraph(kept, clearance[reached], parent, _length_to_root(kept, parent), spacing_mm, costs)
 
 
 def pieces(pairs: Int[np.ndarray, "m 2"], count: int) -> Int[np.ndarray, "count"]:
@@ -125,9 +131,7 @@ def lumen_graph(
     number = np.cumsum(kept) - 1
     pairs = number[np.concatenate(rows)], number[np.concatenate(columns)]
     matrix = csr_matrix((np.concatenate(costs), pairs), shape=(int(kept.sum()),) * 2)
-    empty = np.empty(0)
-    graph = LumenGraph(points[kept], clearance[kept], empty.astype(int), empty, float(edges.max()), matrix)
-    return graph.rooted_at(int(number[root]))
+    return _rooted(points[kept], clearance[kept], float(edges.max()), matrix, int(number[root]))
 
 
 def _levels(
@@ -147,7 +151,7 @@ def _levels(
         filled = np.asarray(distance_transform_edt(~middle, sampling=edges)) <= wide
         narrow = lumen & ~filled
         narrow[tuple(index[root])] = True
-        coarse = (filled & ~dilated(narrow, 2 * stride))[tuple(index.T)]
+        coarse = (filled & ~dilated(narrow, 2 * int(stride)))[tuple(index.T)]
         if not coarse.any():
             break
         level[coarse] = int(np.log2(stride))

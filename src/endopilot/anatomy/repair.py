@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import center_of_mass, distance_transform_edt, find_objects
 from scipy.spatial import KDTree
 
-from endopilot.anatomy.medial_lines import MedialLines
+from endopilot.anatomy.medial_lines import MedialLines, piece_labels
 from endopilot.anatomy.parent_vessel import COMPARABLE, Vessel, piece_on_side
 from endopilot.anatomy.surface import filled_box
 from endopilot.anatomy.topology import MOST_LISTED, SMALLEST_PIECE, Touch, parted, touch_remarks
@@ -91,11 +91,10 @@ def pieces_of(mask: Volume) -> Pieces:
     voxels = np.asarray(mask.voxels[box], dtype=bool)
     origin = mask.index_to_world(np.array([part.start for part in box][::-1], dtype=float))
     labels = connected_components(voxels, corners=True)
-    sizes = np.bincount(labels.ravel())
-    sizes[0] = 0
+    sizes = np.bincount(labels[voxels])
     order = np.argsort(-sizes, kind="stable")[:_MOST_JOINED]
     order = order[sizes[order] >= min(SMALLEST_PIECE, sizes.max())]
-    large = np.isin(np.arange(len(sizes)), order)[labels]
+    large = voxels if len(order) == labels.max() else np.isin(np.arange(len(sizes)), order)[labels]
     joined, gaps = _joined(large, labels, order)
     read = replace(mask, voxels=joined, origin_mm=origin)
     return Pieces(read, gaps, voxels & ~large, *parted(read))
@@ -129,16 +128,15 @@ def connected_mask(
         raise InputError(f"{label}: the mask is a solid block (every voxel belongs to it); segment the vessel alone")
     _refuse_blocks_and_noise(np.asarray(mask.voxels[filled_box(mask.voxels)], dtype=bool), label)
     whole = pieces_of(mask)
-    labels = connected_components(whole.parted.voxels, corners=True)
-    sizes = np.bincount(labels.ravel())
-    sizes[0] = 0
+    labels, read = piece_labels(whole.parted), piece_labels(whole.joined)
+    sizes = np.bincount(labels[whole.parted.voxels])
     if given is None:
         main, others = _piece_on_side(whole.parted, labels, sizes, vessel)
     else:
         main, others = _nearest_piece(whole.parted, labels, sizes, given, label), []
     if sizes[main] < SMALLEST_PIECE:
         raise InputError(f"{label}: the lumen has only {sizes[main]} voxels; check the label or segment again")
-    result, read = labels == main, connected_components(whole.joined.voxels, corners=True)
+    result = labels == main
     own = read == read[result][0]  # all that the file connects with it
     foreign = _piece_at(whole.parted, labels, sizes, other_ostium)
     severed = np.setdiff1d(labels[own], [0, main])
@@ -231,11 +229,10 @@ def _left_out(
         severed: numbers of those that touched the lumen and were parted from it.
         vessel: which vessel is wanted.
     """
-    mask, labels = (
-        whole.parted,
-        np.where(whole.specks, connected_components(whole.specks, corners=True) + labels.max(), labels),
-    )
-    sizes = np.bincount(labels.ravel())
+    mask = whole.parted
+    if whole.specks.any():
+        labels = labels + np.where(whole.specks, piece_labels(replace(mask, voxels=whole.specks)) + labels.max(), 0)
+    sizes = np.bincount(labels[mask.voxels | whole.specks])
     lost = np.setdiff1d(np.flatnonzero(sizes), [0, labels[result][0], foreign])
     if len(lost) == 0:
         return []

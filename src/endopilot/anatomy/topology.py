@@ -135,9 +135,8 @@ def parted(mask: Volume) -> tuple[Volume, list[Touch], MedialLines, MedialLines]
     parting, opened = _Parting(mask), True
     lines = before = traced_lines(mask)
     for _ in range(_ROUNDS):
-        result = replace(mask, voxels=parting.voxels)
-        thin = thinned_lines(result)  # has all loops, but not all ends
-        lines = lines if parting.voxels is parting.whole else traced_lines(result)
+        thin = thinned_lines(parting.result)  # has all loops, but not all ends
+        lines = before if parting.result is mask else traced_lines(parting.result)
         rings = _rings(thin, mask)
         long = [ring for ring in rings if ring.around_mm >= SHORTEST_LOOP_MM]
         crossings = itertools.chain(_crossings(thin, long), _crossings(lines, []))
@@ -148,7 +147,7 @@ def parted(mask: Volume) -> tuple[Volume, list[Touch], MedialLines, MedialLines]
                 if ring.around_mm < SHORTEST_LOOP_MM:
                     parting.say("hole", thin.local[ring.nodes[0]], ring.around_mm)
             break
-    result = replace(mask, voxels=parting.voxels)
+    result = parting.result
     lines = traced_lines(result) if opened else lines
     aside = _without_sides(result, lines)
     if aside is not None:
@@ -175,8 +174,13 @@ class _Parting:
 
     def __init__(self, mask: Volume) -> None:
         self.mask, self.edges = mask, mask.spacing_mm[::-1]
-        self.whole = np.asarray(mask.voxels, dtype=bool)
-        self.voxels, self.found = self.whole, list[Touch]()
+        self.whole = mask.voxels
+        self.result, self.found = mask, list[Touch]()
+
+    @property
+    def voxels(self) -> Bool[np.ndarray, "nz ny nx"]:
+        """The voxels as they are parted so far."""
+        return self.result.voxels
 
     def say(self, kind: Kind, place: Float[np.ndarray, "3"], size_mm: float = 0.0) -> None:
         """Keep what was found at a place, along the mask's own axes, unless something is said of it."""
@@ -205,7 +209,7 @@ class _Parting:
         through = [r.around_mm for r in rings if cdist(lines.local[r.nodes], [place]).min() < reach]
         self.say(kind, place, min(through, default=0.0) if kind == "itself" else 0.0)
         if kind != "perhaps":
-            self.voxels = trial
+            self.result = replace(self.mask, voxels=trial)
         return kind != "perhaps"
 
     def _held(self, voxels: Bool[np.ndarray, "nz ny nx"], crossing: _Crossing) -> tuple[int, int, bool]:
@@ -228,7 +232,7 @@ class _Parting:
             return False
         narrow = float(lines.clearance[ends].min()) < CONTACT * float(np.median(clearance))
         self.say("itself" if narrow else "loop", place, ring.around_mm)
-        self.voxels = trial
+        self.result = replace(self.mask, voxels=trial)
         return True
 
     def _flap(self, place: Float[np.ndarray, "3"], reach_mm: float) -> bool:
