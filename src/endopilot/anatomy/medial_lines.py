@@ -21,6 +21,9 @@ from endopilot.anatomy.lumen_graph import lumen_graph, pieces, trace_branches
 from endopilot.imaging.grid import connected_components
 from endopilot.types import Volume
 
+SMALLEST_PIECE = 12
+"""A piece of fewer voxels is noise."""
+
 _NEIGHBOURS_APART = 1.8
 """Voxels that share a corner lie this near each other, in voxels."""
 
@@ -28,7 +31,6 @@ _NEAR_VOXELS, _MOSTLY_DEEP = 5.0, 0.5
 """A search for the nearest border takes long from voxels deeper than this. Where this share of them is, as in an aorta
 of fine voxels (33 against 3 s), distances are swept over the whole box instead."""
 
-_FEWEST = 4
 _STUB_VOXELS, _SLENDER = 4.0, 1.5
 """A side branch of the middle reaches this far out of its parent: in voxels, and in its own radii."""
 
@@ -162,7 +164,7 @@ def _traced_piece(
     """Return the voxels of the middle of one piece, their clearance, mm, and their edges."""
     index = np.argwhere(voxels)
     clearance = _clearance(voxels, index, edges_mm)
-    if len(index) < _FEWEST:
+    if len(index) < SMALLEST_PIECE:
         return index[:1], clearance[:1], np.empty((0, 2), int)
     graph = lumen_graph(index[:, ::-1] * edges_mm, clearance, edges_mm, int(clearance.argmax()))
     graph = graph.rooted_at(int(graph.length.argmax()))
@@ -194,7 +196,7 @@ def _clearance(
     tree, places = KDTree(np.argwhere(border) * edges), index * edges
     gap = np.asarray(tree.query(places, distance_upper_bound=_NEAR_VOXELS * float(edges.max()))[0])
     deep = np.isinf(gap)
-    if deep.mean() > _MOSTLY_DEEP:
+    if deep.sum() > _MOSTLY_DEEP * len(index):
         gap = np.asarray(distance_transform_edt(~border, sampling=edges))[tuple(index.T)]
     elif deep.any():
         gap[deep] = tree.query(places[deep])[0]

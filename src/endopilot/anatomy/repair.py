@@ -63,12 +63,11 @@ class Lumen:
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """The pieces of a mask, without specks.
+    """The pieces of a mask.
 
     Attributes:
         joined: voxels as they were read, and over gaps of a few voxels to what carries on.
         gaps: a voxel at each gap, and whether what lies beyond was joined or runs alongside.
-        specks: voxels that are no vessel.
         parted: the joined voxels, parted where they touch.
         touches: what touches.
         before: middle of the joined voxels.
@@ -77,7 +76,6 @@ class Pieces:
 
     joined: Volume
     gaps: list[tuple[Int[np.ndarray, "3"], bool]]
-    specks: Bool[np.ndarray, "nz ny nx"]
     parted: Volume
     touches: list[Touch]
     before: MedialLines
@@ -88,16 +86,10 @@ class Pieces:
 def pieces_of(mask: Volume) -> Pieces:
     """Return the pieces of a mask that holds some; the last mask's are kept: several stages ask for them."""
     box = filled_box(mask.voxels)
-    voxels = np.asarray(mask.voxels[box], dtype=bool)
     origin = mask.index_to_world(np.array([part.start for part in box][::-1], dtype=float))
-    labels = connected_components(voxels, corners=True)
-    sizes = np.bincount(labels[voxels])
-    order = np.argsort(-sizes, kind="stable")[:_MOST_JOINED]
-    order = order[sizes[order] >= min(SMALLEST_PIECE, sizes.max())]
-    large = voxels if len(order) == labels.max() else np.isin(np.arange(len(sizes)), order)[labels]
-    joined, gaps = _joined(large, labels, order)
+    joined, gaps = _joined(np.asarray(mask.voxels[box], dtype=bool))
     read = replace(mask, voxels=joined, origin_mm=origin)
-    return Pieces(read, gaps, voxels & ~large, *parted(read))
+    return Pieces(read, gaps, *parted(read))
 
 
 def connected_mask(
@@ -133,12 +125,21 @@ def connected_mask(
     if given is None:
         main, others = _piece_on_side(whole.parted, labels, sizes, vessel)
     else:
-        main, others = _nearest_piece(whole.parted, labels, sizes, given, label), []
+        main, gap, nearest = _nearest_piece(whole.parted, labels, sizes, given.position)
+        others = []
+        if gap > max(NEAR_OSTIUM_MM, 2.0 * float(mask.spacing_mm.max())):
+            raise InputError(
+                f"{label}: the mask touches nothing near the ostium at {place_text(given.position)}; "
+                f"its nearest voxel is {gap:.1f} mm away at {place_text(nearest)}"
+            )
     if sizes[main] < SMALLEST_PIECE:
         raise InputError(f"{label}: the lumen has only {sizes[main]} voxels; check the label or segment again")
     result = labels == main
     own = read == read[result][0]  # all that the file connects with it
-    foreign = _piece_at(whole.parted, labels, sizes, other_ostium)
+    foreign = 0
+    if other_ostium is not None:
+        piece, gap, _ = _nearest_piece(whole.parted, labels, sizes, other_ostium)
+        foreign = piece if gap < NEAR_OSTIUM_MM and piece != main else 0
     severed = np.setdiff1d(labels[own], [0, main])
     remarks = touch_remarks([touch for touch in whole.touches if _holds(whole.joined, own, touch.place)])
     joints = [joined for place, joined in whole.gaps if own[tuple(place)]]
@@ -187,28 +188,15 @@ def _refuse_blocks_and_noise(voxels: Bool[np.ndarray, "nz ny nx"], label: str) -
         raise InputError(f"{label}: the mask is a solid block ({share:.0%} of its box); segment the vessel alone")
 
 
-def _nearest_piece(mask: Volume, labels: np.ndarray, sizes: np.ndarray, given: Insertion, label: str) -> int:
-    """Return the label of the piece at the ostium; a speck of noise beside it does not count."""
-    index = np.argwhere(labels > 0)
+def _nearest_piece(
+    mask: Volume, labels: np.ndarray, sizes: np.ndarray, place: Float[np.ndarray, "3"]
+) -> tuple[int, float, Float[np.ndarray, "3"]]:
+    """Return the label of the piece at a place, how far away it is, mm, and where; a speck of noise does not count."""
+    index = np.argwhere(mask.voxels)
     index = index[sizes[labels[tuple(index.T)]] >= min(SMALLEST_PIECE, sizes.max())]
-    gap = np.linalg.norm(mask.index_to_world(index[:, ::-1].astype(float)) - given.position, axis=1)
-    if gap.min() > max(NEAR_OSTIUM_MM, 2.0 * float(mask.spacing_mm.max())):
-        nearest = mask.index_to_world(index[gap.argmin()][::-1].astype(float))
-        raise InputError(
-            f"{label}: the mask touches nothing near the ostium at {place_text(given.position)}; "
-            f"its nearest voxel is {gap.min():.1f} mm away at {place_text(nearest)}"
-        )
-    return int(labels[tuple(index[gap.argmin()])])
-
-
-def _piece_at(mask: Volume, labels: np.ndarray, sizes: np.ndarray, place: Float[np.ndarray, "3"] | None) -> int:
-    """Return the label of the piece at a place, 0 if there is none."""
-    if place is None:
-        return 0
-    index = np.argwhere(labels > 0)
-    index = index[sizes[labels[tuple(index.T)]] >= SMALLEST_PIECE]
-    gap = np.linalg.norm(mask.index_to_world(index[:, ::-1].astype(float)) - place, axis=1)
-    return int(labels[tuple(index[gap.argmin()])]) if len(gap) and gap.min() < NEAR_OSTIUM_MM else 0
+    points = mask.index_to_world(index[:, ::-1].astype(float))
+    gap = np.linalg.norm(points - place, axis=1)
+    return int(labels[tuple(index[gap.argmin()])]), float(gap.min()), points[gap.argmin()]
 
 
 def _left_out(
@@ -230,9 +218,7 @@ def _left_out(
         vessel: which vessel is wanted.
     """
     mask = whole.parted
-    if whole.specks.any():
-        labels = labels + np.where(whole.specks, piece_labels(replace(mask, voxels=whole.specks)) + labels.max(), 0)
-    sizes = np.bincount(labels[mask.voxels | whole.specks])
+    sizes = np.bincount(labels[mask.voxels])
     lost = np.setdiff1d(np.flatnonzero(sizes), [0, labels[result][0], foreign])
     if len(lost) == 0:
         return []
@@ -270,51 +256,41 @@ def _left_out(
 
 
 def _joined(
-    voxels: Bool[np.ndarray, "nz ny nx"], labels: Int[np.ndarray, "nz ny nx"], order: Int[np.ndarray, "_"]
+    voxels: Bool[np.ndarray, "nz ny nx"],
 ) -> tuple[Bool[np.ndarray, "nz ny nx"], list[tuple[Int[np.ndarray, "3"], bool]]]:
     """Join pieces that lie within the largest gap by tubes as wide as the vessels at both ends.
 
-    Two vessels that pass each other are not one: a piece that runs alongside another is not joined to it.
-
-    Args:
-        voxels: the pieces.
-        labels: number of each.
-        order: these numbers, the largest piece first.
-
-    Returns:
-        The voxels, and for each gap a voxel at it and whether it was bridged.
+    Two vessels that pass each other are not one: a piece that runs alongside another is not joined to it. Returns the
+    voxels, and for each gap a voxel at it and whether it was bridged.
     """
-    index = np.argwhere(voxels)
-    index = index[np.argsort(labels[tuple(index.T)], kind="stable")]
-    numbers, starts = np.unique(labels[tuple(index.T)], return_index=True)
-    members = dict(zip(numbers.tolist(), np.split(index, starts[1:]), strict=True))
-    left, gaps, result = order.tolist(), list[tuple[np.ndarray, bool]](), voxels.copy()
+    labels, index = connected_components(voxels, corners=True), np.argwhere(voxels)
+    numbers = labels[tuple(index.T)]
+    sizes = np.bincount(numbers)
+    order = np.argsort(numbers, kind="stable")
+    members = dict(enumerate(np.split(index[order], np.cumsum(sizes)[:-1])))
+    large = np.argsort(-sizes, kind="stable")[:_MOST_JOINED].tolist()
+    left = [piece for piece in large if sizes[piece] >= SMALLEST_PIECE]
+    gaps, result = list[tuple[np.ndarray, bool]](), voxels.copy()
     clearance: np.ndarray | None = None  # where nothing is joined it is not needed
     while len(left) > 1:
-        here, asked = members[left.pop(0)], list(left)
+        here, asked, beside = members[left.pop(0)], list(left), list[int]()
+        reach = KDTree(here)
         while asked:
-            reach = KDTree(here)
-            found = [
-                (piece, *map(np.asarray, reach.query(members[piece], distance_upper_bound=LARGEST_GAP_VOXELS)))
-                for piece in asked
-            ]
-            found = [each for each in found if np.isfinite(each[1].min())]
-            if not found:
-                break
-            asked, grown = [piece for piece in asked if piece not in [each[0] for each in found]], False
-            for piece, gap, nearest in found:
-                best = int(gap.argmin())
-                start, end = here[nearest[best]], members[piece][best]
-                onwards = _carries_on(here, start, end) or _carries_on(members[piece], end, start)
-                gaps.append((start, onwards))
-                if onwards:
-                    clearance = np.asarray(distance_transform_edt(voxels)) if clearance is None else clearance
-                    _draw_tube(result, start, end, min(_widest(clearance, start), _widest(clearance, end)))
-                    left.remove(piece)
-                    members[piece], here = members[piece][:0], np.concatenate([here, members[piece]])
-                    grown = True
-            if not grown:
-                break
+            piece = asked.pop(0)
+            gap, nearest = map(np.asarray, reach.query(members[piece], distance_upper_bound=LARGEST_GAP_VOXELS))
+            best = int(gap.argmin())
+            if not np.isfinite(gap[best]):
+                continue
+            start, end = here[nearest[best]], members[piece][best]
+            onwards = _carries_on(here, start, end) or _carries_on(members[piece], end, start)
+            gaps.append((start, onwards))
+            beside += [piece] * (not onwards)
+            if onwards:
+                clearance = np.asarray(distance_transform_edt(voxels)) if clearance is None else clearance
+                _draw_tube(result, start, end, min(_widest(clearance, start), _widest(clearance, end)))
+                left.remove(piece)
+                here, asked = np.concatenate([here, members[piece]]), [other for other in left if other not in beside]
+                reach = KDTree(here)
     return result, gaps
 
 

@@ -24,7 +24,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
 from endopilot.anatomy.lumen_graph import pieces
-from endopilot.anatomy.medial_lines import MedialLines, thinned_lines, traced_lines
+from endopilot.anatomy.medial_lines import SMALLEST_PIECE, MedialLines, thinned_lines, traced_lines
 from endopilot.anatomy.parent_vessel import AORTA_RADIUS_MM
 from endopilot.errors import place_text
 from endopilot.imaging.grid import connected_components
@@ -40,9 +40,6 @@ hole: which way a line takes hardly matters."""
 
 SHORTEST_TUNNEL_MM = 6.0
 """Tunnels shorter than this, or no longer than round the vessel itself, are rough voxels."""
-
-SMALLEST_PIECE = 12
-"""A piece of fewer voxels is noise."""
 
 MOST_LISTED = 8
 """As many places or pieces are listed one by one."""
@@ -72,7 +69,7 @@ _SAID: dict[Kind, tuple[str, str]] = {
     "vessels": ("two vessels touch and were parted at", ""),
     "perhaps": ("two vessels may touch, or one forks; they were left joined at", ""),
     "flap": ("a wall inside the vessel, such as a flap, was left with its openings at", " (ring of {:.0f} mm)"),
-    "hole": ("small tunnels were left as they are, at", " ({:.0f} mm around)"),
+    "hole": ("tunnels were left as they are, at", " ({:.0f} mm around)"),
 }
 
 
@@ -132,8 +129,7 @@ def parted(mask: Volume) -> tuple[Volume, list[Touch], MedialLines, MedialLines]
     No part of a lumen loses its way to the rest, except one of two vessels that certainly only touch. The middle is
     that of the mask as it was, and as it is.
     """
-    parting, opened = _Parting(mask), True
-    lines = before = traced_lines(mask)
+    parting, before = _Parting(mask), traced_lines(mask)
     for _ in range(_ROUNDS):
         thin = thinned_lines(parting.result)  # has all loops, but not all ends
         lines = before if parting.result is mask else traced_lines(parting.result)
@@ -148,12 +144,10 @@ def parted(mask: Volume) -> tuple[Volume, list[Touch], MedialLines, MedialLines]
                     parting.say("hole", thin.local[ring.nodes[0]], ring.around_mm)
             break
     result = parting.result
-    lines = traced_lines(result) if opened else lines
-    aside = _without_sides(result, lines)
-    if aside is not None:
-        result, touch = aside
-        lines = traced_lines(result)
-        parting.found.append(touch)
+    lines = before if result is mask else traced_lines(result)
+    if aside := _without_sides(result, lines):
+        result, lines = aside[0], traced_lines(aside[0])
+        parting.found.append(aside[1])
     return result, parting.found, before, lines
 
 
@@ -173,8 +167,7 @@ class _Parting:
     """A mask that is being parted, and what was found in it."""
 
     def __init__(self, mask: Volume) -> None:
-        self.mask, self.edges = mask, mask.spacing_mm[::-1]
-        self.whole = mask.voxels
+        self.mask, self.edges, self.whole = mask, mask.spacing_mm[::-1], mask.voxels
         self.result, self.found = mask, list[Touch]()
 
     @property
@@ -229,6 +222,7 @@ class _Parting:
         trial = self.voxels.copy()
         _sever(trial, lines, (int(ends[0]), int(ends[1])))
         if _count(trial) > _count(self.voxels):
+            self.say("hole", place, ring.around_mm)
             return False
         narrow = float(lines.clearance[ends].min()) < CONTACT * float(np.median(clearance))
         self.say("itself" if narrow else "loop", place, ring.around_mm)
