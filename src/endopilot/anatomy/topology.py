@@ -32,7 +32,7 @@ from endopilot.lines import length_along
 from endopilot.types import Volume
 
 CONTACT = 0.6
-"""A place of a loop whose clearance is less than this share of the vessel's is a contact, not a stenosis."""
+"""A place whose clearance is less than this share of the vessels' on both sides is a contact, not a stenosis."""
 
 SHORTEST_LOOP_MM = 20.0
 """Loops from this length are cut. In shorter ones two branches touch again just behind their fork, or a wall has a
@@ -183,7 +183,8 @@ class _Parting:
 
     def crossing(self, crossing: _Crossing, lines: MedialLines, rings: list[_Ring]) -> bool:
         """Part two lines that run past each other, if nothing is lost by it, and return whether that was done."""
-        if self._flap(crossing.place, sum(crossing.radii)):
+        neck, flap = self._neck(crossing.place, sum(crossing.radii))
+        if flap:
             self.say("flap", crossing.place)
             return False
         rim = _rim(self.voxels, self.edges, crossing)
@@ -192,7 +193,7 @@ class _Parting:
         kind: Kind = "perhaps"
         if whole and one == two and _count(trial) <= _count(self.voxels) and _are_apart(trial, self.edges, crossing):
             kind = "itself"
-        elif whole and one != two and crossing.certain:
+        elif whole and one != two and crossing.certain and neck < CONTACT * min(crossing.radii):
             one, two, _ = self._held(self.whole & ~rim, crossing)
             kind = "vessels" if one != two else "perhaps"
         if kind == "perhaps" and not crossing.likely:
@@ -216,7 +217,7 @@ class _Parting:
         """Cut a loop at its narrowest place, if nothing is lost by it, and return whether that was done."""
         clearance, ends = lines.clearance[ring.nodes], ring.nodes[[0, -1]]
         place = lines.local[ends].mean(axis=0)
-        if self._flap(place, 2.0 * float(np.median(clearance))):
+        if self._neck(place, 2.0 * float(np.median(clearance)))[1]:
             self.say("flap", place, ring.around_mm)
             return False
         trial = self.voxels.copy()
@@ -229,8 +230,11 @@ class _Parting:
         self.result = replace(self.mask, voxels=trial)
         return True
 
-    def _flap(self, place: Float[np.ndarray, "3"], reach_mm: float) -> bool:
-        """Return whether the vessel gets wider than any lumen within reach where the wall at a place is filled in."""
+    def _neck(self, place: Float[np.ndarray, "3"], reach_mm: float) -> tuple[float, bool]:
+        """Return the clearance at a place, mm, and whether a flap is there.
+
+        With its wall filled in, the vessel then is wider there than any lumen within reach.
+        """
         reach, at = np.ceil(reach_mm / self.edges).astype(int), np.rint(place / self.edges).astype(int)
         window = tuple(slice(max(0, c - 2 * r), c + 2 * r + 1) for c, r in zip(at, reach, strict=True))
         own = np.pad(self.voxels[window], 1)
@@ -241,7 +245,8 @@ class _Parting:
             tuple(slice(max(0, c - r), c + r + 1) for c, r in zip(at, size, strict=True))
             for size in (reach, np.ones(3, int))
         )
-        return float(after[here].max(initial=0.0)) > _FLAP * float(before[near].max(initial=0.0))
+        widest, filled = float(before[near].max(initial=0.0)), float(after[here].max(initial=0.0))
+        return float(before[here].max(initial=0.0)), filled > _FLAP * widest
 
 
 def _count(voxels: Bool[np.ndarray, "nz ny nx"]) -> int:
