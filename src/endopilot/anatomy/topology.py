@@ -183,7 +183,8 @@ class _Parting:
 
     def crossing(self, crossing: _Crossing, lines: MedialLines, rings: list[_Ring]) -> bool:
         """Part two lines that run past each other, if nothing is lost by it, and return whether that was done."""
-        neck, flap = self._neck(crossing.place, sum(crossing.radii))
+        across = np.linspace(*crossing.nearest, 12)
+        neck, flap = self._neck(crossing.place, sum(crossing.radii), across)
         if flap:
             self.say("flap", crossing.place)
             return False
@@ -217,7 +218,7 @@ class _Parting:
         """Cut a loop at its narrowest place, if nothing is lost by it, and return whether that was done."""
         clearance, ends = lines.clearance[ring.nodes], ring.nodes[[0, -1]]
         place = lines.local[ends].mean(axis=0)
-        if self._neck(place, 2.0 * float(np.median(clearance)))[1]:
+        if self._neck(place, 2.0 * float(np.median(clearance)), place[None])[1]:
             self.say("flap", place, ring.around_mm)
             return False
         trial = self.voxels.copy()
@@ -230,8 +231,10 @@ class _Parting:
         self.result = replace(self.mask, voxels=trial)
         return True
 
-    def _neck(self, place: Float[np.ndarray, "3"], reach_mm: float) -> tuple[float, bool]:
-        """Return the clearance at a place, mm, and whether a flap is there.
+    def _neck(
+        self, place: Float[np.ndarray, "3"], reach_mm: float, across: Float[np.ndarray, "n 3"]
+    ) -> tuple[float, bool]:
+        """Return the least clearance at places across a neck, mm, and whether a flap is at its middle.
 
         With its wall filled in, the vessel then is wider there than any lumen within reach.
         """
@@ -246,7 +249,8 @@ class _Parting:
             for size in (reach, np.ones(3, int))
         )
         widest, filled = float(before[near].max(initial=0.0)), float(after[here].max(initial=0.0))
-        return float(before[here].max(initial=0.0)), filled > _FLAP * widest
+        at = np.rint(across / self.edges).astype(int) - [part.start for part in window] + 1
+        return float(before[tuple(np.clip(at, 0, np.array(before.shape) - 1).T)].min()), filled > _FLAP * widest
 
 
 def _count(voxels: Bool[np.ndarray, "nz ny nx"]) -> int:
