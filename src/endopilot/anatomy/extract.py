@@ -194,6 +194,7 @@ def _wall(
 ) -> _Wall:
     """Return the closed wall of the wanted vessel, with repairs stated."""
     inlet = None
+    repair.pieces_of.cache_clear()  # what a caller's mask held before may be another vessel
     if isinstance(content, Surface):
         check_unit(content.vertices, None, config.vessel, label)
     if given is None and config.vessel != "generic":
