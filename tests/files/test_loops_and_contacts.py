@@ -7,9 +7,10 @@ import re
 import numpy as np
 import pytest
 from make_vessels import hairpin, length_of, line, lumen, tubes, with_voxels
+from scipy.ndimage import label
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
-from endopilot.anatomy.topology import parted
+from endopilot.anatomy.topology import parted, touch_remarks
 from endopilot.errors import InputError
 from endopilot.types import Volume
 
@@ -52,9 +53,9 @@ def test_the_root_of_a_hairpin_is_its_wide_end_though_the_narrow_end_touches_it(
 
 def test_two_limbs_that_touch_over_their_length_are_parted():
     mask = tubes((hairpin(50, 3.4), 1.8), voxel_mm=(0.35, 0.35, 0.5))
-    whole, remarks = parted(mask)
+    whole, found, *_ = parted(mask)
     assert whole.voxels.sum() < mask.voxels.sum()
-    assert len(remarks) == 1 and "touch over" in remarks[0]
+    assert len(found) == 1 and "touch over" in touch_remarks(found)[0]
 
 
 @pytest.mark.parametrize("voxel_mm", VOXELS)
@@ -74,6 +75,55 @@ def test_two_vessels_that_touch_in_passing_are_parted(voxel_mm):
     assert len(anatomy.tree.branches) == 1 and abs(length_of(anatomy) - 60) < 3
     assert "two vessels touch and were parted at" in notes_of(anatomy) and abs(places_of(anatomy)[0][0] - 2.0) <= 0.5
     assert any("left out" in note and ("62 mm long" in note or "63 mm long" in note) for note in notes)
+
+
+@pytest.mark.parametrize(("angle", "overlap_mm"), [(25.0, 0.3), (50.0, 0.5), (75.0, 0.8)])
+def test_two_vessels_that_touch_along_their_walls_are_never_one_tree_unsaid(angle, overlap_mm):
+    one, turn = line((0, 0, -28), (0, 0, 28)), np.radians(angle)
+    other = 24.0 * np.array([0.0, np.sin(turn), np.cos(turn)])
+    aside = np.array([1.9 + 1.5 - overlap_mm, 0, 0])
+    mask = tubes((one, 1.9), (line(aside - other, aside + other), 1.5), voxel_mm=(0.5, 0.5, 0.5))
+    anatomy = extract_anatomy(lumen(mask), name="touching")
+    said = [note for note in anatomy.provenance["notes"] if note.startswith("two vessels")]
+    assert said and any(np.linalg.norm(place - [1.9, 0, 0]) < 3.0 for place in places_of(anatomy))
+    balance = anatomy.provenance["coverage"]
+    assert balance["length_mm"] > 95.0  # of both, as the file holds them
+    assert balance["left_out_mm"] < 5.0 or "another vessel that touches this one left out" in notes_of(anatomy)
+
+
+@pytest.mark.parametrize("angles", [(12.0, -12.0), (25.0, -70.0), (40.0, 0.0, -40.0), (20.0, 120.0)])
+def test_a_fork_keeps_all_its_branches_and_is_not_called_a_contact(angles):
+    arms = [(line((0, 0, 0), 30.0 * np.array([np.sin(a), 0.1, np.cos(a)])), 1.3) for a in np.radians(angles)]
+    mask = tubes((line((0, 0, -30), (0, 0, 0)), 1.9), *arms, voxel_mm=(0.5, 0.5, 0.5))
+    anatomy = extract_anatomy(lumen(mask), name="fork")
+    assert length_of(anatomy) > 0.9 * 30 * (1 + len(angles)) and "touch" not in notes_of(anatomy)
+
+
+def flap(tears: int) -> Volume:
+    """Return a wide vessel along z with a wall one voxel thick inside, open at both its ends and at some tears."""
+    z, y, x = np.indices((70, 22, 22)) * 1.2
+    voxels = (np.hypot(x - 12.6, y - 12.6) < 10.0) & (z > 5) & (z < 78)
+    wall = (np.abs(x - 13.8) < 0.7) & (z > 14) & (z < 66)
+    for place in np.linspace(20, 60, tears + 2)[1:-1]:
+        wall &= ~((np.abs(z - place) < 2.5) & (np.abs(y - 12.6) < 3))
+    return Volume(voxels & ~wall, np.full(3, 1.2), np.zeros(3), np.eye(3))
+
+
+@pytest.mark.parametrize("tears", [0, 1, 3])
+def test_a_flap_takes_nothing_away_whatever_its_tears(tears):
+    anatomy = extract_anatomy(lumen(flap(tears)), name="flap")
+    notes = notes_of(anatomy)
+    assert "apart from the lumen" not in notes and "another vessel" not in notes
+    assert any(word in notes for word in ("touches itself", "a wall inside the vessel", "holds no loops"))
+
+
+def test_no_cut_of_a_loop_takes_vessel_away():
+    ring = np.stack([9 * np.cos(t := np.linspace(0, 2 * np.pi, 200)), 0 * t, 9 * np.sin(t)], axis=1)
+    ways = [(line((0, 0, -40), (0, 0, -9)), 1.7), (ring, 1.2), (line((6, 0, 6), (16, 6, 30)), 1.1)]
+    mask = tubes(*ways, (line((-6, 0, 6), (-16, -6, 30)), 1.1), voxel_mm=(0.45, 0.45, 0.5))
+    whole, _, before, after = parted(mask)
+    assert label(whole.voxels, np.ones((3, 3, 3)))[1] == 1
+    assert abs(after.share_mm.sum() - before.share_mm.sum()) < 0.1 * before.share_mm.sum()
 
 
 def test_a_second_inlet_is_named():

@@ -15,7 +15,6 @@ from endopilot.anatomy.coronary_ends import OpenEnd, Skeleton, open_ends, skelet
 from endopilot.anatomy.coronary_ostia import OTHER_AXES, OstiumCandidate, OstiumRanking, Side, rank_ostia
 from endopilot.anatomy.distance import distance_map_from_surface
 from endopilot.anatomy.surface import Surface, filled_box, surface_from_mask
-from endopilot.anatomy.topology import parted
 from endopilot.anatomy.units import check_unit
 from endopilot.errors import InputError, place_text
 from endopilot.imaging.grid import connected_components
@@ -87,9 +86,13 @@ def coronary_inlet(
     """
     pieces: list[list[OpenEnd]] = []
     skeletons: list[Skeleton] = []
-    coarse = _coarse(content.volume) if isinstance(content, LumenMask) else content
-    if isinstance(coarse, Volume) and _holds_aorta(coarse):
-        return None
+    coarse = content.volume if isinstance(content, LumenMask) else content
+    if isinstance(content, LumenMask) and content.volume.voxels.any():
+        corners = np.array([np.zeros(3), np.array(content.volume.voxels.shape[::-1]) - 1.0])
+        check_unit(content.volume.index_to_world(corners), None, "rca", label)
+        if _holds_aorta(_coarse(content.volume)):
+            return None
+        coarse = _coarse(repair.pieces_of(content.volume).parted)
     for lumen in _lumens(coarse, label):
         inside = lumen.values > 0
         for points, clearance in _parts(lumen, inside):
@@ -178,10 +181,7 @@ def _option(position: Float[np.ndarray, "3"]) -> str:
 def _lumens(content: Volume | Surface, label: str) -> Iterator[DistanceMap]:
     if isinstance(content, Volume):
         if content.voxels.any():
-            corners = content.index_to_world(np.array([np.zeros(3), np.array(content.voxels.shape[::-1]) - 1.0]))
-            check_unit(corners, None, "rca", label)
-            wall = surface_from_mask(parted(repair.joined_mask(content))[0])
-            yield distance_map_from_surface(wall, spacing_mm=GRID_MM, band_mm=2 * GRID_MM)
+            yield distance_map_from_surface(surface_from_mask(content), spacing_mm=GRID_MM, band_mm=2 * GRID_MM)
         return
     for place in repair_surface.region_places(content):
         wall, _ = repair_surface.closed_surface(content, Insertion(place, np.zeros(3)), label)

@@ -15,8 +15,9 @@ from scipy.spatial import KDTree
 from endopilot.anatomy.distance import MAXIMUM_GRID_POINTS
 from endopilot.anatomy.lumen_graph import pieces
 from endopilot.anatomy.medial_lines import MedialLines
-from endopilot.anatomy.repair import MOST_LISTED, NOTED_MM
+from endopilot.anatomy.repair import NOTED_MM
 from endopilot.anatomy.surface import Surface, blur_voxels, level_function
+from endopilot.anatomy.topology import MOST_LISTED
 from endopilot.anatomy.tree import sampled
 from endopilot.errors import place_text
 from endopilot.imaging.grid import connected_components
@@ -73,8 +74,8 @@ def voxelised(surface: Surface, step_mm: float) -> Volume:
     return Volume(voxels, np.full(3, step), origin, np.eye(3))
 
 
-def widened(mask: Volume, lines: MedialLines, minimum_mm: float) -> tuple[Volume, list[Stretch], list[str]]:
-    """Return the mask with a tube wherever it is too thin for the wall and the grid to carry it on, and remarks.
+def widened(mask: Volume, lines: MedialLines, minimum_mm: float) -> tuple[Volume, Float[np.ndarray, "n 3"], list[str]]:
+    """Return the mask with a tube wherever it is too thin for the wall and the grid to carry it on, where, and remarks.
 
     Args:
         mask: one connected lumen.
@@ -88,7 +89,7 @@ def widened(mask: Volume, lines: MedialLines, minimum_mm: float) -> tuple[Volume
     thin = _thin(mask, lines, enough)
     wanted = [s for s in stretches(lines, thin) if s.length_mm + s.beyond_mm >= minimum_mm]
     if not wanted:
-        return mask, [], []
+        return mask, np.empty((0, 3)), []
     voxels = mask.voxels.copy()
     narrowest = _NARROWEST * blur_voxels(edges[::-1])
     reach = narrowest = np.maximum(narrowest, _NARROWEST_STEPS * step / edges[::-1])
@@ -102,7 +103,7 @@ def widened(mask: Volume, lines: MedialLines, minimum_mm: float) -> tuple[Volume
             break
         _draw_balls(voxels, lines.index[nodes], reach)
     radius = float((narrowest * edges[::-1]).mean())
-    return replace(mask, voxels=voxels), wanted, _widened_text(wanted, radius)
+    return replace(mask, voxels=voxels), lines.points[asked], _widened_text(wanted, radius)
 
 
 def unreached(lines: MedialLines, tree: VesselTree, voxel_mm: float) -> list[Stretch]:
@@ -170,14 +171,18 @@ def left_out_text(left: list[Stretch], ostium: Float[np.ndarray, "3"], reach_mm:
     return remarks
 
 
-def record(lines: MedialLines, wide: list[Stretch], left: list[Stretch]) -> dict[str, float]:
-    """Return the balance that `anatomy.json` keeps, mm: length = reached + widened + left out."""
+def record(lines: MedialLines, wide: Float[np.ndarray, "m 3"], left: list[Stretch]) -> dict[str, float]:
+    """Return the balance that `anatomy.json` keeps, mm: length = reached + widened + left out.
+
+    Args:
+        lines: the middle of all that the file connects.
+        wide: places that were widened, LPS mm.
+        left: parts that the tree does not reach.
+    """
     out = np.zeros(len(lines.points), dtype=bool)
-    thin = out.copy()
+    thin = np.asarray(KDTree(wide).query(lines.points)[0]) < lines.edges_mm.min() if len(wide) else out
     for stretch in left:
         out[stretch.nodes] = True
-    for stretch in wide:
-        thin[stretch.nodes] = True
     share = lines.share_mm
     parts = {
         "reached_mm": share[~out & ~thin].sum(),

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from endopilot import __version__
 from endopilot.anatomy import coverage, polylines, repair, repair_surface
@@ -133,6 +134,7 @@ def extract_anatomy(
             notes += _other_inlets(tree, rule)
             left = coverage.unreached(wall.lines, tree, wall.voxel_mm)
             balance = coverage.record(wall.lines, wall.widened, left)
+            left = [stretch for stretch in left if wall.told is None or not wall.told[stretch.nodes].all()]
             line = tree.branches[0].centerline
             notes += coverage.left_out_text(left, line.points[0], 3.0 * float(line.radius[0]) + wall.voxel_mm)
         advance()
@@ -174,9 +176,10 @@ class _Wall:
         finest_mm: the voxels' shortest edge, mm; 0 where there are none.
         voxel_mm: their longest edge, mm.
         inlet: where the coronary artery begins, if that was looked for.
-        lines: middle of what the wall was made from: all that the tree should reach.
-        widened: thin parts of it that were widened.
+        lines: middle of all that the file connects with it: what the tree should reach.
+        widened: places of parts that were too thin and were widened, LPS mm.
         notes: remarks on what was repaired.
+        told: which points of `lines` a remark names as another vessel; None where there are none.
     """
 
     surface: Surface
@@ -184,8 +187,9 @@ class _Wall:
     voxel_mm: float
     inlet: CoronaryInlet | None
     lines: MedialLines
-    widened: list[coverage.Stretch]
+    widened: Float[np.ndarray, "wide 3"]
     notes: list[str]
+    told: Bool[np.ndarray, "n"] | None = None
 
 
 def _wall(
@@ -193,6 +197,7 @@ def _wall(
 ) -> _Wall:
     """Return the closed wall of the wanted vessel, with repairs stated."""
     inlet = None
+    repair.pieces_of.cache_clear()  # what a caller's mask held before may be another vessel
     if isinstance(content, Surface):
         check_unit(content.vertices, None, config.vessel, label)
     if given is None and config.vessel != "generic":
@@ -200,15 +205,15 @@ def _wall(
         given = None if inlet is None else Insertion(inlet.position, np.zeros(3))
     other = None if inlet is None else inlet.other
     if isinstance(content, LumenMask):
-        mask, notes = repair.connected_mask(content.volume, given, label, config.vessel, other)
-        lines = traced_lines(mask)
-        mask, wide, remarks = coverage.widened(mask, lines, config.minimum_branch_length_mm)
+        lumen = repair.connected_mask(content.volume, given, label, config.vessel, other)
+        mask, wide, remarks = coverage.widened(lumen.mask, lumen.lines, config.minimum_branch_length_mm)
         finest, longest = float(mask.spacing_mm.min()), float(mask.spacing_mm.max())
-        return _Wall(surface_from_mask(mask), finest, longest, inlet, lines, wide, notes + remarks)
+        wall, notes = surface_from_mask(mask), lumen.notes + remarks
+        return _Wall(wall, finest, longest, inlet, lumen.before, wide, notes, lumen.told)
     surface, notes = repair_surface.closed_surface(content, given, label, config.vessel, other)
     step = min(2.0 * surface.volume / surface.area, CORONARY_RADIUS_MM) / 5.0
     voxels = coverage.voxelised(surface, max(step, SMALLEST_RADIUS_MM))
-    return _Wall(surface, 0.0, float(voxels.spacing_mm.max()), inlet, traced_lines(voxels), [], notes)
+    return _Wall(surface, 0.0, float(voxels.spacing_mm.max()), inlet, traced_lines(voxels), np.empty((0, 3)), notes)
 
 
 def _other_inlets(tree: VesselTree, rule: str) -> list[str]:

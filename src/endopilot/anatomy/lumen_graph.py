@@ -13,15 +13,22 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.ndimage import distance_transform_edt
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import KDTree
+
+from endopilot.imaging.grid import dilated
 
 COVERAGE = 1.6
 """A path covers what lies within this many inscribed radii (and two grid steps) of it."""
 
 SLENDERNESS = 2.2
 """A side branch is kept if it reaches this many times its own radius out of its parent's inscribed sphere."""
+
+_FINE_STEPS = 10.0
+"""A part of the lumen is as wide as this many grid steps where every second one of them is enough: five steps a radius
+is what a lumen's own grid has."""
 
 _HALF_NEIGHBOURHOOD = np.array(
     [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1) if (i, j, k) > (0, 0, 0)]
@@ -38,6 +45,7 @@ class LumenGraph:
         predecessor: next node on the path to the root, -1 at the root itself.
         length: length of the path to the root, mm.
         spacing_mm: grid spacing, mm.
+        costs: the edges and what they cost.
     """
 
     points: Float[np.ndarray, "n 3"]
@@ -45,6 +53,24 @@ class LumenGraph:
     predecessor: Int[np.ndarray, "n"]
     length: Float[np.ndarray, "n"]
     spacing_mm: float
+    costs: csr_matrix
+
+    def rooted_at(self, node: int) -> LumenGraph:
+        """Return the same graph with the cheapest paths to another root; points that it does not reach are left out."""
+        return _rooted(self.points, self.clearance, self.spacing_mm, self.costs, node)
+
+
+def _rooted(
+    points: Float[np.ndarray, "n 3"], clearance: Float[np.ndarray, "n"], spacing_mm: float, costs: csr_matrix, node: int
+) -> LumenGraph:
+    cost, predecessor = dijkstra(costs, directed=False, indices=node, return_predecessors=True)
+    reached = np.isfinite(cost)
+    renumber = np.cumsum(reached) - 1
+    parent = predecessor[reached].astype(np.int64)
+    parent = np.where(parent >= 0, renumber[np.maximum(parent, 0)], -1)
+    kept = points[reached]
+    costs = costs if reached.all() else costs[reached][:, reached]
+    return LumenGraph(kept, clearance[reached], parent, _length_to_root(kept, parent), spacing_mm, costs)
 
 
 def pieces(pairs: Int[np.ndarray, "m 2"], count: int) -> Int[np.ndarray, "count"]:
@@ -78,26 +104,58 @@ def lumen_graph(
     key = np.asarray(np.ravel_multi_index(tuple(index.T), tuple(shape)))
     order = np.asarray(np.argsort(key))
     ordered = key[order]
+
+    def at(wanted: Int[np.ndarray, "m"]) -> Int[np.ndarray, "m"]:
+        """Return the points with these keys, -1 where there are none."""
+        place = np.minimum(np.searchsorted(ordered, wanted), len(ordered) - 1)
+        return np.where(ordered[place] == wanted, order[place], -1)
+
+    level = _levels(index, clearance, edges, root)
+    kept = (index % (1 << level)[:, None] == 0).all(axis=1)
     weight = 1.0 / np.maximum(clearance, 0.1 * edges.max()) ** 2
     rows, columns, costs = [], [], []
-    for step in _HALF_NEIGHBOURHOOD:
-        wanted = key + int(np.dot(step, [shape[1] * shape[2], shape[2], 1]))
-        place = np.minimum(np.searchsorted(ordered, wanted), len(ordered) - 1)
-        start = np.flatnonzero(ordered[place] == wanted)
-        end = order[place[start]]
-        rows.append(start)
-        columns.append(end)
-        costs.append(np.linalg.norm(step * edges) * 0.5 * (weight[start] + weight[end]))
-    matrix = csr_matrix(
-        (np.concatenate(costs), (np.concatenate(rows), np.concatenate(columns))), shape=(len(points), len(points))
-    )
-    cost, predecessor = dijkstra(matrix, directed=False, indices=root, return_predecessors=True)
-    reached = np.isfinite(cost)
-    renumber = np.cumsum(reached) - 1
-    parent = predecessor[reached].astype(np.int64)
-    parent = np.where(parent >= 0, renumber[np.maximum(parent, 0)], -1)
-    kept = points[reached]
-    return LumenGraph(kept, clearance[reached], parent, _length_to_root(kept, parent), float(edges.max()))
+    for stride in 1 << np.arange(level.max() + 1):
+        own = np.flatnonzero(kept & (index % stride == 0).all(axis=1)) if stride > 1 else np.flatnonzero(kept)
+        for step in _HALF_NEIGHBOURHOOD:
+            jump = int(np.dot(step, [shape[1] * shape[2], shape[2], 1]))
+            end = at(key[own] + stride * jump)
+            found = (end >= 0) & kept[end]
+            if stride > 1:  # between points of a wide part, or one of it and one beside it, through the lumen
+                found &= np.maximum(level[own], level[end]) >= np.log2(stride)
+                for between in range(1, stride):
+                    found &= at(key[own] + between * jump) >= 0
+            rows.append(own[found])
+            columns.append(end[found])
+            cost = 0.5 * (weight[rows[-1]] + weight[columns[-1]])
+            costs.append(float(stride * np.linalg.norm(step * edges)) * cost)
+    number = np.cumsum(kept) - 1
+    pairs = number[np.concatenate(rows)], number[np.concatenate(columns)]
+    matrix = csr_matrix((np.concatenate(costs), pairs), shape=(int(kept.sum()),) * 2)
+    return _rooted(points[kept], clearance[kept], float(edges.max()), matrix, int(number[root]))
+
+
+def _levels(
+    index: Int[np.ndarray, "n 3"], clearance: Float[np.ndarray, "n"], edges: Float[np.ndarray, "3"], root: int
+) -> Int[np.ndarray, "n"]:
+    """Return how coarse the grid may be at each point: every 2 to this power-th point is enough.
+
+    A part of the lumen that spheres of `_FINE_STEPS` times so many steps fill is as well resolved by it, away from
+    narrower parts and from the root.
+    """
+    level = np.zeros(len(index), dtype=int)
+    while (core := clearance > (wide := _FINE_STEPS * edges.max() * (1 << level.max()))).any():
+        stride = 2 << level.max()
+        lumen, middle = (np.zeros(index.max(axis=0) + 2, dtype=bool) for _ in range(2))
+        lumen[tuple(index.T)] = True
+        middle[tuple(index[core].T)] = True
+        filled = np.asarray(distance_transform_edt(~middle, sampling=edges)) <= wide
+        narrow = lumen & ~filled
+        narrow[tuple(index[root])] = True
+        coarse = (filled & ~dilated(narrow, 2 * int(stride)))[tuple(index.T)]
+        if not coarse.any():
+            break
+        level[coarse] = int(np.log2(stride))
+    return level
 
 
 def trace_branches(

@@ -5,16 +5,18 @@ Every repair returns remarks, which `extract_anatomy` writes into the provenance
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import binary_fill_holes, center_of_mass, distance_transform_edt, find_objects
+from scipy.ndimage import center_of_mass, distance_transform_edt, find_objects
 from scipy.spatial import KDTree
 
+from endopilot.anatomy.medial_lines import MedialLines, piece_labels
 from endopilot.anatomy.parent_vessel import COMPARABLE, Vessel, piece_on_side
 from endopilot.anatomy.surface import filled_box
-from endopilot.anatomy.topology import parted
+from endopilot.anatomy.topology import MOST_LISTED, SMALLEST_PIECE, Touch, parted, touch_remarks
 from endopilot.errors import InputError, place_text
 from endopilot.imaging.grid import connected_components
 from endopilot.types import Insertion, Volume
@@ -31,17 +33,63 @@ _DIRECTION_VOXELS = 12.0
 _ONWARDS = 0.5
 """Cosine of the largest angle between a piece and the gap that it is joined across."""
 
-SMALLEST_PIECE = 12
-"""A piece of fewer voxels is noise."""
-
 NOTED_MM = 5.0
 """What is left out or widened gets a remark of its own from this length; shorter pieces are summed up."""
 
-MOST_LISTED = 8
-"""As many pieces are listed one by one."""
+_MOST_JOINED = 200
+"""At most this many pieces of a mask are looked at as vessels or parts of them."""
 
-MOST_PIECES = 12
-"""At most this many pieces of a mask are looked at as coronary arteries or parts of them."""
+OTHER_SIDE = {"rca": "left coronary artery", "lca": "right coronary artery"}
+
+
+@dataclass(frozen=True, eq=False)
+class Lumen:
+    """One lumen of a mask, ready for its wall.
+
+    Attributes:
+        mask: its voxels.
+        lines: their middle.
+        before: middle of all that the file connects with it: what the tree should reach.
+        told: which points of `before` lie in another vessel that was parted from this one, and that a remark names.
+        notes: remarks on what was joined, parted and left out.
+    """
+
+    mask: Volume
+    lines: MedialLines
+    before: MedialLines
+    told: Bool[np.ndarray, "_"]
+    notes: list[str]
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """The pieces of a mask.
+
+    Attributes:
+        joined: voxels as they were read, and over gaps of a few voxels to what carries on.
+        gaps: a voxel at each gap, and whether what lies beyond was joined or runs alongside.
+        parted: the joined voxels, parted where they touch.
+        touches: what touches.
+        before: middle of the joined voxels.
+        lines: middle of the parted ones.
+    """
+
+    joined: Volume
+    gaps: list[tuple[Int[np.ndarray, "3"], bool]]
+    parted: Volume
+    touches: list[Touch]
+    before: MedialLines
+    lines: MedialLines
+
+
+@lru_cache(maxsize=1)
+def pieces_of(mask: Volume) -> Pieces:
+    """Return the pieces of a mask that holds some; the last mask's are kept: several stages ask for them."""
+    box = filled_box(mask.voxels)
+    origin = mask.index_to_world(np.array([part.start for part in box][::-1], dtype=float))
+    joined, gaps = _joined(np.asarray(mask.voxels[box], dtype=bool))
+    read = replace(mask, voxels=joined, origin_mm=origin)
+    return Pieces(read, gaps, *parted(read))
 
 
 def connected_mask(
@@ -50,11 +98,11 @@ def connected_mask(
     label: str,
     vessel: Vessel = "generic",
     other_ostium: Float[np.ndarray, "3"] | None = None,
-) -> tuple[Volume, list[str]]:
+) -> Lumen:
     """Return the one lumen at the ostium, or the largest: gaps of a few voxels bridged, cavities filled, blobs removed.
 
-    Loops of it and places where it touches itself are cut (`topology.parted`). Where a mask holds both coronary
-    arteries and no ostium is given, `vessel` decides by the patient's side.
+    Places where it touches itself are parted (`topology.parted`). Where a mask holds both coronary arteries and no
+    ostium is given, `vessel` decides by the patient's side.
 
     Args:
         mask: one or several lumens, and specks.
@@ -66,66 +114,66 @@ def connected_mask(
     Raises:
         InputError: the mask is empty, full, a solid block, noise, or touches nothing near the given ostium.
     """
-    box = filled_box(mask.voxels)
-    if box[0].stop == 0:
+    if not mask.voxels.any():
         raise InputError(f"{label}: the mask is empty; check the label or segment again")
     if mask.voxels.all():
         raise InputError(f"{label}: the mask is a solid block (every voxel belongs to it); segment the vessel alone")
+    _refuse_blocks_and_noise(np.asarray(mask.voxels[filled_box(mask.voxels)], dtype=bool), label)
+    whole = pieces_of(mask)
+    labels, read = piece_labels(whole.parted), piece_labels(whole.joined)
+    sizes = np.bincount(labels[whole.parted.voxels])
+    if given is None:
+        main, others = _piece_on_side(whole.parted, labels, sizes, vessel)
+    else:
+        main, gap, nearest = _nearest_piece(whole.parted, labels, sizes, given.position)
+        others = []
+        if gap > max(NEAR_OSTIUM_MM, 2.0 * float(mask.spacing_mm.max())):
+            raise InputError(
+                f"{label}: the mask touches nothing near the ostium at {place_text(given.position)}; "
+                f"its nearest voxel is {gap:.1f} mm away at {place_text(nearest)}"
+            )
+    if sizes[main] < SMALLEST_PIECE:
+        raise InputError(f"{label}: the lumen has only {sizes[main]} voxels; check the label or segment again")
+    result = labels == main
+    own = read == read[result][0]  # all that the file connects with it
+    foreign = 0
+    if other_ostium is not None:
+        piece, gap, _ = _nearest_piece(whole.parted, labels, sizes, other_ostium)
+        foreign = piece if gap < NEAR_OSTIUM_MM and piece != main else 0
+    severed = np.setdiff1d(labels[own], [0, main])
+    remarks = touch_remarks([touch for touch in whole.touches if _holds(whole.joined, own, touch.place)])
+    joints = [joined for place, joined in whole.gaps if own[tuple(place)]]
+    if beside := joints.count(False):
+        remarks.append(f"{beside} pieces that run alongside the lumen, not on from it, were not joined to it")
+    if apart := np.setdiff1d(others, [foreign, *severed]).tolist():
+        remarks.append(other_pieces_text(vessel, len(apart)))
+    if joints.count(True):
+        remarks.append(f"{joints.count(True)} gaps of up to {LARGEST_GAP_VOXELS:g} voxels bridged")
+    if foreign:
+        remarks.append(f"the {OTHER_SIDE[vessel]} ({sizes[foreign]} voxels) is not part of this one")
+    remarks += _left_out(whole, result, labels, foreign, severed, vessel)
+    box = filled_box(result)
     corner = np.array([part.start for part in box])
-    voxels = np.asarray(mask.voxels[box], dtype=bool)
-    _refuse_blocks_and_noise(voxels, label)
-    cropped = replace(mask, voxels=voxels, origin_mm=mask.index_to_world(corner[::-1].astype(float)))
-    labels, sizes, main, others = _pieces(cropped, given, label, vessel)
-    own, piece = _cut_out(cropped, labels == main)
-    whole, remarks = parted(piece)
-    severed: set[int] = set()  # what was cut off must not be bridged again
-    if remarks:
-        cropped = replace(cropped, voxels=voxels.copy())
-        cropped.voxels[own] &= ~piece.voxels | whole.voxels
-        labels, sizes, main, others = _pieces(cropped, given, label, vessel)
-        severed = {int(number) for number in np.unique(labels[own][whole.voxels])}
-    result, count = labels == main, len(sizes) - 1
-    if count > 1:
-        pieces = [int(piece) for piece in np.argsort(-sizes)[: min(count, 200)] if piece != main]
-        foreign = _piece_at(cropped, labels, sizes, other_ostium)
-        near = [p for p in pieces if sizes[p] >= SMALLEST_PIECE and p not in (foreign, *severed)]
-        result, joined, beside = _bridged(result, labels, near)
-        if beside:
-            remarks.append(f"{beside} pieces that run alongside the lumen, not on from it, were not joined to it")
-        apart = [piece for piece in others if piece != foreign and not result[labels == piece].any()]
-        if apart:
-            remarks.append(other_pieces_text(vessel, len(apart)))
-        if joined:
-            remarks.append(f"{joined} gaps of up to {LARGEST_GAP_VOXELS:g} voxels bridged")
-        if foreign:
-            other = "left" if vessel == "rca" else "right"
-            remarks.append(f"the {other} coronary artery ({sizes[foreign]} voxels) is not part of this one")
-        remarks += _left_out(cropped, result, labels, sizes, foreign)
-    if result.sum() < SMALLEST_PIECE:
-        raise InputError(f"{label}: the lumen has only {int(result.sum())} voxels; check the label or segment again")
-    _, lumen = _cut_out(cropped, result)
-    closed = binary_fill_holes(lumen.voxels)
-    assert closed is not None
-    if closed.sum() > lumen.voxels.sum():
-        remarks.append(f"cavities of {int(closed.sum() - lumen.voxels.sum())} voxels filled")
-    return replace(lumen, voxels=closed), remarks
+    closed = _filled(result[box])
+    if closed.sum() > sizes[main]:
+        remarks.append(f"cavities of {int(closed.sum() - sizes[main])} voxels filled")
+    lumen = replace(mask, voxels=closed, origin_mm=whole.joined.index_to_world(corner[::-1].astype(float)))
+    lines = whole.lines.part(result[tuple(whole.lines.index.T)], corner)
+    before = whole.before.part(own[tuple(whole.before.index.T)], corner)
+    told = np.isin(labels[tuple((before.index + corner).T)], severed)
+    return Lumen(lumen, lines, before, told, remarks)
 
 
-def joined_mask(mask: Volume) -> Volume:
-    """Return a mask in which each of the largest pieces is joined to what carries it on; specks are left out."""
-    voxels = np.asarray(mask.voxels, dtype=bool)
-    labels = connected_components(voxels, corners=True)
-    sizes = np.bincount(labels.ravel())
-    sizes[0] = 0
-    pieces = [int(piece) for piece in np.argsort(-sizes)[:MOST_PIECES] if sizes[piece] >= SMALLEST_PIECE]
-    result = np.zeros_like(voxels)
-    for piece in pieces:
-        own = labels == piece
-        if result[own].any():
-            continue
-        others = [other for other in pieces if other != piece and not result[labels == other].any()]
-        result |= _bridged(own, labels, others)[0]
-    return replace(mask, voxels=result)
+def _holds(mask: Volume, voxels: Bool[np.ndarray, "nz ny nx"], place: Float[np.ndarray, "3"]) -> bool:
+    """Return whether some voxels lie at a place, LPS mm, or next to it."""
+    at = np.rint(mask.world_to_index(place)).astype(int)[::-1]
+    return bool(voxels[tuple(slice(max(0, i - 2), i + 3) for i in at)].any())
+
+
+def _filled(voxels: Bool[np.ndarray, "nz ny nx"]) -> Bool[np.ndarray, "nz ny nx"]:
+    """Return voxels with the cavities inside them."""
+    outside = connected_components(np.pad(~voxels, 1, constant_values=True))
+    return (outside != outside[0, 0, 0])[1:-1, 1:-1, 1:-1]
 
 
 def _refuse_blocks_and_noise(voxels: Bool[np.ndarray, "nz ny nx"], label: str) -> None:
@@ -140,64 +188,38 @@ def _refuse_blocks_and_noise(voxels: Bool[np.ndarray, "nz ny nx"], label: str) -
         raise InputError(f"{label}: the mask is a solid block ({share:.0%} of its box); segment the vessel alone")
 
 
-def _nearest_piece(mask: Volume, labels: np.ndarray, sizes: np.ndarray, given: Insertion, label: str) -> int:
-    """Return the label of the piece at the ostium; a speck of noise beside it does not count."""
-    index = np.argwhere(labels > 0)
+def _nearest_piece(
+    mask: Volume, labels: np.ndarray, sizes: np.ndarray, place: Float[np.ndarray, "3"]
+) -> tuple[int, float, Float[np.ndarray, "3"]]:
+    """Return the label of the piece at a place, how far away it is, mm, and where; a speck of noise does not count."""
+    index = np.argwhere(mask.voxels)
     index = index[sizes[labels[tuple(index.T)]] >= min(SMALLEST_PIECE, sizes.max())]
-    gap = np.linalg.norm(mask.index_to_world(index[:, ::-1].astype(float)) - given.position, axis=1)
-    if gap.min() > max(NEAR_OSTIUM_MM, 2.0 * float(mask.spacing_mm.max())):
-        nearest = mask.index_to_world(index[gap.argmin()][::-1].astype(float))
-        raise InputError(
-            f"{label}: the mask touches nothing near the ostium at {place_text(given.position)}; "
-            f"its nearest voxel is {gap.min():.1f} mm away at {place_text(nearest)}"
-        )
-    return int(labels[tuple(index[gap.argmin()])])
-
-
-def _pieces(
-    mask: Volume, given: Insertion | None, label: str, vessel: Vessel
-) -> tuple[np.ndarray, np.ndarray, int, list[int]]:
-    """Return the connected pieces' labels and sizes, the wanted one, and others that are nearly as large."""
-    labels = connected_components(mask.voxels, corners=True)
-    sizes = np.bincount(labels.ravel())
-    sizes[0] = 0
-    if given is None:
-        return labels, sizes, *_piece_on_side(mask, labels, sizes, vessel)
-    return labels, sizes, _nearest_piece(mask, labels, sizes, given, label), []
-
-
-def _cut_out(mask: Volume, voxels: Bool[np.ndarray, "nz ny nx"]) -> tuple[tuple[slice, slice, slice], Volume]:
-    """Return the smallest box that holds some voxels of a mask, and these voxels alone as a mask of that box."""
-    box = filled_box(voxels)
-    corner = np.array([part.start for part in box][::-1], dtype=float)
-    return box, replace(mask, voxels=voxels[box], origin_mm=mask.index_to_world(corner))
-
-
-def _piece_at(mask: Volume, labels: np.ndarray, sizes: np.ndarray, place: Float[np.ndarray, "3"] | None) -> int:
-    """Return the label of the piece at a place, 0 if there is none."""
-    if place is None:
-        return 0
-    index = np.argwhere(labels > 0)
-    index = index[sizes[labels[tuple(index.T)]] >= SMALLEST_PIECE]
-    gap = np.linalg.norm(mask.index_to_world(index[:, ::-1].astype(float)) - place, axis=1)
-    return int(labels[tuple(index[gap.argmin()])]) if len(gap) and gap.min() < NEAR_OSTIUM_MM else 0
+    points = mask.index_to_world(index[:, ::-1].astype(float))
+    gap = np.linalg.norm(points - place, axis=1)
+    return int(labels[tuple(index[gap.argmin()])]), float(gap.min()), points[gap.argmin()]
 
 
 def _left_out(
-    mask: Volume, result: Bool[np.ndarray, "nz ny nx"], labels: np.ndarray, sizes: np.ndarray, foreign: int
+    whole: Pieces,
+    result: Bool[np.ndarray, "nz ny nx"],
+    labels: Int[np.ndarray, "nz ny nx"],
+    foreign: int,
+    severed: Int[np.ndarray, "_"],
+    vessel: Vessel,
 ) -> list[str]:
     """Say which pieces were left out and where they lie, since a real vessel may be lost with them.
 
     Args:
-        mask: all pieces.
+        whole: all pieces.
         result: the lumen.
         labels: number of each piece.
-        sizes: their voxels, by number.
-        foreign: number of a piece that belongs to another vessel, 0 if there is none.
+        foreign: number of the other coronary artery, 0 if it is not there or not known.
+        severed: numbers of those that touched the lumen and were parted from it.
+        vessel: which vessel is wanted.
     """
-    kept = np.isin(np.arange(len(sizes)), labels[result])
-    kept[[0, foreign]] = True
-    lost = np.flatnonzero(~kept)
+    mask = whole.parted
+    sizes = np.bincount(labels[mask.voxels])
+    lost = np.setdiff1d(np.flatnonzero(sizes), [0, labels[result][0], foreign])
     if len(lost) == 0:
         return []
     boxes = find_objects(labels)
@@ -209,14 +231,21 @@ def _left_out(
     for number in order[:MOST_LISTED]:
         if extent[number] < NOTED_MM:
             break
-        box = boxes[lost[number] - 1]
-        own = np.argwhere(labels[box] == lost[number]) + corners[number, :, 0]
+        piece = lost[number]
+        own = np.argwhere(labels[boxes[piece - 1]] == piece) + corners[number, :, 0]
         place = mask.index_to_world(own[:, ::-1].astype(float))
         gap = np.asarray(reach.query(place)[0])
+        at, apart = place_text(place[gap.argmin()]), "apart from the lumen"
+        begins = f"begins {gap.min():.1f} mm away at {at}"
+        kind = "a piece"
+        if piece in severed:
+            kind, apart, begins = "another vessel", "that touches this one", f"touches it at {at}"
+        elif sizes[piece] >= COMPARABLE * result.sum():
+            kind = "another vessel, " + (
+                f"perhaps the {OTHER_SIDE[vessel]}," if vessel in OTHER_SIDE else "or a part not connected in the file,"
+            )
         remarks.append(
-            f"a piece apart from the lumen left out ({sizes[lost[number]]} voxels): it is {extent[number]:.0f} mm long "
-            f"and begins {gap.min():.1f} mm away at {place_text(place[gap.argmin()])}; close the gap in the mask if it "
-            "belongs to the vessel"
+            f"{kind} {apart} left out ({sizes[piece]} voxels): it is {extent[number]:.0f} mm long and {begins}"
         )
     rest = order[len(remarks) :]
     if len(rest):
@@ -226,42 +255,43 @@ def _left_out(
     return remarks
 
 
-def _bridged(
-    result: Bool[np.ndarray, "nz ny nx"], labels: np.ndarray, pieces: list[int]
-) -> tuple[Bool[np.ndarray, "nz ny nx"], int, int]:
+def _joined(
+    voxels: Bool[np.ndarray, "nz ny nx"],
+) -> tuple[Bool[np.ndarray, "nz ny nx"], list[tuple[Int[np.ndarray, "3"], bool]]]:
     """Join pieces that lie within the largest gap by tubes as wide as the vessels at both ends.
 
-    Returns the lumen, how many pieces were joined, and how many are near enough but run alongside it: two vessels that
-    pass each other are not one.
+    Two vessels that pass each other are not one: a piece that runs alongside another is not joined to it. Returns the
+    voxels, and for each gap a voxel at it and whether it was bridged.
     """
-    if not pieces:
-        return result, 0, 0
-    result, joined, beside = result.copy(), 0, 0
+    labels, index = connected_components(voxels, corners=True), np.argwhere(voxels)
+    numbers = labels[tuple(index.T)]
+    sizes = np.bincount(numbers)
+    order = np.argsort(numbers, kind="stable")
+    members = dict(enumerate(np.split(index[order], np.cumsum(sizes)[:-1])))
+    large = np.argsort(-sizes, kind="stable")[:_MOST_JOINED].tolist()
+    left = [piece for piece in large if sizes[piece] >= SMALLEST_PIECE]
+    gaps, result = list[tuple[np.ndarray, bool]](), voxels.copy()
     clearance: np.ndarray | None = None  # where nothing is joined it is not needed
-    members = {piece: np.argwhere(labels == piece) for piece in pieces}
-    changed = True
-    while changed:
-        changed = False
-        here = np.argwhere(result)
+    while len(left) > 1:
+        here, asked, beside = members[left.pop(0)], list(left), list[int]()
         reach = KDTree(here)
-        for piece in list(members):
+        while asked:
+            piece = asked.pop(0)
             gap, nearest = map(np.asarray, reach.query(members[piece], distance_upper_bound=LARGEST_GAP_VOXELS))
-            best = int(np.argmin(gap))
+            best = int(gap.argmin())
             if not np.isfinite(gap[best]):
                 continue
-            start, own = here[nearest[best]], members.pop(piece)
-            end = own[best]
-            if not (_carries_on(here, start, end) or _carries_on(own, end, start)):
-                beside += 1
-                continue
-            if clearance is None:
-                clearance = np.asarray(distance_transform_edt(labels > 0))
-            width = min(_widest(clearance, start), _widest(clearance, end))
-            _draw_tube(result, start, end, width)
-            result |= labels == piece
-            joined += 1
-            changed = True
-    return result, joined, beside
+            start, end = here[nearest[best]], members[piece][best]
+            onwards = _carries_on(here, start, end) or _carries_on(members[piece], end, start)
+            gaps.append((start, onwards))
+            beside += [piece] * (not onwards)
+            if onwards:
+                clearance = np.asarray(distance_transform_edt(voxels)) if clearance is None else clearance
+                _draw_tube(result, start, end, min(_widest(clearance, start), _widest(clearance, end)))
+                left.remove(piece)
+                here, asked = np.concatenate([here, members[piece]]), [other for other in left if other not in beside]
+                reach = KDTree(here)
+    return result, gaps
 
 
 def _carries_on(voxels: Int[np.ndarray, "n 3"], end: Int[np.ndarray, "3"], beyond: Int[np.ndarray, "3"]) -> bool:

@@ -14,10 +14,14 @@ from scipy.spatial import KDTree
 
 from endopilot.anatomy.lumen_graph import pieces
 from endopilot.anatomy.parent_vessel import Vessel, piece_on_side
-from endopilot.anatomy.repair import MOST_LISTED, MOST_PIECES, NEAR_OSTIUM_MM, NOTED_MM, other_pieces_text
+from endopilot.anatomy.repair import NEAR_OSTIUM_MM, NOTED_MM, OTHER_SIDE, other_pieces_text
 from endopilot.anatomy.surface import Surface, surface_from_mask
+from endopilot.anatomy.topology import MOST_LISTED
 from endopilot.errors import InputError, place_text
 from endopilot.types import Insertion, Volume
+
+MOST_PIECES = 12
+"""At most this many pieces of a surface are looked at as coronary arteries or parts of them."""
 
 
 def closed_surface(
@@ -110,8 +114,7 @@ def _regions_left_out(
         place = points[ids == region]
         extent = float(np.linalg.norm(np.ptp(place, axis=0)))
         if other_ostium is not None and np.linalg.norm(place - other_ostium, axis=1).min() < NEAR_OSTIUM_MM:
-            other = "left" if vessel == "rca" else "right"
-            found.append((np.inf, f"the {other} coronary artery ({len(place)} vertices) is not part of this one"))
+            found.append((np.inf, f"the {OTHER_SIDE[vessel]} ({len(place)} vertices) is not part of this one"))
         elif extent >= NOTED_MM:
             gap = np.asarray(own.query(place)[0])
             at = place_text(place[gap.argmin()])

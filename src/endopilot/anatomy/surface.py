@@ -97,6 +97,8 @@ class Surface:
 
     def refined(self, edge_mm: float) -> Surface:
         """Return the same wall with triangles whose edges are no longer than `edge_mm`, by halving the longest."""
+        if self.longest_edge <= edge_mm:
+            return self  # what is kept of it, such as its search tree, serves on
         vertices, faces = self.vertices, self.faces
         done: list[np.ndarray] = []
         while len(faces):

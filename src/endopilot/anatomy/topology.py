@@ -1,25 +1,34 @@
-"""Loops and contacts of a mask: a tree holds neither, so they are cut where they are narrowest, and stated.
+"""What touches in a mask: one model of contacts, loops, flaps and forks, so that a tree goes on where the vessel does.
 
-The middle of a mask (`medial_lines`) closes a loop for every tunnel through it. A loop whose narrowest place is much
-thinner than the vessel is one that touches itself, a hairpin for instance; any other is a loop of the vessel, such as a
-bypass. Two vessels that run past each other and touch in between, without a loop, are joined by a short and thin bridge
-that leaves both from the side.
+The middle of a mask (`medial_lines`) is cut into segments between its junctions. Where four of them leave a junction,
+or two that are near each other, two vessels may run past each other: then they pair up to two lines that carry on
+straight, about as far apart as both radii together. At a true fork the lines meet. A contact is parted, unless the
+lumen would fall apart that way and the two are not certain to be two vessels: then it stays, and is said. What is left
+of loops is cut at its narrowest place. Where filling in a wall makes the vessel much wider, that wall is a flap, and
+its openings stay.
 """
 
 from __future__ import annotations
 
+import itertools
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
-from scipy.ndimage import binary_dilation
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import binary_closing, binary_dilation, distance_transform_edt
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist
 
-from endopilot.anatomy.medial_lines import MedialLines, thinned_lines, traced_lines
+from endopilot.anatomy.lumen_graph import pieces
+from endopilot.anatomy.medial_lines import SMALLEST_PIECE, MedialLines, thinned_lines, traced_lines
 from endopilot.anatomy.parent_vessel import AORTA_RADIUS_MM
 from endopilot.errors import place_text
+from endopilot.imaging.grid import connected_components
+from endopilot.lines import length_along
 from endopilot.types import Volume
 
 CONTACT = 0.6
@@ -32,247 +41,443 @@ hole: which way a line takes hardly matters."""
 SHORTEST_TUNNEL_MM = 6.0
 """Tunnels shorter than this, or no longer than round the vessel itself, are rough voxels."""
 
+MOST_LISTED = 8
+"""As many places or pieces are listed one by one."""
+
 _SLIT_VOXELS = 3.0
 """So are those whose opposite sides come as near each other as this, in voxels."""
 
+_APART, _STRAIGHT = (0.35, 0.5, 0.8), (0.6, 0.8)
+"""Axes that stay apart by these shares of both radii together: of one vessel that touches itself, of two that perhaps
+touch, of two that certainly do. Each one carries on by the first cosine at least, certainly by the second."""
+
+_FLAP = 1.15
+"""Where the wall between two lumens of one vessel is filled in, it is wider than either of them by this factor, unless
+the wall lies far off its middle; where two round vessels touch, it never is."""
+
 _SAME_PLACE_MM = 5.0
 _SIDE_BY_SIDE_MM = 3.0
-
-_BRIDGE = 1.5
-"""A bridge between two vessels that touch is no longer than this many times both their radii and a slit."""
-
-_THROUGH = -0.6
-"""Cosine of the smallest angle between a vessel's two directions where it runs past a contact."""
-
-_THICK_VOXELS = 1.0
-_ARM_RADII = 4.0
+_NEAR_RADII, _ARM_RADII = 8.0, 4.0
 _ROUNDS = 4
-_MOST_CUTS = 8
-"""A lumen that closes on itself in more places is no tree that touches itself: so are the lumens of a dissection, with
-the tears between them. It is left as it is."""
+
+Kind = Literal["itself", "loop", "side", "vessels", "perhaps", "flap", "hole"]
+
+_SAID: dict[Kind, tuple[str, str]] = {
+    "itself": ("the vessel touches itself and was parted at", " ({:.0f} mm of vessel between the two sides)"),
+    "loop": ("a tree holds no loops: cut at the narrowest place", " (loop of {:.0f} mm)"),
+    "side": ("distant parts of the vessel touch over some length and were parted around", " (over {:.0f} mm)"),
+    "vessels": ("two vessels touch and were parted at", ""),
+    "perhaps": ("two vessels may touch, or one forks; they were left joined at", ""),
+    "flap": ("a wall inside the vessel, such as a flap, was left with its openings at", " (ring of {:.0f} mm)"),
+    "hole": ("tunnels were left as they are, at", " ({:.0f} mm around)"),
+}
 
 
 @dataclass(frozen=True, eq=False)
-class _Cut:
-    """A place where a mask is cut: two neighbouring points of its middle."""
+class Touch:
+    """A place where a mask touches itself or closes a loop, and what was made of it.
 
-    ends: tuple[int, int]
-    kind: Literal["contact", "loop", "bridge"]
+    Attributes:
+        kind: parted: the vessel touches itself, a loop is narrowest, distant parts lie side by side, two vessels
+            touch; left: two vessels perhaps touch, a flap has an opening, a tunnel is small.
+        place: where, LPS mm.
+        size_mm: length of the vessel between the two sides, or of the contact.
+    """
+
+    kind: Kind
     place: Float[np.ndarray, "3"]
+    size_mm: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Arm:
+    """A segment of the middle as it leaves a junction, outwards: mm along the mask's own axes (z, y, x)."""
+
+    points: Float[np.ndarray, "n 3"]
+    direction: Float[np.ndarray, "3"]
+    radius: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Crossing:
+    """Two lines that run past each other, mm along the mask's own axes: points, radii, and where they are nearest."""
+
+    lines: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]
+    radii: tuple[float, float]
+    nearest: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
+    likely: bool
+    certain: bool
+
+    @property
+    def place(self) -> Float[np.ndarray, "3"]:
+        """A place on both walls."""
+        share = self.radii[0] / sum(self.radii)
+        return (1 - share) * self.nearest[0] + share * self.nearest[1]
+
+
+@dataclass(frozen=True, eq=False)
+class _Ring:
+    """A loop of the middle: its points from one side of its narrowest place to the other, and its length, mm."""
+
+    nodes: Int[np.ndarray, "n"]
     around_mm: float
 
 
-def parted(mask: Volume) -> tuple[Volume, list[str]]:
-    """Return the mask without loops and contacts, each cut at its narrowest place, and remarks on them.
+def parted(mask: Volume) -> tuple[Volume, list[Touch], MedialLines, MedialLines]:
+    """Return the mask parted where it touches itself, all places where it touches or closes a loop, and its middle.
 
-    A lumen that has more than a few of them is returned as it is.
+    No part of a lumen loses its way to the rest, except one of two vessels that certainly only touch. The middle is
+    that of the mask as it was, and as it is.
     """
-    whole, done = mask, list[_Cut]()
-    holes: list[_Cut] = []
-    sides: list[str] = []
+    parting, before = _Parting(mask), traced_lines(mask)
     for _ in range(_ROUNDS):
-        lines = thinned_lines(mask)
-        loops = _loops(lines, mask)
-        cuts = [loop for loop in loops if loop.around_mm >= SHORTEST_LOOP_MM]
-        holes = holes if done else [loop for loop in loops if loop.around_mm < SHORTEST_LOOP_MM]
-        if not cuts:
-            lines = traced_lines(mask)
-            cuts = _contacts(lines, mask)
-        if not cuts:
-            mask, sides = _without_sides(mask, lines)
+        thin = thinned_lines(parting.result)  # has all loops, but not all ends
+        lines = before if parting.result is mask else traced_lines(parting.result)
+        rings = _rings(thin, mask)
+        long = [ring for ring in rings if ring.around_mm >= SHORTEST_LOOP_MM]
+        crossings = itertools.chain(_crossings(thin, long), _crossings(lines, []))
+        opened = sum([parting.crossing(each, thin, long) for each in crossings])
+        opened = opened or sum([parting.ring(each, thin) for each in long])
+        if not opened:
+            for ring in rings:
+                if ring.around_mm < SHORTEST_LOOP_MM:
+                    parting.say("hole", thin.local[ring.nodes[0]], ring.around_mm)
             break
-        if len(places := _apart(done + cuts)) > _MOST_CUTS:
-            return whole, [_porous(places)]
-        voxels = mask.voxels.copy()
-        for cut in cuts:
-            _sever(voxels, lines, cut.ends)
-        mask = replace(mask, voxels=voxels)
-        done += cuts
-    return mask, _remarks(done, holes) + sides
+    result = parting.result
+    lines = before if result is mask else traced_lines(result)
+    if aside := _without_sides(result, lines):
+        result, lines = aside[0], traced_lines(aside[0])
+        parting.found.append(aside[1])
+    return result, parting.found, before, lines
 
 
-def _apart(cuts: list[_Cut]) -> list[_Cut]:
-    """Return those of some cuts that lie at places of their own, that of the longest loop first."""
-    found: list[_Cut] = []
-    for cut in sorted(cuts, key=lambda cut: -cut.around_mm):
-        if all(np.linalg.norm(cut.place - other.place) >= _SAME_PLACE_MM for other in found):
-            found.append(cut)
-    return found
-
-
-def _porous(cuts: list[_Cut]) -> str:
-    """Say that a lumen closes on itself in many places."""
-    return (
-        f"the lumen closes on itself in {len(cuts)} places or more, as those of a dissection do at tears: they are "
-        f"left open, and the tree takes one way round each; the longest ring has {cuts[0].around_mm:.0f} mm, at "
-        f"{place_text(cuts[0].place)}"
-    )
-
-
-def _remarks(cuts: list[_Cut], holes: list[_Cut]) -> list[str]:
-    """Say where a mask was cut, one remark for each kind."""
-    words = {
-        "contact": ("the vessel touches itself and was parted at", " ({:.0f} mm of vessel between the two sides)"),
-        "loop": ("a tree holds no loops: cut at the narrowest place", " (loop of {:.0f} mm)"),
-        "bridge": ("two vessels touch and were parted at", ""),
-    }
+def touch_remarks(found: list[Touch]) -> list[str]:
+    """Return what is said of places where a mask touches itself: one remark for each kind, the largest place first."""
     remarks = []
-    for kind, (text, size) in words.items():
-        cut_here = _apart([cut for cut in cuts if cut.kind == kind])
-        places = [place_text(cut.place) + size.format(cut.around_mm) for cut in cut_here]
+    for kind, (text, size) in _SAID.items():
+        own = sorted((touch for touch in found if touch.kind == kind), key=lambda touch: -touch.size_mm)
+        places = [place_text(touch.place) + size.format(touch.size_mm) * (touch.size_mm > 0) for touch in own]
         if places:
-            remarks.append(f"{text} {', '.join(places)}")
-    if holes:
-        largest = max(holes, key=lambda hole: hole.around_mm)
-        remarks.append(
-            f"{len(holes)} small tunnels were left as they are, the largest of {largest.around_mm:.0f} mm around at "
-            f"{place_text(largest.place)}"
-        )
+            more = f" and {len(places) - MOST_LISTED} places more" if len(places) > MOST_LISTED else ""
+            remarks.append(f"{text} {', '.join(places[:MOST_LISTED])}{more}")
     return remarks
 
 
-def _loops(lines: MedialLines, mask: Volume) -> list[_Cut]:
-    """Return a cut for every loop of the vessel's middle."""
-    cuts = []
+class _Parting:
+    """A mask that is being parted, and what was found in it."""
+
+    def __init__(self, mask: Volume) -> None:
+        self.mask, self.edges, self.whole = mask, mask.spacing_mm[::-1], mask.voxels
+        self.result, self.found = mask, list[Touch]()
+
+    @property
+    def voxels(self) -> Bool[np.ndarray, "nz ny nx"]:
+        """The voxels as they are parted so far."""
+        return self.result.voxels
+
+    def say(self, kind: Kind, place: Float[np.ndarray, "3"], size_mm: float = 0.0) -> None:
+        """Keep what was found at a place, along the mask's own axes, unless something is said of it."""
+        at = self.mask.index_to_world((place / self.edges)[::-1])
+        if all(np.linalg.norm(at - touch.place) >= _SAME_PLACE_MM for touch in self.found):
+            self.found.append(Touch(kind, at, size_mm))
+
+    def crossing(self, crossing: _Crossing, lines: MedialLines, rings: list[_Ring]) -> bool:
+        """Part two lines that run past each other, if nothing is lost by it, and return whether that was done."""
+        across = np.linspace(*crossing.nearest, 12)
+        neck, flap = self._neck(crossing.place, sum(crossing.radii), across)
+        if flap:
+            self.say("flap", crossing.place)
+            return False
+        rim = _rim(self.voxels, self.edges, crossing)
+        trial = self.voxels & ~rim
+        one, two, whole = self._held(trial, crossing)
+        kind: Kind = "perhaps"
+        if whole and one == two and _count(trial) <= _count(self.voxels) and _are_apart(trial, self.edges, crossing):
+            kind = "itself"
+        elif whole and one != two and crossing.certain and neck < CONTACT * min(crossing.radii):
+            one, two, _ = self._held(self.whole & ~rim, crossing)
+            kind = "vessels" if one != two else "perhaps"
+        if kind == "perhaps" and not crossing.likely:
+            return False
+        place = np.argwhere(rim).mean(axis=0) * self.edges if rim.any() else crossing.place
+        reach = sum(crossing.radii)
+        through = [r.around_mm for r in rings if cdist(lines.local[r.nodes], [place]).min() < reach]
+        self.say(kind, place, min(through, default=0.0) if kind == "itself" else 0.0)
+        if kind != "perhaps":
+            self.result = replace(self.mask, voxels=trial)
+        return kind != "perhaps"
+
+    def _held(self, voxels: Bool[np.ndarray, "nz ny nx"], crossing: _Crossing) -> tuple[int, int, bool]:
+        """Return which pieces two lines lie in, and whether either lies in one piece from end to end."""
+        labels = connected_components(voxels, corners=True)
+        ends = np.array([line[at] for line in crossing.lines for at in (0, -1)])
+        one, other, two, last = (int(labels[tuple(at)]) for at in np.rint(ends / self.edges).astype(int))
+        return one, two, one == other > 0 and two == last > 0
+
+    def ring(self, ring: _Ring, lines: MedialLines) -> bool:
+        """Cut a loop at its narrowest place, if nothing is lost by it, and return whether that was done."""
+        clearance, ends = lines.clearance[ring.nodes], ring.nodes[[0, -1]]
+        place = lines.local[ends].mean(axis=0)
+        if self._neck(place, 2.0 * float(np.median(clearance)), place[None])[1]:
+            self.say("flap", place, ring.around_mm)
+            return False
+        trial = self.voxels.copy()
+        _sever(trial, lines, (int(ends[0]), int(ends[1])))
+        if _count(trial) > _count(self.voxels):
+            self.say("hole", place, ring.around_mm)
+            return False
+        narrow = float(lines.clearance[ends].min()) < CONTACT * float(np.median(clearance))
+        self.say("itself" if narrow else "loop", place, ring.around_mm)
+        self.result = replace(self.mask, voxels=trial)
+        return True
+
+    def _neck(
+        self, place: Float[np.ndarray, "3"], reach_mm: float, across: Float[np.ndarray, "n 3"]
+    ) -> tuple[float, bool]:
+        """Return the least clearance at places across a neck, mm, and whether a flap is at its middle.
+
+        With its wall filled in, the vessel then is wider there than any lumen within reach.
+        """
+        reach, at = np.ceil(reach_mm / self.edges).astype(int), np.rint(place / self.edges).astype(int)
+        window = tuple(slice(max(0, c - 2 * r), c + 2 * r + 1) for c, r in zip(at, reach, strict=True))
+        own = np.pad(self.voxels[window], 1)
+        filled = np.asarray(binary_closing(own, np.ones((3, 3, 3))))  # walls of one or two voxels
+        before, after = (np.asarray(distance_transform_edt(each, sampling=self.edges)) for each in (own, filled))
+        at = at - [part.start for part in window] + 1
+        near, here = (
+            tuple(slice(max(0, c - r), c + r + 1) for c, r in zip(at, size, strict=True))
+            for size in (reach, np.ones(3, int))
+        )
+        widest, filled = float(before[near].max(initial=0.0)), float(after[here].max(initial=0.0))
+        at = np.rint(across / self.edges).astype(int) - [part.start for part in window] + 1
+        return float(before[tuple(np.clip(at, 0, np.array(before.shape) - 1).T)].min()), filled > _FLAP * widest
+
+
+def _count(voxels: Bool[np.ndarray, "nz ny nx"]) -> int:
+    """Return how many pieces a mask has, without specks."""
+    return int((np.bincount(connected_components(voxels, corners=True).ravel())[1:] >= SMALLEST_PIECE).sum())
+
+
+def _rings(lines: MedialLines, mask: Volume) -> list[_Ring]:
+    """Return the loops of a mask's middle that are not rough voxels, one for each edge that closes one."""
+    rings = []
     for start, end in lines.closing:
-        loop = lines.way(int(end), int(start))
-        around = float(np.cumsum(lines.lengths(np.column_stack([loop[:0:-1], loop[-2::-1]])))[-1])
-        clearance = lines.clearance[loop]
-        across = np.linalg.norm(lines.points[loop] - np.roll(lines.points[loop], len(loop) // 2, axis=0), axis=1)
-        slit = across.min() < _SLIT_VOXELS * mask.spacing_mm.max()
-        if slit or around < max(SHORTEST_TUNNEL_MM, 2 * np.pi * float(np.quantile(clearance, 0.9))):
+        nodes = np.array(lines.way(int(end), int(start)))
+        around = float(lines.lengths(np.column_stack([nodes, np.roll(nodes, 1)])).sum())
+        across = np.linalg.norm(lines.points[nodes] - np.roll(lines.points[nodes], len(nodes) // 2, axis=0), axis=1)
+        wide = 2 * np.pi * float(np.quantile(lines.clearance[nodes], 0.9))
+        if across.min() >= _SLIT_VOXELS * mask.spacing_mm.max() and around >= max(SHORTEST_TUNNEL_MM, wide):
+            rings.append(_Ring(nodes, around))
+    return rings
+
+
+def _crossings(lines: MedialLines, rings: list[_Ring]) -> Iterator[_Crossing]:
+    """Yield where two vessels may run past each other: four arms of one junction, or of two that are near."""
+    segments = _segments(lines, rings)
+    ends = Counter(node for segment in segments for node in (segment[0], segment[-1]))
+    length = [float(length_along(lines.local[segment])[-1]) for segment in segments]
+    forks = [ends[segment[0]] > 2 and ends[segment[-1]] > 2 for segment in segments]
+    radius = [float(lines.clearance[[segment[0], segment[-1]]].max()) for segment in segments]
+    inner = [fork and size <= wide for fork, size, wide in zip(forks, length, radius, strict=True)]
+    short = np.array([(s[0], s[-1]) for s, within in zip(segments, inner, strict=True) if within], int).reshape(-1, 2)
+    group = pieces(short, len(lines.points))
+    arms: dict[int, list[tuple[int, _Arm | None]]] = {}
+    for number, segment in enumerate(segments):
+        for path in () if inner[number] else (segment, segment[::-1]):
+            if ends[path[0]] > 2:
+                arms.setdefault(int(group[path[0]]), []).append((number, _arm(lines, path)))
+    unions = [(own, -1) for own in arms.values()]
+    for number, segment in enumerate(segments):
+        one, two = int(group[segment[0]]), int(group[segment[-1]])
+        if forks[number] and not inner[number] and one != two and length[number] < _NEAR_RADII * radius[number]:
+            unions.append((arms[one] + arms[two], number))
+    for union, link in unions:
+        usable = [arm for number, arm in union if number != link and arm is not None]
+        if len(usable) > 3 and (crossing := _crossing(usable)):
+            yield crossing
+
+
+def _segments(lines: MedialLines, rings: list[_Ring]) -> list[list[int]]:
+    """Return the paths of the middle between its ends and junctions, without stubs as short as it is wide."""
+    ways: dict[int, set[int]] = {}
+    for one, two in [*lines.edges.tolist(), *(ring.nodes[[0, -1]].tolist() for ring in rings)]:
+        ways.setdefault(one, set()).add(two)
+        ways.setdefault(two, set()).add(one)
+    while True:
+        segments: list[list[int]] = []
+        for node in sorted(node for node, others in ways.items() if len(others) != 2):
+            for following in sorted(ways[node]):
+                path = [node, following]
+                while len(ways[path[-1]]) == 2:
+                    path.append(next(other for other in ways[path[-1]] if other != path[-2]))
+                if (path[-1], path[-2]) > (node, following):
+                    segments.append(path)
+        stubs = [s for s in segments if (len(ways[s[0]]) == 1) != (len(ways[s[-1]]) == 1)]
+        stubs = [s if len(ways[s[0]]) > 1 else s[::-1] for s in stubs]
+        stubs = [s for s in stubs if _is_stub(lines, s)]
+        if not stubs:
+            return segments
+        for stub in stubs:
+            for one, two in itertools.pairwise(stub):
+                ways[one].discard(two)
+                ways[two].discard(one)
+        ways = {node: others for node, others in ways.items() if others}
+
+
+def _is_stub(lines: MedialLines, path: list[int]) -> bool:
+    """Return whether a segment that ends is no longer than the middle is wide where it begins."""
+    length = float(length_along(lines.local[path])[-1])
+    around = np.linalg.norm(lines.local - lines.local[path[0]], axis=1) <= length
+    return length < max(2.0 * float(lines.clearance[around].max()), _SLIT_VOXELS * float(lines.edges_mm.max()))
+
+
+def _arm(lines: MedialLines, path: list[int]) -> _Arm | None:
+    """Return what leaves a junction outside its inscribed sphere; None if that is too short to have a direction."""
+    points, wide = lines.local[path], float(lines.clearance[path[0]])
+    along = length_along(points)
+    first = int(np.searchsorted(along, wide))
+    last = int(np.searchsorted(along, along[min(first, len(path) - 1)] + _ARM_RADII * wide))
+    points = points[first : last + 1]
+    if len(points) < 3 or np.linalg.norm(points[-1] - points[0]) < 1.5 * wide:
+        return None
+    direction = (points[-1] - points[0]) / np.linalg.norm(points[-1] - points[0])
+    return _Arm(points, direction, float(np.quantile(lines.clearance[path[first : last + 1]], 0.75)))
+
+
+def _crossing(arms: list[_Arm]) -> _Crossing | None:
+    """Return two lines that run past each other, of the arms that carry each other on best; None if they are a fork."""
+    ways = {
+        (i, j): -float(arms[i].direction @ arms[j].direction) for i, j in itertools.combinations(range(len(arms)), 2)
+    }
+    best, found = 0.0, None
+    for couple in itertools.combinations(ways, 2):
+        straight = min(ways[pair] for pair in couple)
+        if set(couple[0]) & set(couple[1]) or straight < _STRAIGHT[0]:
             continue
-        contact = float(lines.clearance[[start, end]].min()) < CONTACT * float(np.median(clearance))
-        place = lines.points[[start, end]].mean(axis=0)
-        cuts.append(_Cut((int(start), int(end)), "contact" if contact else "loop", place, around))
-    return cuts
+        one, two = (_carried_on(arms[i], arms[j]) for i, j in couple)
+        radii = tuple((arms[i].radius + arms[j].radius) / 2 for i, j in couple)
+        gaps = cdist(one, two)
+        at = np.unravel_index(gaps.argmin(), gaps.shape)
+        apart = float(gaps.min()) / sum(radii)
+        if apart > _APART[0] and straight + min(apart, 1.0) > best:
+            best = straight + min(apart, 1.0)
+            lines = tuple(
+                np.concatenate([arms[i].points[::-1], line, arms[j].points])
+                for (i, j), line in zip(couple, (one, two), strict=True)
+            )
+            certain = straight > _STRAIGHT[1] and apart > _APART[2]
+            found = _Crossing(lines, radii, (one[at[0]], two[at[1]]), apart > _APART[1], certain)  # pyright: ignore[reportArgumentType]
+    return found
 
 
-def _contacts(lines: MedialLines, mask: Volume) -> list[_Cut]:
-    """Return a cut for every short and thin bridge between two vessels that run past each other."""
-    ways: list[list[int]] = [[] for _ in lines.points]
-    for one, two in lines.edges:
-        ways[one].append(int(two))
-        ways[two].append(int(one))
-    thin = [i for i in np.argsort(lines.clearance) if len(ways[i]) == 2]
-    done = np.zeros(len(lines.points), dtype=bool)
-    cuts = []
-    for node in thin:
-        if done[node]:
-            continue
-        sides = [_crossing(ways, int(node), first) for first in ways[node]]
-        if any(side is None for side in sides):
-            continue
-        (one, path_one), (two, path_two) = sides  # pyright: ignore[reportGeneralTypeIssues, reportOptionalIterable]
-        done[[*path_one, *path_two]] = True
-        radius = lines.clearance[[one, two]]
-        gap = float(np.linalg.norm(lines.points[one] - lines.points[two]))
-        reach = _BRIDGE * radius.sum() + _SLIT_VOXELS * mask.spacing_mm.max()
-        thick = radius.min() > _THICK_VOXELS * mask.spacing_mm.max()
-        thin_and_short = lines.clearance[node] < CONTACT * radius.min() and gap < reach
-        past = thick and thin_and_short and _runs_past(lines, ways, one, path_one)
-        if past and _runs_past(lines, ways, two, path_two):
-            cuts.append(_Cut((int(node), path_two[0]), "bridge", lines.points[node], 0.0))
-    return cuts
+def _carried_on(one: _Arm, two: _Arm) -> Float[np.ndarray, "n 3"]:
+    """Return the cubic that carries one arm on into another."""
+    start, end = one.points[0], two.points[0]
+    size = float(np.linalg.norm(end - start))
+    at = np.linspace(0.0, 1.0, 24)[:, None]
+    bend = at * (1 - at) * ((1 - at) * (start - end - size * one.direction) + at * (end - start - size * two.direction))
+    return (1 - at) * start + at * end + bend
 
 
-def _without_sides(mask: Volume, lines: MedialLines) -> tuple[Volume, list[str]]:
+def _rim(
+    voxels: Bool[np.ndarray, "nz ny nx"], edges: Float[np.ndarray, "3"], crossing: _Crossing
+) -> Bool[np.ndarray, "nz ny nx"]:
+    """Return the voxels between two lines that touch, a layer of either, so that their walls stay apart."""
+    window = _window(voxels.shape, edges, crossing)
+    corner = np.array([part.start for part in window])
+    index = np.argwhere(voxels[window])
+    local = (index + corner) * edges
+    one, two = (
+        np.asarray(KDTree(line).query(local)[0]) - radius
+        for line, radius in zip(crossing.lines, crossing.radii, strict=True)
+    )
+    gap = max(0.0, float(np.linalg.norm(np.subtract(*crossing.nearest))) - sum(crossing.radii))
+    near = np.maximum(one, two) < gap / 2 + 1.5 * float(edges.max())
+    rim = _between(voxels[window], index, one <= two)
+    rim[tuple(index[~near].T)] = False
+    whole = np.zeros_like(voxels)
+    whole[window] = rim
+    return whole
+
+
+def _between(
+    voxels: Bool[np.ndarray, "nz ny nx"], index: Int[np.ndarray, "n 3"], chosen: Bool[np.ndarray, "n"]
+) -> Bool[np.ndarray, "nz ny nx"]:
+    """Return the voxels of a mask that lie where two parts of it meet, of both."""
+    first = np.zeros(voxels.shape, dtype=bool)
+    first[tuple(index[chosen].T)] = True
+    second, block = voxels & ~first, np.ones((3, 3, 3), dtype=bool)
+    beside_first, beside_second = (np.asarray(binary_dilation(side, block), dtype=bool) for side in (first, second))
+    return (first & beside_second) | (second & beside_first)
+
+
+def _window(shape: tuple[int, ...], edges: Float[np.ndarray, "3"], crossing: _Crossing) -> tuple[slice, ...]:
+    """Return the part of a grid around two lines that run past each other."""
+    points = np.concatenate(crossing.lines)
+    margin = max(crossing.radii) + 3.0 * edges
+    low, high = (points.min(axis=0) - margin) / edges, (points.max(axis=0) + margin) / edges
+    return tuple(slice(max(0, int(a)), min(n, int(b) + 2)) for a, b, n in zip(low, high, shape, strict=True))
+
+
+def _are_apart(voxels: Bool[np.ndarray, "nz ny nx"], edges: Float[np.ndarray, "3"], crossing: _Crossing) -> bool:
+    """Return whether two lines that were parted are connected no more, where they touched."""
+    window = _window(voxels.shape, edges, crossing)
+    labels = connected_components(voxels[window], corners=True)
+    index = np.argwhere(labels)
+    tree = KDTree((index + [part.start for part in window]) * edges)
+    one, two = (labels[tuple(index[tree.query(place)[1]])] for place in crossing.nearest)
+    return bool(one != two)
+
+
+def _sever(voxels: Bool[np.ndarray, "nz ny nx"], lines: MedialLines, ends: tuple[int, int]) -> None:
+    """Empty the voxels between the two sides of a cut, a layer of either, so that their walls do not run together."""
+    others = ~np.isin(lines.edges, ends).all(axis=1)
+    near, far = dijkstra(lines.matrix(lines.edges[others]), indices=list(ends))
+    centre = lines.index[list(ends)].mean(axis=0)
+    reach = 3.0 * lines.clearance[list(ends)].max() / float(lines.edges_mm.mean()) + 4.0
+    local = np.flatnonzero(np.linalg.norm(lines.index - centre, axis=1) < 3.0 * reach)
+    window = tuple(slice(max(0, int(c - reach)), int(c + reach) + 2) for c in centre)
+    index = np.argwhere(voxels[window])
+    corner = np.array([part.start for part in window])
+    nearest = local[np.asarray(KDTree(lines.index[local]).query(index + corner)[1])]
+    voxels[window] &= ~_between(voxels[window], index, near[nearest] <= far[nearest])
+
+
+def _without_sides(mask: Volume, lines: MedialLines) -> tuple[Volume, Touch] | None:
     """Return the mask with parts that lie far from each other along the vessel parted where they touch over a length.
 
-    Each voxel belongs to the nearest point of the middle; neighbours that belong to distant points are emptied.
+    Each voxel belongs to the nearest point of the middle; neighbours that belong to distant points are emptied, unless
+    the lumen falls apart that way. None if there are none.
     """
     if lines.clearance.max(initial=0.0) > AORTA_RADIUS_MM:  # a branch's first part lies inside the aorta's own middle
-        return mask, []
+        return None
     voxel = float(mask.spacing_mm.max())
     pairs = KDTree(lines.points).query_pairs(2.0 * float(lines.clearance.max()) + voxel, output_type="ndarray")
     gap = np.linalg.norm(lines.points[pairs[:, 0]] - lines.points[pairs[:, 1]], axis=1)
     pairs = pairs[gap < lines.clearance[pairs].sum(axis=1) + voxel]
     sources, own = np.unique(pairs[:, 0], return_inverse=True)
     if len(sources) == 0:
-        return mask, []
+        return None
     along = np.asarray(dijkstra(lines.forest, indices=sources, limit=SHORTEST_LOOP_MM))
-    far = pairs[np.isinf(along[own.reshape(-1), pairs[:, 1]])]
-    touching = np.unique(far)
+    touching = np.unique(pairs[np.isinf(along[own.reshape(-1), pairs[:, 1]])])
+    if len(touching) == 0:
+        return None
     index = np.argwhere(mask.voxels)
     home = np.full(np.array(mask.voxels.shape) + 2, -1)
-    local = KDTree(lines.index * mask.spacing_mm[::-1])
-    home[tuple((index + 1).T)] = local.query(index * mask.spacing_mm[::-1])[1]
+    home[tuple((index + 1).T)] = KDTree(lines.local).query(index * lines.edges_mm)[1]
     number = np.full(len(lines.points), -1)
     number[touching] = np.arange(len(touching))
     distant = np.isinf(np.asarray(dijkstra(lines.forest, indices=touching, limit=SHORTEST_LOOP_MM)))
-    rim = np.zeros(len(index), dtype=bool)
     own = home[tuple((index + 1).T)]
-    asked = np.flatnonzero(number[own] >= 0) if len(touching) else np.empty(0, int)
+    rim = np.zeros(len(index), dtype=bool)
+    asked = np.flatnonzero(number[own] >= 0)
     for step in np.array(list(np.ndindex(3, 3, 3))) - 1:
         beside = home[tuple((index[asked] + 1 + step).T)]
         rim[asked] |= (beside >= 0) & distant[number[own[asked]], beside]
-    length = 0.5 * float(lines.share_mm[np.unique(own[rim])].sum()) if rim.any() else 0.0
-    if length < _SIDE_BY_SIDE_MM:
-        return mask, []
+    length = 0.5 * float(lines.share_mm[np.unique(own[rim])].sum())
     voxels = mask.voxels.copy()
     voxels[tuple(index[rim].T)] = False
+    if length < _SIDE_BY_SIDE_MM or _count(voxels) > _count(mask.voxels):
+        return None
     place = mask.index_to_world(index[rim][:, ::-1].mean(axis=0))
-    text = f"distant parts of the vessel touch over {length:.0f} mm around {place_text(place)} and were parted there"
-    return replace(mask, voxels=voxels), [text]
-
-
-def _crossing(ways: list[list[int]], node: int, first: int) -> tuple[int, list[int]] | None:
-    """Return the fork that a bridge leads to from one of its points, and the bridge's points up to it."""
-    path, before = [first], node
-    while len(ways[path[-1]]) == 2:
-        following = next(i for i in ways[path[-1]] if i != before)
-        before = path[-1]
-        path.append(following)
-        if len(path) > 60:
-            return None
-    return (path[-1], path) if len(ways[path[-1]]) > 2 else None
-
-
-def _runs_past(lines: MedialLines, ways: list[list[int]], fork: int, bridge: list[int]) -> bool:
-    """Return whether the vessel at a fork goes on both ways, nearly straight, apart from the bridge."""
-    reach = max(_ARM_RADII * float(lines.clearance[fork]), 5.0)
-    came = bridge[-2] if len(bridge) > 1 else -1
-    length, before = {fork: 0.0}, {fork: came}
-    queue, ends = [fork], []
-    while queue:
-        node = queue.pop()
-        if length[node] > reach:
-            ends.append(node)
-            continue
-        for other in ways[node]:
-            if other not in length and other not in bridge and not (node == fork and other == came):
-                length[other] = length[node] + float(np.linalg.norm(lines.points[other] - lines.points[node]))
-                before[other] = node
-                queue.append(other)
-    if len(ends) < 2:
-        return False
-    arms = lines.points[ends] - lines.points[fork]
-    arms /= np.linalg.norm(arms, axis=1, keepdims=True)
-    return bool((arms @ arms.T).min() < _THROUGH)
-
-
-def _sever(voxels: np.ndarray, lines: MedialLines, ends: tuple[int, int]) -> None:
-    """Empty the voxels between the two sides of a cut, two layers of them, so that their walls do not run together."""
-    one, two = ends
-    others = ~np.isin(lines.edges, ends).all(axis=1)
-    forest = lines.matrix(lines.edges[others])
-    near, far = dijkstra(forest, indices=[one, two])
-    centre = 0.5 * (lines.index[one] + lines.index[two])
-    reach = 3.0 * lines.clearance[[one, two]].max() / _voxel(lines) + 4.0
-    local = np.flatnonzero(np.linalg.norm(lines.index - centre, axis=1) < 3.0 * reach)
-    window = tuple(slice(max(0, int(c - reach)), int(c + reach) + 2) for c in centre)
-    own = np.argwhere(voxels[window]) + np.array([part.start for part in window])
-    nearest = local[np.asarray(KDTree(lines.index[local]).query(own)[1])]
-    first = np.zeros(voxels[window].shape, dtype=bool)
-    first[tuple((own[near[nearest] <= far[nearest]] - [part.start for part in window]).T)] = True
-    second = voxels[window] & ~first
-    block = np.ones((3, 3, 3), dtype=bool)
-    beside_first, beside_second = (np.asarray(binary_dilation(side, block), dtype=bool) for side in (first, second))
-    rim = (first & beside_second) | (second & beside_first)
-    voxels[window] &= ~rim
-
-
-def _voxel(lines: MedialLines) -> float:
-    """Return the mean edge of the voxels, mm."""
-    apart = np.linalg.norm(lines.index[lines.edges[:, 0]] - lines.index[lines.edges[:, 1]], axis=1)
-    return float((lines.lengths(lines.edges) / apart).mean())
+    return replace(mask, voxels=voxels), Touch("side", place, length)
