@@ -1,4 +1,4 @@
-"""What a tree made from centerlines does not show: what it leaves out, where vessels meet again, further inlets."""
+"""What a tree made from centerlines does not show: what it leaves out, where vessels meet again."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from scipy.spatial import KDTree
 
 from endopilot.anatomy.line_graph import STEP_MM, LineNodes
 from endopilot.anatomy.lumen_graph import groups, pieces
-from endopilot.anatomy.sources import Polylines
 from endopilot.errors import place_text
 from endopilot.lines import length_along
 from endopilot.types import VesselTree
@@ -21,9 +20,6 @@ _MOST_NOTES = 12
 
 _OPEN_MM = 0.2
 """A loop has a hole where the spheres on its two sides are this far apart, mm."""
-
-_AS_WIDE, _WIDENS = 0.75, 1.2
-"""Another inlet is at least this share of the ostium's radius wide, and this many times as wide as the way to it."""
 
 
 def left_out(
@@ -220,25 +216,3 @@ def _ends_near(
     number = int(branch[index])
     end = float(tree.branches[number].centerline.abscissa[-1])
     return number in tree.leaves() and end - float(abscissa[index]) < 2 * float(radius[index]) + STEP_MM
-
-
-def further_inlets(source: Polylines, tree: VesselTree) -> list[str]:
-    """Return a note on each end at which the vessel could be entered as well.
-
-    It is about as wide as the ostium, and lines begin there as they do at the ostium, or the vessel widens towards it.
-    """
-    root = tree.branches[0].centerline
-    starts = np.array([line[0] for line in source.points])
-    begins_here = np.linalg.norm(starts - root.points[0], axis=1).min() <= root.radius[0]
-    notes = []
-    for leaf in tree.leaves():
-        line = tree.path(leaf)
-        end, size = line.points[-1], float(np.median(line.radius[-5:]))
-        begins = begins_here and np.linalg.norm(starts - end, axis=1).min() <= size
-        widens = size > _WIDENS * float(line.radius.min())
-        if size >= _AS_WIDE * float(root.radius[0]) and (begins or widens):
-            notes.append(
-                f"the end at {place_text(end)} could be an inlet too (radius {size:.2f} mm, "
-                f"{root.radius[0]:.2f} mm at the ostium): the tree has one, and --ostium-mm chooses it"
-            )
-    return notes
