@@ -101,7 +101,7 @@ def coronary_inlet(
                 skeletons.append(skeleton)
     if not pieces:
         raise InputError(
-            f"{label}: holds no vessel of {SHORTEST_MM:g} mm or more; check the label and the unit (--scale 10 for cm)"
+            f"{label}: holds no vessel of {SHORTEST_MM:g} mm or more; check the label and the unit (cm: --scale 10)"
         )
     vessels = np.concatenate([skeleton.points[::_EVERY] for skeleton in skeletons])
     rankings = rank_ostia(pieces, vessels, stated=coordinates is None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -33,6 +33,7 @@ from endopilot.anatomy.sources import AnatomySource, Polylines, transformed
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.anatomy.tree import tree_from_lines
 from endopilot.anatomy.units import SMALLEST_RADIUS_MM, check_unit
+from endopilot.anatomy.walls import without_wall
 from endopilot.errors import InputError
 from endopilot.imaging.grid import connected_components
 from endopilot.progress import progress
@@ -188,7 +189,10 @@ def _wall(
     content: LumenMask | Surface, given: Insertion | None, config: AnatomyConfig, label: str, axes: str | None
 ) -> _Wall:
     """Return the closed wall of the wanted vessel, with repairs stated."""
-    inlet = None
+    inlet, remarks = None, list[str]()
+    if isinstance(content, LumenMask):
+        volume, remarks = without_wall(content.volume)
+        content = replace(content, volume=volume)
     if given is None and config.vessel != "generic":
         inlet = coronary_inlet(content, config.vessel, label, axes)
         given = None if inlet is None else Insertion(inlet.position, np.zeros(3))
@@ -196,7 +200,7 @@ def _wall(
     if isinstance(content, LumenMask):
         mask, notes = repair.connected_mask(content.volume, given, label, config.vessel, other)
         lines = traced_lines(mask)
-        mask, wide, remarks = coverage.widened(mask, lines, config.minimum_branch_length_mm)
+        mask, wide, thin = coverage.widened(mask, lines, config.minimum_branch_length_mm)
         finest, longest = float(mask.spacing_mm.min()), float(mask.spacing_mm.max())
         surface = surface_from_mask(mask)
         if surface.mean_radius < min(SMALLEST_RADIUS_MM, finest):
@@ -204,7 +208,7 @@ def _wall(
                 f"{label}: the lumen is about one voxel thick (mean radius {surface.mean_radius:.2g} mm, voxels of "
                 f"{finest:.2g} mm), too thin to follow; segment on a finer grid"
             )
-        return _Wall(surface, finest, longest, inlet, lines, wide, notes + remarks)
+        return _Wall(surface, finest, longest, inlet, lines, wide, [*remarks, *notes, *thin])
     surface, notes = repair_surface.closed_surface(content, given, label, config.vessel, other)
     step = min(surface.mean_radius, CORONARY_RADIUS_MM) / 5.0
     voxels = coverage.voxelised(surface, max(step, SMALLEST_RADIUS_MM))

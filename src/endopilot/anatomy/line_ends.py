@@ -45,6 +45,10 @@ _ROUND_CAP, _FLAT_CAP = 0.3, 0.7
 _NECK, _DOME = 1.3, 4.0
 """An end this many times as wide as its neck, which lies no more of its radii behind than the second, is a dome."""
 
+_LINE_ENDS, _NO_LINE = 0.5, 0.1
+"""Lines run from the inlet, as VMTK writes them: one that ends at a place says this share of what one that begins there
+says for it; a place where no line begins or ends is as little likely as the second."""
+
 _RIVAL = 0.55
 """Ends that look this much like the inlet as the best one are named."""
 
@@ -58,7 +62,7 @@ class InletEnd:
 
     Attributes:
         node: index of its tip.
-        position: place of the tip, mm.
+        position: middle of the end, mm.
         radius: of the vessel there, mm.
         score: how much it looks like the inlet, mm: its radius, less where something speaks against it.
     """
@@ -89,9 +93,9 @@ def likely_inlets(
 ) -> list[InletEnd]:
     """Return the ends of a tree, the one that looks most like its inlet first.
 
-    The inlet is wide, the tree narrows from it, it is cut flat, and lines that share an end share that. An end that
-    bulges behind a neck is an aneurysm's dome: it counts as its neck does, less by how much it bulges. A cut flat is
-    none: the aorta's root, and an inlet in an aneurysm, bulge too.
+    The inlet is wide, the tree narrows from it, it is cut flat, and lines begin there. An end that bulges behind a neck
+    is an aneurysm's dome: it counts as its neck does, less by how much it bulges. A cut that bulges is none: the root
+    of the aorta does.
 
     Args:
         tree: points with their distance to the wall; of lines, their radii.
@@ -110,22 +114,25 @@ def likely_inlets(
             while inwards[-1] in before:
                 inwards.append(before[inwards[-1]])
         points, clearance = tree.points[inwards], tree.clearance[inwards]
-        place = len(path) - before_cap(tree, path)
+        place = min(len(path) - before_cap(tree, path), len(path) - 1)
         radius = float(np.median(clearance[place : place + 5]))
         widest, bulge, neck = _bulge(points, clearance, len(path))
-        dome, open_ = float(bulge > _NECK), 1.0
+        dome, open_, middle_of_end = float(bulge > _NECK), 1.0, points[0]
         if triangles is not None:
-            at, width = (widest, clearance[widest]) if dome else (min(place, len(points) - 1), radius)
-            flat = _flatness(points, at, float(width), triangles)
+            behind = points[min(place + 5, len(points) - 1)]
+            axis = (points[place] - behind) / max(np.linalg.norm(points[place] - behind), 1e-9)
+            middle_of_end = behind + max(float((points[0] - behind) @ axis), 0.0) * axis  # the tip lies in the rim
+            at, width = (widest, clearance[widest]) if dome else (place, radius)
+            flat = _flatness(points, int(at), float(width), triangles)
             cut = float(np.clip((flat - _ROUND_CAP) / (_FLAT_CAP - _ROUND_CAP), 0.0, 1.0))
             dome, open_ = dome * (1.0 - cut), _BLIND + (1.0 - _BLIND) * cut
         score = open_ * ((1.0 - dome) * radius + dome * min(radius, neck / bulge))
         away = np.linalg.norm(tree.points[middle] - points[0], axis=1)
         score *= 0.6 - 0.4 * (rank_correlation(away, widths) if np.ptp(widths) > 0 else 0.0)
-        if len(lines) > 1:
-            reach = max(radius, tree.spacing_mm)
-            score *= 0.5 + 0.5 * np.mean([np.linalg.norm(ends - points[0], axis=1).min() <= reach for ends in lines])
-        found.append(InletEnd(int(path[-1]), points[0], radius, float(score)))
+        if lines:
+            near = np.linalg.norm(np.array(lines) - points[0], axis=2) <= max(radius, tree.spacing_mm)
+            score *= max(float(np.where(near[:, 0], 1.0, _LINE_ENDS * near[:, 1]).mean()), _NO_LINE)
+        found.append(InletEnd(int(path[-1]), middle_of_end, radius, float(score)))
     return sorted(found, key=lambda end: -end.score)
 
 

@@ -8,16 +8,24 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening
+from jaxtyping import Float, Int
+from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening, distance_transform_edt
 from scipy.spatial import KDTree
 
+from endopilot.anatomy.coverage import voxelised
 from endopilot.anatomy.lumen_graph import pieces
 from endopilot.anatomy.parent_vessel import Vessel, piece_on_side
 from endopilot.anatomy.repair import MOST_LISTED, MOST_PIECES, NEAR_OSTIUM_MM, NOTED_MM, other_pieces_text
 from endopilot.anatomy.surface import Surface, surface_from_mask
+from endopilot.anatomy.walls import lumen_in_wall, wall_text
 from endopilot.errors import InputError, place_text
 from endopilot.types import Insertion, Volume
+
+_ACROSS = 120.0
+"""A surface is looked at in voxels of this share of its box's mean edge: 2 million."""
+
+_OVERLAP = 20
+"""Surfaces that have no more voxels than this in common touch."""
 
 
 def closed_surface(
@@ -41,22 +49,22 @@ def closed_surface(
     Raises:
         InputError: the holes cannot be closed, or the surface is nowhere near the given ostium.
     """
-    import pyvista
-
-    remarks = []
-    faces = np.insert(surface.faces, 0, 3, axis=1).ravel()
-    mesh: Any = _without_duplicates(pyvista.PolyData(surface.vertices, faces).clean().triangulate())
+    mesh: Any = _without_duplicates(_polydata(surface.vertices, surface.faces).clean().triangulate())
+    mesh, remarks = _lumen_of(mesh)
     regions = mesh.connectivity(extraction_mode="all")
     ids = np.asarray(regions.point_data["RegionId"])
     if ids.max() > 0:
         if given is None:
             chosen, others = _region_on_side(regions, ids, vessel)
-            if others:
-                remarks.append(other_pieces_text(vessel, len(others)))
         else:
-            chosen = int(ids[np.linalg.norm(regions.points - given.position, axis=1).argmin()])
-        faces = regions.faces.reshape(-1, 4)
-        mesh = pyvista.PolyData(regions.points, faces[ids[faces[:, 1]] == chosen].ravel()).clean()
+            chosen, others = int(ids[np.linalg.norm(regions.points - given.position, axis=1).argmin()]), []
+        joined, mesh = _united(regions, ids, chosen)
+        others = [other for other in others if other not in joined]
+        if others:
+            remarks.append(other_pieces_text(vessel, len(others)))
+        if len(joined) > 1:
+            remarks.append(f"{len(joined)} closed surfaces overlap: united to one vessel")
+        ids = np.where(np.isin(ids, joined), chosen, ids)
         remarks += _regions_left_out(
             np.asarray(regions.points, float), ids.astype(np.int64), chosen, vessel, other_ostium
         )
@@ -74,7 +82,7 @@ def closed_surface(
     mesh = mesh.compute_normals(
         cell_normals=False, point_normals=True, consistent_normals=True, split_vertices=False, auto_orient_normals=False
     )
-    result = Surface(np.asarray(mesh.points, dtype=float), np.asarray(mesh.faces.reshape(-1, 4)[:, 1:], dtype=np.int64))
+    result = _surface(mesh)
     if mesh.n_open_edges or abs(result.volume) < 1e-9:
         result = _from_shell(result, label)
         remarks.append("the surface could not be capped and was closed by filling a voxel shell")
@@ -85,12 +93,70 @@ def closed_surface(
     return result, remarks
 
 
-def region_places(surface: Surface) -> list[Float[np.ndarray, "3"]]:
-    """Return a point on each of the largest connected parts of a surface, LPS mm."""
+def _lumen_of(mesh: Any) -> tuple[Any, list[str]]:
+    """Return the inner faces of a wall that has a thickness, with a remark; any other mesh as it is.
+
+    Only nested shells, and one shell with a tunnel (a wall open at its ends), can be such a wall.
+    """
+    edges = mesh.extract_all_edges().n_cells
+    if mesh.n_points - edges + mesh.n_cells == 2 and mesh.n_open_edges == 0:
+        return mesh, []
+    closed = _surface(_capped(mesh))
+    step = float(np.prod(np.ptp(closed.vertices, axis=0))) ** (1 / 3) / _ACROSS
+    solid = voxelised(closed, step)
+    found = lumen_in_wall(solid)
+    if found is None:
+        return mesh, []
+    lumen, thickness = found
+    faces = np.asarray(mesh.faces.reshape(-1, 4)[:, 1:])
+    centres = np.asarray(mesh.points)[faces].mean(axis=1)
+    index = tuple(np.rint((centres - solid.origin_mm) / solid.spacing_mm[0]).astype(int).T[::-1])
+    near, far = (distance_transform_edt(~part) for part in (lumen, ~lumen & ~solid.voxels))
+    inner = _polydata(mesh.points, faces[np.asarray(near)[index] < np.asarray(far)[index]]).clean()
+    return inner.connectivity(extraction_mode="largest"), [wall_text(thickness)]
+
+
+def _united(regions: Any, ids: np.ndarray, chosen: int) -> tuple[list[int], Any]:
+    """Return which closed pieces of a surface overlap one, directly or by others, and the wall of all of them."""
+    faces = regions.faces.reshape(-1, 4)[:, 1:]
+    own = ids[faces[:, 0]]
+    parts = {
+        int(i): _surface(_capped(_polydata(regions.points, faces[own == i]).clean()))
+        for i in np.argsort(-np.bincount(own))[:MOST_PIECES]
+    } | {chosen: _surface(_capped(_polydata(regions.points, faces[own == chosen]).clean()))}
+    lower, upper = regions.points.min(axis=0), regions.points.max(axis=0)
+    step = max(
+        min(abs(part.mean_radius) for part in parts.values()) / 4, float(np.prod(upper - lower)) ** (1 / 3) / _ACROSS
+    )
+    shape = tuple(int(size) for size in (np.ceil((upper - lower) / step).astype(int) + 9)[::-1])
+    inside = {i: part.inside((shape[0], shape[1], shape[2]), lower - 4 * step, step) for i, part in parts.items()}
+    joined, union = [chosen], inside[chosen].copy()
+    for _ in parts:
+        for i in set(parts) - set(joined):
+            # What lies wholly inside is an island, and what only touches is another vessel.
+            common = int((inside[i] & union).sum())
+            if _OVERLAP < common < 0.9 * inside[i].sum():
+                joined.append(i)
+                union |= inside[i]
+    if len(joined) == 1:
+        return joined, _polydata(regions.points, faces[own == chosen]).clean()
+    wall = surface_from_mask(Volume(union, np.full(3, step), lower - 4 * step, np.eye(3)))
+    return joined, _polydata(wall.vertices, wall.faces)
+
+
+def _polydata(points: Any, faces: np.ndarray) -> Any:
     import pyvista
 
-    faces = np.insert(surface.faces, 0, 3, axis=1).ravel()
-    regions: Any = pyvista.PolyData(surface.vertices, faces).clean().triangulate().connectivity(extraction_mode="all")
+    return pyvista.PolyData(np.asarray(points, dtype=float), np.insert(faces, 0, 3, axis=1).ravel())
+
+
+def _surface(mesh: Any) -> Surface:
+    return Surface(np.asarray(mesh.points, dtype=float), np.asarray(mesh.faces.reshape(-1, 4)[:, 1:], dtype=np.int64))
+
+
+def region_places(surface: Surface) -> list[Float[np.ndarray, "3"]]:
+    """Return a point on each of the largest connected parts of a surface, LPS mm."""
+    regions = _polydata(surface.vertices, surface.faces).clean().triangulate().connectivity(extraction_mode="all")
     ids = np.asarray(regions.point_data["RegionId"])
     sizes = np.bincount(ids)
     return [np.asarray(regions.points[ids == i][0], float) for i in np.argsort(-sizes)[:MOST_PIECES] if sizes[i] >= 100]
@@ -135,19 +201,15 @@ def _region_on_side(regions, ids: np.ndarray, vessel: Vessel) -> tuple[int, list
 
 def _without_duplicates(mesh):
     """Drop triangles that occur twice, as where a surface was exported together with its own copy."""
-    import pyvista
-
     faces = np.asarray(mesh.faces.reshape(-1, 4)[:, 1:])
     _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     if len(first) == len(faces):
         return mesh
-    return pyvista.PolyData(np.asarray(mesh.points), np.insert(faces[np.sort(first)], 0, 3, axis=1).ravel())
+    return _polydata(mesh.points, faces[np.sort(first)])
 
 
 def _capped(mesh):
     """Close every hole by a fan of triangles from the centre of its rim to the rim's edges."""
-    import pyvista
-
     points, faces = np.asarray(mesh.points, dtype=float), np.asarray(mesh.faces.reshape(-1, 4)[:, 1:], dtype=np.int64)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     _, inverse, uses = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
@@ -159,7 +221,7 @@ def _capped(mesh):
     centres = np.stack([points[np.unique(rim[own == i])].mean(axis=0) for i in range(len(numbers))])
     fans = np.column_stack([rim[:, 1], rim[:, 0], size + own.reshape(-1)])
     closed = np.concatenate([faces, fans])
-    return pyvista.PolyData(np.concatenate([points, centres]), np.insert(closed, 0, 3, axis=1).ravel())
+    return _polydata(np.concatenate([points, centres]), closed)
 
 
 def _from_shell(surface: Surface, label: str) -> Surface:
