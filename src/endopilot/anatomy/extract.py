@@ -32,6 +32,7 @@ from endopilot.anatomy.read_source import read_source
 from endopilot.anatomy.sources import AnatomySource, Polylines, transformed
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.anatomy.tree import tree_from_lines
+from endopilot.anatomy.understood import understood
 from endopilot.anatomy.units import SMALLEST_RADIUS_MM, check_unit
 from endopilot.anatomy.walls import without_wall
 from endopilot.errors import InputError
@@ -157,7 +158,7 @@ def extract_anatomy(
         "catheter_tilt_deg": round(catheter_tilt_deg(ostium_radius, radius), 1),
         "dominance": _dominance(tree, inlet, short),
         "coverage": balance,
-        "notes": [*doubts, *notes],
+        "notes": [understood(tree, wrapped, config.coordinates, notes), *doubts, *notes],
     }
     return Anatomy(name, tree, distance_map, insertion, radius, provenance)
 

@@ -1,4 +1,4 @@
-"""Surfaces and centerlines from STL, OBJ, PLY, VTP and VTK files, with the axes and the unit that their headers state.
+"""Surfaces and centerlines from STL, OBJ, PLY, VTP, VTU and VTK, with the axes and the unit that their headers state.
 
 3D Slicer writes its axes as `SPACE=LPS` or `SPACE=RAS`: in the header of an STL, in a comment of a PLY or OBJ, in the
 title of a VTK file, and in the field data of a VTP.
@@ -171,7 +171,7 @@ def _lines(data: dict[str, np.ndarray], path: Path, notes: list[str]) -> Polylin
     if len(whole) < len(lines):
         notes.append(f"{len(lines) - len(whole)} lines of a single point are left out")
     lines = Polylines(tuple(places[index] for index in whole), tuple(radius[index] for index in whole))
-    return checked_lines(lines, path)
+    return checked_lines(lines, path, notes)
 
 
 def _radius_array(data: dict[str, np.ndarray], path: Path) -> np.ndarray:

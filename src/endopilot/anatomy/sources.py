@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from endopilot.anatomy.surface import Surface
 from endopilot.anatomy.units import ANSWERED, STATED
-from endopilot.errors import InputError
+from endopilot.errors import InputError, place_text
 from endopilot.types import LumenMask, VesselTree
 
 RADIUS_NAMES = ("maximuminscribedsphereradius", "misr", "radius", "radii")
@@ -112,21 +112,35 @@ def in_mm(content: Any, factor: float, turn: Float[np.ndarray, "3"]) -> Any:
     return content
 
 
-def checked_lines(lines: Polylines, path: Path) -> Polylines:
+def checked_lines(lines: Polylines, path: Path, notes: list[str]) -> Polylines:
     """Return centerlines whose positions are finite and whose radii are positive.
+
+    Where the radius is no number or zero only at the end of a line, it becomes that of the point before, with a note.
 
     Raises:
         InputError: there is no line, or a position or radius is none.
     """
     if not lines.points:
         raise InputError(f"{path}: holds no line of at least two points; export the centerline again")
-    radius = np.concatenate(lines.radius)
-    if not (np.isfinite(radius).all() and np.isfinite(np.concatenate(lines.points)).all()):
-        raise InputError(f"{path}: some positions or radii are not finite numbers; export the centerline again")
-    if (radius <= 0).all():
+    if all((radius == 0).all() for radius in lines.radius):
         raise InputError(f"{path}: all radii are zero; write inscribed-sphere radii in mm")
-    if (radius <= 0).any():
-        raise InputError(
-            f"{path}: {int((radius <= 0).sum())} of {len(radius)} radii are not positive; mend those points"
-        )
-    return lines
+    radii = []
+    for number, (points, radius) in enumerate(zip(lines.points, lines.radius, strict=True)):
+        if not np.isfinite(points).all():
+            raise InputError(f"{path}: {lines.name(number)}: some positions are not finite numbers; export it again")
+        good = np.flatnonzero(np.isfinite(radius) & (radius > 0))
+        bad = np.setdiff1d(np.arange(len(radius)), good)
+        if len(bad):
+            odd = bad[(radius[bad] < 0) | ((bad > good[0]) & (bad < good[-1]))] if len(good) else bad
+            if len(odd):
+                raise InputError(
+                    f"{path}: {lines.name(number)}: the radius at {place_text(points[odd[0]])} is {radius[odd[0]]:g} "
+                    f"({len(odd)} such points); write inscribed-sphere radii, which are positive"
+                )
+            notes.append(
+                f"{lines.name(number)}: the radius of {len(bad)} points at its end, from {place_text(points[bad[0]])}, "
+                "is no positive number: that of the point before is taken"
+            )
+            radius = radius[good[np.abs(good - np.arange(len(radius))[:, None]).argmin(axis=1)]]
+        radii.append(radius)
+    return replace(lines, radius=tuple(radii))

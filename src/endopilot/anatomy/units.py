@@ -65,6 +65,11 @@ def mm_per_unit(name: object) -> float | None:
     return _NAMES.get(str(name).strip().lower())
 
 
+def unit_name(factor: float) -> str:
+    """Return what a unit of so many mm is called."""
+    return next((name for name, one in _UNITS.items() if one == factor), f"units of {factor:g} mm")
+
+
 def check_unit(
     points: Float[np.ndarray, "n 3"],
     radius_mm: float | None,
@@ -91,8 +96,7 @@ def check_unit(
         InputError: the size is no vessel's, or one in several units; the message names each size and its `--scale`.
     """
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
-    units = {factor: next((name for name, one in _UNITS.items() if one == factor), f"units of {factor:g} mm")}
-    units |= {one: name for name, one in _UNITS.items()}
+    units = {factor: unit_name(factor)} | {one: name for name, one in _UNITS.items()}
     chance = {
         one: _usual(radius_mm and radius_mm * one / factor, extent * one / factor, vessel)
         * (odds if one == factor else _RARE.get(name, 1.0))

@@ -61,7 +61,8 @@ def command(
     content = read_source(existing(source), label=label)
     anatomy = extract_anatomy(content, name=name or output.resolve().name, config=config)
     write_anatomy(anatomy, output=output)
-    figures = {"anatomy": output, **describe(anatomy)}
+    said = anatomy.provenance["notes"][0]
+    figures = {"understood": said.partition(": ")[2], "anatomy": output, **describe(anatomy)}
     if picture is not None:
         from endopilot.anatomy.anatomy_picture import draw_anatomy  # matplotlib is slow to import
 
@@ -76,6 +77,7 @@ def describe(anatomy: Anatomy) -> dict[str, object]:
     """Return the figures of an anatomy: extent, calibre, ostium, and what was repaired."""
     path, found = anatomy.tree.longest_path(), anatomy.provenance
     notes = {name: found[name] for name in ("ostium_rule", "ostium_confidence", "notes") if found.get(name)}
+    notes["notes"] = found.get("notes", [])[1:]
     return {
         "branches": len(anatomy.tree.branches),
         "longest_path_mm": round(float(path.abscissa[-1]), 1),
