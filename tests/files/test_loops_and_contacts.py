@@ -17,7 +17,7 @@ VOXELS = [(0.35, 0.35, 0.5), (0.7, 0.7, 0.5)]
 
 
 def notes_of(anatomy) -> str:
-    return " | ".join(anatomy.provenance["notes"])
+    return " | ".join(anatomy.provenance["notes"][1:])
 
 
 def places_of(anatomy) -> list[np.ndarray]:

@@ -122,7 +122,8 @@ def likely_inlets(
             behind = points[min(place + 5, len(points) - 1)]
             axis = (points[place] - behind) / max(np.linalg.norm(points[place] - behind), 1e-9)
             middle_of_end = behind + max(float((points[0] - behind) @ axis), 0.0) * axis  # the tip lies in the rim
-            at, width = (widest, clearance[widest]) if dome else (place, radius)
+            whole = min(int(np.searchsorted(length_along(points), radius)), place)
+            at, width = (widest, clearance[widest]) if dome else (whole, radius)
             flat = _flatness(points, int(at), float(width), triangles)
             cut = float(np.clip((flat - _ROUND_CAP) / (_FLAT_CAP - _ROUND_CAP), 0.0, 1.0))
             dome, open_ = dome * (1.0 - cut), _BLIND + (1.0 - _BLIND) * cut

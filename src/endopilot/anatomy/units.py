@@ -108,8 +108,8 @@ def check_unit(
         return
     fits = [one for one in units if chance[one] >= max(_FITS * best, _NONE)]
     if factor in fits and len(fits) > 1:
-        sizes = (f"in {units[one]} {_size(radius_mm, extent, one / factor)} (--scale {one:g})" for one in fits)
-        raise InputError(f"{label}: states no unit, and fits {' or '.join(sizes)}; give the --scale that is right")
+        sizes = (f"{_size(radius_mm, extent, one / factor)} in {units[one]} (--scale {one:g})" for one in fits)
+        raise InputError(f"{label}: states no unit: its vessel {', or '.join(sizes)}; say which, with --scale")
     text = f"{label}: {_size(radius_mm, extent, 1.0)}, as no vessel does; "
     if not fits or factor in fits:
         raise InputError(text + "check the label and the units of positions and radii (--scale)")
