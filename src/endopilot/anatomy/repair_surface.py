@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening, distance_transform_edt
+from scipy.ndimage import binary_dilation, binary_opening, distance_transform_edt
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.coverage import voxelised
@@ -17,7 +17,7 @@ from endopilot.anatomy.lumen_graph import pieces
 from endopilot.anatomy.parent_vessel import Vessel, piece_on_side
 from endopilot.anatomy.repair import MOST_LISTED, MOST_PIECES, NEAR_OSTIUM_MM, NOTED_MM, other_pieces_text
 from endopilot.anatomy.surface import Surface, surface_from_mask
-from endopilot.anatomy.walls import lumen_in_wall, wall_text
+from endopilot.anatomy.walls import enclosed, lumen_in_wall, wall_text
 from endopilot.errors import InputError, place_text
 from endopilot.types import Insertion, Volume
 
@@ -26,6 +26,9 @@ _ACROSS = 120.0
 
 _FACING = 0.12
 """Of a wall of 1 to 3 mm round lumens of 2 to 6 mm 0.15 to 0.5 of the surface faces itself on both sides."""
+
+_HOLDS = 0.08
+"""A shell of voxels holds at least this share of its own number: half a sixth."""
 
 _OVERLAP = 20
 """Surfaces that have no more voxels than this in common touch."""
@@ -123,7 +126,7 @@ def _met_again(mesh: Any, sign: float) -> float:
     from vtkmodules.vtkCommonCore import mutable
     from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 
-    locator = vtkStaticCellLocator()
+    locator: Any = vtkStaticCellLocator()
     locator.SetDataSet(mesh)
     locator.BuildLocator()
     centres, normals, _ = _surface(mesh).triangles()
@@ -244,7 +247,7 @@ def _capped(mesh):
 
 
 def _from_shell(surface: Surface, label: str) -> Surface:
-    """Close a surface that no cap closes: voxels that the wall shuts off from outside are inside."""
+    """Close a surface that no cap closes: voxels from which its wall is met in most directions are inside."""
     extent = np.ptp(surface.vertices, axis=0)
     spacing = max(float(np.prod(extent) / 3e6) ** (1 / 3), float(extent.max()) / 600)
     fine = surface.refined(0.7 * spacing)
@@ -255,12 +258,8 @@ def _from_shell(surface: Surface, label: str) -> Surface:
     samples = np.concatenate([fine.vertices, fine.vertices[fine.faces].mean(axis=1)])
     index = np.rint((samples - origin) / spacing).astype(int)
     shell[index[:, 2], index[:, 1], index[:, 0]] = True
-    for closing in (0, 2, 4):
-        wall = binary_closing(shell, iterations=closing) if closing else shell
-        inside = binary_fill_holes(wall)
-        assert inside is not None
-        core = np.asarray(binary_opening(inside & ~shell), dtype=bool)
-        if core.sum() > 0.5 * shell.sum() / 6:
-            volume = Volume(core | (inside & shell), np.full(3, spacing), origin, np.eye(3))
-            return surface_from_mask(volume)
+    inside = np.asarray(binary_opening(enclosed(shell)), dtype=bool)
+    if inside.sum() > _HOLDS * shell.sum():
+        inside = np.asarray(binary_dilation(inside), dtype=bool) & (inside | shell)
+        return surface_from_mask(Volume(inside, np.full(3, spacing), origin, np.eye(3)))
     raise InputError(f"{label}: the surface has holes that cannot be closed; cap it or make it watertight")

@@ -43,16 +43,16 @@ def lumen_in_wall(mask: Volume) -> tuple[Bool[np.ndarray, "nz ny nx"], float] | 
     factor = int(np.ceil((solid.size / _MOST_VOXELS) ** (1 / 3)))
     coarse = _blocks(solid, factor)
     edges = mask.spacing_mm[::-1] * factor
-    enclosed = _enclosed(coarse)
-    labels = connected_components(enclosed, corners=False)
+    void = enclosed(coarse)
+    labels = connected_components(void, corners=False)
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
     lumen = labels == sizes.argmax()
     if sizes.max(initial=0) == 0:
         return None
     to_lumen = np.asarray(distance_transform_edt(~lumen, sampling=edges))
-    outside = ~coarse & ~enclosed
-    rim = coarse & ~binary_erosion(~outside, border_value=False)
+    outside = ~coarse & ~void
+    rim = coarse & ~np.asarray(binary_erosion(~outside, border_value=False), dtype=bool)
     thickness = to_lumen[rim]
     middle = float(np.median(thickness)) if rim.any() else 0.0
     width = float(np.asarray(distance_transform_edt(lumen, sampling=edges)).max())
@@ -84,10 +84,10 @@ def _blocks(solid: Bool[np.ndarray, "nz ny nx"], factor: int) -> Bool[np.ndarray
     """Return a mask of blocks of voxels that hold some of a mask."""
     padded = np.pad(solid, [(0, -size % factor) for size in solid.shape])
     shape = [part for size in padded.shape for part in (size // factor, factor)]
-    return padded.reshape(shape).any(axis=(1, 3, 5))
+    return np.asarray(padded.reshape(shape).any(axis=(1, 3, 5)))
 
 
-def _enclosed(solid: Bool[np.ndarray, "nz ny nx"]) -> Bool[np.ndarray, "nz ny nx"]:
+def enclosed(solid: Bool[np.ndarray, "nz ny nx"]) -> Bool[np.ndarray, "nz ny nx"]:
     """Return the void from which a solid is met in most directions."""
     count = np.zeros(solid.shape, dtype=np.int8)
     for step in np.ndindex(3, 3, 3):
