@@ -141,7 +141,7 @@ def test_a_straightened_ct_is_told_by_every_command(patient, tmp_path, capsys, m
     figures = run(capsys, "run", skewed, "-o", tmp_path / "run", *method)
     assert figures["notes"][0].startswith(note)
     assert read_mask(tmp_path / "run" / "masks" / "patient.nii.gz").warnings[0].startswith(note)
-    assert read_anatomy(tmp_path / "run" / "anatomies" / "patient").provenance["notes"][0].startswith(note)
+    assert read_anatomy(tmp_path / "run" / "anatomies" / "patient").provenance["notes"][1].startswith(note)
 
 
 def test_a_phase_is_chosen(few, tmp_path, capsys):

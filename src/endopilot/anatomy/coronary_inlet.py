@@ -103,7 +103,9 @@ def coronary_inlet(
                 pieces.append(open_ends(skeleton))
                 skeletons.append(skeleton)
     if not pieces:
-        raise InputError(f"{label}: holds no vessel of {SHORTEST_MM:g} mm or more; check the label and the unit")
+        raise InputError(
+            f"{label}: holds no vessel of {SHORTEST_MM:g} mm or more; check the label and the unit (cm: --scale 10)"
+        )
     vessels = np.concatenate([skeleton.points[::_EVERY] for skeleton in skeletons])
     rankings = rank_ostia(pieces, vessels, stated=coordinates is None)
     ranking, counterpart = rankings[side], rankings["lca" if side == "rca" else "rca"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -24,7 +24,7 @@ from endopilot.anatomy.distance import (
     distance_map_from_spheres,
     distance_map_from_surface,
 )
-from endopilot.anatomy.inlet import beyond_parent, component, entrance, grid_points, in_front, widest_open_end
+from endopilot.anatomy.inlet import beyond_parent, component, entrance, grid_points, in_front, inlets
 from endopilot.anatomy.labels import dominance, label_tree, missing_main_vessel
 from endopilot.anatomy.labels_coronary import SHORT_MM
 from endopilot.anatomy.lumen_graph import lumen_graph, trace_branches
@@ -33,8 +33,10 @@ from endopilot.anatomy.read_source import read_source
 from endopilot.anatomy.sources import AnatomySource, Polylines, transformed
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.anatomy.tree import tree_from_lines
+from endopilot.anatomy.understood import understood
 from endopilot.anatomy.units import SMALLEST_RADIUS_MM, check_unit
-from endopilot.errors import InputError, place_text
+from endopilot.anatomy.walls import without_wall
+from endopilot.errors import InputError
 from endopilot.imaging.grid import connected_components
 from endopilot.progress import progress
 from endopilot.settings import Finite, Within, public, settings
@@ -49,8 +51,6 @@ _RESOLVED_STEPS = 1.25
 _OTHER_SIDE_DEG = 5.0
 """A coronary artery is in doubt if its course is nearer to that of the other one by this, degrees; in 48 of the
 atlas and 2 real ones its own is the nearer one by 16° at least."""
-_AS_WIDE = 0.9
-"""An end of at least this share of the inlet's radius may be an inlet too."""
 
 SHORTEST_IN_DIAMETERS = 1.5
 """A lumen whose longest path is shorter than this many of its own mean diameters is no vessel."""
@@ -72,8 +72,9 @@ class AnatomyConfig:
     """Grid spacing of the distance map, mm; by default 0.45 times the narrow vessels' radius, from 0.3 to 1.5 mm."""
     minimum_branch_length_mm: Annotated[float, Within(0, 1000, above_low=True)] = 4.0
     """Side branches shorter than this beyond their parent's lumen are dropped, mm."""
-    scale: Annotated[float, Within(1e-4, 10000)] = 1.0
-    """Factor that turns the file's unit into mm: 10 for cm, 1000 for m."""
+    scale: Annotated[float, Within(1e-4, 10000)] | None = None
+    """Factor that turns the file's unit into mm: 1 for mm, 10 for cm, 1000 for m; by default what the file states, or
+    else mm where no other unit gives a usual vessel."""
     coordinates: Literal["lps", "ras"] | None = None
     """Axes of a surface or centerline whose file states none; LPS if not given. A file that states others is
     refused."""
@@ -112,10 +113,12 @@ def extract_anatomy(
     given = content.ostium if isinstance(content, LumenMask) else None
     if config.ostium_mm is not None:
         given = Insertion(np.array(config.ostium_mm, dtype=float), np.zeros(3))
-    source_name = wrapped.file or name
+    source_name, unit = wrapped.file or name, {"factor": wrapped.factor, "odds": wrapped.odds}
     with progress(f"anatomy {name}", 4) as advance:
         if isinstance(content, (Polylines, VesselTree)):
-            _check_lines(content, config, source_name)
+            if isinstance(content, Polylines):
+                points, radius = np.concatenate(content.points), np.concatenate(content.radius)
+                check_unit(points, float(np.median(radius)), config.vessel, source_name, **unit)
             made = polylines.tree_from_polylines(content, given, source_name, config.vessel)
             tree, rule, balance = made.tree, made.rule, made.coverage
             notes += made.notes
@@ -124,14 +127,17 @@ def extract_anatomy(
             distance_map = distance_map_from_spheres(tree, spacing_mm=config.spacing_mm)
         else:
             unstated = wrapped.coordinates is None and isinstance(content, Surface)
+            if isinstance(content, Surface):  # before grids of its size are made
+                check_unit(content.vertices, None, config.vessel, source_name, **unit)
             wall = _wall(content, given, config, source_name, config.coordinates if unstated else None)
             surface, inlet = wall.surface, wall.inlet
+            check_unit(surface.vertices, surface.mean_radius, config.vessel, source_name, **unit)
             notes += [*wall.notes, *(inlet.notes if inlet is not None else ())]
             advance()
-            tree, rule = _tree(surface, wall.finest_mm, given, inlet, config, source_name)
+            tree, rule, rivals = _tree(surface, wall.finest_mm, given, inlet, config, source_name)
             advance()
             distance_map = _final_map(surface, tree, config)
-            notes += _other_inlets(tree, rule)
+            notes += rivals
             left = coverage.unreached(wall.lines, tree, wall.voxel_mm)
             balance = coverage.record(wall.lines, wall.widened, left)
             left = [stretch for stretch in left if wall.told is None or not wall.told[stretch.nodes].all()]
@@ -157,14 +163,9 @@ def extract_anatomy(
         "catheter_tilt_deg": round(catheter_tilt_deg(ostium_radius, radius), 1),
         "dominance": _dominance(tree, inlet, short),
         "coverage": balance,
-        "notes": [*doubts, *notes],
+        "notes": [understood(tree, wrapped, config.coordinates, notes), *doubts, *notes],
     }
     return Anatomy(name, tree, distance_map, insertion, radius, provenance)
-
-
-def _check_lines(lines: Polylines | VesselTree, config: AnatomyConfig, label: str) -> None:
-    if isinstance(lines, Polylines):
-        check_unit(np.concatenate(lines.points), float(np.median(np.concatenate(lines.radius))), config.vessel, label)
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,38 +197,31 @@ def _wall(
     content: LumenMask | Surface, given: Insertion | None, config: AnatomyConfig, label: str, axes: str | None
 ) -> _Wall:
     """Return the closed wall of the wanted vessel, with repairs stated."""
-    inlet = None
+    inlet, remarks = None, list[str]()
     repair.pieces_of.cache_clear()  # what a caller's mask held before may be another vessel
-    if isinstance(content, Surface):
-        check_unit(content.vertices, None, config.vessel, label)
+    if isinstance(content, LumenMask):
+        volume, remarks = without_wall(content.volume)
+        content = replace(content, volume=volume)
     if given is None and config.vessel != "generic":
         inlet = coronary_inlet(content, config.vessel, label, axes)
         given = None if inlet is None else Insertion(inlet.position, np.zeros(3))
     other = None if inlet is None else inlet.other
     if isinstance(content, LumenMask):
         lumen = repair.connected_mask(content.volume, given, label, config.vessel, other)
-        mask, wide, remarks = coverage.widened(lumen.mask, lumen.lines, config.minimum_branch_length_mm)
+        mask, wide, thin = coverage.widened(lumen.mask, lumen.lines, config.minimum_branch_length_mm)
         finest, longest = float(mask.spacing_mm.min()), float(mask.spacing_mm.max())
-        wall, notes = surface_from_mask(mask), lumen.notes + remarks
-        return _Wall(wall, finest, longest, inlet, lumen.before, wide, notes, lumen.told)
+        surface = surface_from_mask(mask)
+        if surface.mean_radius < min(SMALLEST_RADIUS_MM, finest):
+            raise InputError(
+                f"{label}: the lumen is about one voxel thick (mean radius {surface.mean_radius:.2g} mm, voxels of "
+                f"{finest:.2g} mm), too thin to follow; segment on a finer grid"
+            )
+        notes = [*remarks, *lumen.notes, *thin]
+        return _Wall(surface, finest, longest, inlet, lumen.before, wide, notes, lumen.told)
     surface, notes = repair_surface.closed_surface(content, given, label, config.vessel, other)
-    step = min(2.0 * surface.volume / surface.area, CORONARY_RADIUS_MM) / 5.0
+    step = min(surface.mean_radius, CORONARY_RADIUS_MM) / 5.0
     voxels = coverage.voxelised(surface, max(step, SMALLEST_RADIUS_MM))
     return _Wall(surface, 0.0, float(voxels.spacing_mm.max()), inlet, traced_lines(voxels), np.empty((0, 3)), notes)
-
-
-def _other_inlets(tree: VesselTree, rule: str) -> list[str]:
-    """Say so if a vessel of unknown kind is as wide at another end as at the one that was taken for its inlet."""
-    if rule != "widest open end":
-        return []
-    first = tree.branches[0].centerline
-    usual = float(np.median(first.radius[: max(3, len(first.radius) // 4)]))
-    ends = [tree.branches[leaf].centerline for leaf in tree.leaves()]
-    wide = [line for line in ends if float(np.median(line.radius[-max(3, len(line.radius) // 4) :])) > _AS_WIDE * usual]
-    if not wide:
-        return []
-    places = ", ".join(place_text(line.points[-1]) for line in wide[:4])
-    return [f"the vessel may as well begin at {places}, where it is as wide: --ostium-mm chooses another inlet"]
 
 
 def _short(tree: VesselTree, vessel: str) -> list[str]:
@@ -286,15 +280,9 @@ def _tree(
     inlet: CoronaryInlet | None,
     config: AnatomyConfig,
     label: str,
-) -> tuple[VesselTree, str]:
-    """Return the centerline tree inside a closed wall, and the rule by which its root was chosen."""
-    mean_radius = 2.0 * surface.volume / surface.area
-    if mean_radius < min(SMALLEST_RADIUS_MM, finest_mm):
-        raise InputError(
-            f"{label}: the lumen is about one voxel thick (mean radius {mean_radius:.2g} mm, voxels of "
-            f"{finest_mm:.2g} mm), too thin to follow; segment on a finer grid"
-        )
-    check_unit(surface.vertices, mean_radius, config.vessel, label)
+) -> tuple[VesselTree, str, list[str]]:
+    """Return the centerline tree inside a closed wall, the rule by which its root was chosen, and its rivals."""
+    mean_radius = surface.mean_radius
     if config.vessel != "generic":  # a piece of the aorta in the lumen must not set the scale
         mean_radius = min(mean_radius, CORONARY_RADIUS_MM)
     extent = np.ptp(surface.vertices, axis=0)
@@ -314,12 +302,15 @@ def _tree(
     points, clearance = grid_points(distance_map, inside)
     if len(points) < 20:
         raise InputError(f"{label}: the lumen is too small to follow ({len(points)} grid points); check the unit")
+    rivals: list[str] = []
     if given is None:
-        root = widest_open_end(distance_map, points, clearance)
+        first, *others = inlets(surface, points, clearance, spacing)
+        root = int(np.linalg.norm(points - first.position, axis=1).argmin())
+        rivals = first.rivals(others)
     else:
         if not given.direction.any() and rule == "given":
             side = None if config.vessel == "generic" else config.vessel
-            given = entrance(distance_map, points, clearance, given, side)
+            given = entrance(distance_map, points, clearance, given, side, surface)
         points, clearance = in_front(points, clearance, given)
         root = int(np.linalg.norm(points - given.position, axis=1).argmin())
     graph = lumen_graph(points, clearance, spacing, root)
@@ -335,7 +326,7 @@ def _tree(
             f"{label}: is no vessel: its longest path of {longest.abscissa[-1]:.1f} mm is not much more than its width "
             f"of {2 * longest.radius.mean():.1f} mm; check the label or the segmentation"
         )
-    return tree, rule
+    return tree, rule, rivals
 
 
 def _final_map(surface: Surface, tree: VesselTree, config: AnatomyConfig) -> DistanceMap:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Bool, Float, Integer
 
 from endopilot.anatomy import parent_vessel
-from endopilot.anatomy.coronary_ends import open_ends, rank_correlation, skeleton_of
-from endopilot.anatomy.coronary_ostia import Side, end_score, shape_score
+from endopilot.anatomy.coronary_ends import OpenEnd, open_ends, skeleton_of
+from endopilot.anatomy.coronary_ostia import Side, end_score
 from endopilot.anatomy.distance import distance_map_from_surface
-from endopilot.anatomy.line_ends import end_score as inlet_score
+from endopilot.anatomy.line_ends import InletEnd, likely_inlets
 from endopilot.anatomy.lumen_graph import lumen_graph, trace_branches
 from endopilot.anatomy.surface import Surface
 from endopilot.imaging.grid import connected_components
@@ -23,6 +25,9 @@ SNAP_MM, SNAP_SD_MM = 10.0, 4.0
 
 PLAUSIBLE = -5.0
 """An end that scores less than this does not look like an inlet: the tip of a side branch."""
+
+LIKENESS_SD = 0.25
+"""Spread of the logarithm of how much an end looks like the inlet: half the likeness is worth as much as 9 mm."""
 
 _BRANCH_MM = 4.0
 
@@ -111,6 +116,7 @@ def entrance(
     clearance: Float[np.ndarray, "n"],
     given: Insertion,
     side: Side | None,
+    surface: Surface | None = None,
 ) -> Insertion:
     """Return where the device enters if a place some millimetres off is given: at an end near it, or in mid-vessel.
 
@@ -123,17 +129,21 @@ def entrance(
         clearance: their distance to the wall, mm.
         given: the place, without a direction.
         side: which coronary artery this is, None for any other vessel.
+        surface: the wall as triangles, which shows where a vessel is cut.
     """
-    ends = open_ends(skeleton_of(points, clearance, distance_map.spacing_mm))
-    score = np.array([shape_score(end) if side is None else end_score(end, side) for end in ends])
+    spacing = distance_map.spacing_mm
+    ends: Sequence[InletEnd | OpenEnd]
+    if side is None:
+        ends = looks = inlets(surface, points, clearance, spacing)
+        score = np.log([max(end.score, 1e-3) / looks[0].score for end in looks]) / LIKENESS_SD
+    else:
+        ends = shapes = open_ends(skeleton_of(points, clearance, spacing))
+        score = np.array([end_score(end, side) for end in shapes])
     gap = np.array([np.linalg.norm(end.position - given.position) for end in ends])
     offer = np.where((gap < SNAP_MM) & (score > PLAUSIBLE), score - 0.5 * (gap / SNAP_SD_MM) ** 2, -np.inf)
     if np.isfinite(offer.max()):
         return Insertion(ends[int(offer.argmax())].position, np.zeros(3))
-    if side is None:
-        inlet = widest_open_end(distance_map, points, clearance)
-    else:
-        inlet = int(np.linalg.norm(points - ends[int(score.argmax())].position, axis=1).argmin())
+    inlet = int(np.linalg.norm(points - ends[int(score.argmax())].position, axis=1).argmin())
     return _directed(distance_map, points, clearance, given, inlet)
 
 
@@ -171,24 +181,10 @@ def in_front(
     return (points[keep], clearance[keep]) if keep.sum() > 20 else (points, clearance)
 
 
-def widest_open_end(
-    distance_map: DistanceMap, points: Float[np.ndarray, "n 3"], clearance: Float[np.ndarray, "n"]
-) -> int:
-    """Return the grid point at the end that looks most like the inlet: wide, cut open, the tree narrowing from it."""
-    spacing = distance_map.spacing_mm
-    graph = lumen_graph(points, clearance, spacing, int(clearance.argmax()))
-    first = int(graph.length.argmax())
-    graph = lumen_graph(graph.points, graph.clearance, spacing, first)
-    paths = trace_branches(graph, minimum_length_mm=_BRANCH_MM)
-    ends = [*paths, paths[0][::-1]]
-    tips = np.array([graph.points[path[-1]] for path in ends])
-    score = np.array([inlet_score(distance_map, graph, path) for path in ends])
-    middle = np.concatenate(paths)
-    score *= [0.6 + 0.4 * _tapering(graph.points[middle], graph.clearance[middle], tip) for tip in tips]
-    return int(np.linalg.norm(points - tips[score.argmax()], axis=1).argmin())
-
-
-def _tapering(points: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, "n"], tip: Float[np.ndarray, "3"]) -> float:
-    """Return how steadily a tree narrows away from an end: its rank correlation, −1 where it widens throughout."""
-    distance = np.linalg.norm(points - tip, axis=1)
-    return -rank_correlation(distance, radius) if len(points) > 3 else 0.0
+def inlets(
+    surface: Surface | None, points: Float[np.ndarray, "n 3"], clearance: Float[np.ndarray, "n"], spacing_mm: float
+) -> list[InletEnd]:
+    """Return the ends of a lumen, given as grid points; the one that looks most like its inlet comes first."""
+    graph = lumen_graph(points, clearance, spacing_mm, int(clearance.argmax()))
+    graph = lumen_graph(graph.points, graph.clearance, spacing_mm, int(graph.length.argmax()))
+    return likely_inlets(graph, trace_branches(graph, minimum_length_mm=_BRANCH_MM), wall=surface)

@@ -1,4 +1,4 @@
-"""What a tree made from centerlines does not show: what it leaves out, where vessels meet again, further inlets."""
+"""What a tree made from centerlines does not show: what it leaves out, where vessels meet again."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from scipy.spatial import KDTree
 
 from endopilot.anatomy.line_graph import STEP_MM, LineNodes
 from endopilot.anatomy.lumen_graph import groups, pieces
-from endopilot.anatomy.sources import Polylines
 from endopilot.errors import place_text
 from endopilot.lines import length_along
 from endopilot.types import VesselTree
@@ -21,9 +20,6 @@ _MOST_NOTES = 12
 
 _OPEN_MM = 0.2
 """A loop has a hole where the spheres on its two sides are this far apart, mm."""
-
-_AS_WIDE, _WIDENS = 0.75, 1.2
-"""Another inlet is at least this share of the ostium's radius wide, and this many times as wide as the way to it."""
 
 
 def left_out(
@@ -106,27 +102,32 @@ def closures(tree: VesselTree) -> list[str]:
     Spheres of two places meet there, while on the way from one to the other along the tree some do not.
     """
     points, radius, abscissa, branch = _tree_points(tree)
-    keep = _thinned(radius, abscissa, branch)
-    points, radius, abscissa, branch = points[keep], radius[keep], abscissa[keep], branch[keep]
-    fork = np.stack([tree.departures(number) for number in range(len(tree.branches))])
     pairs = KDTree(points).query_pairs(2 * float(radius.max()), output_type="ndarray")
     one, two = pairs.T
     overlap = radius[one] + radius[two] - np.linalg.norm(points[one] - points[two], axis=1)
-    route = _route(abscissa, branch, fork, one, two)
+    fork = np.stack([tree.departures(number) for number in range(len(tree.branches))])[branch[one], branch[two]]
+    route = abscissa[one] + abscissa[two] - 2 * np.minimum(fork, np.minimum(abscissa[one], abscissa[two]))
     found = np.flatnonzero((overlap > 0) & (route > 2 * np.pi * np.maximum(radius[one], radius[two])))
     if len(found) == 0:
         return []
     one, two, overlap, route = one[found], two[found], overlap[found], route[found]
     places = 0.5 * (points[one] + points[two])
-    cluster = groups(places, float(np.median(radius[one])) + STEP_MM)
+    cells, member = np.unique(np.floor(places / STEP_MM), axis=0, return_inverse=True)
+    cluster = groups(STEP_MM * cells, float(np.median(radius[one])) + 2 * STEP_MM)[member.reshape(-1)]
+    last = [np.flatnonzero(branch == number)[-1] for number in tree.leaves()]
     notes = []
     for number in range(cluster.max() + 1):
         mine = np.flatnonzero(cluster == number)
         best = mine[overlap[mine].argmax()]
-        nodes = _way(tree, branch, abscissa, fork, int(one[best]), int(two[best]))
+        ends = [int(one[best]), int(two[best])]
+        nodes = _way(tree, points, branch, ends)
         if not _has_hole(points[nodes], radius[nodes]):
             continue
-        tip = any(_ends_near(tree, branch, abscissa, radius, int(end[best])) for end in (one, two))
+        tip = any(
+            branch[end] == branch[leaf] and abscissa[leaf] - abscissa[end] < 2 * radius[end] + STEP_MM
+            for end in ends
+            for leaf in last
+        )
         what = "two lines meet" if tip else "two vessels touch"
         notes.append(
             (
@@ -151,51 +152,25 @@ def _tree_points(tree: VesselTree) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
     )
 
 
-def _thinned(
-    radius: Float[np.ndarray, "n"], abscissa: Float[np.ndarray, "n"], branch: Int[np.ndarray, "n"]
-) -> Bool[np.ndarray, "n"]:
-    """Return points of which neighbours along a branch are about a third of a radius apart."""
-    keep = np.zeros(len(radius), dtype=bool)
-    last, number = -np.inf, -1
-    for i in range(len(radius)):
-        if branch[i] != number or abscissa[i] - last >= radius[i] / 3:
-            keep[i], last, number = True, abscissa[i], branch[i]
-    return keep
-
-
-def _route(
-    abscissa: Float[np.ndarray, "n"],
-    branch: Int[np.ndarray, "n"],
-    fork: Float[np.ndarray, "b b"],
-    one: Int[np.ndarray, "m"],
-    two: Int[np.ndarray, "m"],
-) -> Float[np.ndarray, "m"]:
-    """Return the length of the way along the tree between points, mm."""
-    at = np.minimum(fork[branch[one], branch[two]], np.minimum(abscissa[one], abscissa[two]))
-    return abscissa[one] + abscissa[two] - 2 * at
-
-
 def _way(
-    tree: VesselTree,
-    branch: Int[np.ndarray, "n"],
-    abscissa: Float[np.ndarray, "n"],
-    fork: Float[np.ndarray, "b b"],
-    one: int,
-    two: int,
+    tree: VesselTree, points: Float[np.ndarray, "n 3"], branch: Int[np.ndarray, "n"], ends: list[int]
 ) -> Int[np.ndarray, "w"]:
     """Return the points on the way along the tree from one point to another, in order."""
-    at = min(float(fork[branch[one], branch[two]]), float(abscissa[one]), float(abscissa[two]))
+    first = np.flatnonzero(np.diff(branch, prepend=-1))
+    before = np.arange(len(points)) - 1
+    for start, own in zip(first, tree.branches, strict=True):
+        if own.parent >= 0:
+            host = np.flatnonzero(branch == own.parent)
+            before[start] = host[np.linalg.norm(points[host] - points[start], axis=1).argmin()]
     sides = []
-    for end in (one, two):
-        number, side = int(branch[end]), []
-        while number >= 0:
-            mine = np.flatnonzero((branch == number) & (abscissa <= abscissa[end]) & (abscissa >= at))
-            side.append(mine[::-1])
-            if tree.branches[number].centerline.abscissa[0] <= at:
-                break
-            number = tree.branches[number].parent
-        sides.append(np.concatenate(side))
-    return np.concatenate([sides[0], sides[1][::-1]])
+    for end in ends:
+        side = [end]
+        while before[side[-1]] >= 0:
+            side.append(int(before[side[-1]]))
+        sides.append(side)
+    common = set(sides[0]) & set(sides[1])
+    ways = [[node for node in side if node not in common] for side in sides]
+    return np.array(ways[0] + ways[1][::-1], dtype=np.int64)
 
 
 def _has_hole(points: Float[np.ndarray, "w 3"], radius: Float[np.ndarray, "w"]) -> bool:
@@ -207,38 +182,3 @@ def _has_hole(points: Float[np.ndarray, "w 3"], radius: Float[np.ndarray, "w"]) 
         np.linalg.norm(points[first, None] - points[None, second], axis=2) - radius[first, None] - radius[None, second]
     )
     return bool(gap.min(axis=1).max(initial=-np.inf) > _OPEN_MM or gap.min(axis=0).max(initial=-np.inf) > _OPEN_MM)
-
-
-def _ends_near(
-    tree: VesselTree,
-    branch: Int[np.ndarray, "n"],
-    abscissa: Float[np.ndarray, "n"],
-    radius: Float[np.ndarray, "n"],
-    index: int,
-) -> bool:
-    """Return whether a point lies within two radii of the end of its branch, and the branch ends blind there."""
-    number = int(branch[index])
-    end = float(tree.branches[number].centerline.abscissa[-1])
-    return number in tree.leaves() and end - float(abscissa[index]) < 2 * float(radius[index]) + STEP_MM
-
-
-def further_inlets(source: Polylines, tree: VesselTree) -> list[str]:
-    """Return a note on each end at which the vessel could be entered as well.
-
-    It is about as wide as the ostium, and lines begin there as they do at the ostium, or the vessel widens towards it.
-    """
-    root = tree.branches[0].centerline
-    starts = np.array([line[0] for line in source.points])
-    begins_here = np.linalg.norm(starts - root.points[0], axis=1).min() <= root.radius[0]
-    notes = []
-    for leaf in tree.leaves():
-        line = tree.path(leaf)
-        end, size = line.points[-1], float(np.median(line.radius[-5:]))
-        begins = begins_here and np.linalg.norm(starts - end, axis=1).min() <= size
-        widens = size > _WIDENS * float(line.radius.min())
-        if size >= _AS_WIDE * float(root.radius[0]) and (begins or widens):
-            notes.append(
-                f"the end at {place_text(end)} could be an inlet too (radius {size:.2f} mm, "
-                f"{root.radius[0]:.2f} mm at the ostium): the tree has one, and --ostium-mm chooses it"
-            )
-    return notes

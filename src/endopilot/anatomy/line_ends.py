@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from endopilot.anatomy.coronary_ends import rank_correlation
 from endopilot.anatomy.distance import sample
 from endopilot.anatomy.lumen_graph import LumenGraph
+from endopilot.anatomy.surface import Surface
 from endopilot.anatomy.tree import Line, cross_axes, resampled, smoothed
+from endopilot.errors import place_text
 from endopilot.lines import length_along
 from endopilot.types import DistanceMap, Insertion
 
@@ -31,33 +36,146 @@ _SIGHT = np.linspace(0.0, 1.0, 50)
 _LED_ELSEWHERE = 2.0
 """A line drawn out to its cut ends within this many radii of the tip that it was traced from."""
 
+_BLIND = 0.6
+"""An end whose cap is as round as a sphere counts this share of one that is cut flat."""
+
+_ROUND_CAP, _FLAT_CAP = 0.3, 0.7
+"""Flat part of a cap over the section: at 0.4 mm voxels domes of 2 to 6 mm have 0.2 to 0.5, cuts 0.6 to 0.9."""
+
+_NECK, _DOME = 1.3, 4.0
+"""An end this many times as wide as its neck, which lies no more of its radii behind than the second, is a dome."""
+
+_LINE_ENDS, _NO_LINE = 0.5, 0.1
+"""Lines run from the inlet, as VMTK writes them: one that ends at a place says this share of what one that begins there
+says for it; a place where no line begins or ends is as little likely as the second."""
+
+_RIVAL = 0.55
+"""Ends that look this much like the inlet as the best one are named."""
+
 _LONGEST_BRIDGE = 4.0
 """A known ostium is joined to a line that begins at most this many radii away."""
 
 
-def end_score(distance_map: DistanceMap, graph: LumenGraph, path: Int[np.ndarray, "_"]) -> float:
-    """Return how much the end of a path looks like the vessel's inlet: its radius in mm, less if it is not cut open.
+@dataclass(frozen=True, eq=False)
+class InletEnd:
+    """An end of a tree that a device may enter at.
 
-    A blind end counts 0.6 times its radius, and one that bulges behind a neck, as an aneurysm does, 0.2 times, but no
-    more than half the neck's.
+    Attributes:
+        node: index of its tip.
+        position: middle of the end, mm.
+        radius: of the vessel there, mm.
+        score: how much it looks like the inlet, mm: its radius, less where something speaks against it.
     """
-    kept = path[: before_cap(graph, path)]
-    radius = float(np.median(graph.clearance[kept[-5:]]))
-    raw = graph.points[kept]
-    points = smoothed(raw, 3.0) if len(raw) > 3 else raw
-    drawn, _ = to_cut(distance_map, points, np.full(len(points), radius), graph.spacing_mm)
-    axis = drawn[-1] - points[max(0, len(points) - 4)]
-    axis /= max(float(np.linalg.norm(axis)), 1e-12)
-    along = np.arange(0.0, 3 * radius, 0.5 * graph.spacing_mm)
-    blind = sample(distance_map, drawn[-1] + along[:, None] * axis) > 0
-    remaining = along[np.argmin(blind)] if not blind.all() else along[-1]
-    if remaining < 0.35 * radius + 0.5 * graph.spacing_mm:
-        return radius
-    gap = np.abs(
-        graph.length[kept] - graph.length[kept[-1]]
-    )  # along the vessel: the other limb of a hairpin is near too
-    neck = graph.clearance[kept[gap < 4 * radius]].min()
-    return min(0.2 * radius, 0.5 * float(neck)) if radius > 1.3 * neck else 0.6 * radius
+
+    node: int
+    position: Float[np.ndarray, "3"]
+    radius: float
+    score: float
+
+    def rivals(self, others: Sequence[InletEnd]) -> list[str]:
+        """Say which other ends look so much like the inlet that the device may as well enter there."""
+        near = [end for end in others if end is not self and end.score > _RIVAL * self.score]
+        if not near:
+            return []
+        places = ", ".join(f"{place_text(end.position)} ({2 * end.radius:.1f} mm wide)" for end in near[:4])
+        return [
+            f"the end at {places} could be an inlet too; taken is {place_text(self.position)} "
+            f"({2 * self.radius:.1f} mm wide): --ostium-mm chooses another"
+        ]
+
+
+def likely_inlets(
+    tree: LumenGraph,
+    paths: Sequence[Int[np.ndarray, "_"]],
+    *,
+    wall: Surface | None = None,
+    lines: Sequence[Float[np.ndarray, "2 3"]] = (),
+) -> list[InletEnd]:
+    """Return the ends of a tree, the one that looks most like its inlet first.
+
+    The inlet is wide, the tree narrows from it, it is cut flat, and lines begin there. An end that bulges behind a neck
+    is an aneurysm's dome: it counts as its neck does, less by how much it bulges. A cut that bulges is none: the root
+    of the aorta does.
+
+    Args:
+        tree: points with their distance to the wall; of lines, their radii.
+        paths: of its nodes, the first from one end to another, each other one from an earlier one to an end.
+        wall: the wall, which shows where a vessel is cut; None for lines.
+        lines: first and last point of each line of a file of lines.
+    """
+    before = {int(node): int(last) for path in paths for last, node in itertools.pairwise(path)}
+    middle = np.concatenate(paths)
+    widths = tree.clearance[middle]
+    triangles = None if wall is None else wall.triangles()
+    found = []
+    for path in (paths[0][::-1], *paths):
+        inwards = [int(node) for node in path[::-1]]
+        if path[0] != paths[0][0] and path[-1] != paths[0][0]:  # a branch is followed on into what carries it
+            while inwards[-1] in before:
+                inwards.append(before[inwards[-1]])
+        points, clearance = tree.points[inwards], tree.clearance[inwards]
+        place = min(len(path) - before_cap(tree, path), len(path) - 1)
+        radius = float(np.median(clearance[place : place + 5]))
+        widest, bulge, neck = _bulge(points, clearance, len(path))
+        dome, open_, middle_of_end = float(bulge > _NECK), 1.0, points[0]
+        if triangles is not None:
+            behind = points[min(place + 5, len(points) - 1)]
+            axis = (points[place] - behind) / max(np.linalg.norm(points[place] - behind), 1e-9)
+            middle_of_end = behind + max(float((points[0] - behind) @ axis), 0.0) * axis  # the tip lies in the rim
+            whole = min(int(np.searchsorted(length_along(points), radius)), place)
+            at, width = (widest, clearance[widest]) if dome else (whole, radius)
+            flat = _flatness(points, int(at), float(width), triangles)
+            cut = float(np.clip((flat - _ROUND_CAP) / (_FLAT_CAP - _ROUND_CAP), 0.0, 1.0))
+            dome, open_ = dome * (1.0 - cut), _BLIND + (1.0 - _BLIND) * cut
+        score = open_ * ((1.0 - dome) * radius + dome * min(radius, neck / bulge))
+        away = np.linalg.norm(tree.points[middle] - points[0], axis=1)
+        score *= 0.6 - 0.4 * (rank_correlation(away, widths) if np.ptp(widths) > 0 else 0.0)
+        if lines:
+            near = np.linalg.norm(np.array(lines) - points[0], axis=2) <= max(radius, tree.spacing_mm)
+            score *= max(float(np.where(near[:, 0], 1.0, _LINE_ENDS * near[:, 1]).mean()), _NO_LINE)
+        found.append(InletEnd(int(path[-1]), middle_of_end, radius, float(score)))
+    return sorted(found, key=lambda end: -end.score)
+
+
+def _bulge(points: Float[np.ndarray, "n 3"], clearance: Float[np.ndarray, "n"], own: int) -> tuple[int, float, float]:
+    """Return where a vessel that is followed inwards from an end is widest against the neck behind: index, ratio, neck.
+
+    Args:
+        points: the way inwards.
+        clearance: distance to the wall, mm.
+        own: as many points belong to the branch that ends there.
+    """
+    length = length_along(points)
+    best = (0, 1.0, float(clearance[0]))
+    for i in np.flatnonzero((length[:own] <= _DOME * clearance[:own]) & (clearance[:own] > 0)):
+        behind = slice(int(i), int(np.searchsorted(length, length[i] + _DOME * clearance[i])) + 1)
+        neck = float(clearance[behind].min())
+        if clearance[i] > best[1] * neck:
+            best = (int(i), float(clearance[i]) / neck, neck)
+    return best
+
+
+def _flatness(
+    points: Float[np.ndarray, "n 3"], place: int, width: float, triangles: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> float:
+    """Return the area of the flattest part of the wall that closes an end, over that of the vessel's section.
+
+    A vessel cut straight or aslant has 1 or more, a dome 0.12 (what lies within 20° of one direction on a sphere).
+
+    Args:
+        points: the way inwards from the tip.
+        place: where on it the vessel has its whole width.
+        width: its radius there, mm.
+        triangles: centres, normals and areas of the wall's triangles.
+    """
+    centres, normals, areas = triangles
+    back = int(np.searchsorted(length_along(points[place:]), 1.5 * width))
+    axis = points[place] - points[min(place + max(back, 1), len(points) - 1)]
+    near = np.flatnonzero(np.linalg.norm(centres - points[place], axis=1) < 2.0 * width)
+    near = near[normals[near] @ axis > 0.5 * np.linalg.norm(axis)]
+    normals, areas = normals[near], areas[near]
+    some = normals[:: max(1, len(near) // 64)]
+    return float(((some @ normals.T > np.cos(np.radians(20.0))) @ areas).max(initial=0.0)) / (np.pi * width**2)
 
 
 def before_cap(graph: LumenGraph, nodes: Int[np.ndarray, "_"]) -> int:

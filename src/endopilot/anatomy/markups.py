@@ -62,7 +62,7 @@ def read_markups(path: Path) -> AnatomySource:
         raise InputError(f"{path}: {refused[0]}")
     notes += [f"{reason.split(':')[0]}, and is left out" for reason in refused]
     factor = factors.pop() if len(factors) == 1 else 1.0
-    lines = checked_lines(Polylines(tuple(points), tuple(radii)), path)
+    lines = checked_lines(Polylines(tuple(points), tuple(radii)), path, notes)
     return AnatomySource(lines, coordinates=" and ".join(sorted(axes)), factor=factor, notes=tuple(notes))
 
 

@@ -77,9 +77,10 @@ def _reader(path: str) -> Any:
     from vtkmodules.vtkIOGeometry import vtkOBJReader, vtkSTLReader
     from vtkmodules.vtkIOLegacy import vtkDataSetReader
     from vtkmodules.vtkIOPLY import vtkPLYReader
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridReader
 
-    readers = {".stl": vtkSTLReader, ".obj": vtkOBJReader, ".ply": vtkPLYReader, ".vtp": vtkXMLPolyDataReader}
+    readers = {".stl": vtkSTLReader, ".obj": vtkOBJReader, ".ply": vtkPLYReader}
+    readers |= {".vtp": vtkXMLPolyDataReader, ".vtu": vtkXMLUnstructuredGridReader}
     return readers.get(Path(path).suffix.lower(), vtkDataSetReader)()
 
 

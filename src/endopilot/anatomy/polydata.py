@@ -1,4 +1,4 @@
-"""Surfaces and centerlines from STL, OBJ, PLY, VTP and VTK files, with the axes and the unit that their headers state.
+"""Surfaces and centerlines from STL, OBJ, PLY, VTP, VTU and VTK, with the axes and the unit that their headers state.
 
 3D Slicer writes its axes as `SPACE=LPS` or `SPACE=RAS`: in the header of an STL, in a comment of a PLY or OBJ, in the
 title of a VTK file, and in the field data of a VTP.
@@ -25,7 +25,7 @@ from endopilot.anatomy.sources import (
     in_mm,
 )
 from endopilot.anatomy.surface import Surface
-from endopilot.anatomy.units import mm_per_unit
+from endopilot.anatomy.units import ASSUMED, BY_ARRAYS, STATED, mm_per_unit
 from endopilot.errors import InputError
 
 _HEADER_BYTES = 65536
@@ -33,6 +33,9 @@ _HEADER_BYTES = 65536
 
 _LONGEST_S, _BYTES_A_SECOND = 30.0, 1e6
 """A file that takes longer to read than this, and than its size at this speed, is damaged."""
+
+_SIMVASCULAR = {"ModelFaceID", "BranchId", "CenterlineSectionArea", "GlobalNodeID"}
+"""Arrays that SimVascular writes into models, centerlines and meshes, all in cm."""
 
 _SPACE = re.compile(r"\bSPACE\s*[=:]\s*[\"']?([A-Za-z][A-Za-z-]*)", re.IGNORECASE)
 _UNIT = re.compile(r"\bUNITS?\s*[=:]\s*[\"']?([A-Za-zµμ]+)", re.IGNORECASE)
@@ -56,7 +59,7 @@ def read_polydata(path: Path) -> AnatomySource:
         raise InputError(f"{path}: some coordinates are not finite numbers; export it again")
     statement = f"{_header(path)}\n{data['fields']}"
     coordinates = _coordinates(statement, path)
-    factor = _factor(statement, notes)
+    factor, odds = _factor(statement, data, notes)
     if "corners" in data:
         content: Surface | Polylines = _surface(points, data["corners"], path)
         if data["kind"] == "vtkUnstructuredGrid":
@@ -68,7 +71,7 @@ def read_polydata(path: Path) -> AnatomySource:
     else:
         content = _lines(data, path, notes)
     content = in_mm(content, factor, RAS_TO_LPS if coordinates == "ras" else np.ones(3))
-    return AnatomySource(content, coordinates=coordinates, factor=factor, notes=tuple(notes))
+    return AnatomySource(content, coordinates=coordinates, factor=factor, odds=odds, notes=tuple(notes))
 
 
 def arrays(path: Path) -> dict[str, np.ndarray]:
@@ -129,17 +132,22 @@ def _coordinates(statement: str, path: Path) -> str | None:
     return axes.pop() if axes else None
 
 
-def _factor(statement: str, notes: list[str]) -> float:
+def _factor(statement: str, data: dict[str, np.ndarray], notes: list[str]) -> tuple[float, float]:
+    """Return mm in a file's unit, and how sure that is: as the header states, or as a program's own arrays tell."""
     found = sorted({name.lower() for name in _UNIT.findall(statement)})
     known = {factor for name in found if (factor := mm_per_unit(name)) is not None}
     if len(known) == 1 and len(found) == 1:
         factor = known.pop()
         if factor != 1.0:
             notes.append(f"the header states the unit {found[0]}: multiplied by {factor:g}")
-        return factor
+        return factor, STATED
     if found:
         notes.append(f"the header states the unit {' and '.join(found)}, which is not one known length: taken for mm")
-    return 1.0
+    arrays = sorted(_SIMVASCULAR & {name.partition(":")[2] for name in data})
+    if arrays:
+        notes.append(f"the arrays {', '.join(arrays)} are SimVascular's, which works in cm: multiplied by 10")
+        return 10.0, BY_ARRAYS
+    return 1.0, ASSUMED
 
 
 def _surface(points: np.ndarray, corners: np.ndarray, path: Path) -> Surface:
@@ -163,7 +171,7 @@ def _lines(data: dict[str, np.ndarray], path: Path, notes: list[str]) -> Polylin
     if len(whole) < len(lines):
         notes.append(f"{len(lines) - len(whole)} lines of a single point are left out")
     lines = Polylines(tuple(places[index] for index in whole), tuple(radius[index] for index in whole))
-    return checked_lines(lines, path)
+    return checked_lines(lines, path, notes)
 
 
 def _radius_array(data: dict[str, np.ndarray], path: Path) -> np.ndarray:

@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
-from endopilot.anatomy.line_checks import closures, further_inlets, left_out
+from endopilot.anatomy.line_checks import closures, left_out
+from endopilot.anatomy.line_ends import InletEnd, likely_inlets
 from endopilot.anatomy.line_graph import (
     STEP_MM,
     Edges,
@@ -25,6 +26,7 @@ from endopilot.anatomy.line_graph import (
     with_bridges,
 )
 from endopilot.anatomy.line_order import in_order
+from endopilot.anatomy.lumen_graph import LumenGraph
 from endopilot.anatomy.sources import Polylines
 from endopilot.anatomy.tree import Line, tree_from_lines
 from endopilot.errors import InputError, place_text
@@ -94,7 +96,7 @@ def tree_from_polylines(
         for gap, end in zip(bridged, gaps[:, 0], strict=True)
     ]
     edges = with_bridges(nodes, edges, gaps)
-    piece = edges.pieces
+    piece, rivals = edges.pieces, list[str]()
     if given is not None:
         gap = np.linalg.norm(nodes.points - given.position, axis=1)
         root, rule = int(gap.argmin()), "given"
@@ -107,13 +109,14 @@ def tree_from_polylines(
         gap = np.linalg.norm(nodes.points - cut_at, axis=1)
         root, rule = int(gap.argmin()), "where the lines leave the parent vessel"
     else:
-        root, rule = _widest_end(nodes, piece, vessel, label), "widest end"
+        first, *others = _inlets(source, nodes, edges, _widest_end(nodes, piece, vessel, label))
+        root, rule, rivals = first.node, "widest end", first.rivals(others)
     paths = _trace(nodes, edges, root)
     tree = tree_from_lines(_lines(nodes.points, nodes.radius, paths))
     lost, covered = left_out(whole, keep, tree, piece, int(piece[root]))
     total = float(whole.share.sum())
     balance = {"length": total, "reached": covered, "left_out": total - covered, "bridged": float(bridged.sum())}
-    notes += [*lost, *closures(tree), *further_inlets(source, tree)]
+    notes += [*lost, *closures(tree), *rivals]
     return LineTree(tree, rule, notes, {f"{name}_mm": round(value, 1) for name, value in balance.items()})
 
 
@@ -173,6 +176,13 @@ def _widest_end(nodes: LineNodes, piece: Int[np.ndarray, "n"], vessel: str, labe
             "name the ostium of one with --ostium-mm"
         )
     return roots[0]
+
+
+def _inlets(source: Polylines, nodes: LineNodes, edges: Edges, end: int) -> list[InletEnd]:
+    """Return the ends of the piece that a node is an end of, the one that looks most like the inlet first."""
+    length, before = dijkstra(edges.matrix, directed=False, indices=end, return_predecessors=True)
+    tree = LumenGraph(nodes.points, nodes.radius, before, length, 0.5 * STEP_MM, edges.matrix)
+    return likely_inlets(tree, _trace(nodes, edges, end), lines=[line[[0, -1]] for line in source.points])
 
 
 def _trace(nodes: LineNodes, edges: Edges, root: int) -> list[Int[np.ndarray, "_"]]:

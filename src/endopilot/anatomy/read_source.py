@@ -12,16 +12,27 @@ from endopilot.errors import InputError
 from endopilot.types import LumenMask
 
 MASK_SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd", ".dcm")
-SURFACE_SUFFIXES = (".stl", ".obj", ".ply", ".vtp", ".vtk")
+SURFACE_SUFFIXES = (".stl", ".obj", ".ply", ".vtp", ".vtu", ".vtk")
+
+_CONVERT = {
+    ".swc": "write its points as the lines of a VTP with an array Radius (mm)",
+    ".fcsv": "its points are a list without radii; open it in Slicer and save a centerline curve as .mrk.json",
+    ".ctgr": "SimVascular's contours are no wall; export its model as VTP or its mesh as VTU",
+    ".glb": "open it in Blender or MeshLab and export STL or PLY",
+    ".gltf": "open it in Blender or MeshLab and export STL or PLY",
+    ".step": "open it in the CAD program and export STL in mm",
+    ".pth": "SimVascular's path has no radii; export its model as VTP or its mesh as VTU",
+}
+"""How a file that is not read becomes one that is, by its suffix."""
 
 
 def read_source(path: str | Path, *, label: int | str | None = None, threshold: float | None = None) -> AnatomySource:
     """Read a vessel from a mask, a surface or centerlines; the kind follows from the file.
 
     Args:
-        path: mask (NIfTI, NRRD, MHA, DICOM-SEG), surface (STL, OBJ, PLY, VTP, VTK) or centerline (VTP with lines and
-            radii, as VMTK writes it, or a Slicer markups curve `.mrk.json` with a radius measurement); or the folder
-            of a patient's markups curves, which are the lines of one tree.
+        path: mask (NIfTI, NRRD, MHA, DICOM-SEG), surface (STL, OBJ, PLY, VTP, VTU, VTK) or centerline (VTP with lines
+            and radii, as VMTK writes it, or a Slicer markups curve `.mrk.json` with radii); or the folder of a
+            patient's markups curves, which are the lines of one tree.
         label: number or name of the segment that is the lumen, where a mask has several.
         threshold: of a mask of grey levels, the value at the wall.
 
@@ -49,7 +60,8 @@ def read_source(path: str | Path, *, label: int | str | None = None, threshold: 
         source = read_polydata(path)
     else:
         known = " ".join((*MASK_SUFFIXES, *SURFACE_SUFFIXES, ".mrk.json"))
-        raise InputError(f"{path}: unknown kind of file; known are {known}")
+        convert = _CONVERT.get(path.suffix.lower())
+        raise InputError(f"{path}: unknown kind of file; {convert or f'known are {known}'}")
     read = source.content.volume.files if isinstance(source.content, LumenMask) else ()
     return replace(source, file=path.name, sha256=files.input_hash(path, read)[path.name])
 

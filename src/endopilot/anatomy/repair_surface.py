@@ -8,20 +8,34 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening
+from jaxtyping import Float, Int
+from scipy.ndimage import binary_dilation, binary_opening, distance_transform_edt
 from scipy.spatial import KDTree
 
+from endopilot.anatomy.coverage import voxelised
 from endopilot.anatomy.lumen_graph import pieces
 from endopilot.anatomy.parent_vessel import Vessel, piece_on_side
 from endopilot.anatomy.repair import NEAR_OSTIUM_MM, NOTED_MM, OTHER_SIDE, other_pieces_text
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.anatomy.topology import MOST_LISTED
+from endopilot.anatomy.walls import enclosed, lumen_in_wall, wall_text
 from endopilot.errors import InputError, place_text
 from endopilot.types import Insertion, Volume
 
 MOST_PIECES = 12
 """At most this many pieces of a surface are looked at as coronary arteries or parts of them."""
+
+_ACROSS = 120.0
+"""A surface is looked at in voxels of this share of its box's mean edge: 2 million."""
+
+_FACING = 0.12
+"""Of a wall of 1 to 3 mm round lumens of 2 to 6 mm 0.15 to 0.5 of the surface faces itself on both sides."""
+
+_HOLDS = 0.08
+"""A shell of voxels holds at least this share of its own number: half a sixth."""
+
+_OVERLAP = 20
+"""Surfaces that have no more voxels than this in common touch."""
 
 
 def closed_surface(
@@ -45,22 +59,22 @@ def closed_surface(
     Raises:
         InputError: the holes cannot be closed, or the surface is nowhere near the given ostium.
     """
-    import pyvista
-
-    remarks = []
-    faces = np.insert(surface.faces, 0, 3, axis=1).ravel()
-    mesh: Any = _without_duplicates(pyvista.PolyData(surface.vertices, faces).clean().triangulate())
+    mesh: Any = _without_duplicates(_polydata(surface.vertices, surface.faces).clean().triangulate())
+    mesh, remarks = _lumen_of(mesh)
     regions = mesh.connectivity(extraction_mode="all")
     ids = np.asarray(regions.point_data["RegionId"])
     if ids.max() > 0:
         if given is None:
             chosen, others = _region_on_side(regions, ids, vessel)
-            if others:
-                remarks.append(other_pieces_text(vessel, len(others)))
         else:
-            chosen = int(ids[np.linalg.norm(regions.points - given.position, axis=1).argmin()])
-        faces = regions.faces.reshape(-1, 4)
-        mesh = pyvista.PolyData(regions.points, faces[ids[faces[:, 1]] == chosen].ravel()).clean()
+            chosen, others = int(ids[np.linalg.norm(regions.points - given.position, axis=1).argmin()]), []
+        joined, mesh = _united(regions, ids, chosen)
+        others = [other for other in others if other not in joined]
+        if others:
+            remarks.append(other_pieces_text(vessel, len(others)))
+        if len(joined) > 1:
+            remarks.append(f"{len(joined)} closed surfaces overlap: united to one vessel")
+        ids = np.where(np.isin(ids, joined), chosen, ids)
         remarks += _regions_left_out(
             np.asarray(regions.points, float), ids.astype(np.int64), chosen, vessel, other_ostium
         )
@@ -78,7 +92,7 @@ def closed_surface(
     mesh = mesh.compute_normals(
         cell_normals=False, point_normals=True, consistent_normals=True, split_vertices=False, auto_orient_normals=False
     )
-    result = Surface(np.asarray(mesh.points, dtype=float), np.asarray(mesh.faces.reshape(-1, 4)[:, 1:], dtype=np.int64))
+    result = _surface(mesh)
     if mesh.n_open_edges or abs(result.volume) < 1e-9:
         result = _from_shell(result, label)
         remarks.append("the surface could not be capped and was closed by filling a voxel shell")
@@ -89,12 +103,86 @@ def closed_surface(
     return result, remarks
 
 
-def region_places(surface: Surface) -> list[Float[np.ndarray, "3"]]:
-    """Return a point on each of the largest connected parts of a surface, LPS mm."""
+def _lumen_of(mesh: Any) -> tuple[Any, list[str]]:
+    """Return the inner faces of a wall that has a thickness, with a remark; any other mesh as it is.
+
+    From a wall, unlike from a vessel, many lines along the normals meet the surface again on both sides.
+    """
+    if min(_met_again(mesh, sign) for sign in (1.0, -1.0)) < _FACING:
+        return mesh, []
+    closed = _surface(_capped(mesh))
+    step = float(np.prod(np.ptp(closed.vertices, axis=0))) ** (1 / 3) / _ACROSS
+    solid = voxelised(closed, step)
+    found = lumen_in_wall(solid)
+    if found is None:
+        return mesh, []
+    lumen, thickness = found
+    faces = np.asarray(mesh.faces.reshape(-1, 4)[:, 1:])
+    centres = np.asarray(mesh.points)[faces].mean(axis=1)
+    index = tuple(np.rint((centres - solid.origin_mm) / solid.spacing_mm[0]).astype(int).T[::-1])
+    near, far = (distance_transform_edt(~part) for part in (lumen, ~lumen & ~solid.voxels))
+    inner = _polydata(mesh.points, faces[np.asarray(near)[index] < np.asarray(far)[index]]).clean()
+    return inner.connectivity(extraction_mode="largest"), [wall_text(thickness)]
+
+
+def _met_again(mesh: Any, sign: float) -> float:
+    """Return from what share of triangles a line along the normal, or against it, meets the surface again."""
+    from vtkmodules.vtkCommonCore import mutable
+    from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
+
+    locator: Any = vtkStaticCellLocator()
+    locator.SetDataSet(mesh)
+    locator.BuildLocator()
+    centres, normals, _ = _surface(mesh).triangles()
+    some = slice(None, None, max(1, len(centres) // 256))
+    reach, met, cell = float(mesh.length), 0, mutable(0)
+    for centre, normal in zip(centres[some], sign * normals[some], strict=True):
+        line = (centre + 1e-4 * reach * normal, centre + reach * normal)
+        met += locator.IntersectWithLine(*line, 0.0, mutable(0.0), [0.0] * 3, [0.0] * 3, cell) != 0
+    return met / len(centres[some])
+
+
+def _united(regions: Any, ids: np.ndarray, chosen: int) -> tuple[list[int], Any]:
+    """Return which closed pieces of a surface overlap one, directly or by others, and the wall of all of them."""
+    faces = regions.faces.reshape(-1, 4)[:, 1:]
+    own = ids[faces[:, 0]]
+    parts = {
+        int(i): _surface(_capped(_polydata(regions.points, faces[own == i]).clean()))
+        for i in np.argsort(-np.bincount(own))[:MOST_PIECES]
+    } | {chosen: _surface(_capped(_polydata(regions.points, faces[own == chosen]).clean()))}
+    lower, upper = regions.points.min(axis=0), regions.points.max(axis=0)
+    step = max(
+        min(abs(part.mean_radius) for part in parts.values()) / 4, float(np.prod(upper - lower)) ** (1 / 3) / _ACROSS
+    )
+    shape = tuple(int(size) for size in (np.ceil((upper - lower) / step).astype(int) + 9)[::-1])
+    inside = {i: part.inside((shape[0], shape[1], shape[2]), lower - 4 * step, step) for i, part in parts.items()}
+    joined, union = [chosen], inside[chosen].copy()
+    for _ in parts:
+        for i in set(parts) - set(joined):
+            # What lies wholly inside is an island, and what only touches is another vessel.
+            common = int((inside[i] & union).sum())
+            if _OVERLAP < common < 0.9 * inside[i].sum():
+                joined.append(i)
+                union |= inside[i]
+    if len(joined) == 1:
+        return joined, _polydata(regions.points, faces[own == chosen]).clean()
+    wall = surface_from_mask(Volume(union, np.full(3, step), lower - 4 * step, np.eye(3)))
+    return joined, _polydata(wall.vertices, wall.faces)
+
+
+def _polydata(points: Any, faces: np.ndarray) -> Any:
     import pyvista
 
-    faces = np.insert(surface.faces, 0, 3, axis=1).ravel()
-    regions: Any = pyvista.PolyData(surface.vertices, faces).clean().triangulate().connectivity(extraction_mode="all")
+    return pyvista.PolyData(np.asarray(points, dtype=float), np.insert(faces, 0, 3, axis=1).ravel())
+
+
+def _surface(mesh: Any) -> Surface:
+    return Surface(np.asarray(mesh.points, dtype=float), np.asarray(mesh.faces.reshape(-1, 4)[:, 1:], dtype=np.int64))
+
+
+def region_places(surface: Surface) -> list[Float[np.ndarray, "3"]]:
+    """Return a point on each of the largest connected parts of a surface, LPS mm."""
+    regions = _polydata(surface.vertices, surface.faces).clean().triangulate().connectivity(extraction_mode="all")
     ids = np.asarray(regions.point_data["RegionId"])
     sizes = np.bincount(ids)
     return [np.asarray(regions.points[ids == i][0], float) for i in np.argsort(-sizes)[:MOST_PIECES] if sizes[i] >= 100]
@@ -138,19 +226,15 @@ def _region_on_side(regions, ids: np.ndarray, vessel: Vessel) -> tuple[int, list
 
 def _without_duplicates(mesh):
     """Drop triangles that occur twice, as where a surface was exported together with its own copy."""
-    import pyvista
-
     faces = np.asarray(mesh.faces.reshape(-1, 4)[:, 1:])
     _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     if len(first) == len(faces):
         return mesh
-    return pyvista.PolyData(np.asarray(mesh.points), np.insert(faces[np.sort(first)], 0, 3, axis=1).ravel())
+    return _polydata(mesh.points, faces[np.sort(first)])
 
 
 def _capped(mesh):
     """Close every hole by a fan of triangles from the centre of its rim to the rim's edges."""
-    import pyvista
-
     points, faces = np.asarray(mesh.points, dtype=float), np.asarray(mesh.faces.reshape(-1, 4)[:, 1:], dtype=np.int64)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     _, inverse, uses = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
@@ -162,11 +246,11 @@ def _capped(mesh):
     centres = np.stack([points[np.unique(rim[own == i])].mean(axis=0) for i in range(len(numbers))])
     fans = np.column_stack([rim[:, 1], rim[:, 0], size + own.reshape(-1)])
     closed = np.concatenate([faces, fans])
-    return pyvista.PolyData(np.concatenate([points, centres]), np.insert(closed, 0, 3, axis=1).ravel())
+    return _polydata(np.concatenate([points, centres]), closed)
 
 
 def _from_shell(surface: Surface, label: str) -> Surface:
-    """Close a surface that no cap closes: voxels that the wall shuts off from outside are inside."""
+    """Close a surface that no cap closes: voxels from which its wall is met in most directions are inside."""
     extent = np.ptp(surface.vertices, axis=0)
     spacing = max(float(np.prod(extent) / 3e6) ** (1 / 3), float(extent.max()) / 600)
     fine = surface.refined(0.7 * spacing)
@@ -177,12 +261,8 @@ def _from_shell(surface: Surface, label: str) -> Surface:
     samples = np.concatenate([fine.vertices, fine.vertices[fine.faces].mean(axis=1)])
     index = np.rint((samples - origin) / spacing).astype(int)
     shell[index[:, 2], index[:, 1], index[:, 0]] = True
-    for closing in (0, 2, 4):
-        wall = binary_closing(shell, iterations=closing) if closing else shell
-        inside = binary_fill_holes(wall)
-        assert inside is not None
-        core = np.asarray(binary_opening(inside & ~shell), dtype=bool)
-        if core.sum() > 0.5 * shell.sum() / 6:
-            volume = Volume(core | (inside & shell), np.full(3, spacing), origin, np.eye(3))
-            return surface_from_mask(volume)
+    inside = np.asarray(binary_opening(enclosed(shell)), dtype=bool)
+    if inside.sum() > _HOLDS * shell.sum():
+        inside = np.asarray(binary_dilation(inside), dtype=bool) & (inside | shell)
+        return surface_from_mask(Volume(inside, np.full(3, spacing), origin, np.eye(3)))
     raise InputError(f"{label}: the surface has holes that cannot be closed; cap it or make it watertight")

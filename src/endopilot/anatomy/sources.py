@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.anatomy.surface import Surface
-from endopilot.errors import InputError
+from endopilot.anatomy.units import ANSWERED, STATED
+from endopilot.errors import InputError, place_text
 from endopilot.types import LumenMask, VesselTree
 
 RADIUS_NAMES = ("maximuminscribedsphereradius", "misr", "radius", "radii")
@@ -47,7 +48,8 @@ class AnatomySource:
         file: name of the file, without its folder.
         sha256: its SHA-256.
         coordinates: axes that the file states, "lps" or "ras"; None where it states none.
-        factor: mm in the unit that the file states; `content` is in mm already where that is not 1.
+        factor: mm in the unit that the file was taken to be in; `content` is in mm already.
+        odds: how much likelier that unit is than any other (`units.ASSUMED` and so on).
         notes: what the reader did or left out, a sentence each.
     """
 
@@ -56,15 +58,16 @@ class AnatomySource:
     sha256: str = ""
     coordinates: str | None = None
     factor: float = 1.0
+    odds: float = STATED
     notes: tuple[str, ...] = ()
 
 
-def transformed(source: AnatomySource, *, scale: float, coordinates: str | None) -> AnatomySource:
+def transformed(source: AnatomySource, *, scale: float | None, coordinates: str | None) -> AnatomySource:
     """Return a source in LPS mm, with a note where nothing states the axes.
 
     Args:
         source: as read.
-        scale: factor that turns its unit into mm; 1 where it is mm, or where the file states its unit.
+        scale: factor that turns its unit into mm, if the user states it.
         coordinates: "lps" or "ras" where the user states the axes, otherwise None.
 
     Raises:
@@ -78,18 +81,18 @@ def transformed(source: AnatomySource, *, scale: float, coordinates: str | None)
             else (f"states {source.coordinates.upper()}")
         )
         raise InputError(f"{label}: --coordinates {coordinates} was given, but the file {stated}; leave the option out")
-    if source.factor != 1.0:
-        if scale not in (1.0, source.factor):
-            raise InputError(
-                f"{label}: --scale {scale:g} was given, but the file states a unit of {source.factor:g} mm; "
-                "leave the option out"
-            )
-        scale = 1.0
+    factor, odds = source.factor, source.odds
+    if scale is not None and factor != 1.0 and odds == STATED and scale not in (1.0, factor):
+        raise InputError(
+            f"{label}: --scale {scale:g} was given, but the file states a unit of {factor:g} mm; leave the option out"
+        )
+    if scale is not None and (factor == 1.0 or odds != STATED):
+        factor, odds = scale, ANSWERED
     if source.coordinates is None and coordinates is None and source.file:
         notes = (*notes, "axes not stated: taken for LPS (--coordinates ras if they are RAS)")
     turned = coordinates == "ras" and source.coordinates is None
-    content = in_mm(source.content, scale, RAS_TO_LPS if turned else np.ones(3))
-    return replace(source, content=content, notes=notes)
+    content = in_mm(source.content, factor / source.factor, RAS_TO_LPS if turned else np.ones(3))
+    return replace(source, content=content, factor=factor, odds=odds, notes=notes)
 
 
 def in_mm(content: Any, factor: float, turn: Float[np.ndarray, "3"]) -> Any:
@@ -109,21 +112,35 @@ def in_mm(content: Any, factor: float, turn: Float[np.ndarray, "3"]) -> Any:
     return content
 
 
-def checked_lines(lines: Polylines, path: Path) -> Polylines:
+def checked_lines(lines: Polylines, path: Path, notes: list[str]) -> Polylines:
     """Return centerlines whose positions are finite and whose radii are positive.
+
+    Where the radius is no number or zero only at the end of a line, it becomes that of the point before, with a note.
 
     Raises:
         InputError: there is no line, or a position or radius is none.
     """
     if not lines.points:
         raise InputError(f"{path}: holds no line of at least two points; export the centerline again")
-    radius = np.concatenate(lines.radius)
-    if not (np.isfinite(radius).all() and np.isfinite(np.concatenate(lines.points)).all()):
-        raise InputError(f"{path}: some positions or radii are not finite numbers; export the centerline again")
-    if (radius <= 0).all():
+    if all((radius == 0).all() for radius in lines.radius):
         raise InputError(f"{path}: all radii are zero; write inscribed-sphere radii in mm")
-    if (radius <= 0).any():
-        raise InputError(
-            f"{path}: {int((radius <= 0).sum())} of {len(radius)} radii are not positive; mend those points"
-        )
-    return lines
+    radii = []
+    for number, (points, radius) in enumerate(zip(lines.points, lines.radius, strict=True)):
+        if not np.isfinite(points).all():
+            raise InputError(f"{path}: {lines.name(number)}: some positions are not finite numbers; export it again")
+        good = np.flatnonzero(np.isfinite(radius) & (radius > 0))
+        bad = np.setdiff1d(np.arange(len(radius)), good)
+        if len(bad):
+            odd = bad[(radius[bad] < 0) | ((bad > good[0]) & (bad < good[-1]))] if len(good) else bad
+            if len(odd):
+                raise InputError(
+                    f"{path}: {lines.name(number)}: the radius at {place_text(points[odd[0]])} is {radius[odd[0]]:g} "
+                    f"({len(odd)} such points); write inscribed-sphere radii, which are positive"
+                )
+            notes.append(
+                f"{lines.name(number)}: the radius of {len(bad)} points at its end, from {place_text(points[bad[0]])}, "
+                "is no positive number: that of the point before is taken"
+            )
+            radius = radius[good[np.abs(good - np.arange(len(radius))[:, None]).argmin(axis=1)]]
+        radii.append(radius)
+    return replace(lines, radius=tuple(radii))

@@ -59,8 +59,14 @@ class Surface:
     @property
     def area(self) -> float:
         """Area of the wall, mm²."""
+        return float(self.triangles()[2].sum())
+
+    def triangles(self) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
+        """Return the triangles' centres, mm, unit normals, and areas, mm²."""
         edges = np.diff(self._corners, axis=1)
-        return float(0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum())
+        normals = 0.5 * np.cross(edges[:, 0], edges[:, 1])
+        areas = np.linalg.norm(normals, axis=1)
+        return self._corners.mean(axis=1), normals / np.maximum(areas, 1e-12)[:, None], areas
 
     @property
     def volume(self) -> float:
@@ -68,6 +74,11 @@ class Surface:
         centre = self.vertices.mean(axis=0)
         first, second, third = np.moveaxis(self._corners - centre, 1, 0)
         return float(np.einsum("ij,ij->", first, np.cross(second, third)) / 6.0)
+
+    @property
+    def mean_radius(self) -> float:
+        """Radius of the tube that has a closed wall's volume and area, mm."""
+        return 2.0 * self.volume / self.area
 
     def distance(self, points: Float[np.ndarray, "n 3"], *, limit_mm: float = np.inf) -> Float[np.ndarray, "n"]:
         """Return the unsigned distance in mm from points to the wall, `limit_mm` where it is at least that.

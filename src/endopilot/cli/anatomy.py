@@ -70,7 +70,8 @@ def command(
         if volume is not None:
             check_covers(volume, anatomy)
         write_anatomy(anatomy, output=output)
-    figures = {"anatomy": output, **describe(anatomy)}
+    said = anatomy.provenance["notes"][0]
+    figures = {"understood": said.partition(": ")[2], "anatomy": output, **describe(anatomy)}
     if picture is not None:
         from endopilot.anatomy.anatomy_picture import draw_anatomy  # matplotlib is slow to import
 
@@ -85,6 +86,7 @@ def describe(anatomy: Anatomy) -> dict[str, object]:
     """Return the figures of an anatomy: extent, calibre, ostium, and what was repaired."""
     path, found = anatomy.tree.longest_path(), anatomy.provenance
     notes = {name: found[name] for name in ("ostium_rule", "ostium_confidence", "notes") if found.get(name)}
+    notes["notes"] = found.get("notes", [])[1:]
     return {
         "branches": len(anatomy.tree.branches),
         "longest_path_mm": round(float(path.abscissa[-1]), 1),
