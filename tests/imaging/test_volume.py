@@ -322,6 +322,8 @@ def test_a_mask_of_one_value_is_taken_whatever_its_type(tmp_path, top, dtype):
     inside = _depth() > 0
     write_volume(Volume((inside * top).astype(dtype), np.ones(3), np.zeros(3), np.eye(3)), tmp_path / "m.mha")
     np.testing.assert_array_equal(read_mask(tmp_path / "m.mha").volume.voxels, inside)
+    write_volume(Volume(np.full((5, 6, 7), top, dtype), np.ones(3), np.zeros(3), np.eye(3)), tmp_path / "m.mha")
+    assert read_mask(tmp_path / "m.mha").volume.voxels.all()
 
 
 def test_label_maps_are_not_taken_for_grey_masks(tmp_path):

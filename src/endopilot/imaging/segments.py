@@ -141,10 +141,11 @@ def _values(layer: Shaped[np.ndarray, "nz ny nx"], asked: bool, path: Path) -> l
         raise InputError(f"{path}: some voxels are not finite numbers; write it again with 0 in their place")
     low, high = float(layer.min()), float(layer.max())
     if layer.dtype.kind in "iu" or np.array_equal(layer, np.round(layer)):
-        if high - low < 1 << 16:
-            above = layer.astype(np.int32) - int(low) if low < 0 else layer
+        if high - min(low, 0) < 1 << 16:
+            least = min(int(low), 0)
+            above = layer.astype(np.int32) - least if least else layer
             counts = np.bincount(above.ravel().astype(np.uint16, copy=False))
-            values, counts = np.flatnonzero(counts) + int(low), counts[counts > 0]
+            values, counts = np.flatnonzero(counts) + least, counts[counts > 0]
         else:
             values, counts = np.unique(layer, return_counts=True)
         counts = counts[values != 0]
