@@ -99,7 +99,11 @@ def test_bytes_that_are_no_text_are_refused(tmp_path, read, content) -> None:
 
 def test_no_more_is_read_than_such_a_file_can_have(tmp_path) -> None:
     assert "larger than 0.25 MiB, too large for a YAML file" in refused(tmp_path / "a.yaml", b"#" * 300_000)
-    with pytest.raises(InputError, match="/dev/zero: is larger"):
+    with (tmp_path / "huge.yaml").open("wb") as stream:
+        stream.truncate(1 << 40)  # of which the disk holds nothing
+    with pytest.raises(InputError, match=r"huge\.yaml: is larger"):
+        read_text(tmp_path / "huge.yaml")
+    with pytest.raises(InputError, match="/dev/zero: is a FIFO, a socket or a device"):
         read_text(Path("/dev/zero"))
 
 

@@ -83,15 +83,18 @@ def read_voxels(
     return np.frombuffer(content, dtype=dtype).reshape(tuple(shape)).astype(dtype.newbyteorder("="))
 
 
-def _unpacked(stream: BufferedIOBase, packing: str, most: int) -> bytes | bytearray:
+def _unpacked(stream: BufferedIOBase, packing: str, most: int) -> bytearray:
     """Return the rest of a stream, unpacked, or its first `most` bytes: a header's size alone allocates nothing.
 
     Raises:
         EOFError: what is packed is cut short.
     """
+    content = bytearray()
     if packing == "raw":
-        return stream.read(most)
-    packed, content = stream.read(), bytearray()
+        while (most < 0 or len(content) < most) and (part := stream.read(1 << 24)):
+            content += part
+        return content if most < 0 else content[:most]
+    packed = stream.read()
     while packed and len(content) < most:  # gzip's members follow one another
         # 32: a header of gzip or of zlib
         unpacker = bz2.BZ2Decompressor() if packing == "bzip2" else zlib.decompressobj(zlib.MAX_WBITS | 32)
