@@ -7,7 +7,6 @@ folder; another model that is advised by the same C-arm finds them there.
 from __future__ import annotations
 
 import hashlib
-import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, fields
 from functools import partial
@@ -161,20 +160,17 @@ def expose_navigations(data: Dataset, anatomy: Anatomy, settings: ImageSettings)
     encoder = data.inserted_length[:, :, 0].astype(float) - deeper_ostium_mm(name, settings.ostium_mm, seed)
     encoder = encoder - world.ostium_mm
     measured: list[list[TipMeasurement | None]] = [[] for _ in data.sequence]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # forces on the wall are in the dataset
-        again = list(simulate_again(data, anatomy, data.command, record_shape=True))
-    for chosen, rollout in again:
-        assert rollout.shape is not None
-        for index, nodes in zip(chosen.tolist(), rollout.shape, strict=True):
-            arm.forget_wires()
-            sequence = int(data.sequence[index])
-            for sample in range(samples):
-                there = nodes[sample] + world.registration_mm if any(world.registration_mm) else nodes[sample]
-                there = there if shown is None else place(shown[sample], there)
-                random = np.random.default_rng([seed, 3, sequence, sample, *name.encode()])
-                depth, given = float(encoder[index, sample]), sample < WINDOW
-                measured[index].append(arm.measure(there, depth, random, refine=given))
+    again = simulate_again(data, anatomy, data.command, record_shape=True)
+    assert again.shape is not None
+    for index, nodes in enumerate(again.shape):
+        arm.forget_wires()
+        sequence = int(data.sequence[index])
+        for sample in range(samples):
+            there = nodes[sample] + world.registration_mm if any(world.registration_mm) else nodes[sample]
+            there = there if shown is None else place(shown[sample], there)
+            random = np.random.default_rng([seed, 3, sequence, sample, *name.encode()])
+            depth, given = float(encoder[index, sample]), sample < WINDOW
+            measured[index].append(arm.measure(there, depth, random, refine=given))
     return _held(measured, encoder, known)
 
 

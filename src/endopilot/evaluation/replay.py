@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -102,16 +102,14 @@ class Recorded:
             advance: called after each anatomy.
 
         Yields:
-            Episodes that one simulation serves, and the simulation: a world for each series and episode, series by
-            series.
+            The episodes of one anatomy, and their simulation: a world for each series and episode, series by series.
         """
         for index, anatomy in enumerate(self.anatomies):
             mine = np.flatnonzero(self.anatomy_of == index)
             worlds = self.data.select(np.tile(mine, len(controls)))
             driven = np.nan_to_num(np.concatenate([self._whole(control)[mine] for control in controls.values()]))
             friction = np.concatenate([REPLAYED.get(name, 1.0) * self.data.friction[mine] for name in controls])
-            for chosen, rollout in simulate_again(worlds, anatomy, driven, friction=friction):
-                yield mine[chosen[: len(chosen) // len(controls)]], rollout
+            yield mine, simulate_again(worlds, anatomy, driven[:, :, None], friction=friction)
             if advance:
                 advance(1, anatomy.name)
 
@@ -127,22 +125,26 @@ class Replay:
     NaN from where the simulation fails, or the series holds no finite control.
     """
 
-    tip: TipSeries
+    abscissa: Samples
+    offset: Samples
+    radius: Samples
     base_force: Samples
     base_torque: Samples
     distance: Samples
 
+    @property
+    def tip(self) -> TipSeries:
+        """Where the tip went."""
+        return TipSeries(self.abscissa, self.offset, self.radius)
+
 
 def replay(recorded: Recorded, controls: Mapping[str, Control], advance: Advance) -> dict[str, Replay]:
-    """Simulate every episode again with each series of controls after the given states.
+    """Simulate every episode again with each series of controls (mm/s and rad/s) after the given states.
 
-    Args:
-        recorded: the episodes.
-        controls: mm/s and rad/s after the given states, by series.
-        advance: called after each anatomy.
+    `advance` is called after each anatomy.
     """
-    shape = recorded.data.valid[:, WINDOW:].shape
-    out = {name: {key: np.full(shape, np.nan) for key in _SIGNALS} for name in controls}
+    shape, signals = recorded.data.valid[:, WINDOW:].shape, [field.name for field in fields(Replay)]
+    out = {name: Replay(*np.full((len(signals), *shape), np.nan)) for name in controls}
     for chosen, rollout in recorded.simulated(controls, advance):
         commanded = np.concatenate([control[chosen] for control in controls.values()])
         usable = rollout.valid[:, WINDOW:] & np.isfinite(commanded).all(axis=-1).cumprod(axis=1).astype(bool)
@@ -150,19 +152,8 @@ def replay(recorded: Recorded, controls: Mapping[str, Control], advance: Advance
         distance = np.linalg.norm(rollout.tip_position - true_tip, axis=-1)[:, :, 0]
         tip, load = rollout.tip, (rollout.base_force, rollout.base_torque)
         of_wire = [each[:, :, 0] for each in (tip.abscissa, tip.offset, tip.radius, *load)]
-        for key, signal in zip(_SIGNALS, (*of_wire, distance), strict=True):
+        for key, signal in zip(signals, (*of_wire, distance), strict=True):
             values = np.where(usable, signal[:, WINDOW:], np.nan)
             for name, part in zip(controls, values.reshape(len(controls), len(chosen), -1), strict=True):
-                out[name][key][chosen] = part
-    return {
-        name: Replay(
-            tip=TipSeries(signals["abscissa"], signals["offset"], signals["radius"]),
-            base_force=signals["base_force"],
-            base_torque=signals["base_torque"],
-            distance=signals["distance"],
-        )
-        for name, signals in out.items()
-    }
-
-
-_SIGNALS = ("abscissa", "offset", "radius", "base_force", "base_torque", "distance")
+                getattr(out[name], key)[chosen] = part
+    return out
