@@ -69,11 +69,6 @@ class Cine:
     def __init__(self, config: AngiogramsConfig, draw: CineDraw, imager: XrayImager) -> None:
         """Simulate what a cine shows.
 
-        Args:
-            config: of the data set.
-            draw: what it shows.
-            imager: of the patient and the devices, with the settings of `config`.
-
         Raises:
             InputError: the devices do not fit, or there is no such policy.
         """

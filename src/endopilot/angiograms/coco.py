@@ -32,15 +32,7 @@ _MOST_FRAMES = 100_000
 def frame_entries(
     cine: Cine, frame: CineFrame, image: str, number: int, cine_number: int
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Return a frame's entry in `images`, and its entries in `annotations`; what does not show has none.
-
-    Args:
-        cine: that the frame belongs to.
-        frame: the frame.
-        image: path of its file in the data set.
-        number: of the frame in the cine.
-        cine_number: of the cine in the data set.
-    """
+    """Return a frame's entry in `images`, and its entries in `annotations`; what does not show has none."""
     pixels = len(frame.grey)
     image_id = cine_number * _MOST_FRAMES + number
     annotations, keypoints = [], cine.keypoints(frame)
@@ -73,12 +65,7 @@ def frame_entries(
 
 
 def coco(parts: Iterable[Mapping[str, Any]], about: str) -> dict[str, Any]:
-    """Return one COCO object of those of some cines.
-
-    Args:
-        parts: each with `images` and `annotations`.
-        about: what they are.
-    """
+    """Return one COCO object of those of some cines."""
     parts = list(parts)
     return {
         "info": {"description": about},

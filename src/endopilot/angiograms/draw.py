@@ -58,7 +58,6 @@ def draw_cine(config: AngiogramsConfig, anatomy: Anatomy, number: int) -> CineDr
     """Draw a cine of a patient; it is the same whatever the others are.
 
     Args:
-        config: what is drawn from.
         anatomy: the patient's vessel.
         number: of the cine among the patient's.
     """

@@ -57,12 +57,6 @@ class Driven:
 def drive_devices(config: AngiogramsConfig, draw: CineDraw, anatomy: Anatomy, stack: Stack) -> Driven:
     """Simulate the devices of a cine.
 
-    Args:
-        config: what drives them, and rate and number of the frames.
-        draw: what is drawn.
-        anatomy: the vessel.
-        stack: the devices.
-
     Raises:
         InputError: the devices do not fit, no motion of them can be simulated, or there is no such policy.
     """

@@ -65,7 +65,6 @@ class Flow:
         """Share the blood among the branches.
 
         Args:
-            tree: the vessel.
             velocity_mm_s: of the blood behind the ostium, mean over the section, mm/s.
         """
         lines = [branch.centerline for branch in tree.branches]
@@ -91,12 +90,7 @@ class Flow:
     def contrast(
         self, injection: Injection, times_s: Float[np.ndarray, "frames"]
     ) -> tuple[Float[np.ndarray, "tanks"], Float[np.ndarray, "frames tanks"]]:
-        """Return transit times, s, and the share of contrast in the blood there at some times from 0 on.
-
-        Args:
-            injection: what is injected.
-            times_s: increasing, s.
-        """
+        """Return transit times, s, and the share of contrast in the blood there at some times from 0 on."""
         step = MIXING_S / _STEPS
         longest = min(float(self.transit_s.max()), float(times_s[-1]))
         tanks = int(np.ceil(longest / MIXING_S)) + 2

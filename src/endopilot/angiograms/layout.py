@@ -70,12 +70,6 @@ class Layout:
 def lay_out(sources: Sequence[Path], output: Path, stack: Stack, config: AngiogramsConfig) -> Layout:
     """Read who the patients are, and share them among the splits.
 
-    Args:
-        sources: folders of anatomies, and CTs.
-        output: folder of the data set.
-        stack: the wire, and the catheters around it.
-        config: how many cines, and what they show.
-
     Raises:
         InputError: no source, or one that cannot be read; two of one name; too few for the splits.
     """

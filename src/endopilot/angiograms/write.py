@@ -35,10 +35,6 @@ _kept: dict[str, XrayImager] = {}
 def write_patient(layout: Layout, folder: Path) -> None:
     """Write a patient's vessel and CT into the data set. The vessel of a CT is segmented.
 
-    Args:
-        layout: of the data set.
-        folder: of the patient in it.
-
     Raises:
         InputError: the source cannot be read, the CT shows no such vessel, or the devices do not fit.
     """
@@ -61,10 +57,6 @@ def write_patient(layout: Layout, folder: Path) -> None:
 
 def write_cine(layout: Layout, folder: Path) -> None:
     """Make a cine, and write its frames, and what is true of them, into its folder.
-
-    Args:
-        layout: of the data set.
-        folder: of the cine.
 
     Raises:
         InputError: no motion of the devices can be simulated in the vessel, or there is no such policy.

@@ -78,9 +78,7 @@ def make_arch(
     """Return one aortic arch and what was drawn for it.
 
     Args:
-        generator: random stream of this patient.
         stenosis_share: probability of a stenosis, in a common carotid or the left subclavian artery.
-        population: how patients vary.
     """
     sex = "man" if generator.random() < 0.5 else "woman"
     kind = str(generator.choice(list(TYPE_SHARES), p=np.array(list(TYPE_SHARES.values())) / sum(TYPE_SHARES.values())))

@@ -80,7 +80,6 @@ def until_it_fits(
     """Draw trees until one fits; its record states how many failed before (`redrawn`).
 
     Args:
-        draw: draws one tree, and raises `NoShape` if it fails.
         what: what is drawn, for the error.
 
     Raises:
@@ -118,7 +117,6 @@ def stenosis(
     """Return a narrowing of 30 to 65 % of the diameter over 6 to 14 mm, and the factor on the radius.
 
     Args:
-        generator: random stream.
         along: abscissa of the vessel's points, mm.
         shares: it lies between these shares of the vessel's abscissa.
     """
@@ -203,9 +201,6 @@ def with_side_branches(
     """Return the vessels with the planned branches; one that cuts another lumen is drawn again, twelve times at most.
 
     Args:
-        generator: random stream.
-        vessels: those that are there.
-        plans: the branches.
         carina_mm: over this length behind a fork and twice their radii lumens may be in contact, mm.
 
     Raises:
@@ -301,7 +296,6 @@ def lumens_collide(vessels: Sequence[Vessel], carina_mm: float = _BEND_MM) -> bo
     """Return whether lumens touch that lie far apart along the tree.
 
     Args:
-        vessels: the tree.
         carina_mm: behind a fork two vessels are far apart from this length and twice their radii on, mm.
     """
     points = np.concatenate([vessel.points for vessel in vessels])

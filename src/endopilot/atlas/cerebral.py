@@ -73,9 +73,7 @@ def make_cerebral(
     """Return one side's anterior circulation and what was drawn for it.
 
     Args:
-        generator: random stream of this patient.
         stenosis_share: probability of a stenosis, in M1 or the carotid artery.
-        population: how patients vary.
     """
     side = "left" if generator.random() < 0.5 else "right"
     trunks = 3 if generator.random() < TRIFURCATION_SHARE else 2

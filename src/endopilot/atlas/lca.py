@@ -169,9 +169,7 @@ def make_lca(
     """Return one left coronary tree and what was drawn for it.
 
     Args:
-        generator: random stream of this patient.
         stenosis_share: probability of a stenosis, in the anterior descending artery or the circumflex.
-        population: how patients vary.
     """
     u = generator.random()
     dominance = "right" if u < _RIGHT_SHARE else "balanced" if u < _RIGHT_SHARE + _BALANCED_SHARE else "left"

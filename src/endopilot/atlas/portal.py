@@ -73,9 +73,7 @@ def make_portal(
     """Return one portal vein and what was drawn for it.
 
     Args:
-        generator: random stream of this patient.
         stenosis_share: probability of a stenosis, in the main, right or left portal vein.
-        population: how patients vary.
     """
     shares = np.array(list(VARIANT_SHARES.values()))
     variant = str(generator.choice(list(VARIANT_SHARES), p=shares / shares.sum()))

@@ -109,11 +109,6 @@ def make_rca(
     """Return one right coronary tree and what was drawn for it.
 
     Targets are kept when a shape fails, so that failures do not bias the statistics.
-
-    Args:
-        generator: random stream of this patient.
-        stenosis_share: probability of a stenosis.
-        population: how patients vary.
     """
     for _ in range(10):
         targets = _targets(generator)

@@ -74,12 +74,9 @@ def seen_through_ct(
     """Return the anatomy that `endopilot anatomy` makes of a mask of the patient's lumen, and what was drawn for it.
 
     Args:
-        generator: random stream.
-        vessel: kind of vessel tree.
         tree: the patient's vessels.
         lumen: distance to the wall, without a catheter.
         direction: the vessel's first direction.
-        name: of the patient.
         catheter_radius_mm: inner radius of the guiding catheter, mm.
 
     Raises:
@@ -117,7 +114,6 @@ def rasterised(
 
     Args:
         lumen: distance to the wall, mm.
-        voxel_mm: edges of the voxels, mm.
         taken_in: that share.
         shift: of the grid, in voxels.
     """

@@ -42,8 +42,6 @@ def advise(
         run: made by `endopilot train`, or "pretrained", the model of the package.
         dataset: made by `endopilot dataset`; its patients must not be those that the run was trained on, unless they
             are of its split 'train'.
-        output: where the figures go.
-        config: what is advised.
         also_test: datasets of the same wire that were made otherwise, with another wall or other elements: their test
             patients are advised with the same calibration, and measured apart.
 
@@ -136,8 +134,6 @@ def _other(run: Path, folder: Path, ours: Sequence[Dataset]) -> Dataset:
     """Return the test patients of a dataset that was made otherwise.
 
     Args:
-        run: of the model.
-        folder: of the dataset.
         ours: what the bands are fitted to and scaled on.
 
     Raises:

@@ -35,8 +35,6 @@ class Allowance:
         """Begin at an exposure.
 
         Args:
-            inserted_mm: Δ.
-            abscissa_mm: Δtip.
             alone: whether no catheter is around the wire; nothing is allowed for where one is.
         """
         self._at, self._alone, self.held_mm = np.array([inserted_mm, abscissa_mm]), alone, 0.0

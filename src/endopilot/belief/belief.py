@@ -163,12 +163,9 @@ class Belief:
         """Bring every member's wire to the start of the navigation.
 
         Args:
-            navigation: as it is given.
             members: what each takes reality to be; all have the same kind of wall.
-            config: accuracy of measurements, and settings of the rod core.
             drives: of another belief about the same devices; at rest at the start if not given.
             vessels: that other beliefs have prepared.
-            motion: of the vessel, if one was found.
         """
         self.motion, self._given = motion, navigation
         self.navigation = navigation if motion is None else replace(navigation, known_motion=motion)

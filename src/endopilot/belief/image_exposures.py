@@ -87,10 +87,6 @@ def deeper_ostium_mm(name: str, largest_mm: float, seed: int) -> float:
 def image_exposures(dataset: Dataset, settings: ImageSettings) -> tuple[dict[str, Exposures], tuple[str, ...]]:
     """Return what images show of navigations: those that are kept, and those that are made now and kept.
 
-    Args:
-        dataset: the navigations of one split.
-        settings: what the images follow from.
-
     Returns:
         What is shown, by the patient's name; and the names of the patients who cannot be registered.
 
@@ -140,8 +136,6 @@ def expose_navigations(data: Dataset, anatomy: Anatomy, settings: ImageSettings)
 
     Args:
         data: the patient's navigations.
-        anatomy: the patient.
-        settings: what the images follow from.
 
     Raises:
         NotRegistered: the patient cannot be registered.
@@ -180,7 +174,6 @@ def _held(
     """Return measurements of the first samples of each navigation as arrays, with what is held where there is none.
 
     Args:
-        measured: in each navigation.
         encoder: Δ, mm.
         known: the patient's motion as it was measured.
     """

@@ -25,9 +25,7 @@ class LoadRatio:
         """Take a reading.
 
         Args:
-            read_n: force that the drive reads, N.
             predicted_n: what the wire ahead of the valve takes of it by the model, N.
-            speed_mm_s: at which the drive advanced, mm/s.
             valve: friction of the introducer's valve, N, and its drag, N·s/mm.
         """
         if predicted_n < _LEAST_N or speed_mm_s < _LEAST_MM_S:

@@ -84,10 +84,7 @@ class Monitor:
         """Lay out the simulated wires at the start of a navigation.
 
         Args:
-            navigation: as it is given.
             calibration: of the bands around what the simulated wires predict.
-            config: the simulated wires.
-            advice: which events X-ray must not miss.
         """
         self._navigation, self._config = navigation, config or BeliefConfig()
         self._given = Belief.around(self._config)

@@ -98,7 +98,6 @@ class Lumen:
         """Tabulate the radii.
 
         Args:
-            trees: of the patients.
             owner: of each episode, the index of its patient.
         """
         lines = [[_onwards(tree, branch) for branch in range(len(tree.branches))] for tree in trees]
@@ -130,7 +129,6 @@ def monitor(predictor: Predictor, dataset: Dataset, config: AdviseConfig, *, sam
     """Return the navigations of a split with an online predictor of their tips.
 
     Args:
-        predictor: the model.
         dataset: the navigations as they truly went; encoders and exposures err as its world says.
         config: the C-arm, and the model mismatch.
         samples: exposures of so many samples are needed, from the first on; of all if not given. Images take time.
@@ -194,7 +192,6 @@ def calibrate(fitted: Monitored, own: Monitored, config: AdviserConfig) -> Calib
 
     Args:
         fitted: navigations that the terms of the spread are fitted to; they need be no calibration patients.
-        own: navigations of the calibration patients.
         config: how many of the intervals the bands shall hold throughout, and how many events the adviser may miss.
 
     Raises:
@@ -227,11 +224,6 @@ def least_offset_share(own: Monitored, bands: Calibration, config: AdviserConfig
 
     The shares of `OFFSET_SHARES` are tried from the largest on. The last one before the first that misses too many is
     taken, so that chance among many shares favours none; 1, where even the whole band misses too many.
-
-    Args:
-        own: navigations of the calibration patients.
-        bands: the calibration of these.
-        config: the events, and the share of them that may be missed.
     """
     names, owner = np.unique(own.episodes.anatomy, return_inverse=True)
     least = OFFSET_SHARES[0]

@@ -52,29 +52,14 @@ class MovedCopies:
         config: SimulatorConfig,
         sharing: Simulator,
     ) -> None:
-        """Prepare the copies.
-
-        Args:
-            kind: vessel and devices.
-            count: number of copies.
-            limits: of the drive of each device.
-            motion: of the vessel, as it is known.
-            config: settings of the rod core.
-            sharing: simulator of the same vessel.
-        """
+        """Prepare the copies."""
         anatomy, stack = kind
         self.simulator = Simulator(anatomy, stack, worlds=count, motion=motion, config=config, sharing=[sharing])
         self._limits = list(limits)
         self._random, self.at = np.random.default_rng(0xC0B1), 0
 
     def seek(self, member: int, of: Simulator, misfit: Misfit) -> float:
-        """Move copies of a member to and fro; return how near the nearest comes, `at`.
-
-        Args:
-            member: its place among those of a belief.
-            of: the simulator of these.
-            misfit: of each copy.
-        """
+        """Move copies of a member to and fro; return how near the nearest comes, `at`."""
         copies, count = self.simulator, self.simulator.worlds
         copies.copy_worlds(np.full(count, member), of=of)
         best = np.inf

@@ -43,10 +43,7 @@ class OnlinePredictor(Protocol):
         """Take what X-ray shows of some navigations at a sample, and predict the later samples anew.
 
         Args:
-            episodes: indices of the navigations.
-            sample: of the exposure.
             tip: (Δtip, γtip) in the image, mm.
-            branch: of that tip.
             sd_mm: standard deviations of both as the detector states them, mm; none if not given. The twin weighs its
                 wires by them; networks have no such input.
         """
@@ -125,7 +122,6 @@ class OnlineWindowed:
         """Predict from the first `WINDOW` samples.
 
         Args:
-            predictor: the model.
             episodes: their controls, and their tips as they are measured.
         """
         self._predictor, self._episodes = predictor, episodes
@@ -159,7 +155,6 @@ def online_predictor(predictor: Predictor, episodes: Episodes, observed: EachObs
     """Return what predicts the tips of navigations with a model as exposures come in.
 
     Args:
-        predictor: of a run.
         episodes: their controls, and their tips as they are measured.
         observed: which of the first `WINDOW` samples were measured; all if not given. The paper's networks take the
             others' tips as they stand in `episodes`.

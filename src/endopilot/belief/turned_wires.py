@@ -23,24 +23,12 @@ class Fans:
     """Copies of a member of a belief, each turned by another angle; members of a kind share theirs."""
 
     def __init__(self, kinds: Sequence[tuple[Anatomy, Stack]], motion: Motion | None, config: SimulatorConfig) -> None:
-        """Take what the members are simulated with.
-
-        Args:
-            kinds: vessel and devices, those that differ.
-            motion: of the vessel, as it is known.
-            config: settings of the rod core.
-        """
+        """Take what the members are simulated with."""
         self._kinds, self._motion, self._config = kinds, motion, config
         self._made = dict[int, Simulator]()
 
     def of(self, kind: int, member: int, simulator: Simulator) -> Simulator:
-        """Return copies of a member as it lies now, those turned to more than half a turn backwards.
-
-        Args:
-            kind: of the member.
-            member: its place in the simulator.
-            simulator: of all members.
-        """
+        """Return copies of a member as it lies now, those turned to more than half a turn backwards."""
         if kind not in self._made:
             anatomy, stack = self._kinds[kind]
             self._made[kind] = Simulator(
@@ -66,9 +54,6 @@ def turned(
     """Return the end of a member's wire, turned by some angles, rad, and its direction there, LPS mm.
 
     Args:
-        simulator: of all members.
-        member: its place there.
-        turn: the angles.
         fan: its copies; where there are none, the wire is taken not to turn.
     """
     if fan is None:

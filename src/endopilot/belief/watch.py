@@ -27,10 +27,6 @@ class Watch:
         """Begin at an exposure.
 
         Args:
-            calibration: of the model that predicts.
-            config: which events X-ray must not miss.
-            tip_radius_mm: radius of the wire at its tip, mm.
-            at: what the model predicts there.
             alone: whether the model is of a wire that no catheter is around; else nothing is allowed for.
         """
         self.innovations = Innovations()

@@ -60,13 +60,7 @@ class Autopilot:
         return self.drives and (self._pending is not None or self._world.loop.between_periods)
 
     def start(self, name: str, target: Target) -> None:
-        """Hand the wheel to a policy, or back to it, from the next decision on.
-
-        Args:
-            name: of the policy.
-            target: where the tip is to go.
-
-        """
+        """Hand the wheel to a policy, or back to it, from the next decision on."""
         if self._policy is None or (name, target) != (self.policy_name, self._target) or not self._led:
             self._policy, self.policy_name, self._target = None, name, target
             self._started, self._believed = False, None

@@ -92,7 +92,6 @@ def open_film(path: Path, patient: Path | None = None, *, world: int = 0, task: 
     Args:
         path: a session (.cockpit.jsonl); a trajectory (.npz); a folder of a plan, of `endopilot navigate` or of a data
             set; a submission.json, or a navigation's result of the ladder.
-        patient: folder of the anatomy, for trajectories and plans.
         world: which of a trajectory's worlds, a data set's episodes, or a task's patients.
         task: of the ladder's files.
 
@@ -184,11 +183,7 @@ def _film(
     """Return a film of one world that is driven again by its commands.
 
     Args:
-        set_up: of that world alone.
-        commands: of its drives.
-        period_s: time that each holds, s.
         about: its `target` and `exposures_s`, if they are known.
-        title: what it is.
     """
     (anatomy,), (stack,), (start,) = set_up.anatomies, set_up.stacks, set_up.initial
     if np.isnan(start).any():

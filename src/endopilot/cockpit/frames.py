@@ -29,8 +29,6 @@ def encode(kind: str, header: dict[str, Any], **arrays: np.ndarray) -> bytes:
     """Return a message.
 
     Args:
-        kind: goes into the header as `type`.
-        header: plain values.
         arrays: float32, uint32 or uint8.
     """
     listed = [{"name": name, "type": _TYPES[array.dtype], "shape": array.shape} for name, array in arrays.items()]
@@ -69,7 +67,6 @@ def motion_values(snapshot: Snapshot, counted: Float[np.ndarray, "devices 2"] | 
     """Return how far wire and catheters are inserted and turned, and what their drives do, for the page's figures.
 
     Args:
-        snapshot: the world.
         counted: inserted length, mm, and rotation, rad, as the drives' encoders have them, which a robot shows; as they
             truly are if not given.
     """
@@ -110,7 +107,6 @@ def scene(navigation: Navigation, about: dict[str, Any]) -> bytes:
     """Return what does not move: the lumen, the centerlines with the names of their sections, the devices, the target.
 
     Args:
-        navigation: vessel, wire, catheters and target.
         about: further entries of the header.
     """
     from endopilot.report.wall_mesh import wall_mesh  # slow to import, and needed in the thread that makes the scene

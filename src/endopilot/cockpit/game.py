@@ -77,10 +77,7 @@ class GameSession(Session):
         """Take the parts; the clock stands still.
 
         Args:
-            tried: which task in which patient.
             world: at the task's start.
-            xray: C-arm, pedal and contrast.
-            recorder: writes what happens.
             policies: names of those that a page may choose at the end.
         """
         super().__init__(world, xray, recorder, policies)

@@ -32,9 +32,6 @@ def serve(
     """Serve a stage until Ctrl-C.
 
     Args:
-        stage: what is driven or replayed.
-        scene: makes the message with what does not move.
-        cycle_s: length of a cycle, s.
         host: address to listen on; by default only this machine can connect. 0.0.0.0 or :: listens on all of this
             machine's addresses.
         port: TCP port; 0 for a free one.

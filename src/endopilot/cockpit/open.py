@@ -63,11 +63,7 @@ def open_session(
 
     Args:
         patient: folder of an anatomy; a synthetic one is written into `output` if not given.
-        device: name of a wire or a YAML file.
-        catheters: names or YAML files of catheters around it, from the inside out.
-        robot: what drives them.
         ct: CT angiogram of the patient, for the X-ray's background.
-        output: folder of the recordings.
 
     Raises:
         InputError: a file that is missing or bad, or a device that does not fit.
@@ -83,10 +79,8 @@ def open_task(
     """Open a task of the ladder, to be driven by hand under X-ray alone.
 
     Args:
-        name: of the task.
         place: of the patient in the task's list.
         robot: what drives; the agent, whose score stands beside a person's, drives the same one.
-        output: folder of the recordings.
 
     Raises:
         InputError: the ladder has no such task, or the task no such patient.
@@ -107,8 +101,6 @@ def open_replay(
     """Open what was recorded, simulated, planned or scored, to be looked at with a time slider.
 
     Args:
-        path: as for `open_film`.
-        patient: folder of the anatomy, for trajectories and plans.
         world: which of a trajectory's worlds, a data set's episodes, or a task's patients.
         task: of the ladder's files.
         ct: CT angiogram of the patient, for the X-ray's background.

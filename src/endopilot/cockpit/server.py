@@ -66,11 +66,8 @@ class Cockpit:
         """Lay the routes out.
 
         Args:
-            stage: what is driven or replayed.
-            scene: makes the message with what does not move.
             token: that a page's address must hold.
             hosts: names under which the page may be asked for, besides the address that a connection comes in at.
-            cycle_s: length of a cycle, s.
         """
         self._token, self._hosts, self._scene = token, hosts, scene
         self.loop = Loop(stage, cycle_s, self._publish)

@@ -116,8 +116,6 @@ class LiveWorld:
         """Bring wire and catheters to the navigation's start.
 
         Args:
-            navigation: vessel, wire, catheters and start.
-            config: robot, rod core and length of a cycle.
             seed: of the encoders' noise and of errors of detection.
             reality: what reality is; as the navigation says if not given.
 
@@ -201,7 +199,6 @@ def loop_snapshot(loop: NavigationLoop, *, cycle: int, force_n: float) -> Snapsh
     """Return how the world of a navigation is now.
 
     Args:
-        loop: the navigation.
         cycle: how many of the drives' cycles have passed.
         force_n: largest wall force on one node in the last one, N.
     """
@@ -227,10 +224,6 @@ def take_snapshot(
     """Return how the one world of a simulator is now.
 
     Args:
-        simulator: of one world.
-        step: its last step; None before the first.
-        cycle: how many have passed.
-        time_s: since the start, s.
         force_n: largest wall force on one node in the cycle, N.
         velocity: of the drives, mm/s and rad/s of the wire, then of each catheter.
     """

@@ -60,10 +60,8 @@ def simulate_again(
 
     Args:
         data: episodes of the anatomy alone, in any order; one may stand there several times.
-        anatomy: of theirs.
         control: of the drives, mm/s and rad/s.
         friction: Coulomb coefficients of the devices on the wall; as recorded if not given.
-        record_shape: record the positions of all nodes too.
     """
     set_up = replace(episodes_set_up(data, anatomy), actuation="velocity")
     set_up = set_up if friction is None else replace(set_up, friction=friction)

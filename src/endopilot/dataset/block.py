@@ -30,9 +30,6 @@ def write_block(
     """Simulate one block and write its episodes, then its samples: the sample file marks both as complete.
 
     Args:
-        context: what all blocks share.
-        block: which navigations.
-        threads: of the rod core.
         advance: called with the number of samples that were simulated since the last call.
     """
     config, anatomy, stack = context.config, _read(block.folder, block.identity), context.stack
@@ -66,10 +63,7 @@ def store_block(
     """Write navigations: their episodes, then their samples, which mark both as complete.
 
     Args:
-        context: what all blocks share.
-        block: which navigations.
         draw: their tips.
-        trajectory: their motion, one world each.
         stopped: which were stopped short of an end of the vessel.
     """
     data_path, episodes_path = schema.paths_of_file(context.output, block.number)

@@ -64,10 +64,6 @@ def draw_navigations(
     """Draw some navigations of an anatomy; each is the same whatever the number of the others.
 
     Args:
-        config: how they are drawn.
-        device: the wire.
-        anatomy: the vessel.
-        sequences: their indices among those of the anatomy.
         devices: their number, each driven independently; the wire's draw is the same with and without catheters.
     """
     controls, friction, tip, surplus, _, robots = _streams(config, anatomy.name)
@@ -97,12 +93,7 @@ def draw_navigations(
 
 
 def patient_motion(config: DatasetConfig, anatomy: str) -> Motion | None:
-    """Return how the vessel of an anatomy moves in the navigations of a dataset; None if it lies still.
-
-    Args:
-        config: of the dataset.
-        anatomy: its name.
-    """
+    """Return how the vessel of an anatomy moves in the navigations of a dataset; None if it lies still."""
     return motion_named(config.motion, int(_streams(config, anatomy)[4].generate_state(1, np.uint64)[0]))
 
 

@@ -34,12 +34,8 @@ def write_episode(
 
     Args:
         trajectory: the navigation, of one world.
-        anatomy_folder: of its vessel.
-        output: folder of the dataset.
         stack: the devices as they were given; friction and stiffness of the wire's tip may have been others.
-        task: what was done, in words.
         tip_stiffness_factor: the true factor on the stiffness of the distal 10 mm.
-        seed: of the navigation.
         origin: what else it followed from, such as target and policy.
 
     Raises:

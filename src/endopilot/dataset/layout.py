@@ -123,11 +123,6 @@ def make_layout(
     """Read the anatomies' records, and lay out the dataset in blocks.
 
     Args:
-        folders: of the anatomies.
-        output: folder of the dataset.
-        stack: the wire, and the catheters around it.
-        config: number, length, distribution and split of the navigations.
-        task: what they do.
         robot: what makes the motions; they are made as drawn if not given.
         world: what reality is; as given if not given.
         origin: what else they follow from, where they were not drawn at random.

@@ -57,19 +57,13 @@ def simulate_navigations(
     """Simulate navigations, stopped short of the ends of the vessel.
 
     Args:
-        anatomy: the vessel.
         stacks: the devices of each world.
         initial: (Δ mm, φ rad) of each device before the first period.
         control: velocities (mm/s, rad/s) or loads (N, N·mm) that were drawn.
-        friction: friction coefficients on the wall.
-        config: settings of the rod core.
-        actuation: what the controls are.
-        motion: how the vessel moves with time; it lies still if not given.
         robot: what makes the motions and measures them, its drives' mean over a sample moves the devices; they are made
             as drawn if not given.
         seeds: of each world's robot.
         ostium_mm: the true inserted lengths are this much more than its encoders', mm.
-        record_shape: record the positions of all nodes too.
         advance: called after each sample with the number of worlds.
 
     Returns:

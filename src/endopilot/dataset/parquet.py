@@ -129,8 +129,6 @@ def statistics(
 
     Args:
         actuation: what the dataset's control is.
-        paths: the data files.
-        key: key of the dataset.
         advance: called once for each file that has been read.
         devices: their number; the manoeuvres are the wire's.
     """

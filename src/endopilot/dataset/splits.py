@@ -34,8 +34,6 @@ def assign_splits(
     matters.
 
     Args:
-        names: names of the anatomies, all different.
-        n_sequences: sequences of each anatomy.
         anatomy_shares: shares of train, calibrate and test. None means 0.6, 0.2, 0.2, and for a single anatomy, which
             cannot be divided, a split by sequence alone.
         seen_test_share: share of the sequences of a train anatomy that are held out as `seen_test`.

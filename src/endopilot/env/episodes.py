@@ -100,10 +100,7 @@ class Episodes:
         """Score what the worlds did in a step, of which those of `fresh` have only begun.
 
         Args:
-            now: the worlds at its end.
             distances: path length from every tip to its target, mm.
-            fresh: worlds that were reset in place of a step.
-            exposed: worlds that took an exposure.
 
         Returns:
             Rewards, terminations and truncations.

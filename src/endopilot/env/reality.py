@@ -163,12 +163,7 @@ class Reality:
         return np.concatenate([self.encoders, self.simulator.drive_load], axis=-1)
 
     def begin(self, mask: Bool[np.ndarray, "worlds"], generators: Sequence[np.random.Generator]) -> None:
-        """Start an episode in the worlds of a mask: the wire's rotation is drawn, and what is random in them.
-
-        Args:
-            mask: of the worlds.
-            generators: of each world.
-        """
+        """Start an episode in the worlds of a mask: the wire's rotation is drawn, and what is random in them."""
         simulator, drawn, chosen = self.simulator, self.drawn, np.flatnonzero(mask).tolist()
         turn, friction = self._start[..., 1].copy(), self._friction.copy()
         begun: list[World] = []
@@ -199,7 +194,6 @@ class Reality:
 
         Args:
             control: what drives are commanded, mm/s and rad/s.
-            period_s: how long, s.
             time_s: since each episode's start, s.
         """
         simulator, drawn = self.simulator, self.drawn

@@ -86,8 +86,6 @@ def compare_trees(
     """Return how far an extracted centerline tree agrees with the true one.
 
     Args:
-        extracted: the tree to be measured.
-        truth: the true tree.
         smallest_radius_mm: true points of a smaller radius are not counted, mm.
     """
     true_points, true_radius = sampled(truth)

@@ -132,12 +132,7 @@ def evaluate(
 
 
 def _parted(dataset: Dataset, known: Collection[str]) -> tuple[dict[str, Dataset], Dataset | None]:
-    """Return the valid navigations that a run was not trained on, by split of the result, and those that it was.
-
-    Args:
-        dataset: whatever its splits.
-        known: patients that the run was trained on.
-    """
+    """Return the valid navigations that a run was not trained on, by split of the result, and those that it was."""
     valid, of_known = dataset.valid.all(axis=1), np.isin(dataset.anatomy, sorted(known))
     trained = of_known & (dataset.split == "train")
     masks = dict(zip(SPLITS, (valid & of_known & ~trained, valid & ~of_known), strict=True))

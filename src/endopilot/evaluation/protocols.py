@@ -44,8 +44,6 @@ def run_protocols(
     made anew at X-ray images (`replanning`).
 
     Args:
-        predictor: the networks of a run.
-        data: the episodes of one split.
         training: the episodes that the run was trained on, over which the baselines that are means are taken; these
             are left out if there are none.
         advance: called after each protocol in each anatomy, with P1's error so far, each new plan and each anatomy's

@@ -34,11 +34,7 @@ def replanned(
     stay the same. Where the simulation fails, or no finite control is planned, controls are NaN from there on.
 
     Args:
-        predictor: of the plans.
-        recorded: the navigations.
         episodes: the same as the predictor is given them; their tips are the desired ones.
-        first: the plan from the given states on.
-        advance: called after each plan.
     """
     control, under_way, observed = first.control.copy(), _predicted(episodes, first, WINDOW), given_states(episodes)
     for now in exposures(recorded.data):

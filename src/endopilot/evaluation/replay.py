@@ -49,10 +49,6 @@ class Recorded:
     def of(data: Dataset, robot: RobotConfig | None = None) -> Recorded:
         """Read what the episodes of a dataset were recorded with.
 
-        Args:
-            data: the episodes.
-            robot: what controls pass.
-
         Raises:
             InputError: an anatomy is missing or damaged.
         """
@@ -99,7 +95,6 @@ class Recorded:
 
         Args:
             controls: after the given states, by series, all of one length.
-            advance: called after each anatomy.
 
         Yields:
             The episodes of one anatomy, and their simulation: a world for each series and episode, series by series.

@@ -131,9 +131,6 @@ def generalisation_gap(splits: Mapping[str, Any]) -> dict[str, Any]:
 
     By series, coordinate and span: `difference` (mm) and `ratio`; None where an error is not known or is 0. Empty
     unless there are both kinds of patients.
-
-    Args:
-        splits: of metrics.json.
     """
     if not {"seen_test", "test"} <= splits.keys():
         return {}

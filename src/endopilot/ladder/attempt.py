@@ -66,12 +66,6 @@ class Recording:
     ) -> Recording:
         """Return the recording that `packed` made a text of.
 
-        Args:
-            text: the arrays.
-            devices: number of wire and catheters.
-            robot: what drove; the default one if not given.
-            world: what reality was; nominal if not given.
-
         Raises:
             InputError: an array cannot be read, is not finite, or has another length than the others.
         """
@@ -109,7 +103,6 @@ def attempt(
     from run to run.
 
     Args:
-        policy: its name.
         navigation: what is to be done, as the policy is given it.
         seed: of encoder noise, detection errors and the policy.
         world: what reality is; as the navigation says if not given.
@@ -129,8 +122,6 @@ def scored(navigation: Navigation, record: NavigationRecord, *, tells: bool = Fa
     """Return the figures of a navigation, whoever drove it, its course and its recording.
 
     Args:
-        navigation: what was to be done.
-        record: how it truly went.
         tells: whether events count that who drove did not believe.
     """
     believed = record.believed[:-1, 0] if tells and record.believed is not None else None
@@ -209,13 +200,7 @@ class Repeated:
 
 
 def _figures(navigation: Navigation, record: NavigationRecord, recording: Recording) -> dict[str, Any]:
-    """Return what a navigation is scored by, and the hash of all that was recorded of it and of how it went.
-
-    Args:
-        navigation: what was to be done.
-        record: how it truly went.
-        recording: what was decided.
-    """
+    """Return what a navigation is scored by, and the hash of all that was recorded of it and of how it went."""
     length_mm = navigation.target.abscissa - float(record.tip.abscissa[0, 0])
     scored = {
         "success": record.success,
@@ -247,7 +232,6 @@ def navigation_events(
         tip: as it truly was, at the start and after each decision period.
         exposed: whether X-ray was on, at the same moments.
         believed_mm: Δtip as the policy believed it at each decision, mm.
-        wire_radius_mm: radius of the wire at its tip, mm.
     """
     count, advice = len(believed_mm), AdviserConfig()
     at_wall = safety_ratio(tip.offset, tip.radius, wire_radius_mm)[:count] >= advice.wall_ratio

@@ -50,10 +50,6 @@ def write_demonstrations(submission: str | Path, *, output: str | Path) -> dict[
     - `exposed`: whether the images are of this moment;
     - `contact_force_max_n`: largest wall force on a node over the period that follows.
 
-    Args:
-        submission: the file.
-        output: folder of the data set.
-
     Returns:
         `dataset` (the folder), `episodes`, `samples` and `exposures`.
 

@@ -178,13 +178,8 @@ def write_submission(
     """Write the submission file of a policy.
 
     Args:
-        path: the file.
-        policy: name of the policy.
-        version: of the ladder.
         results: by the task's name, the results of its navigations (`attempt`) in the order of the task's patients.
         scores: what `score` made of them.
-        robot: what drove.
-        world: what reality was.
     """
     known = {each.name for each in fields(NavigationEntry)}
     submission = Submission(
@@ -316,7 +311,6 @@ def recorded_navigation(path: Path, name: str | None, place: int) -> tuple[Task,
 
     Args:
         path: a submission.json or TASK/NUMBER.json.
-        name: of the task, in a submission.
         place: of the patient in the task's list, likewise.
 
     Returns:

@@ -91,7 +91,6 @@ class CausalNetwork(nn.Module):
         """Return the mixture, as `Mixture.of` takes it: log weights, locations and scales of both changes, and jumps.
 
         Args:
-            inputs: of every sample.
             others: by how much the guesses after the first differ from it.
         """
         scaled = ((inputs - self.input_mean) / self.input_scale).clamp(-_FARTHEST, _FARTHEST)

@@ -38,10 +38,6 @@ def write_network(
     """Write weights and scales of a network, whole or not at all.
 
     Args:
-        path: the file to write.
-        name: "ff" or "if".
-        network: the network.
-        config: its size.
         facts: what else the header shall say, as JSON values.
     """
     kind = "causal" if isinstance(config, CausalConfig) else "paper"

@@ -48,12 +48,8 @@ class Ensemble:
         """Take what all have in common, and in what they differ.
 
         Args:
-            anatomy: the vessel.
             device: the wire as it is given, or the wire and its catheters.
-            parameters: of each member.
             start: inserted length (mm) and rotation (rad) of each device as the encoders have it at the start.
-            config: settings of the rod core.
-            motion: how the vessel moves, as far as that is known.
         """
         stack, self.parameters = Stack.of(device), parameters
         wire = stack.wire

@@ -200,11 +200,7 @@ def read_or_prepare(
 
     Args:
         folder: where patients are kept, one file for each patient and device.
-        name: of the patient.
         identity: SHA-256 of what the simulation depends on in the anatomy.
-        device: the wire.
-        config: settings of the rod core.
-        read: reads the anatomy, where it is needed.
 
     Raises:
         InputError: the patient cannot be prepared, or the folder cannot be written.

@@ -81,11 +81,8 @@ def unfold(
     desired tips up to t and the motion before it, where observed.
 
     Args:
-        direction: forward or inverse.
         vessels: tables of the patients.
         patient: row of the tables, for each episode.
-        episodes: the navigations.
-        observed: samples at which the tip was observed.
         wires: forward: what the simulated wires did. By how much the patient's motion displaces the tip is taken off
             all tips before, and added to the guess behind.
     """
@@ -195,8 +192,6 @@ class Sequences:
         Args:
             episodes: the navigations, with their true tips.
             vessels: tables of their patients, as `play_tables` gives them.
-            networks: "ff", "if" or both.
-            seed: of the samples at which tips are observed.
         """
         patient = np.unique(episodes.anatomy, return_inverse=True)[1]
         shape = episodes.branch.shape

@@ -93,7 +93,6 @@ class SimulatedWires:
 
         Args:
             episodes: their controls, and their tips where `observed` among the first `WINDOW` samples.
-            observed: samples at which the tip was observed.
 
         Raises:
             InputError: an anatomy is missing or damaged.
@@ -152,8 +151,6 @@ class Course:
 
         Args:
             ensembles: rows of the wires that are simulated together, and the wires.
-            reach_mm: what they are laid out for.
-            samples: of the course.
         """
         self.reach_mm = reach_mm
         self._parts = [(rows, ensemble.started(reach_mm)) for rows, ensemble in ensembles]
@@ -184,9 +181,7 @@ def _each_patient(
     """Return what a function of episodes of one patient returns, with their rows, on all cores.
 
     Args:
-        episodes: the navigations.
         what: this is, for the progress bar.
-        of_one: the function.
         parts: into which each patient's episodes are split; fewer if there are fewer episodes.
     """
     patients = [np.flatnonzero(episodes.anatomy == name) for name in np.unique(episodes.anatomy)]
@@ -231,7 +226,6 @@ def simulated_tips(
     """Simulate wires under the commanded controls of each episode.
 
     Args:
-        episodes: the navigations.
         wires: the fitted wire of each.
         courses: of the same wires before, which are brought up to date.
 

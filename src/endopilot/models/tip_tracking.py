@@ -38,14 +38,11 @@ def track(
     and keeps the one whose tip ends nearest to the desired (Δtip, γtip), in the sum of both distances.
 
     Args:
-        anatomy: the vessel.
         wires: the device of each episode; the same object where it is the same.
         friction: Coulomb friction coefficient of each episode.
         start: (Δ mm, φ rad) before the first given control.
         given: controls (mm/s, rad/s) that come first.
         desired: (Δtip, γtip) mm at the end of each sample period after them.
-        config: settings of the rod core.
-        motion: how the vessel moves with time; it lies still if not given.
 
     Returns:
         Tip (Δtip, γtip) mm, and control (mm/s, rad/s) as the drive made it, after the given ones.

@@ -188,11 +188,8 @@ class Job:
         """Go through one epoch, check the loss on held-out navigations, and add both to the state's curve.
 
         Args:
-            network: what is trained.
             together: the same, as all processes of the group run it.
-            optimizer: of its parameters.
             state: `seconds` and `curve` so far.
-            advance: called after every step.
         """
         epoch, epochs, start = len(state["curve"]), self.config.epochs, time.perf_counter()
         batches = self.batches(epoch, self._steps(network, state))

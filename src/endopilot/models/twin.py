@@ -213,7 +213,6 @@ def weigh(
     Args:
         paths: of the members, mm, as `TwinPredictor.ensemble` gives them.
         tips: (Δtip, γtip) where `observed`, mm; no other is read.
-        observed: samples at which the tip was observed.
         sd_mm: standard deviations of these tips as whatever measured them states them, mm; 0 where it states none.
         config: scales of the error of a good member.
     """

@@ -137,11 +137,6 @@ def _histograms(table: pd.DataFrame, titles: Mapping[str, str], panels: Sequence
 
     Sequences beyond the 98 % quantile of the second-widest series are counted in the last bar; the tick below a
     histogram marks its median. The highest bar of each histogram says how many sequences it holds.
-
-    Args:
-        table: with columns `split` and `series`.
-        titles: what a reader calls each split.
-        panels: column and label of each histogram.
     """
     splits, series = distinct(table, "split"), distinct(table, "series")
     with matplotlib.rc_context(STYLE):

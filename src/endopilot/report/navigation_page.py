@@ -25,11 +25,7 @@ def write_navigation_page(
     """Write the page as one HTML file that needs nothing beside it.
 
     Args:
-        path: where to.
-        found: the navigation.
-        picture: its course in time, a PNG.
         commands: what repeats it, by purpose.
-        manifest: how it was made.
 
     Raises:
         InputError: the page cannot be written.

@@ -43,7 +43,6 @@ def navigation_scene(
     """Return a plotly figure of the wall, the centerline by section, and the first world of a rollout replayed.
 
     Args:
-        anatomy: the vessel.
         rollout: navigations with `shape`; without one the vessel is shown alone.
         devices: the wire and the catheters of the rollout, whose names and diameters are shown; a wire alone is drawn
             without.
@@ -66,10 +65,8 @@ def mark_target(
     """Add the target to a scene, and where the tip was when X-ray was on.
 
     Args:
-        figure: the scene.
         target: LPS mm.
         observed: places of the tip, LPS mm.
-        seconds: times of the exposures, s.
     """
     for points, name, marker, labels in (
         (target[None], "Target", {"symbol": "diamond", "size": 6}, ["target"]),

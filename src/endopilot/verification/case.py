@@ -121,12 +121,10 @@ def straight_rod(
 
     Args:
         elements: number of elements, the half clamped one included.
-        length_mm: free length, mm.
         bend: EI, N·mm².
         twist: GJ, N·mm².
         shear: κGA, N; very stiff if not given.
         stretch: EA, N; very stiff if not given.
-        radius_mm: outer radius, mm.
         drag: drag of a node, N·s/mm.
         clamp: nodes behind the wall that the drive holds.
     """
@@ -220,12 +218,7 @@ def equilibrium(
 
     Args:
         rod: the rod; all nodes but the last three are free.
-        loading: dead loads and springs.
-        samples: number of samples to run, if no control is given.
         control: motion of the clamp, mm/s and rad/s.
-        lumen: a wall.
-        friction: Coulomb coefficient.
-        config: settings of the core.
         insertion: where the wall of the clamp is, and the rod's direction.
         inserted_length_mm: free length; the rod's own if not given.
         free_behind_mm: the rod is held this far behind the wall of the clamp.
@@ -265,14 +258,9 @@ def driven(
     The axis of devices is there with tubes alone.
 
     Args:
-        rod: nodes and stiffnesses.
         control: mm/s and rad/s, of each tube if there are some.
         initial: inserted length (mm) and rotation (rad) at the start.
-        config: settings of the core.
         tubes: from the inside out, in place of the rod's stiffnesses.
-        loading: dead loads and springs.
-        lumen: a wall.
-        friction: Coulomb coefficient of the wall.
         insertion: where and in which direction the base slides.
         approach: bring the rod to its first inserted length from the ostium; else it starts there, straight.
         free_behind_mm: nodes farther behind the insertion follow the drive, mm.
