@@ -14,7 +14,7 @@ from jaxtyping import Float
 from benchmarks.figures import Bar, judged
 from benchmarks.imaging.xray import SHOWN, Exposure, errors_of, summary
 from endopilot.anatomy.projection import project_tip
-from endopilot.angiograms.views import view_text
+from endopilot.angiograms.draw import view_text
 from endopilot.cli.arguments import OutputFolder
 from endopilot.files import read_json, write_json
 from endopilot.runs import claim

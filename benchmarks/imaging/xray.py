@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.figures import Bar, judged
 from endopilot.anatomy.projection import project_tip
-from endopilot.angiograms.views import view_text
+from endopilot.angiograms.draw import view_text
 from endopilot.settings import Seed, Within, settings
 from endopilot.simulation.motion import draw_motion, published_mean
 from endopilot.xray.carm import Pose

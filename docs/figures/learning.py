@@ -21,7 +21,7 @@ from benchmarks.figures import made_on
 from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.devices.device import read_wire
 from endopilot.evaluation.metrics import OFF_WALL_MM
-from endopilot.evaluation.prediction_baselines import hold_slack
+from endopilot.evaluation.protocols import hold_slack
 from endopilot.files import read_json
 from endopilot.models.causal import CausalPredictor
 from endopilot.models.config import PRETRAINED, WINDOW

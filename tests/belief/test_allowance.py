@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from endopilot.belief.allowance import Allowance
+from endopilot.belief.watch import Allowance
 
 
 def test_a_wire_that_is_pushed_while_its_tip_rests_is_known_less_well_until_it_is_seen() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from endopilot.belief.loads import LoadRatio
+from endopilot.belief.monitor import LoadRatio
 
 
 def test_the_load_ratio_is_the_one_that_the_forces_have() -> None:

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from endopilot.belief.identification import Identified
-from endopilot.belief.innovations import ASSUMED_SD_MM, Innovations
 from endopilot.belief.monitor import BelievedTip, Monitor
 from endopilot.belief.patient_motion import FoundMotion
-from endopilot.belief.watch import MISMATCH
+from endopilot.belief.watch import ASSUMED_SD_MM, MISMATCH, Innovations
 from endopilot.control.agent_config import read_agent_calibration
 from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.navigation.loop import NavigationLoop

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endopilot.belief.turned_wires import Fans
+from endopilot.belief.moved_copies import Fans
 from endopilot.devices.stack import Stack
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulator import Simulator

@@ -21,7 +21,7 @@ from endopilot.evaluation.results import read_results
 from endopilot.files import read_json, write_json
 from endopilot.models.config import WINDOW
 from endopilot.models.open_loop import OpenLoop, begin_after
-from endopilot.report.evaluation_report import report_evaluation
+from endopilot.report.report import report_evaluation
 from toy_navigation import LENGTH_MM, make_toy_dataset, toy_run
 
 
@@ -168,7 +168,7 @@ def test_all_navigations_of_a_dataset_of_new_patients_are_evaluated(elsewhere, t
     assert metrics["training_mean"] is None and "generalisation_gap" not in metrics
     assert "training_mean" not in results["test"].tips.keys() | results["test"].controls.keys()
     assert metrics["splits"]["test"]["tip"]["P1"]["abscissa"]["all"]["skill"].keys() == {"hold_slack"}
-    with patch("endopilot.report.evaluation_report.png", lambda _: b""):  # drawn, and not made pixels
+    with patch("endopilot.report.report.png", lambda _: b""):  # drawn, and not made pixels
         report_evaluation(out)
     assert "training mean" not in (out / "report.html").read_text(encoding="utf-8").lower()
 
@@ -218,7 +218,7 @@ def test_a_dataset_that_was_trained_on_as_a_whole_is_refused(trained_on, tmp_pat
 def test_the_command_prints_errors_findings_and_paths(evaluated, monkeypatch, capsys):
     metrics = evaluated[1]
     monkeypatch.setattr("endopilot.cli.evaluate.evaluate", lambda *_, **__: metrics)
-    monkeypatch.setattr("endopilot.report.evaluation_report.report_evaluation", lambda _: None)
+    monkeypatch.setattr("endopilot.report.report.report_evaluation", lambda _: None)
     with pytest.raises(SystemExit, match="0"):
         main(["evaluate", "r", "-o", "out"])
     printed = capsys.readouterr().out

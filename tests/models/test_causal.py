@@ -17,7 +17,7 @@ from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.devices.device import read_wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.errors import InputError
-from endopilot.evaluation.prediction_baselines import follow_slack, hold_slack, mean_control
+from endopilot.evaluation.protocols import follow_slack, hold_slack, mean_control
 from endopilot.files import read_json, sha256
 from endopilot.models.causal import CausalPredictor, ForwardNetwork, InverseNetwork, Mixture
 from endopilot.models.config import CausalConfig, TrainConfig

@@ -20,11 +20,9 @@ from endopilot.files import read_json, sha256
 from endopilot.models.checkpoint import read_network, read_tensors
 from endopilot.models.config import TrainConfig, TransformerConfig
 from endopilot.models.episodes import Episodes
-from endopilot.models.learning_curves import tensorboard_writer
 from endopilot.models.rollout import load_model
-from endopilot.models.train import train
-from endopilot.models.transformer import NETWORKS
-from endopilot.models.windows import Windows
+from endopilot.models.train import tensorboard_writer, train
+from endopilot.models.transformer import NETWORKS, Windows
 from toy_navigation import make_toy_dataset
 
 SMALL = TransformerConfig(d_model=24, heads=2, encoder_layers=1, decoder_layers=1, feedforward=32)

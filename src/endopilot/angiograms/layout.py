@@ -11,8 +11,7 @@ from typing import Any
 
 from endopilot import __version__
 from endopilot.angiograms.config import AngiogramsConfig
-from endopilot.dataset.layout import identify
-from endopilot.dataset.splits import assign_splits
+from endopilot.dataset.layout import assign_splits, identify
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import input_hash, json_text, sha256

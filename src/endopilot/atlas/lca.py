@@ -1,7 +1,7 @@
 """Left coronary arteries: left main, anterior descending and circumflex with their branches, by dominance.
 
 Facts and their sources: mean courses and origins of branches, Dodge JT et al., Circulation 1988;78:1167-80 (see
-`heart_left`); lumen diameters and the influence of dominance and sex, Dodge JT et al., Circulation 1992;86:232-46 (left
+`heart_reference`); lumen diameters by dominance and sex, Dodge JT et al., Circulation 1992;86:232-46 (left
 main 4.5 ± 0.5 mm, anterior descending 3.7 ± 0.4 to 1.9 ± 0.4 mm, circumflex 3.4 ± 0.5 mm, 4.2 ± 0.6 mm where it is
 dominant); left main 13.1 mm long and the circumflex most often 65 to 80 mm, a cadaver study of 80 hearts from Gujarat
 (docs/evidence/atlas.md), where the SD of the left main's length, 2.4 mm, is smaller than the 5.2 mm of Reig J, Petit M,
@@ -22,7 +22,6 @@ from scipy.spatial.transform import Rotation
 
 from endopilot.anatomy.labels_tree import LCA_SECTIONS
 from endopilot.atlas import curves as shape
-from endopilot.atlas import heart_left
 from endopilot.atlas.branching import (
     NoShape,
     SidePlan,
@@ -37,7 +36,7 @@ from endopilot.atlas.branching import (
     wiggled,
     with_side_branches,
 )
-from endopilot.atlas.heart_reference import HeartFit
+from endopilot.atlas.heart_reference import FORK, INFERIOR, LAD, LCX, HeartFit, fit_left_heart
 from endopilot.atlas.population import Population
 from endopilot.atlas.variation import bent, drawn_from, ectasia, factor, forks_of, opened_fork, varied
 from endopilot.lines import length_along
@@ -160,7 +159,7 @@ class _Trunk:
 
     def heart(self) -> HeartFit:
         """Fit the reference heart to the courses."""
-        return heart_left.fit_left_heart(self.whole_lad, self.whole_lcx[: self.crux + 1], self.whole_lcx[self.crux :])
+        return fit_left_heart(self.whole_lad, self.whole_lcx[: self.crux + 1], self.whole_lcx[self.crux :])
 
 
 def make_lca(
@@ -228,8 +227,8 @@ def _draw(
 @cache
 def _templates() -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:
     """Return the mean courses of the anterior descending artery, and of circumflex and left posterior descending."""
-    lcx = np.concatenate([heart_left.LCX, heart_left.INFERIOR[1:]])
-    return shape.curve_through(heart_left.LAD, 1.0), shape.curve_through(lcx, 1.0)
+    lcx = np.concatenate([LCX, INFERIOR[1:]])
+    return shape.curve_through(LAD, 1.0), shape.curve_through(lcx, 1.0)
 
 
 def _trunk(generator: np.random.Generator, dominance: str, main_mm: float | None, population: Population) -> _Trunk:
@@ -239,14 +238,14 @@ def _trunk(generator: np.random.Generator, dominance: str, main_mm: float | None
     if main_mm is None:
         main_mm = truncated(generator, LEFT_MAIN_MM, LEFT_MAIN_SD_MM, 5.0, 22.0)
     lad, lcx = ((template - template[0]) * size for template in _templates())
-    end_of_main = main_mm * heart_left.FORK / np.linalg.norm(heart_left.FORK)
+    end_of_main = main_mm * FORK / np.linalg.norm(FORK)
     bow = np.array([[0.0, 0.0, 0.0], 0.5 * end_of_main + main_mm * np.array([0.0, 0.06, 0.08])])
     stride = round(6.0 * size)
     lad = wiggled(
         generator, shape.curve_through(np.concatenate([bow, lad[::stride] + end_of_main])), _WIGGLE_MM, quiet_mm=9.0
     )
     fork = round(main_mm / shape.STEP_MM)
-    crux_at = (heart_left.LCX[-1] - heart_left.FORK) * size
+    crux_at = (LCX[-1] - FORK) * size
     lcx = wiggled(generator, shape.curve_through(lcx[::stride]), _WIGGLE_MM, quiet_mm=7.0)
     crux = int(np.argmin(np.linalg.norm(lcx - crux_at, axis=1)))
     lad, lcx = turn.apply(lad), turn.apply(lcx + lad[fork])

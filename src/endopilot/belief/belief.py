@@ -21,8 +21,7 @@ from jaxtyping import Float, Int
 
 from endopilot.anatomy.projection import TipProjector
 from endopilot.belief.drives import Drives
-from endopilot.belief.moved_copies import MovedCopies
-from endopilot.belief.turned_wires import Fans, shifted, turned
+from endopilot.belief.moved_copies import Fans, MovedCopies, shifted, turned
 from endopilot.belief.vessels import SharedVessels
 from endopilot.devices.device import lateral_reach
 from endopilot.devices.drive_limits import DriveLimits

@@ -108,8 +108,7 @@ def open_replay(
     Raises:
         InputError: it cannot be read, or lacks its patient or task.
     """
-    from endopilot.cockpit.film import FRAME_S, open_film  # slow to import, and needed for replays alone
-    from endopilot.cockpit.replay import ReplayStage
+    from endopilot.cockpit.film import FRAME_S, ReplayStage, open_film  # slow to import, and needed for replays alone
 
     film = open_film(path, patient, world=world, task=task)
     navigation = film.navigation

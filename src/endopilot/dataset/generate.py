@@ -18,8 +18,7 @@ from typing import Any
 
 from endopilot.dataset import parquet, schema
 from endopilot.dataset.config import DatasetConfig
-from endopilot.dataset.layout import Block, Layout, make_layout
-from endopilot.dataset.splits import SPLITS
+from endopilot.dataset.layout import SPLITS, Block, Layout, make_layout
 from endopilot.dataset.workers import run_locally, run_on_cluster, write_timed
 from endopilot.devices.device import Wire
 from endopilot.devices.robot import RobotConfig

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from endopilot.env.observation import Measured
-from endopilot.env.route_tables import RouteTables
+from endopilot.env.observation import Measured, RouteTables
 from endopilot.simulation.state import SimulatorState
 from endopilot.tasks.navigation import Navigation, is_safe, reached
 from endopilot.types import TipProjection

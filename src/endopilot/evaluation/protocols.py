@@ -9,7 +9,6 @@ from jaxtyping import Float, Int
 
 from endopilot.dataset.loader import Dataset
 from endopilot.devices.robot import RobotConfig
-from endopilot.evaluation import prediction_baselines as baselines
 from endopilot.evaluation.metrics import tip_events
 from endopilot.evaluation.replanning import exposures, replanned
 from endopilot.evaluation.replay import Control, Recorded, Samples, replay
@@ -19,6 +18,42 @@ from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import OpenLoop, Predictor
 from endopilot.progress import Advance
 from endopilot.types import VesselTree
+
+
+def hold_slack(data: Dataset, given: int) -> Float[np.ndarray, "episodes samples 2"]:
+    """Return (Δtip, γtip), mm, if the slack Δ − Δtip and the offset stay as in the last given state."""
+    slack = data.inserted_length[:, given - 1, 0] - data.tip_abscissa[:, given - 1, 0]
+    abscissa = data.inserted_length[:, given:, 0] - slack[:, None]
+    offset = np.broadcast_to(data.tip_offset[:, given - 1], abscissa.shape)
+    return np.stack([abscissa, offset], axis=-1).astype(float)
+
+
+def mean_tip(train: Dataset, data: Dataset, given: int) -> Float[np.ndarray, "episodes samples 2"]:
+    """Return (Δtip, γtip), mm, if slack and offset are always the means over the training episodes."""
+    slack = np.mean(train.inserted_length - train.tip_abscissa, dtype=float)
+    abscissa = data.inserted_length[:, given:, 0] - slack
+    return np.stack([abscissa, np.full(abscissa.shape, np.mean(train.tip_offset, dtype=float))], axis=-1)
+
+
+def hold_control(data: Dataset, given: int) -> Float[np.ndarray, "episodes samples 2"]:
+    """Return the last given control at every sample, (mm/s, rad/s)."""
+    samples = data.control.shape[1] - given
+    return np.repeat(data.control[:, given - 1], samples, axis=1).astype(float)
+
+
+def mean_control(train: Dataset, data: Dataset, given: int) -> Float[np.ndarray, "episodes samples 2"]:
+    """Return the mean control of the training episodes at every sample, (mm/s, rad/s)."""
+    return np.broadcast_to(train.control.mean(axis=(0, 1), dtype=float), data.control[:, given:, 0].shape).copy()
+
+
+def follow_slack(data: Dataset, given: int) -> Float[np.ndarray, "episodes samples 2"]:
+    """Return the control that moves the drive as far as the tip is to move, without rotation, (mm/s, rad/s).
+
+    With the slack of the last given state held this puts the tip where it is desired.
+    """
+    travel = np.diff(data.tip_abscissa[:, given - 1 :, 0].astype(float), axis=1)
+    return np.stack([travel / data.sample_period_s, np.zeros_like(travel)], axis=-1)
+
 
 PROTOCOLS = ("forward", "inverse", "dual")
 """What a predictor does with the episodes of each patient."""
@@ -55,17 +90,17 @@ def run_protocols(
     controls: dict[str, Control] = {
         "P2": predicted["inverse"].control,
         "P3": predicted["dual"].control,
-        "hold_control": baselines.hold_control(data, WINDOW),
-        "follow_slack": baselines.follow_slack(data, WINDOW),
+        "hold_control": hold_control(data, WINDOW),
+        "follow_slack": follow_slack(data, WINDOW),
     }
     predicted_tips = {
         "P1": predicted["forward"].tip,
         "P3": predicted["dual"].tip,
-        "hold_slack": baselines.hold_slack(data, WINDOW),
+        "hold_slack": hold_slack(data, WINDOW),
     }
     if training is not None:
-        controls["training_mean"] = baselines.mean_control(training, data, WINDOW)
-        predicted_tips["training_mean"] = baselines.mean_tip(training, data, WINDOW)
+        controls["training_mean"] = mean_control(training, data, WINDOW)
+        predicted_tips["training_mean"] = mean_tip(training, data, WINDOW)
     trees = [anatomy.tree for anatomy in recorded.anatomies]
     tips = {
         name: _series(tip, trees, recorded.anatomy_of, data.branch[:, :, 0]) for name, tip in predicted_tips.items()

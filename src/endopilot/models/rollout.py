@@ -21,9 +21,8 @@ from endopilot.models.checkpoint import read_network
 from endopilot.models.config import PRETRAINED, WINDOW, TwinConfig, read_run, run_path
 from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import Observed, OpenLoop, Predictor, Steps2, begin_after
-from endopilot.models.transformer import Network
+from endopilot.models.transformer import Network, Windows
 from endopilot.models.twin import TwinPredictor
-from endopilot.models.windows import Windows
 from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.types import SAMPLE_PERIOD_S

@@ -11,7 +11,8 @@ import copy
 import math
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,13 +37,47 @@ from endopilot.models.checkpoint import (
 )
 from endopilot.models.config import TrainConfig
 from endopilot.models.episodes import Episodes
-from endopilot.models.learning_curves import tensorboard_writer
 from endopilot.models.process_group import ProcessGroup, joined
 from endopilot.models.sequences import Sequences, play_tables
-from endopilot.models.transformer import Network
-from endopilot.models.windows import Windows
+from endopilot.models.transformer import Network, Windows
 from endopilot.progress import Advance, progress
 from endopilot.runs import claim
+
+SCALARS = ("loss", "validation_loss", "learning_rate", "samples_per_second")
+"""What is shown of each epoch."""
+
+
+@contextmanager
+def tensorboard_writer(folder: Path | None) -> Iterator[Callable[[Mapping[str, Any]], None]]:
+    """Yield a function that adds an epoch of a network's learning curve to its event files.
+
+    If a killed training had already written an epoch, TensorBoard drops the old one and what followed it.
+
+    Args:
+        folder: of the event files, one for each time that training was begun; none is written if not given.
+    """
+    with ExitStack() as stack:
+        writer = None
+
+        def add(epoch: Mapping[str, Any]) -> None:
+            nonlocal writer
+            if folder is None:
+                return
+            step = epoch["epoch"]
+            if writer is None:
+                from torch.utils.tensorboard import SummaryWriter  # slow to import
+
+                if any(folder.glob("events.*")):
+                    time.sleep(1)  # TensorBoard reads files in order of their names, which hold whole seconds
+                writer = stack.enter_context(SummaryWriter(str(folder), purge_step=step))
+            for name in SCALARS:
+                value = epoch[name]
+                if value is not None:
+                    writer.add_scalar(name, value, step)
+            writer.flush()
+
+        yield add
+
 
 VALIDATION_WINDOWS = 512
 """Windows of held-out navigations that the loss is checked on after every epoch."""

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import plotly.graph_objects as go
 from jaxtyping import Float
+from markupsafe import Markup
 
 from endopilot.devices.device import Device
 from endopilot.devices.stack import lines_from_tips, shown_part
@@ -54,6 +55,13 @@ def navigation_scene(
     if rollout is not None and rollout.shape is not None:
         _add_navigation(figure, rollout, devices, believed)
     return figure
+
+
+def scene_html(figure: go.Figure) -> Markup:
+    """Return a scene as a part of a page, which holds plotly's library."""
+    config = {"displaylogo": False, "responsive": True, "modeBarButtonsToRemove": ["toImage"]}
+    how = {"full_html": False, "include_plotlyjs": False, "auto_play": False, "div_id": "navigation"}
+    return Markup(figure.to_html(**how, config=config))
 
 
 def mark_target(
