@@ -23,7 +23,7 @@ from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.files import write_json
 from endopilot.models.config import WINDOW, TwinConfig, run_path
-from endopilot.models.open_loop import OpenLoop, Prediction
+from endopilot.models.episodes import OpenLoop, Prediction
 from endopilot.models.twin import TwinPredictor
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
@@ -63,7 +63,7 @@ def folder(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def hold_slack(monkeypatch) -> None:
-    monkeypatch.setattr("endopilot.models.rollout.load_model", lambda run: HoldSlack())
+    monkeypatch.setattr("endopilot.models.checkpoint.load_model", lambda run: HoldSlack())
 
 
 @pytest.fixture(scope="module")

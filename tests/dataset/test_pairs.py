@@ -11,15 +11,12 @@ import pytest
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.cli import main
-from endopilot.dataset import join
 from endopilot.dataset.again import episode_set_up, simulate_again
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.draw import draw_navigations
-from endopilot.dataset.episode import write_episode
-from endopilot.dataset.generate import generate_dataset
+from endopilot.dataset.generate import generate_dataset, write_episode
 from endopilot.dataset.info import describe_dataset
-from endopilot.dataset.join import read_joined
-from endopilot.dataset.loader import Dataset, read_dataset
+from endopilot.dataset.loader import Dataset, read_dataset, read_joined
 from endopilot.dataset.navigations import STOP_SHORT_MM, simulate_navigations
 from endopilot.dataset.schema import OF_ROBOT
 from endopilot.devices.catheter import read_catheter
@@ -173,7 +170,7 @@ def test_models_refuse_it_with_one_line(pairs, capsys, tmp_path):
 def test_what_does_not_go_together_is_refused(pairs, patient, tmp_path, monkeypatch):
     data = read_dataset(pairs)
     bare = replace(data, folder=tmp_path, manifest=data.manifest | {"catheters": []})
-    monkeypatch.setattr(join, "read_dataset", {pairs: data, tmp_path: bare}.__getitem__)
+    monkeypatch.setattr(loader, "read_dataset", {pairs: data, tmp_path: bare}.__getitem__)
     with pytest.raises(InputError, match=r"lies in no catheter, and that of .* in microcatheter-1\.7f; join"):
         read_joined([pairs, tmp_path])
     assert len(read_joined([pairs, pairs]).slip) == 2 * len(data)

@@ -20,7 +20,7 @@ from endopilot.evaluation.replay import Recorded
 from endopilot.evaluation.results import read_results
 from endopilot.files import read_json, write_json
 from endopilot.models.config import WINDOW
-from endopilot.models.open_loop import OpenLoop, begin_after
+from endopilot.models.episodes import OpenLoop, begin_after
 from endopilot.report.report import report_evaluation
 from toy_navigation import LENGTH_MM, make_toy_dataset, toy_run
 

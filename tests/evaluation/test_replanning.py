@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 
 from endopilot.dataset.loader import read_dataset
-from endopilot.evaluation.replanning import EXPOSURE_PERIOD_S, exposures, replanned
-from endopilot.evaluation.replay import Recorded, replay
-from endopilot.models.episodes import Episodes
-from endopilot.models.open_loop import OpenLoop, begin_after, given_states
+from endopilot.evaluation.replay import EXPOSURE_PERIOD_S, Recorded, exposures, replanned, replay
+from endopilot.models.episodes import Episodes, OpenLoop, begin_after, given_states
 from toy_navigation import toy_run
 
 GIVEN = 30

@@ -53,7 +53,7 @@ def advise(
             calibration patients, or too few that can be registered in images, or one of `also_test` tests on patients
             that the bands are fitted to.
     """
-    from endopilot.models.rollout import load_model  # brings torch
+    from endopilot.models.checkpoint import load_model  # brings torch
     from endopilot.plotting import png  # brings matplotlib, which takes a second to import
 
     start = time.perf_counter()

@@ -18,8 +18,7 @@ from endopilot.belief.watch import Watch
 from endopilot.dataset.loader import Dataset
 from endopilot.devices.device import Wire
 from endopilot.models.config import WINDOW
-from endopilot.models.episodes import Episodes
-from endopilot.models.open_loop import Predictor
+from endopilot.models.episodes import Episodes, Predictor
 from endopilot.progress import progress
 from endopilot.settings import NonNegative, Seed, from_record, settings
 from endopilot.tasks.navigation import XrayKind

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from endopilot.anatomy.io import write_anatomy
 from endopilot.cockpit.recording import read_session, replayed
-from endopilot.dataset.episode import write_episode
+from endopilot.dataset.generate import write_episode
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import DECISION_PERIOD_S
 

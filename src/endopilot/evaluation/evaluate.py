@@ -79,8 +79,8 @@ def evaluate(
     """
     with extra_named("evaluate"):
         from endopilot.evaluation.protocols import count_steps, run_protocols  # brings torch, slow to import
+        from endopilot.models.checkpoint import load_model
         from endopilot.models.episodes import Episodes
-        from endopilot.models.rollout import load_model
 
     config = config or EvaluateConfig()
     robot = None if config.robot is None else read_robot(config.robot)

@@ -10,12 +10,10 @@ from jaxtyping import Float, Int
 from endopilot.dataset.loader import Dataset
 from endopilot.devices.robot import RobotConfig
 from endopilot.evaluation.metrics import tip_events
-from endopilot.evaluation.replanning import exposures, replanned
-from endopilot.evaluation.replay import Control, Recorded, Samples, replay
+from endopilot.evaluation.replay import Control, Recorded, Samples, exposures, replanned, replay
 from endopilot.evaluation.results import REPLAYED, SplitResult, TipSeries
 from endopilot.models.config import WINDOW
-from endopilot.models.episodes import Episodes
-from endopilot.models.open_loop import OpenLoop, Predictor
+from endopilot.models.episodes import Episodes, OpenLoop, Predictor
 from endopilot.progress import Advance
 from endopilot.types import VesselTree
 
@@ -76,7 +74,7 @@ def run_protocols(
     P1 is the forward network under the true controls; P2 the inverse network with the true tip as desired; P3 the
     paper's loop of both; P4 the controls of P3 simulated again from the start of the episode, in the anatomy and with
     the device and friction that it was recorded with, within the limits of the drive. P4 is driven once more with plans
-    made anew at X-ray images (`replanning`).
+    made anew at X-ray images (`replanned`).
 
     Args:
         training: the episodes that the run was trained on, over which the baselines that are means are taken; these

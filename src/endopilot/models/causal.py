@@ -31,8 +31,17 @@ from torch import Tensor, nn
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.errors import InputError
 from endopilot.models.config import WINDOW, CausalConfig
-from endopilot.models.episodes import Episodes, EpisodeSetUp
-from endopilot.models.open_loop import EachObserved, Observed, OpenLoop, Prediction, Steps2, begin_after, given_states
+from endopilot.models.episodes import (
+    EachObserved,
+    Episodes,
+    EpisodeSetUp,
+    Observed,
+    OpenLoop,
+    Prediction,
+    Steps2,
+    begin_after,
+    given_states,
+)
 from endopilot.models.play import Direction, PlayTables
 from endopilot.models.sequences import N_INPUTS, N_WIRE_INPUTS, Unfolded, play_tables, unfold
 from endopilot.models.simulated_wires import FRICTION_FACTORS, SimulatedWires

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from endopilot.models import play
 from endopilot.models.config import WINDOW
-from endopilot.models.episodes import Episodes
-from endopilot.models.open_loop import jumps
+from endopilot.models.episodes import Episodes, jumps
 from endopilot.models.play import PARTIAL_PLAYS, Direction, PlayTables
 from endopilot.models.simulated_wires import FRICTION_FACTORS, WireTips, read_or_simulate
 from endopilot.progress import progress

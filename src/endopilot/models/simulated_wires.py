@@ -24,9 +24,8 @@ from jaxtyping import Float, Int
 from endopilot.files import json_text, writing
 from endopilot.models.config import WINDOW
 from endopilot.models.ensemble import Ensemble
-from endopilot.models.episodes import Episodes, EpisodeSetUp
+from endopilot.models.episodes import EachObserved, Episodes, EpisodeSetUp
 from endopilot.models.fitted_wires import Wires, by_motion, ensemble_of, fitted
-from endopilot.models.open_loop import EachObserved
 from endopilot.parallel import CORES
 from endopilot.progress import progress
 from endopilot.simulation.state import SimulatorState

@@ -22,8 +22,7 @@ import torch
 from torch import nn
 
 from endopilot import __version__
-from endopilot.dataset.join import read_joined
-from endopilot.dataset.loader import Dataset
+from endopilot.dataset.loader import Dataset, read_joined
 from endopilot.errors import InputError
 from endopilot.files import manifest, write_json
 from endopilot.models.causal import CausalNetwork

@@ -20,9 +20,9 @@ from endopilot.devices.device import Wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.models.config import WINDOW, TwinConfig
 from endopilot.models.ensemble import NOMINAL, Ensemble, likelihoods
-from endopilot.models.episodes import Episodes
-from endopilot.models.open_loop import (
+from endopilot.models.episodes import (
     EachObserved,
+    Episodes,
     Observed,
     OpenLoop,
     Prediction,
