@@ -16,7 +16,7 @@ from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import Calibration
 from endopilot.belief.image_exposures import Exposures
 from endopilot.belief.monitoring import AdviseConfig
-from endopilot.belief.online_predictors import OnlineTwin, OnlineWindowed, online_predictor
+from endopilot.belief.online_predictors import OnlinePredictor, OnlineTwin, OnlineWindowed, online_predictor
 from endopilot.cli import main
 from endopilot.dataset.loader import read_dataset
 from endopilot.devices.device import read_wire
@@ -151,7 +151,7 @@ def test_models_know_the_motion_that_images_have_measured(folder, split, monkeyp
     np.testing.assert_array_equal(found.episodes.tip, split.episodes.tip)
 
 
-class Errs:
+class Errs(OnlinePredictor):
     """Errs by given amounts and states no spread."""
 
     def __init__(self, tip: np.ndarray) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from endopilot.dataset import loader
 from endopilot.dataset.loader import read_dataset, read_joined
 from endopilot.errors import InputError
 from endopilot.simulation.motion import Motion

@@ -11,6 +11,7 @@ import pytest
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.cli import main
+from endopilot.dataset import loader
 from endopilot.dataset.again import episode_set_up, simulate_again
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.draw import draw_navigations

@@ -34,7 +34,7 @@ from endopilot.atlas.branching import (
     wiggled,
     with_side_branches,
 )
-from endopilot.atlas.population import Population
+from endopilot.atlas.population import Population, vessel_data
 from endopilot.atlas.variation import bent, varied
 from endopilot.lines import length_along
 from endopilot.types import VesselTree
@@ -57,19 +57,6 @@ TRUNK_MM = (38.2, 9.5)
 
 _DESCENDING_MM, _ASCENDING_MM = 100.0, 35.0
 """Aorta before and behind the arch, mm: from the middle of the chest, and to the root."""
-_COURSES = {
-    "brachiocephalic trunk": ((0.0, (-0.45, -0.1, 0.9)), (20.0, (-0.6, 0.1, 0.8))),
-    "left common carotid": ((0.0, (0.1, 0.1, 1.0)), (30.0, (0.15, 0.15, 1.0))),
-    "left subclavian": ((0.0, (0.2, 0.25, 1.0)), (28.0, (0.8, 0.1, 0.5)), (50.0, (0.95, -0.1, -0.15))),
-    "right common carotid": ((0.0, (0.0, 0.1, 1.0)), (20.0, (-0.1, 0.1, 1.0))),
-    "right subclavian": ((0.0, (-0.75, 0.1, 0.65)), (22.0, (-0.95, 0.05, 0.1)), (45.0, (-0.95, -0.1, -0.25))),
-}
-LENGTH_MM = {
-    "left common carotid": 95.0,
-    "left subclavian": 85.0,
-    "right common carotid": 70.0,
-    "right subclavian": 65.0,
-}
 
 
 def make_arch(
@@ -167,10 +154,10 @@ def _origins(
 def _plans(
     generator: np.random.Generator, aorta: Vessel, origins: dict[str, int], wide: dict[str, float], bovine: bool
 ) -> list[SidePlan]:
-    tangents = shape.tangents(aorta.points)
+    tangents, data = shape.tangents(aorta.points), vessel_data("arch")
 
     def plan(name: str, diameter: float, parent: int, origin: int, length: float, taper: float) -> SidePlan:
-        course = np.array(_COURSES[name][0][1])
+        course = np.array(data["courses"][name][0][1])
         # Branches of the arch head upwards, however the aorta runs under them.
         up = np.rad2deg(np.arccos(tangents[origin] @ course / np.linalg.norm(course))) if parent == 0 else 30.0
         angle = float(np.clip(up, 30.0, 130.0))
@@ -180,7 +167,7 @@ def _plans(
             origin=origin,
             length_mm=length,
             diameter_mm=diameter,
-            courses=_COURSES[name],
+            courses=data["courses"][name],
             taper=taper,
             angle_deg=(angle - 8.0, angle + 8.0),
         )
@@ -194,6 +181,6 @@ def _plans(
         parent, origin = (0, origins[name]) if name in origins else (1, -1)
         if name == "left common carotid" and bovine:
             parent, origin = 1, round((wall + float(generator.uniform(3.0, 12.0))) / shape.STEP_MM)
-        reach = wall + LENGTH_MM[name] if parent == 0 else LENGTH_MM[name]
+        reach = data["length_mm"][name] + (wall if parent == 0 else 0.0)
         plans.append(plan(name, diameter, parent, origin, reach * float(generator.uniform(0.9, 1.1)), 0.2))
     return plans

@@ -35,7 +35,7 @@ from endopilot.atlas.branching import (
     until_it_fits,
     with_side_branches,
 )
-from endopilot.atlas.population import Population
+from endopilot.atlas.population import Population, vessel_data
 from endopilot.atlas.variation import Fork, bent, factor, forks_of, varied
 from endopilot.lines import length_along
 from endopilot.types import VesselTree
@@ -54,13 +54,6 @@ _SIPHON = np.array(
 """Left internal carotid artery, LPS mm from the entrance of the carotid canal; the midline lies at x = -27."""
 _BEYOND_M1 = np.array([[4, 4, 5], [5, 12, 10], [7, 23, 15], [13, 34, 19.0]])
 """Inferior trunk of M2 over the insula, mm from the end of M1."""
-_COURSES = {
-    "M2 superior": ((0.0, (0.1, -0.7, 0.7)), (10.0, (0.2, 0.0, 1.0)), (20.0, (0.6, 0.2, 0.75))),
-    "M2 middle": ((0.0, (0.85, -0.2, 0.5)), (10.0, (0.6, 0.3, 0.75)), (20.0, (0.6, 0.55, 0.55))),
-    "A1": ((0.0, (-0.85, -0.5, 0.1)), (A1_MM, (-0.05, -0.6, 0.8)), (30.0, (0.05, 0.0, 1.0)), (46.0, (0.05, 0.9, 0.4))),
-    "ophthalmic": ((0.0, (0.3, -0.95, 0.2)), (12.0, (0.5, -0.85, 0.0))),
-    "PCom": ((0.0, (-0.15, 0.95, 0.1)), (8.0, (-0.1, 1.0, 0.05))),
-}
 _PCOM_SHARE = 0.6
 """Share of patients in whom the posterior communicating artery is wide enough to be visible: an assumption."""
 _SHARPEST_PER_MM = 0.4
@@ -203,7 +196,8 @@ def _plans(
     for name, origin in origins.items():
         if generator.random() >= shares.get(name, 1.0):
             continue
-        begins = [begin + a1_mm - A1_MM if name == "A1" and begin else begin for begin, _ in _COURSES[name]]
+        courses = vessel_data("cerebral")["courses"][name]
+        begins = [begin + a1_mm - A1_MM if name == "A1" and begin else begin for begin, _ in courses]
         own = DIAMETER_MM.get(name, DIAMETER_MM["M2"]) * calibre
         plans.append(
             SidePlan(
@@ -211,7 +205,7 @@ def _plans(
                 origin=origin,
                 length_mm=lengths[name] * float(generator.uniform(0.85, 1.15)),
                 diameter_mm=own * truncated(generator, 1.0, 0.1, 0.7, 1.3),
-                courses=tuple((begin, course) for begin, (_, course) in zip(begins, _COURSES[name], strict=True)),
+                courses=tuple((begin, course) for begin, (_, course) in zip(begins, courses, strict=True)),
                 angle_deg=(38.0, 58.0) if name.startswith("M2") else (60.0, 90.0),
             )
         )

@@ -37,7 +37,7 @@ from endopilot.atlas.branching import (
     with_side_branches,
 )
 from endopilot.atlas.heart_reference import FORK, INFERIOR, LAD, LCX, HeartFit, fit_left_heart
-from endopilot.atlas.population import Population
+from endopilot.atlas.population import Population, SideKind, side_kinds
 from endopilot.atlas.variation import bent, drawn_from, ectasia, factor, forks_of, opened_fork, varied
 from endopilot.lines import length_along
 from endopilot.types import VesselTree
@@ -55,8 +55,6 @@ LCX_DIAMETER_MM = {
 
 _RIGHT_SHARE, _BALANCED_SHARE = 0.88, 0.06
 """Shares of right and balanced dominance; the rest is left: as in the right coronary arteries of this atlas."""
-_RAMUS_SHARE = 0.25
-"""Share of patients with a ramus intermedius; the literature reports 15 to 37 %."""
 _FEMALE_CALIBRE = 0.91
 """Women's lumens against men's (Dodge 1992)."""
 _SIZE_SD, _TURN_SD_DEG, _WIGGLE_MM = 0.085, 6.0, (0.5, 1.3)
@@ -65,64 +63,6 @@ _SIZE_SD, _TURN_SD_DEG, _WIGGLE_MM = 0.085, 6.0, (0.5, 1.3)
 _ENDS = {"right": (66.0, 9.0, 40.0, 76.0), "balanced": (88.0, 4.0, 82.0, 97.0)}
 """Length of the circumflex artery, mm: mean, SD, least, most, in a heart of mean size. A left-dominant one goes on over
 the crux into the posterior descending artery."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _SideKind:
-    """How a side branch leaves: origin beyond the fork and length, mean and SD in mm; lumen, share, courses."""
-
-    origin_mm: tuple[float, float]
-    length_mm: tuple[float, float]
-    diameter_mm: float
-    share: float
-    courses: tuple[tuple[float, tuple[float, float, float]], ...]
-
-
-_LAD_SIDES = {
-    "9": _SideKind(
-        origin_mm=(20.0, 6.0), length_mm=(55.0, 12.0), diameter_mm=2.1, share=1.0,
-        courses=((0.0, (0.8, -0.3, -0.45)), (18.0, (0.6, -0.4, -0.65)), (40.0, (0.45, -0.55, -0.7))),
-    ),
-    "10": _SideKind(
-        origin_mm=(42.0, 7.0), length_mm=(45.0, 10.0), diameter_mm=1.9, share=0.9,
-        courses=((0.0, (0.75, -0.35, -0.5)), (16.0, (0.45, -0.5, -0.7))),
-    ),
-    "D": _SideKind(
-        origin_mm=(61.0, 6.0), length_mm=(32.0, 8.0), diameter_mm=1.7, share=0.6,
-        courses=((0.0, (0.75, -0.3, -0.6)), (14.0, (0.4, -0.4, -0.8))),
-    ),
-    "septal": _SideKind(
-        origin_mm=(21.0, 7.0), length_mm=(24.0, 5.0), diameter_mm=1.4, share=0.9,
-        courses=((0.0, (-0.5, -0.35, -0.8)), (10.0, (-0.2, -0.55, -0.8))),
-    ),
-    "septal 2": _SideKind(
-        origin_mm=(45.0, 8.0), length_mm=(20.0, 4.0), diameter_mm=1.2, share=0.6,
-        courses=((0.0, (-0.6, -0.2, -0.75)), (9.0, (-0.2, -0.4, -0.9))),
-    ),
-}  # fmt: skip
-_LCX_SIDES = {
-    "12": _SideKind(
-        origin_mm=(15.0, 5.0), length_mm=(55.0, 12.0), diameter_mm=2.4, share=1.0,
-        courses=((0.0, (0.85, -0.05, -0.5)), (18.0, (0.5, -0.3, -0.8)), (40.0, (0.3, -0.55, -0.75))),
-    ),
-    "14": _SideKind(
-        origin_mm=(30.0, 5.0), length_mm=(45.0, 10.0), diameter_mm=2.0, share=0.9,
-        courses=((0.0, (0.65, 0.1, -0.75)), (18.0, (0.4, -0.35, -0.8)), (36.0, (0.4, -0.6, -0.65))),
-    ),
-    "14 third": _SideKind(
-        origin_mm=(46.0, 5.0), length_mm=(36.0, 8.0), diameter_mm=1.7, share=0.6,
-        courses=((0.0, (0.6, 0.0, -0.8)), (14.0, (0.45, -0.5, -0.7))),
-    ),
-    "14 posterior": _SideKind(
-        origin_mm=(68.0, 4.0), length_mm=(40.0, 8.0), diameter_mm=1.9, share=1.0,
-        courses=((0.0, (0.45, -0.35, -0.8)), (12.0, (0.65, -0.7, -0.25))),
-    ),
-}  # fmt: skip
-"""The last one leaves balanced and left-dominant circumflex arteries alone, for the inferior wall (Dodge's CP)."""
-_RAMUS = _SideKind(
-    origin_mm=(0.0, 0.0), length_mm=(55.0, 12.0), diameter_mm=1.9, share=_RAMUS_SHARE,
-    courses=((0.0, (0.9, -0.05, -0.35)), (14.0, (0.7, -0.2, -0.65)), (36.0, (0.4, -0.5, -0.75))),
-)  # fmt: skip
 
 
 _ORDERED = (("9", "10"), ("12",))
@@ -322,7 +262,7 @@ def _plan_branches(
     """Draw which branches there are, where they leave, how long and how wide they are; named in their order."""
     plans: list[SidePlan] = []
     presence = factor(generator, population.side_share)
-    for parent, kinds in enumerate((_LAD_SIDES, _LCX_SIDES)):
+    for parent, kinds in enumerate((side_kinds("lca", "lad"), side_kinds("lca", "lcx"))):
         first = trunk.fork if parent == 0 else 0
         taken: list[int] = []
         for name, kind in kinds.items():
@@ -337,15 +277,16 @@ def _plan_branches(
         own = sorted((plan for plan in plans if plan.parent == parent and plan.section != "septal"), key=_origin)
         named = {id(plan): name for plan, name in zip(own, _ORDERED[parent], strict=False)}
         plans = [replace(plan, section=named.get(id(plan), plan.section)) for plan in plans]
-    if generator.random() < _RAMUS.share:
-        plans.insert(0, _plan(generator, "17", _RAMUS, 0, trunk.fork, trunk, calibre))
+    ramus = side_kinds("lca", "ramus")["17"]
+    if generator.random() < ramus.share:
+        plans.insert(0, _plan(generator, "17", ramus, 0, trunk.fork, trunk, calibre))
     return plans
 
 
 def _plan(
     generator: np.random.Generator,
     section: str,
-    kind: _SideKind,
+    kind: SideKind,
     parent: int,
     origin: int,
     trunk: _Trunk,

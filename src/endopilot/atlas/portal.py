@@ -36,7 +36,7 @@ from endopilot.atlas.branching import (
     wiggled,
     with_side_branches,
 )
-from endopilot.atlas.population import Population
+from endopilot.atlas.population import Population, vessel_data
 from endopilot.atlas.variation import Fork, bent, varied
 from endopilot.lines import length_along
 from endopilot.types import VesselTree
@@ -52,16 +52,6 @@ _COURSE = np.array([[0, 0, 0], [-18, 4, 13], [-36, 9, 29], [-52, 12, 45], [-64, 
 """The main portal vein from the confluence to the porta hepatis, mm."""
 _RIGHT = np.array([[-10, -1, 3], [-19, -5, 6], [-27, -12, 13], [-33, -17, 25], [-37, -19, 40], [-41, -18, 54.0]])
 """Onwards along the right branch, its anterior one and the vein of segment 8, mm from the porta hepatis."""
-_SIDES = {
-    "LPV": ((0.0, (0.75, -0.25, 0.6)), (12.0, (0.85, -0.45, 0.3)), (LEFT_MM, (0.35, -0.95, 0.0))),
-    "RPPV": ((0.0, (-0.75, 0.6, -0.1)), (12.0, (-0.7, 0.65, 0.05)), (24.0, (-0.55, 0.4, 0.75))),
-    "S5": ((0.0, (-0.5, -0.6, -0.6)), (12.0, (-0.35, -0.45, -0.85))),
-    "S6": ((0.0, (-0.6, 0.2, -0.75)), (12.0, (-0.5, 0.0, -0.9))),
-    "S4": ((0.0, (-0.75, -0.45, -0.3)), (10.0, (-0.5, -0.5, -0.65))),
-    "S3": ((0.0, (0.9, -0.3, -0.35)), (10.0, (0.85, -0.3, -0.5))),
-    "S2": ((0.0, (0.75, 0.35, 0.45)), (12.0, (0.9, 0.2, 0.3))),
-}
-_LENGTH_MM = {"S5": 36.0, "S6": 38.0, "S4": 32.0, "S3": 38.0, "S2": 40.0}
 _SEGMENT_DIAMETER_MM = 5.0
 _SHARPEST_PER_MM = 0.15
 """Greatest curvature of the widest line, 1/mm: its wall must not fold."""
@@ -99,7 +89,7 @@ def _draw(
     radius = 0.5 * calibre * _profile(len(points), left, posterior, anterior)
     radius = radius * uneven(generator, length_along(points))
     origins = {"LPV": left, "RPPV": posterior, "S5": anterior}
-    forks = [Fork(origin, _SIDES[name][0][1]) for name, origin in origins.items()]
+    forks = [Fork(origin, vessel_data("portal")["courses"][name][0][1]) for name, origin in origins.items()]
     points = bent(generator, points, radius, population, forks=forks)
     place = np.arange(len(points))
     ends = [place <= left, place <= posterior, place <= anterior]
@@ -158,16 +148,17 @@ def _grown(
             origin=origin,
             length_mm=size * length_mm * float(generator.uniform(0.9, 1.1)),
             diameter_mm=calibre * diameter_mm * truncated(generator, 1.0, 0.08, 0.8, 1.2),
-            courses=_SIDES[name],
+            courses=vessel_data("portal")["courses"][name],
             taper=taper,
             angle_deg=(55.0, 80.0) if name == "LPV" else (40.0, 65.0),
         )
 
+    length_mm = vessel_data("portal")["length_mm"]
     transverse = truncated(generator, LEFT_MM, LEFT_SD_MM, 24.0, 46.0)
     large = [
         plan("LPV", 0, origins["LPV"], transverse + 18.0, 8.5, 0.35),
         plan("RPPV", 0, origins["RPPV"], 62.0, 7.5, 0.5),
-        plan("S5", 0, origins["S5"], _LENGTH_MM["S5"], _SEGMENT_DIAMETER_MM, 0.4),
+        plan("S5", 0, origins["S5"], length_mm["S5"], _SEGMENT_DIAMETER_MM, 0.4),
     ]
     vessels = with_side_branches(generator, vessels, varied(generator, large, population), population.carina_mm)
     turn = round(size * transverse / shape.STEP_MM)
@@ -179,7 +170,7 @@ def _grown(
         "S6": (2, low),
     }
     plans = [
-        plan(name, parent, place, _LENGTH_MM[name], _SEGMENT_DIAMETER_MM, 0.4)
+        plan(name, parent, place, length_mm[name], _SEGMENT_DIAMETER_MM, 0.4)
         for name, (parent, place) in places.items()
     ]
     vessels = with_side_branches(generator, vessels, varied(generator, plans, population), population.carina_mm)

@@ -35,7 +35,7 @@ from endopilot.atlas.branching import (
     with_side_branches,
 )
 from endopilot.atlas.heart_reference import BEYOND_CRUX, TO_CRUX, fit_heart
-from endopilot.atlas.population import Population
+from endopilot.atlas.population import Courses, Population, side_kinds, vessel_data
 from endopilot.atlas.variation import bent, ectasia, factor, forks_of, varied
 from endopilot.lines import length_along
 from endopilot.types import VesselTree
@@ -52,44 +52,6 @@ _CALIBRE = {"right": 1.025, "balanced": 0.9, "left": 0.74}
 """Lumen against the average of all patients (Dodge 1992: balanced 0.78, left 0.70 of right dominance)."""
 _FEMALE_CALIBRE = 0.91
 """Women's lumens against men's (Dodge 1992)."""
-
-Courses = tuple[tuple[float, tuple[float, float, float]], ...]
-"""Where a side branch heads: (abscissa from which it holds, mm; LPS direction), in order."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _SideKind:
-    """How a kind of side branch leaves: mean and SD of origin and length, mm; lumen; courses in LPS directions."""
-
-    origin_mm: tuple[float, float]
-    length_mm: tuple[float, float]
-    diameter_mm: float
-    share: float
-    courses: Courses
-
-
-_SIDES = {
-    "conus": _SideKind(
-        origin_mm=(15.0, 6.0), length_mm=(26.0, 6.0), diameter_mm=1.6, share=0.85,
-        courses=((0.0, (0.45, -0.85, 0.3)), (8.0, (0.85, -0.5, 0.0)), (18.0, (0.8, -0.35, -0.5))),
-    ),
-    "SA": _SideKind(
-        origin_mm=(16.0, 6.0), length_mm=(30.0, 7.0), diameter_mm=1.5, share=0.6,
-        courses=((0.0, (-0.25, 0.75, 0.6)), (10.0, (0.15, 0.85, 0.5)), (20.0, (-0.5, 0.6, 0.6))),
-    ),
-    "RV": _SideKind(
-        origin_mm=(29.0, 5.0), length_mm=(36.0, 8.0), diameter_mm=1.7, share=0.8,
-        courses=((0.0, (0.4, -0.9, -0.1)), (10.0, (0.75, -0.55, -0.35)), (22.0, (0.75, -0.2, -0.6))),
-    ),
-    "AM": _SideKind(
-        origin_mm=(42.0, 8.0), length_mm=(50.0, 10.0), diameter_mm=2.0, share=1.0,
-        courses=((0.0, (0.3, -0.85, -0.4)), (12.0, (0.7, -0.5, -0.5)), (30.0, (0.85, -0.3, -0.4))),
-    ),
-}  # fmt: skip
-_DISTAL_COURSES = {
-    "4": ((0.0, (0.72, -0.6, -0.35)), (18.0, (0.73, -0.68, -0.08)), (45.0, (0.7, -0.65, 0.25))),
-    "16": ((0.0, (0.68, 0.65, 0.32)), (16.0, (0.6, 0.7, 0.3)), (26.0, (0.85, 0.1, -0.5)), (45.0, (0.85, -0.4, -0.3))),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -250,7 +212,7 @@ def _plan_branches(
     plans: list[SidePlan] = []
     end_mm = (len(radius) - 1) * shape.STEP_MM
     presence = factor(generator, population.side_share)
-    for section, kind in _SIDES.items():
+    for section, kind in side_kinds("rca", "sides").items():
         if generator.random() > kind.share * presence:
             continue
         origin = free_origin(generator, *kind.origin_mm, [plan.origin for plan in plans])
@@ -263,7 +225,7 @@ def _plan_branches(
         other = "16" if targets.ends_in == "4" else "4"
         length = max((end_mm - crux * shape.STEP_MM) * float(generator.uniform(0.6, 0.92)), 12.0)
         diameter = 2 * float(radius[crux]) * float(generator.uniform(0.68, 0.8))
-        plans.append(_plan(other, crux, length, diameter, _DISTAL_COURSES[other]))
+        plans.append(_plan(other, crux, length, diameter, vessel_data("rca")["distal"][other]))
     return plans
 
 
