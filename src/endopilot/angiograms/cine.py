@@ -53,14 +53,10 @@ class Cine:
     """One cine of a patient.
 
     Attributes:
-        config: of the data set.
-        draw: what it shows.
-        imager: of the patient.
         view: source and detector, in the frame of the CT.
         times_s: of the frames since heart, breath and devices began to move, s.
         placed: affine map of the vessel, and of what lies in it, from where CT shows it to where heart and breath have
             moved it at each frame, LPS mm of the CT.
-        flow: of the blood.
         contrast: share of contrast in the blood at each frame and point of `flow`; 0 where none is injected.
         driven: the devices; None where none are shown.
         air_kerma_ugy: of a frame, at the patient's entrance reference point, µGy; 0 before the first is made.

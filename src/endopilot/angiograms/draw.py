@@ -75,15 +75,10 @@ class CineDraw:
     """What one cine shows.
 
     Attributes:
-        view: name of the view.
         angles_deg: LAO (positive) or RAO, and cranial (positive) or caudal, degrees.
-        pose: in which the patient lies.
         dose: of a frame, as a multiple of fluoroscopy's.
         lead: frames for which heart, breath and devices move before the first one.
         injection: of contrast; None where there is none.
-        blood_mm_s: velocity of the blood behind the ostium, mm/s.
-        devices: whether wire and catheters are shown.
-        drive_seed: of the devices' motion.
         noise_seed: of the first frame's noise; it grows by one a frame.
     """
 

@@ -32,8 +32,6 @@ class Injection:
     """Contrast that is injected through the guiding catheter.
 
     Attributes:
-        start_s: when it begins, s.
-        duration_s: how long it lasts, s.
         rate_ml_s: ml/s; what the vessel does not take flows back into the aorta.
         ramp_s: time in which the rate rises and falls, s.
     """
@@ -56,7 +54,6 @@ class Flow:
     Attributes:
         points: of all centerlines, branch after branch, LPS mm.
         branch: that each belongs to.
-        rate_ml_s: blood that passes each, ml/s.
         transit_s: time from the ostium to each, s.
         inflow_ml_s: blood that flows in at the ostium, ml/s.
     """

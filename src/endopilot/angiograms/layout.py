@@ -30,11 +30,7 @@ class Layout:
     """The patients of a data set, and where everything stands.
 
     Attributes:
-        output: folder of the data set.
-        config: how many cines, and what they show.
-        stack: the wire, and the catheters around it.
         sources: where each patient comes from: a folder of an anatomy, or a CT.
-        names: of the patients.
         splits: of each: train, calibrate or test.
         settings: what a resumed run must share with the run that it continues.
         key: marks all of that.

@@ -52,10 +52,8 @@ class SidePlan:
     """A side branch to be drawn.
 
     Attributes:
-        section: name of its anatomical section.
         parent: index of the vessel that it leaves.
         origin: index of the parent's point where it leaves; -1 for its end.
-        length_mm: its length.
         diameter_mm: lumen diameter at its origin.
         courses: (abscissa from which it holds, mm; LPS direction), in order.
         taper: share of the diameter that is lost towards the end.

@@ -87,9 +87,7 @@ class SideKind:
     Attributes:
         origin_mm: mean and SD of its origin's distance from where the vessel begins, mm.
         length_mm: mean and SD, mm.
-        diameter_mm: of the lumen.
         share: of the patients that have it.
-        courses: where it heads.
     """
 
     origin_mm: tuple[float, float]

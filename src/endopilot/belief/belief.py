@@ -133,7 +133,6 @@ class Belief:
 
     Attributes:
         members: what each takes reality to be.
-        config: accuracy of measurements, and settings of the rod core.
         kinds: vessel and devices, those that differ; members share them.
         kind: the place among these of each member.
         ostium_mm: how much deeper each member's devices lie than the encoders say, mm.

@@ -44,7 +44,6 @@ class Exposures:
         tip: (Δtip, γtip), mm.
         branch: of that tip.
         sd_mm: standard deviations of (Δtip, γtip) as the detector states them, mm; 0 where it states none.
-        found: whether an image shows a wire.
         motion: the patient's motion as a run of contrast shows it, the numbers of `Motion` in their order; empty for a
             patient who lies still.
     """
@@ -67,7 +66,6 @@ class ImageSettings:
     """What the images of a dataset's navigations follow from, beside the dataset.
 
     Attributes:
-        fluoroscope: the C-arm.
         ostium_mm: each patient's ostium lies up to this much deeper or less deep than in the model, mm.
         seed: of poses, noise and ostia.
         samples: images are made of so many samples of each navigation, from the first on.

@@ -103,7 +103,6 @@ class Monitor:
         belief: about the wire; another one once the model was taken to be wrong and another was identified.
         lost: whether no wire explains the last exposure.
         sought: whether one was sought for this exposure, and found.
-        past: what was measured so far.
         identified: what was found when the belief was last changed; None before.
         moves: how the vessel was found to move; None if it was not.
         seen: the last exposure, less that motion; None where X-ray is off.

@@ -61,10 +61,7 @@ class Monitored:
         episodes: Δ by the encoder, and tips as X-ray would show them.
         found: at which samples X-ray would show a tip.
         unregistered: names of the patients who could not be registered in X-ray images, and were left out.
-        model: what predicts them.
         lumen: radii of the lumen, to look up.
-        wire_radius_mm: radius of the wire, mm.
-        dataset: key of the dataset.
     """
 
     truth: Float[np.ndarray, "episodes samples 2"]
@@ -271,9 +268,7 @@ class Followed:
     """Navigations in which a policy decided when X-ray is on, from the last given sample on.
 
     Attributes:
-        exposed: which samples were exposed.
         near: which have an exposure within 0.5 s that shows the tip.
-        wall: whether the tip is at the wall.
         astray: whether the predicted Δtip errs by δ.
     """
 

@@ -105,7 +105,6 @@ class MovedCopies:
     """Copies of a belief's likeliest devices.
 
     Attributes:
-        simulator: of the copies.
         at: the one that was found nearest to what X-ray shows.
     """
 

@@ -43,8 +43,6 @@ class FilmFrame:
     """The world at one moment of a film.
 
     Attributes:
-        snapshot: the world.
-        exposed: whether X-ray was on.
         peak_n: largest wall force on one node so far, N.
     """
 
@@ -59,10 +57,7 @@ class Film:
 
     Attributes:
         navigation: vessel, wire and target.
-        seconds: how long it lasts, s.
-        title: what it is, for the page.
         frames: those that are there so far.
-        done: whether all are.
         failure: why it ended early, in a line; empty if it did not.
     """
 
@@ -231,8 +226,6 @@ class ReplayStage:
     """A film in place of a session.
 
     Attributes:
-        film: what is shown.
-        playing: whether time passes.
         at: index of the frame that is shown.
     """
 

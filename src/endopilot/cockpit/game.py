@@ -34,7 +34,6 @@ class Attempt:
     """Which task in which patient.
 
     Attributes:
-        task: of the ladder.
         place: of the patient in the task's list.
         robot: what drives, for a person and for the agent.
     """

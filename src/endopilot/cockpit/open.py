@@ -38,9 +38,6 @@ class Opened:
     """What the server needs.
 
     Attributes:
-        stage: what is driven or replayed.
-        scene: makes the message with what does not move.
-        cycle_s: length of a cycle, s.
         recording: where the session is kept; None for a replay.
     """
 

@@ -94,14 +94,8 @@ class RecordedSession:
     """A session that was recorded.
 
     Attributes:
-        path: of the file.
         navigation: vessel, wire, target and start.
-        config: robot, rod core and length of a cycle.
-        reality: what reality was.
         seed: of the encoders' noise.
-        where: it took place.
-        events: one each, in their order.
-        cycles: how many it lasted.
     """
 
     path: Path

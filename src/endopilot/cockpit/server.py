@@ -58,12 +58,7 @@ class _Page:
 
 
 class Cockpit:
-    """The application around one stage.
-
-    Attributes:
-        loop: the thread that runs the stage.
-        app: the ASGI application.
-    """
+    """The application around one stage."""
 
     def __init__(
         self, stage: Stage, scene: Callable[[], bytes], *, token: str, hosts: frozenset[str], cycle_s: float

@@ -34,8 +34,6 @@ class Session:
     """One world driven from a page.
 
     Attributes:
-        world: the wire in its vessel.
-        xray: C-arm, pedal and contrast.
         autopilot: a policy that may drive.
         sight: whether the page may show the wire in space.
     """

@@ -51,8 +51,6 @@ class Snapshot:
     """The world at the end of a cycle.
 
     Attributes:
-        cycle: how many have passed.
-        time_s: since the start, s.
         nodes: of the wire from its tip to a little behind the ostium, LPS mm.
         node_force: of the wall at each of them, N; 0 where it lies in a catheter.
         tip_direction: unit vector along the wire at its tip.
@@ -98,9 +96,6 @@ class LiveWorld:
     Attributes:
         loop: wire, catheters, robot and C-arm; the hand drives it until it is handed over.
         hand: what the hand holds.
-        config: robot, rod core and length of a cycle.
-        reality: what reality is.
-        cycle: how many cycles have passed.
         force_n: largest wall force on one node in the last cycle, N.
         peak_force_n: the same so far, N.
     """

@@ -33,8 +33,6 @@ class Draw:
     Attributes:
         initial: Δ (mm) and φ (rad) of each device before the first period.
         control: velocities (mm/s, rad/s) or loads (N, N·mm) of the drives.
-        friction: friction coefficient.
-        tip_bend_rad: angle of the unloaded tip.
         tip_stiffness_factor: factor on the stiffness of the distal 10 mm.
         seeds: of each navigation's robot.
     """

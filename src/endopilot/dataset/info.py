@@ -27,7 +27,6 @@ class Histogram:
     """How often a quantity took which value, over all valid samples.
 
     Attributes:
-        title: the quantity, as a figure names it.
         unit: "" if it has none.
         edges: of the bins, increasing; values beyond count in the outermost.
         counts: samples in each bin.
@@ -54,7 +53,6 @@ class Description:
     """A dataset in figures.
 
     Attributes:
-        figures: named figures, as JSON has them.
         histograms: by the name of their picture.
         branch_visits: share of the navigations whose tip was in n branches, for n = 0, 1, 2, ...
         manoeuvres: share of the samples that are insertion, retraction, spin and pause.

@@ -111,13 +111,9 @@ class Block:
     """Navigations of one anatomy that share a file: the unit of work, on this machine or on a cluster.
 
     Attributes:
-        number: of the file.
-        folder: of the anatomy.
-        anatomy: its name.
-        identity: SHA-256 of what the simulation depends on in it.
+        identity: SHA-256 of what the simulation depends on in the anatomy.
         sequences: indices of the navigations among those of the anatomy.
         first_episode: index of the first one in the dataset.
-        splits: split of each.
     """
 
     number: int
@@ -134,9 +130,6 @@ class BlockContext:
     """What all blocks share.
 
     Attributes:
-        output: folder of the dataset.
-        config: number, length, distribution and split of the navigations.
-        stack: the wire, and the catheters around it.
         key: marks the files of this dataset; it follows from all settings.
         task: what the navigations do, as LeRobot names it.
         robot: what makes the motions; None where they are made as drawn.
@@ -157,11 +150,6 @@ class Layout:
     """Which navigations of which anatomies a dataset holds.
 
     Attributes:
-        context: what all blocks share.
-        folders: of the anatomies.
-        names: their names.
-        identities: their SHA-256s.
-        splits: of every navigation.
         motions: how the vessel of each anatomy moves; None for one that lies still.
         settings: what a resumed run must share with the run it continues, as plain JSON values.
     """

@@ -132,7 +132,6 @@ class _PushRoom:
     """How far each device may still be pushed. Arrays have a row a world and a column a device, the wire first.
 
     Attributes:
-        deepest_mm: inserted length that no device may exceed.
         caught_n: push at which each counts as caught, N.
     """
 

@@ -80,7 +80,6 @@ class Reality:
     """The worlds of an environment as they truly are.
 
     Attributes:
-        simulator: the worlds.
         drawn: what differs from episode to episode.
     """
 

@@ -31,11 +31,8 @@ class Recorded:
     """Recorded episodes, with the patients and the wire that they were recorded with.
 
     Attributes:
-        data: the episodes.
-        names: of the anatomies, sorted.
         anatomies: in the order of their names.
         anatomy_of: index of each episode's anatomy.
-        device: the wire.
         robot: what controls pass before they move the wire; None where a drive does exactly what it can.
     """
 

@@ -79,9 +79,7 @@ class Submission:
     """What a policy did on the ladder, and how that can be done again.
 
     Attributes:
-        format: version of this form.
         ladder: version of the ladder; a file without it is one of version 1.
-        policy: name of the policy.
         origin: package and version that it comes from, or its file and the SHA-256 of that.
         versions: of endopilot, Python and libraries.
         core: processor level that the rod core was built for.

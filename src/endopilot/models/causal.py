@@ -64,10 +64,6 @@ class CausalNetwork(nn.Module):
     """What FF and IF have in common.
 
     Buffers `input_mean`, `input_scale` and `output_scale` are part of the checkpoint; `fit_scales` sets them.
-
-    Attributes:
-        n_inputs: inputs at a sample.
-        n_guesses: components of the mixture.
     """
 
     n_inputs: int
@@ -205,9 +201,7 @@ class CausalPredictor:
     Attributes:
         forward: FF, if it was trained.
         inverse: IF, if it was trained.
-        limits: of the drive.
         prepared: names and tables of the patients of each setup that it has predicted in.
-        wires: simulated so far.
     """
 
     forward: CausalNetwork | None

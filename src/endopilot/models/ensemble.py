@@ -33,7 +33,6 @@ class Ensemble:
     Attributes:
         parameters: friction factor, tip stiffness factor and depth of the ostium (mm) of each member.
         wires: the wires by the stiffness factor of their tip; members share them.
-        set_up: what their worlds are simulated with.
     """
 
     def __init__(

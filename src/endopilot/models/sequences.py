@@ -32,7 +32,6 @@ class Unfolded:
     """Episodes with the play operator applied along them.
 
     Attributes:
-        inputs: of the network.
         guess: forward: (Δtip, γtip) of play and envelopes, mm, displaced by the patient's motion; inverse: Δ by the
             play (mm) and a turn of 0 (rad).
         others: forward: by how much the simulated wires differ from that guess, mm; inverse: none.

@@ -129,8 +129,6 @@ class TwinPredictor:
 
     Attributes:
         device: the nominal wire.
-        simulator: settings of the rod core.
-        config: size and spread of the ensemble.
         predicted: predictions from the given states, by episodes; all protocols share them.
         tracked: controls that lead the tip along the desired one, likewise.
     """

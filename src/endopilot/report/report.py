@@ -66,16 +66,12 @@ class ReportContent:
     """Everything that a pipeline has to report; what is None or empty is left out of the report.
 
     Attributes:
-        title: title of the report.
         origin: one sentence that says what the patients are: real, or synthetic and how made.
-        command: the command that makes this report again.
-        patients: the patients.
         evaluation: folder made by `endopilot evaluate`.
         run: folder made by `endopilot train`.
         replay: navigations with `shape`, the first of which is shown in space.
         replay_anatomy: folder of the anatomy that they are in.
         navigation: folder made by `endopilot navigate`, beside or below the report; its page is linked.
-        stage_seconds: seconds that each stage took, in the order of the stages.
         manifest: how everything was made (`files.manifest`).
     """
 

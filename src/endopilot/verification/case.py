@@ -49,11 +49,8 @@ class Case:
     """One comparison.
 
     Attributes:
-        case: what is compared.
         reference: value of the closed form, or of the other engine.
-        value: value of the core.
         error: relative error, or absolute where the reference is 0.
-        bar: largest error that passes.
         picture: the case's figure.
         skipped: why the comparison could not be made; empty if it was.
     """
