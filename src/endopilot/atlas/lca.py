@@ -274,7 +274,9 @@ def _plan_branches(
                 continue
             taken.append(origin - first)
             plans.append(_plan(generator, name.split()[0], kind, parent, origin, trunk, calibre))
-        own = sorted((plan for plan in plans if plan.parent == parent and plan.section != "septal"), key=_origin)
+        own = sorted(
+            (plan for plan in plans if plan.parent == parent and plan.section != "septal"), key=lambda plan: plan.origin
+        )
         named = {id(plan): name for plan, name in zip(own, _ORDERED[parent], strict=False)}
         plans = [replace(plan, section=named.get(id(plan), plan.section)) for plan in plans]
     ramus = side_kinds("lca", "ramus")["17"]
@@ -303,10 +305,6 @@ def _plan(
         courses=tuple((begin, tuple(trunk.turn.apply(course))) for begin, course in kind.courses),
         angle_deg=(60.0, 90.0) if septal else (40.0, 70.0),
     )
-
-
-def _origin(plan: SidePlan) -> int:
-    return plan.origin
 
 
 def _with_sections(trunk: _Trunk, vessels: list[Vessel], plans: list[SidePlan], dominance: str) -> list[Vessel]:

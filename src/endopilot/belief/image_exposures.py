@@ -103,12 +103,12 @@ def image_exposures(dataset: Dataset, settings: ImageSettings) -> tuple[dict[str
     if len(bad) == len(paths):
         first = next(iter(bad.values()))
         raise InputError(f"{dataset.folder}: no patient of its split '{split}' can be registered; the first: {first}")
-    return {name: _read(path) for name, path in paths.items() if path not in bad}, tuple(path.stem for path in bad)
-
-
-def _read(path: Path) -> Exposures:
-    with np.load(path, allow_pickle=False) as stored:
-        return Exposures(**{field.name: stored[field.name] for field in fields(Exposures)})
+    found = {}
+    for name, path in paths.items():
+        if path not in bad:
+            with np.load(path, allow_pickle=False) as stored:
+                found[name] = Exposures(**{field.name: stored[field.name] for field in fields(Exposures)})
+    return found, tuple(path.stem for path in bad)
 
 
 def _expose_patient(path: Path, *, dataset: Path, split: str, settings: ImageSettings) -> None:

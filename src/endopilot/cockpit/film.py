@@ -247,7 +247,7 @@ class ReplayStage:
         elif isinstance(message, messages.Pedal):
             self._xray.pedal = message.down
         elif isinstance(message, messages.Contrast):
-            self._xray.inject(self._time_s)
+            self._xray.inject(self.film.frames[self.at].snapshot.time_s if self.film.frames else 0.0)
         elif isinstance(message, messages.CArm):
             self._xray.configure(**message.model_dump(exclude={"type"}, exclude_none=True))
         elif not isinstance(message, messages.Drive | messages.Autopilot):
@@ -280,10 +280,6 @@ class ReplayStage:
     def close(self) -> None:
         """End it."""
         self._xray.close()
-
-    @property
-    def _time_s(self) -> float:
-        return self.film.frames[self.at].snapshot.time_s if self.film.frames else 0.0
 
     def _values(self) -> dict[str, Any]:
         film, snapshot = self.film, self.film.frames[self.at].snapshot

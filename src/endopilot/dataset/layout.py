@@ -196,7 +196,10 @@ def make_layout(
             fit around the wire, or are to be driven by force; a world that a dataset cannot hold.
     """
     world = world or World()
-    _check_world(world)
+    world.check_engine("datasets")
+    for name in ("share", "backs_out_mm"):
+        if (value := getattr(world, name)) != getattr(World(), name):
+            raise InputError(f"world: {name} = {value}; it is not the same throughout a dataset: leave it out")
     check_nested(stack.wire, stack.catheters)
     if stack.catheters and config.control == "force":
         raise InputError("control: 'force' with catheters; give 'velocity'")
@@ -228,18 +231,6 @@ def make_layout(
     context = BlockContext(Path(output), config, stack, key, task, robot, world)
     motions = tuple(world.motion or patient_motion(config, name) for name in names)
     return Layout(context, tuple(map(Path, folders)), names, identities, splits, motions, settings)
-
-
-def _check_world(world: World) -> None:
-    """Refuse what differs from navigation to navigation and within one.
-
-    Raises:
-        InputError: the world has such fields.
-    """
-    world.check_engine("datasets")
-    for name in ("share", "backs_out_mm"):
-        if (value := getattr(world, name)) != getattr(World(), name):
-            raise InputError(f"world: {name} = {value}; it is not the same throughout a dataset: leave it out")
 
 
 def version() -> str:

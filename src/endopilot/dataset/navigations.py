@@ -128,6 +128,14 @@ class _Driven:
         return {"decided": decided, "encoders": encoders, "load": load}
 
 
+def branch_ends(tree: VesselTree) -> Float[np.ndarray, "branches"]:
+    """Return the abscissa at which every branch ends, mm; infinite where it goes on."""
+    ends = np.full(len(tree.branches), np.inf)
+    for leaf in tree.leaves():
+        ends[leaf] = tree.branches[leaf].centerline.abscissa[-1]
+    return ends
+
+
 class _PushRoom:
     """How far each device may still be pushed. Arrays have a row a world and a column a device, the wire first.
 
@@ -136,9 +144,7 @@ class _PushRoom:
     """
 
     def __init__(self, tree: VesselTree, stacks: Sequence[Stack]) -> None:
-        self._ends = np.full(len(tree.branches), np.inf)
-        for leaf in tree.leaves():
-            self._ends[leaf] = tree.branches[leaf].centerline.abscissa[-1]
+        self._ends = branch_ends(tree)
         self.deepest_mm = max(float(self._ends[np.isfinite(self._ends)].max()) - STOP_SHORT_MM, 0.0)
         self.caught_n = CAUGHT * np.array([[device.push_limit_n for device in stack.devices] for stack in stacks])
         self._limit = np.full(self.caught_n.shape, np.inf)

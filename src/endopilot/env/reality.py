@@ -22,7 +22,6 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
 from endopilot.simulation.world import NOMINAL, World, read_world
 from endopilot.tasks.navigation import Navigation
-from endopilot.types import Anatomy
 
 RANDOM = "random"
 """In place of a world or a robot: another one in each episode."""
@@ -124,7 +123,11 @@ class Reality:
                 raise InputError(
                     "robot: its grip is weaker than devices of different push limits; give config a wall stiffness"
                 )
-        self.simulator = Simulator(_vessels(navigations, fixed), stacks, motion=motion, config=config)
+        made = {
+            id(each.anatomy): SharedVessels(each.anatomy) for each in navigations
+        }  # the same differences, one vessel
+        vessels = [made[id(each.anatomy)].of(world) for each, world in zip(navigations, fixed, strict=True)]
+        self.simulator = Simulator(vessels, stacks, motion=motion, config=config)
         self._friction = np.array([[device.friction for device in stack.devices] for stack in stacks])
         self._start = np.array([navigation.start for navigation in navigations])
         self._backs_out_s = np.array([each.backs_out_after_s for each in fixed])
@@ -255,9 +258,3 @@ def _common(worlds: Sequence[World], names: str, values: Sequence[Any]) -> Any:
             f"world: worlds differ in {names}, which all in an environment have in common; give worlds that agree"
         )
     return values[0]
-
-
-def _vessels(navigations: Sequence[Navigation], worlds: Sequence[World]) -> list[Anatomy]:
-    """Return the vessel of each world; worlds with the same differences share one."""
-    made = {id(each.anatomy): SharedVessels(each.anatomy) for each in navigations}
-    return [made[id(each.anatomy)].of(world) for each, world in zip(navigations, worlds, strict=True)]

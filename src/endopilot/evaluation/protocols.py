@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from endopilot.dataset.loader import Dataset
 from endopilot.devices.robot import RobotConfig
 from endopilot.evaluation.metrics import tip_events
-from endopilot.evaluation.replay import Control, Recorded, Samples, exposures, replanned, replay
+from endopilot.evaluation.replay import Control, Recorded, exposures, replanned, replay
 from endopilot.evaluation.results import REPLAYED, SplitResult, TipSeries
 from endopilot.models.config import WINDOW
 from endopilot.models.episodes import Episodes, OpenLoop, Predictor
@@ -109,7 +109,8 @@ def run_protocols(
     driven = {name: recorded.drivable(control) for name, control in planned.items()}
     replays = replay(recorded, driven | dict.fromkeys(REPLAYED, data.command[:, WINDOW:, 0]), advance)
     true = (data.tip_abscissa, data.tip_offset, data.lumen_radius, data.base_force, data.base_torque)
-    *true_tip, true_force, true_torque = (_after_given(values[:, :, 0]) for values in true)
+    *true_tip, true_force, true_torque = (values[:, WINDOW:, 0].astype(float) for values in true)
+    moving = (data.inserted_length, data.rotation, data.tip_abscissa, data.tip_direction)
     return SplitResult(
         sample_period_s=data.sample_period_s,
         anatomies=recorded.names,
@@ -123,7 +124,7 @@ def run_protocols(
         base_force={"true": true_force} | {name: r.base_force for name, r in replays.items()},
         base_torque={"true": true_torque} | {name: r.base_torque for name, r in replays.items()},
         tip_distance={name: r.distance for name, r in replays.items()},
-        events=tip_events(*(signal[:, WINDOW - 1 :] for signal in _moving(data))),
+        events=tip_events(*(signal[:, WINDOW - 1 :, 0] for signal in moving)),
     )
 
 
@@ -153,10 +154,6 @@ def _predicted(
     return found
 
 
-def _moving(data: Dataset) -> tuple[np.ndarray, ...]:
-    return tuple(each[:, :, 0] for each in (data.inserted_length, data.rotation, data.tip_abscissa, data.tip_direction))
-
-
 def _series(
     tip: Float[np.ndarray, "episodes samples 2"],
     trees: Sequence[VesselTree],
@@ -173,7 +170,3 @@ def _series(
             line = tree.path(int(into))
             radius[here] = np.interp(abscissa[here], line.abscissa, line.radius)
     return TipSeries(abscissa, offset, radius)
-
-
-def _after_given(values: Float[np.ndarray, "episodes all_samples"]) -> Samples:
-    return values[:, WINDOW:].astype(float)

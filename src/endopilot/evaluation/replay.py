@@ -100,15 +100,12 @@ class Recorded:
         for index, anatomy in enumerate(self.anatomies):
             mine = np.flatnonzero(self.anatomy_of == index)
             worlds = self.data.select(np.tile(mine, len(controls)))
-            driven = np.nan_to_num(np.concatenate([self._whole(control)[mine] for control in controls.values()]))
+            after = np.concatenate([control[mine] for control in controls.values()])
+            driven = np.nan_to_num(np.concatenate([worlds.command[:, :WINDOW, 0], after], axis=1))
             friction = np.concatenate([REPLAYED.get(name, 1.0) * self.data.friction[mine] for name in controls])
             yield mine, simulate_again(worlds, anatomy, driven[:, :, None], friction=friction)
             if advance:
                 advance(1, anatomy.name)
-
-    def _whole(self, control: Control) -> Float[np.ndarray, "episodes all_samples 2"]:
-        """Return the recorded commands while states are given, followed by `control`."""
-        return np.concatenate([self.data.command[:, :WINDOW, 0], control], axis=1)
 
 
 @dataclass(frozen=True, eq=False)

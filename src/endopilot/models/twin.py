@@ -218,7 +218,8 @@ class TwinPredictor:
         """Drive wires of these parameters along the desired tips from a sample on."""
         desired = episodes.tip[:, begin:].astype(float)
         tip, control = np.empty(desired.shape), np.empty(desired.shape)
-        wires = {stiffness: self._wire(stiffness) for stiffness in np.unique(likeliest[:, 1])}
+        wire, stiffnesses = self.device, np.unique(likeliest[:, 1]).tolist()
+        wires = {each: wire.with_tip(bend_rad=wire.tip_bend_rad, stiffness_factor=each) for each in stiffnesses}
         for anatomy, chosen in _by_anatomy(episodes):
             data, ours = episodes.select(chosen), likeliest[chosen]
             tip[chosen], control[chosen] = track(
@@ -251,9 +252,6 @@ class TwinPredictor:
         level = np.linspace(1 - self.config.stiffness_spread, 1 + self.config.stiffness_spread, LEVELS)
         members[..., 1] = level[np.abs(members[..., 1, None] - level).argmin(axis=-1)]
         return members
-
-    def _wire(self, stiffness: float) -> Wire:
-        return self.device.with_tip(bend_rad=self.device.tip_bend_rad, stiffness_factor=float(stiffness))
 
     def _simulate(
         self, anatomy: Anatomy, data: Episodes, members: Members, samples: int

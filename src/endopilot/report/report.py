@@ -37,7 +37,6 @@ from endopilot.report.scene import navigation_scene, scene_html, visible_devices
 from endopilot.report.still import render_still
 from endopilot.report.tables import stage_table
 from endopilot.simulation.trajectory import Trajectory
-from endopilot.types import Anatomy
 
 STILL_FILE = "scene.png"
 
@@ -166,7 +165,10 @@ def _scene(content: ReportContent, still: Path, remarks: list[str]) -> dict[str,
     if folder is None:
         return None
     anatomy, replay = read_anatomy(folder), content.replay
-    figure = navigation_scene(anatomy, replay)
+    figure, caption = navigation_scene(anatomy, replay), f"The vessel of {anatomy.name}."
+    if replay is not None:
+        seconds = replay.valid.shape[1] * replay.period_s
+        caption = f"{seconds:g} s of navigation in {anatomy.name}, simulated with the Cosserat rod core."
     problem = render_still(anatomy, _farthest(replay), still)
     if problem is not None:
         remarks.append(problem)
@@ -174,7 +176,7 @@ def _scene(content: ReportContent, still: Path, remarks: list[str]) -> dict[str,
         "html": scene_html(figure),
         "plotly": Markup(get_plotlyjs()),
         "still": None if problem else image(still.read_bytes(), f"The vessel of {anatomy.name} with the wire in it"),
-        "caption": _scene_caption(anatomy, replay),
+        "caption": caption,
     }
 
 
@@ -184,13 +186,6 @@ def _farthest(replay: Trajectory | None) -> list[np.ndarray]:
         return []
     depth = np.where(replay.valid[0], replay.tip.abscissa[0, :, 0], -np.inf)
     return visible_devices(replay, 0, int(np.argmax(depth)))
-
-
-def _scene_caption(anatomy: Anatomy, replay: Trajectory | None) -> str:
-    if replay is None:
-        return f"The vessel of {anatomy.name}."
-    seconds = replay.valid.shape[1] * replay.period_s
-    return f"{seconds:g} s of navigation in {anatomy.name}, simulated with the Cosserat rod core."
 
 
 def _stored_figure(evaluation: Path | None, name: str) -> Markup | None:
