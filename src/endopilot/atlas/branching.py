@@ -24,6 +24,12 @@ _BEND_MM = 4.0
 """Two places of one vessel that lie farther apart along it than this and twice their radii must not touch, mm."""
 
 
+_RIGHT_SHARE, _BALANCED_SHARE = 0.88, 0.06
+"""Shares of right and balanced dominance; the rest is left. Chosen within the range that the literature reports."""
+_FEMALE_CALIBRE = 0.91
+"""Women's coronary lumens against men's (Dodge JT et al., Circulation 1992;86:232-46)."""
+
+
 class NoShape(Exception):
     """The drawn shape is impossible, or lumens collide: draw again."""
 
@@ -98,6 +104,17 @@ def truncated(generator: np.random.Generator, mean: float, sd: float, low: float
         value = generator.normal(mean, sd)
         if low <= value <= high:
             return float(value)
+
+
+def coronary_dominance(u: float) -> str:
+    """Return right, balanced or left dominance for a number between 0 and 1."""
+    return "right" if u < _RIGHT_SHARE else "balanced" if u < _RIGHT_SHARE + _BALANCED_SHARE else "left"
+
+
+def coronary_calibre(generator: np.random.Generator, mean: float, low: float, high: float) -> float:
+    """Draw a patient's coronary lumen against the average, by sex."""
+    sex = _FEMALE_CALIBRE if generator.random() < 0.5 else 1.0
+    return float(np.clip(mean * sex / (0.5 + 0.5 * _FEMALE_CALIBRE) * (1 + 0.1 * generator.normal()), low, high))
 
 
 def free_origin(generator: np.random.Generator, mean_mm: float, sd_mm: float, taken: Sequence[int]) -> int:

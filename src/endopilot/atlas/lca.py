@@ -27,6 +27,8 @@ from endopilot.atlas.branching import (
     SidePlan,
     Vessel,
     build_tree,
+    coronary_calibre,
+    coronary_dominance,
     free_origin,
     mouth,
     narrowed,
@@ -53,10 +55,6 @@ LCX_DIAMETER_MM = {
 }
 """The same along the circumflex artery from its origin to its end, by dominance."""
 
-_RIGHT_SHARE, _BALANCED_SHARE = 0.88, 0.06
-"""Shares of right and balanced dominance; the rest is left: as in the right coronary arteries of this atlas."""
-_FEMALE_CALIBRE = 0.91
-"""Women's lumens against men's (Dodge 1992)."""
 _SIZE_SD, _TURN_SD_DEG, _WIGGLE_MM = 0.085, 6.0, (0.5, 1.3)
 """Spread of the heart's size, of its position about each axis (from the SD of Dodge's positions), of the wiggles."""
 
@@ -110,8 +108,7 @@ def make_lca(
     Args:
         stenosis_share: probability of a stenosis, in the anterior descending artery or the circumflex.
     """
-    u = generator.random()
-    dominance = "right" if u < _RIGHT_SHARE else "balanced" if u < _RIGHT_SHARE + _BALANCED_SHARE else "left"
+    dominance = coronary_dominance(generator.random())
     # Drawn once, so that shapes that fail do not bias it.
     main_mm = None if population.left_main_mm is None else drawn_from(generator, population.left_main_mm)
     draw = partial(_draw, generator, dominance, main_mm, stenosis_share, population)
@@ -126,7 +123,7 @@ def _draw(
     population: Population,
 ) -> tuple[VesselTree, dict[str, Any]]:
     trunk = _trunk(generator, dominance, main_mm, population)
-    calibre = _calibre(generator)
+    calibre = coronary_calibre(generator, 1.0, 0.65, 1.4)
     lad = _lad(generator, trunk, calibre)
     flare = factor(generator, population.left_main_flare) - 1
     if flare:
@@ -222,12 +219,6 @@ def _bent(
         forks = [fork for fork in forks_of(plans, index) if fork.index > first]
         bent_lines.append(bent(generator, line, radius, population, forks=forks, first=first))
     return replace(trunk, whole_lad=bent_lines[0], whole_lcx=bent_lines[1])
-
-
-def _calibre(generator: np.random.Generator) -> float:
-    """Return the patient's lumen against the average."""
-    sex = _FEMALE_CALIBRE if generator.random() < 0.5 else 1.0
-    return float(np.clip(sex / (0.5 + 0.5 * _FEMALE_CALIBRE) * (1 + 0.1 * generator.normal()), 0.65, 1.4))
 
 
 def _lad(generator: np.random.Generator, trunk: _Trunk, calibre: float) -> Vessel:

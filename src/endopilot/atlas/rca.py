@@ -27,6 +27,8 @@ from endopilot.atlas.branching import (
     SidePlan,
     Vessel,
     build_tree,
+    coronary_calibre,
+    coronary_dominance,
     free_origin,
     stenoses,
     truncated,
@@ -46,12 +48,8 @@ CURVATURE, CURVATURE_SD = 0.061, 0.017
 DIAMETER_MM = {0.1: 4.0, 0.2: 3.8, 0.5: 3.5, 0.7: 2.7, 0.9: 2.3}
 """Lumen diameter, mm, at fractions of the path from the ostium to the farthest tip."""
 
-_RIGHT_SHARE, _BALANCED_SHARE = 0.88, 0.06
-"""Shares of right and balanced dominance; the rest is left. Chosen within the range that the literature reports."""
 _CALIBRE = {"right": 1.025, "balanced": 0.9, "left": 0.74}
 """Lumen against the average of all patients (Dodge 1992: balanced 0.78, left 0.70 of right dominance)."""
-_FEMALE_CALIBRE = 0.91
-"""Women's lumens against men's (Dodge 1992)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +79,7 @@ def make_rca(
 
 
 def _targets(generator: np.random.Generator) -> _Targets:
-    dominance = _dominance(generator.random())
+    dominance = coronary_dominance(generator.random())
     if dominance == "left":
         # A small right coronary ends before the crux.
         length, ends_in = 112.0 + abs(float(generator.normal(0, 10))), "3"
@@ -126,10 +124,6 @@ def _draw(
         "ectasias": wide,
     }
     return tree, drawn
-
-
-def _dominance(u: float) -> str:
-    return "right" if u < _RIGHT_SHARE else "balanced" if u < _RIGHT_SHARE + _BALANCED_SHARE else "left"
 
 
 def _main_vessel(generator: np.random.Generator, targets: _Targets) -> tuple[Float[np.ndarray, "n 3"], int]:
@@ -182,9 +176,7 @@ def _main_radius(
     generator: np.random.Generator, dominance: str, main: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n"], float]:
     """Return the lumen radius along the main vessel, mm, and the patient's calibre against the average."""
-    sex = _FEMALE_CALIBRE if generator.random() < 0.5 else 1.0
-    calibre = _CALIBRE[dominance] * sex / (0.5 + 0.5 * _FEMALE_CALIBRE) * (1 + 0.1 * generator.normal())
-    calibre = float(np.clip(calibre, 0.55, 1.4))
+    calibre = coronary_calibre(generator, _CALIBRE[dominance], 0.55, 1.4)
     share = np.linspace(0.0, 1.0, len(main))
     diameter = PchipInterpolator([0.0, *DIAMETER_MM, 1.0], [4.1, *DIAMETER_MM.values(), 2.15])(share)
     if dominance == "left":

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from endopilot.belief import monitoring
+from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import CALIBRATION_FILE, Calibration, check_enough
 from endopilot.belief.monitoring import AdviseConfig, Monitored
 from endopilot.dataset.loader import Dataset, read_dataset
@@ -69,30 +70,25 @@ def advise(
     calibration = monitoring.calibrate(fitted, own, config.adviser)
     shares = sorted({*SHARES, calibration.offset_share})
     with progress("Advising", len(PERIODS) + len(shares) + len(THRESHOLDS) + 1) as advance:
-        curves: dict[str, list[dict[str, float]]] = {"periodic": [], "adviser": []}
-        thresholds: list[dict[str, float]] = []
-        for period in PERIODS:
-            curves["periodic"].append(
-                monitoring.measure_policy(test, monitoring.periodic_policy(test, period), config.adviser)
-            )
+
+        def measured(policy: monitoring.ExposurePolicy, events: AdviserConfig = config.adviser) -> dict[str, float]:
+            point = monitoring.measure_policy(test, policy, events)
             advance()
-        for share in shares:
-            bands = replace(calibration, offset_share=share)
-            test.model.reset()
-            policy = monitoring.adviser_policy(test, bands, config.adviser)
-            point = monitoring.measure_policy(test, policy, config.adviser)
-            curves["adviser"].append({"offset_share": share, **point})
-            advance()
-        for ratio, mm in THRESHOLDS:
-            other = replace(config.adviser, wall_ratio=ratio, abscissa_mm=mm)
-            test.model.reset()
-            policy = monitoring.adviser_policy(test, calibration, other)
-            point = monitoring.measure_policy(test, policy, other)
-            thresholds.append({"wall_ratio": ratio, "abscissa_mm": mm, **point})
-            advance()
-        oracle = monitoring.oracle_policy(test, config.adviser)
-        curves["oracle"] = [monitoring.measure_policy(test, oracle, config.adviser)]
-        advance()
+            return point
+
+        curves = {"periodic": [measured(monitoring.periodic_policy(test, period)) for period in PERIODS]}
+        bands = {share: replace(calibration, offset_share=share) for share in shares}
+        curves["adviser"] = [
+            {"offset_share": share} | measured(monitoring.adviser_policy(test, each, config.adviser))
+            for share, each in bands.items()
+        ]
+        events = [replace(config.adviser, wall_ratio=ratio, abscissa_mm=mm) for ratio, mm in THRESHOLDS]
+        thresholds = [
+            {"wall_ratio": each.wall_ratio, "abscissa_mm": each.abscissa_mm}
+            | measured(monitoring.adviser_policy(test, calibration, each), each)
+            for each in events
+        ]
+        curves["oracle"] = [measured(monitoring.oracle_policy(test, config.adviser))]
     otherwise = [
         _measure_otherwise(monitoring.monitor(predictor, other, config), other, episodes, calibration, config)
         for other in others
@@ -158,7 +154,6 @@ def _measure_otherwise(
     """Return what the calibrated adviser misses and costs on navigations that were made otherwise, and how."""
     theirs, ours = (_leaves(data.manifest["config"]) for data in (made, calibrated))
     cover = monitoring.coverage(test, calibration)
-    test.model.reset()
     policy = monitoring.adviser_policy(test, calibration, config.adviser)
     return {
         "dataset": str(made.folder),

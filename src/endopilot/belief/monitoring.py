@@ -225,7 +225,6 @@ def least_offset_share(own: Monitored, bands: Calibration, config: AdviserConfig
     least = OFFSET_SHARES[0]
     with progress("Using less of the bands", len(OFFSET_SHARES)) as advance:
         for share in OFFSET_SHARES:
-            own.model.reset()
             found = follow_policy(own, adviser_policy(own, replace(bands, offset_share=share), config), config)
             counts = np.array([np.sum(found.count(owner == index), axis=0) for index in range(len(names))])
             if surely_missed(counts[:, 1], counts[:, 0]) > config.missed:
@@ -328,6 +327,7 @@ def measure_policy(monitored: Monitored, policy: ExposurePolicy, config: Adviser
 
 def adviser_policy(monitored: Monitored, calibration: Calibration, config: AdviserConfig) -> ExposurePolicy:
     """Return the adviser as an exposure policy: a `Watch` of each navigation, which tests the model by innovations."""
+    monitored.model.reset()
     episodes, last = monitored.episodes, WINDOW - 1
     branch = episodes.branch[:, last].astype(int)
 

@@ -213,12 +213,7 @@ class CausalPredictor:
     wires: SimulatedWires = field(default_factory=SimulatedWires, repr=False)
 
     def predict(self, episodes: Episodes, observed: Observed | EachObserved) -> Prediction:
-        """Predict the tips of episodes from their controls and from the observed tips.
-
-        Args:
-            episodes: their controls, and their tips where `observed`; no other tip is read.
-            observed: samples at which the tip was observed, of all episodes alike or of each.
-        """
+        """Predict the tips of episodes from their controls and from the observed tips: see `ProbabilisticPredictor`."""
         network = _needed(self.forward, "forward")
         given = np.broadcast_to(observed, episodes.branch.shape)
         unfolded, found = self._run(network, "forward", episodes, given)

@@ -140,12 +140,7 @@ class TwinPredictor:
     tracked: WeakKeyDictionary[Episodes, OpenLoop] = field(default_factory=WeakKeyDictionary, repr=False)
 
     def predict(self, episodes: Episodes, observed: Observed | EachObserved) -> TwinPrediction:
-        """Predict the tips of episodes from their controls and from the observed tips.
-
-        Args:
-            episodes: their controls, and their tips where `observed`; no other tip is read.
-            observed: samples at which the tip was observed, of all episodes alike or of each.
-        """
+        """Predict the tips of episodes from their controls and from the observed tips: see `ProbabilisticPredictor`."""
         tip, spread = np.full(episodes.tip.shape, np.nan), np.full(episodes.tip.shape, np.nan)
         parameters, jump = np.full((len(episodes), 3), np.nan), np.zeros(episodes.branch.shape)
         seen = np.broadcast_to(observed, episodes.branch.shape)
