@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from endopilot.angiograms.config import AngiogramsConfig
-from endopilot.angiograms.draw import CineDraw, motion_of
-from endopilot.angiograms.drive import Driven, drive_devices
+from endopilot.angiograms.draw import CineDraw, Driven, drive_devices, motion_of
 from endopilot.angiograms.flow import Flow
 from endopilot.angiograms.masks import CONTRAST_SHARE, LUMEN_MM, stroke
 from endopilot.lines import length_along, places_on

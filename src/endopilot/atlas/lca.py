@@ -21,23 +21,8 @@ from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from endopilot.anatomy.labels_tree import LCA_SECTIONS
+from endopilot.atlas import branching
 from endopilot.atlas import curves as shape
-from endopilot.atlas.branching import (
-    NoShape,
-    SidePlan,
-    Vessel,
-    build_tree,
-    coronary_calibre,
-    coronary_dominance,
-    free_origin,
-    mouth,
-    narrowed,
-    truncated,
-    uneven,
-    until_it_fits,
-    wiggled,
-    with_side_branches,
-)
 from endopilot.atlas.heart_reference import FORK, INFERIOR, LAD, LCX, HeartFit, fit_left_heart
 from endopilot.atlas.population import Population, SideKind, side_kinds
 from endopilot.atlas.variation import bent, drawn_from, ectasia, factor, forks_of, opened_fork, varied
@@ -108,11 +93,11 @@ def make_lca(
     Args:
         stenosis_share: probability of a stenosis, in the anterior descending artery or the circumflex.
     """
-    dominance = coronary_dominance(generator.random())
+    dominance = branching.coronary_dominance(generator.random())
     # Drawn once, so that shapes that fail do not bias it.
     main_mm = None if population.left_main_mm is None else drawn_from(generator, population.left_main_mm)
     draw = partial(_draw, generator, dominance, main_mm, stenosis_share, population)
-    return until_it_fits(draw, "left coronary artery")
+    return branching.until_it_fits(draw, "left coronary artery")
 
 
 def _draw(
@@ -123,7 +108,7 @@ def _draw(
     population: Population,
 ) -> tuple[VesselTree, dict[str, Any]]:
     trunk = _trunk(generator, dominance, main_mm, population)
-    calibre = coronary_calibre(generator, 1.0, 0.65, 1.4)
+    calibre = branching.coronary_calibre(generator, 1.0, 0.65, 1.4)
     lad = _lad(generator, trunk, calibre)
     flare = factor(generator, population.left_main_flare) - 1
     if flare:
@@ -142,9 +127,9 @@ def _draw(
     if generator.random() < stenosis_share:
         fork = trunk.fork / len(lad.points)
         which, shares = (0, (fork + 0.06, 0.65)) if generator.random() < 0.6 else (1, (0.15, 0.6))
-        narrow, vessels = narrowed(generator, vessels, which, shares, population.tandem_share)
-    vessels = with_side_branches(generator, vessels, plans, population.carina_mm)
-    tree = build_tree(vessels, LCA_SECTIONS)
+        narrow, vessels = branching.narrowed(generator, vessels, which, shares, population.tandem_share)
+    vessels = branching.with_side_branches(generator, vessels, plans, population.carina_mm)
+    tree = branching.build_tree(vessels, LCA_SECTIONS)
     along, bends = length_along(lad.points), shape.curvature(lad.points)
     drawn = {
         "dominance": dominance,
@@ -173,39 +158,39 @@ def _trunk(generator: np.random.Generator, dominance: str, main_mm: float | None
     size = float(np.exp(_SIZE_SD * np.clip(generator.normal(), -2.5, 2.5)))
     turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, _TURN_SD_DEG, 3)))
     if main_mm is None:
-        main_mm = truncated(generator, LEFT_MAIN_MM, LEFT_MAIN_SD_MM, 5.0, 22.0)
+        main_mm = branching.truncated(generator, LEFT_MAIN_MM, LEFT_MAIN_SD_MM, 5.0, 22.0)
     lad, lcx = ((template - template[0]) * size for template in _templates())
     end_of_main = main_mm * FORK / np.linalg.norm(FORK)
     bow = np.array([[0.0, 0.0, 0.0], 0.5 * end_of_main + main_mm * np.array([0.0, 0.06, 0.08])])
     stride = round(6.0 * size)
-    lad = wiggled(
+    lad = branching.wiggled(
         generator, shape.curve_through(np.concatenate([bow, lad[::stride] + end_of_main])), _WIGGLE_MM, quiet_mm=9.0
     )
     fork = round(main_mm / shape.STEP_MM)
     crux_at = (LCX[-1] - FORK) * size
-    lcx = wiggled(generator, shape.curve_through(lcx[::stride]), _WIGGLE_MM, quiet_mm=7.0)
+    lcx = branching.wiggled(generator, shape.curve_through(lcx[::stride]), _WIGGLE_MM, quiet_mm=7.0)
     crux = int(np.argmin(np.linalg.norm(lcx - crux_at, axis=1)))
     lad, lcx = turn.apply(lad), turn.apply(lcx + lad[fork])
     if population.left_main_turns_deg is not None:
         wide = 0.5 * LEFT_MAIN_DIAMETER_MM
         lad, lcx = opened_fork(generator, lad, lcx, fork, wide, population.left_main_turns_deg)
     if dominance == "left":
-        end_mm = shape.STEP_MM * crux + size * truncated(generator, 48.0, 10.0, 28.0, 68.0)
+        end_mm = shape.STEP_MM * crux + size * branching.truncated(generator, 48.0, 10.0, 28.0, 68.0)
     else:
-        end_mm = size * truncated(generator, *_ENDS[dominance])
+        end_mm = size * branching.truncated(generator, *_ENDS[dominance])
     # The anterior descending artery ends before, at or beyond the apex.
     last = fork + round((len(lad) - 1 - fork) * generator.uniform(0.74, 1.0))
     trunk = _Trunk(lad, lcx, (last + 1, round(end_mm / shape.STEP_MM) + 1), fork, crux, size, turn)
     if max(shape.curvature(trunk.lad).max(), shape.curvature(trunk.lcx).max()) > _SHARPEST_PER_MM:
-        raise NoShape
+        raise branching.NoShape
     return trunk
 
 
 def _bent(
     generator: np.random.Generator,
     trunk: _Trunk,
-    vessels: Sequence[Vessel],
-    plans: Sequence[SidePlan],
+    vessels: Sequence[branching.Vessel],
+    plans: Sequence[branching.SidePlan],
     population: Population,
 ) -> _Trunk:
     """Return the main vessels with a patient's bends beyond the left main's fork."""
@@ -221,7 +206,7 @@ def _bent(
     return replace(trunk, whole_lad=bent_lines[0], whole_lcx=bent_lines[1])
 
 
-def _lad(generator: np.random.Generator, trunk: _Trunk, calibre: float) -> Vessel:
+def _lad(generator: np.random.Generator, trunk: _Trunk, calibre: float) -> branching.Vessel:
     along = length_along(trunk.lad)
     beyond = along - along[trunk.fork]
     whole = trunk.size * float(length_along(_templates()[0])[-1])
@@ -229,29 +214,31 @@ def _lad(generator: np.random.Generator, trunk: _Trunk, calibre: float) -> Vesse
     # The left main's lumen changes into that of the anterior descending artery just behind the fork.
     share = np.clip((beyond + 1.0) / 4.0, 0.0, 1.0)
     diameter = LEFT_MAIN_DIAMETER_MM + (own - LEFT_MAIN_DIAMETER_MM) * share**2 * (3 - 2 * share)
-    return Vessel(trunk.lad, 0.5 * diameter * calibre * uneven(generator, along), ())
+    return branching.Vessel(trunk.lad, 0.5 * diameter * calibre * branching.uneven(generator, along), ())
 
 
-def _lcx(generator: np.random.Generator, trunk: _Trunk, lad: Vessel, dominance: str, calibre: float) -> Vessel:
+def _lcx(
+    generator: np.random.Generator, trunk: _Trunk, lad: branching.Vessel, dominance: str, calibre: float
+) -> branching.Vessel:
     along = length_along(trunk.lcx)
     profile = LCX_DIAMETER_MM[dominance]
     own = PchipInterpolator(list(profile), list(profile.values()))(along / along[-1])
-    radius = np.minimum(0.5 * own * calibre * uneven(generator, along), lad.radius[trunk.fork])
+    radius = np.minimum(0.5 * own * calibre * branching.uneven(generator, along), lad.radius[trunk.fork])
     forward = shape.tangents(trunk.lad)[trunk.fork]
-    radius = mouth(radius, trunk.lcx, forward, float(lad.radius[trunk.fork]))
-    return Vessel(trunk.lcx, radius, (), 0, trunk.fork)
+    radius = branching.mouth(radius, trunk.lcx, forward, float(lad.radius[trunk.fork]))
+    return branching.Vessel(trunk.lcx, radius, (), 0, trunk.fork)
 
 
 def _plan_branches(
     generator: np.random.Generator,
     trunk: _Trunk,
-    vessels: list[Vessel],
+    vessels: list[branching.Vessel],
     dominance: str,
     calibre: float,
     population: Population,
-) -> list[SidePlan]:
+) -> list[branching.SidePlan]:
     """Draw which branches there are, where they leave, how long and how wide they are; named in their order."""
-    plans: list[SidePlan] = []
+    plans: list[branching.SidePlan] = []
     presence = factor(generator, population.side_share)
     for parent, kinds in enumerate((side_kinds("lca", "lad"), side_kinds("lca", "lcx"))):
         first = trunk.fork if parent == 0 else 0
@@ -260,7 +247,7 @@ def _plan_branches(
             if generator.random() > kind.share * presence or (name == "14 posterior" and dominance == "right"):
                 continue
             mean, sd = (trunk.size * value for value in kind.origin_mm)
-            origin = first + free_origin(generator, mean, sd, taken)
+            origin = first + branching.free_origin(generator, mean, sd, taken)
             if origin * shape.STEP_MM > length_along(vessels[parent].points)[-1] - 8.0:
                 continue
             taken.append(origin - first)
@@ -284,21 +271,23 @@ def _plan(
     origin: int,
     trunk: _Trunk,
     calibre: float,
-) -> SidePlan:
+) -> branching.SidePlan:
     mean, sd = kind.length_mm
     septal = section == "septal"
-    return SidePlan(
+    return branching.SidePlan(
         section=section,
         parent=parent,
         origin=origin,
-        length_mm=trunk.size * truncated(generator, mean, sd, 0.5 * mean, 1.5 * mean),
+        length_mm=trunk.size * branching.truncated(generator, mean, sd, 0.5 * mean, 1.5 * mean),
         diameter_mm=kind.diameter_mm * (0.6 + 0.4 * calibre) * (1 + 0.1 * float(generator.normal())),
         courses=tuple((begin, tuple(trunk.turn.apply(course))) for begin, course in kind.courses),
         angle_deg=(60.0, 90.0) if septal else (40.0, 70.0),
     )
 
 
-def _with_sections(trunk: _Trunk, vessels: list[Vessel], plans: list[SidePlan], dominance: str) -> list[Vessel]:
+def _with_sections(
+    trunk: _Trunk, vessels: list[branching.Vessel], plans: list[branching.SidePlan], dominance: str
+) -> list[branching.Vessel]:
     """Name the points of the two main vessels (SCCT), without branches by the lengths of `labels_coronary`."""
     lad, lcx = vessels
     place = np.arange(len(lad.points))

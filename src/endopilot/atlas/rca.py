@@ -21,21 +21,8 @@ from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
 from endopilot.anatomy.labels_tree import RCA_SECTIONS
+from endopilot.atlas import branching
 from endopilot.atlas import curves as shape
-from endopilot.atlas.branching import (
-    NoShape,
-    SidePlan,
-    Vessel,
-    build_tree,
-    coronary_calibre,
-    coronary_dominance,
-    free_origin,
-    stenoses,
-    truncated,
-    uneven,
-    until_it_fits,
-    with_side_branches,
-)
 from endopilot.atlas.heart_reference import BEYOND_CRUX, TO_CRUX, fit_heart
 from endopilot.atlas.population import Courses, Population, side_kinds, vessel_data
 from endopilot.atlas.variation import bent, ectasia, factor, forks_of, varied
@@ -73,25 +60,25 @@ def make_rca(
     for _ in range(10):
         targets = _targets(generator)
         draw = partial(_draw, generator, targets, stenosis_share, population)
-        with suppress(NoShape):
-            return until_it_fits(draw, "right coronary artery")
+        with suppress(branching.NoShape):
+            return branching.until_it_fits(draw, "right coronary artery")
     raise RuntimeError("no right coronary artery found in 600 draws")
 
 
 def _targets(generator: np.random.Generator) -> _Targets:
-    dominance = coronary_dominance(generator.random())
+    dominance = branching.coronary_dominance(generator.random())
     if dominance == "left":
         # A small right coronary ends before the crux.
         length, ends_in = 112.0 + abs(float(generator.normal(0, 10))), "3"
     else:
         # The mean makes up for the shorter left-dominant arteries.
-        length = truncated(generator, LENGTH_MM + 2.4, LENGTH_SD_MM, *LENGTH_RANGE_MM)
+        length = branching.truncated(generator, LENGTH_MM + 2.4, LENGTH_SD_MM, *LENGTH_RANGE_MM)
         ends_in = "4" if dominance == "balanced" or generator.random() < 0.6 else "16"
     return _Targets(
         dominance=dominance,
         length_mm=length,
-        tortuosity=truncated(generator, TORTUOSITY, TORTUOSITY_SD, TORTUOSITY - 0.45, TORTUOSITY + 0.45),
-        curvature_per_mm=truncated(generator, CURVATURE, CURVATURE_SD, CURVATURE - 0.025, CURVATURE + 0.025),
+        tortuosity=branching.truncated(generator, TORTUOSITY, TORTUOSITY_SD, TORTUOSITY - 0.45, TORTUOSITY + 0.45),
+        curvature_per_mm=branching.truncated(generator, CURVATURE, CURVATURE_SD, CURVATURE - 0.025, CURVATURE + 0.025),
         ends_in=ends_in,
     )
 
@@ -103,7 +90,7 @@ def _draw(
     healthy, calibre = _main_radius(generator, targets.dominance, main)
     radius, narrow = healthy, []
     if generator.random() < stenosis_share:
-        narrow, narrowing = stenoses(generator, length_along(main), (0.12, 0.75), population.tandem_share)
+        narrow, narrowing = branching.stenoses(generator, length_along(main), (0.12, 0.75), population.tandem_share)
         radius = healthy * narrowing
     wide, widening = ectasia(generator, length_along(main), population)
     radius = radius * widening
@@ -111,8 +98,10 @@ def _draw(
     main = bent(generator, main, radius, population, forks=forks_of(plans, 0))
     heart = fit_heart(main, 0.5 * crux, targets.ends_in)
     plans = [replace(plan, depth=heart.solid_depth) for plan in plans]
-    vessels = [Vessel(main, radius, _main_sections(main, crux, targets.ends_in))]
-    tree = build_tree(with_side_branches(generator, vessels, plans, population.carina_mm), RCA_SECTIONS)
+    vessels = [branching.Vessel(main, radius, _main_sections(main, crux, targets.ends_in))]
+    tree = branching.build_tree(
+        branching.with_side_branches(generator, vessels, plans, population.carina_mm), RCA_SECTIONS
+    )
     bends = shape.curvature(main)
     drawn = {
         "dominance": targets.dominance,
@@ -167,7 +156,7 @@ def _main_vessel(generator: np.random.Generator, targets: _Targets) -> tuple[Flo
     solution = solve(misfit, np.array([np.log(length / keep) - 0.05, 0.0, 0.5]), tol=1e-3, options={"maxfev": 60})
     points = curve(np.clip(solution.x, (-1, -2, -4), (1, 2, 3)))
     if np.abs(misfit(solution.x)).max() > 0.01 or shape.curvature(points).max() > 0.28:
-        raise NoShape
+        raise branching.NoShape
     crux = len(points) - 1 if ends_in == "3" else round(len(points) * template_crux / keep)
     return points, crux
 
@@ -176,12 +165,12 @@ def _main_radius(
     generator: np.random.Generator, dominance: str, main: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n"], float]:
     """Return the lumen radius along the main vessel, mm, and the patient's calibre against the average."""
-    calibre = coronary_calibre(generator, _CALIBRE[dominance], 0.55, 1.4)
+    calibre = branching.coronary_calibre(generator, _CALIBRE[dominance], 0.55, 1.4)
     share = np.linspace(0.0, 1.0, len(main))
     diameter = PchipInterpolator([0.0, *DIAMETER_MM, 1.0], [4.1, *DIAMETER_MM.values(), 2.15])(share)
     if dominance == "left":
         diameter = diameter * (1 - 0.2 * share)
-    return 0.5 * diameter * calibre * uneven(generator, length_along(main)), calibre
+    return 0.5 * diameter * calibre * branching.uneven(generator, length_along(main)), calibre
 
 
 def _main_sections(main: Float[np.ndarray, "n 3"], crux: int, ends_in: str) -> list[str]:
@@ -199,16 +188,16 @@ def _plan_branches(
     targets: _Targets,
     calibre: float,
     population: Population,
-) -> list[SidePlan]:
+) -> list[branching.SidePlan]:
     """Draw which branches there are, where they leave, how long and how wide they are."""
-    plans: list[SidePlan] = []
+    plans: list[branching.SidePlan] = []
     end_mm = (len(radius) - 1) * shape.STEP_MM
     presence = factor(generator, population.side_share)
     for section, kind in side_kinds("rca", "sides").items():
         if generator.random() > kind.share * presence:
             continue
-        origin = free_origin(generator, *kind.origin_mm, [plan.origin for plan in plans])
-        length = truncated(generator, *kind.length_mm, 0.5 * kind.length_mm[0], 1.5 * kind.length_mm[0])
+        origin = branching.free_origin(generator, *kind.origin_mm, [plan.origin for plan in plans])
+        length = branching.truncated(generator, *kind.length_mm, 0.5 * kind.length_mm[0], 1.5 * kind.length_mm[0])
         # The main vessel's tip stays the farthest.
         length = min(length, 0.95 * end_mm - origin * shape.STEP_MM)
         diameter = kind.diameter_mm * (0.6 + 0.4 * calibre) * (1 + 0.1 * float(generator.normal()))
@@ -221,5 +210,7 @@ def _plan_branches(
     return plans
 
 
-def _plan(section: str, origin: int, length_mm: float, diameter_mm: float, courses: Courses) -> SidePlan:
-    return SidePlan(section=section, origin=origin, length_mm=length_mm, diameter_mm=diameter_mm, courses=courses)
+def _plan(section: str, origin: int, length_mm: float, diameter_mm: float, courses: Courses) -> branching.SidePlan:
+    return branching.SidePlan(
+        section=section, origin=origin, length_mm=length_mm, diameter_mm=diameter_mm, courses=courses
+    )

@@ -124,7 +124,8 @@ def resume_session(path: Path, *, ct: Path | None = None) -> Opened:
     recording = read_session(path)
     history = replayed(recording)
     first = next(history)
-    _drop_half_line(path)
+    with path.open("rb+") as stream:  # without what a killed server left behind its last whole line
+        stream.truncate(stream.read().rfind(b"\n") + 1)
     where, make = recording.where, Session
     if where.task is not None and not any("score" in event for event in recording.events):
         make = _attempt(where.task, where.place, recording.config.robot).session
@@ -216,10 +217,3 @@ def _free(output: Path, name: str) -> Path:
     while path.exists():
         number, path = number + 1, output / f"{name}-{number + 1}{SUFFIX}"
     return path
-
-
-def _drop_half_line(path: Path) -> None:
-    """Cut off what a killed server left behind its last whole line."""
-    with path.open("rb+") as stream:
-        whole = stream.read().rfind(b"\n") + 1
-        stream.truncate(whole)

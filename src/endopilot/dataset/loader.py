@@ -12,20 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
+from endopilot.dataset import schema
 from endopilot.dataset.layout import identify, version
-from endopilot.dataset.schema import (
-    INFO_PATH,
-    LEROBOT_VERSION,
-    MANIFEST_PATH,
-    OF_ROBOT,
-    OWN_COLUMNS,
-    STATE,
-    actuation_of,
-    devices_of,
-    made_by_robot,
-    paths_of_file,
-    signal_columns,
-)
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire
 from endopilot.devices.robot import RobotConfig
@@ -193,24 +181,24 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     Raises:
         InputError: the folder holds no finished dataset, or one of another version.
     """
-    if not (folder / MANIFEST_PATH).exists():
+    if not (folder / schema.MANIFEST_PATH).exists():
         if (folder / RECORD_FILE).exists():
             raise InputError(f"{folder}: the dataset is unfinished; run the same `endopilot dataset` command again")
         raise InputError(f"{folder}: no dataset here ({MANIFEST_PATH} is missing); make one with `endopilot dataset`")
-    manifest = read_json(folder / MANIFEST_PATH, keys=("key", "settings"), mend=_MEND)
-    with reading(folder / MANIFEST_PATH, _MEND):
+    manifest = read_json(folder / schema.MANIFEST_PATH, keys=("key", "settings"), mend=_MEND)
+    with reading(folder / schema.MANIFEST_PATH, _MEND):
         made = manifest["settings"].get("version")
         parts = (record[part] for record in manifest["anatomies"] for part in ("name", "sha256", "folder"))
         if not all(isinstance(text, str) for text in (manifest["key"], *parts)):
             raise ValueError("key or anatomies: no text")
     if made != version():
         raise InputError(f"{folder}: made by {made}, which {version()} cannot read; make the dataset again")
-    if not (folder / INFO_PATH).exists():
+    if not (folder / schema.INFO_PATH).exists():
         raise InputError(
             f"{folder / INFO_PATH}: missing from the dataset; run the same `endopilot dataset` command again"
         )
-    info = read_json(folder / INFO_PATH, keys=("features", "fps", "total_episodes", "total_frames"), mend=_MEND)
-    if info.get("codebase_version") != LEROBOT_VERSION:
+    info = read_json(folder / schema.INFO_PATH, keys=("features", "fps", "total_episodes", "total_frames"), mend=_MEND)
+    if info.get("codebase_version") != schema.LEROBOT_VERSION:
         found = info.get("codebase_version")
         raise InputError(f"{folder / INFO_PATH}: codebase_version is {found}, not {LEROBOT_VERSION}; make it again")
     return manifest, info
@@ -235,13 +223,13 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
     from endopilot.dataset.parquet import column_values, read_table
 
     samples, total = manifest["samples_per_episode"], info["total_episodes"]
-    actuation, devices = actuation_of(info["features"]), devices_of(info["features"])
-    by_robot = made_by_robot(info["features"])
+    actuation, devices = schema.actuation_of(info["features"]), schema.devices_of(info["features"])
+    by_robot = schema.made_by_robot(info["features"])
     episodes: dict[str, list[np.ndarray]] = {}
     signal: dict[str, np.ndarray] = {}
     filled = 0
     for number in range(manifest["files"]):
-        data_path, episodes_path = paths_of_file(folder, number)
+        data_path, episodes_path = schema.paths_of_file(folder, number)
         table = read_table(episodes_path, manifest["key"])
         for name in table.column_names:
             episodes.setdefault(name, []).append(column_values(table, name))
@@ -254,7 +242,7 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
         end = filled + table.num_rows
         if end > total:
             break
-        for name in signal_columns(actuation, devices, by_robot=by_robot):
+        for name in schema.signal_columns(actuation, devices, by_robot=by_robot):
             values = column_values(data, name)
             values = values.reshape(table.num_rows, samples, *values.shape[1:])
             if name not in signal:  # in place, so that a large dataset is never held twice
@@ -270,14 +258,14 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
         )
     shape = (total, samples, devices)
     vectors = {name: signal[name].reshape(*shape, -1) for name in ("action", "velocity") if name in signal}
-    recorded = {name: _of_signal(name, signal[column], devices) for column, (name, *_) in OWN_COLUMNS.items()}
-    recorded |= {name: signal["observation.state"].reshape(*shape, -1)[..., k] for k, name in enumerate(STATE)}
+    recorded = {name: _of_signal(name, signal[column], devices) for column, (name, *_) in schema.OWN_COLUMNS.items()}
+    recorded |= {name: signal["observation.state"].reshape(*shape, -1)[..., k] for k, name in enumerate(schema.STATE)}
     if actuation == "force":
         control = vectors["velocity"]
     else:
         slip = np.stack([recorded["slip"], recorded["rotation_slip"]], axis=-1)
         control = (vectors["action"] - slip * info["fps"]).astype(np.float32)
-    recorded |= {name: signal[name].reshape(*shape, 2) for name in OF_ROBOT if by_robot}
+    recorded |= {name: signal[name].reshape(*shape, 2) for name in schema.OF_ROBOT if by_robot}
     prefixes = column_prefixes(devices)
     starts = [f"{prefix}initial_{name}" for prefix in prefixes for name in ("inserted_length_mm", "rotation_rad")]
     return Dataset(

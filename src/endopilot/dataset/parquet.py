@@ -10,15 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from endopilot.dataset.schema import (
-    INDEX_COLUMNS,
-    MANOEUVRES,
-    OF_ROBOT,
-    OWN_COLUMNS,
-    STATE,
-    manoeuvres,
-    signal_columns,
-)
+from endopilot.dataset import schema
 from endopilot.errors import InputError
 from endopilot.progress import Advance
 from endopilot.simulation.config import Actuation
@@ -51,13 +43,13 @@ def sample_table(trajectory: Trajectory, first_episode: int, key: str) -> pa.Tab
         "timestamp": np.tile(np.arange(samples) * trajectory.period_s, worlds),
         "action": trajectory.command,
         "velocity": trajectory.control,
-        "observation.state": np.stack([signals[name] for name in STATE], axis=-1),
-        **{own: signals[name] for own, (name, *_) in OWN_COLUMNS.items()},
+        "observation.state": np.stack([signals[name] for name in schema.STATE], axis=-1),
+        **{own: signals[name] for own, (name, *_) in schema.OWN_COLUMNS.items()},
     }
-    kinds = dict.fromkeys(INDEX_COLUMNS, ("int64", None)) | {"timestamp": ("float32", None)}
+    kinds = dict.fromkeys(schema.INDEX_COLUMNS, ("int64", None)) | {"timestamp": ("float32", None)}
     columns |= trajectory.columns
-    by_robot = set(OF_ROBOT) <= set(trajectory.columns)
-    kinds |= signal_columns(trajectory.set_up.actuation, trajectory.devices, by_robot=by_robot)
+    by_robot = set(schema.OF_ROBOT) <= set(trajectory.columns)
+    kinds |= schema.signal_columns(trajectory.set_up.actuation, trajectory.devices, by_robot=by_robot)
     arrays = {name: column(columns[name], *kinds[name]) for name in columns if name in kinds}
     return marked_table(arrays, key)
 
@@ -70,7 +62,9 @@ def marked_table(columns: Mapping[str, Any], key: str) -> pa.Table:
 def parquet_bytes(table: pa.Table) -> bytes:
     """Return a table as a Parquet file in memory, so that a full disk shows as an ordinary OSError on writing."""
     sink = pa.BufferOutputStream()
-    floats = {field.name for field in table.schema if _is_float(field.type)} - _FEW_VALUES
+    floats = {
+        field.name for field in table.schema if pa.float32() in (field.type, getattr(field.type, "value_type", None))
+    } - _FEW_VALUES
     counters = {name for name in ("index", "episode_index") if name in table.column_names}
     leaf = {name: name if table.schema.field(name).type == pa.float32() else f"{name}.list.element" for name in floats}
     write: Any = pq.write_table  # whose types do not know lists of columns
@@ -83,7 +77,7 @@ def parquet_bytes(table: pa.Table) -> bytes:
         # Bytes of like significance side by side compress best; counters by their differences.
         column_encoding={leaf[name]: "BYTE_STREAM_SPLIT" for name in floats}
         | dict.fromkeys(counters, "DELTA_BINARY_PACKED"),
-        write_statistics=list(INDEX_COLUMNS),
+        write_statistics=list(schema.INDEX_COLUMNS),
     )
     return sink.getvalue().to_pybytes()
 
@@ -108,10 +102,6 @@ def read_table(path: Path, key: str) -> pa.Table:
     return table
 
 
-def _is_float(kind: pa.DataType) -> bool:
-    return kind == pa.float32() or (pa.types.is_fixed_size_list(kind) and kind.value_type == pa.float32())
-
-
 def column_values(table: pa.Table, name: str) -> np.ndarray:
     """Return a column as an array, (rows,) for scalars and (rows, components) for vectors."""
     values = table.column(name).combine_chunks()
@@ -132,19 +122,19 @@ def statistics(
         advance: called once for each file that has been read.
         devices: their number; the manoeuvres are the wire's.
     """
-    sums, count, driven = Sums(), 0, np.zeros(len(MANOEUVRES))
+    sums, count, driven = Sums(), 0, np.zeros(len(schema.MANOEUVRES))
     for path in paths:
         table = read_table(path, key)
         valid = column_values(table, "valid")
         count += int(valid.sum())
         velocity = column_values(table, "velocity" if actuation == "force" else "action")[valid]
-        driven += np.bincount(manoeuvres(velocity), minlength=len(driven))
-        by_robot = set(OF_ROBOT) <= set(table.column_names)
-        for name, (dtype, _) in signal_columns(actuation, devices, by_robot=by_robot).items():
+        driven += np.bincount(schema.manoeuvres(velocity), minlength=len(driven))
+        by_robot = set(schema.OF_ROBOT) <= set(table.column_names)
+        for name, (dtype, _) in schema.signal_columns(actuation, devices, by_robot=by_robot).items():
             if dtype != "bool" and valid.any():
                 sums.add(name, column_values(table, name)[valid])
         advance()
-    return sums.stats(), dict(zip(MANOEUVRES, (driven / max(count, 1)).tolist(), strict=True))
+    return sums.stats(), dict(zip(schema.MANOEUVRES, (driven / max(count, 1)).tolist(), strict=True))
 
 
 class Sums:

@@ -193,7 +193,9 @@ class Job:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(_seed(config.seed, self.name, "weights"))
             network = make_network(self.name, config.network_size)
-            self._fit_scales(network)
+            targets = self.training.targets()
+            chosen = torch.linspace(0, len(targets) - 1, min(len(targets), _SCALE_WINDOWS)).long()
+            network.fit_scales(*self.training.window(self.name, targets[chosen]))
             network.to(self.group.device)
             optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
             state = self._resume(network, optimizer) or {"seconds": 0.0, "curve": []}
@@ -310,11 +312,6 @@ class Job:
     def _window(self, examples: Examples, targets: torch.Tensor) -> list[torch.Tensor]:
         """Return the network's inputs of some targets, and the truth, where this process computes."""
         return [part.to(self.group.device) for part in examples.window(self.name, targets)]
-
-    def _fit_scales(self, network: AnyNetwork) -> None:
-        targets = self.training.targets()
-        chosen = torch.linspace(0, len(targets) - 1, min(len(targets), _SCALE_WINDOWS)).long()
-        network.fit_scales(*self.training.window(self.name, targets[chosen]))
 
     def _steps(self, network: AnyNetwork, state: dict[str, Any]) -> int:
         """Return the steps of the next epoch: every window once, or what `windows_per_epoch` or the time allow."""
