@@ -51,11 +51,7 @@ _DESCENDING_MM, _ASCENDING_MM = 100.0, 35.0
 def make_arch(
     generator: np.random.Generator, stenosis_share: float, population: Population
 ) -> tuple[VesselTree, dict[str, Any]]:
-    """Return one aortic arch and what was drawn for it.
-
-    Args:
-        stenosis_share: probability of a stenosis, in a common carotid or the left subclavian artery.
-    """
+    """Return one aortic arch and what was drawn for it; a stenosis lies in a carotid or the left subclavian artery."""
     sex = "man" if generator.random() < 0.5 else "woman"
     kind = str(generator.choice(list(TYPE_SHARES), p=np.array(list(TYPE_SHARES.values())) / sum(TYPE_SHARES.values())))
     bovine = bool(generator.random() < BOVINE_SHARE)

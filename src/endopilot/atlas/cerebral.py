@@ -53,11 +53,7 @@ _SHARPEST_PER_MM = 0.4
 def make_cerebral(
     generator: np.random.Generator, stenosis_share: float, population: Population
 ) -> tuple[VesselTree, dict[str, Any]]:
-    """Return one side's anterior circulation and what was drawn for it.
-
-    Args:
-        stenosis_share: probability of a stenosis, in M1 or the carotid artery.
-    """
+    """Return one side's anterior circulation and what was drawn for it; a stenosis lies in M1 or the carotid artery."""
     side = "left" if generator.random() < 0.5 else "right"
     trunks = 3 if generator.random() < TRIFURCATION_SHARE else 2
     siphon = branching.truncated(generator, SIPHON_MM, SIPHON_SD_MM, 21.0, 45.0)

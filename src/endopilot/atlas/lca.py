@@ -88,11 +88,7 @@ class _Trunk:
 def make_lca(
     generator: np.random.Generator, stenosis_share: float, population: Population
 ) -> tuple[VesselTree, dict[str, Any]]:
-    """Return one left coronary tree and what was drawn for it.
-
-    Args:
-        stenosis_share: probability of a stenosis, in the anterior descending artery or the circumflex.
-    """
+    """Return one left coronary tree and what was drawn for it; a stenosis lies in either of its main branches."""
     dominance = branching.coronary_dominance(generator.random())
     # Drawn once, so that shapes that fail do not bias it.
     main_mm = None if population.left_main_mm is None else drawn_from(generator, population.left_main_mm)

@@ -49,11 +49,7 @@ _SHARPEST_PER_MM = 0.15
 def make_portal(
     generator: np.random.Generator, stenosis_share: float, population: Population
 ) -> tuple[VesselTree, dict[str, Any]]:
-    """Return one portal vein and what was drawn for it.
-
-    Args:
-        stenosis_share: probability of a stenosis, in the main, right or left portal vein.
-    """
+    """Return one portal vein and what was drawn for it; a stenosis lies in the main, right or left portal vein."""
     shares = np.array(list(VARIANT_SHARES.values()))
     variant = str(generator.choice(list(VARIANT_SHARES), p=shares / shares.sum()))
     length = branching.truncated(generator, MAIN_MM, MAIN_SD_MM, 60.0, 96.0)

@@ -29,7 +29,6 @@ class Fans:
     """Copies of a member of a belief, each turned by another angle; members of a kind share theirs."""
 
     def __init__(self, kinds: Sequence[tuple[Anatomy, Stack]], motion: Motion | None, config: SimulatorConfig) -> None:
-        """Take what the members are simulated with."""
         self._kinds, self._motion, self._config = kinds, motion, config
         self._made = dict[int, Simulator]()
 
@@ -118,7 +117,6 @@ class MovedCopies:
         config: SimulatorConfig,
         sharing: Simulator,
     ) -> None:
-        """Prepare the copies."""
         anatomy, stack = kind
         self.simulator = Simulator(anatomy, stack, worlds=count, motion=motion, config=config, sharing=[sharing])
         self._limits = list(limits)

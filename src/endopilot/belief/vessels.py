@@ -25,7 +25,6 @@ class SharedVessels:
     """
 
     def __init__(self, given: Anatomy) -> None:
-        """Begin with the vessel as it is given."""
         self._made = {World(): given}
         self.simulators: list[Simulator] = []
         self._kept = set[tuple[int, float]]()

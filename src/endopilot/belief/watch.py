@@ -39,7 +39,6 @@ class Innovations:
     """
 
     def __init__(self) -> None:
-        """Begin with the bands as they are calibrated."""
         self._shares, self._off = list[float](), list[Float[np.ndarray, "2"]]()
         self.factor, self.alarm = np.ones(2), False
         self._excess, self._weight = np.full(2, _PRIOR), np.full(2, _PRIOR)

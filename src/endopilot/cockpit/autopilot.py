@@ -39,7 +39,6 @@ class Autopilot:
     """
 
     def __init__(self, world: LiveWorld) -> None:
-        """Take the world; nobody drives yet."""
         self.status, self.policy_name, self.asks, self.failure = "off", "", "", ""
         self._world, self._pool = world, ThreadPoolExecutor(1)
         self._policy: Policy | None = None

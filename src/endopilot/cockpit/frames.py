@@ -116,7 +116,8 @@ def scene(navigation: Navigation, about: dict[str, Any]) -> bytes:
     lines, points, labels, places = [], [], [], []
     for branch in anatomy.tree.branches:
         line = branch.centerline
-        chosen = _every(line.abscissa, _POINT_MM)
+        wanted = np.append(np.arange(line.abscissa[0], line.abscissa[-1], _POINT_MM), line.abscissa[-1])
+        chosen = np.unique(np.searchsorted(line.abscissa, wanted).clip(0, len(line.abscissa) - 1))
         lines.append(len(chosen))
         points.append(line.points[chosen])
         labels.append(branch.section[chosen])
@@ -167,9 +168,3 @@ def target_values(anatomy: Anatomy, target: Target | None) -> dict[str, Any] | N
         "abscissa": round(target.abscissa, 2),
         "section": anatomy.tree.section_names[int(branch.section[nearest])],
     }
-
-
-def _every(abscissa: np.ndarray, step: float) -> np.ndarray:
-    """Return indices about `step` apart along a line, its two ends included."""
-    wanted = np.append(np.arange(abscissa[0], abscissa[-1], step), abscissa[-1])
-    return np.unique(np.searchsorted(abscissa, wanted).clip(0, len(abscissa) - 1))

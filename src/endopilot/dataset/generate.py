@@ -164,6 +164,10 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
     reported = ("episode_index", "anatomy", "sequence", "invalid_reason")
     invalid = [{name: row[name] for name in reported} for row in episodes if not row["valid"]]
     counts = Counter(row["split"] for row in episodes)
+    where = (os.path.relpath(folder.resolve(), context.output.resolve()) for folder in layout.folders)
+    motions = (None if motion is None else asdict(motion) for motion in layout.motions)
+    parts = zip(layout.names, where, layout.identities, motions, strict=True)
+    anatomies = [dict(zip(("name", "folder", "sha256", "motion"), part, strict=True)) for part in parts]
     record = manifest(
         config=context.config,
         seed=context.config.seed,
@@ -176,7 +180,7 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
         catheters=[asdict(catheter) for catheter in context.stack.catheters],
         robot=None if context.robot is None else asdict(context.robot),
         world=context.world.differences(),
-        anatomies=[_anatomy_record(layout, i) for i in range(len(layout.names))],
+        anatomies=anatomies,
         splits={name: counts[name] for name in SPLITS if counts[name]},
         manoeuvres=shares,
         stopped_short=sum(row["stopped_short"] for row in episodes),
@@ -185,18 +189,6 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
     )
     write_json(context.output / schema.MANIFEST_PATH, record)
     (context.output / _WORK_PATH).unlink(missing_ok=True)
-
-
-def _anatomy_record(layout: Layout, index: int) -> dict[str, Any]:
-    """Return name, folder relative to the dataset, identity and motion of an anatomy."""
-    folder = os.path.relpath(layout.folders[index].resolve(), layout.context.output.resolve())
-    motion = layout.motions[index]
-    return {
-        "name": layout.names[index],
-        "folder": folder,
-        "sha256": layout.identities[index],
-        "motion": None if motion is None else asdict(motion),
-    }
 
 
 def write_episode(

@@ -184,7 +184,9 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     if not (folder / schema.MANIFEST_PATH).exists():
         if (folder / RECORD_FILE).exists():
             raise InputError(f"{folder}: the dataset is unfinished; run the same `endopilot dataset` command again")
-        raise InputError(f"{folder}: no dataset here ({MANIFEST_PATH} is missing); make one with `endopilot dataset`")
+        raise InputError(
+            f"{folder}: no dataset here ({schema.MANIFEST_PATH} is missing); make one with `endopilot dataset`"
+        )
     manifest = read_json(folder / schema.MANIFEST_PATH, keys=("key", "settings"), mend=_MEND)
     with reading(folder / schema.MANIFEST_PATH, _MEND):
         made = manifest["settings"].get("version")
@@ -200,7 +202,9 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     info = read_json(folder / schema.INFO_PATH, keys=("features", "fps", "total_episodes", "total_frames"), mend=_MEND)
     if info.get("codebase_version") != schema.LEROBOT_VERSION:
         found = info.get("codebase_version")
-        raise InputError(f"{folder / INFO_PATH}: codebase_version is {found}, not {LEROBOT_VERSION}; make it again")
+        raise InputError(
+            f"{folder / INFO_PATH}: codebase_version is {found}, not {schema.LEROBOT_VERSION}; make it again"
+        )
     return manifest, info
 
 
@@ -253,7 +257,7 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
     episode = {name: np.concatenate(parts) for name, parts in episodes.items()}
     if len(episode["episode_index"]) != total:
         raise InputError(
-            f"{folder}: {len(episode['episode_index'])} episodes where {INFO_PATH} counts {total}; "
+            f"{folder}: {len(episode['episode_index'])} episodes where {schema.INFO_PATH} counts {total}; "
             "run `endopilot dataset` again"
         )
     shape = (total, samples, devices)

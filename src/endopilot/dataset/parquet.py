@@ -141,7 +141,6 @@ class Sums:
     """What the statistics of columns are made of, gathered part by part."""
 
     def __init__(self) -> None:
-        """Begin with nothing."""
         self._of: dict[str, tuple[int, list[np.ndarray]]] = {}
 
     def add(self, name: str, values: np.ndarray) -> None:

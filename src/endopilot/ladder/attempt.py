@@ -112,7 +112,7 @@ def attempt(
         InputError: there is no such policy, or the wire does not fit the vessel.
     """
     driver = make_policy(policy)
-    record = _drive(navigation, driver, seed, world, robot or RobotConfig())
+    record = _loop(navigation, driver, seed, world, robot or RobotConfig()).run()
     result = {"seed": seed} | scored(navigation, record, tells=isinstance(driver, AgentPolicy))
     planning_s = getattr(driver, "planning_s", None)
     return result if planning_s is None else result | {"planning_s": round(planning_s, 2)}
@@ -151,30 +151,23 @@ def driven(recording: Recording, navigation: Navigation, *, seed: int) -> Naviga
     Raises:
         InputError: the recording is shorter than the navigation.
     """
-    return _drive(navigation, Repeated(recording), seed, recording.world, recording.robot)
+    return begun(recording, navigation, seed=seed).run()
 
 
 def begun(recording: Recording, navigation: Navigation, *, seed: int) -> NavigationLoop:
     """Return the loop that drives a navigation as it was recorded, at its start."""
-    config = _config(recording.robot)
-    return NavigationLoop(navigation, Repeated(recording), config=config, seed=seed, world=recording.world)
+    return _loop(navigation, Repeated(recording), seed, recording.world, recording.robot)
 
 
-def _config(robot: RobotConfig) -> LoopConfig:
-    return LoopConfig(robot=robot, simulator=replace(CORE, threads=1))
-
-
-def _drive(
-    navigation: Navigation, policy: Policy, seed: int, world: World | None, robot: RobotConfig
-) -> NavigationRecord:
-    return NavigationLoop(navigation, policy, config=_config(robot), seed=seed, world=world).run()
+def _loop(navigation: Navigation, policy: Policy, seed: int, world: World | None, robot: RobotConfig) -> NavigationLoop:
+    config = LoopConfig(robot=robot, simulator=replace(CORE, threads=1))
+    return NavigationLoop(navigation, policy, config=config, seed=seed, world=world)
 
 
 class Repeated:
     """A policy that decides what was recorded."""
 
     def __init__(self, recording: Recording) -> None:
-        """Take the recording."""
         self._control = [tuple((v, w) for v, w in devices) for devices in recording.control.tolist()]
         self._expose_next = [*recording.exposed[1:].tolist(), False]
         self._gave_up = recording.gave_up

@@ -65,17 +65,12 @@ class Case:
 
     def row(self) -> dict[str, Any]:
         """Return the row that `endopilot verify` prints; `passed` is None where the case was skipped."""
+        figures: dict[str, Any] = {name: getattr(self, name) for name in ("reference", "value", "error")}
         if self.skipped:
-            figures = dict.fromkeys(("reference", "value", "error"))
-            return {"case": f"{self.case} (skipped: {self.skipped})", **figures, "bar": self.bar, "passed": None}
-        return {
-            "case": self.case,
-            "reference": self.reference,
-            "value": self.value,
-            "error": self.error,
-            "bar": self.bar,
-            "passed": bool(self.error <= self.bar),
-        }
+            title, figures, passed = f"{self.case} (skipped: {self.skipped})", dict.fromkeys(figures), None
+        else:
+            title, passed = self.case, bool(self.error <= self.bar)
+        return {"case": title, **figures, "bar": self.bar, "passed": passed}
 
 
 def run(groups: Sequence[Callable[[], list[Case]]]) -> list[Case]:
@@ -152,21 +147,17 @@ def uniform_rod(
     spin_drag: float,
 ) -> RodLayout:
     """Return a straight rod with the same section throughout: see `straight_rod`; elements are `size_mm` long."""
-
-    def all_of(value: float) -> Float[np.ndarray, "n"]:
-        return np.full(nodes, value)
-
-    return RodLayout(
-        abscissa_mm=size_mm * np.arange(nodes),
-        shear_n=all_of(shear),
-        stretch_n=all_of(stretch),
-        bend_n_mm2=all_of(bend),
-        twist_n_mm2=all_of(twist),
-        rest_curvature=np.zeros((nodes, 3)),
-        radius_mm=all_of(radius_mm),
-        drag_n_s_mm=all_of(drag),
-        spin_drag_n_mm_s=all_of(spin_drag),
-    )
+    section = {
+        "shear_n": shear,
+        "stretch_n": stretch,
+        "bend_n_mm2": bend,
+        "twist_n_mm2": twist,
+        "radius_mm": radius_mm,
+        "drag_n_s_mm": drag,
+        "spin_drag_n_mm_s": spin_drag,
+    }
+    throughout = {name: np.full(nodes, value) for name, value in section.items()}
+    return RodLayout(abscissa_mm=size_mm * np.arange(nodes), rest_curvature=np.zeros((nodes, 3)), **throughout)
 
 
 @dataclass(frozen=True, eq=False)
