@@ -197,13 +197,13 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         raise InputError(f"{folder}: made by {made}, which {version()} cannot read; make the dataset again")
     if not (folder / schema.INFO_PATH).exists():
         raise InputError(
-            f"{folder / INFO_PATH}: missing from the dataset; run the same `endopilot dataset` command again"
+            f"{folder / schema.INFO_PATH}: missing from the dataset; run the same `endopilot dataset` command again"
         )
     info = read_json(folder / schema.INFO_PATH, keys=("features", "fps", "total_episodes", "total_frames"), mend=_MEND)
     if info.get("codebase_version") != schema.LEROBOT_VERSION:
         found = info.get("codebase_version")
         raise InputError(
-            f"{folder / INFO_PATH}: codebase_version is {found}, not {schema.LEROBOT_VERSION}; make it again"
+            f"{folder / schema.INFO_PATH}: codebase_version is {found}, not {schema.LEROBOT_VERSION}; make it again"
         )
     return manifest, info
 
