@@ -126,8 +126,6 @@ def rasterised(
 
     Args:
         lumen: distance to the wall, mm.
-        taken_in: that share.
-        shift: of the grid, in voxels.
     """
     k, j, i = np.nonzero(lumen.values > -_MARGIN_MM / 2)
     points = np.stack([i, j, k], axis=1) * lumen.spacing_mm + lumen.origin_mm

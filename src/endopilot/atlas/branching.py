@@ -83,9 +83,6 @@ def until_it_fits(
 ) -> tuple[VesselTree, dict[str, Any]]:
     """Draw trees until one fits; its record states how many failed before (`redrawn`).
 
-    Args:
-        what: what is drawn, for the error.
-
     Raises:
         NoShape: 60 draws failed.
     """

@@ -188,7 +188,6 @@ def opened_fork(
     Args:
         trunk: the vessel that goes on, LPS mm.
         other: the one that leaves, from the fork on.
-        fork: index of the fork on `trunk`.
         wide: lumen radius at the fork, mm: directions are chords over two radii.
         turns_deg: angles by which the two turn away from what arrives, to opposite sides, degrees.
     """
@@ -285,8 +284,6 @@ def catheter_direction(
 
     Args:
         population: how patients vary; the textbook's catheter has the vessel's first direction, and draws nothing.
-        radius_mm: of the tube.
-        length_mm: of the tube behind the ostium.
     """
     first = shape.tangents(tree.branches[0].centerline.points)[0]
     if population.catheter_deg is None:

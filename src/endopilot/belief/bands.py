@@ -166,9 +166,6 @@ def conformal_scale(
     Intervals of one patient are alike, so patients count, not intervals. A quantile of all scores serves; which one, is
     found by leaving each patient out: the smallest whose value on the others covers `level` of the left-out ones.
 
-    Args:
-        score: of each interval, the worst error over the spread.
-
     Raises:
         InputError: there are too few patients for that level.
     """

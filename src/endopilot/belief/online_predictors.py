@@ -112,7 +112,6 @@ def online_predictor(predictor: Predictor, episodes: Episodes, observed: EachObs
     """Return what predicts the tips of navigations with a model as exposures come in.
 
     Args:
-        episodes: their controls, and their tips as they are measured.
         observed: which of the first `WINDOW` samples were measured; all if not given. The paper's networks take the
             others' tips as they stand in `episodes`.
     """

@@ -81,11 +81,7 @@ class Autopilot:
         self.asks = ""
 
     def think(self, expose: Callable[[], None]) -> Proximals | None:
-        """Go on with what the policy has to do now; return what the robot has been commanded, if anything.
-
-        Args:
-            expose: takes an X-ray image for the page, if the policy has one.
-        """
+        """Go on with what the policy has to do now; return what the robot has been commanded, if anything."""
         if self._pending is not None:
             return self._collect()
         loop = self._world.loop

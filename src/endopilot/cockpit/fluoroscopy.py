@@ -75,7 +75,6 @@ class XrayUnit:
         """Set the C-arm up; its first view is computed in the background.
 
         Args:
-            make_imager: of this patient, from a CT or none.
             ct: of the patient, HU; a phantom's for a coronary artery if not given, else plain water.
         """
         self.settings = XraySettings()

@@ -102,10 +102,6 @@ class LiveWorld:
     ) -> None:
         """Bring wire and catheters to the navigation's start.
 
-        Args:
-            seed: of the encoders' noise and of errors of detection.
-            reality: what reality is; as the navigation says if not given.
-
         Raises:
             InputError: a device does not fit the vessel, or starts deeper than it is long.
         """

@@ -60,12 +60,7 @@ def write_block(
 def store_block(
     context: BlockContext, block: Block, draw: Draw, trajectory: Trajectory, stopped: Bool[np.ndarray, "n"]
 ) -> None:
-    """Write navigations: their episodes, then their samples, which mark both as complete.
-
-    Args:
-        draw: their tips.
-        stopped: which were stopped short of an end of the vessel.
-    """
+    """Write navigations: their episodes, then their samples, which mark both as complete."""
     data_path, episodes_path = schema.paths_of_file(context.output, block.number)
     samples = parquet.sample_table(trajectory, block.first_episode, context.key)
     for path, table in (

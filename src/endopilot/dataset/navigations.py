@@ -57,14 +57,12 @@ def simulate_navigations(
     """Simulate navigations, stopped short of the ends of the vessel.
 
     Args:
-        stacks: the devices of each world.
         initial: (Δ mm, φ rad) of each device before the first period.
         control: velocities (mm/s, rad/s) or loads (N, N·mm) that were drawn.
         robot: what makes the motions and measures them, its drives' mean over a sample moves the devices; they are made
             as drawn if not given.
         seeds: of each world's robot.
         ostium_mm: the true inserted lengths are this much more than its encoders', mm.
-        advance: called after each sample with the number of worlds.
 
     Returns:
         What was driven, and which worlds were stopped short. Commands are float32 numbers. With a robot, its columns

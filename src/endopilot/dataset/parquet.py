@@ -25,13 +25,7 @@ _FEW_VALUES = {"timestamp"}
 
 
 def sample_table(trajectory: Trajectory, first_episode: int, key: str) -> pa.Table:
-    """Return the samples of a trajectory as rows, one episode after the other.
-
-    Args:
-        trajectory: one world for each episode.
-        first_episode: index in the dataset of its first world.
-        key: marks the dataset that the file belongs to.
-    """
+    """Return the samples of a trajectory as rows, one episode after the other."""
     worlds, samples = trajectory.valid.shape
     signals = trajectory_signals(trajectory)
     columns = {
@@ -119,7 +113,6 @@ def statistics(
 
     Args:
         actuation: what the dataset's control is.
-        advance: called once for each file that has been read.
         devices: their number; the manoeuvres are the wire's.
     """
     sums, count, driven = Sums(), 0, np.zeros(len(schema.MANOEUVRES))

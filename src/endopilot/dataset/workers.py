@@ -63,7 +63,6 @@ def run_on_cluster(
 
     Args:
         work: a function of a module, or a `functools.partial` of one.
-        done: called with each item and what the work returned for it.
         scheduler: address, such as tcp://host:8786.
 
     Raises:

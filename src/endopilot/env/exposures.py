@@ -192,11 +192,7 @@ class Views:
     """The views of one navigation: what stays the same, and the roadmap with the target that lies under every image."""
 
     def __init__(self, navigation: Navigation, real: Anatomy, config: FluoroscopeConfig, pixels: int) -> None:
-        """Compute what stays the same.
-
-        Args:
-            navigation: its vessel makes the roadmap.
-        """
+        """Compute what stays the same."""
         geometry = replace(config.geometry, pixel_mm=config.geometry.pixel_mm * _FULL_PIXELS / pixels)
         self._imager = XrayImager(real, navigation.stack, config=ImageConfig(geometry=geometry, pixels=pixels))
         given = navigation.anatomy

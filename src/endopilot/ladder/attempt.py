@@ -103,9 +103,7 @@ def attempt(
     from run to run.
 
     Args:
-        navigation: what is to be done, as the policy is given it.
         seed: of encoder noise, detection errors and the policy.
-        world: what reality is; as the navigation says if not given.
         robot: what drives, as it is given; the default one if not given.
 
     Raises:

@@ -177,7 +177,6 @@ def write_submission(
 
     Args:
         results: by the task's name, the results of its navigations (`attempt`) in the order of the task's patients.
-        scores: what `score` made of them.
     """
     known = {each.name for each in fields(NavigationEntry)}
     submission = Submission(

@@ -41,11 +41,7 @@ def make_network(name: str, size: Size) -> Network | CausalNetwork:
 def write_network(
     path: Path, name: str, network: Network | CausalNetwork, config: Size, facts: Mapping[str, Any]
 ) -> None:
-    """Write weights and scales of a network, whole or not at all.
-
-    Args:
-        facts: what else the header shall say, as JSON values.
-    """
+    """Write weights and scales of a network, whole or not at all."""
     kind = "causal" if isinstance(config, CausalConfig) else "paper"
     write_tensors(path, network.state_dict(), {"network": name, "kind": kind, "size": asdict(config), **facts})
 

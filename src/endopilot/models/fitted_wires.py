@@ -54,7 +54,6 @@ def fitted(episodes: Episodes, given: Bool[np.ndarray, "episodes given"]) -> Wir
 
     Args:
         episodes: of one patient; their tips where `given` are read.
-        given: samples from the first on at which the tip was observed.
 
     Raises:
         InputError: the anatomy is missing or damaged.

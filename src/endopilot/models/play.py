@@ -111,9 +111,6 @@ class PlayTables:
         """Take the plays one sample on.
 
         Args:
-            direction: which length is known.
-            patient: row of the tables, for each wire.
-            state: before the sample.
             known: Δ (forward) or Δtip (inverse) at its end, mm.
             rotation: φ at its end, rad.
             turned: by how much it has changed, rad.

@@ -79,8 +79,6 @@ def unfold(
     desired tips up to t and the motion before it, where observed.
 
     Args:
-        vessels: tables of the patients.
-        patient: row of the tables, for each episode.
         wires: forward: what the simulated wires did. By how much the patient's motion displaces the tip is taken off
             all tips before, and added to the guess behind.
     """
@@ -185,12 +183,7 @@ class Sequences:
 
     @staticmethod
     def of(episodes: Episodes, vessels: PlayTables, networks: Sequence[str], seed: int) -> Sequences:
-        """Return the sequences of some episodes.
-
-        Args:
-            episodes: the navigations, with their true tips.
-            vessels: tables of their patients, as `play_tables` gives them.
-        """
+        """Return the sequences of some episodes."""
         patient = np.unique(episodes.anatomy, return_inverse=True)[1]
         shape = episodes.branch.shape
         given = np.broadcast_to(np.arange(shape[1]) < WINDOW, shape)

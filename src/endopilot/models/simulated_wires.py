@@ -180,7 +180,6 @@ def _each_patient(
     """Return what a function of episodes of one patient returns, with their rows, on all cores.
 
     Args:
-        what: this is, for the progress bar.
         parts: into which each patient's episodes are split; fewer if there are fewer episodes.
     """
     patients = [np.flatnonzero(episodes.anatomy == name) for name in np.unique(episodes.anatomy)]

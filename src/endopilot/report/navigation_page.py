@@ -23,9 +23,6 @@ def write_navigation_page(
 ) -> None:
     """Write the page as one HTML file that needs nothing beside it.
 
-    Args:
-        commands: what repeats it, by purpose.
-
     Raises:
         InputError: the page cannot be written.
     """

@@ -230,9 +230,6 @@ def image(png: bytes, description: str) -> Markup:
 def report_evaluation(folder: Path) -> Path:
     """Write the PNG and the CSV of each figure into `figures/`, and then `report.html`, one page that stands alone.
 
-    Args:
-        folder: what `evaluate` wrote; the figures and the page go there too.
-
     Returns:
         The page's path.
 
