@@ -132,13 +132,13 @@ def evaluated(toy_dataset, tmp_path_factory):
     import torch
 
     from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
-    from toy_navigation import make_untrained_run, toy_simulate
+    from toy_navigation import make_untrained_run, toy_run
 
     folder = tmp_path_factory.mktemp("evaluated")
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # small batches gain nothing from two, and lose much where cores are shared
     make_untrained_run(toy_dataset, folder / "run")
-    with patch("endopilot.dataset.again.simulate", toy_simulate):
+    with patch("endopilot.dataset.again.run_set_up", toy_run):
         settings = EvaluateConfig(sequences=8)
         metrics = evaluate(folder / "run", output=folder / "evaluation", config=settings, other_seeds=[folder / "run"])
     torch.set_num_threads(threads)

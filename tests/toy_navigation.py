@@ -102,6 +102,12 @@ def toy_simulate(
     )
 
 
+def toy_run(set_up: SimulationSetUp, command, *, period_s, record_shape) -> Trajectory:
+    """Return what the toy wire does in worlds of one vessel; takes what `run_set_up` takes."""
+    given = {"initial": set_up.initial, "config": set_up.config, "friction": set_up.friction, "motion": set_up.motion}
+    return toy_simulate(set_up.anatomies[0], set_up.stacks[0], command, **given, record_shape=record_shape)
+
+
 def toy_outputs(each: tuple[int, ...], devices: int, **known: np.ndarray) -> dict[str, Any]:
     """Return all that the core records of worlds: 0, and valid, but for what is known."""
     outputs: dict[str, Any] = {

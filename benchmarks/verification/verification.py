@@ -8,9 +8,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from benchmarks.verification import contact, engine, motion, order, stability, tube, tubes
+from benchmarks.verification import contact, engine, motion, order, stability, transmission, tube, tubes
 from benchmarks.verification.plots import draw
-from endopilot.verification import free_rod, transmission
+from endopilot.verification import free_rod
 from endopilot.verification.case import run
 
 

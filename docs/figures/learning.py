@@ -21,13 +21,12 @@ from benchmarks.figures import made_on
 from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.devices.device import read_wire
 from endopilot.evaluation.metrics import OFF_WALL_MM
-from endopilot.evaluation.prediction_baselines import hold_slack
+from endopilot.evaluation.protocols import hold_slack
 from endopilot.files import read_json
 from endopilot.models.causal import CausalPredictor
+from endopilot.models.checkpoint import load_model
 from endopilot.models.config import PRETRAINED, WINDOW
-from endopilot.models.episodes import Episodes
-from endopilot.models.open_loop import Prediction, jumps
-from endopilot.models.rollout import load_model
+from endopilot.models.episodes import Episodes, Prediction, jumps
 from endopilot.models.sequences import play_tables, unfold
 from endopilot.models.simulated_wires import FRICTION_FACTORS
 

@@ -17,7 +17,7 @@ from learning import PAGE, row, written
 from torch import Tensor
 
 from endopilot.dataset.loader import Dataset, read_dataset
-from endopilot.evaluation.prediction_baselines import hold_slack
+from endopilot.evaluation.protocols import hold_slack
 from endopilot.models import play
 from endopilot.models.causal import CausalNetwork, ForwardNetwork, InverseNetwork, Mixture
 from endopilot.models.config import WINDOW, CausalConfig

@@ -215,7 +215,7 @@ def test_the_patient_and_the_card_are_part_of_it(made, fork):
 
 
 def test_the_command_drives_devices_by_a_policy(patient, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("endopilot.angiograms.drive._NAVIGATION_S", 3.0)
+    monkeypatch.setattr("endopilot.angiograms.draw._NAVIGATION_S", 3.0)
     settings = ["--cines", "1", "--seconds", "0.4", "--frames-per-second", "5", "--pixels", "64", "--pixel-mm", "1.3"]
     where = ["angiograms", str(patient), "-o", str(tmp_path / "o"), "--json"]
     with pytest.raises(SystemExit) as left:

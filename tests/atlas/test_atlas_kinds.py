@@ -8,7 +8,7 @@ import pytest
 from benchmarks.anatomy.labels import label_agreement
 from endopilot.anatomy.distance import sample
 from endopilot.anatomy.labels import dominance, label_tree
-from endopilot.atlas import heart_left
+from endopilot.atlas import heart_reference
 from endopilot.atlas.atlas import AtlasConfig, make_patient, make_patient_tree
 
 COUNT = 12
@@ -69,7 +69,7 @@ def test_a_patient_depends_on_seed_and_index_alone(atlas, kind):
 
 
 def test_left_coronary_courses_pass_dodges_mean_positions(atlas):
-    at = heart_left.place_from_ostium
+    at = heart_reference.place_from_ostium
     # Azimuth, elevation and distance of L1m, L2m, L3m, L4p on the LAD, C1m, C2m, C3m on the LCx; SD of distance in mm.
     means = {
         "LAD": [(at(2.3, 63.0, -5.0), 8.0), (at(5.3, 44.0, -12.0), 8.0), (at(10.1, 30.0, -32.0), 9.0)],

@@ -15,10 +15,9 @@ from endopilot.anatomy import distance
 from endopilot.anatomy.distance import distance_map_from_spheres, sample
 from endopilot.anatomy.tree import Line, sampled, tree_from_lines
 from endopilot.atlas import curves as shape
-from endopilot.atlas.atlas import VESSELS, AtlasConfig, make_patient, make_patient_tree
+from endopilot.atlas.atlas import VESSELS, AtlasConfig, make_patient, make_patient_tree, rasterised, visible
 from endopilot.atlas.branching import SidePlan, Vessel, lumens_collide, stenoses, with_side_branches
 from endopilot.atlas.population import Population, population_of
-from endopilot.atlas.through_ct import rasterised, visible
 from endopilot.atlas.variation import TIGHTEST, Fork, bent, catheter_direction, drawn_from, ectasia, opened_fork
 
 COUNT = 32

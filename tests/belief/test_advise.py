@@ -16,14 +16,14 @@ from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import Calibration
 from endopilot.belief.image_exposures import Exposures
 from endopilot.belief.monitoring import AdviseConfig
-from endopilot.belief.online_predictors import OnlineTwin, OnlineWindowed, online_predictor
+from endopilot.belief.online_predictors import OnlinePredictor, OnlineTwin, OnlineWindowed, online_predictor
 from endopilot.cli import main
 from endopilot.dataset.loader import read_dataset
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.files import write_json
 from endopilot.models.config import WINDOW, TwinConfig, run_path
-from endopilot.models.open_loop import OpenLoop, Prediction
+from endopilot.models.episodes import OpenLoop, Prediction
 from endopilot.models.twin import TwinPredictor
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
@@ -63,7 +63,7 @@ def folder(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def hold_slack(monkeypatch) -> None:
-    monkeypatch.setattr("endopilot.models.rollout.load_model", lambda run: HoldSlack())
+    monkeypatch.setattr("endopilot.models.checkpoint.load_model", lambda run: HoldSlack())
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +151,7 @@ def test_models_know_the_motion_that_images_have_measured(folder, split, monkeyp
     np.testing.assert_array_equal(found.episodes.tip, split.episodes.tip)
 
 
-class Errs:
+class Errs(OnlinePredictor):
     """Errs by given amounts and states no spread."""
 
     def __init__(self, tip: np.ndarray) -> None:

@@ -17,7 +17,7 @@ from endopilot.simulation.motion import Motion
 from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement
 from endopilot.xray.image_fluoroscope import NotRegistered
 from endopilot.xray.moving_patient import seen_in_episodes
-from toy_navigation import make_toy_dataset, toy_simulate
+from toy_navigation import make_toy_dataset, toy_run
 
 SETTINGS = ImageSettings(FluoroscopeConfig(), ostium_mm=0.3, seed=2, samples=4)
 
@@ -53,7 +53,7 @@ def dataset(tmp_path, monkeypatch):
     )
     monkeypatch.setattr(module, "ImageFluoroscope", Arm)
     monkeypatch.setattr(parallel, "CORES", 1)
-    monkeypatch.setattr("endopilot.dataset.again.simulate", toy_simulate)
+    monkeypatch.setattr("endopilot.dataset.again.run_set_up", toy_run)
     Arm.made.clear()
     Arm.refined.clear()
     return read_dataset(tmp_path / "data").of_split("test")

@@ -7,10 +7,9 @@ import time
 import numpy as np
 import pytest
 
-from endopilot.cockpit.film import open_film
+from endopilot.cockpit.film import ReplayStage, open_film
 from endopilot.cockpit.frames import decode
 from endopilot.cockpit.messages import Drive, Pedal, Replay, Target
-from endopilot.cockpit.open import ReplayStage
 from endopilot.errors import InputError
 from endopilot.files import write_json
 from endopilot.ladder.attempt import attempt, navigation_seed

@@ -9,7 +9,7 @@ import pytest
 
 uvicorn = pytest.importorskip("uvicorn", reason="the extra `cockpit` is not installed")
 
-from endopilot.cockpit.launch import serve  # noqa: E402
+from endopilot.cockpit.server import serve  # noqa: E402
 from endopilot.errors import InputError  # noqa: E402
 
 

@@ -22,8 +22,7 @@ from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
 from endopilot.models.config import WINDOW
-from endopilot.models.episodes import Episodes
-from endopilot.models.open_loop import Observed, OpenLoop
+from endopilot.models.episodes import Episodes, Observed, OpenLoop
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import read_controls_csv
 from endopilot.simulation.simulate import simulate

@@ -17,8 +17,7 @@ from endopilot.control.plan_xray import PlannedXray, plan_xray, read_calibration
 from endopilot.errors import InputError
 from endopilot.files import write_json
 from endopilot.models.config import WINDOW
-from endopilot.models.episodes import Episodes
-from endopilot.models.open_loop import OpenLoop, Prediction
+from endopilot.models.episodes import Episodes, OpenLoop, Prediction
 from endopilot.tasks.route import Route
 
 STILL = (0.0, 0.0, 0.0, 0.0)
@@ -65,7 +64,7 @@ def by_network(found, tmp_path, monkeypatch):
     """Return what makes a plan of 20 periods at 4 mm/s by a run that predicts as the given predictor does."""
 
     def made(predictor):
-        monkeypatch.setattr("endopilot.models.rollout.load_model", lambda _: predictor)
+        monkeypatch.setattr("endopilot.models.checkpoint.load_model", lambda _: predictor)
         write_json(tmp_path / "run" / "manifest.json", {"config": {}, "networks": {}, "device": {}})
         inserted = 2.0 + 2.0 * np.arange(1, 21)
         longer = found.trajectory._each(lambda values: np.resize(values, (1, 20, *values.shape[2:])))

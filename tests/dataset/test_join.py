@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from endopilot.dataset import join
-from endopilot.dataset.join import read_joined
-from endopilot.dataset.loader import read_dataset
+from endopilot.dataset import loader
+from endopilot.dataset.loader import read_dataset, read_joined
 from endopilot.errors import InputError
 from endopilot.simulation.motion import Motion
 from toy_navigation import make_toy_dataset
@@ -59,9 +58,9 @@ def test_what_does_not_go_together_is_refused(toy_dataset, second, monkeypatch):
     }
     for message, changed in cases.items():
         made = {toy_dataset: read_dataset(toy_dataset), second: replace(other, manifest=other.manifest | changed)}
-        monkeypatch.setattr(join, "read_dataset", made.__getitem__)
+        monkeypatch.setattr(loader, "read_dataset", made.__getitem__)
         with pytest.raises(InputError, match=message):
             read_joined([toy_dataset, second])
     same = replace(other, manifest=other.manifest | {"device": device | {"friction": 0.3, "name": "mine"}})
-    monkeypatch.setattr(join, "read_dataset", {toy_dataset: read_dataset(toy_dataset), second: same}.__getitem__)
+    monkeypatch.setattr(loader, "read_dataset", {toy_dataset: read_dataset(toy_dataset), second: same}.__getitem__)
     assert len(read_joined([toy_dataset, second])) > len(other)

@@ -7,7 +7,7 @@ import hashlib
 import numpy as np
 import pytest
 
-from endopilot.dataset.splits import assign_splits
+from endopilot.dataset.layout import assign_splits
 from endopilot.errors import InputError
 
 NAMES = [f"patient-{i:03d}" for i in range(100)]

@@ -12,8 +12,7 @@ from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.draw import TIP_GROUP, draw_navigations, patient_motion
-from endopilot.dataset.episode import write_episode
-from endopilot.dataset.generate import generate_dataset
+from endopilot.dataset.generate import generate_dataset, write_episode
 from endopilot.dataset.loader import read_dataset
 from endopilot.dataset.navigations import PULL_BACK_MM, STOP_SHORT_MM, simulate_navigations
 from endopilot.devices.device import read_wire

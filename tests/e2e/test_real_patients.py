@@ -34,7 +34,7 @@ def test_real_coronary_centerlines_are_simulated_and_learnt_on(tmp_path, capsys)
     sizes = ("--sequences", "4", "--seconds", "20", "--anatomy-shares", "0.5", "0", "0.5")
     run(capsys, "dataset", *both, "-o", tmp_path / "data", *sizes)
     run(capsys, "train", tmp_path / "data", "-o", tmp_path / "run", "--epochs", "1", "--max-seconds", "2")
-    with patch("endopilot.report.evaluation_report.png", lambda _: b""):  # drawn, and not made pixels
+    with patch("endopilot.report.report.png", lambda _: b""):  # drawn, and not made pixels
         figures = run(capsys, "evaluate", tmp_path / "run", "-o", tmp_path / "evaluation")
     assert set(figures["splits"]) >= {"test"}
     assert np.isfinite(figures["splits"]["test"]["tip"]["P4"]["abscissa"]["all"]["mae"])

@@ -20,9 +20,9 @@ from endopilot.evaluation.replay import Recorded
 from endopilot.evaluation.results import read_results
 from endopilot.files import read_json, write_json
 from endopilot.models.config import WINDOW
-from endopilot.models.open_loop import OpenLoop, begin_after
-from endopilot.report.evaluation_report import report_evaluation
-from toy_navigation import LENGTH_MM, make_toy_dataset, toy_simulate
+from endopilot.models.episodes import OpenLoop, begin_after
+from endopilot.report.report import report_evaluation
+from toy_navigation import LENGTH_MM, make_toy_dataset, toy_run
 
 
 def test_metrics_are_on_disk_as_returned(evaluated):
@@ -81,7 +81,7 @@ def test_patients_are_predicted_one_after_the_other_with_the_error_so_far(toy_da
     data = read_dataset(toy_dataset)
     data = data.select(np.random.default_rng(0).permutation(len(data)))
     remarks, predictor = [], Parroting()
-    with patch("endopilot.dataset.again.simulate", toy_simulate):
+    with patch("endopilot.dataset.again.run_set_up", toy_run):
         result = run_protocols(predictor, data, None, lambda amount=1, remark="": remarks.append(remark))
     np.testing.assert_array_equal(result.tips["P1"].abscissa, result.true.abscissa)
     assert len(remarks) == count_steps(data)
@@ -105,11 +105,11 @@ def test_recorded_controls_lead_back_to_the_recorded_tips(evaluated):
 def test_the_core_is_replayed_with_other_friction(toy_dataset, evaluated):
     asked = {}
 
-    def watched(anatomy, device, control, *, friction, **others):
-        asked[anatomy.name] = friction
-        return toy_simulate(anatomy, device, control, friction=friction, **others)
+    def watched(set_up, command, **how):
+        asked[set_up.anatomies[0].name] = set_up.friction
+        return toy_run(set_up, command, **how)
 
-    with patch("endopilot.dataset.again.simulate", watched):
+    with patch("endopilot.dataset.again.run_set_up", watched):
         metrics = evaluate(evaluated[0] / "run", output=evaluated[0] / "again", config=EvaluateConfig(sequences=2))
     true = read_dataset(toy_dataset).friction[0]
     for friction in asked.values():
@@ -157,7 +157,7 @@ def chosen(dataset, mask) -> set[tuple[str, int]]:
 
 def test_all_navigations_of_a_dataset_of_new_patients_are_evaluated(elsewhere, trained_on, tmp_path):
     dataset, out = read_dataset(elsewhere), tmp_path / "out"
-    with patch("endopilot.dataset.again.simulate", toy_simulate):
+    with patch("endopilot.dataset.again.run_set_up", toy_run):
         metrics = evaluate(trained_on(elsewhere, set()), output=out, config=EvaluateConfig(), dataset=elsewhere)
     results = read_results(out / "evaluation.npz")
     assert {"train", "calibrate", "test"} <= set(dataset.split.tolist())
@@ -168,7 +168,7 @@ def test_all_navigations_of_a_dataset_of_new_patients_are_evaluated(elsewhere, t
     assert metrics["training_mean"] is None and "generalisation_gap" not in metrics
     assert "training_mean" not in results["test"].tips.keys() | results["test"].controls.keys()
     assert metrics["splits"]["test"]["tip"]["P1"]["abscissa"]["all"]["skill"].keys() == {"hold_slack"}
-    with patch("endopilot.report.evaluation_report.png", lambda _: b""):  # drawn, and not made pixels
+    with patch("endopilot.report.report.png", lambda _: b""):  # drawn, and not made pixels
         report_evaluation(out)
     assert "training mean" not in (out / "report.html").read_text(encoding="utf-8").lower()
 
@@ -177,7 +177,7 @@ def test_known_patients_among_new_ones_stay_known(elsewhere, trained_on, tmp_pat
     dataset = read_dataset(elsewhere)
     names = {str(dataset.anatomy[dataset.split == split][0]) for split in ("train", "calibrate", "test")}
     known, training = np.isin(dataset.anatomy, sorted(names)), dataset.split == "train"
-    with patch("endopilot.dataset.again.simulate", toy_simulate):
+    with patch("endopilot.dataset.again.run_set_up", toy_run):
         metrics = evaluate(
             trained_on(elsewhere, names), output=tmp_path / "out", config=EvaluateConfig(), dataset=elsewhere
         )
@@ -218,7 +218,7 @@ def test_a_dataset_that_was_trained_on_as_a_whole_is_refused(trained_on, tmp_pat
 def test_the_command_prints_errors_findings_and_paths(evaluated, monkeypatch, capsys):
     metrics = evaluated[1]
     monkeypatch.setattr("endopilot.cli.evaluate.evaluate", lambda *_, **__: metrics)
-    monkeypatch.setattr("endopilot.report.evaluation_report.report_evaluation", lambda _: None)
+    monkeypatch.setattr("endopilot.report.report.report_evaluation", lambda _: None)
     with pytest.raises(SystemExit, match="0"):
         main(["evaluate", "r", "-o", "out"])
     printed = capsys.readouterr().out

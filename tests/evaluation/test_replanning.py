@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 
 from endopilot.dataset.loader import read_dataset
-from endopilot.evaluation.protocols import EXPOSURE_PERIOD_S, exposures, replanned
-from endopilot.evaluation.replay import Recorded, replay
-from endopilot.models.episodes import Episodes
-from endopilot.models.open_loop import OpenLoop, begin_after, given_states
-from toy_navigation import toy_simulate
+from endopilot.evaluation.replay import EXPOSURE_PERIOD_S, Recorded, exposures, replanned, replay
+from endopilot.models.episodes import Episodes, OpenLoop, begin_after, given_states
+from toy_navigation import toy_run
 
 GIVEN = 30
 
@@ -51,7 +49,7 @@ def planned(recorded, predictor):
 
 def test_each_plan_is_given_the_drive_and_what_was_exposed_and_nothing_else(recorded) -> None:
     predictor, data = HoldSlack(), recorded.data
-    with patch("endopilot.dataset.again.simulate", toy_simulate):
+    with patch("endopilot.dataset.again.run_set_up", toy_run):
         _, control = planned(recorded, predictor)
         done = replay(recorded, {"P4": recorded.drivable(control)}, lambda *_: None)["P4"]
     assert (
@@ -81,7 +79,7 @@ def test_each_plan_is_given_the_drive_and_what_was_exposed_and_nothing_else(reco
 
 def test_x_ray_brings_the_tip_back_to_its_desired_path(recorded) -> None:
     predictor, data = HoldSlack(), recorded.data
-    with patch("endopilot.dataset.again.simulate", toy_simulate):
+    with patch("endopilot.dataset.again.run_set_up", toy_run):
         first, control = planned(recorded, predictor)
         series = {"P4": recorded.drivable(first.control), "P4_replanned": recorded.drivable(control)}
         done = replay(recorded, series, lambda *_: None)
@@ -92,13 +90,13 @@ def test_x_ray_brings_the_tip_back_to_its_desired_path(recorded) -> None:
 
 
 def test_a_world_that_fails_has_no_controls_from_there_on(recorded) -> None:
-    def failing(anatomy, device, control, **settings):
-        rollout = toy_simulate(anatomy, device, control, **settings)
+    def failing(set_up, command, **how):
+        rollout = toy_run(set_up, command, **how)
         valid = rollout.valid.copy()
         valid[0, 60:] = False  # first episode of each patient
         return replace(rollout, valid=valid)
 
-    with patch("endopilot.dataset.again.simulate", failing):
+    with patch("endopilot.dataset.again.run_set_up", failing):
         _, control = planned(recorded, HoldSlack())
     firsts = [int(np.flatnonzero(recorded.anatomy_of == i)[0]) for i in range(len(recorded.anatomies))]
     lost = np.isnan(control).any(axis=-1)

@@ -17,16 +17,15 @@ from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.devices.device import read_wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.errors import InputError
-from endopilot.evaluation.prediction_baselines import follow_slack, hold_slack, mean_control
+from endopilot.evaluation.protocols import follow_slack, hold_slack, mean_control
 from endopilot.files import read_json, sha256
 from endopilot.models.causal import CausalPredictor, ForwardNetwork, InverseNetwork, Mixture
+from endopilot.models.checkpoint import load_model
 from endopilot.models.config import CausalConfig, TrainConfig
-from endopilot.models.episodes import Episodes
+from endopilot.models.episodes import JUMP_MM, Episodes, Predictor, ProbabilisticPredictor, jumps
 from endopilot.models.fitted_wires import SCALES_MM, SPREADS, posterior, rounded
-from endopilot.models.open_loop import JUMP_MM, Predictor, ProbabilisticPredictor, jumps
 from endopilot.models.patient import STEP_MM, prepare
 from endopilot.models.play import N_FEATURES, mirrored
-from endopilot.models.rollout import load_model
 from endopilot.models.sequences import N_INPUTS, Sequences, play_tables, unfold
 from endopilot.models.simulated_wires import FRICTION_FACTORS, SimulatedWires, read_or_simulate, simulated_tips
 from endopilot.models.train import train

@@ -11,9 +11,8 @@ import pytest
 from endopilot.dataset.loader import read_dataset
 from endopilot.errors import InputError
 from endopilot.models import patient
-from endopilot.models.episodes import PATIENTS_FOLDER, Episodes, EpisodeSetUp
-from endopilot.models.open_loop import given_states
-from endopilot.models.rollout import load_model
+from endopilot.models.checkpoint import load_model
+from endopilot.models.episodes import PATIENTS_FOLDER, Episodes, EpisodeSetUp, given_states
 from endopilot.simulation.config import SimulatorConfig
 from toy_navigation import make_toy_dataset
 

@@ -11,11 +11,11 @@ import torch
 from endopilot.dataset.loader import read_dataset
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.errors import InputError
+from endopilot.models.checkpoint import load_model
 from endopilot.models.config import TrainConfig, TransformerConfig
 from endopilot.models.episodes import Episodes
-from endopilot.models.rollout import TransformerPredictor, load_model
 from endopilot.models.train import train
-from endopilot.models.transformer import ForwardNetwork, InverseNetwork
+from endopilot.models.transformer import ForwardNetwork, InverseNetwork, TransformerPredictor
 
 GIVEN = 30
 SMALL = TransformerConfig(d_model=24, heads=2, encoder_layers=1, decoder_layers=1, feedforward=32)

@@ -17,13 +17,11 @@ from endopilot import __version__
 from endopilot.dataset.loader import read_dataset
 from endopilot.errors import InputError
 from endopilot.files import read_json, sha256
-from endopilot.models.checkpoint import read_network, read_tensors
+from endopilot.models.checkpoint import load_model, read_network, read_tensors
 from endopilot.models.config import TrainConfig, TransformerConfig
 from endopilot.models.episodes import Episodes
-from endopilot.models.rollout import load_model
-from endopilot.models.sequences import Windows
 from endopilot.models.train import tensorboard_writer, train
-from endopilot.models.transformer import NETWORKS
+from endopilot.models.transformer import NETWORKS, Windows
 from toy_navigation import make_toy_dataset
 
 SMALL = TransformerConfig(d_model=24, heads=2, encoder_layers=1, decoder_layers=1, feedforward=32)

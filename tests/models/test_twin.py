@@ -15,10 +15,10 @@ from endopilot.dataset.loader import read_dataset
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.models import twin as twin_module
+from endopilot.models.checkpoint import load_model
 from endopilot.models.config import TrainConfig, TwinConfig
 from endopilot.models.ensemble import Ensemble
 from endopilot.models.episodes import Episodes
-from endopilot.models.rollout import load_model
 from endopilot.models.simulated_wires import FRICTION_FACTORS
 from endopilot.models.train import train
 from endopilot.simulation.simulate import simulate

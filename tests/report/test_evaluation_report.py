@@ -7,7 +7,7 @@ import pytest
 
 from endopilot.errors import InputError
 from endopilot.evaluation.results import METRICS_FILE, RESULTS_FILE
-from endopilot.report.evaluation_report import report_evaluation
+from endopilot.report.report import report_evaluation
 
 
 @pytest.fixture(scope="module")

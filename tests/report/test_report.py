@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
@@ -13,7 +14,7 @@ from endopilot.errors import InputError
 from endopilot.evaluation import evaluate
 from endopilot.files import manifest, read_json, write_json
 from endopilot.imaging.volume import write_mask, write_volume
-from endopilot.report import evaluation_report, report, report_text
+from endopilot.report import report, report_text
 from endopilot.report.report import PatientContent, ReportContent, write_report
 from endopilot.report.still import LIBRARIES_MISSING
 from endopilot.types import LumenMask, Volume
@@ -62,7 +63,7 @@ def material(tmp_path_factory, anatomy, results):
     write_mask(LumenMask(Volume(inside, *grid), anatomy.insertion), folder / "mask.nii.gz", manifest={})
     write_json(folder / "evaluation" / "metrics.json", evaluate._metrics(results, {"a", "b"}, 0))
     titles = {"seen_test": "New navigations, known patients", "test": "New patients"}
-    evaluation_report._write_figures(results, titles, folder / "evaluation" / "figures")
+    report._write_figures(results, titles, folder / "evaluation" / "figures")
     curve = [{"epoch": n, "steps": 20, "loss": 1.0 / n, "validation_loss": None} for n in (1, 2, 3)]
     record = {"seconds": 12.0, "curve": curve}
     write_json(folder / "run" / "training.json", {"ff": record, "if": record})
@@ -118,7 +119,9 @@ def test_nothing_is_loaded_from_outside(page):
 
 
 def test_style_sheets_load_nothing():
-    assert not re.search(r"url\(|@import", report.template_text("report.css"))
+    assert not re.search(
+        r"url\(|@import", (Path(report.__file__).parent / "templates" / "report.css").read_text(encoding="utf-8")
+    )
 
 
 def test_the_numbers_of_the_tables_are_those_of_metrics_json(page, material):

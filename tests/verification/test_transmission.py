@@ -1,4 +1,4 @@
-"""Between drive and ostium, against closed forms; derivations stand in `endopilot.verification.transmission`."""
+"""Between drive and ostium, against closed forms; derivations stand in `benchmarks.verification.transmission`."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from endopilot.verification import transmission
+from benchmarks.verification import transmission
+from benchmarks.verification.transmission import LAG_RAD, turn
 from endopilot.verification.case import Case
-from endopilot.verification.transmission import LAG_RAD, turn
 
 
 @pytest.mark.parametrize("group", transmission.CASES, ids=lambda group: group.__name__)

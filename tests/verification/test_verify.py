@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from benchmarks.__main__ import main as benchmarks
-from benchmarks.verification import contact, engine, motion, order, stability, tube, tubes
+from benchmarks.verification import contact, engine, motion, order, stability, transmission, tube, tubes
 from endopilot.cli import main
-from endopilot.verification import free_rod, transmission
+from endopilot.verification import free_rod
 from endopilot.verification.case import Case, compare
 
 KEYS = ["case", "reference", "value", "error", "bar", "passed"]

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from endopilot.angiograms.config import AngiogramsConfig
-from endopilot.angiograms.draw import CineDraw, motion_of
-from endopilot.angiograms.drive import Driven, drive_devices
+from endopilot.angiograms.draw import CineDraw, Driven, drive_devices, motion_of
 from endopilot.angiograms.flow import Flow
 from endopilot.angiograms.masks import CONTRAST_SHARE, LUMEN_MM, stroke
 from endopilot.lines import length_along, places_on
@@ -53,14 +52,10 @@ class Cine:
     """One cine of a patient.
 
     Attributes:
-        config: of the data set.
-        draw: what it shows.
-        imager: of the patient.
         view: source and detector, in the frame of the CT.
         times_s: of the frames since heart, breath and devices began to move, s.
         placed: affine map of the vessel, and of what lies in it, from where CT shows it to where heart and breath have
             moved it at each frame, LPS mm of the CT.
-        flow: of the blood.
         contrast: share of contrast in the blood at each frame and point of `flow`; 0 where none is injected.
         driven: the devices; None where none are shown.
         air_kerma_ugy: of a frame, at the patient's entrance reference point, µGy; 0 before the first is made.
@@ -68,11 +63,6 @@ class Cine:
 
     def __init__(self, config: AngiogramsConfig, draw: CineDraw, imager: XrayImager) -> None:
         """Simulate what a cine shows.
-
-        Args:
-            config: of the data set.
-            draw: what it shows.
-            imager: of the patient and the devices, with the settings of `config`.
 
         Raises:
             InputError: the devices do not fit, or there is no such policy.

@@ -30,7 +30,6 @@ def stored(signal: Float32[np.ndarray, "rows columns"], window: float) -> UInt16
     """Return a frame as its file holds it: the logarithm of the light, 12 bits, wider than what a monitor shows.
 
     Args:
-        signal: what the detector reads.
         window: half-width of the monitor's grey scale, powers of e.
     """
     value = np.float32(_LARGEST / 2) * (1 + signal / np.float32(_WIDER * window))
@@ -43,9 +42,6 @@ def write_xa(
     """Write the frames of a cine. The same cine gives the same bytes.
 
     Args:
-        path: of the file.
-        cine: what they show.
-        frames: from `stored`.
         number: of the cine among the patient's.
         identity: of the patient in this data set; UIDs are made of it.
     """

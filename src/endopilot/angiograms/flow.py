@@ -32,8 +32,6 @@ class Injection:
     """Contrast that is injected through the guiding catheter.
 
     Attributes:
-        start_s: when it begins, s.
-        duration_s: how long it lasts, s.
         rate_ml_s: ml/s; what the vessel does not take flows back into the aorta.
         ramp_s: time in which the rate rises and falls, s.
     """
@@ -56,7 +54,6 @@ class Flow:
     Attributes:
         points: of all centerlines, branch after branch, LPS mm.
         branch: that each belongs to.
-        rate_ml_s: blood that passes each, ml/s.
         transit_s: time from the ostium to each, s.
         inflow_ml_s: blood that flows in at the ostium, ml/s.
     """
@@ -65,7 +62,6 @@ class Flow:
         """Share the blood among the branches.
 
         Args:
-            tree: the vessel.
             velocity_mm_s: of the blood behind the ostium, mean over the section, mm/s.
         """
         lines = [branch.centerline for branch in tree.branches]
@@ -91,12 +87,7 @@ class Flow:
     def contrast(
         self, injection: Injection, times_s: Float[np.ndarray, "frames"]
     ) -> tuple[Float[np.ndarray, "tanks"], Float[np.ndarray, "frames tanks"]]:
-        """Return transit times, s, and the share of contrast in the blood there at some times from 0 on.
-
-        Args:
-            injection: what is injected.
-            times_s: increasing, s.
-        """
+        """Return transit times, s, and the share of contrast in the blood there at some times from 0 on."""
         step = MIXING_S / _STEPS
         longest = min(float(self.transit_s.max()), float(times_s[-1]))
         tanks = int(np.ceil(longest / MIXING_S)) + 2

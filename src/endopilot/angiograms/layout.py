@@ -11,8 +11,7 @@ from typing import Any
 
 from endopilot import __version__
 from endopilot.angiograms.config import AngiogramsConfig
-from endopilot.dataset.layout import identify
-from endopilot.dataset.splits import assign_splits
+from endopilot.dataset.layout import assign_splits, identify
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import input_hash, json_text, sha256
@@ -31,11 +30,7 @@ class Layout:
     """The patients of a data set, and where everything stands.
 
     Attributes:
-        output: folder of the data set.
-        config: how many cines, and what they show.
-        stack: the wire, and the catheters around it.
         sources: where each patient comes from: a folder of an anatomy, or a CT.
-        names: of the patients.
         splits: of each: train, calibrate or test.
         settings: what a resumed run must share with the run that it continues.
         key: marks all of that.
@@ -69,12 +64,6 @@ class Layout:
 
 def lay_out(sources: Sequence[Path], output: Path, stack: Stack, config: AngiogramsConfig) -> Layout:
     """Read who the patients are, and share them among the splits.
-
-    Args:
-        sources: folders of anatomies, and CTs.
-        output: folder of the data set.
-        stack: the wire, and the catheters around it.
-        config: how many cines, and what they show.
 
     Raises:
         InputError: no source, or one that cannot be read; two of one name; too few for the splits.

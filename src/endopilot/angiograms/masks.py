@@ -29,7 +29,6 @@ def stroke(
     Args:
         line: column and row, pixels.
         radius: half the width at each point, pixels.
-        pixels: of the image along a side.
     """
     mask = np.zeros((pixels, pixels), dtype=bool)
     if len(line) < 2:

@@ -1,8 +1,8 @@
-"""A patient and a cine of a data set on disk: `write_patient` and `write_cine`."""
+"""A patient and a cine on disk, with keypoints and masks as COCO has them: `write_patient` and `write_cine`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,18 +12,82 @@ from jaxtyping import Float
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import read_anatomy, write_anatomy
-from endopilot.angiograms.cine import Cine, CineFrame
-from endopilot.angiograms.coco import coco, frame_entries
+from endopilot.angiograms.cine import KEYPOINTS, Cine, CineFrame
 from endopilot.angiograms.dicom import stored, write_xa
 from endopilot.angiograms.draw import draw_cine, motion_of
 from endopilot.angiograms.layout import CT_FILE, Layout, is_anatomy
-from endopilot.angiograms.masks import CLASSES, laid_together
+from endopilot.angiograms.masks import CLASSES, box_of, encoded, laid_together
 from endopilot.files import png_image, write_json, writing
 from endopilot.imaging.segment import segment
 from endopilot.imaging.volume import read_volume, write_volume
 from endopilot.types import Volume
 from endopilot.xray.absorbers import surroundings
 from endopilot.xray.image import XrayImager
+
+CATEGORIES: tuple[dict[str, Any], ...] = tuple(
+    {"id": number, "name": name, "supercategory": "vessel" if name in ("vessel", "contrast") else "device"}
+    | (
+        {
+            "keypoints": list(KEYPOINTS[name]),
+            "skeleton": [[k, k + 1] for k in range(1, len(KEYPOINTS[name]))],
+        }
+        if name in KEYPOINTS
+        else {}
+    )
+    for number, name in enumerate(CLASSES, 1)
+)
+"""COCO's categories: the masks by name, with the keypoints of the devices. Of several driven catheters, the mask is
+that of all, and the keypoints are those of the inner one."""
+_SEEN = 2
+_MOST_FRAMES = 100_000
+"""A cine's images are numbered from its own number times this."""
+
+
+def frame_entries(
+    cine: Cine, frame: CineFrame, image: str, number: int, cine_number: int
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return a frame's entry in `images`, and its entries in `annotations`; what does not show has none."""
+    pixels = len(frame.grey)
+    image_id = cine_number * _MOST_FRAMES + number
+    annotations, keypoints = [], cine.keypoints(frame)
+    for category in CATEGORIES:
+        name = category["name"]
+        mask = frame.masks.get(name)
+        if mask is None or not mask.any():
+            continue
+        entry = {
+            "id": image_id * (len(CATEGORIES) + 1) + category["id"],
+            "image_id": image_id,
+            "category_id": category["id"],
+            "segmentation": encoded(mask),
+            "area": int(np.count_nonzero(mask)),
+            "bbox": box_of(mask),
+            "iscrowd": 0,
+        }
+        if name in keypoints:
+            at = keypoints[name][1]
+            shown = np.all((at >= -0.5) & (at < pixels - 0.5), axis=1)  # NaN, beyond the device's end, is not
+            entry["keypoints"] = [
+                value
+                for (column, row), is_shown in zip(at.tolist(), shown.tolist(), strict=True)
+                for value in ((round(column, 2), round(row, 2), _SEEN) if is_shown else (0, 0, 0))
+            ]
+            entry["num_keypoints"] = int(shown.sum())
+        annotations.append(entry)
+    entry = {"id": image_id, "file_name": image, "width": pixels, "height": pixels, "frame": number}
+    return entry, annotations
+
+
+def coco(parts: Iterable[Mapping[str, Any]], about: str) -> dict[str, Any]:
+    """Return one COCO object of those of some cines."""
+    parts = list(parts)
+    return {
+        "info": {"description": about},
+        "images": [image for part in parts for image in part["images"]],
+        "annotations": [entry for part in parts for entry in part["annotations"]],
+        "categories": list(CATEGORIES),
+    }
+
 
 RECORD_FILE, COCO_FILE = "cine.json", "coco.json"
 """What a cine shows, and its keypoints and masks."""
@@ -34,10 +98,6 @@ _kept: dict[str, XrayImager] = {}
 
 def write_patient(layout: Layout, folder: Path) -> None:
     """Write a patient's vessel and CT into the data set. The vessel of a CT is segmented.
-
-    Args:
-        layout: of the data set.
-        folder: of the patient in it.
 
     Raises:
         InputError: the source cannot be read, the CT shows no such vessel, or the devices do not fit.
@@ -61,10 +121,6 @@ def write_patient(layout: Layout, folder: Path) -> None:
 
 def write_cine(layout: Layout, folder: Path) -> None:
     """Make a cine, and write its frames, and what is true of them, into its folder.
-
-    Args:
-        layout: of the data set.
-        folder: of the cine.
 
     Raises:
         InputError: no motion of the devices can be simulated in the vessel, or there is no such policy.

@@ -21,20 +21,9 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.anatomy.labels_tree import ARCH_SECTIONS
+from endopilot.atlas import branching
 from endopilot.atlas import curves as shape
-from endopilot.atlas.branching import (
-    NoShape,
-    SidePlan,
-    Vessel,
-    build_tree,
-    narrowed,
-    truncated,
-    uneven,
-    until_it_fits,
-    wiggled,
-    with_side_branches,
-)
-from endopilot.atlas.population import Population
+from endopilot.atlas.population import Population, vessel_data
 from endopilot.atlas.variation import bent, varied
 from endopilot.lines import length_along
 from endopilot.types import VesselTree
@@ -57,44 +46,28 @@ TRUNK_MM = (38.2, 9.5)
 
 _DESCENDING_MM, _ASCENDING_MM = 100.0, 35.0
 """Aorta before and behind the arch, mm: from the middle of the chest, and to the root."""
-_COURSES = {
-    "brachiocephalic trunk": ((0.0, (-0.45, -0.1, 0.9)), (20.0, (-0.6, 0.1, 0.8))),
-    "left common carotid": ((0.0, (0.1, 0.1, 1.0)), (30.0, (0.15, 0.15, 1.0))),
-    "left subclavian": ((0.0, (0.2, 0.25, 1.0)), (28.0, (0.8, 0.1, 0.5)), (50.0, (0.95, -0.1, -0.15))),
-    "right common carotid": ((0.0, (0.0, 0.1, 1.0)), (20.0, (-0.1, 0.1, 1.0))),
-    "right subclavian": ((0.0, (-0.75, 0.1, 0.65)), (22.0, (-0.95, 0.05, 0.1)), (45.0, (-0.95, -0.1, -0.25))),
-}
-LENGTH_MM = {
-    "left common carotid": 95.0,
-    "left subclavian": 85.0,
-    "right common carotid": 70.0,
-    "right subclavian": 65.0,
-}
 
 
 def make_arch(
     generator: np.random.Generator, stenosis_share: float, population: Population
 ) -> tuple[VesselTree, dict[str, Any]]:
-    """Return one aortic arch and what was drawn for it.
-
-    Args:
-        generator: random stream of this patient.
-        stenosis_share: probability of a stenosis, in a common carotid or the left subclavian artery.
-        population: how patients vary.
-    """
+    """Return one aortic arch and what was drawn for it; a stenosis lies in a carotid or the left subclavian artery."""
     sex = "man" if generator.random() < 0.5 else "woman"
     kind = str(generator.choice(list(TYPE_SHARES), p=np.array(list(TYPE_SHARES.values())) / sum(TYPE_SHARES.values())))
     bovine = bool(generator.random() < BOVINE_SHARE)
-    return until_it_fits(partial(_draw, generator, sex, kind, bovine, stenosis_share, population), "aortic arch")
+    return branching.until_it_fits(
+        partial(_draw, generator, sex, kind, bovine, stenosis_share, population), "aortic arch"
+    )
 
 
 def _draw(
     generator: np.random.Generator, sex: str, kind: str, bovine: bool, stenosis_share: float, population: Population
 ) -> tuple[VesselTree, dict[str, Any]]:
-    size = truncated(generator, 1.0, 0.08, 0.8, 1.2)
+    size = branching.truncated(generator, 1.0, 0.08, 0.8, 1.2)
     height, width = size * HEIGHT_MM[sex], size * WIDTH_MM[sex]
     wide = {
-        name: truncated(generator, mean, sd, mean - 2 * sd, mean + 2 * sd) for name, (mean, sd) in DIAMETER_MM.items()
+        name: branching.truncated(generator, mean, sd, mean - 2 * sd, mean + 2 * sd)
+        for name, (mean, sd) in DIAMETER_MM.items()
     }
     points = _aorta(generator, height, width)
     low, high = {"I": (0.1, 1.0), "II": (1.0, 2.0), "III": (2.0, 2.9)}[kind]
@@ -103,17 +76,17 @@ def _draw(
     first, last = origins["left subclavian"], origins["brachiocephalic trunk"]
     along, place = length_along(points), np.arange(len(points))
     marks = along[[0, first - 60, first, (first + last) // 2, last, last + 60, -1]]
-    radius = 0.5 * np.interp(along, marks, AORTA_DIAMETER_MM) * uneven(generator, along)
-    radius = radius * truncated(generator, 1.0, 0.13, 0.7, 1.3)
+    radius = 0.5 * np.interp(along, marks, AORTA_DIAMETER_MM) * branching.uneven(generator, along)
+    radius = radius * branching.truncated(generator, 1.0, 0.13, 0.7, 1.3)
     section = np.select([place <= first, place <= last], ARCH_SECTIONS[:2], default=ARCH_SECTIONS[2]).tolist()
-    vessels = [Vessel(bent(generator, points, radius, population), radius, section)]
+    vessels = [branching.Vessel(bent(generator, points, radius, population), radius, section)]
     plans = varied(generator, _plans(generator, vessels[0], origins, wide, bovine), population)
-    vessels = with_side_branches(generator, vessels, plans, population.carina_mm)
+    vessels = branching.with_side_branches(generator, vessels, plans, population.carina_mm)
     narrow = []
     if generator.random() < stenosis_share:
         where = str(generator.choice(["left common carotid", "left subclavian", "right common carotid"]))
         index = [vessel.section[-1] for vessel in vessels].index(where)
-        narrow, vessels = narrowed(generator, vessels, index, (0.4, 0.8), population.tandem_share)
+        narrow, vessels = branching.narrowed(generator, vessels, index, (0.4, 0.8), population.tandem_share)
     drawn = {
         "arch_type": kind,
         "bovine": bovine,
@@ -123,7 +96,7 @@ def _draw(
         "trunk_drop_mm": drop,
         "stenoses": narrow,
     }
-    return build_tree(vessels, ARCH_SECTIONS), drawn
+    return branching.build_tree(vessels, ARCH_SECTIONS), drawn
 
 
 def _aorta(generator: np.random.Generator, height_mm: float, width_mm: float) -> Float[np.ndarray, "n 3"]:
@@ -133,11 +106,11 @@ def _aorta(generator: np.random.Generator, height_mm: float, width_mm: float) ->
     down, root = np.linspace(-_DESCENDING_MM, -8.0, 12), np.linspace(-8.0, -_ASCENDING_MM, 5)
     across = np.concatenate([np.full(12, across[0]), across, np.full(5, across[-1])])
     up = np.concatenate([down, up, root])
-    angle = np.deg2rad(truncated(generator, 50.3, 13.8, 22.0, 78.0))
+    angle = np.deg2rad(branching.truncated(generator, 50.3, 13.8, 22.0, 78.0))
     forwards = np.array([-np.sin(angle), -np.cos(angle), 0.0])
     points = across[:, None] * forwards + up[:, None] * np.array([0.0, 0.0, 1.0])
     line = shape.curve_through(points)
-    return wiggled(generator, line, (1.5, 4.0), quiet_mm=30.0, wavelengths_mm=(60.0, 160.0))
+    return branching.wiggled(generator, line, (1.5, 4.0), quiet_mm=30.0, wavelengths_mm=(60.0, 160.0))
 
 
 def _origins(
@@ -158,37 +131,41 @@ def _origins(
     for name, (mean, sd) in GAP_MM.items():
         if bovine and name == "left common carotid":
             continue
-        gap = truncated(generator, mean, sd, 0.5, mean + 2 * sd)
+        gap = branching.truncated(generator, mean, sd, 0.5, mean + 2 * sd)
         away = gap + 0.5 * (wide[before] + wide[name])
         origins[name], before = origins[before] - round(away / shape.STEP_MM), name
     if points[origins["left subclavian"], 2] < 0.2 * points[top, 2]:
-        raise NoShape
+        raise branching.NoShape
     return origins
 
 
 def _plans(
-    generator: np.random.Generator, aorta: Vessel, origins: dict[str, int], wide: dict[str, float], bovine: bool
-) -> list[SidePlan]:
-    tangents = shape.tangents(aorta.points)
+    generator: np.random.Generator,
+    aorta: branching.Vessel,
+    origins: dict[str, int],
+    wide: dict[str, float],
+    bovine: bool,
+) -> list[branching.SidePlan]:
+    tangents, data = shape.tangents(aorta.points), vessel_data("arch")
 
-    def plan(name: str, diameter: float, parent: int, origin: int, length: float, taper: float) -> SidePlan:
-        course = np.array(_COURSES[name][0][1])
+    def plan(name: str, diameter: float, parent: int, origin: int, length: float, taper: float) -> branching.SidePlan:
+        course = np.array(data["courses"][name][0][1])
         # Branches of the arch head upwards, however the aorta runs under them.
         up = np.rad2deg(np.arccos(tangents[origin] @ course / np.linalg.norm(course))) if parent == 0 else 30.0
         angle = float(np.clip(up, 30.0, 130.0))
-        return SidePlan(
+        return branching.SidePlan(
             section=name,
             parent=parent,
             origin=origin,
             length_mm=length,
             diameter_mm=diameter,
-            courses=_COURSES[name],
+            courses=data["courses"][name],
             taper=taper,
             angle_deg=(angle - 8.0, angle + 8.0),
         )
 
     trunk = "brachiocephalic trunk"
-    length = truncated(generator, *TRUNK_MM, 24.0, 58.0)
+    length = branching.truncated(generator, *TRUNK_MM, 24.0, 58.0)
     wall = float(aorta.radius[origins[trunk]])
     plans = [plan(trunk, wide[trunk], 0, origins[trunk], wall + length, 0.1)]
     for name in ("left common carotid", "left subclavian", "right common carotid", "right subclavian"):
@@ -196,6 +173,6 @@ def _plans(
         parent, origin = (0, origins[name]) if name in origins else (1, -1)
         if name == "left common carotid" and bovine:
             parent, origin = 1, round((wall + float(generator.uniform(3.0, 12.0))) / shape.STEP_MM)
-        reach = wall + LENGTH_MM[name] if parent == 0 else LENGTH_MM[name]
+        reach = data["length_mm"][name] + (wall if parent == 0 else 0.0)
         plans.append(plan(name, diameter, parent, origin, reach * float(generator.uniform(0.9, 1.1)), 0.2))
     return plans

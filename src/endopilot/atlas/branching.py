@@ -24,6 +24,12 @@ _BEND_MM = 4.0
 """Two places of one vessel that lie farther apart along it than this and twice their radii must not touch, mm."""
 
 
+_RIGHT_SHARE, _BALANCED_SHARE = 0.88, 0.06
+"""Shares of right and balanced dominance; the rest is left. Chosen within the range that the literature reports."""
+_FEMALE_CALIBRE = 0.91
+"""Women's coronary lumens against men's (Dodge JT et al., Circulation 1992;86:232-46)."""
+
+
 class NoShape(Exception):
     """The drawn shape is impossible, or lumens collide: draw again."""
 
@@ -52,10 +58,8 @@ class SidePlan:
     """A side branch to be drawn.
 
     Attributes:
-        section: name of its anatomical section.
         parent: index of the vessel that it leaves.
         origin: index of the parent's point where it leaves; -1 for its end.
-        length_mm: its length.
         diameter_mm: lumen diameter at its origin.
         courses: (abscissa from which it holds, mm; LPS direction), in order.
         taper: share of the diameter that is lost towards the end.
@@ -79,10 +83,6 @@ def until_it_fits(
 ) -> tuple[VesselTree, dict[str, Any]]:
     """Draw trees until one fits; its record states how many failed before (`redrawn`).
 
-    Args:
-        draw: draws one tree, and raises `NoShape` if it fails.
-        what: what is drawn, for the error.
-
     Raises:
         NoShape: 60 draws failed.
     """
@@ -103,6 +103,17 @@ def truncated(generator: np.random.Generator, mean: float, sd: float, low: float
             return float(value)
 
 
+def coronary_dominance(u: float) -> str:
+    """Return right, balanced or left dominance for a number between 0 and 1."""
+    return "right" if u < _RIGHT_SHARE else "balanced" if u < _RIGHT_SHARE + _BALANCED_SHARE else "left"
+
+
+def coronary_calibre(generator: np.random.Generator, mean: float, low: float, high: float) -> float:
+    """Draw a patient's coronary lumen against the average, by sex."""
+    sex = _FEMALE_CALIBRE if generator.random() < 0.5 else 1.0
+    return float(np.clip(mean * sex / (0.5 + 0.5 * _FEMALE_CALIBRE) * (1 + 0.1 * generator.normal()), low, high))
+
+
 def free_origin(generator: np.random.Generator, mean_mm: float, sd_mm: float, taken: Sequence[int]) -> int:
     """Draw the index of a branch's origin, 3 mm or more from the vessel's start and from other origins."""
     while True:
@@ -118,7 +129,6 @@ def stenosis(
     """Return a narrowing of 30 to 65 % of the diameter over 6 to 14 mm, and the factor on the radius.
 
     Args:
-        generator: random stream.
         along: abscissa of the vessel's points, mm.
         shares: it lies between these shares of the vessel's abscissa.
     """
@@ -203,9 +213,6 @@ def with_side_branches(
     """Return the vessels with the planned branches; one that cuts another lumen is drawn again, twelve times at most.
 
     Args:
-        generator: random stream.
-        vessels: those that are there.
-        plans: the branches.
         carina_mm: over this length behind a fork and twice their radii lumens may be in contact, mm.
 
     Raises:
@@ -301,7 +308,6 @@ def lumens_collide(vessels: Sequence[Vessel], carina_mm: float = _BEND_MM) -> bo
     """Return whether lumens touch that lie far apart along the tree.
 
     Args:
-        vessels: the tree.
         carina_mm: behind a fork two vessels are far apart from this length and twice their radii on, mm.
     """
     points = np.concatenate([vessel.points for vessel in vessels])

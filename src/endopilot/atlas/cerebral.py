@@ -23,19 +23,9 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
 from endopilot.anatomy.labels_tree import CEREBRAL_SECTIONS
+from endopilot.atlas import branching
 from endopilot.atlas import curves as shape
-from endopilot.atlas.branching import (
-    NoShape,
-    SidePlan,
-    Vessel,
-    build_tree,
-    narrowed,
-    truncated,
-    uneven,
-    until_it_fits,
-    with_side_branches,
-)
-from endopilot.atlas.population import Population
+from endopilot.atlas.population import Population, vessel_data
 from endopilot.atlas.variation import Fork, bent, factor, forks_of, varied
 from endopilot.lines import length_along
 from endopilot.types import VesselTree
@@ -54,13 +44,6 @@ _SIPHON = np.array(
 """Left internal carotid artery, LPS mm from the entrance of the carotid canal; the midline lies at x = -27."""
 _BEYOND_M1 = np.array([[4, 4, 5], [5, 12, 10], [7, 23, 15], [13, 34, 19.0]])
 """Inferior trunk of M2 over the insula, mm from the end of M1."""
-_COURSES = {
-    "M2 superior": ((0.0, (0.1, -0.7, 0.7)), (10.0, (0.2, 0.0, 1.0)), (20.0, (0.6, 0.2, 0.75))),
-    "M2 middle": ((0.0, (0.85, -0.2, 0.5)), (10.0, (0.6, 0.3, 0.75)), (20.0, (0.6, 0.55, 0.55))),
-    "A1": ((0.0, (-0.85, -0.5, 0.1)), (A1_MM, (-0.05, -0.6, 0.8)), (30.0, (0.05, 0.0, 1.0)), (46.0, (0.05, 0.9, 0.4))),
-    "ophthalmic": ((0.0, (0.3, -0.95, 0.2)), (12.0, (0.5, -0.85, 0.0))),
-    "PCom": ((0.0, (-0.15, 0.95, 0.1)), (8.0, (-0.1, 1.0, 0.05))),
-}
 _PCOM_SHARE = 0.6
 """Share of patients in whom the posterior communicating artery is wide enough to be visible: an assumption."""
 _SHARPEST_PER_MM = 0.4
@@ -70,19 +53,13 @@ _SHARPEST_PER_MM = 0.4
 def make_cerebral(
     generator: np.random.Generator, stenosis_share: float, population: Population
 ) -> tuple[VesselTree, dict[str, Any]]:
-    """Return one side's anterior circulation and what was drawn for it.
-
-    Args:
-        generator: random stream of this patient.
-        stenosis_share: probability of a stenosis, in M1 or the carotid artery.
-        population: how patients vary.
-    """
+    """Return one side's anterior circulation and what was drawn for it; a stenosis lies in M1 or the carotid artery."""
     side = "left" if generator.random() < 0.5 else "right"
     trunks = 3 if generator.random() < TRIFURCATION_SHARE else 2
-    siphon = truncated(generator, SIPHON_MM, SIPHON_SD_MM, 21.0, 45.0)
-    m1 = truncated(generator, M1_MM, M1_SD_MM, 7.0, 38.0)
+    siphon = branching.truncated(generator, SIPHON_MM, SIPHON_SD_MM, 21.0, 45.0)
+    m1 = branching.truncated(generator, M1_MM, M1_SD_MM, 7.0, 38.0)
     draw = partial(_draw, generator, side, trunks, siphon, m1, stenosis_share, population)
-    return until_it_fits(draw, "cerebral arteries")
+    return branching.until_it_fits(draw, "cerebral arteries")
 
 
 def _draw(
@@ -98,12 +75,12 @@ def _draw(
     radius, calibre = _radius(generator, points, marks)
     place = np.arange(len(points))
     section = np.select([place <= marks["terminus"], place <= marks["M2"]], ["ICA", "M1"], default="M2 inferior")
-    a1_mm = truncated(generator, A1_MM, 3.0, *A1_RANGE_MM)
+    a1_mm = branching.truncated(generator, A1_MM, 3.0, *A1_RANGE_MM)
     plans = varied(generator, _plans(generator, marks, a1_mm, calibre, trunks, population), population)
     plans, forks = _opened_trunks(generator, plans, population)
     points = bent(generator, points, radius, population, forks=forks)
-    vessels = [Vessel(points, radius, section.tolist())]
-    vessels = with_side_branches(generator, vessels, plans, population.carina_mm)
+    vessels = [branching.Vessel(points, radius, section.tolist())]
+    vessels = branching.with_side_branches(generator, vessels, plans, population.carina_mm)
     narrow = []
     if generator.random() < stenosis_share:
         low, high = (
@@ -111,7 +88,7 @@ def _draw(
         )
         low, high = low + 0.2 * (high - low), high - 0.2 * (high - low)
         shares = (low / len(points), high / len(points))
-        narrow, vessels = narrowed(generator, vessels, 0, shares, population.tandem_share)
+        narrow, vessels = branching.narrowed(generator, vessels, 0, shares, population.tandem_share)
     whole = {vessel.section[-1]: index for index, vessel in enumerate(vessels)}
     aca = vessels[whole["A1"]]
     beyond = length_along(aca.points) > a1_mm
@@ -130,7 +107,7 @@ def _draw(
         "carotid_curvature_mean_per_mm": float(shape.curvature(carotid).mean()),
         "stenoses": narrow,
     }
-    return build_tree(vessels, CEREBRAL_SECTIONS), drawn
+    return branching.build_tree(vessels, CEREBRAL_SECTIONS), drawn
 
 
 def _main(
@@ -160,7 +137,7 @@ def _main(
         found = along[[marks["terminus"], marks["M2"]]] - along[[marks["cavernous"], marks["terminus"]]]
         stretch = stretch * np.array([siphon_mm, m1_mm]) / np.maximum(found, 1.0)
     if shape.curvature(points).max() > _SHARPEST_PER_MM or marks["M2"] - marks["terminus"] < 8:
-        raise NoShape
+        raise branching.NoShape
     return points, marks
 
 
@@ -173,12 +150,12 @@ def _radius(
     generator: np.random.Generator, points: Float[np.ndarray, "n 3"], marks: dict[str, int]
 ) -> tuple[Float[np.ndarray, "n"], float]:
     """Return the lumen radius along the main line, mm, and the patient's calibre against the average."""
-    calibre = truncated(generator, 1.0, 0.12, 0.72, 1.3)
+    calibre = branching.truncated(generator, 1.0, 0.12, 0.72, 1.3)
     place = [0, marks["cavernous"], marks["terminus"], marks["terminus"] + 5, marks["M2"], marks["M2"] + 5, len(points)]
     wide = DIAMETER_MM
     diameter = [4.8, wide["cavernous"], wide["terminus"], wide["M1"], 2.8, wide["M2"], 1.5]
     own = np.interp(np.arange(len(points)), place, diameter)
-    return 0.5 * calibre * own * uneven(generator, length_along(points)), calibre
+    return 0.5 * calibre * own * branching.uneven(generator, length_along(points)), calibre
 
 
 def _plans(
@@ -188,7 +165,7 @@ def _plans(
     calibre: float,
     trunks: int,
     population: Population,
-) -> list[SidePlan]:
+) -> list[branching.SidePlan]:
     origins = {
         "A1": marks["terminus"],
         "M2 superior": marks["M2"],
@@ -205,15 +182,16 @@ def _plans(
     for name, origin in origins.items():
         if generator.random() >= shares.get(name, 1.0):
             continue
-        begins = [begin + a1_mm - A1_MM if name == "A1" and begin else begin for begin, _ in _COURSES[name]]
+        courses = vessel_data("cerebral")["courses"][name]
+        begins = [begin + a1_mm - A1_MM if name == "A1" and begin else begin for begin, _ in courses]
         own = DIAMETER_MM.get(name, DIAMETER_MM["M2"]) * calibre
         plans.append(
-            SidePlan(
+            branching.SidePlan(
                 section=name,
                 origin=origin,
                 length_mm=lengths[name] * float(generator.uniform(0.85, 1.15)),
-                diameter_mm=own * truncated(generator, 1.0, 0.1, 0.7, 1.3),
-                courses=tuple((begin, course) for begin, (_, course) in zip(begins, _COURSES[name], strict=True)),
+                diameter_mm=own * branching.truncated(generator, 1.0, 0.1, 0.7, 1.3),
+                courses=tuple((begin, course) for begin, (_, course) in zip(begins, courses, strict=True)),
                 angle_deg=(38.0, 58.0) if name.startswith("M2") else (60.0, 90.0),
             )
         )
@@ -221,8 +199,8 @@ def _plans(
 
 
 def _opened_trunks(
-    generator: np.random.Generator, plans: list[SidePlan], population: Population
-) -> tuple[list[SidePlan], list[Fork]]:
+    generator: np.random.Generator, plans: list[branching.SidePlan], population: Population
+) -> tuple[list[branching.SidePlan], list[Fork]]:
     """Return the plans and where the main line gives way; the trunks of M2 part at the population's angle.
 
     The inferior trunk, which goes on from M1, and the superior one each take their half of it.
@@ -231,7 +209,7 @@ def _opened_trunks(
     if population.trunks_angle_deg is None:
         return plans, forks
     mean, sd, low, high = population.trunks_angle_deg
-    half = 0.5 * truncated(generator, mean, sd, low, high)
+    half = 0.5 * branching.truncated(generator, mean, sd, low, high)
     at = next(place for place, plan in enumerate(plans) if plan.section == "M2 superior")
     plans = [*plans[:at], replace(plans[at], angle_deg=(half - 4.0, half + 4.0)), *plans[at + 1 :]]
     own = Fork(plans[at].origin, plans[at].courses[0][1], half)

@@ -51,7 +51,6 @@ def parallel_normals(
     """Return unit vectors perpendicular to the tangents, carried along without twist.
 
     Args:
-        tangent: unit tangents.
         first: direction that the first normal takes as nearly as it can.
     """
     start = np.eye(3)[np.argmin(np.abs(tangent[0]))] if first is None else first
@@ -127,7 +126,6 @@ def steer(
         start: first point, LPS mm.
         direction: unit tangent there.
         courses: (abscissa from which it holds, mm; unit direction), in order.
-        length_mm: length of the curve.
         relaxation_mm: length over which the direction approaches the course by a factor e.
         depth: how deep points lie below the surface, mm; the curve seeks a height of `_HEIGHT_MM` above it. None for
             no surface.

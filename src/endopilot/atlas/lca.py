@@ -1,7 +1,7 @@
 """Left coronary arteries: left main, anterior descending and circumflex with their branches, by dominance.
 
 Facts and their sources: mean courses and origins of branches, Dodge JT et al., Circulation 1988;78:1167-80 (see
-`heart_left`); lumen diameters and the influence of dominance and sex, Dodge JT et al., Circulation 1992;86:232-46 (left
+`heart_reference`); lumen diameters by dominance and sex, Dodge JT et al., Circulation 1992;86:232-46 (left
 main 4.5 ± 0.5 mm, anterior descending 3.7 ± 0.4 to 1.9 ± 0.4 mm, circumflex 3.4 ± 0.5 mm, 4.2 ± 0.6 mm where it is
 dominant); left main 13.1 mm long and the circumflex most often 65 to 80 mm, a cadaver study of 80 hearts from Gujarat
 (docs/evidence/atlas.md), where the SD of the left main's length, 2.4 mm, is smaller than the 5.2 mm of Reig J, Petit M,
@@ -21,24 +21,10 @@ from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from endopilot.anatomy.labels_tree import LCA_SECTIONS
+from endopilot.atlas import branching
 from endopilot.atlas import curves as shape
-from endopilot.atlas import heart_left
-from endopilot.atlas.branching import (
-    NoShape,
-    SidePlan,
-    Vessel,
-    build_tree,
-    free_origin,
-    mouth,
-    narrowed,
-    truncated,
-    uneven,
-    until_it_fits,
-    wiggled,
-    with_side_branches,
-)
-from endopilot.atlas.heart_reference import HeartFit
-from endopilot.atlas.population import Population
+from endopilot.atlas.heart_reference import FORK, INFERIOR, LAD, LCX, HeartFit, fit_left_heart
+from endopilot.atlas.population import Population, SideKind, side_kinds
 from endopilot.atlas.variation import bent, drawn_from, ectasia, factor, forks_of, opened_fork, varied
 from endopilot.lines import length_along
 from endopilot.types import VesselTree
@@ -54,76 +40,12 @@ LCX_DIAMETER_MM = {
 }
 """The same along the circumflex artery from its origin to its end, by dominance."""
 
-_RIGHT_SHARE, _BALANCED_SHARE = 0.88, 0.06
-"""Shares of right and balanced dominance; the rest is left: as in the right coronary arteries of this atlas."""
-_RAMUS_SHARE = 0.25
-"""Share of patients with a ramus intermedius; the literature reports 15 to 37 %."""
-_FEMALE_CALIBRE = 0.91
-"""Women's lumens against men's (Dodge 1992)."""
 _SIZE_SD, _TURN_SD_DEG, _WIGGLE_MM = 0.085, 6.0, (0.5, 1.3)
 """Spread of the heart's size, of its position about each axis (from the SD of Dodge's positions), of the wiggles."""
 
 _ENDS = {"right": (66.0, 9.0, 40.0, 76.0), "balanced": (88.0, 4.0, 82.0, 97.0)}
 """Length of the circumflex artery, mm: mean, SD, least, most, in a heart of mean size. A left-dominant one goes on over
 the crux into the posterior descending artery."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _SideKind:
-    """How a side branch leaves: origin beyond the fork and length, mean and SD in mm; lumen, share, courses."""
-
-    origin_mm: tuple[float, float]
-    length_mm: tuple[float, float]
-    diameter_mm: float
-    share: float
-    courses: tuple[tuple[float, tuple[float, float, float]], ...]
-
-
-_LAD_SIDES = {
-    "9": _SideKind(
-        origin_mm=(20.0, 6.0), length_mm=(55.0, 12.0), diameter_mm=2.1, share=1.0,
-        courses=((0.0, (0.8, -0.3, -0.45)), (18.0, (0.6, -0.4, -0.65)), (40.0, (0.45, -0.55, -0.7))),
-    ),
-    "10": _SideKind(
-        origin_mm=(42.0, 7.0), length_mm=(45.0, 10.0), diameter_mm=1.9, share=0.9,
-        courses=((0.0, (0.75, -0.35, -0.5)), (16.0, (0.45, -0.5, -0.7))),
-    ),
-    "D": _SideKind(
-        origin_mm=(61.0, 6.0), length_mm=(32.0, 8.0), diameter_mm=1.7, share=0.6,
-        courses=((0.0, (0.75, -0.3, -0.6)), (14.0, (0.4, -0.4, -0.8))),
-    ),
-    "septal": _SideKind(
-        origin_mm=(21.0, 7.0), length_mm=(24.0, 5.0), diameter_mm=1.4, share=0.9,
-        courses=((0.0, (-0.5, -0.35, -0.8)), (10.0, (-0.2, -0.55, -0.8))),
-    ),
-    "septal 2": _SideKind(
-        origin_mm=(45.0, 8.0), length_mm=(20.0, 4.0), diameter_mm=1.2, share=0.6,
-        courses=((0.0, (-0.6, -0.2, -0.75)), (9.0, (-0.2, -0.4, -0.9))),
-    ),
-}  # fmt: skip
-_LCX_SIDES = {
-    "12": _SideKind(
-        origin_mm=(15.0, 5.0), length_mm=(55.0, 12.0), diameter_mm=2.4, share=1.0,
-        courses=((0.0, (0.85, -0.05, -0.5)), (18.0, (0.5, -0.3, -0.8)), (40.0, (0.3, -0.55, -0.75))),
-    ),
-    "14": _SideKind(
-        origin_mm=(30.0, 5.0), length_mm=(45.0, 10.0), diameter_mm=2.0, share=0.9,
-        courses=((0.0, (0.65, 0.1, -0.75)), (18.0, (0.4, -0.35, -0.8)), (36.0, (0.4, -0.6, -0.65))),
-    ),
-    "14 third": _SideKind(
-        origin_mm=(46.0, 5.0), length_mm=(36.0, 8.0), diameter_mm=1.7, share=0.6,
-        courses=((0.0, (0.6, 0.0, -0.8)), (14.0, (0.45, -0.5, -0.7))),
-    ),
-    "14 posterior": _SideKind(
-        origin_mm=(68.0, 4.0), length_mm=(40.0, 8.0), diameter_mm=1.9, share=1.0,
-        courses=((0.0, (0.45, -0.35, -0.8)), (12.0, (0.65, -0.7, -0.25))),
-    ),
-}  # fmt: skip
-"""The last one leaves balanced and left-dominant circumflex arteries alone, for the inferior wall (Dodge's CP)."""
-_RAMUS = _SideKind(
-    origin_mm=(0.0, 0.0), length_mm=(55.0, 12.0), diameter_mm=1.9, share=_RAMUS_SHARE,
-    courses=((0.0, (0.9, -0.05, -0.35)), (14.0, (0.7, -0.2, -0.65)), (36.0, (0.4, -0.5, -0.75))),
-)  # fmt: skip
 
 
 _ORDERED = (("9", "10"), ("12",))
@@ -160,25 +82,18 @@ class _Trunk:
 
     def heart(self) -> HeartFit:
         """Fit the reference heart to the courses."""
-        return heart_left.fit_left_heart(self.whole_lad, self.whole_lcx[: self.crux + 1], self.whole_lcx[self.crux :])
+        return fit_left_heart(self.whole_lad, self.whole_lcx[: self.crux + 1], self.whole_lcx[self.crux :])
 
 
 def make_lca(
     generator: np.random.Generator, stenosis_share: float, population: Population
 ) -> tuple[VesselTree, dict[str, Any]]:
-    """Return one left coronary tree and what was drawn for it.
-
-    Args:
-        generator: random stream of this patient.
-        stenosis_share: probability of a stenosis, in the anterior descending artery or the circumflex.
-        population: how patients vary.
-    """
-    u = generator.random()
-    dominance = "right" if u < _RIGHT_SHARE else "balanced" if u < _RIGHT_SHARE + _BALANCED_SHARE else "left"
+    """Return one left coronary tree and what was drawn for it; a stenosis lies in either of its main branches."""
+    dominance = branching.coronary_dominance(generator.random())
     # Drawn once, so that shapes that fail do not bias it.
     main_mm = None if population.left_main_mm is None else drawn_from(generator, population.left_main_mm)
     draw = partial(_draw, generator, dominance, main_mm, stenosis_share, population)
-    return until_it_fits(draw, "left coronary artery")
+    return branching.until_it_fits(draw, "left coronary artery")
 
 
 def _draw(
@@ -189,7 +104,7 @@ def _draw(
     population: Population,
 ) -> tuple[VesselTree, dict[str, Any]]:
     trunk = _trunk(generator, dominance, main_mm, population)
-    calibre = _calibre(generator)
+    calibre = branching.coronary_calibre(generator, 1.0, 0.65, 1.4)
     lad = _lad(generator, trunk, calibre)
     flare = factor(generator, population.left_main_flare) - 1
     if flare:
@@ -208,9 +123,9 @@ def _draw(
     if generator.random() < stenosis_share:
         fork = trunk.fork / len(lad.points)
         which, shares = (0, (fork + 0.06, 0.65)) if generator.random() < 0.6 else (1, (0.15, 0.6))
-        narrow, vessels = narrowed(generator, vessels, which, shares, population.tandem_share)
-    vessels = with_side_branches(generator, vessels, plans, population.carina_mm)
-    tree = build_tree(vessels, LCA_SECTIONS)
+        narrow, vessels = branching.narrowed(generator, vessels, which, shares, population.tandem_share)
+    vessels = branching.with_side_branches(generator, vessels, plans, population.carina_mm)
+    tree = branching.build_tree(vessels, LCA_SECTIONS)
     along, bends = length_along(lad.points), shape.curvature(lad.points)
     drawn = {
         "dominance": dominance,
@@ -230,8 +145,8 @@ def _draw(
 @cache
 def _templates() -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:
     """Return the mean courses of the anterior descending artery, and of circumflex and left posterior descending."""
-    lcx = np.concatenate([heart_left.LCX, heart_left.INFERIOR[1:]])
-    return shape.curve_through(heart_left.LAD, 1.0), shape.curve_through(lcx, 1.0)
+    lcx = np.concatenate([LCX, INFERIOR[1:]])
+    return shape.curve_through(LAD, 1.0), shape.curve_through(lcx, 1.0)
 
 
 def _trunk(generator: np.random.Generator, dominance: str, main_mm: float | None, population: Population) -> _Trunk:
@@ -239,39 +154,39 @@ def _trunk(generator: np.random.Generator, dominance: str, main_mm: float | None
     size = float(np.exp(_SIZE_SD * np.clip(generator.normal(), -2.5, 2.5)))
     turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, _TURN_SD_DEG, 3)))
     if main_mm is None:
-        main_mm = truncated(generator, LEFT_MAIN_MM, LEFT_MAIN_SD_MM, 5.0, 22.0)
+        main_mm = branching.truncated(generator, LEFT_MAIN_MM, LEFT_MAIN_SD_MM, 5.0, 22.0)
     lad, lcx = ((template - template[0]) * size for template in _templates())
-    end_of_main = main_mm * heart_left.FORK / np.linalg.norm(heart_left.FORK)
+    end_of_main = main_mm * FORK / np.linalg.norm(FORK)
     bow = np.array([[0.0, 0.0, 0.0], 0.5 * end_of_main + main_mm * np.array([0.0, 0.06, 0.08])])
     stride = round(6.0 * size)
-    lad = wiggled(
+    lad = branching.wiggled(
         generator, shape.curve_through(np.concatenate([bow, lad[::stride] + end_of_main])), _WIGGLE_MM, quiet_mm=9.0
     )
     fork = round(main_mm / shape.STEP_MM)
-    crux_at = (heart_left.LCX[-1] - heart_left.FORK) * size
-    lcx = wiggled(generator, shape.curve_through(lcx[::stride]), _WIGGLE_MM, quiet_mm=7.0)
+    crux_at = (LCX[-1] - FORK) * size
+    lcx = branching.wiggled(generator, shape.curve_through(lcx[::stride]), _WIGGLE_MM, quiet_mm=7.0)
     crux = int(np.argmin(np.linalg.norm(lcx - crux_at, axis=1)))
     lad, lcx = turn.apply(lad), turn.apply(lcx + lad[fork])
     if population.left_main_turns_deg is not None:
         wide = 0.5 * LEFT_MAIN_DIAMETER_MM
         lad, lcx = opened_fork(generator, lad, lcx, fork, wide, population.left_main_turns_deg)
     if dominance == "left":
-        end_mm = shape.STEP_MM * crux + size * truncated(generator, 48.0, 10.0, 28.0, 68.0)
+        end_mm = shape.STEP_MM * crux + size * branching.truncated(generator, 48.0, 10.0, 28.0, 68.0)
     else:
-        end_mm = size * truncated(generator, *_ENDS[dominance])
+        end_mm = size * branching.truncated(generator, *_ENDS[dominance])
     # The anterior descending artery ends before, at or beyond the apex.
     last = fork + round((len(lad) - 1 - fork) * generator.uniform(0.74, 1.0))
     trunk = _Trunk(lad, lcx, (last + 1, round(end_mm / shape.STEP_MM) + 1), fork, crux, size, turn)
     if max(shape.curvature(trunk.lad).max(), shape.curvature(trunk.lcx).max()) > _SHARPEST_PER_MM:
-        raise NoShape
+        raise branching.NoShape
     return trunk
 
 
 def _bent(
     generator: np.random.Generator,
     trunk: _Trunk,
-    vessels: Sequence[Vessel],
-    plans: Sequence[SidePlan],
+    vessels: Sequence[branching.Vessel],
+    plans: Sequence[branching.SidePlan],
     population: Population,
 ) -> _Trunk:
     """Return the main vessels with a patient's bends beyond the left main's fork."""
@@ -287,13 +202,7 @@ def _bent(
     return replace(trunk, whole_lad=bent_lines[0], whole_lcx=bent_lines[1])
 
 
-def _calibre(generator: np.random.Generator) -> float:
-    """Return the patient's lumen against the average."""
-    sex = _FEMALE_CALIBRE if generator.random() < 0.5 else 1.0
-    return float(np.clip(sex / (0.5 + 0.5 * _FEMALE_CALIBRE) * (1 + 0.1 * generator.normal()), 0.65, 1.4))
-
-
-def _lad(generator: np.random.Generator, trunk: _Trunk, calibre: float) -> Vessel:
+def _lad(generator: np.random.Generator, trunk: _Trunk, calibre: float) -> branching.Vessel:
     along = length_along(trunk.lad)
     beyond = along - along[trunk.fork]
     whole = trunk.size * float(length_along(_templates()[0])[-1])
@@ -301,77 +210,80 @@ def _lad(generator: np.random.Generator, trunk: _Trunk, calibre: float) -> Vesse
     # The left main's lumen changes into that of the anterior descending artery just behind the fork.
     share = np.clip((beyond + 1.0) / 4.0, 0.0, 1.0)
     diameter = LEFT_MAIN_DIAMETER_MM + (own - LEFT_MAIN_DIAMETER_MM) * share**2 * (3 - 2 * share)
-    return Vessel(trunk.lad, 0.5 * diameter * calibre * uneven(generator, along), ())
+    return branching.Vessel(trunk.lad, 0.5 * diameter * calibre * branching.uneven(generator, along), ())
 
 
-def _lcx(generator: np.random.Generator, trunk: _Trunk, lad: Vessel, dominance: str, calibre: float) -> Vessel:
+def _lcx(
+    generator: np.random.Generator, trunk: _Trunk, lad: branching.Vessel, dominance: str, calibre: float
+) -> branching.Vessel:
     along = length_along(trunk.lcx)
     profile = LCX_DIAMETER_MM[dominance]
     own = PchipInterpolator(list(profile), list(profile.values()))(along / along[-1])
-    radius = np.minimum(0.5 * own * calibre * uneven(generator, along), lad.radius[trunk.fork])
+    radius = np.minimum(0.5 * own * calibre * branching.uneven(generator, along), lad.radius[trunk.fork])
     forward = shape.tangents(trunk.lad)[trunk.fork]
-    radius = mouth(radius, trunk.lcx, forward, float(lad.radius[trunk.fork]))
-    return Vessel(trunk.lcx, radius, (), 0, trunk.fork)
+    radius = branching.mouth(radius, trunk.lcx, forward, float(lad.radius[trunk.fork]))
+    return branching.Vessel(trunk.lcx, radius, (), 0, trunk.fork)
 
 
 def _plan_branches(
     generator: np.random.Generator,
     trunk: _Trunk,
-    vessels: list[Vessel],
+    vessels: list[branching.Vessel],
     dominance: str,
     calibre: float,
     population: Population,
-) -> list[SidePlan]:
+) -> list[branching.SidePlan]:
     """Draw which branches there are, where they leave, how long and how wide they are; named in their order."""
-    plans: list[SidePlan] = []
+    plans: list[branching.SidePlan] = []
     presence = factor(generator, population.side_share)
-    for parent, kinds in enumerate((_LAD_SIDES, _LCX_SIDES)):
+    for parent, kinds in enumerate((side_kinds("lca", "lad"), side_kinds("lca", "lcx"))):
         first = trunk.fork if parent == 0 else 0
         taken: list[int] = []
         for name, kind in kinds.items():
             if generator.random() > kind.share * presence or (name == "14 posterior" and dominance == "right"):
                 continue
             mean, sd = (trunk.size * value for value in kind.origin_mm)
-            origin = first + free_origin(generator, mean, sd, taken)
+            origin = first + branching.free_origin(generator, mean, sd, taken)
             if origin * shape.STEP_MM > length_along(vessels[parent].points)[-1] - 8.0:
                 continue
             taken.append(origin - first)
             plans.append(_plan(generator, name.split()[0], kind, parent, origin, trunk, calibre))
-        own = sorted((plan for plan in plans if plan.parent == parent and plan.section != "septal"), key=_origin)
+        own = sorted(
+            (plan for plan in plans if plan.parent == parent and plan.section != "septal"), key=lambda plan: plan.origin
+        )
         named = {id(plan): name for plan, name in zip(own, _ORDERED[parent], strict=False)}
         plans = [replace(plan, section=named.get(id(plan), plan.section)) for plan in plans]
-    if generator.random() < _RAMUS.share:
-        plans.insert(0, _plan(generator, "17", _RAMUS, 0, trunk.fork, trunk, calibre))
+    ramus = side_kinds("lca", "ramus")["17"]
+    if generator.random() < ramus.share:
+        plans.insert(0, _plan(generator, "17", ramus, 0, trunk.fork, trunk, calibre))
     return plans
 
 
 def _plan(
     generator: np.random.Generator,
     section: str,
-    kind: _SideKind,
+    kind: SideKind,
     parent: int,
     origin: int,
     trunk: _Trunk,
     calibre: float,
-) -> SidePlan:
+) -> branching.SidePlan:
     mean, sd = kind.length_mm
     septal = section == "septal"
-    return SidePlan(
+    return branching.SidePlan(
         section=section,
         parent=parent,
         origin=origin,
-        length_mm=trunk.size * truncated(generator, mean, sd, 0.5 * mean, 1.5 * mean),
+        length_mm=trunk.size * branching.truncated(generator, mean, sd, 0.5 * mean, 1.5 * mean),
         diameter_mm=kind.diameter_mm * (0.6 + 0.4 * calibre) * (1 + 0.1 * float(generator.normal())),
         courses=tuple((begin, tuple(trunk.turn.apply(course))) for begin, course in kind.courses),
         angle_deg=(60.0, 90.0) if septal else (40.0, 70.0),
     )
 
 
-def _origin(plan: SidePlan) -> int:
-    return plan.origin
-
-
-def _with_sections(trunk: _Trunk, vessels: list[Vessel], plans: list[SidePlan], dominance: str) -> list[Vessel]:
+def _with_sections(
+    trunk: _Trunk, vessels: list[branching.Vessel], plans: list[branching.SidePlan], dominance: str
+) -> list[branching.Vessel]:
     """Name the points of the two main vessels (SCCT), without branches by the lengths of `labels_coronary`."""
     lad, lcx = vessels
     place = np.arange(len(lad.points))

@@ -10,12 +10,19 @@ angle.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+from endopilot.files import read_yaml
 
 PopulationName = Literal["patients", "textbook"]
 
 Spread = tuple[float, float, float, float]
 """Median, SD of the logarithm, smallest and largest value of a log-normal distribution."""
+
+Courses = tuple[tuple[float, tuple[float, float, float]], ...]
+"""Where a side branch heads: (abscissa from which it holds, mm; LPS direction), in order."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,72 +80,42 @@ class Population:
         return self.waves_deg[1] > 0
 
 
-_TEXTBOOK = Population()
-_PATIENTS = {
-    "rca": Population(
-        waves_deg=(3.0, 9.0),
-        waves_mm=(12.0, 40.0),
-        bends_per_100_mm=1.3,
-        deflection_deg=(14.0, 0.8, 2.0, 60.0),
-        side_angle_deg=(56.0, 0.45, 20.0, 110.0),
-        side_calibre=(0.9, 1.7),
-        side_share=(0.1, 1.15),
-        carina_mm=14.0,
-        flattening=(0.04, 0.22),
-        ectasia_share=0.03,
-        tandem_share=0.25,
-        catheter_deg=(34.0, 0.55, 10.0, 70.0),
-    ),
-    "lca": Population(
-        waves_deg=(1.0, 6.0),
-        waves_mm=(12.0, 40.0),
-        bends_per_100_mm=0.9,
-        deflection_deg=(20.0, 0.65, 4.0, 60.0),
-        side_angle_deg=(55.0, 0.5, 20.0, 110.0),
-        side_calibre=(0.9, 1.4),
-        side_share=(0.05, 0.9),
-        carina_mm=14.0,
-        flattening=(0.04, 0.22),
-        ectasia_share=0.03,
-        tandem_share=0.25,
-        catheter_deg=(28.0, 0.42, 13.0, 53.0),
-        left_main_flare=(1.0, 1.35),
-        left_main_mm=(5.0, 0.95, 1.0, 20.0),
-        left_main_turns_deg=((26.0, 0.7, 5.0, 65.0), (51.0, 0.25, 30.0, 72.0)),
-    ),
-    "cerebral": Population(
-        waves_deg=(2.0, 8.0),
-        bends_per_100_mm=0.25,
-        deflection_deg=(14.0, 0.6, 2.0, 45.0),
-        side_calibre=(0.85, 1.15),
-        side_share=(0.5, 1.1),
-        carina_mm=8.0,
-        flattening=(0.04, 0.3),
-        tandem_share=0.15,
-        catheter_deg=(12.0, 0.5, 3.0, 30.0),
-        trunks_angle_deg=(97.0, 19.0, 55.0, 140.0),
-    ),
-    "arch": Population(
-        waves_deg=(1.0, 5.0),
-        waves_mm=(40.0, 120.0),
-        side_calibre=(0.85, 1.2),
-        carina_mm=8.0,
-        flattening=(0.04, 0.25),
-        ectasia_share=0.02,
-        catheter_deg=(8.0, 0.5, 2.0, 20.0),
-    ),
-    "portal": Population(
-        waves_deg=(2.0, 6.0),
-        waves_mm=(25.0, 70.0),
-        deflection_deg=(12.0, 0.5, 2.0, 35.0),
-        side_calibre=(0.8, 1.25),
-        carina_mm=10.0,
-        flattening=(0.06, 0.4),
-        catheter_deg=(12.0, 0.5, 3.0, 35.0),
-    ),
-}
+@dataclass(frozen=True, kw_only=True)
+class SideKind:
+    """How a kind of side branch leaves.
+
+    Attributes:
+        origin_mm: mean and SD of its origin's distance from where the vessel begins, mm.
+        length_mm: mean and SD, mm.
+        share: of the patients that have it.
+    """
+
+    origin_mm: tuple[float, float]
+    length_mm: tuple[float, float]
+    diameter_mm: float
+    share: float
+    courses: Courses
 
 
-def population_of(anatomy: str, name: PopulationName) -> Population:
+def population_of(vessel: str, name: PopulationName) -> Population:
     """Return how a kind of vessel tree varies in a population."""
-    return _PATIENTS[anatomy] if name == "patients" else _TEXTBOOK
+    return Population(**vessel_data(vessel)["patients"]) if name == "patients" else Population()
+
+
+@cache
+def side_kinds(vessel: str, of: str) -> dict[str, SideKind]:
+    """Return the kinds of side branches of a vessel, by the names of their sections."""
+    return {section: SideKind(**values) for section, values in vessel_data(vessel)[of].items()}
+
+
+@cache
+def vessel_data(vessel: str) -> dict[str, Any]:
+    """Return what `vessels.yaml` holds of a kind of vessel tree."""
+    return _frozen(read_yaml(Path(__file__).parent / "vessels.yaml")[vessel])
+
+
+def _frozen(value: Any) -> Any:
+    """Return read values with tuples in place of lists."""
+    if isinstance(value, dict):
+        return {name: _frozen(each) for name, each in value.items()}
+    return tuple(map(_frozen, value)) if isinstance(value, list) else value

@@ -23,20 +23,9 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from endopilot.anatomy.labels_tree import PORTAL_SECTIONS
+from endopilot.atlas import branching
 from endopilot.atlas import curves as shape
-from endopilot.atlas.branching import (
-    NoShape,
-    SidePlan,
-    Vessel,
-    build_tree,
-    narrowed,
-    truncated,
-    uneven,
-    until_it_fits,
-    wiggled,
-    with_side_branches,
-)
-from endopilot.atlas.population import Population
+from endopilot.atlas.population import Population, vessel_data
 from endopilot.atlas.variation import Fork, bent, varied
 from endopilot.lines import length_along
 from endopilot.types import VesselTree
@@ -52,16 +41,6 @@ _COURSE = np.array([[0, 0, 0], [-18, 4, 13], [-36, 9, 29], [-52, 12, 45], [-64, 
 """The main portal vein from the confluence to the porta hepatis, mm."""
 _RIGHT = np.array([[-10, -1, 3], [-19, -5, 6], [-27, -12, 13], [-33, -17, 25], [-37, -19, 40], [-41, -18, 54.0]])
 """Onwards along the right branch, its anterior one and the vein of segment 8, mm from the porta hepatis."""
-_SIDES = {
-    "LPV": ((0.0, (0.75, -0.25, 0.6)), (12.0, (0.85, -0.45, 0.3)), (LEFT_MM, (0.35, -0.95, 0.0))),
-    "RPPV": ((0.0, (-0.75, 0.6, -0.1)), (12.0, (-0.7, 0.65, 0.05)), (24.0, (-0.55, 0.4, 0.75))),
-    "S5": ((0.0, (-0.5, -0.6, -0.6)), (12.0, (-0.35, -0.45, -0.85))),
-    "S6": ((0.0, (-0.6, 0.2, -0.75)), (12.0, (-0.5, 0.0, -0.9))),
-    "S4": ((0.0, (-0.75, -0.45, -0.3)), (10.0, (-0.5, -0.5, -0.65))),
-    "S3": ((0.0, (0.9, -0.3, -0.35)), (10.0, (0.85, -0.3, -0.5))),
-    "S2": ((0.0, (0.75, 0.35, 0.45)), (12.0, (0.9, 0.2, 0.3))),
-}
-_LENGTH_MM = {"S5": 36.0, "S6": 38.0, "S4": 32.0, "S3": 38.0, "S2": 40.0}
 _SEGMENT_DIAMETER_MM = 5.0
 _SHARPEST_PER_MM = 0.15
 """Greatest curvature of the widest line, 1/mm: its wall must not fold."""
@@ -70,55 +49,49 @@ _SHARPEST_PER_MM = 0.15
 def make_portal(
     generator: np.random.Generator, stenosis_share: float, population: Population
 ) -> tuple[VesselTree, dict[str, Any]]:
-    """Return one portal vein and what was drawn for it.
-
-    Args:
-        generator: random stream of this patient.
-        stenosis_share: probability of a stenosis, in the main, right or left portal vein.
-        population: how patients vary.
-    """
+    """Return one portal vein and what was drawn for it; a stenosis lies in the main, right or left portal vein."""
     shares = np.array(list(VARIANT_SHARES.values()))
     variant = str(generator.choice(list(VARIANT_SHARES), p=shares / shares.sum()))
-    length = truncated(generator, MAIN_MM, MAIN_SD_MM, 60.0, 96.0)
+    length = branching.truncated(generator, MAIN_MM, MAIN_SD_MM, 60.0, 96.0)
     draw = partial(_draw, generator, variant, length, stenosis_share, population)
-    return until_it_fits(draw, "portal vein")
+    return branching.until_it_fits(draw, "portal vein")
 
 
 def _draw(
     generator: np.random.Generator, variant: str, main_mm: float, stenosis_share: float, population: Population
 ) -> tuple[VesselTree, dict[str, Any]]:
-    size = truncated(generator, 1.0, 0.1, 0.8, 1.2)
+    size = branching.truncated(generator, 1.0, 0.1, 0.8, 1.2)
     points, hilum = _main(generator, main_mm, size)
-    right_mm = size * truncated(generator, RIGHT_MM, RIGHT_SD_MM, 12.0, 30.0)
+    right_mm = size * branching.truncated(generator, RIGHT_MM, RIGHT_SD_MM, 12.0, 30.0)
     left, posterior = hilum, hilum
     if variant == "bifurcation":
         posterior = hilum + round(right_mm / shape.STEP_MM)
     elif variant == "right posterior first":
         left = hilum + round(0.7 * right_mm / shape.STEP_MM)
     anterior = max(left, posterior) + round(size * float(generator.uniform(12.0, 18.0)) / shape.STEP_MM)
-    diameter = truncated(generator, MAIN_DIAMETER_MM, MAIN_DIAMETER_SD_MM, 9.0, 15.0)
+    diameter = branching.truncated(generator, MAIN_DIAMETER_MM, MAIN_DIAMETER_SD_MM, 9.0, 15.0)
     calibre = diameter / MAIN_DIAMETER_MM
     radius = 0.5 * calibre * _profile(len(points), left, posterior, anterior)
-    radius = radius * uneven(generator, length_along(points))
+    radius = radius * branching.uneven(generator, length_along(points))
     origins = {"LPV": left, "RPPV": posterior, "S5": anterior}
-    forks = [Fork(origin, _SIDES[name][0][1]) for name, origin in origins.items()]
+    forks = [Fork(origin, vessel_data("portal")["courses"][name][0][1]) for name, origin in origins.items()]
     points = bent(generator, points, radius, population, forks=forks)
     place = np.arange(len(points))
     ends = [place <= left, place <= posterior, place <= anterior]
-    vessels = [Vessel(points, radius, np.select(ends, ["MPV", "RPV", "RAPV"], default="S8").tolist())]
+    vessels = [branching.Vessel(points, radius, np.select(ends, ["MPV", "RPV", "RAPV"], default="S8").tolist())]
     vessels = _grown(generator, vessels, origins, size, calibre, population)
     narrow = []
     if generator.random() < stenosis_share:
         share = hilum / len(points)
         which, shares = (0, (0.3 * share, 0.8 * share)) if generator.random() < 0.6 else (1, (0.3, 0.5))
-        narrow, vessels = narrowed(generator, vessels, which, shares, population.tandem_share)
+        narrow, vessels = branching.narrowed(generator, vessels, which, shares, population.tandem_share)
     drawn = {
         "variant": variant,
         "main_length_mm": float(length_along(points)[min(left, posterior)]),
         "main_diameter_mm": diameter,
         "stenoses": narrow,
     }
-    return build_tree(vessels, PORTAL_SECTIONS), drawn
+    return branching.build_tree(vessels, PORTAL_SECTIONS), drawn
 
 
 def _main(generator: np.random.Generator, main_mm: float, size: float) -> tuple[Float[np.ndarray, "n 3"], int]:
@@ -127,9 +100,9 @@ def _main(generator: np.random.Generator, main_mm: float, size: float) -> tuple[
     main = _COURSE * main_mm / length_along(shape.curve_through(_COURSE))[-1]
     right = main[-1] + size * turn.apply(_RIGHT)
     points = shape.curve_through(np.concatenate([main, right]))
-    points = wiggled(generator, points, (0.8, 2.2), quiet_mm=25.0, wavelengths_mm=(25.0, 80.0))
+    points = branching.wiggled(generator, points, (0.8, 2.2), quiet_mm=25.0, wavelengths_mm=(25.0, 80.0))
     if shape.curvature(points).max() > _SHARPEST_PER_MM:
-        raise NoShape
+        raise branching.NoShape
     return points, round(main_mm / shape.STEP_MM)
 
 
@@ -145,33 +118,38 @@ def _profile(count: int, left: int, posterior: int, anterior: int) -> Float[np.n
 
 def _grown(
     generator: np.random.Generator,
-    vessels: list[Vessel],
+    vessels: list[branching.Vessel],
     origins: dict[str, int],
     size: float,
     calibre: float,
     population: Population,
-) -> list[Vessel]:
+) -> list[branching.Vessel]:
     """Return the vessels with left and right posterior branch, then their segments' veins, then those of segment 5."""
 
-    def plan(name: str, parent: int, origin: int, length_mm: float, diameter_mm: float, taper: float) -> SidePlan:
-        return SidePlan(
+    def plan(
+        name: str, parent: int, origin: int, length_mm: float, diameter_mm: float, taper: float
+    ) -> branching.SidePlan:
+        return branching.SidePlan(
             section=name,
             parent=parent,
             origin=origin,
             length_mm=size * length_mm * float(generator.uniform(0.9, 1.1)),
-            diameter_mm=calibre * diameter_mm * truncated(generator, 1.0, 0.08, 0.8, 1.2),
-            courses=_SIDES[name],
+            diameter_mm=calibre * diameter_mm * branching.truncated(generator, 1.0, 0.08, 0.8, 1.2),
+            courses=vessel_data("portal")["courses"][name],
             taper=taper,
             angle_deg=(55.0, 80.0) if name == "LPV" else (40.0, 65.0),
         )
 
-    transverse = truncated(generator, LEFT_MM, LEFT_SD_MM, 24.0, 46.0)
+    length_mm = vessel_data("portal")["length_mm"]
+    transverse = branching.truncated(generator, LEFT_MM, LEFT_SD_MM, 24.0, 46.0)
     large = [
         plan("LPV", 0, origins["LPV"], transverse + 18.0, 8.5, 0.35),
         plan("RPPV", 0, origins["RPPV"], 62.0, 7.5, 0.5),
-        plan("S5", 0, origins["S5"], _LENGTH_MM["S5"], _SEGMENT_DIAMETER_MM, 0.4),
+        plan("S5", 0, origins["S5"], length_mm["S5"], _SEGMENT_DIAMETER_MM, 0.4),
     ]
-    vessels = with_side_branches(generator, vessels, varied(generator, large, population), population.carina_mm)
+    vessels = branching.with_side_branches(
+        generator, vessels, varied(generator, large, population), population.carina_mm
+    )
     turn = round(size * transverse / shape.STEP_MM)
     low = round(size * float(generator.uniform(22.0, 28.0)) / shape.STEP_MM)
     places = {
@@ -181,10 +159,12 @@ def _grown(
         "S6": (2, low),
     }
     plans = [
-        plan(name, parent, place, _LENGTH_MM[name], _SEGMENT_DIAMETER_MM, 0.4)
+        plan(name, parent, place, length_mm[name], _SEGMENT_DIAMETER_MM, 0.4)
         for name, (parent, place) in places.items()
     ]
-    vessels = with_side_branches(generator, vessels, varied(generator, plans, population), population.carina_mm)
+    vessels = branching.with_side_branches(
+        generator, vessels, varied(generator, plans, population), population.carina_mm
+    )
     posterior = vessels[2]
     names = np.where(np.arange(len(posterior.points)) <= low, "RPPV", "S7").tolist()
     vessels[2] = replace(posterior, section=names)

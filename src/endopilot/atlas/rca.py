@@ -21,21 +21,10 @@ from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
 from endopilot.anatomy.labels_tree import RCA_SECTIONS
+from endopilot.atlas import branching
 from endopilot.atlas import curves as shape
-from endopilot.atlas.branching import (
-    NoShape,
-    SidePlan,
-    Vessel,
-    build_tree,
-    free_origin,
-    stenoses,
-    truncated,
-    uneven,
-    until_it_fits,
-    with_side_branches,
-)
 from endopilot.atlas.heart_reference import BEYOND_CRUX, TO_CRUX, fit_heart
-from endopilot.atlas.population import Population
+from endopilot.atlas.population import Courses, Population, side_kinds, vessel_data
 from endopilot.atlas.variation import bent, ectasia, factor, forks_of, varied
 from endopilot.lines import length_along
 from endopilot.types import VesselTree
@@ -46,50 +35,8 @@ CURVATURE, CURVATURE_SD = 0.061, 0.017
 DIAMETER_MM = {0.1: 4.0, 0.2: 3.8, 0.5: 3.5, 0.7: 2.7, 0.9: 2.3}
 """Lumen diameter, mm, at fractions of the path from the ostium to the farthest tip."""
 
-_RIGHT_SHARE, _BALANCED_SHARE = 0.88, 0.06
-"""Shares of right and balanced dominance; the rest is left. Chosen within the range that the literature reports."""
 _CALIBRE = {"right": 1.025, "balanced": 0.9, "left": 0.74}
 """Lumen against the average of all patients (Dodge 1992: balanced 0.78, left 0.70 of right dominance)."""
-_FEMALE_CALIBRE = 0.91
-"""Women's lumens against men's (Dodge 1992)."""
-
-Courses = tuple[tuple[float, tuple[float, float, float]], ...]
-"""Where a side branch heads: (abscissa from which it holds, mm; LPS direction), in order."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _SideKind:
-    """How a kind of side branch leaves: mean and SD of origin and length, mm; lumen; courses in LPS directions."""
-
-    origin_mm: tuple[float, float]
-    length_mm: tuple[float, float]
-    diameter_mm: float
-    share: float
-    courses: Courses
-
-
-_SIDES = {
-    "conus": _SideKind(
-        origin_mm=(15.0, 6.0), length_mm=(26.0, 6.0), diameter_mm=1.6, share=0.85,
-        courses=((0.0, (0.45, -0.85, 0.3)), (8.0, (0.85, -0.5, 0.0)), (18.0, (0.8, -0.35, -0.5))),
-    ),
-    "SA": _SideKind(
-        origin_mm=(16.0, 6.0), length_mm=(30.0, 7.0), diameter_mm=1.5, share=0.6,
-        courses=((0.0, (-0.25, 0.75, 0.6)), (10.0, (0.15, 0.85, 0.5)), (20.0, (-0.5, 0.6, 0.6))),
-    ),
-    "RV": _SideKind(
-        origin_mm=(29.0, 5.0), length_mm=(36.0, 8.0), diameter_mm=1.7, share=0.8,
-        courses=((0.0, (0.4, -0.9, -0.1)), (10.0, (0.75, -0.55, -0.35)), (22.0, (0.75, -0.2, -0.6))),
-    ),
-    "AM": _SideKind(
-        origin_mm=(42.0, 8.0), length_mm=(50.0, 10.0), diameter_mm=2.0, share=1.0,
-        courses=((0.0, (0.3, -0.85, -0.4)), (12.0, (0.7, -0.5, -0.5)), (30.0, (0.85, -0.3, -0.4))),
-    ),
-}  # fmt: skip
-_DISTAL_COURSES = {
-    "4": ((0.0, (0.72, -0.6, -0.35)), (18.0, (0.73, -0.68, -0.08)), (45.0, (0.7, -0.65, 0.25))),
-    "16": ((0.0, (0.68, 0.65, 0.32)), (16.0, (0.6, 0.7, 0.3)), (26.0, (0.85, 0.1, -0.5)), (45.0, (0.85, -0.4, -0.3))),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,34 +56,29 @@ def make_rca(
     """Return one right coronary tree and what was drawn for it.
 
     Targets are kept when a shape fails, so that failures do not bias the statistics.
-
-    Args:
-        generator: random stream of this patient.
-        stenosis_share: probability of a stenosis.
-        population: how patients vary.
     """
     for _ in range(10):
         targets = _targets(generator)
         draw = partial(_draw, generator, targets, stenosis_share, population)
-        with suppress(NoShape):
-            return until_it_fits(draw, "right coronary artery")
+        with suppress(branching.NoShape):
+            return branching.until_it_fits(draw, "right coronary artery")
     raise RuntimeError("no right coronary artery found in 600 draws")
 
 
 def _targets(generator: np.random.Generator) -> _Targets:
-    dominance = _dominance(generator.random())
+    dominance = branching.coronary_dominance(generator.random())
     if dominance == "left":
         # A small right coronary ends before the crux.
         length, ends_in = 112.0 + abs(float(generator.normal(0, 10))), "3"
     else:
         # The mean makes up for the shorter left-dominant arteries.
-        length = truncated(generator, LENGTH_MM + 2.4, LENGTH_SD_MM, *LENGTH_RANGE_MM)
+        length = branching.truncated(generator, LENGTH_MM + 2.4, LENGTH_SD_MM, *LENGTH_RANGE_MM)
         ends_in = "4" if dominance == "balanced" or generator.random() < 0.6 else "16"
     return _Targets(
         dominance=dominance,
         length_mm=length,
-        tortuosity=truncated(generator, TORTUOSITY, TORTUOSITY_SD, TORTUOSITY - 0.45, TORTUOSITY + 0.45),
-        curvature_per_mm=truncated(generator, CURVATURE, CURVATURE_SD, CURVATURE - 0.025, CURVATURE + 0.025),
+        tortuosity=branching.truncated(generator, TORTUOSITY, TORTUOSITY_SD, TORTUOSITY - 0.45, TORTUOSITY + 0.45),
+        curvature_per_mm=branching.truncated(generator, CURVATURE, CURVATURE_SD, CURVATURE - 0.025, CURVATURE + 0.025),
         ends_in=ends_in,
     )
 
@@ -148,7 +90,7 @@ def _draw(
     healthy, calibre = _main_radius(generator, targets.dominance, main)
     radius, narrow = healthy, []
     if generator.random() < stenosis_share:
-        narrow, narrowing = stenoses(generator, length_along(main), (0.12, 0.75), population.tandem_share)
+        narrow, narrowing = branching.stenoses(generator, length_along(main), (0.12, 0.75), population.tandem_share)
         radius = healthy * narrowing
     wide, widening = ectasia(generator, length_along(main), population)
     radius = radius * widening
@@ -156,8 +98,10 @@ def _draw(
     main = bent(generator, main, radius, population, forks=forks_of(plans, 0))
     heart = fit_heart(main, 0.5 * crux, targets.ends_in)
     plans = [replace(plan, depth=heart.solid_depth) for plan in plans]
-    vessels = [Vessel(main, radius, _main_sections(main, crux, targets.ends_in))]
-    tree = build_tree(with_side_branches(generator, vessels, plans, population.carina_mm), RCA_SECTIONS)
+    vessels = [branching.Vessel(main, radius, _main_sections(main, crux, targets.ends_in))]
+    tree = branching.build_tree(
+        branching.with_side_branches(generator, vessels, plans, population.carina_mm), RCA_SECTIONS
+    )
     bends = shape.curvature(main)
     drawn = {
         "dominance": targets.dominance,
@@ -169,10 +113,6 @@ def _draw(
         "ectasias": wide,
     }
     return tree, drawn
-
-
-def _dominance(u: float) -> str:
-    return "right" if u < _RIGHT_SHARE else "balanced" if u < _RIGHT_SHARE + _BALANCED_SHARE else "left"
 
 
 def _main_vessel(generator: np.random.Generator, targets: _Targets) -> tuple[Float[np.ndarray, "n 3"], int]:
@@ -216,7 +156,7 @@ def _main_vessel(generator: np.random.Generator, targets: _Targets) -> tuple[Flo
     solution = solve(misfit, np.array([np.log(length / keep) - 0.05, 0.0, 0.5]), tol=1e-3, options={"maxfev": 60})
     points = curve(np.clip(solution.x, (-1, -2, -4), (1, 2, 3)))
     if np.abs(misfit(solution.x)).max() > 0.01 or shape.curvature(points).max() > 0.28:
-        raise NoShape
+        raise branching.NoShape
     crux = len(points) - 1 if ends_in == "3" else round(len(points) * template_crux / keep)
     return points, crux
 
@@ -225,14 +165,12 @@ def _main_radius(
     generator: np.random.Generator, dominance: str, main: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n"], float]:
     """Return the lumen radius along the main vessel, mm, and the patient's calibre against the average."""
-    sex = _FEMALE_CALIBRE if generator.random() < 0.5 else 1.0
-    calibre = _CALIBRE[dominance] * sex / (0.5 + 0.5 * _FEMALE_CALIBRE) * (1 + 0.1 * generator.normal())
-    calibre = float(np.clip(calibre, 0.55, 1.4))
+    calibre = branching.coronary_calibre(generator, _CALIBRE[dominance], 0.55, 1.4)
     share = np.linspace(0.0, 1.0, len(main))
     diameter = PchipInterpolator([0.0, *DIAMETER_MM, 1.0], [4.1, *DIAMETER_MM.values(), 2.15])(share)
     if dominance == "left":
         diameter = diameter * (1 - 0.2 * share)
-    return 0.5 * diameter * calibre * uneven(generator, length_along(main)), calibre
+    return 0.5 * diameter * calibre * branching.uneven(generator, length_along(main)), calibre
 
 
 def _main_sections(main: Float[np.ndarray, "n 3"], crux: int, ends_in: str) -> list[str]:
@@ -250,16 +188,16 @@ def _plan_branches(
     targets: _Targets,
     calibre: float,
     population: Population,
-) -> list[SidePlan]:
+) -> list[branching.SidePlan]:
     """Draw which branches there are, where they leave, how long and how wide they are."""
-    plans: list[SidePlan] = []
+    plans: list[branching.SidePlan] = []
     end_mm = (len(radius) - 1) * shape.STEP_MM
     presence = factor(generator, population.side_share)
-    for section, kind in _SIDES.items():
+    for section, kind in side_kinds("rca", "sides").items():
         if generator.random() > kind.share * presence:
             continue
-        origin = free_origin(generator, *kind.origin_mm, [plan.origin for plan in plans])
-        length = truncated(generator, *kind.length_mm, 0.5 * kind.length_mm[0], 1.5 * kind.length_mm[0])
+        origin = branching.free_origin(generator, *kind.origin_mm, [plan.origin for plan in plans])
+        length = branching.truncated(generator, *kind.length_mm, 0.5 * kind.length_mm[0], 1.5 * kind.length_mm[0])
         # The main vessel's tip stays the farthest.
         length = min(length, 0.95 * end_mm - origin * shape.STEP_MM)
         diameter = kind.diameter_mm * (0.6 + 0.4 * calibre) * (1 + 0.1 * float(generator.normal()))
@@ -268,9 +206,11 @@ def _plan_branches(
         other = "16" if targets.ends_in == "4" else "4"
         length = max((end_mm - crux * shape.STEP_MM) * float(generator.uniform(0.6, 0.92)), 12.0)
         diameter = 2 * float(radius[crux]) * float(generator.uniform(0.68, 0.8))
-        plans.append(_plan(other, crux, length, diameter, _DISTAL_COURSES[other]))
+        plans.append(_plan(other, crux, length, diameter, vessel_data("rca")["distal"][other]))
     return plans
 
 
-def _plan(section: str, origin: int, length_mm: float, diameter_mm: float, courses: Courses) -> SidePlan:
-    return SidePlan(section=section, origin=origin, length_mm=length_mm, diameter_mm=diameter_mm, courses=courses)
+def _plan(section: str, origin: int, length_mm: float, diameter_mm: float, courses: Courses) -> branching.SidePlan:
+    return branching.SidePlan(
+        section=section, origin=origin, length_mm=length_mm, diameter_mm=diameter_mm, courses=courses
+    )

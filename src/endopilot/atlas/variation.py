@@ -92,11 +92,9 @@ def bent(
     """Return a vessel with waves, sharp bends and deflections behind its point `first`; of the same length.
 
     Args:
-        generator: random stream.
         points: evenly spaced, LPS mm.
         radius: lumen radius, mm.
         population: how patients vary; the textbook's leaves the vessel as it is and draws nothing.
-        forks: where it gives way.
         first: what lies before this point is left.
 
     Raises:
@@ -188,10 +186,8 @@ def opened_fork(
     """Return a vessel that goes on behind a fork, and the one that leaves there, at drawn angles to what arrives.
 
     Args:
-        generator: random stream.
         trunk: the vessel that goes on, LPS mm.
         other: the one that leaves, from the fork on.
-        fork: index of the fork on `trunk`.
         wide: lumen radius at the fork, mm: directions are chords over two radii.
         turns_deg: angles by which the two turn away from what arrives, to opposite sides, degrees.
     """
@@ -287,11 +283,7 @@ def catheter_direction(
     does, the catheter has the vessel's first direction.
 
     Args:
-        generator: random stream.
-        tree: the vessels.
         population: how patients vary; the textbook's catheter has the vessel's first direction, and draws nothing.
-        radius_mm: of the tube.
-        length_mm: of the tube behind the ostium.
     """
     first = shape.tangents(tree.branches[0].centerline.points)[0]
     if population.catheter_deg is None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from endopilot import __version__
 from endopilot.belief import monitoring
+from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import CALIBRATION_FILE, Calibration, check_enough
 from endopilot.belief.monitoring import AdviseConfig, Monitored
 from endopilot.dataset.loader import Dataset, read_dataset
@@ -44,8 +45,6 @@ def advise(
         run: made by `endopilot train`, or "pretrained", the model of the package.
         dataset: made by `endopilot dataset`; its patients must not be those that the run was trained on, unless they
             are of its split 'train'.
-        output: where the figures go.
-        config: what is advised.
         also_test: datasets of the same wire that were made otherwise, with another wall or other elements: their test
             patients are advised with the same calibration, and measured apart.
 
@@ -57,7 +56,7 @@ def advise(
             calibration patients, or too few that can be registered in images, or one of `also_test` tests on patients
             that the bands are fitted to.
     """
-    from endopilot.models.rollout import load_model  # brings torch
+    from endopilot.models.checkpoint import load_model  # brings torch
     from endopilot.plotting import png  # brings matplotlib, which takes a second to import
 
     start = time.perf_counter()
@@ -76,30 +75,25 @@ def advise(
     calibration = monitoring.calibrate(fitted, own, config.adviser)
     shares = sorted({*SHARES, calibration.offset_share})
     with progress("Advising", len(PERIODS) + len(shares) + len(THRESHOLDS) + 1) as advance:
-        curves: dict[str, list[dict[str, float]]] = {"periodic": [], "adviser": []}
-        thresholds: list[dict[str, float]] = []
-        for period in PERIODS:
-            curves["periodic"].append(
-                monitoring.measure_policy(test, monitoring.periodic_policy(test, period), config.adviser)
-            )
+
+        def measured(policy: monitoring.ExposurePolicy, events: AdviserConfig = config.adviser) -> dict[str, float]:
+            point = monitoring.measure_policy(test, policy, events)
             advance()
-        for share in shares:
-            bands = replace(calibration, offset_share=share)
-            test.model.reset()
-            policy = monitoring.adviser_policy(test, bands, config.adviser)
-            point = monitoring.measure_policy(test, policy, config.adviser)
-            curves["adviser"].append({"offset_share": share, **point})
-            advance()
-        for ratio, mm in THRESHOLDS:
-            other = replace(config.adviser, wall_ratio=ratio, abscissa_mm=mm)
-            test.model.reset()
-            policy = monitoring.adviser_policy(test, calibration, other)
-            point = monitoring.measure_policy(test, policy, other)
-            thresholds.append({"wall_ratio": ratio, "abscissa_mm": mm, **point})
-            advance()
-        oracle = monitoring.oracle_policy(test, config.adviser)
-        curves["oracle"] = [monitoring.measure_policy(test, oracle, config.adviser)]
-        advance()
+            return point
+
+        curves = {"periodic": [measured(monitoring.periodic_policy(test, period)) for period in PERIODS]}
+        bands = {share: replace(calibration, offset_share=share) for share in shares}
+        curves["adviser"] = [
+            {"offset_share": share} | measured(monitoring.adviser_policy(test, each, config.adviser))
+            for share, each in bands.items()
+        ]
+        events = [replace(config.adviser, wall_ratio=ratio, abscissa_mm=mm) for ratio, mm in THRESHOLDS]
+        thresholds = [
+            {"wall_ratio": each.wall_ratio, "abscissa_mm": each.abscissa_mm}
+            | measured(monitoring.adviser_policy(test, calibration, each), each)
+            for each in events
+        ]
+        curves["oracle"] = [measured(monitoring.oracle_policy(test, config.adviser))]
     otherwise = [
         _measure_otherwise(monitoring.monitor(predictor, other, config), other, episodes, calibration, config)
         for other in others
@@ -141,8 +135,6 @@ def _other(run: Path, folder: Path, ours: Sequence[Dataset]) -> Dataset:
     """Return the test patients of a dataset that was made otherwise.
 
     Args:
-        run: of the model.
-        folder: of the dataset.
         ours: what the bands are fitted to and scaled on.
 
     Raises:
@@ -167,7 +159,6 @@ def _measure_otherwise(
     """Return what the calibrated adviser misses and costs on navigations that were made otherwise, and how."""
     theirs, ours = (_leaves(data.manifest["config"]) for data in (made, calibrated))
     cover = monitoring.coverage(test, calibration)
-    test.model.reset()
     policy = monitoring.adviser_policy(test, calibration, config.adviser)
     return {
         "dataset": str(made.folder),

@@ -92,10 +92,7 @@ class XrayAdviser:
         """Begin at an exposure.
 
         Args:
-            calibration: of the model that predicts.
             config: τ and δ.
-            wire_radius_mm: radius of the wire at its tip, mm.
-            at: what the model predicts there.
         """
         self._calibration, self._config, self._wire_radius_mm = calibration, config, wire_radius_mm
         self._inserted_mm, self._travel_mm, self._periods = float(at.proximal[0]), 0.0, 0
@@ -116,7 +113,6 @@ class XrayAdviser:
         """Return whether X-ray is due now, a period after the last call.
 
         Args:
-            at: what is predicted for now.
             beside_mm: standard deviations of Δtip and γtip by what the calibration does not know, such as the play of a
                 drive, mm; none if not given.
             factor: by which the bands are wider than they are calibrated.

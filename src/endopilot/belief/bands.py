@@ -104,8 +104,6 @@ def fit_spread(
 
     Args:
         error: of Δtip and γtip, mm, on patients that serve neither for calibration nor for the test.
-        seconds: since the last exposure, s.
-        travel_mm: since then, mm.
         spread: the model's estimate of its own error, mm.
     """
     found = [
@@ -126,7 +124,6 @@ def narrowest(
     branch, are left out where they would widen a band the most.
 
     Args:
-        terms: as they were fitted.
         worst: of each interval, the largest error over the spread of these terms, of Δtip and of γtip.
         level: share of the intervals that both hold throughout, under a scale of 1.
     """
@@ -169,11 +166,6 @@ def conformal_scale(
     Intervals of one patient are alike, so patients count, not intervals. A quantile of all scores serves; which one, is
     found by leaving each patient out: the smallest whose value on the others covers `level` of the left-out ones.
 
-    Args:
-        score: of each interval, the worst error over the spread.
-        anatomy: whose each is.
-        level: share to be covered.
-
     Raises:
         InputError: there are too few patients for that level.
     """
@@ -194,10 +186,6 @@ def surely_missed(missed: Real[np.ndarray, "patients"], events: Real[np.ndarray,
     It is the share of all their events plus its standard error. Events of one patient are alike, so patients count, not
     events: the share is a ratio of two sums over patients, with the error that such a ratio has (W. G. Cochran,
     *Sampling techniques*, 1977, section 6.3).
-
-    Args:
-        missed: events of each patient that are missed.
-        events: of each patient.
 
     Returns:
         The share; 0 without events, and more than 1 where the patients say next to nothing.

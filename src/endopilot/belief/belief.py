@@ -133,7 +133,6 @@ class Belief:
 
     Attributes:
         members: what each takes reality to be.
-        config: accuracy of measurements, and settings of the rod core.
         kinds: vessel and devices, those that differ; members share them.
         kind: the place among these of each member.
         ostium_mm: how much deeper each member's devices lie than the encoders say, mm.
@@ -162,12 +161,8 @@ class Belief:
         """Bring every member's wire to the start of the navigation.
 
         Args:
-            navigation: as it is given.
             members: what each takes reality to be; all have the same kind of wall.
-            config: accuracy of measurements, and settings of the rod core.
             drives: of another belief about the same devices; at rest at the start if not given.
-            vessels: that other beliefs have prepared.
-            motion: of the vessel, if one was found.
         """
         self.motion, self._given = motion, navigation
         self.navigation = navigation if motion is None else replace(navigation, known_motion=motion)
@@ -192,7 +187,6 @@ class Belief:
         """Return a belief of other members about the same devices, at the start of the navigation.
 
         Args:
-            members: what each takes reality to be.
             changed: `drives` and `motion`, where they are not to be those of this belief.
         """
         kept = {"drives": self.drives, "vessels": self.vessels, "motion": self.motion}
@@ -241,7 +235,6 @@ class Belief:
 
         Args:
             measured: as the C-arm has it, less the known motion.
-            period: the decision at which it was taken.
         """
         if self.motion is None:
             return measured
@@ -330,7 +323,6 @@ class Belief:
 
         Args:
             position: the place, LPS mm.
-            simulator: whose tips; the members' if not given.
         """
         simulator = simulator or self.simulator
         if self._coaxial:  # the first nodes are the foremost tube's

@@ -205,8 +205,6 @@ class Drives:
         """Weight the samples of a device by the force that its drive reads while the motor turns.
 
         Args:
-            device: its place in the stack.
-            force_n: as it is read, N.
             pushed_n: what the device ahead of the valve is believed to take of it, N.
             valve: friction of the introducer's valve, N, and its drag, N·s/mm.
         """

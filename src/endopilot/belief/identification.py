@@ -106,11 +106,6 @@ class Identified:
 def identify(belief: Belief, past: Past, *, seed: int = 0) -> tuple[Belief, Identified]:
     """Find what explains the exposures of a navigation so far.
 
-    Args:
-        belief: that does not explain them, or not well.
-        past: of the navigation.
-        seed: of the members that are drawn.
-
     Returns:
         The belief that takes its place, at the same moment, and what was found.
     """

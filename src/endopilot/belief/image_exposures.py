@@ -7,7 +7,6 @@ folder; another model that is advised by the same C-arm finds them there.
 from __future__ import annotations
 
 import hashlib
-import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, fields
 from functools import partial
@@ -45,7 +44,6 @@ class Exposures:
         tip: (Δtip, γtip), mm.
         branch: of that tip.
         sd_mm: standard deviations of (Δtip, γtip) as the detector states them, mm; 0 where it states none.
-        found: whether an image shows a wire.
         motion: the patient's motion as a run of contrast shows it, the numbers of `Motion` in their order; empty for a
             patient who lies still.
     """
@@ -68,7 +66,6 @@ class ImageSettings:
     """What the images of a dataset's navigations follow from, beside the dataset.
 
     Attributes:
-        fluoroscope: the C-arm.
         ostium_mm: each patient's ostium lies up to this much deeper or less deep than in the model, mm.
         seed: of poses, noise and ostia.
         samples: images are made of so many samples of each navigation, from the first on.
@@ -88,10 +85,6 @@ def deeper_ostium_mm(name: str, largest_mm: float, seed: int) -> float:
 def image_exposures(dataset: Dataset, settings: ImageSettings) -> tuple[dict[str, Exposures], tuple[str, ...]]:
     """Return what images show of navigations: those that are kept, and those that are made now and kept.
 
-    Args:
-        dataset: the navigations of one split.
-        settings: what the images follow from.
-
     Returns:
         What is shown, by the patient's name; and the names of the patients who cannot be registered.
 
@@ -110,12 +103,12 @@ def image_exposures(dataset: Dataset, settings: ImageSettings) -> tuple[dict[str
     if len(bad) == len(paths):
         first = next(iter(bad.values()))
         raise InputError(f"{dataset.folder}: no patient of its split '{split}' can be registered; the first: {first}")
-    return {name: _read(path) for name, path in paths.items() if path not in bad}, tuple(path.stem for path in bad)
-
-
-def _read(path: Path) -> Exposures:
-    with np.load(path, allow_pickle=False) as stored:
-        return Exposures(**{field.name: stored[field.name] for field in fields(Exposures)})
+    found = {}
+    for name, path in paths.items():
+        if path not in bad:
+            with np.load(path, allow_pickle=False) as stored:
+                found[name] = Exposures(**{field.name: stored[field.name] for field in fields(Exposures)})
+    return found, tuple(path.stem for path in bad)
 
 
 def _expose_patient(path: Path, *, dataset: Path, split: str, settings: ImageSettings) -> None:
@@ -141,8 +134,6 @@ def expose_navigations(data: Dataset, anatomy: Anatomy, settings: ImageSettings)
 
     Args:
         data: the patient's navigations.
-        anatomy: the patient.
-        settings: what the images follow from.
 
     Raises:
         NotRegistered: the patient cannot be registered.
@@ -161,20 +152,17 @@ def expose_navigations(data: Dataset, anatomy: Anatomy, settings: ImageSettings)
     encoder = data.inserted_length[:, :, 0].astype(float) - deeper_ostium_mm(name, settings.ostium_mm, seed)
     encoder = encoder - world.ostium_mm
     measured: list[list[TipMeasurement | None]] = [[] for _ in data.sequence]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # forces on the wall are in the dataset
-        again = list(simulate_again(data, anatomy, data.command, record_shape=True))
-    for chosen, rollout in again:
-        assert rollout.shape is not None
-        for index, nodes in zip(chosen.tolist(), rollout.shape, strict=True):
-            arm.forget_wires()
-            sequence = int(data.sequence[index])
-            for sample in range(samples):
-                there = nodes[sample] + world.registration_mm if any(world.registration_mm) else nodes[sample]
-                there = there if shown is None else place(shown[sample], there)
-                random = np.random.default_rng([seed, 3, sequence, sample, *name.encode()])
-                depth, given = float(encoder[index, sample]), sample < WINDOW
-                measured[index].append(arm.measure(there, depth, random, refine=given))
+    again = simulate_again(data, anatomy, data.command, record_shape=True)
+    assert again.shape is not None
+    for index, nodes in enumerate(again.shape):
+        arm.forget_wires()
+        sequence = int(data.sequence[index])
+        for sample in range(samples):
+            there = nodes[sample] + world.registration_mm if any(world.registration_mm) else nodes[sample]
+            there = there if shown is None else place(shown[sample], there)
+            random = np.random.default_rng([seed, 3, sequence, sample, *name.encode()])
+            depth, given = float(encoder[index, sample]), sample < WINDOW
+            measured[index].append(arm.measure(there, depth, random, refine=given))
     return _held(measured, encoder, known)
 
 
@@ -184,7 +172,6 @@ def _held(
     """Return measurements of the first samples of each navigation as arrays, with what is held where there is none.
 
     Args:
-        measured: in each navigation.
         encoder: Δ, mm.
         known: the patient's motion as it was measured.
     """

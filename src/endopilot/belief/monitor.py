@@ -105,7 +105,6 @@ class Monitor:
         belief: about the wire; another one once the model was taken to be wrong and another was identified.
         lost: whether no wire explains the last exposure.
         sought: whether one was sought for this exposure, and found.
-        past: what was measured so far.
         identified: what was found when the belief was last changed; None before.
         moves: how the vessel was found to move; None if it was not.
         seen: the last exposure, less that motion; None where X-ray is off.
@@ -123,10 +122,7 @@ class Monitor:
         """Lay out the simulated wires at the start of a navigation.
 
         Args:
-            navigation: as it is given.
             calibration: of the bands around what the simulated wires predict.
-            config: the simulated wires.
-            advice: which events X-ray must not miss.
         """
         self._navigation, self._config = navigation, config or BeliefConfig()
         self._given = Belief.around(self._config)

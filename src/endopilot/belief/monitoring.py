@@ -18,8 +18,7 @@ from endopilot.belief.watch import Watch
 from endopilot.dataset.loader import Dataset
 from endopilot.devices.device import Wire
 from endopilot.models.config import WINDOW
-from endopilot.models.episodes import Episodes
-from endopilot.models.open_loop import Predictor
+from endopilot.models.episodes import Episodes, Predictor
 from endopilot.progress import progress
 from endopilot.settings import NonNegative, Seed, from_record, settings
 from endopilot.tasks.navigation import XrayKind
@@ -62,10 +61,7 @@ class Monitored:
         episodes: Δ by the encoder, and tips as X-ray would show them.
         found: at which samples X-ray would show a tip.
         unregistered: names of the patients who could not be registered in X-ray images, and were left out.
-        model: what predicts them.
         lumen: radii of the lumen, to look up.
-        wire_radius_mm: radius of the wire, mm.
-        dataset: key of the dataset.
     """
 
     truth: Float[np.ndarray, "episodes samples 2"]
@@ -98,7 +94,6 @@ class Lumen:
         """Tabulate the radii.
 
         Args:
-            trees: of the patients.
             owner: of each episode, the index of its patient.
         """
         lines = [[_onwards(tree, branch) for branch in range(len(tree.branches))] for tree in trees]
@@ -130,7 +125,6 @@ def monitor(predictor: Predictor, dataset: Dataset, config: AdviseConfig, *, sam
     """Return the navigations of a split with an online predictor of their tips.
 
     Args:
-        predictor: the model.
         dataset: the navigations as they truly went; encoders and exposures err as its world says.
         config: the C-arm, and the model mismatch.
         samples: exposures of so many samples are needed, from the first on; of all if not given. Images take time.
@@ -194,7 +188,6 @@ def calibrate(fitted: Monitored, own: Monitored, config: AdviserConfig) -> Calib
 
     Args:
         fitted: navigations that the terms of the spread are fitted to; they need be no calibration patients.
-        own: navigations of the calibration patients.
         config: how many of the intervals the bands shall hold throughout, and how many events the adviser may miss.
 
     Raises:
@@ -227,17 +220,11 @@ def least_offset_share(own: Monitored, bands: Calibration, config: AdviserConfig
 
     The shares of `OFFSET_SHARES` are tried from the largest on. The last one before the first that misses too many is
     taken, so that chance among many shares favours none; 1, where even the whole band misses too many.
-
-    Args:
-        own: navigations of the calibration patients.
-        bands: the calibration of these.
-        config: the events, and the share of them that may be missed.
     """
     names, owner = np.unique(own.episodes.anatomy, return_inverse=True)
     least = OFFSET_SHARES[0]
     with progress("Using less of the bands", len(OFFSET_SHARES)) as advance:
         for share in OFFSET_SHARES:
-            own.model.reset()
             found = follow_policy(own, adviser_policy(own, replace(bands, offset_share=share), config), config)
             counts = np.array([np.sum(found.count(owner == index), axis=0) for index in range(len(names))])
             if surely_missed(counts[:, 1], counts[:, 0]) > config.missed:
@@ -280,9 +267,7 @@ class Followed:
     """Navigations in which a policy decided when X-ray is on, from the last given sample on.
 
     Attributes:
-        exposed: which samples were exposed.
         near: which have an exposure within 0.5 s that shows the tip.
-        wall: whether the tip is at the wall.
         astray: whether the predicted Δtip errs by δ.
     """
 
@@ -342,6 +327,7 @@ def measure_policy(monitored: Monitored, policy: ExposurePolicy, config: Adviser
 
 def adviser_policy(monitored: Monitored, calibration: Calibration, config: AdviserConfig) -> ExposurePolicy:
     """Return the adviser as an exposure policy: a `Watch` of each navigation, which tests the model by innovations."""
+    monitored.model.reset()
     episodes, last = monitored.episodes, WINDOW - 1
     branch = episodes.branch[:, last].astype(int)
 

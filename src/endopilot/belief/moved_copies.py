@@ -1,4 +1,4 @@
-"""Copies of simulated devices that are moved to and fro until one lies as X-ray shows it: `MovedCopies`.
+"""Copies of simulated devices, turned to all sides (`Fans`), or moved until one lies as X-ray shows it (`MovedCopies`).
 
 Soft devices lie otherwise after they were pushed and pulled, though their drives are where they were: what lies in
 loops comes out elsewhere. So copies whose drives go somewhere and come back lie in many of the ways in which the real
@@ -21,6 +21,53 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S
 from endopilot.types import Anatomy
 
+_SIDES = 16
+"""Angles that a wire is turned to where its rotation is looked for."""
+
+
+class Fans:
+    """Copies of a member of a belief, each turned by another angle; members of a kind share theirs."""
+
+    def __init__(self, kinds: Sequence[tuple[Anatomy, Stack]], motion: Motion | None, config: SimulatorConfig) -> None:
+        self._kinds, self._motion, self._config = kinds, motion, config
+        self._made = dict[int, Simulator]()
+
+    def of(self, kind: int, member: int, simulator: Simulator) -> Simulator:
+        """Return copies of a member as it lies now, those turned to more than half a turn backwards."""
+        if kind not in self._made:
+            anatomy, stack = self._kinds[kind]
+            self._made[kind] = Simulator(
+                anatomy, stack, worlds=_SIDES, motion=self._motion, config=self._config, sharing=[simulator]
+            )
+        fan, side = self._made[kind], 2 * np.pi * np.arange(_SIDES) / _SIDES
+        fan.copy_worlds(np.full(_SIDES, member), of=simulator)
+        turn = np.where(side > np.pi, side - 2 * np.pi, side)
+        fastest = self._kinds[kind][1].wire.max_rotation_rad_s
+        periods = int(np.ceil(np.pi / (fastest * DECISION_PERIOD_S)))
+        control = np.zeros((_SIDES, fan.devices, 2))
+        control[:, 0, 1] = turn / (periods * DECISION_PERIOD_S)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # one that fails stays where it was
+            for _ in range(periods):
+                fan.step(control, DECISION_PERIOD_S)
+        return fan
+
+
+def shifted(
+    anatomy: Anatomy, branch: int, abscissa_mm: float, along_mm: Float[np.ndarray, "n"]
+) -> Float[np.ndarray, "n 3"]:
+    """Return how far a tip moves, mm, that goes some way along the vessel, mm, from a place on a branch."""
+    line, insertion = anatomy.tree.path(branch), anatomy.insertion
+    behind = np.array([-20.0, -10.0])
+    abscissa = np.concatenate([behind, line.abscissa])
+    points = np.concatenate([insertion.position + behind[:, None] * insertion.direction, line.points])
+    there, here = (
+        np.column_stack([np.interp(x, abscissa, axis) for axis in points.T])
+        for x in (abscissa_mm + along_mm, np.array([abscissa_mm]))
+    )
+    return there - here
+
+
 _ROUNDS, _PERIODS = 4, 3
 """Rounds, each from the nearest copy of the last, and decision periods that drives go away in each and come back."""
 _NEAR_ENOUGH = 0.5
@@ -38,7 +85,6 @@ class MovedCopies:
     """Copies of a belief's likeliest devices.
 
     Attributes:
-        simulator: of the copies.
         at: the one that was found nearest to what X-ray shows.
     """
 
@@ -52,29 +98,13 @@ class MovedCopies:
         config: SimulatorConfig,
         sharing: Simulator,
     ) -> None:
-        """Prepare the copies.
-
-        Args:
-            kind: vessel and devices.
-            count: number of copies.
-            limits: of the drive of each device.
-            motion: of the vessel, as it is known.
-            config: settings of the rod core.
-            sharing: simulator of the same vessel.
-        """
         anatomy, stack = kind
         self.simulator = Simulator(anatomy, stack, worlds=count, motion=motion, config=config, sharing=[sharing])
         self._limits = list(limits)
         self._random, self.at = np.random.default_rng(0xC0B1), 0
 
     def seek(self, member: int, of: Simulator, misfit: Misfit) -> float:
-        """Move copies of a member to and fro; return how near the nearest comes, `at`.
-
-        Args:
-            member: its place among those of a belief.
-            of: the simulator of these.
-            misfit: of each copy.
-        """
+        """Move copies of a member to and fro; return how near the nearest comes, `at`."""
         copies, count = self.simulator, self.simulator.worlds
         copies.copy_worlds(np.full(count, member), of=of)
         best = np.inf
@@ -107,51 +137,6 @@ class MovedCopies:
         return control
 
 
-_SIDES = 16
-"""Angles that a wire is turned to where its rotation is looked for."""
-
-
-class Fans:
-    """Copies of a member of a belief, each turned by another angle; members of a kind share theirs."""
-
-    def __init__(self, kinds: Sequence[tuple[Anatomy, Stack]], motion: Motion | None, config: SimulatorConfig) -> None:
-        """Take what the members are simulated with.
-
-        Args:
-            kinds: vessel and devices, those that differ.
-            motion: of the vessel, as it is known.
-            config: settings of the rod core.
-        """
-        self._kinds, self._motion, self._config = kinds, motion, config
-        self._made = dict[int, Simulator]()
-
-    def of(self, kind: int, member: int, simulator: Simulator) -> Simulator:
-        """Return copies of a member as it lies now, those turned to more than half a turn backwards.
-
-        Args:
-            kind: of the member.
-            member: its place in the simulator.
-            simulator: of all members.
-        """
-        if kind not in self._made:
-            anatomy, stack = self._kinds[kind]
-            self._made[kind] = Simulator(
-                anatomy, stack, worlds=_SIDES, motion=self._motion, config=self._config, sharing=[simulator]
-            )
-        fan, side = self._made[kind], 2 * np.pi * np.arange(_SIDES) / _SIDES
-        fan.copy_worlds(np.full(_SIDES, member), of=simulator)
-        turn = np.where(side > np.pi, side - 2 * np.pi, side)
-        fastest = self._kinds[kind][1].wire.max_rotation_rad_s
-        periods = int(np.ceil(np.pi / (fastest * DECISION_PERIOD_S)))
-        control = np.zeros((_SIDES, fan.devices, 2))
-        control[:, 0, 1] = turn / (periods * DECISION_PERIOD_S)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # one that fails stays where it was
-            for _ in range(periods):
-                fan.step(control, DECISION_PERIOD_S)
-        return fan
-
-
 def turned(
     simulator: Simulator, member: int, turn: Float[np.ndarray, "n"], fan: Simulator | None
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
@@ -172,18 +157,3 @@ def turned(
     share = (place % 1.0)[:, None]
     mixed = [(1 - share) * each[low] + share * each[(low + 1) % _SIDES] for each in (ends, directions)]
     return mixed[0], mixed[1] / np.maximum(np.linalg.norm(mixed[1], axis=1, keepdims=True), 1e-9)
-
-
-def shifted(
-    anatomy: Anatomy, branch: int, abscissa_mm: float, along_mm: Float[np.ndarray, "n"]
-) -> Float[np.ndarray, "n 3"]:
-    """Return how far a tip moves, mm, that goes some way along the vessel, mm, from a place on a branch."""
-    line, insertion = anatomy.tree.path(branch), anatomy.insertion
-    behind = np.array([-20.0, -10.0])
-    abscissa = np.concatenate([behind, line.abscissa])
-    points = np.concatenate([insertion.position + behind[:, None] * insertion.direction, line.points])
-    there, here = (
-        np.column_stack([np.interp(x, abscissa, axis) for axis in points.T])
-        for x in (abscissa_mm + along_mm, np.array([abscissa_mm]))
-    )
-    return there - here

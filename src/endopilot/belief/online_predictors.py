@@ -3,68 +3,34 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from endopilot.models.config import WINDOW
-from endopilot.models.episodes import Episodes
-from endopilot.models.open_loop import EachObserved, Predictor, ProbabilisticPredictor, given_states
+from endopilot.models.episodes import EachObserved, Episodes, Predictor, ProbabilisticPredictor, given_states
 from endopilot.models.twin import TwinPredictor, weigh
 
 Tips = Float[np.ndarray, "episodes samples 2"]
 
 
-@runtime_checkable
-class OnlinePredictor(Protocol):
-    """Predicts the tips of navigations whose controls are known.
+class OnlinePredictor:
+    """Predicts the tips of navigations whose controls are known, from the first `WINDOW` samples and from exposures.
 
     Attributes:
         tip: (Δtip, γtip) at every sample, mm, from what has been observed so far; for past samples, as predicted then.
         spread: the model's estimate of its own error, mm; 0 where it makes none.
     """
 
-    tip: Tips
-    spread: Tips
-
-    def reset(self) -> None:
-        """Forget what was observed after the first `WINDOW` samples."""
-        ...
-
-    def observe(
-        self,
-        episodes: Int[np.ndarray, "some"],
-        sample: int,
-        tip: Float[np.ndarray, "some 2"],
-        branch: Int[np.ndarray, "some"],
-        sd_mm: Float[np.ndarray, "some 2"] | None = None,
-    ) -> None:
-        """Take what X-ray shows of some navigations at a sample, and predict the later samples anew.
-
-        Args:
-            episodes: indices of the navigations.
-            sample: of the exposure.
-            tip: (Δtip, γtip) in the image, mm.
-            branch: of that tip.
-            sd_mm: standard deviations of both as the detector states them, mm; none if not given. The twin weighs its
-                wires by them; networks have no such input.
-        """
-        ...
-
-
-class _OnlineProbabilistic:
-    """What is common to models that take tips observed at any time: the observations, and the prediction from them."""
-
     def __init__(self, episodes: Episodes, observed: EachObserved) -> None:
         self._observed = observed & given_states(episodes)
         self._tip, self._branch = episodes.tip.astype(float), episodes.branch.copy()
         self._sd = episodes.tip_sd.astype(float)
-        self._first = self._predict(np.arange(len(episodes)))
+        self._first = self._predict(np.arange(len(episodes)), WINDOW - 1)
         self.reset()
 
-    def _predict(self, chosen: Int[np.ndarray, "some"]) -> tuple[Tips, Tips]:
-        """Return tips and spread, mm, of some navigations, from what was observed of them."""
+    def _predict(self, chosen: Int[np.ndarray, "some"], sample: int) -> tuple[Tips, Tips]:
+        """Return tips and spread, mm, of some navigations, from what was observed of them up to a sample."""
         raise NotImplementedError
 
     def reset(self) -> None:
@@ -80,87 +46,72 @@ class _OnlineProbabilistic:
         branch: Int[np.ndarray, "some"],
         sd_mm: Float[np.ndarray, "some 2"] | None = None,
     ) -> None:
-        """Take what X-ray shows of some navigations at a sample, and predict the later samples anew."""
+        """Take what X-ray shows of some navigations at a sample, and predict the later samples anew.
+
+        Args:
+            tip: (Δtip, γtip) in the image, mm.
+            sd_mm: standard deviations of both as the detector states them, mm; none if not given. The twin weighs its
+                wires by them; networks have no such input.
+        """
         self._observed[episodes, sample] = True
         self._tip[episodes, sample], self._branch[episodes, sample] = tip, branch
         self._sd[episodes, sample] = 0.0 if sd_mm is None else sd_mm
-        later = slice(sample + 1, None)
-        self.tip[episodes, later], self.spread[episodes, later] = (part[:, later] for part in self._predict(episodes))
+        later, found = slice(sample + 1, None), self._predict(episodes, sample)
+        self.tip[episodes, later], self.spread[episodes, later] = (part[:, later] for part in found)
 
 
-class OnlineTwin(_OnlineProbabilistic):
+class OnlineTwin(OnlinePredictor):
     """A twin, whose ensemble is simulated once and weighted again at every exposure."""
 
     def __init__(self, twin: TwinPredictor, episodes: Episodes, observed: EachObserved) -> None:
-        """Simulate, and predict from the first `WINDOW` samples; the arguments are those of `online_predictor`."""
         self._config, self._paths = twin.config, twin.ensemble(episodes, observed & given_states(episodes))
         super().__init__(episodes, observed)
 
-    def _predict(self, chosen: Int[np.ndarray, "some"]) -> tuple[Tips, Tips]:
+    def _predict(self, chosen: Int[np.ndarray, "some"], sample: int) -> tuple[Tips, Tips]:
         paths, seen = self._paths[:, chosen], self._observed[chosen]
         return weigh(paths, self._tip[chosen], seen, self._sd[chosen], self._config)
 
 
-class OnlineCausal(_OnlineProbabilistic):
+class OnlineCausal(OnlinePredictor):
     """The causal networks, which run again over the whole navigation at every exposure."""
 
     def __init__(self, predictor: ProbabilisticPredictor, episodes: Episodes, observed: EachObserved) -> None:
-        """Predict from the first `WINDOW` samples; the arguments are those of `online_predictor`."""
         self._predictor, self._episodes = predictor, episodes
         super().__init__(episodes, observed)
 
-    def _predict(self, chosen: Int[np.ndarray, "some"]) -> tuple[Tips, Tips]:
+    def _predict(self, chosen: Int[np.ndarray, "some"], sample: int) -> tuple[Tips, Tips]:
         episodes = replace(self._episodes.select(chosen), tip=self._tip[chosen], branch=self._branch[chosen])
         found = self._predictor.predict(episodes, self._observed[chosen])
         return found.tip, found.spread
 
 
-class OnlineWindowed:
+class OnlineWindowed(OnlinePredictor):
     """The paper's networks: they go on from the last `WINDOW` states, those not observed as they predicted them.
 
     Of the first `WINDOW` they need every one.
     """
 
     def __init__(self, predictor: Predictor, episodes: Episodes) -> None:
-        """Predict from the first `WINDOW` samples.
-
-        Args:
-            predictor: the model.
-            episodes: their controls, and their tips as they are measured.
-        """
         self._predictor, self._episodes = predictor, episodes
-        self.tip = episodes.tip.astype(float)
-        self.spread = np.zeros_like(self.tip)
-        self.tip[:, WINDOW:] = predictor.rollout_forward(episodes).tip
-        self._first, self._known = self.tip.copy(), self.tip.copy()
+        super().__init__(episodes, np.ones(episodes.branch.shape, dtype=bool))
+
+    def _predict(self, chosen: Int[np.ndarray, "some"], sample: int) -> tuple[Tips, Tips]:
+        if sample + 1 < self._tip.shape[1]:
+            known = replace(self._episodes.select(chosen), tip=self._tip[chosen].astype(np.float32))
+            found = self._predictor.rollout_forward(known.from_sample(sample + 1 - WINDOW))
+            self._tip[chosen, sample + 1 :] = found.tip
+        return self._tip[chosen], np.zeros_like(self._tip[chosen])
 
     def reset(self) -> None:
         """Forget what was observed after the first `WINDOW` samples."""
-        self.tip, self._known = self._first.copy(), self._first.copy()
-
-    def observe(
-        self,
-        episodes: Int[np.ndarray, "some"],
-        sample: int,
-        tip: Float[np.ndarray, "some 2"],
-        branch: Int[np.ndarray, "some"],
-        sd_mm: Float[np.ndarray, "some 2"] | None = None,
-    ) -> None:
-        """Take what X-ray shows of some navigations at a sample, and predict the later samples anew."""
-        self._known[episodes, sample] = tip
-        if sample + 1 == self._known.shape[1]:
-            return
-        known = replace(self._episodes.select(episodes), tip=self._known[episodes].astype(np.float32))
-        found = self._predictor.rollout_forward(known.from_sample(sample + 1 - WINDOW))
-        self.tip[episodes, sample + 1 :] = self._known[episodes, sample + 1 :] = found.tip
+        super().reset()
+        self._tip = self.tip.copy()
 
 
 def online_predictor(predictor: Predictor, episodes: Episodes, observed: EachObserved | None = None) -> OnlinePredictor:
     """Return what predicts the tips of navigations with a model as exposures come in.
 
     Args:
-        predictor: of a run.
-        episodes: their controls, and their tips as they are measured.
         observed: which of the first `WINDOW` samples were measured; all if not given. The paper's networks take the
             others' tips as they stand in `episodes`.
     """

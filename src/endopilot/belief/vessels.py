@@ -25,7 +25,6 @@ class SharedVessels:
     """
 
     def __init__(self, given: Anatomy) -> None:
-        """Begin with the vessel as it is given."""
         self._made = {World(): given}
         self.simulators: list[Simulator] = []
         self._kept = set[tuple[int, float]]()
@@ -47,12 +46,7 @@ class SharedVessels:
     def kinds(
         self, given: Stack, members: Sequence[World]
     ) -> tuple[list[tuple[Anatomy, Stack]], Int[np.ndarray, "members"]]:
-        """Return vessels and devices of members, those that differ, and which of them each member has.
-
-        Args:
-            given: the devices as they are given.
-            members: as they take reality to be.
-        """
+        """Return vessels and devices of members, those that differ, and which of them each member has."""
         found: dict[World, int] = {}
         alike = [replace(each, friction_factor=1.0, ostium_mm=0.0, about="") for each in members]
         kind = np.array([found.setdefault(each, len(found)) for each in alike])

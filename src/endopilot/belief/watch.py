@@ -36,7 +36,10 @@ its bands begin: members that a few images chose are more alike than they are ri
 
 
 class Innovations:
-    """The innovations of a navigation.
+    """Whether a model is wrong, by the innovations of a navigation: what exposures show less what was predicted.
+
+    The covariance of an innovation is that of the prediction plus that of the measurement. Where the innovations are
+    larger, the bands are widened until both agree (covariance matching).
 
     Attributes:
         factor: by which the bands of Δtip and γtip are widened, 1 or more.
@@ -45,7 +48,6 @@ class Innovations:
     """
 
     def __init__(self) -> None:
-        """Begin with the bands as they are calibrated."""
         self._shares, self._off = list[float](), list[Float[np.ndarray, "2"]]()
         self.factor, self.alarm = np.ones(2), False
         self._excess, self._weight = np.full(2, _PRIOR), np.full(2, _PRIOR)
@@ -105,7 +107,11 @@ have the given one agree better than they are right; found with other tips, on p
 
 
 class Allowance:
-    """What a wire's bands allow for, beside what they are calibrated for.
+    """What a wire's bands allow for that no calibration knows.
+
+    The lumen may be another than CT shows it, and the tip another than it is given. A wire that is pushed while its tip
+    rests buckles, and then snaps or folds, which no two wires do alike. In a wide lumen it lies down on the outer walls
+    of bends before, which simulated wires predict.
 
     Attributes:
         held_mm: by how much the wire was moved while its tip rested, since the last exposure, mm.
@@ -115,8 +121,6 @@ class Allowance:
         """Begin at an exposure.
 
         Args:
-            inserted_mm: Δ.
-            abscissa_mm: Δtip.
             alone: whether no catheter is around the wire; nothing is allowed for where one is.
         """
         self._at, self._alone, self.held_mm = np.array([inserted_mm, abscissa_mm]), alone, 0.0
@@ -161,10 +165,6 @@ class Watch:
         """Begin at an exposure.
 
         Args:
-            calibration: of the model that predicts.
-            config: which events X-ray must not miss.
-            tip_radius_mm: radius of the wire at its tip, mm.
-            at: what the model predicts there.
             alone: whether the model is of a wire that no catheter is around; else nothing is allowed for.
         """
         self.innovations = Innovations()

@@ -54,8 +54,8 @@ def command(
     if episode is not None:
         _write_episode(replay, episode)
         return
-    from endopilot.cockpit.launch import serve
     from endopilot.cockpit.open import open_replay, open_session, open_task, resume_session
+    from endopilot.cockpit.server import serve
 
     if catheter and (replay is not None or task is not None or resume is not None):
         raise InputError("catheter: a replay, a task and a session have theirs; leave it out")

@@ -31,7 +31,7 @@ def command(
             mean and standard deviation.
         config: what to evaluate.
     """
-    from endopilot.report.evaluation_report import report_evaluation  # matplotlib and plotly are slow to import
+    from endopilot.report.report import report_evaluation  # matplotlib and plotly are slow to import
 
     metrics = evaluate(run, output=output, config=config, dataset=dataset, other_seeds=other_seeds)
     report_evaluation(output)

@@ -39,7 +39,6 @@ class Autopilot:
     """
 
     def __init__(self, world: LiveWorld) -> None:
-        """Take the world; nobody drives yet."""
         self.status, self.policy_name, self.asks, self.failure = "off", "", "", ""
         self._world, self._pool = world, ThreadPoolExecutor(1)
         self._policy: Policy | None = None
@@ -60,13 +59,7 @@ class Autopilot:
         return self.drives and (self._pending is not None or self._world.loop.between_periods)
 
     def start(self, name: str, target: Target) -> None:
-        """Hand the wheel to a policy, or back to it, from the next decision on.
-
-        Args:
-            name: of the policy.
-            target: where the tip is to go.
-
-        """
+        """Hand the wheel to a policy, or back to it, from the next decision on."""
         if self._policy is None or (name, target) != (self.policy_name, self._target) or not self._led:
             self._policy, self.policy_name, self._target = None, name, target
             self._started, self._believed = False, None
@@ -88,11 +81,7 @@ class Autopilot:
         self.asks = ""
 
     def think(self, expose: Callable[[], None]) -> Proximals | None:
-        """Go on with what the policy has to do now; return what the robot has been commanded, if anything.
-
-        Args:
-            expose: takes an X-ray image for the page, if the policy has one.
-        """
+        """Go on with what the policy has to do now; return what the robot has been commanded, if anything."""
         if self._pending is not None:
             return self._collect()
         loop = self._world.loop

@@ -75,8 +75,6 @@ class XrayUnit:
         """Set the C-arm up; its first view is computed in the background.
 
         Args:
-            anatomy: the vessel.
-            make_imager: of this patient, from a CT or none.
             ct: of the patient, HU; a phantom's for a coronary artery if not given, else plain water.
         """
         self.settings = XraySettings()
@@ -134,7 +132,6 @@ class XrayUnit:
         """Expose once and return the images as messages for the page.
 
         Args:
-            snapshot: the world.
             seconds: of fluoroscopy that the exposure counts for, s.
         """
         self.frames, self.seconds, self._image_s = self.frames + 1, self.seconds + seconds, snapshot.time_s

@@ -29,8 +29,6 @@ def encode(kind: str, header: dict[str, Any], **arrays: np.ndarray) -> bytes:
     """Return a message.
 
     Args:
-        kind: goes into the header as `type`.
-        header: plain values.
         arrays: float32, uint32 or uint8.
     """
     listed = [{"name": name, "type": _TYPES[array.dtype], "shape": array.shape} for name, array in arrays.items()]
@@ -69,7 +67,6 @@ def motion_values(snapshot: Snapshot, counted: Float[np.ndarray, "devices 2"] | 
     """Return how far wire and catheters are inserted and turned, and what their drives do, for the page's figures.
 
     Args:
-        snapshot: the world.
         counted: inserted length, mm, and rotation, rad, as the drives' encoders have them, which a robot shows; as they
             truly are if not given.
     """
@@ -107,12 +104,7 @@ def tip_values(anatomy: Anatomy, snapshot: Snapshot) -> dict[str, Any]:
 
 
 def scene(navigation: Navigation, about: dict[str, Any]) -> bytes:
-    """Return what does not move: the lumen, the centerlines with the names of their sections, the devices, the target.
-
-    Args:
-        navigation: vessel, wire, catheters and target.
-        about: further entries of the header.
-    """
+    """Return what does not move: the lumen, the centerlines with the names of their sections, devices and target."""
     from endopilot.report.wall_mesh import wall_mesh  # slow to import, and needed in the thread that makes the scene
 
     anatomy, device = navigation.anatomy, navigation.device
@@ -120,7 +112,8 @@ def scene(navigation: Navigation, about: dict[str, Any]) -> bytes:
     lines, points, labels, places = [], [], [], []
     for branch in anatomy.tree.branches:
         line = branch.centerline
-        chosen = _every(line.abscissa, _POINT_MM)
+        wanted = np.append(np.arange(line.abscissa[0], line.abscissa[-1], _POINT_MM), line.abscissa[-1])
+        chosen = np.unique(np.searchsorted(line.abscissa, wanted).clip(0, len(line.abscissa) - 1))
         lines.append(len(chosen))
         points.append(line.points[chosen])
         labels.append(branch.section[chosen])
@@ -171,9 +164,3 @@ def target_values(anatomy: Anatomy, target: Target | None) -> dict[str, Any] | N
         "abscissa": round(target.abscissa, 2),
         "section": anatomy.tree.section_names[int(branch.section[nearest])],
     }
-
-
-def _every(abscissa: np.ndarray, step: float) -> np.ndarray:
-    """Return indices about `step` apart along a line, its two ends included."""
-    wanted = np.append(np.arange(abscissa[0], abscissa[-1], step), abscissa[-1])
-    return np.unique(np.searchsorted(abscissa, wanted).clip(0, len(abscissa) - 1))

@@ -34,7 +34,6 @@ class Attempt:
     """Which task in which patient.
 
     Attributes:
-        task: of the ladder.
         place: of the patient in the task's list.
         robot: what drives, for a person and for the agent.
     """
@@ -77,10 +76,7 @@ class GameSession(Session):
         """Take the parts; the clock stands still.
 
         Args:
-            tried: which task in which patient.
             world: at the task's start.
-            xray: C-arm, pedal and contrast.
-            recorder: writes what happens.
             policies: names of those that a page may choose at the end.
         """
         super().__init__(world, xray, recorder, policies)

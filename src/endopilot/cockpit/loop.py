@@ -48,8 +48,6 @@ class Loop:
         """Take the stage.
 
         Args:
-            stage: what is run.
-            cycle_s: length of a cycle, s.
             publish: called in the thread with a channel's name and a message.
         """
         self._stage, self._cycle_s, self._publish = stage, cycle_s, publish

@@ -73,7 +73,6 @@ class Target(_Message):
 
     Attributes:
         section: name; the target lies in the middle of it.
-        branch: index of a branch.
         abscissa: distance from the ostium along that branch's path, mm.
     """
 
@@ -104,12 +103,7 @@ class Game(_Message):
 
 
 class Replay(_Message):
-    """Play, pause or seek in what is replayed.
-
-    Attributes:
-        playing: whether time passes.
-        at_s: where to go, s.
-    """
+    """Play, pause or seek in what is replayed."""
 
     type: Literal["replay"]
     playing: bool | None = None

@@ -12,110 +12,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from endopilot.anatomy.io import read_anatomy, write_anatomy
-from endopilot.cockpit import messages
-from endopilot.cockpit.film import FRAME_S, Film
+from endopilot.cockpit.film import FRAME_S
 from endopilot.cockpit.fluoroscopy import XrayUnit
-from endopilot.cockpit.frames import device_arrays, encode, motion_values, scene, target_values, tip_values
+from endopilot.cockpit.frames import scene
 from endopilot.cockpit.loop import Stage
 from endopilot.cockpit.recording import SUFFIX, Recorder, Where, read_session, replayed
 from endopilot.cockpit.session import Session
 from endopilot.cockpit.world import BY_HAND, LiveWorld
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
-from endopilot.errors import InputError
 from endopilot.navigation.policies import POLICIES
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import Anatomy, Volume
 from endopilot.xray.image import XrayImager
-
-
-class ReplayStage:
-    """A film in place of a session.
-
-    Attributes:
-        film: what is shown.
-        playing: whether time passes.
-        at: index of the frame that is shown.
-    """
-
-    def __init__(self, film: Film, xray: XrayUnit) -> None:
-        """Begin at the start; the film is driven meanwhile."""
-        self.film, self._xray = film, xray
-        self.playing, self.at, self._shown = True, 0, -1
-        film.start()
-
-    def handle(self, message: messages.Message, now_s: float) -> None:
-        """Play, pause, seek, expose, or set the C-arm."""
-        if isinstance(message, messages.Replay):
-            if message.playing is not None:
-                ended = self.film.done and self.at >= len(self.film.frames) - 1
-                self.playing, self.at = message.playing, 0 if message.playing and ended else self.at
-            if message.at_s is not None:
-                self.at = max(min(round(message.at_s / FRAME_S), len(self.film.frames) - 1), 0)
-                self._shown = -1
-        elif isinstance(message, messages.Pedal):
-            self._xray.pedal = message.down
-        elif isinstance(message, messages.Contrast):
-            self._xray.inject(self._time_s)
-        elif isinstance(message, messages.CArm):
-            self._xray.configure(**message.model_dump(exclude={"type"}, exclude_none=True))
-        elif not isinstance(message, messages.Drive | messages.Autopilot):
-            raise InputError(f"{message.type}: not in a replay")
-
-    def halt(self, why: str) -> None:
-        """Let the pedal go."""
-        self._xray.pedal = False
-
-    def cycle(self, now_s: float) -> list[tuple[str, bytes]]:
-        """Show the next frame."""
-        if not self.film.frames:
-            return []
-        sent: list[tuple[str, bytes]] = []
-        self.at = min(self.at, len(self.film.frames) - 1)
-        frame = self.film.frames[self.at]
-        if self._xray.ready:
-            images = self._xray.pulse(frame.snapshot)
-            if images is None and frame.exposed and self._shown != self.at:
-                images = self._xray.expose(frame.snapshot)
-            self._shown = self.at
-            sent = [(f"image{number}", image) for number, image in enumerate(images or [])]
-        sent.append(("state", encode("state", self._values(), **device_arrays(frame.snapshot))))
-        if self.playing and self.at + 1 < len(self.film.frames):
-            self.at += 1
-        elif self.playing and self.film.done:
-            self.playing = False
-        return sent
-
-    def close(self) -> None:
-        """End it."""
-        self._xray.close()
-
-    @property
-    def _time_s(self) -> float:
-        return self.film.frames[self.at].snapshot.time_s if self.film.frames else 0.0
-
-    def _values(self) -> dict[str, Any]:
-        film, snapshot = self.film, self.film.frames[self.at].snapshot
-        anatomy = film.navigation.anatomy
-        return {
-            "mode": "replay",
-            **motion_values(snapshot),
-            "command": snapshot.velocity,
-            "stopped": "",
-            "peak_force_n": round(film.frames[self.at].peak_n, 4),
-            "sight": True,
-            "target": target_values(anatomy, film.navigation.target),
-            "xray": self._xray.values(snapshot.time_s),
-            "target_px": self._xray.pixels(film.navigation.target.position(anatomy)),
-            "replay": {
-                "title": film.title,
-                "seconds": round(film.seconds, 3),
-                "ready_s": round(film.frames[-1].snapshot.time_s, 2),
-                "playing": self.playing,
-                "failure": film.failure,
-            },
-        } | tip_values(anatomy, snapshot)
-
 
 if TYPE_CHECKING:
     from endopilot.cockpit.game import Attempt
@@ -130,9 +39,6 @@ class Opened:
     """What the server needs.
 
     Attributes:
-        stage: what is driven or replayed.
-        scene: makes the message with what does not move.
-        cycle_s: length of a cycle, s.
         recording: where the session is kept; None for a replay.
     """
 
@@ -155,11 +61,7 @@ def open_session(
 
     Args:
         patient: folder of an anatomy; a synthetic one is written into `output` if not given.
-        device: name of a wire or a YAML file.
-        catheters: names or YAML files of catheters around it, from the inside out.
-        robot: what drives them.
         ct: CT angiogram of the patient, for the X-ray's background.
-        output: folder of the recordings.
 
     Raises:
         InputError: a file that is missing or bad, or a device that does not fit.
@@ -175,10 +77,8 @@ def open_task(
     """Open a task of the ladder, to be driven by hand under X-ray alone.
 
     Args:
-        name: of the task.
         place: of the patient in the task's list.
         robot: what drives; the agent, whose score stands beside a person's, drives the same one.
-        output: folder of the recordings.
 
     Raises:
         InputError: the ladder has no such task, or the task no such patient.
@@ -199,8 +99,6 @@ def open_replay(
     """Open what was recorded, simulated, planned or scored, to be looked at with a time slider.
 
     Args:
-        path: as for `open_film`.
-        patient: folder of the anatomy, for trajectories and plans.
         world: which of a trajectory's worlds, a data set's episodes, or a task's patients.
         task: of the ladder's files.
         ct: CT angiogram of the patient, for the X-ray's background.
@@ -208,8 +106,7 @@ def open_replay(
     Raises:
         InputError: it cannot be read, or lacks its patient or task.
     """
-    from endopilot.cockpit.film import FRAME_S, open_film  # slow to import, and needed for replays alone
-    from endopilot.cockpit.open import ReplayStage
+    from endopilot.cockpit.film import ReplayStage, open_film  # slow to import, and needed for replays alone
 
     film = open_film(path, patient, world=world, task=task)
     navigation = film.navigation
@@ -228,7 +125,8 @@ def resume_session(path: Path, *, ct: Path | None = None) -> Opened:
     recording = read_session(path)
     history = replayed(recording)
     first = next(history)
-    _drop_half_line(path)
+    with path.open("rb+") as stream:  # without what a killed server left behind its last whole line
+        stream.truncate(stream.read().rfind(b"\n") + 1)
     where, make = recording.where, Session
     if where.task is not None and not any("score" in event for event in recording.events):
         make = _attempt(where.task, where.place, recording.config.robot).session
@@ -320,10 +218,3 @@ def _free(output: Path, name: str) -> Path:
     while path.exists():
         number, path = number + 1, output / f"{name}-{number + 1}{SUFFIX}"
     return path
-
-
-def _drop_half_line(path: Path) -> None:
-    """Cut off what a killed server left behind its last whole line."""
-    with path.open("rb+") as stream:
-        whole = stream.read().rfind(b"\n") + 1
-        stream.truncate(whole)

@@ -19,7 +19,7 @@ import numpy as np
 from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.cockpit.world import LiveWorld
-from endopilot.dataset.episode import write_episode
+from endopilot.dataset.generate import write_episode
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire
 from endopilot.devices.stack import Proximals
@@ -95,14 +95,8 @@ class RecordedSession:
     """A session that was recorded.
 
     Attributes:
-        path: of the file.
         navigation: vessel, wire, target and start.
-        config: robot, rod core and length of a cycle.
-        reality: what reality was.
         seed: of the encoders' noise.
-        where: it took place.
-        events: one each, in their order.
-        cycles: how many it lasted.
     """
 
     path: Path

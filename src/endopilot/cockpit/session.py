@@ -34,8 +34,6 @@ class Session:
     """One world driven from a page.
 
     Attributes:
-        world: the wire in its vessel.
-        xray: C-arm, pedal and contrast.
         autopilot: a policy that may drive.
         sight: whether the page may show the wire in space.
     """
@@ -46,8 +44,6 @@ class Session:
         """Take the parts.
 
         Args:
-            world: the wire in its vessel.
-            xray: C-arm, pedal and contrast.
             recorder: writes what happens; nothing is kept without one.
             policies: names of those that a page may choose.
         """
@@ -68,10 +64,6 @@ class Session:
 
     def handle(self, message: messages.Message, now_s: float) -> None:
         """Do what the page of who drives asks for.
-
-        Args:
-            message: from that page.
-            now_s: real time, s.
 
         Raises:
             InputError: it cannot be done; one line says why.
@@ -119,11 +111,7 @@ class Session:
                 self.xray.seconds, self.xray.kerma_ugy = event["seconds"], event["kerma_ugy"]
 
     def halt(self, why: str) -> None:
-        """Brake at once and let the pedal go.
-
-        Args:
-            why: goes into the page and the recording.
-        """
+        """Brake at once and let the pedal go."""
         if self.autopilot.drives:
             self.autopilot.pause(True)
             self._moving = True
@@ -136,11 +124,7 @@ class Session:
             self._record(stop=why)
 
     def cycle(self, now_s: float) -> list[tuple[str, bytes]]:
-        """Let one cycle pass, and return what the pages are to get: a channel's name and a message each.
-
-        Args:
-            now_s: real time, s.
-        """
+        """Let one cycle pass, and return what the pages are to get: a channel's name and a message each."""
         limit = AUTOPILOT_SILENCE_S if self.autopilot.drives else SILENCE_S
         if (self._moving or self.autopilot.drives or self.xray.pedal) and now_s - self._heard_s > limit:
             self._held = {"drive"} if self._moving else set()

@@ -28,15 +28,15 @@ BY_HAND = LoopConfig(cycle_s=0.0125)
 
 
 @dataclass(frozen=True, eq=False)
-class ShownCatheter:
-    """A catheter around the wire, at the end of a cycle.
+class ShownDevice:
+    """Wire or catheter at the end of a cycle.
 
     Attributes:
         nodes: of its axis from its tip to a little behind the ostium, LPS mm.
-        node_force: of the wall at each of them, N; 0 where it lies in another catheter.
+        node_force: of the wall at each of them, N; 0 where it lies in a catheter.
         tip: Δtip, γtip, branch and lumen radius, as arrays of one.
-        inserted_length_mm: inserted length as it truly is, mm.
-        rotation: of its drive, rad.
+        inserted_length_mm: Δ, mm, as it truly is.
+        rotation: φ of its drive, rad.
     """
 
     nodes: Float[np.ndarray, "n 3"]
@@ -47,18 +47,13 @@ class ShownCatheter:
 
 
 @dataclass(frozen=True, eq=False)
-class Snapshot:
-    """The world at the end of a cycle.
+class Snapshot(ShownDevice):
+    """The wire, and the world around it, at the end of a cycle.
 
     Attributes:
         cycle: how many have passed.
         time_s: since the start, s.
-        nodes: of the wire from its tip to a little behind the ostium, LPS mm.
-        node_force: of the wall at each of them, N; 0 where it lies in a catheter.
         tip_direction: unit vector along the wire at its tip.
-        tip: Δtip, γtip, branch and lumen radius, as arrays of one.
-        inserted_length_mm: Δ, mm, as it truly is.
-        rotation: φ, rad.
         velocity: of the drive's motor, mm/s and rad/s of the wire, then of each catheter.
         force_n: largest wall force on one node during the cycle, N.
         wall_force_n: largest resultant of the wall on 2 mm of the wire, N.
@@ -70,24 +65,19 @@ class Snapshot:
 
     cycle: int
     time_s: float
-    nodes: Float[np.ndarray, "n 3"]
-    node_force: Float[np.ndarray, "n"]
     tip_direction: Float[np.ndarray, "3"]
-    tip: TipProjection
-    inserted_length_mm: float
-    rotation: float
     velocity: tuple[float, ...]
     force_n: float
     wall_force_n: float
     drive_load: tuple[float, ...]
     slip: tuple[float, ...]
     valid: bool
-    catheters: tuple[ShownCatheter, ...] = ()
+    catheters: tuple[ShownDevice, ...] = ()
 
     @property
     def deepest_mm(self) -> float:
         """Largest inserted length, mm."""
-        return max([self.inserted_length_mm, *(catheter.inserted_length_mm for catheter in self.catheters)])
+        return max(device.inserted_length_mm for device in (self, *self.catheters))
 
 
 class LiveWorld:
@@ -98,9 +88,6 @@ class LiveWorld:
     Attributes:
         loop: wire, catheters, robot and C-arm; the hand drives it until it is handed over.
         hand: what the hand holds.
-        config: robot, rod core and length of a cycle.
-        reality: what reality is.
-        cycle: how many cycles have passed.
         force_n: largest wall force on one node in the last cycle, N.
         peak_force_n: the same so far, N.
     """
@@ -114,12 +101,6 @@ class LiveWorld:
         reality: World | None = None,
     ) -> None:
         """Bring wire and catheters to the navigation's start.
-
-        Args:
-            navigation: vessel, wire, catheters and start.
-            config: robot, rod core and length of a cycle.
-            seed: of the encoders' noise and of errors of detection.
-            reality: what reality is; as the navigation says if not given.
 
         Raises:
             InputError: a device does not fit the vessel, or starts deeper than it is long.
@@ -201,7 +182,6 @@ def loop_snapshot(loop: NavigationLoop, *, cycle: int, force_n: float) -> Snapsh
     """Return how the world of a navigation is now.
 
     Args:
-        loop: the navigation.
         cycle: how many of the drives' cycles have passed.
         force_n: largest wall force on one node in the last one, N.
     """
@@ -227,35 +207,27 @@ def take_snapshot(
     """Return how the one world of a simulator is now.
 
     Args:
-        simulator: of one world.
-        step: its last step; None before the first.
-        cycle: how many have passed.
-        time_s: since the start, s.
         force_n: largest wall force on one node in the cycle, N.
         velocity: of the drives, mm/s and rad/s of the wire, then of each catheter.
     """
     inserted, turned, tip = simulator.inserted_length[0], simulator.rotation[0].tolist(), simulator.project()
-    (nodes, force), *around = _lines(simulator, inserted)
-    catheters = tuple(
-        ShownCatheter(*line, tip[:, k], float(inserted[k]), turned[k]) for k, line in enumerate(around, start=1)
+    wire, *catheters = (
+        ShownDevice(*line, tip[:, k], float(inserted[k]), turned[k])
+        for k, line in enumerate(_lines(simulator, inserted))
     )
     slip = np.zeros((len(inserted), 2)) if step is None else simulator.slip[0]
     return Snapshot(
+        **vars(wire),
         cycle=cycle,
         time_s=time_s,
-        nodes=nodes,
-        node_force=force,
         tip_direction=simulator.tip_direction[0, 0],
-        tip=tip[:, 0],
-        inserted_length_mm=float(inserted[0]),
-        rotation=turned[0],
         velocity=velocity,
         force_n=force_n,
         wall_force_n=0.0 if step is None else float(step.wall_force[0]),
         drive_load=tuple(simulator.drive_load[0].ravel().tolist()),
         slip=tuple(slip.ravel().tolist()),
         valid=bool(simulator.valid[0]),
-        catheters=catheters,
+        catheters=tuple(catheters),
     )
 
 

@@ -16,10 +16,9 @@ from scipy.ndimage import convolve1d
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.plan_config import PlanConfig, Steps
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.models.checkpoint import load_model
 from endopilot.models.config import WINDOW, read_run
-from endopilot.models.episodes import Episodes, EpisodeSetUp
-from endopilot.models.open_loop import Predictor
-from endopilot.models.rollout import load_model
+from endopilot.models.episodes import Episodes, EpisodeSetUp, Predictor
 from endopilot.progress import progress
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulator import Simulator

@@ -249,7 +249,7 @@ def _check_kept(made: Plan) -> None:
 
 def _track(navigation: Navigation, desired: Steps) -> tuple[Steps, Steps]:
     """Track desired tips in the rod core, one sample at a time."""
-    from endopilot.models.tip_tracking import track
+    from endopilot.models.twin import track
 
     core = SimulatorConfig(threads=1)
     tip, control = track(

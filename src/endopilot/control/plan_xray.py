@@ -130,7 +130,7 @@ class _Wires:
 class _Networks:
     def __init__(self, plan: Plan) -> None:
         from endopilot.control.network_plan import RestingStart  # brings torch, which is slow to import
-        from endopilot.models.rollout import load_model
+        from endopilot.models.checkpoint import load_model
 
         assert plan.model is not None
         run, navigation = Path(plan.model), plan.navigation

@@ -33,8 +33,6 @@ class Draw:
     Attributes:
         initial: Δ (mm) and φ (rad) of each device before the first period.
         control: velocities (mm/s, rad/s) or loads (N, N·mm) of the drives.
-        friction: friction coefficient.
-        tip_bend_rad: angle of the unloaded tip.
         tip_stiffness_factor: factor on the stiffness of the distal 10 mm.
         seeds: of each navigation's robot.
     """
@@ -64,10 +62,6 @@ def draw_navigations(
     """Draw some navigations of an anatomy; each is the same whatever the number of the others.
 
     Args:
-        config: how they are drawn.
-        device: the wire.
-        anatomy: the vessel.
-        sequences: their indices among those of the anatomy.
         devices: their number, each driven independently; the wire's draw is the same with and without catheters.
     """
     controls, friction, tip, surplus, _, robots = _streams(config, anatomy.name)
@@ -97,12 +91,7 @@ def draw_navigations(
 
 
 def patient_motion(config: DatasetConfig, anatomy: str) -> Motion | None:
-    """Return how the vessel of an anatomy moves in the navigations of a dataset; None if it lies still.
-
-    Args:
-        config: of the dataset.
-        anatomy: its name.
-    """
+    """Return how the vessel of an anatomy moves in the navigations of a dataset; None if it lies still."""
     return motion_named(config.motion, int(_streams(config, anatomy)[4].generate_state(1, np.uint64)[0]))
 
 

@@ -10,20 +10,21 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from endopilot.dataset import parquet, schema
 from endopilot.dataset.config import DatasetConfig
-from endopilot.dataset.layout import Block, Layout, make_layout
-from endopilot.dataset.splits import SPLITS
-from endopilot.dataset.workers import run_locally, run_on_cluster, write_timed
+from endopilot.dataset.draw import Draw
+from endopilot.dataset.layout import SPLITS, Block, Layout, make_layout
+from endopilot.dataset.workers import run_locally, run_on_cluster, store_block, write_timed
 from endopilot.devices.device import Wire
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
@@ -32,6 +33,7 @@ from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.progress import progress
 from endopilot.runs import claim, remove_partial_files
 from endopilot.simulation.robots import in_grip
+from endopilot.simulation.trajectory import Trajectory
 from endopilot.simulation.world import World
 
 _WORK_PATH = "meta/work.json"
@@ -173,6 +175,10 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
     reported = ("episode_index", "anatomy", "sequence", "invalid_reason")
     invalid = [{name: row[name] for name in reported} for row in episodes if not row["valid"]]
     counts = Counter(row["split"] for row in episodes)
+    where = (os.path.relpath(folder.resolve(), context.output.resolve()) for folder in layout.folders)
+    motions = (None if motion is None else asdict(motion) for motion in layout.motions)
+    parts = zip(layout.names, where, layout.identities, motions, strict=True)
+    anatomies = [dict(zip(("name", "folder", "sha256", "motion"), part, strict=True)) for part in parts]
     record = manifest(
         config=context.config,
         seed=context.config.seed,
@@ -185,7 +191,7 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
         catheters=[asdict(catheter) for catheter in context.stack.catheters],
         robot=None if context.robot is None else asdict(context.robot),
         world=context.world.differences(),
-        anatomies=[_anatomy_record(layout, i) for i in range(len(layout.names))],
+        anatomies=anatomies,
         splits={name: counts[name] for name in SPLITS if counts[name]},
         manoeuvres=shares,
         stopped_short=sum(row["stopped_short"] for row in episodes),
@@ -196,13 +202,48 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
     (context.output / _WORK_PATH).unlink(missing_ok=True)
 
 
-def _anatomy_record(layout: Layout, index: int) -> dict[str, Any]:
-    """Return name, folder relative to the dataset, identity and motion of an anatomy."""
-    folder = os.path.relpath(layout.folders[index].resolve(), layout.context.output.resolve())
-    motion = layout.motions[index]
-    return {
-        "name": layout.names[index],
-        "folder": folder,
-        "sha256": layout.identities[index],
-        "motion": None if motion is None else asdict(motion),
-    }
+def write_episode(
+    trajectory: Trajectory,
+    anatomy_folder: Path,
+    output: Path,
+    stack: Stack,
+    *,
+    task: str,
+    tip_stiffness_factor: float,
+    seed: int,
+    origin: Mapping[str, Any],
+) -> None:
+    """Write a navigation that was recorded every 0.5 s as a dataset of one episode. That of a wire alone trains.
+
+    Args:
+        trajectory: the navigation, of one world.
+        stack: the devices as they were given; friction and stiffness of the wire's tip may have been others.
+        tip_stiffness_factor: the true factor on the stiffness of the distal 10 mm.
+        origin: what else it followed from, such as target and policy.
+
+    Raises:
+        InputError: the output folder holds something else.
+    """
+    set_up = trajectory.set_up
+    config = DatasetConfig(
+        sequences=1,
+        seconds=trajectory.valid.shape[1] * trajectory.period_s,
+        seed=seed,
+        simulator=set_up.config,
+        anatomy_shares=(1.0, 0.0, 0.0),
+        seen_test_share=0.0,
+    )
+    moved = {"motion": None if set_up.motion is None else asdict(set_up.motion)}
+    layout = make_layout([anatomy_folder], output, stack, config, task=task, origin={**origin, **moved})
+    layout = replace(layout, motions=(set_up.motion,))  # it was not drawn with the seed
+    (block,) = layout.blocks()
+    claim(output, "endopilot navigate", **layout.settings)
+    drawn = Draw(
+        set_up.initial,
+        trajectory.command,
+        friction=set_up.friction[:1, 0],
+        tip_bend_rad=np.array([stack.wire.tip_bend_rad]),
+        tip_stiffness_factor=np.array([tip_stiffness_factor]),
+    )
+    store_block(layout.context, block, drawn, trajectory, np.array([False]))
+    describe(layout, [block])

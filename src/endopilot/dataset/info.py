@@ -19,6 +19,7 @@ from endopilot.progress import progress
 from endopilot.types import SAMPLE_PERIOD_S
 
 BINS = 400
+_TIP = ("tip_bend_rad", "tip_stiffness_factor")
 _QUANTILES = {"p5": 0.05, "median": 0.5, "p95": 0.95, "p99": 0.99}
 
 
@@ -27,7 +28,6 @@ class Histogram:
     """How often a quantity took which value, over all valid samples.
 
     Attributes:
-        title: the quantity, as a figure names it.
         unit: "" if it has none.
         edges: of the bins, increasing; values beyond count in the outermost.
         counts: samples in each bin.
@@ -54,7 +54,6 @@ class Description:
     """A dataset in figures.
 
     Attributes:
-        figures: named figures, as JSON has them.
         histograms: by the name of their picture.
         branch_visits: share of the navigations whose tip was in n branches, for n = 0, 1, 2, ...
         manoeuvres: share of the samples that are insertion, retraction, spin and pause.
@@ -74,14 +73,9 @@ def describe_dataset(folder: Path) -> Description:
     Raises:
         InputError: the folder holds no finished dataset, or a file of it is missing, damaged or of another version.
     """
-    with reading(Path(folder), "make the dataset again"):
-        return _describe(Path(folder))
-
-
-def _describe(folder: Path) -> Description:
-    manifest, info = read_manifest(folder)
+    folder = Path(folder)
     with reading(folder, "make the dataset again"):
-        return _described(folder, manifest, info)
+        return _described(folder, *read_manifest(folder))
 
 
 def _described(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> Description:
@@ -100,6 +94,7 @@ def _described(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> 
             advance()
     total = max(sum(visits.values()), 1)
     branch_visits = np.array([visits[n] / total for n in range(max(visits, default=0) + 1)])
+    pairs = set(zip(episodes["split"], episodes["anatomy"], strict=True))
     reasons = Counter(re.sub(r" after .*", "", reason) for reason in episodes["invalid_reason"] if reason)
     files = [file for file in folder.rglob("*") if file.is_file()]
     catheters = [catheter["name"] for catheter in manifest.get("catheters", ())]
@@ -114,14 +109,14 @@ def _described(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> 
         "control": schema.actuation_of(info["features"]),
         "made_by": manifest["settings"]["version"],
         "splits": dict(Counter(episodes["split"])),
-        "anatomies_by_split": _anatomies(episodes),
+        "anatomies_by_split": dict(Counter(split for split, _ in sorted(pairs))),
         "manoeuvres": {name: round(share, 4) for name, share in manifest["manoeuvres"].items()},
         "stopped_short": sum(episodes["stopped_short"]),
         "invalid": len(manifest["invalid"]["which"]),
         "invalid_reasons": dict(reasons),
         **{f"{h.title} {h.unit}".strip(): h.quantiles() for h in histograms.values()},
         "branches visited": {str(n): round(float(share), 4) for n, share in enumerate(branch_visits) if share},
-        **{name: _range(episodes[name]) for name in ("friction", "tip_bend_rad", "tip_stiffness_factor")},
+        **{name: [round(of(episodes[name]), 4) for of in (min, max)] for name in ("friction", *_TIP)},
     }
     return Description(figures, histograms, branch_visits, manifest["manoeuvres"])
 
@@ -160,16 +155,6 @@ def _of_wire(table, name: str) -> np.ndarray:
     return parquet.column_values(table, name).reshape(len(table), -1)[:, 0]
 
 
-def _anatomies(episodes: dict[str, list[Any]]) -> dict[str, int]:
-    """Return how many anatomies each split has navigations of."""
-    pairs = set(zip(episodes["split"], episodes["anatomy"], strict=True))
-    return dict(Counter(split for split, _ in sorted(pairs)))
-
-
-def _range(values: list[float]) -> list[float]:
-    return [round(min(values), 4), round(max(values), 4)]
-
-
 def draw_pictures(description: Description, folder: Path) -> list[Path]:
     """Draw the distributions as PNG files, and return their paths."""
     from matplotlib.figure import Figure  # slow to import
@@ -183,7 +168,8 @@ def draw_pictures(description: Description, folder: Path) -> list[Path]:
 
     for name, histogram in description.histograms.items():
         keep(name, _histogram_figure(histogram, logarithmic=name == "contact-force"))
-    keep("branches", _bars("branches that the tip was in", "navigations", _by_number(description.branch_visits)))
+    visits = {str(n): float(share) for n, share in enumerate(description.branch_visits) if n > 0}
+    keep("branches", _bars("branches that the tip was in", "navigations", visits))
     keep("manoeuvres", _bars("", "samples", description.manoeuvres))
     return paths
 
@@ -216,10 +202,6 @@ def _bars(label: str, of: str, shares: dict[str, float]):
     axes.set_xlabel(label)
     axes.set_ylabel(f"{of}, %")
     return figure
-
-
-def _by_number(shares: Float[np.ndarray, "n"]) -> dict[str, float]:
-    return {str(n): float(share) for n, share in enumerate(shares) if n > 0}
 
 
 _COLOUR = "#0072B2"

@@ -17,7 +17,6 @@ from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset import schema
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.draw import patient_motion
-from endopilot.dataset.splits import assign_splits
 from endopilot.devices.catheter import check_nested
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
@@ -25,6 +24,83 @@ from endopilot.errors import InputError
 from endopilot.files import json_text, read_json
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.world import World
+
+SPLITS = ("train", "seen_test", "calibrate", "test")
+DEFAULT_ANATOMY_SHARES = (0.6, 0.2, 0.2)
+"""Shares of the anatomies that train, calibrate and test."""
+
+
+def assign_splits(
+    names: Sequence[str],
+    n_sequences: int,
+    *,
+    anatomy_shares: tuple[float, float, float] | None = None,
+    seen_test_share: float = 0.2,
+) -> Shaped[np.ndarray, "anatomies sequences"]:
+    """Return the split of every sequence of every anatomy, one of `SPLITS`: fixed by hash, not by chance or order.
+
+    Two splits are nested. By anatomy, whole patients go to train, calibrate or test, so that no data of a test patient
+    are used before. Within the train patients, some navigations are held out as `seen_test`: new controls on known
+    vessels, the paper's likely reading of its 80/20 split.
+
+    Anatomies are ranked by the SHA-256 of their name and dealt out by counts, so that the shares are met as closely
+    as few patients allow; sequences likewise by the SHA-256 of "name/index". Neither a seed nor the order of `names`
+    matters.
+
+    Args:
+        anatomy_shares: shares of train, calibrate and test. None means 0.6, 0.2, 0.2, and for a single anatomy, which
+            cannot be divided, a split by sequence alone.
+        seen_test_share: share of the sequences of a train anatomy that are held out as `seen_test`.
+
+    Raises:
+        InputError: too few anatomies for the requested splits, or too few sequences.
+    """
+    if anatomy_shares is None:
+        anatomy_shares = (1.0, 0.0, 0.0) if len(names) == 1 else DEFAULT_ANATOMY_SHARES
+    counts = _counts(len(names), anatomy_shares)
+    order = sorted(range(len(names)), key=lambda i: _digest(names[i]))
+    by_anatomy = np.empty(len(names), dtype="<U9")
+    by_anatomy[order] = np.repeat(np.array(["train", "calibrate", "test"]), counts)
+
+    splits = np.repeat(by_anatomy[:, None], n_sequences, axis=1)
+    held_out = _held_out(n_sequences, seen_test_share) if counts[0] else 0
+    for row, name in enumerate(names):
+        if by_anatomy[row] == "train":
+            ranked = sorted(range(n_sequences), key=lambda i: _digest(f"{name}/{i}"))
+            splits[row, ranked[:held_out]] = "seen_test"
+    return splits
+
+
+def _counts(n: int, shares: tuple[float, float, float]) -> list[int]:
+    """Turn shares into counts: one for each positive share, the rest by the largest shortfall (first split first)."""
+    wanted = [share > 0 for share in shares]
+    if n < sum(wanted):
+        raise InputError(
+            f"anatomy_shares: {n} anatomies cannot fill {sum(wanted)} splits (train, calibrate, test = {shares}); "
+            f"give at least {sum(wanted)} anatomies or set a share to 0"
+        )
+    counts = [int(share) for share in wanted]
+    while sum(counts) < n:
+        shortfall = [n * share - count for share, count in zip(shares, counts, strict=True)]
+        counts[shortfall.index(max(shortfall))] += 1
+    return counts
+
+
+def _held_out(n_sequences: int, share: float) -> int:
+    """Return how many of the sequences are held out: the rounded share, but at least one, and never all."""
+    if share == 0:
+        return 0
+    if n_sequences < 2:
+        raise InputError(
+            f"sequences: {n_sequences} cannot be split into train and seen_test; "
+            "give at least 2 or set seen_test_share to 0"
+        )
+    return min(max(round(n_sequences * share), 1), n_sequences - 1)
+
+
+def _digest(text: str) -> bytes:
+    return hashlib.sha256(text.encode()).digest()
+
 
 FORMAT_VERSION = 7
 """Counts changes of the columns or of their meaning."""
@@ -35,13 +111,9 @@ class Block:
     """Navigations of one anatomy that share a file: the unit of work, on this machine or on a cluster.
 
     Attributes:
-        number: of the file.
-        folder: of the anatomy.
-        anatomy: its name.
-        identity: SHA-256 of what the simulation depends on in it.
+        identity: SHA-256 of what the simulation depends on in the anatomy.
         sequences: indices of the navigations among those of the anatomy.
         first_episode: index of the first one in the dataset.
-        splits: split of each.
     """
 
     number: int
@@ -58,9 +130,6 @@ class BlockContext:
     """What all blocks share.
 
     Attributes:
-        output: folder of the dataset.
-        config: number, length, distribution and split of the navigations.
-        stack: the wire, and the catheters around it.
         key: marks the files of this dataset; it follows from all settings.
         task: what the navigations do, as LeRobot names it.
         robot: what makes the motions; None where they are made as drawn.
@@ -81,11 +150,6 @@ class Layout:
     """Which navigations of which anatomies a dataset holds.
 
     Attributes:
-        context: what all blocks share.
-        folders: of the anatomies.
-        names: their names.
-        identities: their SHA-256s.
-        splits: of every navigation.
         motions: how the vessel of each anatomy moves; None for one that lies still.
         settings: what a resumed run must share with the run it continues, as plain JSON values.
     """
@@ -123,11 +187,6 @@ def make_layout(
     """Read the anatomies' records, and lay out the dataset in blocks.
 
     Args:
-        folders: of the anatomies.
-        output: folder of the dataset.
-        stack: the wire, and the catheters around it.
-        config: number, length, distribution and split of the navigations.
-        task: what they do.
         robot: what makes the motions; they are made as drawn if not given.
         world: what reality is; as given if not given.
         origin: what else they follow from, where they were not drawn at random.
@@ -137,7 +196,10 @@ def make_layout(
             fit around the wire, or are to be driven by force; a world that a dataset cannot hold.
     """
     world = world or World()
-    _check_world(world)
+    world.check_engine("datasets")
+    for name in ("share", "backs_out_mm"):
+        if (value := getattr(world, name)) != getattr(World(), name):
+            raise InputError(f"world: {name} = {value}; it is not the same throughout a dataset: leave it out")
     check_nested(stack.wire, stack.catheters)
     if stack.catheters and config.control == "force":
         raise InputError("control: 'force' with catheters; give 'velocity'")
@@ -169,18 +231,6 @@ def make_layout(
     context = BlockContext(Path(output), config, stack, key, task, robot, world)
     motions = tuple(world.motion or patient_motion(config, name) for name in names)
     return Layout(context, tuple(map(Path, folders)), names, identities, splits, motions, settings)
-
-
-def _check_world(world: World) -> None:
-    """Refuse what differs from navigation to navigation and within one.
-
-    Raises:
-        InputError: the world has such fields.
-    """
-    world.check_engine("datasets")
-    for name in ("share", "backs_out_mm"):
-        if (value := getattr(world, name)) != getattr(World(), name):
-            raise InputError(f"world: {name} = {value}; it is not the same throughout a dataset: leave it out")
 
 
 def version() -> str:

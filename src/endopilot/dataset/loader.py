@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -9,20 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
+from endopilot.dataset import schema
 from endopilot.dataset.layout import identify, version
-from endopilot.dataset.schema import (
-    INFO_PATH,
-    LEROBOT_VERSION,
-    MANIFEST_PATH,
-    OF_ROBOT,
-    OWN_COLUMNS,
-    STATE,
-    actuation_of,
-    devices_of,
-    made_by_robot,
-    paths_of_file,
-    signal_columns,
-)
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire
 from endopilot.devices.robot import RobotConfig
@@ -190,26 +181,30 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     Raises:
         InputError: the folder holds no finished dataset, or one of another version.
     """
-    if not (folder / MANIFEST_PATH).exists():
+    if not (folder / schema.MANIFEST_PATH).exists():
         if (folder / RECORD_FILE).exists():
             raise InputError(f"{folder}: the dataset is unfinished; run the same `endopilot dataset` command again")
-        raise InputError(f"{folder}: no dataset here ({MANIFEST_PATH} is missing); make one with `endopilot dataset`")
-    manifest = read_json(folder / MANIFEST_PATH, keys=("key", "settings"), mend=_MEND)
-    with reading(folder / MANIFEST_PATH, _MEND):
+        raise InputError(
+            f"{folder}: no dataset here ({schema.MANIFEST_PATH} is missing); make one with `endopilot dataset`"
+        )
+    manifest = read_json(folder / schema.MANIFEST_PATH, keys=("key", "settings"), mend=_MEND)
+    with reading(folder / schema.MANIFEST_PATH, _MEND):
         made = manifest["settings"].get("version")
         parts = (record[part] for record in manifest["anatomies"] for part in ("name", "sha256", "folder"))
         if not all(isinstance(text, str) for text in (manifest["key"], *parts)):
             raise ValueError("key or anatomies: no text")
     if made != version():
         raise InputError(f"{folder}: made by {made}, which {version()} cannot read; make the dataset again")
-    if not (folder / INFO_PATH).exists():
+    if not (folder / schema.INFO_PATH).exists():
         raise InputError(
-            f"{folder / INFO_PATH}: missing from the dataset; run the same `endopilot dataset` command again"
+            f"{folder / schema.INFO_PATH}: missing from the dataset; run the same `endopilot dataset` command again"
         )
-    info = read_json(folder / INFO_PATH, keys=("features", "fps", "total_episodes", "total_frames"), mend=_MEND)
-    if info.get("codebase_version") != LEROBOT_VERSION:
+    info = read_json(folder / schema.INFO_PATH, keys=("features", "fps", "total_episodes", "total_frames"), mend=_MEND)
+    if info.get("codebase_version") != schema.LEROBOT_VERSION:
         found = info.get("codebase_version")
-        raise InputError(f"{folder / INFO_PATH}: codebase_version is {found}, not {LEROBOT_VERSION}; make it again")
+        raise InputError(
+            f"{folder / schema.INFO_PATH}: codebase_version is {found}, not {schema.LEROBOT_VERSION}; make it again"
+        )
     return manifest, info
 
 
@@ -232,13 +227,13 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
     from endopilot.dataset.parquet import column_values, read_table
 
     samples, total = manifest["samples_per_episode"], info["total_episodes"]
-    actuation, devices = actuation_of(info["features"]), devices_of(info["features"])
-    by_robot = made_by_robot(info["features"])
+    actuation, devices = schema.actuation_of(info["features"]), schema.devices_of(info["features"])
+    by_robot = schema.made_by_robot(info["features"])
     episodes: dict[str, list[np.ndarray]] = {}
     signal: dict[str, np.ndarray] = {}
     filled = 0
     for number in range(manifest["files"]):
-        data_path, episodes_path = paths_of_file(folder, number)
+        data_path, episodes_path = schema.paths_of_file(folder, number)
         table = read_table(episodes_path, manifest["key"])
         for name in table.column_names:
             episodes.setdefault(name, []).append(column_values(table, name))
@@ -251,7 +246,7 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
         end = filled + table.num_rows
         if end > total:
             break
-        for name in signal_columns(actuation, devices, by_robot=by_robot):
+        for name in schema.signal_columns(actuation, devices, by_robot=by_robot):
             values = column_values(data, name)
             values = values.reshape(table.num_rows, samples, *values.shape[1:])
             if name not in signal:  # in place, so that a large dataset is never held twice
@@ -262,19 +257,19 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
     episode = {name: np.concatenate(parts) for name, parts in episodes.items()}
     if len(episode["episode_index"]) != total:
         raise InputError(
-            f"{folder}: {len(episode['episode_index'])} episodes where {INFO_PATH} counts {total}; "
+            f"{folder}: {len(episode['episode_index'])} episodes where {schema.INFO_PATH} counts {total}; "
             "run `endopilot dataset` again"
         )
     shape = (total, samples, devices)
     vectors = {name: signal[name].reshape(*shape, -1) for name in ("action", "velocity") if name in signal}
-    recorded = {name: _of_signal(name, signal[column], devices) for column, (name, *_) in OWN_COLUMNS.items()}
-    recorded |= {name: signal["observation.state"].reshape(*shape, -1)[..., k] for k, name in enumerate(STATE)}
+    recorded = {name: _of_signal(name, signal[column], devices) for column, (name, *_) in schema.OWN_COLUMNS.items()}
+    recorded |= {name: signal["observation.state"].reshape(*shape, -1)[..., k] for k, name in enumerate(schema.STATE)}
     if actuation == "force":
         control = vectors["velocity"]
     else:
         slip = np.stack([recorded["slip"], recorded["rotation_slip"]], axis=-1)
         control = (vectors["action"] - slip * info["fps"]).astype(np.float32)
-    recorded |= {name: signal[name].reshape(*shape, 2) for name in OF_ROBOT if by_robot}
+    recorded |= {name: signal[name].reshape(*shape, 2) for name in schema.OF_ROBOT if by_robot}
     prefixes = column_prefixes(devices)
     starts = [f"{prefix}initial_{name}" for prefix in prefixes for name in ("inserted_length_mm", "rotation_rad")]
     return Dataset(
@@ -302,3 +297,85 @@ def _of_signal(name: str, values: np.ndarray, devices: int) -> np.ndarray:
     if not SIGNALS[name].of_devices:
         return values
     return values.reshape(*values.shape[:2], devices, *([-1] if len(SIGNALS[name].columns) > 1 else []))
+
+
+_DRIVE = ("max_velocity_mm_s", "max_rotation_rad_s", "push_limit_n", "pull_limit_n", "torque_limit_n_mm")
+_OTHER = ("name", "friction", "tip_load_n", "tip_shaping", "sources", *_DRIVE)
+"""What does not make another wire: names and sources, limits of the drive, and friction, which is the navigation's."""
+
+
+def read_joined(folders: Sequence[Path]) -> Dataset:
+    """Read datasets as one: the first one, with the episodes of the others behind its own.
+
+    A patient that the first dataset holds keeps the split that it has there, so nothing that is kept for a test is
+    trained on.
+
+    Args:
+        folders: of the datasets, made with the same devices and with episodes of one length.
+
+    Raises:
+        InputError: none is given; one cannot be read, was made with another wire or other catheters, has episodes of
+            another length, or has another patient of the same name, or the same one who moves otherwise.
+    """
+    if not folders:
+        raise InputError("dataset: none given; name at least one folder made by `endopilot dataset`")
+    first, *others = (read_dataset(folder) for folder in folders)
+    for other in others:
+        first = _joined(first, other)
+    return first
+
+
+def _joined(first: Dataset, other: Dataset) -> Dataset:
+    _check_alike(first, other)
+    home = dict(zip(first.anatomy.tolist(), first.split.tolist(), strict=True))
+    held = {name: split if split in ("calibrate", "test") else None for name, split in home.items()}
+    split = [held.get(name) or own for name, own in zip(other.anatomy.tolist(), other.split.tolist(), strict=True)]
+    other = replace(other, split=np.array(split))
+    records = {record["name"]: record for record in first.manifest["anatomies"]}
+    for record in other.manifest["anatomies"]:
+        folder = (other.folder / record["folder"]).resolve()
+        records.setdefault(record["name"], record | {"folder": os.path.relpath(folder, first.folder.resolve())})
+    keys = [first.manifest["key"], other.manifest["key"]]
+    manifest = first.manifest | {
+        "key": hashlib.sha256("".join(keys).encode()).hexdigest(),
+        "anatomies": list(records.values()),
+        "world": ours if (ours := first.manifest.get("world", {})) == other.manifest.get("world", {}) else None,
+    }
+    names = [field.name for field in fields(Dataset) if field.name not in ("folder", "manifest", "sample_period_s")]
+    pairs = {name: (getattr(first, name), getattr(other, name)) for name in names}
+    # where one of them has no robot, neither has what it measured
+    arrays = {
+        name: np.concatenate(pair) if all(isinstance(part, np.ndarray) for part in pair) else None
+        for name, pair in pairs.items()
+    }
+    return replace(first, manifest=manifest, **arrays)
+
+
+def _check_alike(first: Dataset, other: Dataset) -> None:
+    ours, theirs = first.manifest["device"], other.manifest["device"]
+    for name in ours.keys() - set(_OTHER):
+        if not np.array_equal(ours[name], theirs[name]):
+            raise InputError(
+                f"{other.folder}: its wire is {theirs['name']}, and that of {first.folder} is {ours['name']}, with "
+                f"another {name}; join datasets of one wire"
+            )
+    if first.stack.catheters != other.stack.catheters:
+        around = [", ".join(each.name for each in data.stack.catheters) or "no catheter" for data in (other, first)]
+        raise InputError(
+            f"{other.folder}: its wire lies in {around[0]}, and that of {first.folder} in {around[1]}; join datasets "
+            "of the same devices"
+        )
+    length, other_length = (dataset.valid.shape[1] * dataset.sample_period_s for dataset in (first, other))
+    if length != other_length:
+        raise InputError(
+            f"{other.folder}: episodes of {other_length:g} s, and those of {first.folder} take {length:g} s; "
+            f"make it with --seconds {length:g}"
+        )
+    for name in first.patients.keys() & other.patients.keys():
+        if first.patients[name] != other.patients[name]:
+            raise InputError(f"{other.folder}: its patient {name} is another than that of {first.folder}; rename one")
+        if first.motion(name) != other.motion(name):
+            raise InputError(
+                f"{other.folder}: its patient {name} moves otherwise than in {first.folder}; join datasets of other "
+                "patients, or of one motion"
+            )

@@ -56,20 +56,12 @@ def simulate_navigations(
     """Simulate navigations, stopped short of the ends of the vessel.
 
     Args:
-        anatomy: the vessel.
-        stacks: the devices of each world.
         initial: (Δ mm, φ rad) of each device before the first period.
         control: velocities (mm/s, rad/s) or loads (N, N·mm) that were drawn.
-        friction: friction coefficients on the wall.
-        config: settings of the rod core.
-        actuation: what the controls are.
-        motion: how the vessel moves with time; it lies still if not given.
         robot: what makes the motions and measures them, its drives' mean over a sample moves the devices; they are made
             as drawn if not given.
         seeds: of each world's robot.
         ostium_mm: the true inserted lengths are this much more than its encoders', mm.
-        record_shape: record the positions of all nodes too.
-        advance: called after each sample with the number of worlds.
 
     Returns:
         What was driven, and which worlds were stopped short. Commands are float32 numbers. With a robot, its columns
@@ -133,18 +125,23 @@ class _Driven:
         return {"decided": decided, "encoders": encoders, "load": load}
 
 
+def branch_ends(tree: VesselTree) -> Float[np.ndarray, "branches"]:
+    """Return the abscissa at which every branch ends, mm; infinite where it goes on."""
+    ends = np.full(len(tree.branches), np.inf)
+    for leaf in tree.leaves():
+        ends[leaf] = tree.branches[leaf].centerline.abscissa[-1]
+    return ends
+
+
 class _PushRoom:
     """How far each device may still be pushed. Arrays have a row a world and a column a device, the wire first.
 
     Attributes:
-        deepest_mm: inserted length that no device may exceed.
         caught_n: push at which each counts as caught, N.
     """
 
     def __init__(self, tree: VesselTree, stacks: Sequence[Stack]) -> None:
-        self._ends = np.full(len(tree.branches), np.inf)
-        for leaf in tree.leaves():
-            self._ends[leaf] = tree.branches[leaf].centerline.abscissa[-1]
+        self._ends = branch_ends(tree)
         self.deepest_mm = max(float(self._ends[np.isfinite(self._ends)].max()) - STOP_SHORT_MM, 0.0)
         self.caught_n = CAUGHT * np.array([[device.push_limit_n for device in stack.devices] for stack in stacks])
         self._limit = np.full(self.caught_n.shape, np.inf)

@@ -10,15 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from endopilot.dataset.schema import (
-    INDEX_COLUMNS,
-    MANOEUVRES,
-    OF_ROBOT,
-    OWN_COLUMNS,
-    STATE,
-    manoeuvres,
-    signal_columns,
-)
+from endopilot.dataset import schema
 from endopilot.errors import InputError
 from endopilot.files import regular
 from endopilot.progress import Advance
@@ -34,13 +26,7 @@ _FEW_VALUES = {"timestamp"}
 
 
 def sample_table(trajectory: Trajectory, first_episode: int, key: str) -> pa.Table:
-    """Return the samples of a trajectory as rows, one episode after the other.
-
-    Args:
-        trajectory: one world for each episode.
-        first_episode: index in the dataset of its first world.
-        key: marks the dataset that the file belongs to.
-    """
+    """Return the samples of a trajectory as rows, one episode after the other."""
     worlds, samples = trajectory.valid.shape
     signals = trajectory_signals(trajectory)
     columns = {
@@ -52,13 +38,13 @@ def sample_table(trajectory: Trajectory, first_episode: int, key: str) -> pa.Tab
         "timestamp": np.tile(np.arange(samples) * trajectory.period_s, worlds),
         "action": trajectory.command,
         "velocity": trajectory.control,
-        "observation.state": np.stack([signals[name] for name in STATE], axis=-1),
-        **{own: signals[name] for own, (name, *_) in OWN_COLUMNS.items()},
+        "observation.state": np.stack([signals[name] for name in schema.STATE], axis=-1),
+        **{own: signals[name] for own, (name, *_) in schema.OWN_COLUMNS.items()},
     }
-    kinds = dict.fromkeys(INDEX_COLUMNS, ("int64", None)) | {"timestamp": ("float32", None)}
+    kinds = dict.fromkeys(schema.INDEX_COLUMNS, ("int64", None)) | {"timestamp": ("float32", None)}
     columns |= trajectory.columns
-    by_robot = set(OF_ROBOT) <= set(trajectory.columns)
-    kinds |= signal_columns(trajectory.set_up.actuation, trajectory.devices, by_robot=by_robot)
+    by_robot = set(schema.OF_ROBOT) <= set(trajectory.columns)
+    kinds |= schema.signal_columns(trajectory.set_up.actuation, trajectory.devices, by_robot=by_robot)
     arrays = {name: column(columns[name], *kinds[name]) for name in columns if name in kinds}
     return marked_table(arrays, key)
 
@@ -71,7 +57,9 @@ def marked_table(columns: Mapping[str, Any], key: str) -> pa.Table:
 def parquet_bytes(table: pa.Table) -> bytes:
     """Return a table as a Parquet file in memory, so that a full disk shows as an ordinary OSError on writing."""
     sink = pa.BufferOutputStream()
-    floats = {field.name for field in table.schema if _is_float(field.type)} - _FEW_VALUES
+    floats = {
+        field.name for field in table.schema if pa.float32() in (field.type, getattr(field.type, "value_type", None))
+    } - _FEW_VALUES
     counters = {name for name in ("index", "episode_index") if name in table.column_names}
     leaf = {name: name if table.schema.field(name).type == pa.float32() else f"{name}.list.element" for name in floats}
     write: Any = pq.write_table  # whose types do not know lists of columns
@@ -84,7 +72,7 @@ def parquet_bytes(table: pa.Table) -> bytes:
         # Bytes of like significance side by side compress best; counters by their differences.
         column_encoding={leaf[name]: "BYTE_STREAM_SPLIT" for name in floats}
         | dict.fromkeys(counters, "DELTA_BINARY_PACKED"),
-        write_statistics=list(INDEX_COLUMNS),
+        write_statistics=list(schema.INDEX_COLUMNS),
     )
     return sink.getvalue().to_pybytes()
 
@@ -109,10 +97,6 @@ def read_table(path: Path, key: str) -> pa.Table:
     return table
 
 
-def _is_float(kind: pa.DataType) -> bool:
-    return kind == pa.float32() or (pa.types.is_fixed_size_list(kind) and kind.value_type == pa.float32())
-
-
 def column_values(table: pa.Table, name: str) -> np.ndarray:
     """Return a column as an array, (rows,) for scalars and (rows, components) for vectors."""
     values = table.column(name).combine_chunks()
@@ -130,31 +114,27 @@ def statistics(
 
     Args:
         actuation: what the dataset's control is.
-        paths: the data files.
-        key: key of the dataset.
-        advance: called once for each file that has been read.
         devices: their number; the manoeuvres are the wire's.
     """
-    sums, count, driven = Sums(), 0, np.zeros(len(MANOEUVRES))
+    sums, count, driven = Sums(), 0, np.zeros(len(schema.MANOEUVRES))
     for path in paths:
         table = read_table(path, key)
         valid = column_values(table, "valid")
         count += int(valid.sum())
         velocity = column_values(table, "velocity" if actuation == "force" else "action")[valid]
-        driven += np.bincount(manoeuvres(velocity), minlength=len(driven))
-        by_robot = set(OF_ROBOT) <= set(table.column_names)
-        for name, (dtype, _) in signal_columns(actuation, devices, by_robot=by_robot).items():
+        driven += np.bincount(schema.manoeuvres(velocity), minlength=len(driven))
+        by_robot = set(schema.OF_ROBOT) <= set(table.column_names)
+        for name, (dtype, _) in schema.signal_columns(actuation, devices, by_robot=by_robot).items():
             if dtype != "bool" and valid.any():
                 sums.add(name, column_values(table, name)[valid])
         advance()
-    return sums.stats(), dict(zip(MANOEUVRES, (driven / max(count, 1)).tolist(), strict=True))
+    return sums.stats(), dict(zip(schema.MANOEUVRES, (driven / max(count, 1)).tolist(), strict=True))
 
 
 class Sums:
     """What the statistics of columns are made of, gathered part by part."""
 
     def __init__(self) -> None:
-        """Begin with nothing."""
         self._of: dict[str, tuple[int, list[np.ndarray]]] = {}
 
     def add(self, name: str, values: np.ndarray) -> None:

@@ -133,12 +133,6 @@ def info(described: Mapping[str, Any], *, episodes: int, samples: int, tasks: in
     """Return the content of `meta/info.json`.
 
     LeRobot's `splits` are ranges of episodes, which ours are not: they are in the episode table, column `split`.
-
-    Args:
-        described: its `features`.
-        episodes: their number.
-        samples: number of all samples.
-        tasks: number of tasks.
     """
     return {
         "codebase_version": LEROBOT_VERSION,

@@ -153,12 +153,6 @@ def run_locally(context: BlockContext, blocks: Sequence[Block], done: Done, adva
     """Write blocks with one thread each, as many at a time as there are cores.
 
     Where there are fewer blocks than cores, the rod core uses the remaining cores.
-
-    Args:
-        context: what all blocks share.
-        blocks: what to write.
-        done: called after each block.
-        advance: called with the number of samples simulated since the last call.
     """
     cores = context.config.simulator.threads or CORES
     workers = max(1, min(cores, len(blocks)))
@@ -194,8 +188,6 @@ def run_on_cluster(
 
     Args:
         work: a function of a module, or a `functools.partial` of one.
-        items: what to work on.
-        done: called with each item and what the work returned for it.
         scheduler: address, such as tcp://host:8786.
 
     Raises:

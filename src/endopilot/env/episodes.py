@@ -53,11 +53,8 @@ class Episodes:
     """The episodes that many worlds are in; row i belongs to world i.
 
     Attributes:
-        routes: to the targets.
-        steps: of each world since its reset.
         distance: path length from each tip that counts to its target at the last step, mm.
         safe: worlds whose force has not been too large since their reset.
-        ended: worlds whose episode has ended.
     """
 
     def __init__(self, navigations: Sequence[Navigation]) -> None:
@@ -99,10 +96,7 @@ class Episodes:
         """Score what the worlds did in a step, of which those of `fresh` have only begun.
 
         Args:
-            now: the worlds at its end.
             distances: path length from every tip to its target, mm.
-            fresh: worlds that were reset in place of a step.
-            exposed: worlds that took an exposure.
 
         Returns:
             Rewards, terminations and truncations.

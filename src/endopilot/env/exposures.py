@@ -71,9 +71,6 @@ class CArms:
         """Bring the middle of each vessel to the isocenter.
 
         Args:
-            navigations: of each world.
-            simulator: the worlds as they truly are.
-            config: views, and errors of detection.
             pixels: columns and rows of an image; 0 for exposures that say where the tip is.
         """
         count, first = len(navigations), navigations[0]
@@ -121,11 +118,8 @@ class CArms:
         """Take an exposure of every view in the worlds of a mask.
 
         Args:
-            mask: of the worlds.
-            simulator: the worlds as they truly are.
             encoders: Δ, mm, and φ, rad, of the devices as they are measured.
             registration_mm: the wires show displaced by this, mm LPS.
-            time_s: since the start of each episode, s.
         """
         chosen = np.flatnonzero(mask & simulator.valid)
         if not len(chosen):
@@ -198,14 +192,7 @@ class Views:
     """The views of one navigation: what stays the same, and the roadmap with the target that lies under every image."""
 
     def __init__(self, navigation: Navigation, real: Anatomy, config: FluoroscopeConfig, pixels: int) -> None:
-        """Compute what stays the same.
-
-        Args:
-            navigation: its vessel makes the roadmap.
-            real: the vessel as it truly is.
-            config: the views.
-            pixels: columns and rows.
-        """
+        """Compute what stays the same."""
         geometry = replace(config.geometry, pixel_mm=config.geometry.pixel_mm * _FULL_PIXELS / pixels)
         self._imager = XrayImager(real, navigation.stack, config=ImageConfig(geometry=geometry, pixels=pixels))
         given = navigation.anatomy

@@ -133,13 +133,7 @@ Observed = Literal["state", "xray", "image"]
 
 
 def space(observed: Observed, catheters: int, images: tuple[int, int, int]) -> Space:
-    """Return the space of one world's observation; what lies beyond is cut off.
-
-    Args:
-        observed: what.
-        catheters: number around the wire.
-        images: their number, rows and columns.
-    """
+    """Return the space of one world's observation; what lies beyond is cut off."""
     if observed == "state":
         return Box(-_BOUND, _BOUND, (_OF_WIRE + _OF_CATHETER * catheters,), np.float32)
     of_tip = _OF_TIP if observed == "xray" else 0
@@ -207,15 +201,7 @@ def observe(
     force_limit_n: Float[np.ndarray, "worlds"],
     time_share: Float[np.ndarray, "worlds"],
 ) -> Float[np.ndarray, "worlds features"]:
-    """Return the observations, as the tables at `NavigateVectorEnv` have them.
-
-    Args:
-        now: the worlds.
-        routes: the paths to their targets.
-        distances_mm: path length to the target of the devices' tips.
-        force_limit_n: their force limits.
-        time_share: share of the time limit that is used up.
-    """
+    """Return the observations, as the tables at `NavigateVectorEnv` have them."""
     tip, inserted, turned = now.tip[:, 0], now.encoders[:, 0, 0], now.encoders[:, 0, 1]
     place = routes.place(tip)
     outside = np.empty((len(time_share), 3, 2))
@@ -261,10 +247,7 @@ def observe_exposed(
 
     Args:
         proximal: Δ, mm, φ, rad, and the drives' force and torque, N and N·mm, as they are measured.
-        exposed: the last exposures.
         routes: the paths to the targets; not given where exposures are images.
-        time_s: since the start, s.
-        time_share: share of the time limit that is used up.
     """
     around = proximal.shape[1] - 1
     of_tip = 0 if routes is None else _OF_TIP

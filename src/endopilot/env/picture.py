@@ -27,7 +27,6 @@ class Picture:
     """The vessel of a navigation with its target, seen as `Anatomy.plot` shows it."""
 
     def __init__(self, navigation: Navigation) -> None:
-        """Draw what stays the same."""
         anatomy = navigation.anatomy
         lines = [branch.centerline for branch in anatomy.tree.branches]
         self._axes = list(anatomy.tree.widest_axes())

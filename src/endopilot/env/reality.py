@@ -22,7 +22,6 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
 from endopilot.simulation.world import NOMINAL, World, read_world
 from endopilot.tasks.navigation import Navigation
-from endopilot.types import Anatomy
 
 RANDOM = "random"
 """In place of a world or a robot: another one in each episode."""
@@ -80,7 +79,6 @@ class Reality:
     """The worlds of an environment as they truly are.
 
     Attributes:
-        simulator: the worlds.
         drawn: what differs from episode to episode.
     """
 
@@ -125,7 +123,11 @@ class Reality:
                 raise InputError(
                     "robot: its grip is weaker than devices of different push limits; give config a wall stiffness"
                 )
-        self.simulator = Simulator(_vessels(navigations, fixed), stacks, motion=motion, config=config)
+        made = {
+            id(each.anatomy): SharedVessels(each.anatomy) for each in navigations
+        }  # the same differences, one vessel
+        vessels = [made[id(each.anatomy)].of(world) for each, world in zip(navigations, fixed, strict=True)]
+        self.simulator = Simulator(vessels, stacks, motion=motion, config=config)
         self._friction = np.array([[device.friction for device in stack.devices] for stack in stacks])
         self._start = np.array([navigation.start for navigation in navigations])
         self._backs_out_s = np.array([each.backs_out_after_s for each in fixed])
@@ -163,12 +165,7 @@ class Reality:
         return np.concatenate([self.encoders, self.simulator.drive_load], axis=-1)
 
     def begin(self, mask: Bool[np.ndarray, "worlds"], generators: Sequence[np.random.Generator]) -> None:
-        """Start an episode in the worlds of a mask: the wire's rotation is drawn, and what is random in them.
-
-        Args:
-            mask: of the worlds.
-            generators: of each world.
-        """
+        """Start an episode in the worlds of a mask: the wire's rotation is drawn, and what is random in them."""
         simulator, drawn, chosen = self.simulator, self.drawn, np.flatnonzero(mask).tolist()
         turn, friction = self._start[..., 1].copy(), self._friction.copy()
         begun: list[World] = []
@@ -199,7 +196,6 @@ class Reality:
 
         Args:
             control: what drives are commanded, mm/s and rad/s.
-            period_s: how long, s.
             time_s: since each episode's start, s.
         """
         simulator, drawn = self.simulator, self.drawn
@@ -262,9 +258,3 @@ def _common(worlds: Sequence[World], names: str, values: Sequence[Any]) -> Any:
             f"world: worlds differ in {names}, which all in an environment have in common; give worlds that agree"
         )
     return values[0]
-
-
-def _vessels(navigations: Sequence[Navigation], worlds: Sequence[World]) -> list[Anatomy]:
-    """Return the vessel of each world; worlds with the same differences share one."""
-    made = {id(each.anatomy): SharedVessels(each.anatomy) for each in navigations}
-    return [made[id(each.anatomy)].of(world) for each, world in zip(navigations, worlds, strict=True)]

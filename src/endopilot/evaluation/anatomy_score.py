@@ -86,8 +86,6 @@ def compare_trees(
     """Return how far an extracted centerline tree agrees with the true one.
 
     Args:
-        extracted: the tree to be measured.
-        truth: the true tree.
         smallest_radius_mm: true points of a smaller radius are not counted, mm.
     """
     true_points, true_radius = sampled(truth)
@@ -99,11 +97,13 @@ def compare_trees(
     found, right = to_extracted <= true_radius[large], follows & scored
     agreeing = int(found.sum() + right.sum())
     pairs = np.concatenate([to_extracted[found], distance[right]])
+    astray = points[~follows]
+    pieces = np.bincount(groups(astray, 2.5 * SAMPLE_STEP_MM)) if len(astray) else np.zeros(0)
     return Agreement(
         overlap=agreeing / max(len(found) + int(scored.sum()), 1),
         inside_accuracy_mm=float(pairs.mean()) if len(pairs) else float("nan"),
         radius_mae_mm=float(np.abs(radius - true_radius[nearest])[right].mean()) if right.any() else float("nan"),
-        false_length_mm=_longest_piece(points[~follows]),
+        false_length_mm=float(pieces.max(initial=0) * SAMPLE_STEP_MM),
     )
 
 
@@ -121,13 +121,6 @@ def cl_dice(
     precision = (mask_skeleton & truth).sum() / max(mask_skeleton.sum(), 1)
     sensitivity = (truth_skeleton & mask).sum() / max(truth_skeleton.sum(), 1)
     return float(2 * precision * sensitivity / max(precision + sensitivity, 1e-12))
-
-
-def _longest_piece(points: Float[np.ndarray, "n 3"]) -> float:
-    """Return the length of the largest group of samples that hang together, mm."""
-    if len(points) == 0:
-        return 0.0
-    return float(np.bincount(groups(points, 2.5 * SAMPLE_STEP_MM)).max() * SAMPLE_STEP_MM)
 
 
 def _mask_scores(mask: LumenMask, truth: Anatomy) -> tuple[float, float]:

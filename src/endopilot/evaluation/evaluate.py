@@ -82,8 +82,8 @@ def evaluate(
     """
     with extra_named("evaluate"):
         from endopilot.evaluation.protocols import count_steps, run_protocols  # brings torch, slow to import
+        from endopilot.models.checkpoint import load_model
         from endopilot.models.episodes import Episodes
-        from endopilot.models.rollout import load_model
 
     config = config or EvaluateConfig()
     robot = None if config.robot is None else read_robot(config.robot)
@@ -139,12 +139,7 @@ def evaluate(
 
 
 def _parted(dataset: Dataset, known: Collection[str]) -> tuple[dict[str, Dataset], Dataset | None]:
-    """Return the valid navigations that a run was not trained on, by split of the result, and those that it was.
-
-    Args:
-        dataset: whatever its splits.
-        known: patients that the run was trained on.
-    """
+    """Return the valid navigations that a run was not trained on, by split of the result, and those that it was."""
     valid, of_known = dataset.valid.all(axis=1), np.isin(dataset.anatomy, sorted(known))
     trained = of_known & (dataset.split == "train")
     masks = dict(zip(SPLITS, (valid & of_known & ~trained, valid & ~of_known), strict=True))

@@ -55,7 +55,6 @@ def tip_events(
         inserted: Δ, mm.
         rotation: φ, rad.
         abscissa: Δtip, mm.
-        direction: unit vector along the wire at its tip.
     """
     pushed, moved = np.diff(inserted.astype(float), axis=1), np.diff(abscissa.astype(float), axis=1)
     turned = np.abs(np.diff(rotation.astype(float), axis=1))
@@ -235,9 +234,6 @@ def tip_statistics(
         error: predicted − true Δtip or γtip, mm; NaN where there is nothing to compare.
         radius: lumen radius at the true tip, mm; `over_radius` holds the statistics of the error over the radius.
         baselines: errors of the baselines on the same samples, mm, by name.
-        anatomy: which anatomy each sequence belongs to.
-        sample_period_s: time between samples, s.
-        seed: seed of the bootstrap.
     """
     spans: dict[str, slice] = {**span_slices(error.shape[1], sample_period_s), "all": slice(None)}
     statistics = {}

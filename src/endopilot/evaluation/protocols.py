@@ -3,101 +3,54 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from endopilot.dataset.loader import Dataset
 from endopilot.devices.robot import RobotConfig
-from endopilot.evaluation import prediction_baselines as baselines
 from endopilot.evaluation.metrics import tip_events
-from endopilot.evaluation.replay import Control, Recorded, Samples, replay
+from endopilot.evaluation.replay import Control, Recorded, exposures, replanned, replay
 from endopilot.evaluation.results import REPLAYED, SplitResult, TipSeries
 from endopilot.models.config import WINDOW
-from endopilot.models.episodes import Episodes
-from endopilot.models.open_loop import OpenLoop, Predictor, begin_after, given_states
+from endopilot.models.episodes import Episodes, OpenLoop, Predictor
 from endopilot.progress import Advance
 from endopilot.types import VesselTree
 
-EXPOSURE_PERIOD_S = 10.0
-"""Time between X-ray images after the given states, s."""
+
+def hold_slack(data: Dataset, given: int) -> Float[np.ndarray, "episodes samples 2"]:
+    """Return (Δtip, γtip), mm, if the slack Δ − Δtip and the offset stay as in the last given state."""
+    slack = data.inserted_length[:, given - 1, 0] - data.tip_abscissa[:, given - 1, 0]
+    abscissa = data.inserted_length[:, given:, 0] - slack[:, None]
+    offset = np.broadcast_to(data.tip_offset[:, given - 1], abscissa.shape)
+    return np.stack([abscissa, offset], axis=-1).astype(float)
 
 
-def exposures(data: Dataset) -> list[int]:
-    """Return the samples after the given states at which an X-ray image shows the tip."""
-    every = round(EXPOSURE_PERIOD_S / data.sample_period_s)
-    return list(range(WINDOW - 1 + every, data.valid.shape[1] - 1, every))
+def mean_tip(train: Dataset, data: Dataset, given: int) -> Float[np.ndarray, "episodes samples 2"]:
+    """Return (Δtip, γtip), mm, if slack and offset are always the means over the training episodes."""
+    slack = np.mean(train.inserted_length - train.tip_abscissa, dtype=float)
+    abscissa = data.inserted_length[:, given:, 0] - slack
+    return np.stack([abscissa, np.full(abscissa.shape, np.mean(train.tip_offset, dtype=float))], axis=-1)
 
 
-def replanned(
-    predictor: Predictor, recorded: Recorded, episodes: Episodes, first: OpenLoop, advance: Advance
-) -> Control:
-    """Return controls (mm/s, rad/s) after the given states that are planned anew at each of `exposures`.
+def hold_control(data: Dataset, given: int) -> Float[np.ndarray, "episodes samples 2"]:
+    """Return the last given control at every sample, (mm/s, rad/s)."""
+    samples = data.control.shape[1] - given
+    return np.repeat(data.control[:, given - 1], samples, axis=1).astype(float)
 
-    Each plan is driven in the simulator up to the next exposure. For the next one the predictor is given the motion of
-    the drive, the given tips, the observed tips, and in between the tips that it predicted itself; the desired tips
-    stay the same. Where the simulation fails, or no finite control is planned, controls are NaN from there on.
 
-    Args:
-        predictor: of the plans.
-        recorded: the navigations.
-        episodes: the same as the predictor is given them; their tips are the desired ones.
-        first: the plan from the given states on.
-        advance: called after each plan.
+def mean_control(train: Dataset, data: Dataset, given: int) -> Float[np.ndarray, "episodes samples 2"]:
+    """Return the mean control of the training episodes at every sample, (mm/s, rad/s)."""
+    return np.broadcast_to(train.control.mean(axis=(0, 1), dtype=float), data.control[:, given:, 0].shape).copy()
+
+
+def follow_slack(data: Dataset, given: int) -> Float[np.ndarray, "episodes samples 2"]:
+    """Return the control that moves the drive as far as the tip is to move, without rotation, (mm/s, rad/s).
+
+    With the slack of the last given state held this puts the tip where it is desired.
     """
-    control, under_way, observed = first.control.copy(), _as_predicted(episodes, first, WINDOW), given_states(episodes)
-    for now in exposures(recorded.data):
-        commanded = recorded.drivable(control)[:, : now + 1 - WINDOW]
-        failed = ~np.isfinite(commanded).all(axis=(1, 2))
-        under_way, lost = _driven(recorded, under_way, commanded, begin_after(observed) - 1)
-        observed = observed.copy()
-        observed[now] = True
-        plan = predictor.rollout_dual(_desired(under_way, episodes, now + 1), observed)
-        control[:, now + 1 - WINDOW :] = np.where((failed | lost)[:, None, None], np.nan, plan.control)
-        under_way = _as_predicted(under_way, plan, now + 1)
-        advance(1, "replanning")
-    return control
-
-
-def _driven(
-    recorded: Recorded, under_way: Episodes, commanded: Control, last: int
-) -> tuple[Episodes, Bool[np.ndarray, "episodes"]]:
-    """Return episodes after the drive was commanded, and which of them a simulation lost.
-
-    Known are the motion of the drive and, at the end, the tip in an X-ray image. It was observed before at sample
-    `last`.
-    """
-    now = WINDOW + commanded.shape[1] - 1
-    names = ("control", "command", "proximal", "tip", "branch")
-    made = {name: getattr(under_way, name).copy() for name in names}
-    lost = np.zeros(len(under_way), dtype=bool)
-    for chosen, rollout in recorded.simulated({"P4": commanded}):
-        ok = rollout.valid[:, now]
-        lost[chosen] = ~ok
-        kept, moved = chosen[ok], slice(WINDOW, now + 1)
-        made["control"][kept, moved] = rollout.control[ok, moved, 0]
-        made["command"][kept, moved] = rollout.command[ok, moved, 0]
-        made["proximal"][kept, moved] = rollout.proximal[ok, moved, 0]
-        made["tip"][kept, now] = np.stack([rollout.tip.abscissa, rollout.tip.offset], axis=-1)[ok, now, 0]
-        made["branch"][kept, last + 1 : now] = made["branch"][kept, last, None]  # not observed since
-        made["branch"][kept, now] = rollout.tip.branch[ok, now, 0]
-    return replace(under_way, **made), lost
-
-
-def _as_predicted(under_way: Episodes, plan: OpenLoop, begin: int) -> Episodes:
-    """Return episodes with the tips from a sample on as a plan predicts them, where it does."""
-    tip = under_way.tip.copy()
-    finite = np.isfinite(plan.tip).all(axis=-1, keepdims=True)
-    tip[:, begin:] = np.where(finite, plan.tip, tip[:, begin:])
-    return replace(under_way, tip=tip)
-
-
-def _desired(under_way: Episodes, desired: Episodes, begin: int) -> Episodes:
-    """Return episodes under way with everything from a sample on as it is desired."""
-    names = ("control", "command", "proximal", "tip", "branch")
-    parts = {name: (getattr(under_way, name)[:, :begin], getattr(desired, name)[:, begin:]) for name in names}
-    return replace(under_way, **{name: np.concatenate(both, axis=1) for name, both in parts.items()})
+    travel = np.diff(data.tip_abscissa[:, given - 1 :, 0].astype(float), axis=1)
+    return np.stack([travel / data.sample_period_s, np.zeros_like(travel)], axis=-1)
 
 
 PROTOCOLS = ("forward", "inverse", "dual")
@@ -121,11 +74,9 @@ def run_protocols(
     P1 is the forward network under the true controls; P2 the inverse network with the true tip as desired; P3 the
     paper's loop of both; P4 the controls of P3 simulated again from the start of the episode, in the anatomy and with
     the device and friction that it was recorded with, within the limits of the drive. P4 is driven once more with plans
-    made anew at X-ray images (`replanning`).
+    made anew at X-ray images (`replanned`).
 
     Args:
-        predictor: the networks of a run.
-        data: the episodes of one split.
         training: the episodes that the run was trained on, over which the baselines that are means are taken; these
             are left out if there are none.
         advance: called after each protocol in each anatomy, with P1's error so far, each new plan and each anatomy's
@@ -137,17 +88,17 @@ def run_protocols(
     controls: dict[str, Control] = {
         "P2": predicted["inverse"].control,
         "P3": predicted["dual"].control,
-        "hold_control": baselines.hold_control(data, WINDOW),
-        "follow_slack": baselines.follow_slack(data, WINDOW),
+        "hold_control": hold_control(data, WINDOW),
+        "follow_slack": follow_slack(data, WINDOW),
     }
     predicted_tips = {
         "P1": predicted["forward"].tip,
         "P3": predicted["dual"].tip,
-        "hold_slack": baselines.hold_slack(data, WINDOW),
+        "hold_slack": hold_slack(data, WINDOW),
     }
     if training is not None:
-        controls["training_mean"] = baselines.mean_control(training, data, WINDOW)
-        predicted_tips["training_mean"] = baselines.mean_tip(training, data, WINDOW)
+        controls["training_mean"] = mean_control(training, data, WINDOW)
+        predicted_tips["training_mean"] = mean_tip(training, data, WINDOW)
     trees = [anatomy.tree for anatomy in recorded.anatomies]
     tips = {
         name: _series(tip, trees, recorded.anatomy_of, data.branch[:, :, 0]) for name, tip in predicted_tips.items()
@@ -158,7 +109,8 @@ def run_protocols(
     driven = {name: recorded.drivable(control) for name, control in planned.items()}
     replays = replay(recorded, driven | dict.fromkeys(REPLAYED, data.command[:, WINDOW:, 0]), advance)
     true = (data.tip_abscissa, data.tip_offset, data.lumen_radius, data.base_force, data.base_torque)
-    *true_tip, true_force, true_torque = (_after_given(values[:, :, 0]) for values in true)
+    *true_tip, true_force, true_torque = (values[:, WINDOW:, 0].astype(float) for values in true)
+    moving = (data.inserted_length, data.rotation, data.tip_abscissa, data.tip_direction)
     return SplitResult(
         sample_period_s=data.sample_period_s,
         anatomies=recorded.names,
@@ -172,7 +124,7 @@ def run_protocols(
         base_force={"true": true_force} | {name: r.base_force for name, r in replays.items()},
         base_torque={"true": true_torque} | {name: r.base_torque for name, r in replays.items()},
         tip_distance={name: r.distance for name, r in replays.items()},
-        events=tip_events(*(signal[:, WINDOW - 1 :] for signal in _moving(data))),
+        events=tip_events(*(signal[:, WINDOW - 1 :, 0] for signal in moving)),
     )
 
 
@@ -202,10 +154,6 @@ def _predicted(
     return found
 
 
-def _moving(data: Dataset) -> tuple[np.ndarray, ...]:
-    return tuple(each[:, :, 0] for each in (data.inserted_length, data.rotation, data.tip_abscissa, data.tip_direction))
-
-
 def _series(
     tip: Float[np.ndarray, "episodes samples 2"],
     trees: Sequence[VesselTree],
@@ -222,7 +170,3 @@ def _series(
             line = tree.path(int(into))
             radius[here] = np.interp(abscissa[here], line.abscissa, line.radius)
     return TipSeries(abscissa, offset, radius)
-
-
-def _after_given(values: Float[np.ndarray, "episodes all_samples"]) -> Samples:
-    return values[:, WINDOW:].astype(float)

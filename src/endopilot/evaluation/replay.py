@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.again import simulate_again
@@ -17,6 +17,7 @@ from endopilot.devices.drive_motion import DriveMotion
 from endopilot.devices.robot import RobotConfig
 from endopilot.evaluation.results import REPLAYED, TipSeries
 from endopilot.models.config import WINDOW
+from endopilot.models.episodes import Episodes, OpenLoop, Predictor, begin_after, given_states
 from endopilot.progress import Advance
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import Anatomy
@@ -30,11 +31,8 @@ class Recorded:
     """Recorded episodes, with the patients and the wire that they were recorded with.
 
     Attributes:
-        data: the episodes.
-        names: of the anatomies, sorted.
         anatomies: in the order of their names.
         anatomy_of: index of each episode's anatomy.
-        device: the wire.
         robot: what controls pass before they move the wire; None where a drive does exactly what it can.
     """
 
@@ -48,10 +46,6 @@ class Recorded:
     @staticmethod
     def of(data: Dataset, robot: RobotConfig | None = None) -> Recorded:
         """Read what the episodes of a dataset were recorded with.
-
-        Args:
-            data: the episodes.
-            robot: what controls pass.
 
         Raises:
             InputError: an anatomy is missing or damaged.
@@ -99,25 +93,19 @@ class Recorded:
 
         Args:
             controls: after the given states, by series, all of one length.
-            advance: called after each anatomy.
 
         Yields:
-            Episodes that one simulation serves, and the simulation: a world for each series and episode, series by
-            series.
+            The episodes of one anatomy, and their simulation: a world for each series and episode, series by series.
         """
         for index, anatomy in enumerate(self.anatomies):
             mine = np.flatnonzero(self.anatomy_of == index)
             worlds = self.data.select(np.tile(mine, len(controls)))
-            driven = np.nan_to_num(np.concatenate([self._whole(control)[mine] for control in controls.values()]))
+            after = np.concatenate([control[mine] for control in controls.values()])
+            driven = np.nan_to_num(np.concatenate([worlds.command[:, :WINDOW, 0], after], axis=1))
             friction = np.concatenate([REPLAYED.get(name, 1.0) * self.data.friction[mine] for name in controls])
-            for chosen, rollout in simulate_again(worlds, anatomy, driven, friction=friction):
-                yield mine[chosen[: len(chosen) // len(controls)]], rollout
+            yield mine, simulate_again(worlds, anatomy, driven[:, :, None], friction=friction)
             if advance:
                 advance(1, anatomy.name)
-
-    def _whole(self, control: Control) -> Float[np.ndarray, "episodes all_samples 2"]:
-        """Return the recorded commands while states are given, followed by `control`."""
-        return np.concatenate([self.data.command[:, :WINDOW, 0], control], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,22 +115,26 @@ class Replay:
     NaN from where the simulation fails, or the series holds no finite control.
     """
 
-    tip: TipSeries
+    abscissa: Samples
+    offset: Samples
+    radius: Samples
     base_force: Samples
     base_torque: Samples
     distance: Samples
 
+    @property
+    def tip(self) -> TipSeries:
+        """Where the tip went."""
+        return TipSeries(self.abscissa, self.offset, self.radius)
+
 
 def replay(recorded: Recorded, controls: Mapping[str, Control], advance: Advance) -> dict[str, Replay]:
-    """Simulate every episode again with each series of controls after the given states.
+    """Simulate every episode again with each series of controls (mm/s and rad/s) after the given states.
 
-    Args:
-        recorded: the episodes.
-        controls: mm/s and rad/s after the given states, by series.
-        advance: called after each anatomy.
+    `advance` is called after each anatomy.
     """
-    shape = recorded.data.valid[:, WINDOW:].shape
-    out = {name: {key: np.full(shape, np.nan) for key in _SIGNALS} for name in controls}
+    shape, signals = recorded.data.valid[:, WINDOW:].shape, [field.name for field in fields(Replay)]
+    out = {name: Replay(*np.full((len(signals), *shape), np.nan)) for name in controls}
     for chosen, rollout in recorded.simulated(controls, advance):
         commanded = np.concatenate([control[chosen] for control in controls.values()])
         usable = rollout.valid[:, WINDOW:] & np.isfinite(commanded).all(axis=-1).cumprod(axis=1).astype(bool)
@@ -150,19 +142,84 @@ def replay(recorded: Recorded, controls: Mapping[str, Control], advance: Advance
         distance = np.linalg.norm(rollout.tip_position - true_tip, axis=-1)[:, :, 0]
         tip, load = rollout.tip, (rollout.base_force, rollout.base_torque)
         of_wire = [each[:, :, 0] for each in (tip.abscissa, tip.offset, tip.radius, *load)]
-        for key, signal in zip(_SIGNALS, (*of_wire, distance), strict=True):
+        for key, signal in zip(signals, (*of_wire, distance), strict=True):
             values = np.where(usable, signal[:, WINDOW:], np.nan)
             for name, part in zip(controls, values.reshape(len(controls), len(chosen), -1), strict=True):
-                out[name][key][chosen] = part
-    return {
-        name: Replay(
-            tip=TipSeries(signals["abscissa"], signals["offset"], signals["radius"]),
-            base_force=signals["base_force"],
-            base_torque=signals["base_torque"],
-            distance=signals["distance"],
-        )
-        for name, signals in out.items()
-    }
+                getattr(out[name], key)[chosen] = part
+    return out
 
 
-_SIGNALS = ("abscissa", "offset", "radius", "base_force", "base_torque", "distance")
+EXPOSURE_PERIOD_S = 10.0
+"""Time between X-ray images after the given states, s."""
+
+
+def exposures(data: Dataset) -> list[int]:
+    """Return the samples after the given states at which an X-ray image shows the tip."""
+    every = round(EXPOSURE_PERIOD_S / data.sample_period_s)
+    return list(range(WINDOW - 1 + every, data.valid.shape[1] - 1, every))
+
+
+def replanned(
+    predictor: Predictor, recorded: Recorded, episodes: Episodes, first: OpenLoop, advance: Advance
+) -> Control:
+    """Return controls (mm/s, rad/s) after the given states that are planned anew at each of `exposures`.
+
+    Each plan is driven in the simulator up to the next exposure. For the next one the predictor is given the motion of
+    the drive, the given tips, the observed tips, and in between the tips that it predicted itself; the desired tips
+    stay the same. Where the simulation fails, or no finite control is planned, controls are NaN from there on.
+
+    Args:
+        episodes: the same as the predictor is given them; their tips are the desired ones.
+    """
+    control, under_way, observed = first.control.copy(), _predicted(episodes, first, WINDOW), given_states(episodes)
+    for now in exposures(recorded.data):
+        commanded = recorded.drivable(control)[:, : now + 1 - WINDOW]
+        failed = ~np.isfinite(commanded).all(axis=(1, 2))
+        under_way, lost = _driven(recorded, under_way, commanded, begin_after(observed) - 1)
+        observed = observed.copy()
+        observed[now] = True
+        plan = predictor.rollout_dual(_desired(under_way, episodes, now + 1), observed)
+        control[:, now + 1 - WINDOW :] = np.where((failed | lost)[:, None, None], np.nan, plan.control)
+        under_way = _predicted(under_way, plan, now + 1)
+        advance(1, "replanning")
+    return control
+
+
+def _driven(
+    recorded: Recorded, under_way: Episodes, commanded: Control, last: int
+) -> tuple[Episodes, Bool[np.ndarray, "episodes"]]:
+    """Return episodes after the drive was commanded, and which of them a simulation lost.
+
+    Known are the motion of the drive and, at the end, the tip in an X-ray image. It was observed before at sample
+    `last`.
+    """
+    now = WINDOW + commanded.shape[1] - 1
+    names = ("control", "command", "proximal", "tip", "branch")
+    made = {name: getattr(under_way, name).copy() for name in names}
+    lost = np.zeros(len(under_way), dtype=bool)
+    for chosen, rollout in recorded.simulated({"P4": commanded}):
+        ok = rollout.valid[:, now]
+        lost[chosen] = ~ok
+        kept, moved = chosen[ok], slice(WINDOW, now + 1)
+        made["control"][kept, moved] = rollout.control[ok, moved, 0]
+        made["command"][kept, moved] = rollout.command[ok, moved, 0]
+        made["proximal"][kept, moved] = rollout.proximal[ok, moved, 0]
+        made["tip"][kept, now] = np.stack([rollout.tip.abscissa, rollout.tip.offset], axis=-1)[ok, now, 0]
+        made["branch"][kept, last + 1 : now] = made["branch"][kept, last, None]  # not observed since
+        made["branch"][kept, now] = rollout.tip.branch[ok, now, 0]
+    return replace(under_way, **made), lost
+
+
+def _predicted(under_way: Episodes, plan: OpenLoop, begin: int) -> Episodes:
+    """Return episodes with the tips from a sample on as a plan predicts them, where it does."""
+    tip = under_way.tip.copy()
+    finite = np.isfinite(plan.tip).all(axis=-1, keepdims=True)
+    tip[:, begin:] = np.where(finite, plan.tip, tip[:, begin:])
+    return replace(under_way, tip=tip)
+
+
+def _desired(under_way: Episodes, desired: Episodes, begin: int) -> Episodes:
+    """Return episodes under way with everything from a sample on as it is desired."""
+    names = ("control", "command", "proximal", "tip", "branch")
+    parts = {name: (getattr(under_way, name)[:, :begin], getattr(desired, name)[:, begin:]) for name in names}
+    return replace(under_way, **{name: np.concatenate(both, axis=1) for name, both in parts.items()})

@@ -77,12 +77,8 @@ class SplitResult:
     """Everything predicted on one split, over the samples after the given states.
 
     Attributes:
-        sample_period_s: time between samples, s.
-        anatomies: names of the anatomies.
         anatomy: index in `anatomies` of each episode.
         sequence: index of each episode among those of its anatomy.
-        wire_radius_mm: radius of the wire at its tip, mm.
-        true: the recorded tip.
         true_control: the recorded control, (mm/s, rad/s).
         tips: predicted tips by series (see `SERIES_TITLES`).
         controls: predicted controls by series, (mm/s, rad/s).

@@ -54,10 +54,9 @@ def _tip(result: SplitResult, series: str, seed: int) -> dict[str, Any]:
             sample_period_s=result.sample_period_s,
             seed=seed,
         )
+        | {"by_depth": by_depth(result.error(series, coordinate), result.true.abscissa)}
         for coordinate in ("abscissa", "offset")
     }
-    for coordinate in ("abscissa", "offset"):
-        out[coordinate]["by_depth"] = by_depth(result.error(series, coordinate), result.true.abscissa)
     clearance = result.true.radius - result.wire_radius_mm - result.true.offset
     off_wall = clearance > OFF_WALL_MM
     error = result.error(series, "abscissa")
@@ -131,9 +130,6 @@ def generalisation_gap(splits: Mapping[str, Any]) -> dict[str, Any]:
 
     By series, coordinate and span: `difference` (mm) and `ratio`; None where an error is not known or is 0. Empty
     unless there are both kinds of patients.
-
-    Args:
-        splits: of metrics.json.
     """
     if not {"seen_test", "test"} <= splits.keys():
         return {}

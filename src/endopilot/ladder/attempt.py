@@ -66,12 +66,6 @@ class Recording:
     ) -> Recording:
         """Return the recording that `packed` made a text of.
 
-        Args:
-            text: the arrays.
-            devices: number of wire and catheters.
-            robot: what drove; the default one if not given.
-            world: what reality was; nominal if not given.
-
         Raises:
             InputError: an array cannot be read, is not finite, or has another length than the others.
         """
@@ -109,17 +103,14 @@ def attempt(
     from run to run.
 
     Args:
-        policy: its name.
-        navigation: what is to be done, as the policy is given it.
         seed: of encoder noise, detection errors and the policy.
-        world: what reality is; as the navigation says if not given.
         robot: what drives, as it is given; the default one if not given.
 
     Raises:
         InputError: there is no such policy, or the wire does not fit the vessel.
     """
     driver = make_policy(policy)
-    record = _drive(navigation, driver, seed, world, robot or RobotConfig())
+    record = _loop(navigation, driver, seed, world, robot or RobotConfig()).run()
     result = {"seed": seed} | scored(navigation, record, tells=isinstance(driver, AgentPolicy))
     planning_s = getattr(driver, "planning_s", None)
     return result if planning_s is None else result | {"planning_s": round(planning_s, 2)}
@@ -129,8 +120,6 @@ def scored(navigation: Navigation, record: NavigationRecord, *, tells: bool = Fa
     """Return the figures of a navigation, whoever drove it, its course and its recording.
 
     Args:
-        navigation: what was to be done.
-        record: how it truly went.
         tells: whether events count that who drove did not believe.
     """
     believed = record.believed[:-1, 0] if tells and record.believed is not None else None
@@ -160,30 +149,23 @@ def driven(recording: Recording, navigation: Navigation, *, seed: int) -> Naviga
     Raises:
         InputError: the recording is shorter than the navigation.
     """
-    return _drive(navigation, Repeated(recording), seed, recording.world, recording.robot)
+    return begun(recording, navigation, seed=seed).run()
 
 
 def begun(recording: Recording, navigation: Navigation, *, seed: int) -> NavigationLoop:
     """Return the loop that drives a navigation as it was recorded, at its start."""
-    config = _config(recording.robot)
-    return NavigationLoop(navigation, Repeated(recording), config=config, seed=seed, world=recording.world)
+    return _loop(navigation, Repeated(recording), seed, recording.world, recording.robot)
 
 
-def _config(robot: RobotConfig) -> LoopConfig:
-    return LoopConfig(robot=robot, simulator=replace(CORE, threads=1))
-
-
-def _drive(
-    navigation: Navigation, policy: Policy, seed: int, world: World | None, robot: RobotConfig
-) -> NavigationRecord:
-    return NavigationLoop(navigation, policy, config=_config(robot), seed=seed, world=world).run()
+def _loop(navigation: Navigation, policy: Policy, seed: int, world: World | None, robot: RobotConfig) -> NavigationLoop:
+    config = LoopConfig(robot=robot, simulator=replace(CORE, threads=1))
+    return NavigationLoop(navigation, policy, config=config, seed=seed, world=world)
 
 
 class Repeated:
     """A policy that decides what was recorded."""
 
     def __init__(self, recording: Recording) -> None:
-        """Take the recording."""
         self._control = [tuple((v, w) for v, w in devices) for devices in recording.control.tolist()]
         self._expose_next = [*recording.exposed[1:].tolist(), False]
         self._gave_up = recording.gave_up
@@ -209,13 +191,7 @@ class Repeated:
 
 
 def _figures(navigation: Navigation, record: NavigationRecord, recording: Recording) -> dict[str, Any]:
-    """Return what a navigation is scored by, and the hash of all that was recorded of it and of how it went.
-
-    Args:
-        navigation: what was to be done.
-        record: how it truly went.
-        recording: what was decided.
-    """
+    """Return what a navigation is scored by, and the hash of all that was recorded of it and of how it went."""
     length_mm = navigation.target.abscissa - float(record.tip.abscissa[0, 0])
     scored = {
         "success": record.success,
@@ -247,7 +223,6 @@ def navigation_events(
         tip: as it truly was, at the start and after each decision period.
         exposed: whether X-ray was on, at the same moments.
         believed_mm: Δtip as the policy believed it at each decision, mm.
-        wire_radius_mm: radius of the wire at its tip, mm.
     """
     count, advice = len(believed_mm), AdviserConfig()
     at_wall = safety_ratio(tip.offset, tip.radius, wire_radius_mm)[:count] >= advice.wall_ratio

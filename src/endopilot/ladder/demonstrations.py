@@ -50,10 +50,6 @@ def write_demonstrations(submission: str | Path, *, output: str | Path) -> dict[
     - `exposed`: whether the images are of this moment;
     - `contact_force_max_n`: largest wall force on a node over the period that follows.
 
-    Args:
-        submission: the file.
-        output: folder of the data set.
-
     Returns:
         `dataset` (the folder), `episodes`, `samples` and `exposures`.
 
@@ -84,7 +80,8 @@ def write_demonstrations(submission: str | Path, *, output: str | Path) -> dict[
             }
             _write_episode(output, episode, task.title, columns, about, described, key)
             for name, values in columns.items():
-                sums.add(name, _pixels(values) if name in _VIEWS else np.asarray(values))
+                white = np.concatenate([image.reshape(-1) for image in values]) / 255 if name in _VIEWS else None
+                sums.add(name, np.asarray(values) if white is None else white)
             samples, exposures = samples + count, exposures + int(columns["exposed"].sum())
             advance()
     _describe(output, described, titles, sums.stats(), len(chosen), samples)
@@ -190,11 +187,6 @@ def _column(values: Any, feature: Mapping[str, Any]) -> pa.Array:
 
 
 _IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-
-
-def _pixels(images: Sequence[UInt8[np.ndarray, "rows columns"]]) -> np.ndarray:
-    """Return the pixels of images, of which white is 1."""
-    return np.concatenate([image.reshape(-1) for image in images]) / 255
 
 
 def _describe(

@@ -33,7 +33,6 @@ def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[d
 
     Args:
         output: folder of the results; `mismatch.json` and `mismatch.png` in it show the scores.
-        config: what climbs.
         share: by which each of `QUANTITIES` differs, up and down, between 0 and 1.
 
     Returns:

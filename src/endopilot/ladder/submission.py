@@ -79,9 +79,7 @@ class Submission:
     """What a policy did on the ladder, and how that can be done again.
 
     Attributes:
-        format: version of this form.
         ladder: version of the ladder; a file without it is one of version 1.
-        policy: name of the policy.
         origin: package and version that it comes from, or its file and the SHA-256 of that.
         versions: of endopilot, Python and libraries.
         core: processor level that the rod core was built for.
@@ -178,13 +176,7 @@ def write_submission(
     """Write the submission file of a policy.
 
     Args:
-        path: the file.
-        policy: name of the policy.
-        version: of the ladder.
         results: by the task's name, the results of its navigations (`attempt`) in the order of the task's patients.
-        scores: what `score` made of them.
-        robot: what drove.
-        world: what reality was.
     """
     known = {each.name for each in fields(NavigationEntry)}
     submission = Submission(
@@ -316,7 +308,6 @@ def recorded_navigation(path: Path, name: str | None, place: int) -> tuple[Task,
 
     Args:
         path: a submission.json or TASK/NUMBER.json.
-        name: of the task, in a submission.
         place: of the patient in the task's list, likewise.
 
     Returns:

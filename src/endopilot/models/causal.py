@@ -31,8 +31,17 @@ from torch import Tensor, nn
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.errors import InputError
 from endopilot.models.config import WINDOW, CausalConfig
-from endopilot.models.episodes import Episodes, EpisodeSetUp
-from endopilot.models.open_loop import EachObserved, Observed, OpenLoop, Prediction, Steps2, begin_after, given_states
+from endopilot.models.episodes import (
+    EachObserved,
+    Episodes,
+    EpisodeSetUp,
+    Observed,
+    OpenLoop,
+    Prediction,
+    Steps2,
+    begin_after,
+    given_states,
+)
 from endopilot.models.play import Direction, PlayTables
 from endopilot.models.sequences import N_INPUTS, N_WIRE_INPUTS, Unfolded, play_tables, unfold
 from endopilot.models.simulated_wires import FRICTION_FACTORS, SimulatedWires
@@ -55,10 +64,6 @@ class CausalNetwork(nn.Module):
     """What FF and IF have in common.
 
     Buffers `input_mean`, `input_scale` and `output_scale` are part of the checkpoint; `fit_scales` sets them.
-
-    Attributes:
-        n_inputs: inputs at a sample.
-        n_guesses: components of the mixture.
     """
 
     n_inputs: int
@@ -91,7 +96,6 @@ class CausalNetwork(nn.Module):
         """Return the mixture, as `Mixture.of` takes it: log weights, locations and scales of both changes, and jumps.
 
         Args:
-            inputs: of every sample.
             others: by how much the guesses after the first differ from it.
         """
         scaled = ((inputs - self.input_mean) / self.input_scale).clamp(-_FARTHEST, _FARTHEST)
@@ -197,9 +201,7 @@ class CausalPredictor:
     Attributes:
         forward: FF, if it was trained.
         inverse: IF, if it was trained.
-        limits: of the drive.
         prepared: names and tables of the patients of each setup that it has predicted in.
-        wires: simulated so far.
     """
 
     forward: CausalNetwork | None
@@ -211,12 +213,7 @@ class CausalPredictor:
     wires: SimulatedWires = field(default_factory=SimulatedWires, repr=False)
 
     def predict(self, episodes: Episodes, observed: Observed | EachObserved) -> Prediction:
-        """Predict the tips of episodes from their controls and from the observed tips.
-
-        Args:
-            episodes: their controls, and their tips where `observed`; no other tip is read.
-            observed: samples at which the tip was observed, of all episodes alike or of each.
-        """
+        """Predict the tips of episodes from their controls and from the observed tips: see `ProbabilisticPredictor`."""
         network = _needed(self.forward, "forward")
         given = np.broadcast_to(observed, episodes.branch.shape)
         unfolded, found = self._run(network, "forward", episodes, given)

@@ -1,4 +1,4 @@
-"""Networks on disk: safetensors with JSON in the header. Nothing is ever unpickled."""
+"""Networks on disk: safetensors with JSON in the header. Nothing is ever unpickled. `load_model` reads a run."""
 
 from __future__ import annotations
 
@@ -13,11 +13,17 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from endopilot.devices.device import Wire
+from endopilot.devices.drive_limits import DriveLimits
 from endopilot.errors import InputError
-from endopilot.files import json_text, regular, writing
-from endopilot.models.causal import CAUSAL_NETWORKS, CausalNetwork
-from endopilot.models.config import CausalConfig, TransformerConfig
-from endopilot.models.transformer import NETWORKS, Network
+from endopilot.files import json_text, reading, regular, writing
+from endopilot.models.causal import CAUSAL_NETWORKS, CausalNetwork, CausalPredictor
+from endopilot.models.config import PRETRAINED, CausalConfig, TransformerConfig, TwinConfig, read_run, run_path
+from endopilot.models.episodes import Predictor
+from endopilot.models.transformer import NETWORKS, Network, TransformerPredictor
+from endopilot.models.twin import TwinPredictor
+from endopilot.settings import from_record
+from endopilot.simulation.config import SimulatorConfig
 
 FORMAT_VERSION = 1
 """Counts changes of the tensors or of their meaning."""
@@ -35,15 +41,7 @@ def make_network(name: str, size: Size) -> Network | CausalNetwork:
 def write_network(
     path: Path, name: str, network: Network | CausalNetwork, config: Size, facts: Mapping[str, Any]
 ) -> None:
-    """Write weights and scales of a network, whole or not at all.
-
-    Args:
-        path: the file to write.
-        name: "ff" or "if".
-        network: the network.
-        config: its size.
-        facts: what else the header shall say, as JSON values.
-    """
+    """Write weights and scales of a network, whole or not at all."""
     kind = "causal" if isinstance(config, CausalConfig) else "paper"
     write_tensors(path, network.state_dict(), {"network": name, "kind": kind, "size": asdict(config), **facts})
 
@@ -105,3 +103,32 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Te
             _, i, name = key.split(".")
             state.setdefault(int(i), {})[name] = tensor
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+
+
+def load_model(run: str | Path = PRETRAINED) -> Predictor:
+    """Return the predictor of a run made by `endopilot train`, or the packaged one, named "pretrained".
+
+    Raises:
+        InputError: the run is unfinished, or a file of it is damaged or of another version.
+    """
+    record, run_folder = read_run(run), run_path(run)
+    with reading(run_folder, "train anew"):
+        return _predictor(record, run_folder)
+
+
+def _predictor(record: dict[str, Any], run_folder: Path) -> Predictor:
+    device = from_record(Wire, record["device"])
+    if record["config"]["model"] == "twin":
+        return TwinPredictor(
+            device=device,
+            simulator=SimulatorConfig(**record["simulator"]),
+            config=TwinConfig(**record["config"]["twin"]),
+        )
+    files = {name: run_folder / f"{name}.safetensors" for name in record["networks"]}
+    networks: dict[str, Any] = {name: read_network(file)[0] for name, file in files.items()}
+    kind = CausalPredictor if record["config"]["model"] == "causal" else TransformerPredictor
+    return kind(
+        forward=networks.get("ff"),
+        inverse=networks.get("if"),
+        limits=DriveLimits.of(device),
+    )

@@ -33,7 +33,6 @@ class Ensemble:
     Attributes:
         parameters: friction factor, tip stiffness factor and depth of the ostium (mm) of each member.
         wires: the wires by the stiffness factor of their tip; members share them.
-        set_up: what their worlds are simulated with.
     """
 
     def __init__(
@@ -49,12 +48,8 @@ class Ensemble:
         """Take what all have in common, and in what they differ.
 
         Args:
-            anatomy: the vessel.
             device: the wire as it is given, or the wire and its catheters.
-            parameters: of each member.
             start: inserted length (mm) and rotation (rad) of each device as the encoders have it at the start.
-            config: settings of the rod core.
-            motion: how the vessel moves, as far as that is known.
         """
         stack, self.parameters = Stack.of(device), parameters
         wire = stack.wire
@@ -65,7 +60,7 @@ class Ensemble:
         self.set_up = SimulationSetUp(
             anatomies=[anatomy] * len(parameters),
             stacks=[replace(stack, wire=self.wires[factor]) for factor in parameters[:, 1]],
-            initial=np.stack([self._deeper(start[..., 0]), start[..., 1]], axis=-1),
+            initial=np.stack([np.maximum(start[..., 0] + parameters[:, 2:], 0.0), start[..., 1]], axis=-1),
             friction=stack.frictions(wire.friction * parameters[:, 0]),
             actuation="velocity",
             motion=motion,
@@ -99,11 +94,6 @@ class Ensemble:
             made = run_set_up(self.set_up, command[:, :, None], period_s=SAMPLE_PERIOD_S, record_shape=False)
         tip = made.tip[:, :, 0]
         return np.where(made.valid[..., None], np.stack([tip.abscissa, tip.offset], axis=-1), np.nan)
-
-    def _deeper(self, given_mm: Float[np.ndarray, "members *devices"]) -> Float[np.ndarray, "members *devices"]:
-        """Return inserted lengths from each member's ostium on, mm, of those from the given one on."""
-        ostium_mm = self.parameters[:, 2].reshape(-1, *[1] * (given_mm.ndim - 1))
-        return np.maximum(given_mm + ostium_mm, 0.0)
 
 
 def likelihoods(score: Float[np.ndarray, "members *n"]) -> Float[np.ndarray, "members *n"]:

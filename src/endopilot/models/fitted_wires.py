@@ -54,7 +54,6 @@ def fitted(episodes: Episodes, given: Bool[np.ndarray, "episodes given"]) -> Wir
 
     Args:
         episodes: of one patient; their tips where `given` are read.
-        given: samples from the first on at which the tip was observed.
 
     Raises:
         InputError: the anatomy is missing or damaged.
@@ -139,11 +138,9 @@ def posterior(
     """Return mean and standard deviation of the parameters of one episode after the given tips.
 
     Args:
-        theta: of the wires that were tried.
         paths: their tips, mm; NaN from where a simulation fails.
         tip: the observed ones, mm.
         scale_mm: of a good wire's errors.
-        given: samples at which the tip was observed.
     """
     whole = np.isfinite(paths).all(axis=(1, 2))
     if whole.sum() < 8 or not given.any():

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.tree import curvature_torsion, make_centerline
-from endopilot.dataset.navigations import CAUGHT, STOP_SHORT_MM
+from endopilot.dataset.navigations import CAUGHT, STOP_SHORT_MM, branch_ends
 from endopilot.devices.device import Wire
 from endopilot.errors import InputError
 from endopilot.files import json_text, writing
@@ -86,7 +86,7 @@ def prepare(anatomy: Anatomy, device: Wire, config: SimulatorConfig) -> Patient:
     simulator = Simulator(anatomy, device, worlds=WIRES, config=config)
     rotation = 2 * np.pi * np.arange(WIRES) / WIRES
     simulator.reset(inserted_length=np.zeros(WIRES), rotation=rotation, friction=np.full(WIRES, device.friction))
-    ends = _ends(anatomy.tree)
+    ends = branch_ends(anatomy.tree)
     deepest = float(ends[np.isfinite(ends)].max()) - STOP_SHORT_MM
     pushing, rows = np.ones(WIRES, dtype=bool), []
     idle, before = np.zeros(WIRES, dtype=int), np.zeros(WIRES)
@@ -124,14 +124,6 @@ def prepare(anatomy: Anatomy, device: Wire, config: SimulatorConfig) -> Patient:
         geometry=geometry,
         branch=branches,
     )
-
-
-def _ends(tree: VesselTree) -> Float[np.ndarray, "branches"]:
-    """Return the abscissa at which every branch ends, mm; infinite where it goes on."""
-    ends = np.full(len(tree.branches), np.inf)
-    for leaf in tree.leaves():
-        ends[leaf] = tree.branches[leaf].centerline.abscissa[-1]
-    return ends
 
 
 def _tabulated(tree: VesselTree, rows: Sequence[np.ndarray]) -> dict[str, Float[np.ndarray, "wires lengths"]]:
@@ -200,11 +192,7 @@ def read_or_prepare(
 
     Args:
         folder: where patients are kept, one file for each patient and device.
-        name: of the patient.
         identity: SHA-256 of what the simulation depends on in the anatomy.
-        device: the wire.
-        config: settings of the rod core.
-        read: reads the anatomy, where it is needed.
 
     Raises:
         InputError: the patient cannot be prepared, or the folder cannot be written.

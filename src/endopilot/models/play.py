@@ -38,7 +38,6 @@ class PlayState:
         tip: Δtip, mm.
         inserted: Δ, mm.
         partial: output of the plays of `PARTIAL_PLAYS`, mm.
-        branch: branch of the tip.
     """
 
     tip: Float[np.ndarray, "n"]
@@ -55,7 +54,6 @@ class PlayTables:
         known: for each direction, (low, high) envelope of the other length over the known one, mm.
         clearance: (push, pull) distance between the wire at its tip and the wall over the inserted length, mm.
         deepest, leaf, on_route, leaf_of_branch, geometry, branch: as `patient.Patient` has them.
-        wire_radius_mm: of the device.
     """
 
     known: dict[str, tuple[Float[np.ndarray, "patients wires lengths"], Float[np.ndarray, "patients wires lengths"]]]
@@ -113,9 +111,6 @@ class PlayTables:
         """Take the plays one sample on.
 
         Args:
-            direction: which length is known.
-            patient: row of the tables, for each wire.
-            state: before the sample.
             known: Δ (forward) or Δtip (inverse) at its end, mm.
             rotation: φ at its end, rad.
             turned: by how much it has changed, rad.

@@ -26,11 +26,6 @@ _WIRE = (
 def check_wire(run: Path, record: Mapping[str, Any], dataset: Dataset) -> None:
     """Check that a dataset was made with the wire that a run was trained with.
 
-    Args:
-        run: the run, as it is named to the user.
-        record: its manifest.
-        dataset: what it is to be measured on.
-
     Raises:
         InputError: it was made with another wire, or with catheters.
     """
@@ -50,11 +45,6 @@ def trained_patients(run: Path, record: Mapping[str, Any], dataset: Dataset) -> 
     """Return the names of the patients of a dataset that a run was trained on.
 
     A patient is known by the SHA-256 of the anatomy.
-
-    Args:
-        run: the run, as it is named to the user.
-        record: its manifest.
-        dataset: what it is to be measured on.
 
     Raises:
         InputError: the run is too old to name its patients, or the dataset was made with another wire.

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from endopilot.models import play
 from endopilot.models.config import WINDOW
-from endopilot.models.episodes import Episodes
-from endopilot.models.open_loop import jumps
+from endopilot.models.episodes import Episodes, jumps
 from endopilot.models.play import PARTIAL_PLAYS, Direction, PlayTables
 from endopilot.models.simulated_wires import FRICTION_FACTORS, WireTips, read_or_simulate
 from endopilot.progress import progress
@@ -33,7 +32,6 @@ class Unfolded:
     """Episodes with the play operator applied along them.
 
     Attributes:
-        inputs: of the network.
         guess: forward: (Δtip, γtip) of play and envelopes, mm, displaced by the patient's motion; inverse: Δ by the
             play (mm) and a turn of 0 (rad).
         others: forward: by how much the simulated wires differ from that guess, mm; inverse: none.
@@ -81,11 +79,6 @@ def unfold(
     desired tips up to t and the motion before it, where observed.
 
     Args:
-        direction: forward or inverse.
-        vessels: tables of the patients.
-        patient: row of the tables, for each episode.
-        episodes: the navigations.
-        observed: samples at which the tip was observed.
         wires: forward: what the simulated wires did. By how much the patient's motion displaces the tip is taken off
             all tips before, and added to the guess behind.
     """
@@ -190,14 +183,7 @@ class Sequences:
 
     @staticmethod
     def of(episodes: Episodes, vessels: PlayTables, networks: Sequence[str], seed: int) -> Sequences:
-        """Return the sequences of some episodes.
-
-        Args:
-            episodes: the navigations, with their true tips.
-            vessels: tables of their patients, as `play_tables` gives them.
-            networks: "ff", "if" or both.
-            seed: of the samples at which tips are observed.
-        """
+        """Return the sequences of some episodes."""
         patient = np.unique(episodes.anatomy, return_inverse=True)[1]
         shape = episodes.branch.shape
         given = np.broadcast_to(np.arange(shape[1]) < WINDOW, shape)
@@ -239,47 +225,3 @@ class Sequences:
         inputs *= torch.where(mirrored, sign, 1.0)  # indexing made copies, which may be changed
         change *= torch.where(mirrored, turned, 1.0)
         return inputs, others, change
-
-
-@dataclass(frozen=True, eq=False)
-class Windows:
-    """Episodes as the paper's networks take them: tensors, out of which windows are cut.
-
-    Attributes:
-        tip: (Δtip, γtip), mm.
-        proximal: x^prox = (Δ mm, φ rad).
-        control: π = (mm/s, rad/s).
-    """
-
-    tip: Float[Tensor, "episodes samples 2"]
-    proximal: Float[Tensor, "episodes samples 2"]
-    control: Float[Tensor, "episodes samples 2"]
-
-    @staticmethod
-    def of(episodes: Episodes) -> Windows:
-        """Return the windows of some episodes."""
-        signals = (episodes.tip, episodes.proximal, episodes.control)
-        return Windows(*(torch.as_tensor(signal, dtype=torch.float32) for signal in signals))
-
-    def targets(self) -> Int[Tensor, "windows 2"]:
-        """Return (episode, sample) of every sample that has a whole window before it."""
-        episodes, samples = self.tip.shape[:2]
-        return torch.cartesian_prod(torch.arange(episodes), torch.arange(WINDOW, samples))
-
-    def window(self, network: str, target: Int[Tensor, "b 2"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return tip, proximal and control of the windows before some targets, and the truth there.
-
-        FF is given tips up to the sample before the target and motions up to the target, and predicts the tip; IF is
-        given motions up to the sample before the target and tips up to the target, and predicts the control (see
-        `transformer`).
-        """
-        episode, sample = target[:, :1], target[:, 1:]
-        before = sample + torch.arange(-WINDOW, 0)
-        tip_at, motion_at = (before, before + 1) if network == "ff" else (before + 1, before)
-        truth = self.tip if network == "ff" else self.control
-        return (
-            self.tip[episode, tip_at],
-            self.proximal[episode, motion_at],
-            self.control[episode, motion_at],
-            truth[target[:, 0], target[:, 1]],
-        )

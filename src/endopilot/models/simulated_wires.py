@@ -24,9 +24,8 @@ from jaxtyping import Float, Int
 from endopilot.files import json_text, writing
 from endopilot.models.config import WINDOW
 from endopilot.models.ensemble import Ensemble
-from endopilot.models.episodes import Episodes, EpisodeSetUp
+from endopilot.models.episodes import EachObserved, Episodes, EpisodeSetUp
 from endopilot.models.fitted_wires import Wires, by_motion, ensemble_of, fitted
-from endopilot.models.open_loop import EachObserved
 from endopilot.parallel import CORES
 from endopilot.progress import progress
 from endopilot.simulation.state import SimulatorState
@@ -93,7 +92,6 @@ class SimulatedWires:
 
         Args:
             episodes: their controls, and their tips where `observed` among the first `WINDOW` samples.
-            observed: samples at which the tip was observed.
 
         Raises:
             InputError: an anatomy is missing or damaged.
@@ -152,8 +150,6 @@ class Course:
 
         Args:
             ensembles: rows of the wires that are simulated together, and the wires.
-            reach_mm: what they are laid out for.
-            samples: of the course.
         """
         self.reach_mm = reach_mm
         self._parts = [(rows, ensemble.started(reach_mm)) for rows, ensemble in ensembles]
@@ -184,9 +180,6 @@ def _each_patient(
     """Return what a function of episodes of one patient returns, with their rows, on all cores.
 
     Args:
-        episodes: the navigations.
-        what: this is, for the progress bar.
-        of_one: the function.
         parts: into which each patient's episodes are split; fewer if there are fewer episodes.
     """
     patients = [np.flatnonzero(episodes.anatomy == name) for name in np.unique(episodes.anatomy)]
@@ -231,7 +224,6 @@ def simulated_tips(
     """Simulate wires under the commanded controls of each episode.
 
     Args:
-        episodes: the navigations.
         wires: the fitted wire of each.
         courses: of the same wires before, which are brought up to date.
 

@@ -22,8 +22,7 @@ import torch
 from torch import nn
 
 from endopilot import __version__
-from endopilot.dataset.join import read_joined
-from endopilot.dataset.loader import Dataset
+from endopilot.dataset.loader import Dataset, read_joined
 from endopilot.errors import InputError
 from endopilot.files import manifest, write_json
 from endopilot.models.causal import CausalNetwork
@@ -38,8 +37,8 @@ from endopilot.models.checkpoint import (
 from endopilot.models.config import TrainConfig
 from endopilot.models.episodes import Episodes
 from endopilot.models.process_group import ProcessGroup, joined
-from endopilot.models.sequences import Sequences, Windows, play_tables
-from endopilot.models.transformer import Network
+from endopilot.models.sequences import Sequences, play_tables
+from endopilot.models.transformer import Network, Windows
 from endopilot.progress import Advance, progress
 from endopilot.runs import claim
 
@@ -194,7 +193,9 @@ class Job:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(_seed(config.seed, self.name, "weights"))
             network = make_network(self.name, config.network_size)
-            self._fit_scales(network)
+            targets = self.training.targets()
+            chosen = torch.linspace(0, len(targets) - 1, min(len(targets), _SCALE_WINDOWS)).long()
+            network.fit_scales(*self.training.window(self.name, targets[chosen]))
             network.to(self.group.device)
             optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
             state = self._resume(network, optimizer) or {"seconds": 0.0, "curve": []}
@@ -223,11 +224,8 @@ class Job:
         """Go through one epoch, check the loss on held-out navigations, and add both to the state's curve.
 
         Args:
-            network: what is trained.
             together: the same, as all processes of the group run it.
-            optimizer: of its parameters.
             state: `seconds` and `curve` so far.
-            advance: called after every step.
         """
         epoch, epochs, start = len(state["curve"]), self.config.epochs, time.perf_counter()
         batches = self.batches(epoch, self._steps(network, state))
@@ -314,11 +312,6 @@ class Job:
     def _window(self, examples: Examples, targets: torch.Tensor) -> list[torch.Tensor]:
         """Return the network's inputs of some targets, and the truth, where this process computes."""
         return [part.to(self.group.device) for part in examples.window(self.name, targets)]
-
-    def _fit_scales(self, network: AnyNetwork) -> None:
-        targets = self.training.targets()
-        chosen = torch.linspace(0, len(targets) - 1, min(len(targets), _SCALE_WINDOWS)).long()
-        network.fit_scales(*self.training.window(self.name, targets[chosen]))
 
     def _steps(self, network: AnyNetwork, state: dict[str, Any]) -> int:
         """Return the steps of the next epoch: every window once, or what `windows_per_epoch` or the time allow."""

@@ -24,13 +24,18 @@ paper leaves open is settled here:
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from endopilot.devices.drive_limits import DriveLimits
+from endopilot.errors import InputError
 from endopilot.models.config import WINDOW, TransformerConfig
+from endopilot.models.episodes import Episodes, Observed, OpenLoop, Steps2, begin_after
 from endopilot.types import SAMPLE_PERIOD_S
 
 N_FEATURES = 9
@@ -203,3 +208,121 @@ def sinusoids(length: int, width: int) -> Float[Tensor, "length width"]:
     rate = torch.exp(torch.arange(0, width, 2) * (-math.log(10000.0) / width))
     angle = torch.arange(length)[:, None] * rate
     return torch.stack([angle.sin(), angle.cos()], dim=-1).flatten(-2)
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Episodes as the paper's networks take them: tensors, out of which windows are cut.
+
+    Attributes:
+        tip: (Δtip, γtip), mm.
+        proximal: x^prox = (Δ mm, φ rad).
+        control: π = (mm/s, rad/s).
+    """
+
+    tip: Float[Tensor, "episodes samples 2"]
+    proximal: Float[Tensor, "episodes samples 2"]
+    control: Float[Tensor, "episodes samples 2"]
+
+    @staticmethod
+    def of(episodes: Episodes) -> Windows:
+        """Return the windows of some episodes."""
+        signals = (episodes.tip, episodes.proximal, episodes.control)
+        return Windows(*(torch.as_tensor(signal, dtype=torch.float32) for signal in signals))
+
+    def targets(self) -> Int[Tensor, "windows 2"]:
+        """Return (episode, sample) of every sample that has a whole window before it."""
+        episodes, samples = self.tip.shape[:2]
+        return torch.cartesian_prod(torch.arange(episodes), torch.arange(WINDOW, samples))
+
+    def window(self, network: str, target: Int[Tensor, "b 2"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return tip, proximal and control of the windows before some targets, and the truth there.
+
+        FF is given tips up to the sample before the target and motions up to the target, and predicts the tip; IF is
+        given motions up to the sample before the target and tips up to the target, and predicts the control (see
+        `transformer`).
+        """
+        episode, sample = target[:, :1], target[:, 1:]
+        before = sample + torch.arange(-WINDOW, 0)
+        tip_at, motion_at = (before, before + 1) if network == "ff" else (before + 1, before)
+        truth = self.tip if network == "ff" else self.control
+        return (
+            self.tip[episode, tip_at],
+            self.proximal[episode, motion_at],
+            self.control[episode, motion_at],
+            truth[target[:, 0], target[:, 1]],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class TransformerPredictor:
+    """The paper's pair of networks, which feed back on themselves after the 30 given states.
+
+    In P3 IF proposes a control, FF predicts the tip that it leads to, and IF takes that tip in place of an X-ray image.
+
+    Attributes:
+        forward: FF, if it was trained.
+        inverse: IF, if it was trained.
+        limits: of the drive; IF's controls are clipped to them.
+        batch_size: episodes that are rolled out together.
+    """
+
+    forward: Network | None
+    inverse: Network | None
+    limits: DriveLimits
+    batch_size: int = 256
+
+    def rollout_forward(self, episodes: Episodes) -> OpenLoop:
+        """P1: predict the tip under the true controls."""
+        return self._rollout(episodes, WINDOW, inverse=False, forward=True)
+
+    def rollout_inverse(self, episodes: Episodes) -> OpenLoop:
+        """P2: predict the controls that bring about the true tip."""
+        return self._rollout(episodes, WINDOW, inverse=True, forward=False)
+
+    def rollout_dual(self, episodes: Episodes, observed: Observed | None = None) -> OpenLoop:
+        """P3: predict the controls that bring about the true tip, and the tip that they lead to.
+
+        The networks take the last 30 states only; those not observed are as they were predicted at the time.
+        """
+        begin = WINDOW if observed is None else begin_after(observed)
+        return self._rollout(episodes, begin, inverse=True, forward=True)
+
+    @torch.inference_mode()
+    def _rollout(self, episodes: Episodes, begin: int, *, forward: bool, inverse: bool) -> OpenLoop:
+        """Roll out from a sample on: controls by IF or the true ones, tips by FF or the true ones."""
+        networks = self._network("forward", forward), self._network("inverse", inverse)
+        parts = []
+        for first in range(0, len(episodes), self.batch_size):
+            chosen = np.arange(first, min(first + self.batch_size, len(episodes)))
+            batch = Windows.of(episodes.select(chosen))
+            parts.append(_rollout_batch(*networks, self.limits, batch, begin))
+        tip, proximal, control = (np.concatenate(signal) for signal in zip(*parts, strict=True))
+        return OpenLoop(tip=tip, proximal=proximal, control=control)
+
+    def _network(self, role: str, needed: bool) -> Network | None:
+        network = getattr(self, role)
+        if needed and network is None:
+            raise InputError(f"the run has no {role} network; train it with --network both")
+        return network if needed else None
+
+
+def _rollout_batch(
+    forward: Network | None, inverse: Network | None, limits: DriveLimits, batch: Windows, begin: int
+) -> tuple[Steps2, Steps2, Steps2]:
+    """Return tip, x^prox and control of one batch from a sample on."""
+    desired = batch.tip
+    tip, control = desired.clone(), batch.control.clone()
+    proximal = batch.proximal.double()  # float64, so that x^prox stays the integral of the controls
+    for k in range(begin, tip.shape[1]):
+        if inverse is not None:
+            wanted = torch.cat([tip[:, k - WINDOW + 1 : k], desired[:, k : k + 1]], dim=1)
+            given = slice(k - WINDOW, k)
+            proposed = inverse(wanted, proximal[:, given].float(), control[:, given])
+            inserted = proximal[:, k - 1, 0].float()
+            control[:, k] = torch.from_numpy(limits.clip(proposed.numpy(), inserted.numpy(), SAMPLE_PERIOD_S))
+            proximal[:, k] = proximal[:, k - 1] + SAMPLE_PERIOD_S * control[:, k].double()
+        if forward is not None:
+            moved = slice(k - WINDOW + 1, k + 1)
+            tip[:, k] = forward(tip[:, k - WINDOW : k], proximal[:, moved].float(), control[:, moved])
+    return tuple(signal[:, begin:].double().numpy() for signal in (tip, proximal, control))  # pyright: ignore[reportReturnType]

@@ -9,7 +9,7 @@ that moves as far as that is known.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from weakref import WeakKeyDictionary
 
@@ -17,13 +17,85 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.devices.device import Wire
+from endopilot.devices.drive_limits import DriveLimits
 from endopilot.models.config import WINDOW, TwinConfig
 from endopilot.models.ensemble import NOMINAL, Ensemble, likelihoods
-from endopilot.models.episodes import Episodes
-from endopilot.models.open_loop import EachObserved, Observed, OpenLoop, Prediction, begin_after, given_states, jumps
-from endopilot.models.tip_tracking import track
+from endopilot.models.episodes import (
+    EachObserved,
+    Episodes,
+    Observed,
+    OpenLoop,
+    Prediction,
+    Steps2,
+    begin_after,
+    given_states,
+    jumps,
+)
 from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.motion import Motion
+from endopilot.simulation.simulator import Simulator
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
+
+TRANSLATIONS_MM_S = (-5.0, -1.5, 0.0, 1.5, 5.0)
+"""Speeds that are tried, beyond the one that would move a tip without slack to where it is desired."""
+ROTATIONS_RAD_S = (-2.0, 0.0, 2.0)
+"""Rotations that are tried with each."""
+
+
+def track(
+    anatomy: Anatomy,
+    wires: Sequence[Wire],
+    *,
+    friction: Float[np.ndarray, "episodes"],
+    start: Float[np.ndarray, "episodes 2"],
+    given: Float[np.ndarray, "episodes given 2"],
+    desired: Steps2,
+    config: SimulatorConfig,
+    motion: Motion | None = None,
+) -> tuple[Steps2, Steps2]:
+    """Drive each episode's wire by its given controls, then sample by sample along the desired tips.
+
+    At every sample each wire tries all combinations of `TRANSLATIONS_MM_S` and `ROTATIONS_RAD_S` from its present state
+    and keeps the one whose tip ends nearest to the desired (Δtip, γtip), in the sum of both distances.
+
+    Args:
+        wires: the device of each episode; the same object where it is the same.
+        friction: Coulomb friction coefficient of each episode.
+        start: (Δ mm, φ rad) before the first given control.
+        given: controls (mm/s, rad/s) that come first.
+        desired: (Δtip, γtip) mm at the end of each sample period after them.
+
+    Returns:
+        Tip (Δtip, γtip) mm, and control (mm/s, rad/s) as the drive made it, after the given ones.
+    """
+    tries = np.array([(v, w) for v in TRANSLATIONS_MM_S for w in ROTATIONS_RAD_S])
+    episodes, each = len(wires), len(tries)
+    simulator = Simulator(anatomy, [wire for wire in wires for _ in range(each)], config=config, motion=motion)
+    inserted, rotation = np.repeat(start, each, axis=0).T
+    simulator.reset(inserted_length=inserted.clip(min=0.0), rotation=rotation, friction=np.repeat(friction, each))
+    limits = DriveLimits.of(wires[0], anatomy)
+    for sample in np.moveaxis(given, 1, 0):
+        command = np.repeat(sample, each, axis=0)
+        simulator.step(limits.clip(command, simulator.inserted_length[:, 0], SAMPLE_PERIOD_S), SAMPLE_PERIOD_S)
+    tip, control = np.empty(desired.shape), np.empty(desired.shape)
+    for k in range(desired.shape[1]):
+        now = simulator.project().abscissa[:, 0]
+        lead = (np.repeat(desired[:, k, 0], each) - now) / SAMPLE_PERIOD_S
+        command = np.tile(tries, (episodes, 1))
+        command[:, 0] += lead
+        command = limits.clip(command, simulator.inserted_length[:, 0], SAMPLE_PERIOD_S)
+        step = simulator.step(command, SAMPLE_PERIOD_S)
+        reached = simulator.project()[:, 0]
+        error = np.abs(reached.abscissa - np.repeat(desired[:, k, 0], each))
+        error += np.abs(reached.offset - np.repeat(desired[:, k, 1], each))
+        error[~step.valid] = np.inf
+        best = error.reshape(episodes, each).argmin(axis=1) + each * np.arange(episodes)
+        tip[:, k] = np.stack([reached.abscissa[best], reached.offset[best]], axis=-1)
+        slip = np.stack([step.slip, step.rotation_slip], axis=-1)[best, 0]
+        control[:, k] = command[best] - slip / SAMPLE_PERIOD_S
+        simulator.copy_worlds(np.repeat(best, each))
+    return tip, control
+
 
 LEVELS = 7
 """Tips of different stiffness in an ensemble. A simulation has one rod, so members share the few."""
@@ -57,8 +129,6 @@ class TwinPredictor:
 
     Attributes:
         device: the nominal wire.
-        simulator: settings of the rod core.
-        config: size and spread of the ensemble.
         predicted: predictions from the given states, by episodes; all protocols share them.
         tracked: controls that lead the tip along the desired one, likewise.
     """
@@ -70,12 +140,7 @@ class TwinPredictor:
     tracked: WeakKeyDictionary[Episodes, OpenLoop] = field(default_factory=WeakKeyDictionary, repr=False)
 
     def predict(self, episodes: Episodes, observed: Observed | EachObserved) -> TwinPrediction:
-        """Predict the tips of episodes from their controls and from the observed tips.
-
-        Args:
-            episodes: their controls, and their tips where `observed`; no other tip is read.
-            observed: samples at which the tip was observed, of all episodes alike or of each.
-        """
+        """Predict the tips of episodes from their controls and from the observed tips: see `ProbabilisticPredictor`."""
         tip, spread = np.full(episodes.tip.shape, np.nan), np.full(episodes.tip.shape, np.nan)
         parameters, jump = np.full((len(episodes), 3), np.nan), np.zeros(episodes.branch.shape)
         seen = np.broadcast_to(observed, episodes.branch.shape)
@@ -131,7 +196,7 @@ class TwinPredictor:
     def rollout_dual(self, episodes: Episodes, observed: Observed | None = None) -> OpenLoop:
         """P3: predict the controls that bring about the true tip, and the tip that they lead to.
 
-        The likeliest member is driven along the desired tips, one sample at a time: see `tip_tracking.track`.
+        The likeliest member is driven along the desired tips, one sample at a time: see `track`.
         """
         if observed is not None:
             return self._track(episodes, self.predict(episodes, observed).parameters, begin_after(observed))
@@ -148,7 +213,8 @@ class TwinPredictor:
         """Drive wires of these parameters along the desired tips from a sample on."""
         desired = episodes.tip[:, begin:].astype(float)
         tip, control = np.empty(desired.shape), np.empty(desired.shape)
-        wires = {stiffness: self._wire(stiffness) for stiffness in np.unique(likeliest[:, 1])}
+        wire, stiffnesses = self.device, np.unique(likeliest[:, 1]).tolist()
+        wires = {each: wire.with_tip(bend_rad=wire.tip_bend_rad, stiffness_factor=each) for each in stiffnesses}
         for anatomy, chosen in _by_anatomy(episodes):
             data, ours = episodes.select(chosen), likeliest[chosen]
             tip[chosen], control[chosen] = track(
@@ -182,9 +248,6 @@ class TwinPredictor:
         members[..., 1] = level[np.abs(members[..., 1, None] - level).argmin(axis=-1)]
         return members
 
-    def _wire(self, stiffness: float) -> Wire:
-        return self.device.with_tip(bend_rad=self.device.tip_bend_rad, stiffness_factor=float(stiffness))
-
     def _simulate(
         self, anatomy: Anatomy, data: Episodes, members: Members, samples: int
     ) -> Float[np.ndarray, "members episodes s 2"]:
@@ -213,7 +276,6 @@ def weigh(
     Args:
         paths: of the members, mm, as `TwinPredictor.ensemble` gives them.
         tips: (Δtip, γtip) where `observed`, mm; no other is read.
-        observed: samples at which the tip was observed.
         sd_mm: standard deviations of these tips as whatever measured them states them, mm; 0 where it states none.
         config: scales of the error of a good member.
     """

@@ -12,8 +12,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from endopilot.atlas import curves as shape
 from endopilot.atlas import heart_reference as reference
-from endopilot.atlas.heart_left import reference_courses
-from endopilot.atlas.heart_reference import HeartFit, ellipsoid, tube
+from endopilot.atlas.heart_reference import HeartFit, ellipsoid, reference_courses, tube
 from endopilot.lines import length_along
 from endopilot.types import Centerline, VesselTree
 

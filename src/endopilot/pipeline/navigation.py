@@ -172,7 +172,7 @@ def navigation_table(found: PatientNavigation) -> pd.DataFrame:
 
 
 def _write_episode(found: PatientNavigation, anatomy_folder: Path, output: Path) -> None:
-    from endopilot.dataset.episode import write_episode  # an extra brings its libraries
+    from endopilot.dataset.generate import write_episode  # an extra brings its libraries
 
     set_up = found.set_up
     world, given = set_up.world, set_up.navigation.stack

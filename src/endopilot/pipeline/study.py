@@ -322,7 +322,7 @@ def _learn(run: _Run, anatomies: Sequence[Path]) -> None:
     from endopilot.dataset.generate import generate_dataset  # an extra brings its libraries
     from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
     from endopilot.models.train import train  # torch takes seconds to import
-    from endopilot.report.evaluation_report import report_evaluation
+    from endopilot.report.report import report_evaluation
 
     output, config, trains = run.output, run.config, run.trains
     tested = len(anatomies) // 3 if trains else len(anatomies) - len(anatomies) // 3  # one at least is of another split

@@ -137,11 +137,6 @@ def _histograms(table: pd.DataFrame, titles: Mapping[str, str], panels: Sequence
 
     Sequences beyond the 98 % quantile of the second-widest series are counted in the last bar; the tick below a
     histogram marks its median. The highest bar of each histogram says how many sequences it holds.
-
-    Args:
-        table: with columns `split` and `series`.
-        titles: what a reader calls each split.
-        panels: column and label of each histogram.
     """
     splits, series = distinct(table, "split"), distinct(table, "series")
     with matplotlib.rc_context(STYLE):
@@ -218,7 +213,7 @@ def volume_figure(volume: Volume, mask: LumenMask, anatomy: Anatomy | None = Non
     """
     ostium = mask.ostium or (anatomy.insertion if anatomy is not None else None)
     voxels, lumen = _along_lps(volume, volume.voxels), _along_lps(volume, mask.volume.voxels).astype(bool)
-    spacing = _along_lps_spacing(volume)
+    spacing = volume.spacing_mm[_lps_axes(volume)]  # along x, y and z
     inside = [np.flatnonzero(np.any(lumen, axis=others)) for others in ((1, 2), (0, 2), (0, 1))]
     margin = np.ceil(CROP_MARGIN_MM / spacing[::-1]).astype(int)
     crop = tuple(slice(max(0, at[0] - m), at[-1] + m + 1) for at, m in zip(inside, margin, strict=True))
@@ -303,11 +298,6 @@ def _along_lps(volume: Volume, voxels: Shaped[np.ndarray, "nz ny nx"]) -> Shaped
     turned = voxels.transpose([2 - axis for axis in axes[::-1]])
     flips = [volume.direction[world, axes[world]] < 0 for world in (2, 1, 0)]
     return turned[tuple(slice(None, None, -1 if flip else 1) for flip in flips)]
-
-
-def _along_lps_spacing(volume: Volume) -> Float[np.ndarray, "3"]:
-    """Return the spacing along x, y and z of `_along_lps`, mm."""
-    return volume.spacing_mm[_lps_axes(volume)]
 
 
 def _lps_axes(volume: Volume) -> list[int]:

@@ -9,8 +9,6 @@ import matplotlib
 import numpy as np
 import plotly.graph_objects as go
 from jaxtyping import Float
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -21,7 +19,7 @@ from endopilot.ladder.attempt import driven, navigation_seed
 from endopilot.ladder.ladder import SCORES_FILE
 from endopilot.ladder.submission import recorded_navigation
 from endopilot.plotting import BLACK, BLUE, GREEN, ORANGE, STYLE, VERMILLION, png
-from endopilot.report.report import image, template_text
+from endopilot.report.report import image, render
 from endopilot.report.scene import mark_target, navigation_scene
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import Task, find_task, list_tasks
@@ -51,16 +49,9 @@ def write_page(output: Path) -> Path:
         with writing(plotly) as partial:
             partial.write_text(get_plotlyjs(), encoding="utf-8")
     sections = [_section(output, task, content["patients"]) for task in tasks]
-    template = Environment(
-        loader=PackageLoader("endopilot.report", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    ).get_template("ladder.html.j2")
-    page = template.render(
+    page = render(
+        "ladder.html.j2",
         of=len(list_tasks(content["ladder"])),
-        css=Markup(template_text("report.css")),
         policy=content["policy"],
         patients=content["patients"],
         scores=content["scores"],

@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from endopilot.control.navigate import PatientNavigation, SetUp
 from endopilot.control.outcome import name_target, slipped_s, tell_outcome, worst_ratio
 from endopilot.files import json_text, writing
-from endopilot.report.report import image, template_text
-from endopilot.report.scene import mark_target, navigation_scene
+from endopilot.report.report import image, render
+from endopilot.report.scene import mark_target, navigation_scene, scene_html
 from endopilot.simulation.world import read_world
 
 
@@ -24,33 +23,19 @@ def write_navigation_page(
 ) -> None:
     """Write the page as one HTML file that needs nothing beside it.
 
-    Args:
-        path: where to.
-        found: the navigation.
-        picture: its course in time, a PNG.
-        commands: what repeats it, by purpose.
-        manifest: how it was made.
-
     Raises:
         InputError: the page cannot be written.
     """
-    environment = Environment(
-        loader=PackageLoader("endopilot.report", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     name = found.set_up.navigation.anatomy.name
     outcome = tell_outcome(found)
-    page = environment.get_template("navigation.html.j2").render(
-        css=Markup(template_text("report.css")),
+    page = render(
+        "navigation.html.j2",
         title=f"{name}: to {name_target(found.set_up)}",
         outcome=outcome[0].upper() + outcome[1:] + ".",
         tiles=_tiles(found),
         facts=_facts(found),
         plotly=Markup(get_plotlyjs()),
-        scene=Markup(_scene(found)),
+        scene=_scene(found),
         believes=found.wires is not None,
         catheters=len(found.set_up.navigation.catheters),
         devices="Wire, catheter" if found.set_up.navigation.catheters else "Wire",
@@ -117,7 +102,7 @@ def _robot(set_up: SetUp) -> str:
     return f"{set_up.config.robot}: {play}, latency {1e3 * robot.latency_s:.3g} ms, encoders on the {where}"
 
 
-def _scene(found: PatientNavigation) -> str:
+def _scene(found: PatientNavigation) -> Markup:
     """Return the replay in space as HTML."""
     record, navigation = found.record, found.set_up.navigation
     figure = navigation_scene(
@@ -126,13 +111,7 @@ def _scene(found: PatientNavigation) -> str:
     exposed = record.exposed
     place = navigation.target.position(navigation.anatomy)
     mark_target(figure, place, record.tip_position[exposed, 0], record.time_s[exposed])
-    return figure.to_html(
-        full_html=False,
-        include_plotlyjs=False,
-        auto_play=False,
-        div_id="navigation",
-        config={"displaylogo": False, "responsive": True, "modeBarButtonsToRemove": ["toImage"]},
-    )
+    return scene_html(figure)
 
 
 def _exposures(found: PatientNavigation) -> list[dict[str, str]]:

@@ -1,4 +1,7 @@
-"""The report: one HTML file that needs nothing beside it, for a surgeon or a reviewer to read."""
+"""The report: one HTML file that needs nothing beside it, for a surgeon or a reviewer to read.
+
+`report_evaluation` makes one, with the figures, of what `evaluate` left on disk.
+"""
 
 from __future__ import annotations
 
@@ -17,16 +20,23 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.evaluation.results import FIGURES_FOLDER, METRICS_FILE
+from endopilot.evaluation.results import (
+    FIGURES_FOLDER,
+    METRICS_FILE,
+    REPORT_FILE,
+    RESULTS_FILE,
+    SplitResult,
+    read_results,
+)
 from endopilot.files import json_text, read_json, writing
 from endopilot.imaging.volume import read_mask, read_volume
+from endopilot.models.config import run_path
 from endopilot.plotting import png
-from endopilot.report import figures, report_text
-from endopilot.report.scene import navigation_scene, visible_devices
+from endopilot.report import figures, report_text, tables
+from endopilot.report.scene import navigation_scene, scene_html, visible_devices
 from endopilot.report.still import render_still
 from endopilot.report.tables import stage_table
 from endopilot.simulation.trajectory import Trajectory
-from endopilot.types import Anatomy
 
 STILL_FILE = "scene.png"
 
@@ -55,16 +65,12 @@ class ReportContent:
     """Everything that a pipeline has to report; what is None or empty is left out of the report.
 
     Attributes:
-        title: title of the report.
         origin: one sentence that says what the patients are: real, or synthetic and how made.
-        command: the command that makes this report again.
-        patients: the patients.
         evaluation: folder made by `endopilot evaluate`.
         run: folder made by `endopilot train`.
         replay: navigations with `shape`, the first of which is shown in space.
         replay_anatomy: folder of the anatomy that they are in.
         navigation: folder made by `endopilot navigate`, beside or below the report; its page is linked.
-        stage_seconds: seconds that each stage took, in the order of the stages.
         manifest: how everything was made (`files.manifest`).
     """
 
@@ -95,7 +101,6 @@ def write_report(output_html: Path, content: ReportContent) -> list[str]:
     metrics = read_json(content.evaluation / METRICS_FILE) if content.evaluation is not None else None
     context = {
         "content": content,
-        "css": Markup(template_text("report.css")),
         "metrics": metrics,
         "text": report_text,
         "patients": [_patient(patient) for patient in content.patients],
@@ -107,25 +112,23 @@ def write_report(output_html: Path, content: ReportContent) -> list[str]:
         "manifest": json_text(content.manifest) if content.manifest else "",
         "remarks": remarks,
     }
-    page = _environment().get_template("report.html.j2").render(context)
+    page = render("report.html.j2", **context)
     with writing(output_html) as partial:
         partial.write_text(page, encoding="utf-8")
     return remarks
 
 
-def _environment() -> Environment:
-    return Environment(
+def render(template: str, **content: Any) -> str:
+    """Return a page of the templates' folder with its style and its content."""
+    made = Environment(
         loader=PackageLoader("endopilot.report", "templates"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-
-
-def template_text(name: str) -> str:
-    """Return a file of the templates' folder."""
-    return (Path(__file__).parent / "templates" / name).read_text(encoding="utf-8")
+    css = (Path(__file__).parent / "templates" / "report.css").read_text(encoding="utf-8")
+    return made.get_template(template).render(css=Markup(css), **content)
 
 
 def _patient(patient: PatientContent) -> dict[str, Any]:
@@ -162,22 +165,18 @@ def _scene(content: ReportContent, still: Path, remarks: list[str]) -> dict[str,
     if folder is None:
         return None
     anatomy, replay = read_anatomy(folder), content.replay
-    figure = navigation_scene(anatomy, replay)
-    body = figure.to_html(
-        full_html=False,
-        include_plotlyjs=False,
-        auto_play=False,
-        div_id="navigation",
-        config={"displaylogo": False, "responsive": True, "modeBarButtonsToRemove": ["toImage"]},
-    )
+    figure, caption = navigation_scene(anatomy, replay), f"The vessel of {anatomy.name}."
+    if replay is not None:
+        seconds = replay.valid.shape[1] * replay.period_s
+        caption = f"{seconds:g} s of navigation in {anatomy.name}, simulated with the Cosserat rod core."
     problem = render_still(anatomy, _farthest(replay), still)
     if problem is not None:
         remarks.append(problem)
     return {
-        "html": Markup(body),
+        "html": scene_html(figure),
         "plotly": Markup(get_plotlyjs()),
         "still": None if problem else image(still.read_bytes(), f"The vessel of {anatomy.name} with the wire in it"),
-        "caption": _scene_caption(anatomy, replay),
+        "caption": caption,
     }
 
 
@@ -187,13 +186,6 @@ def _farthest(replay: Trajectory | None) -> list[np.ndarray]:
         return []
     depth = np.where(replay.valid[0], replay.tip.abscissa[0, :, 0], -np.inf)
     return visible_devices(replay, 0, int(np.argmax(depth)))
-
-
-def _scene_caption(anatomy: Anatomy, replay: Trajectory | None) -> str:
-    if replay is None:
-        return f"The vessel of {anatomy.name}."
-    seconds = replay.valid.shape[1] * replay.period_s
-    return f"{seconds:g} s of navigation in {anatomy.name}, simulated with the Cosserat rod core."
 
 
 def _stored_figure(evaluation: Path | None, name: str) -> Markup | None:
@@ -233,3 +225,51 @@ def image(png: bytes, description: str) -> Markup:
     """Return a PNG as an HTML element that needs no file."""
     data = base64.b64encode(png).decode("ascii")
     return Markup(f'<img alt="{html.escape(description)}" src="data:image/png;base64,{data}">')
+
+
+def report_evaluation(folder: Path) -> Path:
+    """Write the PNG and the CSV of each figure into `figures/`, and then `report.html`, one page that stands alone.
+
+    Returns:
+        The page's path.
+
+    Raises:
+        InputError: the folder holds no evaluation, or a damaged one.
+    """
+    metrics = read_json(folder / METRICS_FILE)
+    titles = {split: of["title"] for split, of in metrics["splits"].items()}
+    _write_figures(read_results(folder / RESULTS_FILE), titles, folder / FIGURES_FOLDER)
+    return _write_page(folder, metrics)
+
+
+def _write_figures(results: Mapping[str, SplitResult], titles: Mapping[str, str], folder: Path) -> None:
+    drawn = {
+        "tip_error": (tables.tip_error_table(results), figures.tip_error_figure),
+        "safety_ratio": (tables.safety_table(results), figures.safety_figure),
+        "control_error": (tables.control_error_table(results), figures.control_error_figure),
+        "drive_difference": (tables.drive_difference_table(results), figures.drive_difference_figure),
+    }
+    for name, (table, draw) in drawn.items():
+        with writing(folder / f"{name}.csv") as partial:
+            table.to_csv(partial, index=False)
+        with writing(folder / f"{name}.png") as partial:
+            partial.write_bytes(png(draw(table, titles)))
+
+
+def _write_page(folder: Path, metrics: Mapping[str, Any]) -> Path:
+    record, run, dataset = metrics["manifest"], metrics["run"], metrics["dataset"]
+    command = ["endopilot", "evaluate", run, "-o", str(folder), "--dataset", dataset]
+    for option in ("sequences", "seed"):
+        value = record["config"][option]
+        command += [] if value is None else [f"--{option}", str(value)]
+    content = ReportContent(
+        title="endopilot: evaluation of a trained run",
+        origin=f"The run {run}, on the dataset {dataset}.",
+        command=" ".join(command),
+        evaluation=folder,
+        run=run_path(Path(run)),
+        manifest=record,
+    )
+    page = folder / REPORT_FILE
+    write_report(page, content)
+    return page

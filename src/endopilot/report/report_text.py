@@ -144,7 +144,9 @@ def mean_errors(metrics: Mapping[str, Any], split: str) -> list[dict[str, str]]:
     return [
         {"series": series}
         | {
-            f"{symbol} {span}": _three_places(tip[series][coordinate].get(span, {}).get("mae"))
+            f"{symbol} {span}": "–"
+            if (mae := tip[series][coordinate].get(span, {}).get("mae")) is None
+            else f"{mae:.3f}"
             for coordinate, symbol in COORDINATES.items()
             for span in (*SPANS, "all")
         }
@@ -270,10 +272,6 @@ def _mean_sd(statistics: Mapping[str, Any]) -> str:
     if statistics.get("mae") is None:
         return "–"
     return f"{statistics['mae']:.2f} ± {statistics['sd']:.2f}"
-
-
-def _three_places(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3f}"
 
 
 def _gap(gap: Mapping[str, float | None]) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import plotly.graph_objects as go
 from jaxtyping import Float
+from markupsafe import Markup
 
 from endopilot.devices.device import Device
 from endopilot.devices.stack import lines_from_tips, shown_part
@@ -43,7 +44,6 @@ def navigation_scene(
     """Return a plotly figure of the wall, the centerline by section, and the first world of a rollout replayed.
 
     Args:
-        anatomy: the vessel.
         rollout: navigations with `shape`; without one the vessel is shown alone.
         devices: the wire and the catheters of the rollout, whose names and diameters are shown; a wire alone is drawn
             without.
@@ -57,6 +57,13 @@ def navigation_scene(
     return figure
 
 
+def scene_html(figure: go.Figure) -> Markup:
+    """Return a scene as a part of a page, which holds plotly's library."""
+    config = {"displaylogo": False, "responsive": True, "modeBarButtonsToRemove": ["toImage"]}
+    how = {"full_html": False, "include_plotlyjs": False, "auto_play": False, "div_id": "navigation"}
+    return Markup(figure.to_html(**how, config=config))
+
+
 def mark_target(
     figure: go.Figure,
     target: Float[np.ndarray, "3"],
@@ -66,10 +73,8 @@ def mark_target(
     """Add the target to a scene, and where the tip was when X-ray was on.
 
     Args:
-        figure: the scene.
         target: LPS mm.
         observed: places of the tip, LPS mm.
-        seconds: times of the exposures, s.
     """
     for points, name, marker, labels in (
         (target[None], "Target", {"symbol": "diamond", "size": 6}, ["target"]),

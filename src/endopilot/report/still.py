@@ -36,9 +36,7 @@ def render_still(
     """Render the vessel's translucent wall, its centerline, the wire and translucent catheters to a PNG.
 
     Args:
-        anatomy: the vessel.
         lines: nodes of the wire, then of each catheter, from its tip backwards, LPS mm; none to show the vessel alone.
-        path: where the picture goes.
         devices: wire and catheters, which are drawn as wide as each other's diameters; needed with catheters.
 
     Returns:

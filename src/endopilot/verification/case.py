@@ -49,11 +49,8 @@ class Case:
     """One comparison.
 
     Attributes:
-        case: what is compared.
         reference: value of the closed form, or of the other engine.
-        value: value of the core.
         error: relative error, or absolute where the reference is 0.
-        bar: largest error that passes.
         picture: the case's figure.
         skipped: why the comparison could not be made; empty if it was.
     """
@@ -68,17 +65,12 @@ class Case:
 
     def row(self) -> dict[str, Any]:
         """Return the row that `endopilot verify` prints; `passed` is None where the case was skipped."""
+        figures: dict[str, Any] = {name: getattr(self, name) for name in ("reference", "value", "error")}
         if self.skipped:
-            figures = dict.fromkeys(("reference", "value", "error"))
-            return {"case": f"{self.case} (skipped: {self.skipped})", **figures, "bar": self.bar, "passed": None}
-        return {
-            "case": self.case,
-            "reference": self.reference,
-            "value": self.value,
-            "error": self.error,
-            "bar": self.bar,
-            "passed": bool(self.error <= self.bar),
-        }
+            title, figures, passed = f"{self.case} (skipped: {self.skipped})", dict.fromkeys(figures), None
+        else:
+            title, passed = self.case, bool(self.error <= self.bar)
+        return {"case": title, **figures, "bar": self.bar, "passed": passed}
 
 
 def run(groups: Sequence[Callable[[], list[Case]]]) -> list[Case]:
@@ -121,12 +113,10 @@ def straight_rod(
 
     Args:
         elements: number of elements, the half clamped one included.
-        length_mm: free length, mm.
         bend: EI, N·mm².
         twist: GJ, N·mm².
         shear: κGA, N; very stiff if not given.
         stretch: EA, N; very stiff if not given.
-        radius_mm: outer radius, mm.
         drag: drag of a node, N·s/mm.
         clamp: nodes behind the wall that the drive holds.
     """
@@ -157,21 +147,17 @@ def uniform_rod(
     spin_drag: float,
 ) -> RodLayout:
     """Return a straight rod with the same section throughout: see `straight_rod`; elements are `size_mm` long."""
-
-    def all_of(value: float) -> Float[np.ndarray, "n"]:
-        return np.full(nodes, value)
-
-    return RodLayout(
-        abscissa_mm=size_mm * np.arange(nodes),
-        shear_n=all_of(shear),
-        stretch_n=all_of(stretch),
-        bend_n_mm2=all_of(bend),
-        twist_n_mm2=all_of(twist),
-        rest_curvature=np.zeros((nodes, 3)),
-        radius_mm=all_of(radius_mm),
-        drag_n_s_mm=all_of(drag),
-        spin_drag_n_mm_s=all_of(spin_drag),
-    )
+    section = {
+        "shear_n": shear,
+        "stretch_n": stretch,
+        "bend_n_mm2": bend,
+        "twist_n_mm2": twist,
+        "radius_mm": radius_mm,
+        "drag_n_s_mm": drag,
+        "spin_drag_n_mm_s": spin_drag,
+    }
+    throughout = {name: np.full(nodes, value) for name, value in section.items()}
+    return RodLayout(abscissa_mm=size_mm * np.arange(nodes), rest_curvature=np.zeros((nodes, 3)), **throughout)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,12 +206,7 @@ def equilibrium(
 
     Args:
         rod: the rod; all nodes but the last three are free.
-        loading: dead loads and springs.
-        samples: number of samples to run, if no control is given.
         control: motion of the clamp, mm/s and rad/s.
-        lumen: a wall.
-        friction: Coulomb coefficient.
-        config: settings of the core.
         insertion: where the wall of the clamp is, and the rod's direction.
         inserted_length_mm: free length; the rod's own if not given.
         free_behind_mm: the rod is held this far behind the wall of the clamp.
@@ -265,14 +246,9 @@ def driven(
     The axis of devices is there with tubes alone.
 
     Args:
-        rod: nodes and stiffnesses.
         control: mm/s and rad/s, of each tube if there are some.
         initial: inserted length (mm) and rotation (rad) at the start.
-        config: settings of the core.
         tubes: from the inside out, in place of the rod's stiffnesses.
-        loading: dead loads and springs.
-        lumen: a wall.
-        friction: Coulomb coefficient of the wall.
         insertion: where and in which direction the base slides.
         approach: bring the rod to its first inserted length from the ostium; else it starts there, straight.
         free_behind_mm: nodes farther behind the insertion follow the drive, mm.
