@@ -99,12 +99,12 @@ def test_a_fork_keeps_all_its_branches_and_is_not_called_a_contact(angles):
     assert length_of(anatomy) > 0.9 * 30 * (1 + len(angles)) and "touch" not in notes_of(anatomy)
 
 
-def flap(tears: int) -> Volume:
+def flap(tears: int, at_mm: float = 13.8, end_mm: float = 66.0) -> Volume:
     """Return a wide vessel along z with a wall one voxel thick inside, open at both its ends and at some tears."""
-    z, y, x = np.indices((70, 22, 22)) * 1.2
-    voxels = (np.hypot(x - 12.6, y - 12.6) < 10.0) & (z > 5) & (z < 78)
-    wall = (np.abs(x - 13.8) < 0.7) & (z > 14) & (z < 66)
-    for place in np.linspace(20, 60, tears + 2)[1:-1]:
+    z, y, x = np.indices((int(end_mm / 1.2) + 15, 22, 22)) * 1.2
+    voxels = (np.hypot(x - 12.6, y - 12.6) < 10.0) & (z > 5) & (z < end_mm + 12)
+    wall = (np.abs(x - at_mm) < 0.7) & (z > 14) & (z < end_mm)
+    for place in np.linspace(20, end_mm - 6, tears + 2)[1:-1]:
         wall &= ~((np.abs(z - place) < 2.5) & (np.abs(y - 12.6) < 3))
     return Volume(voxels & ~wall, np.full(3, 1.2), np.zeros(3), np.eye(3))
 
@@ -115,6 +115,12 @@ def test_a_flap_takes_nothing_away_whatever_its_tears(tears):
     notes = notes_of(anatomy)
     assert "apart from the lumen" not in notes and "another vessel" not in notes
     assert any(word in notes for word in ("touches itself", "a wall inside the vessel", "holds no loops"))
+
+
+def test_a_line_goes_through_a_tear_and_not_through_the_flap():
+    anatomy = extract_anatomy(lumen(flap(4, at_mm=15.0, end_mm=114.0)), name="tears")
+    narrowest = min(branch.centerline.radius.min() for branch in anatomy.tree.branches)
+    assert narrowest > 0.3  # mm; the wall is 1.2 mm thick
 
 
 def test_no_cut_of_a_loop_takes_vessel_away():

@@ -30,6 +30,9 @@ _STRAIGHT = 10
 _NEAR_WALL = 0.8
 """The ring on which the radius is measured, in distances to the wall."""
 
+_CROSSED = 0.25
+"""A straight way narrower than this share of a branch's radius crosses a wall: at flaps of one voxel 0.0 to 0.1."""
+
 _REFINEMENTS = 8
 _STEP_LIMIT = 0.3
 """A refinement moves a point by at most this share of its distance to the wall."""
@@ -71,7 +74,7 @@ def refined_lines(
             points, radius = begun or from_tip(drawn, width, points, radius, graph.points[nodes], step_mm)
         else:
             home[nodes[1:]] = len(lines)
-            place = _meeting_point(points, lines[parent])
+            place = _meeting_point(distance_map, points, float(radius[0]), lines[parent])
             points, radius = _joined(surface, lines[parent], place, points, radius, step_mm)
         lines.append(Line(points, radius, parent, place))
     return lines if ostium is None else without_inlets(distance_map, lines, ostium)
@@ -184,8 +187,11 @@ def _outside(points: Float[np.ndarray, "n 3"], parent: Line) -> int:
     return int(inside[-1]) + 1 if len(inside) else 1
 
 
-def _meeting_point(body: Float[np.ndarray, "n 3"], parent: Line) -> int:
-    """Return the index of the parent's point that the side branch's axis, drawn back, comes nearest to."""
+def _meeting_point(distance_map: DistanceMap, body: Float[np.ndarray, "n 3"], radius_mm: float, parent: Line) -> int:
+    """Return the index of the parent's point that the side branch's axis, drawn back, comes nearest to.
+
+    The straight way to it does not cross a wall, such as a flap beside the tear that the branch comes through.
+    """
     start = body[: min(len(body), _STRAIGHT + 1)]
     back = np.linalg.svd(start - start.mean(axis=0))[2][0]
     back *= np.sign(back @ (start[0] - start[-1]))
@@ -195,5 +201,10 @@ def _meeting_point(body: Float[np.ndarray, "n 3"], parent: Line) -> int:
     gap = np.linalg.norm(parent.points - body[0], axis=1)
     near = gap <= 2.0 * parent.radius + gap.min()
     score = np.where(near, miss + 0.1 * gap, np.inf)
-    place = int(score.argmin())
+    share = np.linspace(0.0, 1.0, _RING)[:, None, None]
+    least = (
+        sample(distance_map, (share * parent.points + (1 - share) * body[0]).reshape(-1, 3)).reshape(_RING, -1).min(0)
+    )
+    order = np.argsort(score, kind="stable")
+    place = int(next((i for i in order if least[i] > _CROSSED * radius_mm), order[0]))
     return int(np.clip(place, 1, len(parent.points) - 2))

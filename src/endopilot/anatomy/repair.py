@@ -249,7 +249,8 @@ def _left_out(
         )
     rest = order[len(remarks) :]
     if len(rest):
-        kind = "more pieces" if remarks else "pieces apart from the lumen"
+        kind = "piece" if len(rest) == 1 else "pieces"
+        kind = f"more {kind}" if remarks else f"{kind} apart from the lumen"
         longest, size = float(extent[rest].max()), int(sizes[lost[rest]].sum())
         remarks.append(f"{len(rest)} {kind} of up to {longest:.0f} mm left out ({size} voxels)")
     return remarks
