@@ -117,7 +117,9 @@ def likely_inlets(
         place = min(len(path) - before_cap(tree, path), len(path) - 1)
         radius = float(np.median(clearance[place : place + 5]))
         widest, bulge, neck = _bulge(points, clearance, len(path))
-        dome, open_, middle_of_end = float(bulge > _NECK), 1.0, points[0]
+        near = np.linalg.norm(np.reshape(lines, (-1, 2, 3)) - points[0], axis=2) <= max(radius, tree.spacing_mm)
+        shared = len(lines) > 0 and near.any(axis=1).mean() >= 0.5  # half of the lines: a trunk, narrow as it forks
+        dome, open_, middle_of_end = float(bulge > _NECK and not shared), 1.0, points[0]
         if triangles is not None:
             behind = points[min(place + 5, len(points) - 1)]
             axis = (points[place] - behind) / max(np.linalg.norm(points[place] - behind), 1e-9)
@@ -131,7 +133,6 @@ def likely_inlets(
         away = np.linalg.norm(tree.points[middle] - points[0], axis=1)
         score *= 0.6 - 0.4 * (rank_correlation(away, widths) if np.ptp(widths) > 0 else 0.0)
         if lines:
-            near = np.linalg.norm(np.array(lines) - points[0], axis=2) <= max(radius, tree.spacing_mm)
             score *= max(float(np.where(near[:, 0], 1.0, _LINE_ENDS * near[:, 1]).mean()), _NO_LINE)
         found.append(InletEnd(int(path[-1]), middle_of_end, radius, float(score)))
     return sorted(found, key=lambda end: -end.score)
