@@ -5,7 +5,7 @@ without an advance: after how many the tip first moves, and after how many it sn
 episode that is predicted: to which side the tip lies, and which branch it takes.
 
     python examples/robot_phantom_logs.py FOLDER LOGS
-    endopilot anatomy FOLDER/phantom2d-occupancy-dev-0.095mm-px.vtp -o PHANTOM
+    endopilot anatomy FOLDER/phantom2d-occupancy-dev-0.095mm-px.vtp --scale 1 -o PHANTOM
     python -m benchmarks robot-twist --logs LOGS --anatomy PHANTOM
 """
 

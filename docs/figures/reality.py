@@ -56,7 +56,7 @@ FIRST_MM, SNAP_MM = 0.3, 0.8
 def main() -> None:
     """Replay the sessions with each robot; tell and draw what real and simulated tips have in common."""
     folder, robot_file, device = Path(sys.argv[1]), sys.argv[2], sys.argv[3]
-    phantom = endopilot.extract_anatomy(next(folder.glob("phantom2d*.vtp")))
+    phantom = endopilot.extract_anatomy(next(folder.glob("phantom2d*.vtp")), config=endopilot.AnatomyConfig(scale=1.0))
     with tempfile.TemporaryDirectory() as made:
         logs = [convert(path, Path(made)) for path in sorted(folder.glob("2D_phantom_*.csv"))]
     episodes, repeats = [], []

@@ -124,7 +124,7 @@ def test_a_header_full_of_identifiers_leaves_no_trace(case, tmp_path, capfd, cap
     with warnings.catch_warnings(record=True) as warned, caplog.at_level(logging.DEBUG):
         warnings.simplefilter("always")
         command("segment", case, "-o", out / "mask.nii.gz", "--picture", out / "mask.png", *_SEEDS)
-        command("segment", case / "slice-0003.dcm", "-o", out / "mask.dcm", *_SEEDS)
+        command("segment", case / "slice-0003.dcm", "-o", out / "seg.dcm", *_SEEDS)
         command("anatomy", out / "mask.nii.gz", "-o", out / "anatomy")
         command("simulate", out / "anatomy", "-o", out / "rollout.parquet", "--sequences", "1", "--seconds", "1")
         file = sorted(case.iterdir())[5]
@@ -138,7 +138,7 @@ def test_a_header_full_of_identifiers_leaves_no_trace(case, tmp_path, capfd, cap
             told.append(refused(capfd, "segment", case, "-o", out / "other.nii.gz", *_SEEDS))
     assert "truncated" in told[0] and "damaged" in told[1] and all("slice" in line for line in told)
     files = [path for path in out.rglob("*") if path.is_file()]
-    assert {"mask.nii.gz", "mask.json", "mask.png", "mask.dcm", "anatomy.json", "rollout.parquet"} <= {
+    assert {"mask.nii.gz", "mask.json", "mask.png", "seg.dcm", "anatomy.json", "rollout.parquet"} <= {
         f.name for f in files
     }
     for path in files:

@@ -126,10 +126,10 @@ def test_a_straightened_ct_is_told_by_every_command(patient, tmp_path, capsys, m
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "examples"))
     _, j, i = np.indices((40, 40, 40))
     hu = np.where(np.hypot(j - 20, i - 20) < 7, 350, -90).astype(np.int16)
-    write_volume(Volume(hu, np.array([0.5, 0.5, 1.0]), np.zeros(3), np.eye(3)), tmp_path / "straight")
+    write_volume(Volume(hu, np.full(3, 2.0), np.array([-25.0, -45.0, -72.0]), np.eye(3)), tmp_path / "straight")
     turned = ["1", "0", "0", "0.002", "0.999998", "0"]
     skewed = _changed(tmp_path / "straight", tmp_path / "ct", ImageOrientationPatient=turned)
-    seed = ("10", "10", "20")
+    seed = ("15", "-5", "0")
     method = ("--method", "my_segmentation:threshold", "--options", "above=200", "--seeds", *seed)
     note = "ct: the axes in ImageOrientationPatient and ImagePositionPatient are off unit vectors"
     figures = run(capsys, "segment", skewed, "-o", tmp_path / "mask.nii.gz", *method)

@@ -90,7 +90,7 @@ def test_the_public_logs_have_the_play_that_was_measured_on_them(tmp_path) -> No
         pytest.skip("the public logs are not here")
     from robot_phantom_logs import convert
 
-    phantom = endopilot.extract_anatomy(next(folder.glob("phantom2d*.vtp")))
+    phantom = endopilot.extract_anatomy(next(folder.glob("phantom2d*.vtp")), config=endopilot.AnatomyConfig(scale=1.0))
     logs = [convert(path, tmp_path) for path in sorted(folder.glob("2D_phantom_Mid_M1*.csv"))]
     found = calibrate(logs, phantom, endopilot.read_wire("workhorse-014"), config=CalibrateConfig(wires=0, episodes=12))
     assert abs(found.robot.wire.gain_translation - 1.01) < 0.03

@@ -15,7 +15,7 @@ from endopilot.anatomy.read_source import MASK_SUFFIXES, SURFACE_SUFFIXES, read_
 from endopilot.anatomy.sources import AnatomySource
 from endopilot.errors import InputError
 from endopilot.parallel import each
-from endopilot.runs import claim, claiming
+from endopilot.runs import claiming
 
 
 def extract_all(
@@ -49,8 +49,16 @@ def extract_all(
         raise InputError(f"ostium_mm={config.ostium_mm}: cannot serve {len(sources)} patients; make them one by one")
     folders = {source: output / name for source, name in zip(sources, _names(sources), strict=True)}
     reading = {"label": label, "threshold": threshold}
-    claim(output, "endopilot anatomy", sources=list(folders), **reading, config=config, version=__version__)
-    bad = each("Anatomies", list(sources), partial(_make, folders=folders, reading=reading, config=config))
+    with claiming(output, "endopilot anatomy", sources=list(folders), **reading, config=config, version=__version__):
+        return _made(folders, output, reading, config)
+
+
+def _made(
+    folders: dict[Path, Path], output: Path, reading: dict[str, Any], config: AnatomyConfig
+) -> tuple[list[Path], dict[str, str]]:
+    """Make the anatomies, and return their folders and why others were rejected."""
+    sources = list(folders)
+    bad = each("Anatomies", sources, partial(_make, folders=folders, reading=reading, config=config))
     rejected = {str(source): str(bad[source]) for source in sources if source in bad}
     if len(rejected) == len(sources):
         raise InputError(

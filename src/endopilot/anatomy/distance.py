@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float
 
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.errors import InputError
-from endopilot.imaging.grid import dilated
 from endopilot.lines import length_along
 from endopilot.types import Centerline, DistanceMap, Insertion, VesselTree, Volume
 
@@ -105,6 +104,8 @@ def distance_map_from_surface(surface: Surface, *, spacing_mm: float, band_mm: f
     shape, origin = _grid(lower, surface.vertices.max(axis=0) + band_mm, spacing_mm)
     inside = surface.inside(shape, origin, spacing_mm)
     surface = surface.refined(3.0 * spacing_mm)
+    from endopilot.imaging.grid import dilated  # brings SimpleITK, which simulating does without
+
     wanted = dilated(inside, math.ceil(band_mm / spacing_mm) + 2)
     values = _far_field(surface, inside, wanted, origin, spacing_mm, band_mm)
     outside = dilated(inside, _NEAR_WALL[0]) & ~inside
@@ -128,6 +129,8 @@ def _far_field(
 
     At a distance ρ from the medial axis this errs by at most h²/2ρ, so it serves away from the wall.
     """
+    from endopilot.imaging.grid import dilated  # brings SimpleITK, which simulating does without
+
     half = np.full(tuple((np.array(inside.shape) + 1) // 2 + 1), -band, dtype=np.float32)
     second, asked = inside[::2, ::2, ::2], wanted[::2, ::2, ::2]
     if (deep := second & ~dilated(~second, _NEAR_WALL[1])).any():

@@ -60,7 +60,11 @@ _SIDE_BY_SIDE_MM = 3.0
 _NEAR_RADII, _ARM_RADII = 8.0, 4.0
 _ROUNDS = 4
 
-Kind = Literal["itself", "loop", "side", "vessels", "perhaps", "flap", "hole"]
+_MOST_RINGS = 8
+"""A lumen with more rings is no vessel that touches itself, and is left as it is: a dissection's two lumens have 48
+between rough tears, generated flaps have 5 at most."""
+
+Kind = Literal["itself", "loop", "side", "vessels", "perhaps", "flap", "hole", "porous"]
 
 _SAID: dict[Kind, tuple[str, str]] = {
     "itself": ("the vessel touches itself and was parted at", " ({:.0f} mm of vessel between the two sides)"),
@@ -70,6 +74,11 @@ _SAID: dict[Kind, tuple[str, str]] = {
     "perhaps": ("two vessels may touch, or one forks; they were left joined at", ""),
     "flap": ("a wall inside the vessel, such as a flap, was left with its openings at", " (ring of {:.0f} mm)"),
     "hole": ("tunnels were left as they are, at", " ({:.0f} mm around)"),
+    "porous": (
+        "the lumen closes on itself in many places, as those of a dissection do at tears: they were left open, and the "
+        "tree takes one way round each; rings begin at",
+        " ({:.0f} mm)",
+    ),
 }
 
 
@@ -79,7 +88,7 @@ class Touch:
 
     Attributes:
         kind: parted: the vessel touches itself, a loop is narrowest, distant parts lie side by side, two vessels
-            touch; left: two vessels perhaps touch, a flap has an opening, a tunnel is small.
+            touch; left: two vessels perhaps touch, a flap has an opening, a tunnel is small, or there are many rings.
         place: where, LPS mm.
         size_mm: length of the vessel between the two sides, or of the contact.
     """
@@ -135,6 +144,8 @@ def parted(mask: Volume) -> tuple[Volume, list[Touch], MedialLines, MedialLines]
         lines = before if parting.result is mask else traced_lines(parting.result)
         rings = _rings(thin, mask)
         long = [ring for ring in rings if ring.around_mm >= SHORTEST_LOOP_MM]
+        if parting.result is mask and len(porous := _porous(mask, thin, long)) > _MOST_RINGS:
+            return mask, porous, before, before
         crossings = itertools.chain(_crossings(thin, long), _crossings(lines, []))
         opened = sum([parting.crossing(each, thin, long) for each in crossings])
         opened = opened or sum([parting.ring(each, thin) for each in long])
@@ -149,6 +160,14 @@ def parted(mask: Volume) -> tuple[Volume, list[Touch], MedialLines, MedialLines]
         result, lines = aside[0], traced_lines(aside[0])
         parting.found.append(aside[1])
     return result, parting.found, before, lines
+
+
+def _porous(mask: Volume, thin: MedialLines, rings: list[_Ring]) -> list[Touch]:
+    """Return the places of a mask's rings, the longest first."""
+    parting = _Parting(mask)
+    for ring in sorted(rings, key=lambda ring: -ring.around_mm):
+        parting.say("porous", thin.local[ring.nodes[0]], ring.around_mm)
+    return parting.found
 
 
 def touch_remarks(found: list[Touch]) -> list[str]:
