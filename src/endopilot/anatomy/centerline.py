@@ -33,6 +33,9 @@ _NEAR_WALL = 0.8
 _CROSSED = 0.25
 """A straight way narrower than this share of a branch's radius crosses a wall: at flaps of one voxel 0.0 to 0.1."""
 
+_WAY = 12
+"""Places at which such a way is looked at."""
+
 _REFINEMENTS = 8
 _STEP_LIMIT = 0.3
 """A refinement moves a point by at most this share of its distance to the wall."""
@@ -201,10 +204,11 @@ def _meeting_point(distance_map: DistanceMap, body: Float[np.ndarray, "n 3"], ra
     gap = np.linalg.norm(parent.points - body[0], axis=1)
     near = gap <= 2.0 * parent.radius + gap.min()
     score = np.where(near, miss + 0.1 * gap, np.inf)
-    share = np.linspace(0.0, 1.0, _RING)[:, None, None]
-    least = (
-        sample(distance_map, (share * parent.points + (1 - share) * body[0]).reshape(-1, 3)).reshape(_RING, -1).min(0)
-    )
+
+    def is_open(place: int) -> bool:
+        way = np.linspace(body[0], parent.points[place], _WAY)
+        return bool(sample(distance_map, way).min() > _CROSSED * radius_mm)
+
     order = np.argsort(score, kind="stable")
-    place = int(next((i for i in order if least[i] > _CROSSED * radius_mm), order[0]))
+    place = int(next((i for i in order if is_open(int(i))), order[0]))
     return int(np.clip(place, 1, len(parent.points) - 2))
