@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -171,24 +171,20 @@ def surface_from_mask(mask: Volume) -> Surface:
     """
     from skimage.measure import marching_cubes
 
-    margin = 4
-    box = filled_box(mask.voxels)
-    lower = np.array([part.start for part in box])
-    inside = np.pad(np.asarray(mask.voxels[box], dtype=bool), margin)
+    level, corner = smooth_level(mask)
     edges = mask.spacing_mm[::-1]
-    level = level_function(inside, edges)
     if level.max() <= 0:
         raise InputError(
             f"the mask is nowhere thick enough to hold a lumen ({int(mask.voxels.sum())} voxels of "
             f"{mask.spacing_mm.round(2).tolist()} mm); segment on a finer grid"
         )
-    ratio = edges / edges.min()
+    shape, ratio = np.array(level.shape), edges / edges.min()
     factor = np.where(ratio > 1.5, np.ceil(ratio / 1.5), 1.0)
     for axis in np.flatnonzero(factor > 1):
         level = _finer(level, int(axis), int(factor[axis]))
-    scale = (np.array(inside.shape) - 1) / (np.array(level.shape) - 1)
+    scale = (shape - 1) / (np.array(level.shape) - 1)
     vertices, faces, _, _ = marching_cubes(level, 0.0)
-    index = vertices * scale - margin + lower
+    index = vertices * scale + corner
     surface = Surface(mask.index_to_world(index[:, ::-1].astype(float)), faces.astype(np.int64))
     return surface if surface.volume > 0 else Surface(surface.vertices, surface.faces[:, ::-1])
 
@@ -206,6 +202,17 @@ def filled_box(voxels: Bool[np.ndarray, "nz ny nx"]) -> tuple[slice, slice, slic
 def blur_voxels(edges_mm: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     """Return the standard deviation in voxels of the Gaussian along each axis, for voxels with these edges in mm."""
     return SMOOTHING_VOXELS * (edges_mm.max() / edges_mm) ** ACROSS_EDGES
+
+
+@lru_cache(maxsize=1)
+def smooth_level(mask: Volume) -> tuple[Float[np.ndarray, "nz ny nx"], Int[np.ndarray, "3"]]:
+    """Return the `level_function` of a mask on its filled box and a margin, and the voxel (z, y, x) it begins at.
+
+    The last mask's is kept: what it is too thin to show is looked for before the wall is made of it.
+    """
+    margin, box = 4, filled_box(mask.voxels)
+    inside = np.pad(np.asarray(mask.voxels[box], dtype=bool), margin)
+    return level_function(inside, mask.spacing_mm[::-1]), np.array([part.start for part in box]) - margin
 
 
 def level_function(
