@@ -28,6 +28,10 @@ _WORTH_THREADS = 20_000
 """With fewer points than this, starting threads takes longer than they save."""
 
 
+_SLICES = 16
+"""A wall's inside is found this many slices at a time: of 170 000 triangles in 0.15 s, in 1.2 s all at once."""
+
+
 @dataclass(frozen=True, eq=False)
 class Surface:
     """A triangulated wall.
@@ -126,22 +130,35 @@ class Surface:
     def inside(
         self, shape: tuple[int, int, int], origin: Float[np.ndarray, "3"], spacing_mm: float
     ) -> Bool[np.ndarray, "nz ny nx"]:
-        """Return which points of a grid along the LPS axes lie inside a closed wall."""
+        """Return which points of a grid along the LPS axes lie inside a closed wall.
+
+        VTK looks at every triangle for every slice, so that it is given a few slices at a time, and what crosses them.
+        """
         from vtkmodules.util.numpy_support import vtk_to_numpy
         from vtkmodules.vtkImagingStencil import vtkImageStencilToImage, vtkPolyDataToImageStencil
 
-        stencil = vtkPolyDataToImageStencil()
-        stencil.SetInputData(self.to_polydata())
-        stencil.SetOutputOrigin(*(float(value) for value in origin))
-        stencil.SetOutputSpacing(spacing_mm, spacing_mm, spacing_mm)
-        stencil.SetOutputWholeExtent(0, shape[2] - 1, 0, shape[1] - 1, 0, shape[0] - 1)
-        image = vtkImageStencilToImage()
-        image.SetInputConnection(stencil.GetOutputPort())
-        image.SetInsideValue(1)
-        image.SetOutsideValue(0)
-        image.SetOutputScalarTypeToUnsignedChar()
-        image.Update()
-        return vtk_to_numpy(image.GetOutput().GetPointData().GetScalars()).reshape(shape).astype(bool)
+        heights = self._corners[..., 2] - origin[2]
+        low, high = heights.min(axis=1) / spacing_mm, heights.max(axis=1) / spacing_mm
+        result = np.zeros(shape, dtype=bool)
+        for first in range(0, shape[0], _SLICES):
+            last = min(first + _SLICES, shape[0]) - 1
+            crossing = (high >= first - 1) & (low <= last + 1)
+            if not crossing.any():
+                continue
+            stencil = vtkPolyDataToImageStencil()
+            stencil.SetInputData(Surface(self.vertices, self.faces[crossing]).to_polydata())
+            stencil.SetOutputOrigin(*(float(value) for value in origin))
+            stencil.SetOutputSpacing(spacing_mm, spacing_mm, spacing_mm)
+            stencil.SetOutputWholeExtent(0, shape[2] - 1, 0, shape[1] - 1, first, last)
+            image = vtkImageStencilToImage()
+            image.SetInputConnection(stencil.GetOutputPort())
+            image.SetInsideValue(1)
+            image.SetOutsideValue(0)
+            image.SetOutputScalarTypeToUnsignedChar()
+            image.Update()
+            voxels = vtk_to_numpy(image.GetOutput().GetPointData().GetScalars())
+            result[first : last + 1] = voxels.reshape(last + 1 - first, *shape[1:])
+        return result
 
     def to_polydata(self):
         """Return the wall as a `vtkPolyData`."""
