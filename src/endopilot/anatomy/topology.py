@@ -64,7 +64,7 @@ _MOST_RINGS = 8
 """A lumen with more rings is no vessel that touches itself, and is left as it is: a dissection's two lumens have 48
 between rough tears, generated flaps have 5 at most."""
 
-Kind = Literal["itself", "loop", "side", "vessels", "perhaps", "flap", "hole", "porous"]
+Kind = Literal["itself", "loop", "side", "vessels", "perhaps", "flap", "hole", "porous", "round"]
 
 _SAID: dict[Kind, tuple[str, str]] = {
     "itself": ("the vessel touches itself and was parted at", " ({:.0f} mm of vessel between the two sides)"),
@@ -79,7 +79,17 @@ _SAID: dict[Kind, tuple[str, str]] = {
         "tree takes one way round each; rings begin at",
         " ({:.0f} mm)",
     ),
+    "round": ("the lumen closes a loop, of which a tree takes one way round; it is narrowest at", " ({:.0f} mm)"),
 }
+
+_LEFT: dict[Kind, Kind | None] = {
+    "itself": "perhaps",
+    "side": "perhaps",
+    "vessels": "perhaps",
+    "loop": "round",
+    "hole": None,
+}
+"""What is said of a wall, of which nothing is parted; small tunnels are its voxels'."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,11 +180,20 @@ def _porous(mask: Volume, thin: MedialLines, rings: list[_Ring]) -> list[Touch]:
     return parting.found
 
 
-def touch_remarks(found: list[Touch]) -> list[str]:
-    """Return what is said of places where a mask touches itself: one remark for each kind, the largest place first."""
+def touch_remarks(found: list[Touch], *, parted: bool = True) -> list[str]:
+    """Return what is said of places where a lumen touches itself: one remark for each kind, the largest place first.
+
+    Args:
+        found: the places.
+        parted: whether the lumen was parted there; a surface is not.
+    """
+    kinds = [touch.kind if parted else _LEFT.get(touch.kind, touch.kind) for touch in found]
     remarks = []
     for kind, (text, size) in _SAID.items():
-        own = sorted((touch for touch in found if touch.kind == kind), key=lambda touch: -touch.size_mm)
+        own = sorted(
+            (touch for touch, told in zip(found, kinds, strict=True) if told == kind), key=lambda t: -t.size_mm
+        )
+        size = size if kind != "perhaps" else ""
         places = [place_text(touch.place) + size.format(touch.size_mm) * (touch.size_mm > 0) for touch in own]
         if places:
             more = f" and {len(places) - MOST_LISTED} places more" if len(places) > MOST_LISTED else ""
