@@ -31,6 +31,7 @@ BENCHMARKS = {
     "anatomy": "anatomy.extraction:bench_anatomy",
     "labels": "anatomy.labels:measure_labels",
     "ostia": "anatomy.ostia:bench_ostia",
+    "touching": "anatomy.touching:bench_touching",
     "imaging": "imaging.segmentation:bench_imaging",
     "xray": "imaging.xray:bench_xray",
     "xray-wires": "imaging.wires:bench_wires",
