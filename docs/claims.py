@@ -46,9 +46,10 @@ def rows() -> Iterator[tuple[str, str, str, str, str]]:
     """Yield claim, figure, day and machine, command, and link of each claim."""
     for page, claimed in claims().items():
         for each in claimed:
-            made = [cell(page, place)[1] for place in re.findall(r"{(.+?)}", each["figure"])]
-            figure = re.sub(r"{(.+?)}", lambda found: cell(page, found[1])[0], each["figure"])  # noqa: B023
-            yield each["claim"], figure, made[0] or "–", f"`{each['command']}`", f"[{page}]({page}.md)"
+            parts = re.split(r"{(.+?)}", each["figure"])
+            cells = [cell(page, place) for place in parts[1::2]]
+            parts[1::2] = [figure for figure, _ in cells]
+            yield each["claim"], "".join(parts), cells[0][1] or "–", f"`{each['command']}`", f"[{page}]({page}.md)"
 
 
 def table() -> list[str]:
