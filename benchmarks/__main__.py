@@ -24,6 +24,7 @@ BENCHMARKS = {
     "robustness": "core.robustness:measure_robustness",
     "verification": "verification.verification:bench_verification",
     "published": "published.published:bench_published",
+    "judges": "judges.judges:bench_judges",
     "robot-twist": "robot.twist:bench_twist",
     "robot-blind": "robot.blind:bench_blind",
     "dataset": "dataset:bench_dataset",
