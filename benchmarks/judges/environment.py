@@ -33,7 +33,8 @@ def environment(name: str, packages: tuple[str, ...], folder: Path, *, newest: b
     shutil.rmtree(root, ignore_errors=True)
     base = next(filter(None, map(_found, ("3.14", "3.13", "3.12"))), sys.executable) if newest else sys.executable
     with progress(f"Installing {name}", 1) as advance:
-        for command in ([base, "-m", "venv", str(root)], [str(python), "-m", "pip", "install", "-q", *packages]):
+        pip = [sys.executable, "-m", "pip", "--python", str(python), "install", "-q"]
+        for command in ([base, "-m", "venv", "--without-pip", str(root)], [*pip, *packages]):
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             if done.returncode:
                 lines = [line for line in done.stderr.splitlines() if line.startswith("ERROR")] or ["pip failed"]

@@ -65,7 +65,7 @@ def beside_vmtk(environments: Path) -> list[dict[str, Any]]:
             found = extract_anatomy(mask, name="judged").tree
             ours, theirs = time.process_time() - started, _vmtk(python, surface_from_mask(mask.volume), tree)
             for program, lines, seconds in (("endopilot", sampled(found), ours), ("VMTK", *theirs)):
-                rows.append({"lumen": name, "program": program} | _errors(tree, lines) | {"seconds": round(seconds, 2)})
+                rows.append({"lumen": name, "program": program} | errors(tree, lines) | {"seconds": round(seconds, 2)})
             advance()
     return rows
 
@@ -93,7 +93,7 @@ def _vmtk(python: Path, wall: Surface, tree: VesselTree) -> tuple[Lines, float]:
     return (points, np.concatenate([line["radius"] for line in made["lines"]])), made["seconds"]
 
 
-def _errors(tree: VesselTree, lines: Lines) -> dict[str, float]:
+def errors(tree: VesselTree, lines: Lines) -> dict[str, float]:
     """Return how far centerlines lie off the true axes, and radii off the true ones, mm."""
     points, radius = lines
     ends = [
