@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import runpy
 from dataclasses import asdict
 from pathlib import Path
@@ -54,10 +55,9 @@ def test_the_shortest_first_navigation_is_confirmed(path, tmp_path):
     content["scores"] = _scores(submission, {name: submission.navigations[name][:1]})
     write_json(tmp_path / "submission.json", content)
     found = check_submission(tmp_path / "submission.json")
-    if not found.confirmed and found.remarks:
-        pytest.skip(f"{found.difference}; {', '.join(found.remarks)}")
-    assert found.confirmed, found.difference
-    assert found.navigations == 1
+    if found.verdict == "not judged" and "CI" not in os.environ:  # there it is not to pass
+        pytest.skip(f"{found.verdict}: {found.remarks[0]}")
+    assert found.confirmed and found.navigations == 1, (found.verdict, found.difference, found.remarks)
 
 
 def test_an_interval_is_wilsons(script):

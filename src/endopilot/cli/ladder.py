@@ -29,9 +29,9 @@ def command(
         mismatch: model mismatch, a share between 0 and 1 such as 0.2: friction, tip stiffness, latency and ostium
             differ by it from what the policy is given, one after another and together. The scores of each case are
             printed instead of the ladder's.
-        check: a submission.json. Its recorded controls are driven again, without the policy, and its scores confirmed
-            to the bit, or but for rounding with another kernel of linear algebra; exit code 1 if one differs. No
-            policy climbs then.
+        check: a submission.json. Its recorded controls are driven again, a shipped policy also decides again, and what
+            that gives is printed; exit code 1 if anything differs from the file, or cannot be judged here. No policy
+            climbs then.
         dataset: folder of a LeRobot data set of the navigations, with X-ray images, their recordings being driven again
             (docs/concepts/dataset.md).
         page: write index.html with pictures and replays; --no-page leaves it out.
@@ -63,7 +63,9 @@ def _confirmed(file: Path, dataset: Path | None) -> Answer:
     checked = check_submission(file)
     if checked.confirmed and dataset is not None:
         _write_dataset(file, dataset)
-    return Answer({"confirmed": checked.confirmed} | asdict(checked), passed=checked.confirmed)
+    about = {"confirmed": checked.confirmed} | asdict(checked)
+    shown = [{name: value for name, value in about.items() if name != "scores"}, checked.scores]
+    return Answer(about, shown, passed=checked.confirmed)
 
 
 def _write_dataset(file: Path, dataset: Path) -> None:

@@ -2,34 +2,45 @@
 
 from __future__ import annotations
 
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import model_validator
+from pydantic import BeforeValidator, model_validator
 
 from endopilot import __version__
-from endopilot.devices.robot import ASSUMED, RobotConfig, read_robot
+from endopilot.devices.robot import ASSUMED, read_robot
 from endopilot.files import read_json, write_json
-from endopilot.ladder.attempt import attempt, navigation_seed
+from endopilot.ladder.attempt import attempt
 from endopilot.ladder.scores import score
-from endopilot.ladder.submission import MOST_PATIENTS, SUBMISSION_FILE, task_digest, write_submission
+from endopilot.ladder.submission import MOST_PATIENTS, SUBMISSION_FILE, write_submission
+from endopilot.ladder.terms import Terms, navigation_seed, task_digest
 from endopilot.navigation.policies import POLICIES, make_policy
 from endopilot.runs import claim, make_missing
 from endopilot.settings import Text, Within, settings
-from endopilot.simulation.world import NOMINAL, World, read_world
+from endopilot.simulation.world import NOMINAL, read_world
 from endopilot.tasks.task import NEWEST, LadderVersion, Task, find_task, list_tasks
 
 SCORES_FILE = "ladder.json"
+
+
+def _named(policy: Any) -> Any:
+    """Return the MODULE:OBJECT of a FILE.py:OBJECT, whose folder is looked in from now on."""
+    file, found, thing = policy.partition(".py:") if isinstance(policy, str) else ("", "", "")
+    if not found:
+        return policy
+    sys.path.insert(0, str(Path(file).resolve().parent))
+    return f"{Path(file).name}:{thing}"
 
 
 @settings
 class LadderConfig:
     """What climbs the ladder, and how much of it."""
 
-    policy: str = "forward"
+    policy: Annotated[str, BeforeValidator(_named)] = "forward"
     """forward, spin, retract-rotate, cloned, agent, oracle, open-loop, with a catheter in-turn or catheter-alone,
-    the name of a policy of an installed package, or MODULE:OBJECT of a policy of your own."""
+    the name of a policy of an installed package, or MODULE:OBJECT or FILE.py:OBJECT of a policy of your own."""
     tasks: tuple[str, ...] = ()
     """Names of the tasks; all if none is given."""
     patients: Annotated[int, Within(1, MOST_PATIENTS)] | None = None
@@ -43,6 +54,9 @@ class LadderConfig:
     """Name of the robot that drives (docs/concepts/robot.md), or a YAML file."""
     world: Text = NOMINAL
     """Name of the world that reality is (docs/concepts/worlds.md), or a YAML file. The policy does not know it."""
+    drawn: Text | None = None
+    """A word, such as the commit that brings a policy: patients that nobody has seen are drawn from the hash of word,
+    policy and terms, and the policy runs in a process of its own that is handed observations alone."""
 
     @model_validator(mode="after")
     def _consistent(self) -> LadderConfig:
@@ -59,6 +73,19 @@ class LadderConfig:
     def chosen(self) -> list[Task]:
         """The tasks named, or all."""
         return [task for task in list_tasks(self.version) if not self.tasks or task.name in self.tasks]
+
+    @property
+    def terms(self) -> Terms:
+        """On what terms the policy climbs.
+
+        Raises:
+            InputError: no such robot or world.
+        """
+        terms = Terms(self.version, read_robot(self.robot), read_world(self.world))
+        if self.drawn is None:
+            return terms
+        patients = self.patients or max(len(task.ladder.numbers) for task in self.chosen)
+        return terms.drawn(self.policy, POLICIES.origin(self.policy), self.drawn, patients)
 
     def paths(self, folder: Path) -> list[Path]:
         """Return the result files of the navigations in a folder, TASK/PLACE.json."""
@@ -88,36 +115,33 @@ def climb(*, output: str | Path, config: LadderConfig | None = None) -> list[dic
     config = config or LadderConfig()
     output = Path(output)
     make_policy(config.policy)
-    tasks = config.chosen
-    robot, world = read_robot(config.robot), read_world(config.world)
-    claim(output, "endopilot ladder", **identity(config.policy, config.version, robot, world))
+    terms = config.terms
+    claim(output, "endopilot ladder", **identity(config.policy, terms))
     paths = config.paths(output)
-    navigate = partial(_navigate, policy=config.policy, version=config.version, robot=robot, world=world)
-    make_missing(f"Ladder, {config.policy}", paths, navigate)
+    make_missing(f"Ladder, {config.policy}", paths, partial(_navigate, policy=config.policy, terms=terms))
+    tasks = config.chosen
     results = {task.name: [read_json(path) for path in paths if path.parent.name == task.name] for task in tasks}
     rows = score(tasks, results)
     most = max(map(len, results.values()))
     content = {"policy": config.policy, "ladder": config.version, "robot": config.robot, "patients": most}
-    content |= {"world": {"name": config.world, **world.differences()}, "scores": rows}
+    content |= {"world": {"name": config.world, **terms.world.differences()}, "key": terms.key(), "scores": rows}
+    content |= {"request": terms.request} if terms.request else {}
     write_json(output / SCORES_FILE, content)
-    write_submission(output / SUBMISSION_FILE, config.policy, config.version, results, rows, robot, world)
+    write_submission(output / SUBMISSION_FILE, config.policy, terms, results, rows, drawn=config.drawn)
     return rows
 
 
-def identity(
-    policy: str, version: LadderVersion, robot: RobotConfig | None = None, world: World | None = None
-) -> dict[str, Any]:
+def identity(policy: str, terms: Terms) -> dict[str, Any]:
     """Return what a policy's results follow from: its source, tasks, their devices, robot, world and version."""
-    tasks = {task.name: task_digest(task) for task in list_tasks(version)}
-    origin = POLICIES.origin(policy)
-    found = {"policy": policy, "origin": origin, "tasks": tasks, "robot": robot or RobotConfig()}
-    return found | {"world": (world or World()).differences(), "version": __version__}
+    tasks = {task.name: task_digest(task) for task in list_tasks(terms.version)}
+    found = {"policy": policy, "origin": POLICIES.origin(policy), "tasks": tasks, "robot": terms.robot}
+    found |= {"request": terms.request} if terms.request else {}
+    return found | {"world": terms.world.differences(), "version": __version__}
 
 
-def _navigate(path: Path, *, policy: str, version: LadderVersion, robot: RobotConfig, world: World) -> None:
+def _navigate(path: Path, *, policy: str, terms: Terms) -> None:
     """Do one navigation and write what came of it."""
-    task, place = find_task(path.parent.name, version=version), int(path.stem)
+    task, place = terms.task(path.parent.name), int(path.stem)
     navigation = task.ladder_navigation(place)
-    result = attempt(policy, navigation, seed=navigation_seed(task, place), robot=robot, world=world)
-    about = {"task": task.name, "ladder": version, "robot": robot, "world": world, "patient": navigation.anatomy.name}
-    write_json(path, about | result)
+    result = attempt(policy, navigation, seed=navigation_seed(task, place), terms=terms)
+    write_json(path, {"task": task.name, **terms.about(), "patient": navigation.anatomy.name} | result)
