@@ -9,10 +9,10 @@ import pytest
 
 from endopilot.errors import InputError
 from endopilot.ladder.apart import Apart
-from endopilot.ladder.attempt import attempt
-from endopilot.ladder.ladder import LadderConfig, climb
+from endopilot.ladder.attempt import attempt, navigation_seed
+from endopilot.ladder.ladder import LadderConfig, climb, terms_of
 from endopilot.ladder.submission import check_submission
-from endopilot.ladder.terms import Terms, navigation_seed
+from endopilot.ladder.terms import Terms
 from endopilot.navigation.policy import Observation
 from endopilot.tasks.task import find_task
 
@@ -66,7 +66,7 @@ def test_a_policy_from_a_file_is_run_in_patients_that_its_request_draws(spies, t
     assert row["exposures"] > 2 and row["safe_success"] == 1.0
     content = json.loads((tmp_path / "run" / "submission.json").read_text(encoding="utf-8"))
     done, usual = content["navigations"]["straight"], find_task("straight").ladder
-    drawn = config.terms.task("straight").ladder
+    drawn = terms_of(config).task("straight").ladder
     assert [entry["reason"] for entry in done] == ["reached", "reached"]  # it saw no world
     assert [entry["seed"] for entry in done] == [drawn.seed, drawn.seed + 1] and drawn.seed != usual.seed
     assert len({entry["patient"] for entry in done}) == 2

@@ -25,9 +25,8 @@ from endopilot.dataset.again import episode_set_up
 from endopilot.dataset.loader import read_dataset
 from endopilot.errors import InputError
 from endopilot.files import reading
-from endopilot.ladder.attempt import Recording, begun
+from endopilot.ladder.attempt import Recording, begun, navigation_seed
 from endopilot.ladder.submission import recorded_navigation
-from endopilot.ladder.terms import navigation_seed
 from endopilot.simulation.set_up import SimulationSetUp
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.trajectory import Trajectory

@@ -34,7 +34,7 @@ class NavigateEnv(gymnasium.Env):
     def __init__(
         self,
         anatomy: Anatomy | str | Path | None = None,
-        target: Place | None = None,
+        target: str | Place | None = None,
         *,
         render_mode: str | None = None,
         **given: Any,

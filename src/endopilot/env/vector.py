@@ -81,7 +81,7 @@ class NavigateVectorEnv(VectorEnv):
         self,
         num_envs: int = 1,
         anatomy: Anatomy | str | Path | None = None,
-        target: Place | None = None,
+        target: str | Place | None = None,
         *,
         navigations: Navigation | Sequence[Navigation] | None = None,
         task: str | None = None,

@@ -18,12 +18,13 @@ from endopilot.belief.adviser import AdviserConfig, count_events, near_exposures
 from endopilot.control.agent import AgentPolicy
 from endopilot.errors import InputError
 from endopilot.ladder.apart import Apart
-from endopilot.ladder.terms import Terms
+from endopilot.ladder.terms import DRAWN, Terms
 from endopilot.navigation.loop import NavigationLoop
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import Decision, Observation, Policy
 from endopilot.navigation.record import NavigationRecord
 from endopilot.tasks.navigation import Navigation
+from endopilot.tasks.task import Task
 from endopilot.types import TipProjection
 
 _MOST_BYTES = 1 << 20
@@ -78,6 +79,11 @@ class Recording:
             raise InputError("exposed: X-ray is off at the first decision, where it is always on")
         decided, gave_up = control.reshape(count, devices, 2), bool(text.get("gave_up", False))
         return Recording(decided, exposed, believed, gave_up, terms or Terms())
+
+
+def navigation_seed(task: Task, place: int) -> int:
+    """Return the seed of the navigation in the patient at some place of a task's list."""
+    return place + (task.ladder.seed if task.ladder.seed >= DRAWN else 100 * task.level)
 
 
 def attempt(policy: str, navigation: Navigation, *, seed: int, terms: Terms | None = None) -> dict[str, Any]:

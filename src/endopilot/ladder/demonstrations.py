@@ -16,9 +16,8 @@ from endopilot.devices.stack import column_prefixes, lines_from_tips
 from endopilot.env.exposures import Views
 from endopilot.errors import InputError
 from endopilot.files import manifest, png_image, sha256, write_json, writing
-from endopilot.ladder.attempt import Recording, begun
+from endopilot.ladder.attempt import Recording, begun, navigation_seed
 from endopilot.ladder.submission import Submission, read_submission
-from endopilot.ladder.terms import navigation_seed
 from endopilot.navigation.record import NavigationRecord
 from endopilot.progress import progress
 from endopilot.runs import claim

@@ -10,16 +10,16 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, model_validator
 
 from endopilot import __version__
-from endopilot.devices.robot import ASSUMED, read_robot
+from endopilot.devices.robot import ASSUMED, RobotConfig, read_robot
 from endopilot.files import read_json, write_json
-from endopilot.ladder.attempt import attempt
+from endopilot.ladder.attempt import attempt, navigation_seed
 from endopilot.ladder.scores import score
 from endopilot.ladder.submission import MOST_PATIENTS, SUBMISSION_FILE, write_submission
-from endopilot.ladder.terms import Terms, navigation_seed, task_digest
+from endopilot.ladder.terms import Terms, task_digest
 from endopilot.navigation.policies import POLICIES, make_policy
 from endopilot.runs import claim, make_missing
 from endopilot.settings import Text, Within, settings
-from endopilot.simulation.world import NOMINAL, read_world
+from endopilot.simulation.world import NOMINAL, World, read_world
 from endopilot.tasks.task import NEWEST, LadderVersion, Task, find_task, list_tasks
 
 SCORES_FILE = "ladder.json"
@@ -74,19 +74,6 @@ class LadderConfig:
         """The tasks named, or all."""
         return [task for task in list_tasks(self.version) if not self.tasks or task.name in self.tasks]
 
-    @property
-    def terms(self) -> Terms:
-        """On what terms the policy climbs.
-
-        Raises:
-            InputError: no such robot or world.
-        """
-        terms = Terms(self.version, read_robot(self.robot), read_world(self.world))
-        if self.drawn is None:
-            return terms
-        patients = self.patients or max(len(task.ladder.numbers) for task in self.chosen)
-        return terms.drawn(self.policy, POLICIES.origin(self.policy), self.drawn, patients)
-
     def paths(self, folder: Path) -> list[Path]:
         """Return the result files of the navigations in a folder, TASK/PLACE.json."""
         return [
@@ -94,6 +81,19 @@ class LadderConfig:
             for task in self.chosen
             for place in range(len(task.ladder.numbers[: self.patients]))
         ]
+
+
+def terms_of(config: LadderConfig) -> Terms:
+    """Return on what terms a policy climbs.
+
+    Raises:
+        InputError: no such robot or world.
+    """
+    terms = Terms(config.version, read_robot(config.robot), read_world(config.world))
+    if config.drawn is None:
+        return terms
+    patients = config.patients or max(len(task.ladder.numbers) for task in config.chosen)
+    return terms.drawn(config.policy, POLICIES.origin(config.policy), config.drawn, patients)
 
 
 def climb(*, output: str | Path, config: LadderConfig | None = None) -> list[dict[str, Any]]:
@@ -115,8 +115,8 @@ def climb(*, output: str | Path, config: LadderConfig | None = None) -> list[dic
     config = config or LadderConfig()
     output = Path(output)
     make_policy(config.policy)
-    terms = config.terms
-    claim(output, "endopilot ladder", **identity(config.policy, terms))
+    terms = terms_of(config)
+    claim(output, "endopilot ladder", **identity(config.policy, terms.version, terms.robot, terms.world, terms.request))
     paths = config.paths(output)
     make_missing(f"Ladder, {config.policy}", paths, partial(_navigate, policy=config.policy, terms=terms))
     tasks = config.chosen
@@ -131,12 +131,18 @@ def climb(*, output: str | Path, config: LadderConfig | None = None) -> list[dic
     return rows
 
 
-def identity(policy: str, terms: Terms) -> dict[str, Any]:
+def identity(
+    policy: str,
+    version: LadderVersion,
+    robot: RobotConfig | None = None,
+    world: World | None = None,
+    request: str = "",
+) -> dict[str, Any]:
     """Return what a policy's results follow from: its source, tasks, their devices, robot, world and version."""
-    tasks = {task.name: task_digest(task) for task in list_tasks(terms.version)}
-    found = {"policy": policy, "origin": POLICIES.origin(policy), "tasks": tasks, "robot": terms.robot}
-    found |= {"request": terms.request} if terms.request else {}
-    return found | {"world": terms.world.differences(), "version": __version__}
+    tasks = {task.name: task_digest(task) for task in list_tasks(version)}
+    found = {"policy": policy, "origin": POLICIES.origin(policy), "tasks": tasks, "robot": robot or RobotConfig()}
+    found |= {"request": request} if request else {}
+    return found | {"world": (world or World()).differences(), "version": __version__}
 
 
 def _navigate(path: Path, *, policy: str, terms: Terms) -> None:

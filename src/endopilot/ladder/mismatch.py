@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json, writing
-from endopilot.ladder.attempt import attempt
-from endopilot.ladder.ladder import LadderConfig, identity
+from endopilot.ladder.attempt import attempt, navigation_seed
+from endopilot.ladder.ladder import LadderConfig, identity, terms_of
 from endopilot.ladder.scores import score_navigations
-from endopilot.ladder.terms import Terms, navigation_seed
+from endopilot.ladder.terms import Terms
 from endopilot.navigation.policies import make_policy
 from endopilot.runs import claim, make_missing
 from endopilot.simulation.world import NOMINAL, QUANTITIES, World, drawn_sides, world_by
@@ -49,8 +49,8 @@ def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[d
         raise InputError(f"world: {config.world}; mismatch makes worlds of its own and draws none: leave both out")
     make_policy(config.policy)
     tasks = config.chosen
-    terms = config.terms
-    claim(output, "endopilot ladder --mismatch", **identity(config.policy, terms), mismatch=share)
+    terms = terms_of(config)
+    claim(output, "endopilot ladder --mismatch", **identity(config.policy, terms.version, terms.robot), mismatch=share)
     paths = {case: config.paths(output / case) for case in CASES}
     every = [path for of_case in paths.values() for path in of_case]
     navigate = partial(_navigate, policy=config.policy, terms=terms, share=share)

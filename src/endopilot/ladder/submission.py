@@ -24,9 +24,9 @@ from endopilot import __version__, _core
 from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, write_json
-from endopilot.ladder.attempt import Recording, attempt, repeat
+from endopilot.ladder.attempt import Recording, attempt, navigation_seed, repeat
 from endopilot.ladder.scores import score, timeless
-from endopilot.ladder.terms import Terms, navigation_seed, task_digest
+from endopilot.ladder.terms import Terms, task_digest
 from endopilot.navigation.policies import POLICIES
 from endopilot.parallel import Workers, each
 from endopilot.settings import CountOrZero, Seed, read_settings, settings

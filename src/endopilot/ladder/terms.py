@@ -23,7 +23,7 @@ from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S
 from endopilot.tasks.task import CORE, NEWEST, LadderVersion, Patients, Task, find_task, list_tasks
 
-_DRAWN = 1 << 62
+DRAWN = 1 << 62
 """Seeds of drawn patients begin here: no task that lies in a file has such a seed."""
 
 
@@ -102,11 +102,6 @@ class Terms:
         }
 
 
-def navigation_seed(task: Task, place: int) -> int:
-    """Return the seed of the navigation in the patient at some place of a task's list."""
-    return place + (task.ladder.seed if task.ladder.seed >= _DRAWN else 100 * task.level)
-
-
 def task_digest(task: Task) -> str:
     """Return the SHA-256 of what a task's navigations follow from: its definition and its devices."""
     # Older tasks had no such fields, or named them otherwise: their hashes stay.
@@ -130,7 +125,7 @@ def _drawn(task: Task, wanted: str, patients: int) -> Task:
     """Return a task in the first patients of an atlas of their own in which the target exists."""
     if task.anatomies is not None:
         raise InputError(f"drawn: task {task.name} has anatomies of its own; leave it out, or leave drawn out")
-    seed = _DRAWN + (int(_digest({"request": wanted, "task": task.name}), 16) % _DRAWN)
+    seed = DRAWN + (int(_digest({"request": wanted, "task": task.name}), 16) % DRAWN)
     atlas, numbers = task.atlas(seed), list[int]()
     for number in itertools.count():
         with suppress(InputError):  # a tree without that section, or with too short a one

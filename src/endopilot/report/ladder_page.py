@@ -15,10 +15,10 @@ from matplotlib.lines import Line2D
 from plotly.offline import get_plotlyjs
 
 from endopilot.files import read_json, writing
-from endopilot.ladder.attempt import driven
+from endopilot.ladder.attempt import driven, navigation_seed
 from endopilot.ladder.ladder import SCORES_FILE
 from endopilot.ladder.submission import recorded_navigation
-from endopilot.ladder.terms import Terms, navigation_seed
+from endopilot.ladder.terms import Terms
 from endopilot.plotting import BLACK, BLUE, GREEN, ORANGE, STYLE, VERMILLION, png
 from endopilot.report.report import image, render
 from endopilot.report.scene import mark_target, navigation_scene
