@@ -77,7 +77,7 @@ def _row(path: Path, submission: Submission, link: str) -> tuple[tuple[int, floa
     done = [asdict(entry) for entries in submission.navigations.values() for entry in entries]
     scores = score_navigations([{key: value for key, value in each.items() if value is not None} for each in done])
     safe, count, tasks = scores["safe_success"], len(done), len(submission.tasks)
-    low, high = interval(round(safe * count), count)
+    low, high = scores["safe_from"], scores["safe_to"]
     called = mark(path, submission)
     cells = (
         f"[{submission.policy}]({link})",
@@ -96,13 +96,6 @@ def _row(path: Path, submission: Submission, link: str) -> tuple[tuple[int, floa
 
 def _line(*cells: object) -> str:
     return "| " + " | ".join(map(str, cells)) + " |"
-
-
-def interval(reached: int, count: int) -> tuple[float, float]:
-    """Return Wilson's 95 % interval of a share (J. Am. Stat. Assoc. 22, 209, 1927)."""
-    z, share = 1.959964, reached / count
-    middle, width = share + z * z / (2 * count), z * ((share * (1 - share) + z * z / (4 * count)) / count) ** 0.5
-    return tuple(max(0.0, (middle + sign * width) / (1 + z * z / count)) for sign in (-1, 1))
 
 
 def climb_again(path: Path) -> None:

@@ -19,7 +19,7 @@ from endopilot.files import json_text
 from endopilot.ladder import submission
 from endopilot.ladder.attempt import Recording, attempt, repeat
 from endopilot.ladder.ladder import LadderConfig, climb
-from endopilot.ladder.scores import score
+from endopilot.ladder.scores import score, submitted
 from endopilot.ladder.submission import check_submission
 from endopilot.ladder.terms import Terms, task_digest
 from endopilot.simulation.world import World
@@ -91,7 +91,7 @@ def test_a_submission_is_confirmed_in_other_processes(written, tmp_path, in_proc
     path.write_text(json.dumps(written), encoding="utf-8")
     found = check_submission(path)
     assert (found.verdict, found.difference, found.navigations, found.remarks) == ("decided again", None, 2, ())
-    assert [dict(row) for row in found.scores] == written["scores"]  # as they were driven again
+    assert [submitted(row) for row in found.scores] == written["scores"]  # as they were driven again
     assert found.policy == "forward" and found.origin.startswith("endopilot ")
     assert {row["task"] for row in written["scores"]} == {"straight", "descending"}
 
@@ -206,7 +206,7 @@ def _score(content: dict) -> None:
         name: [{key: value for key, value in one.items() if value is not None} for one in done]
         for name, done in content["navigations"].items()
     }
-    content["scores"] = score([task for task in list_tasks() if task.name in results], results)
+    content["scores"] = [submitted(row) for row in score([t for t in list_tasks() if t.name in results], results)]
 
 
 def _made_up(content: dict) -> None:

@@ -25,7 +25,7 @@ from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, write_json
 from endopilot.ladder.attempt import Recording, attempt, navigation_seed, repeat
-from endopilot.ladder.scores import score, timeless
+from endopilot.ladder.scores import score, submitted
 from endopilot.ladder.terms import Terms, task_digest
 from endopilot.navigation.policies import POLICIES
 from endopilot.parallel import Workers, each
@@ -198,7 +198,7 @@ def write_submission(
             name: tuple(NavigationEntry(**{key: value for key, value in one.items() if key in known}) for one in done)
             for name, done in results.items()
         },
-        scores=tuple(timeless(row) for row in scores),
+        scores=tuple(submitted(row) for row in scores),
         robot=terms.robot,
         world=terms.world,
         drawn=drawn,
@@ -339,7 +339,7 @@ def _driven_again(submission: Submission, folder: Path, pool: Workers | None) ->
     results = {task.name: [again[path] for path in entries if path.parent.name == task.name] for task in tasks}
     rows = score(tasks, results)
     for given, row in zip_longest(submission.scores, rows, fillvalue={}):
-        remark = _difference(given, row)
+        remark = _difference(given, submitted(row))
         if remark is not None:
             difference = f"scores, {row.get('task') or given.get('task')}: {remark}"
             return {"verdict": "failed", "difference": difference, "scores": (), "remarks": remarks}
