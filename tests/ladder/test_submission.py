@@ -291,7 +291,7 @@ def test_exposures_that_nobody_decided_again_are_not_confirmed(looking, tmp_path
     path.write_text(json.dumps(content), encoding="utf-8")
     found = check_submission(path)
     assert found.verdict == "replayed" and found.remarks[-1] == (
-        "retract-rotate of this version decides otherwise in 1 of 2 navigations"
+        "retract-rotate decides otherwise here in 1 of 2 navigations"
     )
     assert "exposures" not in found.scores[0] and found.scores[0]["exposures_as_recorded"] == 1.0
 
@@ -328,6 +328,11 @@ def test_a_policy_of_one_s_own_climbs_and_its_submission_is_confirmed(tmp_path, 
     assert str(file.relative_to(tmp_path)) in capsys.readouterr().out
     content = json.loads(file.read_text(encoding="utf-8"))
     assert content["origin"].startswith("hurried.py sha256:") and _first(content)["exposures"] > 1
+    assert check_submission(file, policy="hurried:Hurried").verdict == "decided again"
+    forged = json.loads(json.dumps(content))
+    _again(forged, lambda was: replace(was, exposed=np.arange(len(was.exposed)) == 0))
+    (tmp_path / "forged.json").write_text(json.dumps(forged), encoding="utf-8")
+    assert check_submission(tmp_path / "forged.json", policy="hurried:Hurried").verdict == "failed"
     Path("hurried.py").unlink()  # the check does not need the policy
     del sys.modules["hurried"]
     check = ["ladder", "--check", str(file), "--json"]

@@ -218,21 +218,22 @@ def read_submission(path: str | Path) -> Submission:
     return submission
 
 
-def check_submission(path: str | Path) -> SubmissionCheck:
+def check_submission(path: str | Path, *, policy: str = "") -> SubmissionCheck:
     """Drive all recordings of a submission file again, and compare every figure to the bit; nothing else is believed.
 
-    They are driven with the file's kernel of linear algebra, one of `KERNELS`. A shipped policy also decides again: its
-    exposures are counted then. Where it decides otherwise, the file fails, unless it is of another version.
+    They are driven with the file's kernel of linear algebra, one of `KERNELS`. A policy that is at hand also decides
+    again: its exposures are counted then. Where it decides otherwise, the file fails, unless it is of another version.
 
     Args:
         path: the file.
+        policy: MODULE:OBJECT of the file's policy, where you have it and trust it; shipped ones are at hand.
 
     Raises:
         InputError: the file is no submission, its tasks or seeds are not those of this ladder, or it was made with a
             kernel that nobody can drive it again with.
     """
     submission = read_submission(path)
-    kernel = submission.blas or "none"
+    kernel, at_hand = submission.blas or "none", submission.policy in (*POLICIES.shipped, policy)
     if kernel not in KERNELS:
         raise InputError(
             f"{path}: blas: {kernel}; submissions are driven again with {' or '.join(KERNELS)}: run the ladder again "
@@ -250,7 +251,7 @@ def check_submission(path: str | Path) -> SubmissionCheck:
         if not runs:
             remark = f"this machine does not run {kernel}: nothing was driven again"
             return judged(verdict="not judged", difference=None, scores=(), remarks=(remark,))
-        return judged(**_driven_again(submission, Path(folder), pool))
+        return judged(**_driven_again(submission, Path(folder), pool, at_hand))
 
 
 @contextmanager
@@ -307,9 +308,13 @@ def _refuse_another_ladder(path: Path, submission: Submission) -> None:
                 raise InputError(f"{path}: task {name}, patient {place}: seed {entry.seed}; the ladder's is {seed}")
 
 
-def _driven_again(submission: Submission, folder: Path, pool: Workers | None) -> dict[str, Any]:
-    """Drive all recordings again and return verdict, first difference, scores and remarks of `SubmissionCheck`."""
-    terms, shipped = submission.terms, submission.policy in POLICIES.shipped
+def _driven_again(submission: Submission, folder: Path, pool: Workers | None, at_hand: bool) -> dict[str, Any]:
+    """Drive all recordings again, and let a policy that is at hand decide again.
+
+    Returns:
+        Verdict, first difference, scores and remarks of `SubmissionCheck`.
+    """
+    terms, policy, remarks = submission.terms, submission.policy, _remarks(submission)
     tasks = sorted(map(terms.task, submission.navigations), key=lambda task: task.level)
     entries = {
         folder / task.name / f"{place:02d}.json": entry
@@ -318,36 +323,37 @@ def _driven_again(submission: Submission, folder: Path, pool: Workers | None) ->
     }
     for path, entry in entries.items():
         write_json(path, entry.recording)
-    work = partial(_repeat, terms=terms, policy=submission.policy if shipped else None)
-    bad = each(f"Checking {submission.policy}", list(entries), work, pool)
+    work = partial(_repeat, terms=terms, policy=policy if at_hand else None)
+    bad = each(f"Checking {policy}", list(entries), work, pool)
     again = {path: {} if path in bad else read_json(path) for path in entries}
     otherwise = [path for path, figures in again.items() if not figures.pop("decided", False)]
-    remarks = _remarks(submission)
-    if shipped and otherwise:
-        where = f"{len(otherwise)} of {len(entries)} navigations"
-        remarks += (f"{submission.policy} of this version decides otherwise in {where}",)
-    forged = otherwise if shipped and submission.origin == POLICIES.origin(submission.policy) else []
-    differing = []
-    for path, entry in entries.items():
-        remark = str(bad[path]) if path in bad else _difference(entry.figures(), again[path])
-        remark = remark or (f"{submission.policy} decides otherwise" if path in forged else None)
-        if remark is not None:
-            differing.append(f"task {path.parent.name}, patient {int(path.stem)}: {remark}")
+    if at_hand and otherwise:
+        remarks += (f"{policy} decides otherwise here in {len(otherwise)} of {len(entries)} navigations",)
+    forged = otherwise if at_hand and submission.origin == POLICIES.origin(policy) else []
+    found = {
+        path: str(bad[path]) if path in bad else _difference(entry.figures(), again[path])
+        for path, entry in entries.items()
+    }
+    found |= {path: f"{policy} decides otherwise" for path in forged if found[path] is None}
+    differing = [f"task {path.parent.name}, patient {int(path.stem)}: {said}" for path, said in found.items() if said]
+    rows = []
     if differing:
-        difference = f"{differing[0]} ({len(differing)} of {len(entries)} navigations differ)"
-        return {"verdict": "failed", "difference": difference, "scores": (), "remarks": remarks}
-    results = {task.name: [again[path] for path in entries if path.parent.name == task.name] for task in tasks}
-    rows = score(tasks, results)
-    for given, row in zip_longest(submission.scores, rows, fillvalue={}):
-        remark = _difference(given, submitted(row))
-        if remark is not None:
-            difference = f"scores, {row.get('task') or given.get('task')}: {remark}"
-            return {"verdict": "failed", "difference": difference, "scores": (), "remarks": remarks}
-    decided = shipped and not otherwise
-    scores = rows if decided else [{_claimed(name): value for name, value in row.items()} for row in rows]
-    return {"verdict": "decided again" if decided else "replayed"} | {
-        "difference": None, "scores": scores, "remarks": remarks,
-    }  # fmt: skip
+        differing[0] += f" ({len(differing)} of {len(entries)} navigations differ)"
+    else:
+        results = {task.name: [again[path] for path in entries if path.parent.name == task.name] for task in tasks}
+        rows = score(tasks, results)
+        pairs = zip_longest(submission.scores, rows, fillvalue={})
+        said = [(row.get("task") or given.get("task"), _difference(given, submitted(row))) for given, row in pairs]
+        differing = [f"scores, {task}: {remark}" for task, remark in said if remark]
+    decided = at_hand and not otherwise
+    if not decided:
+        rows = [{_claimed(name): value for name, value in row.items()} for row in rows]
+    return {
+        "verdict": "failed" if differing else "decided again" if decided else "replayed",
+        "difference": differing[0] if differing else None,
+        "scores": () if differing else rows,
+        "remarks": remarks,
+    }
 
 
 def _claimed(name: str) -> str:
