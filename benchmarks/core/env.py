@@ -67,11 +67,12 @@ def bench_env() -> dict[str, Any]:
             figures[f"{prefix}steps_per_second_{count}"] = round(steps / wall, 1)
             figures[f"{prefix}processor_steps_per_second_{count}"] = round(steps / processor, 1)
             valid.append(kept)
-    for name, images, given in (
+    seen: tuple[tuple[str, int, dict[str, Any]], ...] = (
         ("exposures_per_second_64", 1, {"observation": "xray"}),
         ("images_per_second_64", 2, {"observation": "image", "pixels": 64}),
         ("images_per_second_128", 2, {"observation": "image", "pixels": 128}),
-    ):
+    )
+    for name, images, given in seen:
         env = NavigateVectorEnv(SEEN, **given)
         wall, processor, _ = _timed(env, 1, independent=False, seconds=SEEN_SECONDS, expose_every=1)
         images *= SEEN * round(SEEN_SECONDS / CONTROL_PERIOD_S)
