@@ -1,40 +1,75 @@
-"""Write the tables of docs/evidence/leaderboard.md from the files in submissions/: `python docs/leaderboard.py`."""
+"""Drive all files of submissions/ again, and write the tables of docs/evidence/leaderboard.md.
+
+`python docs/leaderboard.py` leaves with exit code 1, and the page as it was, if a file is not confirmed. With `--climb`
+the shipped policies climb again first, as many tasks and patients as their files have: a change of theirs asks for it.
+With OPENBLAS_CORETYPE=Haswell the files can be judged on most machines.
+"""
 
 from __future__ import annotations
 
+import sys
+import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
 import yaml
 
+from endopilot.files import json_text
+from endopilot.ladder.ladder import LadderConfig, climb
 from endopilot.ladder.scores import score_navigations
-from endopilot.ladder.submission import Submission, read_submission
+from endopilot.ladder.submission import SUBMISSION_FILE, Submission, check_submission, read_submission
+from endopilot.navigation.policies import POLICIES
 from endopilot.tasks.task import list_tasks
 
 PAGE = Path(__file__).parent / "evidence" / "leaderboard.md"
 FOLDER = PAGE.parents[2] / "submissions"
+BY_US = FOLDER / "run_by_us"
+"""Of files that maintainers made with `--drawn`, and nobody else."""
 LINKS_FILE = "links.yaml"
 TITLES = {2: "Version 2", "coaxial": "Wire and catheter", 1: "Version 1"}
-HEAD = ("policy", "tasks", "navigations", "safe success, %", "95 % interval", "exposures", "peak force, N", "time, s")
+HEAD = ("policy", "mark", "tasks", "navigations", "safe success, %", "95 % interval", "exposures", "peak force, N")
+HEAD += ("time, s", "kernel")
+
+
+def files() -> list[Path]:
+    """Return the files of all submissions."""
+    return sorted([*FOLDER.glob("*.json"), *BY_US.glob("*.json")])
+
+
+def mark(path: Path, submission: Submission) -> str:
+    """Return what a confirmed file may be called."""
+    shipped = submission.policy in POLICIES.shipped and submission.origin == POLICIES.origin(submission.policy)
+    return "run by us" if path.parent == BY_US else "decided again" if shipped else "replayed"
 
 
 def page() -> str:
-    """Return the page as it is to be: the tables between its markers are made of the submissions."""
+    """Return the page as it is to be, if all files are confirmed: the tables between its markers are made of them."""
     text, begin, end = PAGE.read_text(encoding="utf-8"), "<!-- scores:begin -->", "<!-- scores:end -->"
     head, rest = text.split(begin)
     return f"{head}{begin}\n" + "\n".join(_tables()) + f"\n{end}{rest.split(end)[1]}"
 
 
 def _tables() -> Iterator[str]:
+    """Return a table for each key, those of the shipped versions on usual terms first."""
     links = yaml.safe_load((FOLDER / LINKS_FILE).read_text(encoding="utf-8"))
-    read = {path: read_submission(path) for path in sorted(FOLDER.glob("*.json"))}
-    for version, title in TITLES.items():
-        rows = [_row(path, each, links[path.stem]) for path, each in read.items() if each.version == version]
-        if rows:
-            yield from (f"### {title}", "", _line(*HEAD, "made with"), "|" + "---|" * (len(HEAD) + 1))
-            yield from (row for _, row in sorted(rows, reverse=True))
-            yield ""
+    tables: dict[tuple[int, str], list] = {}
+    for path in files():
+        submission = read_submission(path)
+        key, known = submission.terms.key(), list(TITLES)
+        place = known.index(submission.version) if submission.version in known else len(known)
+        row = _row(path, submission, links[path.stem])
+        tables.setdefault((place, json_text(key)), []).append((key, row))
+    for _, rows in sorted(tables.items(), key=lambda item: (item[0][0], len(item[0][1]))):
+        key = rows[0][0]
+        differs = [f"{name}: {key[name]}" for name in ("robot", "world") if key[name]]
+        differs += [f"patients: {key['patients']}"] * (key["patients"] == "drawn")
+        yield from ("### " + ", ".join([TITLES.get(key["ladder"], str(key["ladder"])), *differs]), "")
+        hashes = f"tasks `{key['tasks'][:12]}`, settings `{key['settings'][:12]}`"
+        yield from (f"Key: {hashes}, a decision every {key['decision_period_s']:g} s.", "")
+        yield from (_line(*HEAD), "|" + "---|" * len(HEAD))
+        yield from (line for _, line in sorted((row for _, row in rows), reverse=True))
+        yield ""
 
 
 def _row(path: Path, submission: Submission, link: str) -> tuple[tuple[int, float, int], str]:
@@ -42,19 +77,19 @@ def _row(path: Path, submission: Submission, link: str) -> tuple[tuple[int, floa
     done = [asdict(entry) for entries in submission.navigations.values() for entry in entries]
     scores = score_navigations([{key: value for key, value in each.items() if value is not None} for each in done])
     safe, count, tasks = scores["safe_success"], len(done), len(submission.tasks)
-    low, high = interval(round(safe * count), count)
-    named = f"{tasks} of {len(list_tasks(submission.version))}" if tasks > 2 else ", ".join(submission.tasks)
-    made = f"{submission.versions.get('endopilot')}, {submission.core}"
+    low, high = scores["safe_from"], scores["safe_to"]
+    called = mark(path, submission)
     cells = (
         f"[{submission.policy}]({link})",
-        named,
-        f"[{count}](../../submissions/{path.name})",
+        called,
+        f"{tasks} of {len(list_tasks(submission.version))}" if tasks > 2 else ", ".join(submission.tasks),
+        f"[{count}](../../{path.relative_to(FOLDER.parent)})",
         f"{100 * safe:.0f}",
         f"{100 * low:.0f}–{100 * high:.0f}",
-        scores["exposures"],
+        f"({scores['exposures']})" if called == "replayed" else scores["exposures"],
         scores["peak_force_n"],
         "–" if scores["seconds"] is None else scores["seconds"],
-        made,
+        (submission.blas or "").partition(" ")[2],
     )
     return (tasks, safe, count), _line(*cells)
 
@@ -63,12 +98,29 @@ def _line(*cells: object) -> str:
     return "| " + " | ".join(map(str, cells)) + " |"
 
 
-def interval(reached: int, count: int) -> tuple[float, float]:
-    """Return Wilson's 95 % interval of a share (J. Am. Stat. Assoc. 22, 209, 1927)."""
-    z, share = 1.959964, reached / count
-    middle, width = share + z * z / (2 * count), z * ((share * (1 - share) + z * z / (4 * count)) / count) ** 0.5
-    return tuple(max(0.0, (middle + sign * width) / (1 + z * z / count)) for sign in (-1, 1))
+def climb_again(path: Path) -> None:
+    """Make the file of a shipped policy again."""
+    was = read_submission(path)
+    patients = max(map(len, was.navigations.values()))
+    config = LadderConfig(policy=was.policy, tasks=tuple(was.tasks), patients=patients, version=was.version)
+    with tempfile.TemporaryDirectory() as folder:
+        climb(output=folder, config=config)
+        path.write_bytes((Path(folder) / SUBMISSION_FILE).read_bytes())
+
+
+def main() -> None:
+    """Check all files, and write the page."""
+    bad = 0
+    for path in files():
+        if "--climb" in sys.argv and path.parent == FOLDER and read_submission(path).policy in POLICIES.shipped:
+            climb_again(path)
+        found = check_submission(path)
+        print(f"{path.name}: {found.verdict}; {'; '.join(filter(None, [found.difference, *found.remarks]))}")
+        bad += not found.confirmed
+    if bad:
+        sys.exit(f"{bad} of {len(files())} files are not confirmed; {PAGE.name} stays as it was")
+    PAGE.write_text(page(), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    main()

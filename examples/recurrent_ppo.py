@@ -107,12 +107,11 @@ class Player:
         ended = terminated | truncated
         self.returns += reward
         for world in np.flatnonzero(ended):
-            safe, now = bool(info["success"][world] and info["safe"][world]), time.monotonic() - self.began
-            exposures = int(info["exposures"][world]) if "exposures" in info else 0
+            last, now = info["final_info"], time.monotonic() - self.began
+            safe = bool(last["success"][world] and last["safe"][world])
+            exposures = int(last["exposures"][world]) if "exposures" in last else 0
             self.episodes.append((now, self.returns[world], safe, exposures))
-        if ended.any():
-            self.returns[ended] = 0.0
-            observation, _ = self.worlds.reset(options={"reset_mask": ended})
+        self.returns[ended] = 0.0
         self.observation, self.begun = torch.as_tensor(observation), torch.as_tensor(ended, dtype=torch.float32)
         return torch.as_tensor(reward, dtype=torch.float32), self.begun
 
@@ -186,15 +185,17 @@ def score(path: Path) -> list[tuple[str, int, int, int, float]]:
             action[:, 2:] = chances.sample()[:, 2:]  # when to look is drawn: the mean would look always or never
             after, _, terminated, truncated, info = worlds.step(action.numpy())
             seen, ends = torch.as_tensor(after), going & (terminated | truncated)
-            success[ends], safe[ends] = info["success"][ends], info["safe"][ends]
-            exposures[ends] = info["exposures"][ends] if "exposures" in info else 0
-            going &= ~ends
+            if ends.any():
+                last = info["final_info"]
+                success[ends], safe[ends] = last["success"][ends], last["safe"][ends]
+                exposures[ends] = last["exposures"][ends] if "exposures" in last else 0
+                going &= ~ends
         scores.append((task.name, int((success & safe).sum()), int(success.sum()), len(given), float(exposures.mean())))
     return scores
 
 
 def _worlds(count: int, observation: str, **given: object) -> endopilot.NavigateVectorEnv:
-    return endopilot.NavigateVectorEnv(count, observation=observation, autoreset_mode=AutoresetMode.DISABLED, **given)
+    return endopilot.NavigateVectorEnv(count, observation=observation, autoreset_mode=AutoresetMode.SAME_STEP, **given)
 
 
 def _described(episodes: np.ndarray) -> str:

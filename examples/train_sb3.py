@@ -16,11 +16,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode
 from matplotlib.figure import Figure
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 import endopilot
 
@@ -30,15 +29,13 @@ MOST_MM_S = 12.0
 
 
 class WireVecEnv(VecEnv):
-    """A `NavigateVectorEnv` as Stable-Baselines3 wants it: a world that has ended is reset in the same step."""
+    """A `NavigateVectorEnv` as Stable-Baselines3 wants it: both reset a world that has ended in the same step."""
 
     def __init__(self, count: int, observation: str) -> None:
-        self.worlds = endopilot.NavigateVectorEnv(count, observation=observation, autoreset_mode=AutoresetMode.DISABLED)
+        self.worlds = endopilot.NavigateVectorEnv(count, observation=observation, autoreset_mode="SameStep")
         super().__init__(count, self.worlds.single_observation_space, self.worlds.single_action_space)
-        self.returns = np.zeros(count)
 
     def reset(self):
-        self.returns[:] = 0.0
         return self.worlds.reset(seed=self._seeds[0])[0]
 
     def step_async(self, actions):
@@ -46,20 +43,14 @@ class WireVecEnv(VecEnv):
 
     def step_wait(self):
         observations, rewards, terminations, truncations, info = self.worlds.step(self.actions)
-        self.returns += rewards
-        ended = terminations | truncations
-        infos: list[dict] = [{} for _ in ended]
-        for world in np.flatnonzero(ended):
+        infos: list[dict] = [{} for _ in rewards]
+        for world in np.flatnonzero(terminations | truncations):
             infos[world] = {
-                "terminal_observation": observations[world],
+                "terminal_observation": info["final_obs"][world],
                 "TimeLimit.truncated": bool(truncations[world]),
-                "return": float(self.returns[world]),
-                "success": bool(info["success"][world] and info["safe"][world]),
+                "success": bool(info["final_info"]["success"][world] and info["final_info"]["safe"][world]),
             }
-        if ended.any():
-            self.returns[ended] = 0.0
-            observations, _ = self.worlds.reset(options={"reset_mask": ended})
-        return observations, rewards.astype(np.float32), ended, infos
+        return observations, rewards.astype(np.float32), terminations | truncations, infos
 
     def close(self):
         self.worlds.close()
@@ -67,14 +58,10 @@ class WireVecEnv(VecEnv):
     def get_attr(self, attr_name, indices=None):
         return [getattr(self.worlds, attr_name, None)] * self.num_envs
 
-    def set_attr(self, attr_name, value, indices=None):
-        raise NotImplementedError("the worlds share their attributes")
-
-    def env_method(self, method_name, *args, indices=None, **kwargs):
-        raise NotImplementedError("the worlds are stepped together")
-
     def env_is_wrapped(self, wrapper_class, indices=None):
         return [False] * self.num_envs
+
+    set_attr = env_method = None  # the worlds are stepped together
 
 
 class Clock(BaseCallback):
@@ -89,13 +76,14 @@ class Clock(BaseCallback):
 
     def _on_step(self) -> bool:
         now = time.monotonic() - self.began
-        self.episodes += [(now, info["return"], info["success"]) for info in self.locals["infos"] if "return" in info]
+        infos = [info for info in self.locals["infos"] if "episode" in info]
+        self.episodes += [(now, info["episode"]["r"], info["success"]) for info in infos]
         return now < self.seconds
 
 
 def pushing() -> float:
     """Return the share of safe successes of an agent that only pushes, at 5 mm/s, for comparison."""
-    worlds = endopilot.NavigateVectorEnv(ENVIRONMENTS, autoreset_mode=AutoresetMode.DISABLED)
+    worlds = endopilot.NavigateVectorEnv(ENVIRONMENTS)
     worlds.reset(seed=0)
     ended, safe = np.zeros(ENVIRONMENTS, dtype=bool), np.zeros(ENVIRONMENTS, dtype=bool)
     for _ in range(300):
@@ -116,7 +104,7 @@ def main() -> None:
     asked = parser.parse_args()
     print(f"pushing alone: safe success {100 * pushing():.0f} %")
     torch.set_num_threads(1)
-    env = WireVecEnv(ENVIRONMENTS, "xray" if asked.xray else "state")
+    env = VecMonitor(WireVecEnv(ENVIRONMENTS, "xray" if asked.xray else "state"))
     env.seed(asked.seed)
     model = PPO(
         "MlpPolicy",

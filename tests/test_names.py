@@ -141,7 +141,7 @@ def test_a_public_function_is_a_verb_with_subjects_and_keywords(name: str) -> No
     if name[0].islower():
         assert name.partition("_")[0] in VERBS
     for parameter in CALLS[name].parameters.values():
-        by_keyword = parameter.kind is inspect.Parameter.KEYWORD_ONLY
+        by_keyword = parameter.kind in (inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.VAR_KEYWORD)
         assert by_keyword or parameter.name in SUBJECTS, f"{parameter.name}: not by keyword alone"
         if parameter.name in ("config", "output", "seed"):
             assert by_keyword

@@ -29,7 +29,7 @@ CATHETER = "microcatheter-1.7f"
 EXPOSE_EVERY = 15
 """Steps from one exposure to the next where seeing costs: 2 s."""
 SEEN, SEEN_SECONDS = 64, 8.0
-"""Environments whose images are timed, and for how long, s."""
+"""Environments whose exposures are timed, and for how long, s."""
 COMPARED, COMPARED_SECONDS = 8, 30.0
 """Navigations that the error is measured on, and their length, s."""
 
@@ -45,8 +45,9 @@ def bench_env() -> dict[str, Any]:
         `steps_per_second_256` and `steps_per_second_1`, of 256 environments together and of one, over a minute's
         navigations, on all cores and with all overhead; the same with the prefix `random_actions_` for actions drawn
         independently, with `coaxial_` for a wire in a catheter, and with `xray_` where seeing costs and an exposure is
-        taken every 2 s; `images_per_second_64` and `images_per_second_128`, X-ray images of so many pixels a side, two
-        at every step of 64 environments, the steps included; all these with `processor_` for a second of processor
+        taken every 2 s; `exposures_per_second_64`, of the tip, one at every step of 64 environments, the steps
+        included; `images_per_second_64` and `images_per_second_128`, X-ray images of so many pixels a side, two at
+        every step, likewise; all these with `processor_` for a second of processor
         time; the median, the mean, the 95th percentile and the maximum of the tip's distance from that of a core with
         the settings of the reference (`reference.CONVERGED`), mm, with the environments' settings and with the
         simulator's default ones; and the share of worlds that stayed valid.
@@ -66,12 +67,16 @@ def bench_env() -> dict[str, Any]:
             figures[f"{prefix}steps_per_second_{count}"] = round(steps / wall, 1)
             figures[f"{prefix}processor_steps_per_second_{count}"] = round(steps / processor, 1)
             valid.append(kept)
-    for pixels in (64, 128):
-        env = NavigateVectorEnv(SEEN, observation="image", pixels=pixels)
+    seen: tuple[tuple[str, int, dict[str, Any]], ...] = (
+        ("exposures_per_second_64", 1, {"observation": "xray"}),
+        ("images_per_second_64", 2, {"observation": "image", "pixels": 64}),
+        ("images_per_second_128", 2, {"observation": "image", "pixels": 128}),
+    )
+    for name, images, given in seen:
+        env = NavigateVectorEnv(SEEN, **given)
         wall, processor, _ = _timed(env, 1, independent=False, seconds=SEEN_SECONDS, expose_every=1)
-        images = 2 * SEEN * round(SEEN_SECONDS / CONTROL_PERIOD_S)
-        figures[f"images_per_second_{pixels}"] = round(images / wall, 1)
-        figures[f"processor_images_per_second_{pixels}"] = round(images / processor, 1)
+        images *= SEEN * round(SEEN_SECONDS / CONTROL_PERIOD_S)
+        figures |= {name: round(images / wall, 1), f"processor_{name}": round(images / processor, 1)}
     exact = _tips(CONVERGED)
     for prefix, config in (("", CORE), ("default_", SimulatorConfig())):
         error = np.linalg.norm(_tips(config) - exact, axis=-1)

@@ -1,11 +1,10 @@
-"""Write the environments' specification, picture and speed into docs: `python docs/figures/environment.py`.
+"""Write the environments' picture and speed into docs: `python docs/figures/environment.py`.
 
-Takes some three minutes; nothing else should run meanwhile. With `--specification` the speed is not measured again.
+Takes some three minutes; nothing else should run meanwhile.
 """
 
 from __future__ import annotations
 
-import inspect
 import json
 import subprocess
 import sys
@@ -18,7 +17,6 @@ sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
 
 from benchmarks.figures import fill
 from endopilot.env.single import NavigateEnv
-from endopilot.env.vector import NavigateVectorEnv
 
 ROOT = Path(__file__).parents[2]
 
@@ -43,10 +41,6 @@ def draw() -> None:
 def main() -> None:
     """Fill the page."""
     draw()
-    said = inspect.getdoc(NavigateVectorEnv) or ""
-    fill("concepts/environment-specification.md", "specification", said, dated=False)
-    if "--specification" in sys.argv:
-        return
     command = [sys.executable, "-m", "benchmarks", "env", "--json"]
     figures = json.loads(subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout)
     rows = [f"| {name} | {value} |" for name, value in figures.items() if name != "processor"]

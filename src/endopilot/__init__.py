@@ -12,8 +12,10 @@ Units are mm, N, s, rad and HU; world coordinates are LPS mm throughout.
 """
 
 from functools import cache
+from importlib import import_module
 
 __version__ = "0.2.0"
+register_envs = import_module("endopilot.env").register_envs  # by name: rooms import from the left, and all import this
 
 
 def __getattr__(name: str) -> object:

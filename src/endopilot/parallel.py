@@ -54,7 +54,7 @@ def each(
 
     processes = min(len(items), CORES, MOST_PROCESSES)
     with progress(title, len(items)) as advance:
-        if processes <= 1:
+        if processes <= 1 and pool is None:
             for item in items:
                 settle(item, lambda item=item: work(item))
                 advance(remark=item.name)

@@ -11,17 +11,19 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.env.episodes import CONTROL_PERIOD_S, FORCE_REWARD, PROGRESS_REWARD, STEP_REWARD, SUCCESS_REWARD
 from endopilot.env.single import NavigateEnv
-from endopilot.env.vector import NavigateVectorEnv
+from endopilot.env.vector import NavigateVectorEnv, of_world
 from endopilot.errors import InputError
 from endopilot.simulation.motion import motion_named
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation, Target
+from endopilot.tasks.targets import find_target
 from endopilot.tasks.task import in_catheter, reference_navigation
 
 WORLDS, STEPS = 3, 12
@@ -65,8 +67,9 @@ def test_the_registered_environments_pass_gymnasiums_check(name):
 
 def test_a_process_that_imported_nothing_makes_environments_by_name():
     code = (
-        "import gymnasium\n"
+        "import sys, gymnasium\n"
         "gymnasium.make('endopilot.env:endopilot/Navigate-v0').reset(seed=0)\n"
+        "gymnasium.register_envs(sys.modules['endopilot'])\n"
         "gymnasium.make_vec('endopilot.env:endopilot/Straight-v2', num_envs=2).reset(seed=0)\n"
         "try:\n    gymnasium.make('endopilot/NavigateXray-v0', observation='sonar')\n"
         "except Exception as error:\n"
@@ -75,6 +78,100 @@ def test_a_process_that_imported_nothing_makes_environments_by_name():
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.parametrize("order", ["endopilot, gymnasium", "gymnasium, endopilot"])
+def test_importing_the_package_registers_the_environments_and_not_gymnasium(order):
+    code = (
+        "import sys, endopilot\nassert not {'gymnasium', 'numpy', 'typing'} & set(sys.modules)\n"
+        * order.startswith("e")
+        + f"import {order}\nspec = gymnasium.spec('endopilot/Follow-v2')\n"
+        "assert spec.max_episode_steps == 1350\n"
+        "endopilot.register_envs()\n"
+        "assert sum(name.startswith('endopilot/') for name in gymnasium.registry) == 31\n"
+    )
+    result = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+
+
+def test_episodes_end_when_the_registered_steps_are_over_and_not_before(near):
+    env = gymnasium.make("endopilot/Navigate-v0")
+    assert env.spec.max_episode_steps == env.unwrapped._worlds.navigations[0].periods(CONTROL_PERIOD_S)
+    long = replace(near, seconds=61.0)
+    with pytest.raises(InputError, match="navigations: take up to 458 steps, and the registered environment 450"):
+        gymnasium.make("endopilot/Navigate-v0", navigations=long)
+    worlds = gymnasium.make_vec("endopilot/Navigate-v0", num_envs=1, navigations=long, max_episode_steps=500)
+    assert worlds.num_envs == 1
+
+
+def test_a_step_where_no_episode_goes_on_is_refused(near):
+    one, still = NavigateEnv(navigations=near), np.zeros(2)
+    with pytest.raises(ResetNeeded, match="before reset"):
+        one.step(still)
+    one.reset(seed=0)
+    while not one.step(still)[3]:
+        pass
+    with pytest.raises(ResetNeeded, match="no episode goes on in worlds 0"):
+        one.step(still)
+    many = NavigateVectorEnv(2, navigations=near)
+    many.reset(options={"reset_mask": np.array([True, False])})
+    with pytest.raises(ResetNeeded, match="in worlds 1"):
+        many.step(np.zeros((2, 2)))
+
+
+def test_options_that_reset_does_not_know_are_refused_by_name(near):
+    with pytest.raises(InputError, match="options: 'patient'; reset takes none, all else is given to make"):
+        NavigateEnv(navigations=near).reset(options={"patient": 3})
+    with pytest.raises(InputError, match="options: 'patient'; reset takes reset_mask"):
+        NavigateVectorEnv(2, navigations=near).reset(options={"patient": 3})
+
+
+@pytest.mark.parametrize("observation", ["state", "xray", "image"])
+def test_worlds_that_end_are_reset_in_the_same_step_where_that_is_asked_for(near, observation):
+    """Each world goes on as a single environment that is reset when it ends, to the bit."""
+    times = [replace(near, seconds=seconds) for seconds in (0.5, 0.8, 3.0)]
+    given = {"observation": observation, "robot": "ideal"}
+    env = NavigateVectorEnv(3, navigations=times, autoreset_mode="SameStep", **given)
+    singles = [NavigateEnv(navigations=each, **given) for each in times]
+    env.reset(seed=3)
+    for world, single in enumerate(singles):
+        single.reset(seed=3 + world)
+    actions = np.random.default_rng(0).uniform(-0.5, 1.0, (9, *env.action_space.shape))
+    ends = 0
+    for row in actions:
+        seen, rewards, terminations, truncations, infos = env.step(row)
+        for world, single in enumerate(singles):
+            alone, reward, terminated, truncated, info = single.step(row[world])
+            assert (reward, terminated, truncated) == (rewards[world], terminations[world], truncations[world])
+            over = terminated or truncated
+            assert over == bool(infos.get("_final_obs", np.zeros(3))[world])
+            if over:
+                ends += 1
+                assert same(infos["final_obs"][world], alone)
+                final = infos["final_info"]
+                assert final["_time_s"][world] and {n: v[world] for n, v in final.items() if n[0] != "_"} == info
+                alone, info = single.reset()
+            assert same(of_world(seen, world), alone)
+            assert all(infos[name][world] == value for name, value in info.items())
+    assert ends == 3
+
+
+def same(one, other) -> bool:
+    """Return whether two observations are equal."""
+    if isinstance(one, dict):
+        return all(np.array_equal(one[name], other[name]) for name in one)
+    return np.array_equal(one, other)
+
+
+def test_an_anatomy_and_a_target_are_an_environment():
+    anatomy = reference_navigation().anatomy
+    one, many = NavigateEnv(anatomy, "2"), NavigateVectorEnv(2, anatomy, target="2", patients=1)
+    assert one.reset(seed=0)[1] == {name: value[0] for name, value in many.reset(seed=0)[1].items() if name[0] != "_"}
+    assert many.navigations[0].target == find_target(anatomy.tree, "2")
+    with pytest.raises(InputError, match="anatomy, target: give both"):
+        NavigateEnv(anatomy)
+    with pytest.raises(InputError, match=r"target: 'G1\.2'; the vessel has no such section"):
+        NavigateEnv(anatomy, target="G1.2")
 
 
 def test_a_vector_environment_is_made_by_its_name(near):
@@ -100,12 +197,12 @@ def test_the_same_seed_and_actions_give_the_same_bits(either):
 
 
 def test_a_single_environment_is_one_world_of_the_vector_environment(either):
-    actions = _actions(either, steps=30)
+    actions = _actions(either, steps=22)  # of 23
     many = NavigateVectorEnv(WORLDS, navigations=either, autoreset_mode=AutoresetMode.DISABLED)
     begun = many.reset(seed=7)[0]
     steps = _rollout(many, actions)
     for world in (0, 2):
-        one = NavigateEnv(navigation=either)
+        one = NavigateEnv(navigations=either)
         assert np.array_equal(one.reset(seed=7 + world)[0], begun[world])
         for step, action in enumerate(actions[:, world]):
             observation, reward, terminated, truncated, _ = one.step(action)
@@ -127,7 +224,7 @@ def test_an_environment_goes_on_with_the_same_bits_from_a_state_and_from_a_pickl
 
 
 def test_a_single_environment_can_be_pickled_and_restored(either):
-    env = NavigateEnv(navigation=either)
+    env = NavigateEnv(navigations=either)
     env.reset(seed=3)
     first, second = np.tile([[1.0, 0.2], [0.5, 1.0]], len(either.devices))
     env.step(first)
@@ -150,7 +247,7 @@ def test_a_state_of_another_environment_is_refused(near):
 
 
 def test_reward_is_what_the_table_says_and_success_terminates(near):
-    env = NavigateEnv(navigation=near)
+    env = NavigateEnv(navigations=near)
     _, info = env.reset(seed=0)
     before, ended = info["distance_mm"], False
     assert before == pytest.approx(20.0, abs=1.0)
@@ -166,19 +263,19 @@ def test_reward_is_what_the_table_says_and_success_terminates(near):
 
 def test_a_second_rule_of_a_target_has_to_hold_too(near):
     for near_mm in (3.0, 0.01):  # a tip on the wall lies beside the line
-        env, reached = NavigateEnv(navigation=replace(near, target=replace(near.target, near_mm=near_mm))), False
+        env, reached = NavigateEnv(navigations=replace(near, target=replace(near.target, near_mm=near_mm))), False
         env.reset(seed=0)
         for _ in range(30):
-            _, _, ended, _, info = env.step(np.array([1.0, 0.0]))
+            _, _, terminated, truncated, info = env.step(np.array([1.0, 0.0]))
             reached |= info["success"]
-            if ended:
+            if terminated or truncated:
                 break
         assert reached == (near_mm == 3.0)
 
 
 def test_wire_and_catheter_are_driven_and_observed_each_by_itself(near):
     navigation = in_catheter([near], "microcatheter-1.7f")[0]
-    env = NavigateEnv(navigation=navigation)
+    env = NavigateEnv(navigations=navigation)
     start, _ = env.reset(seed=0)
     assert start.shape == (39,) and env.action_space.shape == (4,)
     assert start[31] == 0.0 and start[0] == pytest.approx(near.start_inserted_length_mm / 100)
@@ -200,7 +297,7 @@ def test_wire_and_catheter_are_driven_and_observed_each_by_itself(near):
 
 def test_the_catheter_arrives_over_its_wire_and_both_tips_are_rewarded(near):
     navigation = replace(in_catheter([near], "microcatheter-1.7f")[0], seconds=10.0)
-    env = NavigateEnv(navigation=navigation)
+    env = NavigateEnv(navigations=navigation)
 
     def left(info: dict) -> float:
         return info["distance_mm"] + abs(25.0 - info["tip_abscissa"])
@@ -262,9 +359,9 @@ def test_a_world_that_fails_terminates_and_says_so(near, monkeypatch):
 
 
 def test_too_large_a_force_is_reported_and_remembered(near):
-    env = NavigateEnv(navigation=replace(near, force_limit_n=1e-4))
+    env = NavigateEnv(navigations=replace(near, force_limit_n=1e-4))
     env.reset(seed=0)
-    infos = [env.step(np.array([1.0, 0.0]))[4] for _ in range(15)]
+    infos = [env.step(np.array([1.0, 0.0]))[4] for _ in range(9)]
     unsafe = np.array([info["contact_force_max"] > 1e-4 for info in infos])
     assert unsafe.any()
     assert [info["safe"] for info in infos] == (~np.maximum.accumulate(unsafe)).tolist()
@@ -273,7 +370,7 @@ def test_too_large_a_force_is_reported_and_remembered(near):
 def test_a_wrong_branch_lengthens_the_route():
     navigation = reference_navigation()
     tree = navigation.anatomy.tree
-    env = NavigateEnv(navigation=navigation)
+    env = NavigateEnv(navigations=navigation)
     env.reset(seed=0)
     route = tree.route(navigation.target.branch)
     side = next(i for i in range(len(tree.branches)) if i not in route and tree.branches[i].parent == 0)
@@ -296,7 +393,7 @@ def test_bad_actions_are_refused(near, action):
 
 def test_pushing_on_for_ever_stops_at_the_end_of_the_wire():
     navigation = replace(reference_navigation(), seconds=60.0, start_inserted_length_mm=130.0)
-    env = NavigateEnv(navigation=navigation)
+    env = NavigateEnv(navigations=navigation)
     env.reset(seed=0)
     longest = navigation.anatomy.tree.longest_path().abscissa[-1]
     for _ in range(30):
@@ -332,7 +429,7 @@ def test_vessels_move_where_a_motion_is_given_and_go_on_from_a_pickle(near):
     actions = _actions(near, steps=6)
     lain, moved = _rollout(still, actions), _rollout(env, actions)
     assert np.abs(moved[0] - lain[0]).max() > 0.01
-    one = NavigateEnv(navigation=near, motion=motion_named("heartbeat"))
+    one = NavigateEnv(navigations=near, motion=motion_named("heartbeat"))
     one.reset(seed=5)
     for step, row in enumerate(actions):
         assert np.array_equal(one.step(row[1])[0], moved[0][step, 1])
@@ -360,7 +457,7 @@ def test_a_robot_drives_and_its_encoders_are_observed(near):
     named = NavigateVectorEnv(1, navigations=near, robot="kweon-2021-2d")
     assert "load_nmm" in named.reset(seed=0)[1]
     with pytest.raises(InputError, match="robot 'none': no such robot or file"):
-        NavigateEnv(navigation=near, robot="none")
+        NavigateEnv(navigations=near, robot="none")
 
 
 def test_worlds_with_robots_do_not_depend_on_each_other_and_go_on_from_a_state(near):

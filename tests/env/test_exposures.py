@@ -13,11 +13,12 @@ from gymnasium.vector import AutoresetMode
 
 from endopilot.env.episodes import CONTROL_PERIOD_S, EXPOSURE_REWARD, STEP_REWARD
 from endopilot.env.single import NavigateEnv
+from endopilot.env.tips import TipFinder
 from endopilot.env.vector import NavigateVectorEnv
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import Navigation, Target
-from endopilot.tasks.task import in_catheter
-from endopilot.xray.fluoroscope import FluoroscopeConfig
+from endopilot.tasks.task import in_catheter, reference_navigation
+from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig
 
 TIP, ABSCISSA, DISTANCE, SLACK = slice(9, 32), 9, 11, 31
 FORWARD, SEEN_FORWARD = np.array([0.5, 0.2, -1.0]), np.array([0.5, 0.2, 1.0])
@@ -35,7 +36,7 @@ def near(fork, wire) -> Navigation:
 def test_they_pass_gymnasiums_check_and_are_made_by_name(near, observation):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(gymnasium.make("endopilot/NavigateXray-v0", observation=observation, navigation=near).unwrapped)
+        check_env(gymnasium.make("endopilot/NavigateXray-v0", observation=observation, navigations=near).unwrapped)
     worlds = gymnasium.make_vec("endopilot/NavigateXray-v0", num_envs=2, navigations=near, observation=observation)
     observations, _ = worlds.reset(seed=0)
     assert worlds.observation_space.contains(observations)
@@ -43,7 +44,7 @@ def test_they_pass_gymnasiums_check_and_are_made_by_name(near, observation):
 
 
 def test_an_exposure_shows_the_tip_costs_and_is_kept_until_the_next(near):
-    env = NavigateEnv(navigation=near, observation="xray", robot="ideal")
+    env = NavigateEnv(navigations=near, observation="xray", robot="ideal")
     start, info = env.reset(seed=0)
     assert start.shape == (32,) and (info["exposures"], info["exposed"]) == (1, True)
     assert start[ABSCISSA] * 100 == pytest.approx(info["tip_abscissa"], abs=1.5)
@@ -64,6 +65,26 @@ def test_an_exposure_shows_the_tip_costs_and_is_kept_until_the_next(near):
     assert seen[SLACK] * 10 == pytest.approx(info["inserted_length"] - seen[ABSCISSA] * 100, abs=1e-4)
 
 
+@pytest.mark.parametrize("biplane", [True, False])
+def test_the_tips_of_all_worlds_are_found_where_a_fluoroscope_finds_each(near, wire, biplane):
+    anatomies, config = [near.anatomy, reference_navigation().anatomy], FluoroscopeConfig(biplane=biplane)
+    arms = [Fluoroscope(anatomy, wire.tip_radius_mm, config=config) for anatomy in anatomies]
+    random, arm = np.random.default_rng(0), np.array([0, 1, 1] * 20)
+    lines = [np.concatenate([branch.centerline.points for branch in a.tree.branches]) for a in anatomies]
+    tips = np.array([lines[k][random.integers(len(lines[k]))] + random.normal(0, 1.5, 3) for k in arm])
+    headings = random.normal(size=(60, 3))
+    headings /= np.linalg.norm(headings, axis=1, keepdims=True)
+    depths, noise = random.uniform(0, 60, 60), []
+    alone = np.empty((60, 3))
+    for k, of in enumerate(arm):
+        alone[k] = arms[of].locate(tips[k], headings[k], depths[k], np.random.default_rng(k))
+        noise.append(np.random.default_rng(k).standard_normal((1 + biplane, 2)))
+    finder, some = TipFinder(arms, arm), np.arange(0, 60, 7)
+    np.testing.assert_allclose(finder.locate(np.arange(60), tips, headings, depths, np.array(noise)), alone, atol=1e-9)
+    part = finder.locate(some, tips[some], headings[some], depths[some], np.array(noise)[some])
+    np.testing.assert_allclose(part, alone[some], atol=1e-9)
+
+
 def test_the_drives_loads_are_observed_and_nothing_that_no_robot_measures(near):
     env = NavigateVectorEnv(2, navigations=near, observation="xray")
     env.reset(seed=0)
@@ -75,7 +96,7 @@ def test_the_drives_loads_are_observed_and_nothing_that_no_robot_measures(near):
 
 
 def test_images_show_the_wire_where_it_is_and_only_when_exposed(near):
-    env = NavigateEnv(navigation=near, observation="image", pixels=128, robot="ideal")
+    env = NavigateEnv(navigations=near, observation="image", pixels=128, robot="ideal")
     start, _ = env.reset(seed=0)
     assert start["image"].shape == (2, 128, 128) and start["measured"].shape == (9,)
     for _ in range(8):
@@ -88,7 +109,7 @@ def test_images_show_the_wire_where_it_is_and_only_when_exposed(near):
         around = np.ix_(row + np.arange(-2, 3), column + np.arange(-2, 3))
         assert image[around].min() < old[around].min() - 40  # the wire has come here
         assert (image == 255).sum() == 9  # the target
-    single = NavigateEnv(navigation=near, observation="image", c_arm=FluoroscopeConfig(biplane=False))
+    single = NavigateEnv(navigations=near, observation="image", c_arm=FluoroscopeConfig(biplane=False))
     assert single.reset(seed=0)[0]["image"].shape == (1, 64, 64)
 
 
@@ -131,7 +152,7 @@ def test_a_robot_starts_an_episode_as_it_would_start_the_first(near):
 
 def test_too_coarse_an_image_is_refused(near):
     with pytest.raises(InputError, match="pixels: 32; give 64 to 128"):
-        NavigateEnv(navigation=near, observation="image", pixels=32)
+        NavigateEnv(navigations=near, observation="image", pixels=32)
 
 
 def _of(observations, world: int):

@@ -26,7 +26,7 @@ def pixels(picture: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
 def shown() -> tuple[NavigateEnv, np.ndarray, np.ndarray]:
     """Return an environment with a catheter, and its pictures before and after some pushing."""
     navigation = in_catheter([reference_navigation()], "microcatheter-1.7f")[0]
-    env = NavigateEnv(navigation=navigation, render_mode="rgb_array")
+    env = NavigateEnv(navigations=navigation, render_mode="rgb_array")
     env.reset(seed=0)
     before = env.render()
     for _ in range(20):

@@ -97,7 +97,7 @@ def test_what_all_worlds_share_may_not_differ(near):
     with pytest.raises(InputError, match="world: worlds differ in motion"):
         NavigateVectorEnv(2, navigations=near, world=["moving", "nominal"])
     with pytest.raises(InputError, match="world 'none': no such world or file"):
-        NavigateEnv(navigation=near, world="none")
+        NavigateEnv(navigations=near, world="none")
     with pytest.raises(InputError, match="world: engine = mujoco; environments are of the rod core alone"):
         NavigateVectorEnv(2, navigations=near, world=World(engine="mujoco"))
     with pytest.raises(InputError, match="an empty list"):

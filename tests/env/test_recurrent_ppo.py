@@ -31,7 +31,7 @@ def worlds(fork, wire):
         "endopilot.env:endopilot/NavigateXray-v0",
         num_envs=4,
         navigations=near,
-        autoreset_mode=AutoresetMode.DISABLED,
+        autoreset_mode=AutoresetMode.SAME_STEP,
     )
 
 

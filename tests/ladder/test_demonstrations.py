@@ -33,7 +33,7 @@ class Looks:
 def made(tmp_path_factory):
     """Return the folder of a data set of two navigations with an exposure every 1.5 s, and the submission's content."""
     folder = tmp_path_factory.mktemp("demonstrations")
-    own_tasks(folder)
+    own_tasks(folder, seconds=8.0, targets_mm=[[0, 0.5, 20], [0, 0, 55]])  # the second is not reached
     (folder / "looks.py").write_text(_POLICY)
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(folder))
@@ -66,6 +66,9 @@ def test_samples_are_what_was_measured_and_decided(made):
         assert samples["exposed"].sum() == entry["exposures"]
         ages = state[:, 4]
         assert (ages[samples["exposed"]] == 0).all() and ages.max() == 1.0
+        assert samples["next.done"].tolist() == [False] * (len(samples) - 1) + [True]
+        assert samples["next.success"].tolist() == (samples["next.done"] & entry["success"]).tolist()
+        assert samples["next.reward"].sum() == float(entry["success"] and entry["safe"])
     assert found["exposures"] == sum(entry["exposures"] for entry in content["navigations"]["along"])
 
 
@@ -91,6 +94,11 @@ def test_episodes_tasks_and_statistics_are_described(made):
     assert (info["total_frames"], info["total_tasks"]) == (found["samples"], 1)
     stats = json.loads((folder / "meta/stats.json").read_text(encoding="utf-8"))
     assert stats["action"]["mean"][0] == pytest.approx(5.0)
+    depths = [np.stack(samples["observation.state"])[:, 0] for samples in _samples(folder)]
+    for name, share in (("q01", 0.01), ("q50", 0.5), ("q99", 0.99)):  # the mean of the episodes', as LeRobot has it
+        wanted = np.average([np.quantile(each, share) for each in depths], weights=[len(each) for each in depths])
+        assert stats["observation.state"][name][0] == pytest.approx(wanted, rel=1e-5)
+    assert np.shape(stats["observation.images.view_1"]["q99"]) == (3, 1, 1)
     pixels = np.stack([_image(cell) for data in _samples(folder) for cell in data["observation.images.view_2"]]) / 255
     of_images = stats["observation.images.view_2"]
     np.testing.assert_allclose(of_images["mean"], np.full((3, 1, 1), pixels.mean()))

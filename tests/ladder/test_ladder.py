@@ -13,7 +13,7 @@ from endopilot import __version__, runs
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.ladder import attempt as attempts
-from endopilot.ladder import ladder, submission
+from endopilot.ladder import ladder, terms
 from endopilot.ladder.attempt import attempt
 from endopilot.ladder.ladder import LadderConfig, climb
 from endopilot.ladder.scores import score
@@ -89,7 +89,7 @@ def test_a_folder_of_another_version_of_the_ladder_is_refused(climbed):
 def test_another_wire_of_the_same_name_or_another_version_is_refused(climbed, monkeypatch):
     folder, _ = climbed
     one = LadderConfig(policy="forward", tasks=("straight",), patients=1)
-    monkeypatch.setattr(submission, "read_wire", lambda name: replace(read_wire(name), friction=0.5))
+    monkeypatch.setattr(terms, "read_wire", lambda name: replace(read_wire(name), friction=0.5))
     with pytest.raises(InputError, match=r"was begun with tasks\.straight = "):
         climb(output=folder, config=one)
     monkeypatch.undo()

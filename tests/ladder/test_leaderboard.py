@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import runpy
 from dataclasses import asdict
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from endopilot.files import read_json, write_json
-from endopilot.ladder.scores import score, timeless
+from endopilot.ladder.scores import interval, score, submitted
 from endopilot.ladder.submission import NavigationEntry, Submission, check_submission, read_submission
 from endopilot.tasks.task import list_tasks
 
@@ -29,7 +30,7 @@ def _scores(submission: Submission, chosen: dict[str, tuple[NavigationEntry, ...
         name: [{key: value for key, value in asdict(one).items() if value is not None} for one in done]
         for name, done in chosen.items()
     }
-    return [timeless(row) for row in score(tasks, results)]
+    return [submitted(row) for row in score(tasks, results)]
 
 
 def test_the_page_is_made_of_the_files(script):
@@ -51,15 +52,15 @@ def test_the_shortest_first_navigation_is_confirmed(path, tmp_path):
     name = min(submission.navigations, key=lambda each: submission.navigations[each][0].seconds)
     content["tasks"] = {name: content["tasks"][name]}
     content["navigations"] = {name: content["navigations"][name][:1]}
+    content["origin"] = "as recorded"  # `python docs/leaderboard.py` tells whether policies still decide so
     content["scores"] = _scores(submission, {name: submission.navigations[name][:1]})
     write_json(tmp_path / "submission.json", content)
     found = check_submission(tmp_path / "submission.json")
-    if not found.confirmed and found.remarks:
-        pytest.skip(f"{found.difference}; {', '.join(found.remarks)}")
-    assert found.confirmed, found.difference
-    assert found.navigations == 1
+    if found.verdict == "not judged" and "CI" not in os.environ:  # there it is not to pass
+        pytest.skip(f"{found.verdict}: {found.remarks[0]}")
+    assert found.confirmed and found.navigations == 1, (found.verdict, found.difference, found.remarks)
 
 
-def test_an_interval_is_wilsons(script):
-    assert script["interval"](5, 10) == pytest.approx((0.2366, 0.7634), abs=1e-4)  # his paper's formula by hand
-    assert script["interval"](0, 20)[0] == 0.0 and script["interval"](20, 20)[1] == pytest.approx(1.0)
+def test_an_interval_is_wilsons():
+    assert interval(5, 10) == pytest.approx((0.2366, 0.7634), abs=1e-4)  # his paper's formula by hand
+    assert interval(0, 20)[0] == 0.0 and interval(20, 20)[1] == pytest.approx(1.0)

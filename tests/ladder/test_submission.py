@@ -13,13 +13,17 @@ import pytest
 
 from endopilot.cli import main
 from endopilot.devices.device import read_wire
+from endopilot.devices.robot import read_robot
 from endopilot.errors import InputError
 from endopilot.files import json_text
 from endopilot.ladder import submission
 from endopilot.ladder.attempt import Recording, attempt, repeat
 from endopilot.ladder.ladder import LadderConfig, climb
+from endopilot.ladder.scores import score, submitted
 from endopilot.ladder.submission import check_submission
-from endopilot.tasks.task import find_task
+from endopilot.ladder.terms import Terms, task_digest
+from endopilot.simulation.world import World
+from endopilot.tasks.task import find_task, list_tasks
 
 _POLICY = """
 import numpy as np
@@ -86,7 +90,8 @@ def test_a_submission_is_confirmed_in_other_processes(written, tmp_path, in_proc
     path = tmp_path / "submission.json"
     path.write_text(json.dumps(written), encoding="utf-8")
     found = check_submission(path)
-    assert found.difference is None and found.navigations == 2 and found.remarks == ()
+    assert (found.verdict, found.difference, found.navigations, found.remarks) == ("decided again", None, 2, ())
+    assert [submitted(row) for row in found.scores] == written["scores"]  # as they were driven again
     assert found.policy == "forward" and found.origin.startswith("endopilot ")
     assert {row["task"] for row in written["scores"]} == {"straight", "descending"}
 
@@ -109,8 +114,8 @@ def test_a_version_1_task_has_the_hash_of_its_file_before_there_were_versions():
     then = {"vessel": "anatomy", "start_inserted_length_mm": "start_inserted_mm"}
     before = {then.get(name, name): value for name, value in asdict(task).items() if name not in since}
     content = json_text(before) + json_text(read_wire(task.device))
-    assert submission.task_digest(task) == hashlib.sha256(content.encode()).hexdigest()
-    assert submission.task_digest(task) != submission.task_digest(replace(task, version=2))
+    assert task_digest(task) == hashlib.sha256(content.encode()).hexdigest()
+    assert task_digest(task) != task_digest(replace(task, version=2))
 
 
 @pytest.mark.parametrize(
@@ -187,48 +192,128 @@ def test_another_task_s_name_is_refused(changed):
         changed(rename)
 
 
-def test_other_versions_are_stated(changed):
-    def older(content):
-        content["versions"] |= {"endopilot": "0.0.1", "numpy": "1.0"}
-        content["core"], content["blas"] = "another", "a third"
+def _again(content: dict, change) -> None:
+    """Change the recording of the first navigation, and make all figures and scores follow from it."""
+    task, entry = find_task("straight"), _first(content)
+    navigation, was = task.ladder_navigation(0), Recording.unpacked(entry["recording"])
+    recording = change(was)
+    entry |= repeat(recording, navigation, seed=entry["seed"]) | {"recording": recording.packed()}
+    _score(content)
 
-    found = changed(older)
-    assert found.difference is None
-    assert [remark.split(",")[0] for remark in found.remarks] == [
-        "made with endopilot 0.0.1", "made with numpy 1.0", "made with core another", "made with blas a third",
-    ]  # fmt: skip
+
+def _score(content: dict) -> None:
+    results = {
+        name: [{key: value for key, value in one.items() if value is not None} for one in done]
+        for name, done in content["navigations"].items()
+    }
+    content["scores"] = [submitted(row) for row in score([t for t in list_tasks() if t.name in results], results)]
+
+
+def _made_up(content: dict) -> None:
+    content["versions"]["endopilot"], content["core"] = "0.0.1", "another"
+    _first(content).update(seconds=0.5, exposures=0, peak_force_n=1e-6)
+    _score(content)
+
+
+def _of_mkl(content: dict) -> None:
+    content["blas"] = "mkl"
+    _first(content)["peak_force_n"] *= 0.95
+    _score(content)
+
+
+def _of_another_kernel(content: dict) -> None:
+    content["blas"] = next(kernel for kernel in submission.KERNELS if kernel != submission.blas_kernel())
+    _first(content)["peak_force_n"] *= 0.97
+    _score(content)
+
+
+def _without_exposures(content: dict) -> None:
+    _again(content, lambda was: replace(was, exposed=np.arange(len(was.exposed)) == 0))
+
+
+def _of_a_better_hand(content: dict) -> None:
+    _again(content, lambda was: replace(was, control=was.control * [1.0 + 1e-9, 1.0]))
+
+
+def _of_another_version(content: dict) -> None:
+    content["origin"] = "endopilot 0.0.1"
+    _without_exposures(content)
+
+
+def _in_another_patient(content: dict) -> None:
+    _first(content).update({k: v for k, v in content["navigations"]["descending"][0].items() if k != "seed"})
+    _score(content)
+
+
+@pytest.fixture(scope="module")
+def looking(tmp_path_factory) -> dict:
+    """Return the content of the submission of `retract-rotate`, which looks at every decision."""
+    folder = tmp_path_factory.mktemp("looking")
+    climb(output=folder, config=LadderConfig(policy="retract-rotate", tasks=("straight", "descending"), patients=1))
+    return json.loads((folder / "submission.json").read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize(
-    ("change", "kernel", "confirmed"),
+    ("forge", "said"),
     [
-        ({"path_ratio": 1e-7}, "another", True),
-        ({"path_ratio": 1e-7}, None, True),  # older files name none
-        ({"path_ratio": 1e-7}, "this", False),
-        ({"path_ratio": 0.06}, "another", False),
-        ({"peak_force_n": 0.06}, "another", False),
-        ({"exposures": 1.0}, "another", False),
+        (_made_up, "seconds is 0.5 in the file and "),
+        (_of_mkl, "blas: mkl; submissions are driven again with openblas Haswell or openblas SkylakeX"),
+        (lambda c: c.update(blas=None), "blas: none; "),
+        (_of_another_kernel, None),  # or this machine lacks the kernel
+        (_without_exposures, "retract-rotate decides otherwise"),
+        (_of_a_better_hand, "retract-rotate decides otherwise"),
+        (_in_another_patient, "task straight, patient 0: "),
+        (lambda c: c["scores"][0].update(safe_success=0.999), "scores, straight: safe_success is 0.999 in the file"),
+        (lambda c: c.update(world=asdict(World(friction_factor=0.2))), "in the file and"),
+        (lambda c: c.update(robot=asdict(read_robot("kweon-2021-2d"))), "in the file and"),
+        (lambda c: c.update(drawn="mine"), "straight, patient 0: seed 100; the ladder's is"),
+        (lambda c: c.update(settings={"element_mm": 5.0}), "settings: no such field"),
+        (lambda c: c.update(decision_period_s=0.1), "decision_period_s: no such field"),
     ],
 )
-def test_with_another_kernel_figures_agree_but_for_rounding(changed, change, kernel, confirmed):
-    def alter(content):
-        first = _first(content)
-        for name, share in change.items():
-            first[name] = type(first[name])(first[name] * (1 + share))
-        content["blas"] = submission.blas_kernel() if kernel == "this" else kernel
+def test_a_forgery_is_never_confirmed(looking, tmp_path, forge, said):
+    content = json.loads(json.dumps(looking))
+    forge(content)
+    path = tmp_path / "submission.json"
+    path.write_text(json.dumps(content), encoding="utf-8")
+    try:
+        found = check_submission(path)
+    except InputError as error:
+        assert said in str(error)
+    else:
+        assert not found.confirmed and not found.scores and (said or "") in (found.difference or "")
+        assert found.verdict == "failed" or (said is None and "does not run" in found.remarks[0])
 
-    found = changed(alter)
-    assert found.difference is not None and found.confirmed == confirmed
+
+def test_exposures_that_nobody_decided_again_are_not_confirmed(looking, tmp_path):
+    content, path = json.loads(json.dumps(looking)), tmp_path / "submission.json"
+    _of_another_version(content)
+    path.write_text(json.dumps(content), encoding="utf-8")
+    found = check_submission(path)
+    assert found.verdict == "replayed" and found.remarks[-1] == (
+        "retract-rotate decides otherwise here in 1 of 2 navigations"
+    )
+    assert "exposures" not in found.scores[0] and found.scores[0]["exposures_as_recorded"] == 1.0
 
 
-def test_scores_that_do_not_follow_are_not_confirmed_with_another_kernel(changed):
-    def alter(content):
-        content["blas"] = "another"
-        _first(content)["path_ratio"] *= 1 + 1e-7
-        content["scores"][0]["exposures"] += 1
+def test_a_kernel_that_this_machine_lacks_is_not_judged(looking, tmp_path, monkeypatch):
+    monkeypatch.setitem(submission.KERNELS, "openblas Loongson", "avx1024")
+    path = tmp_path / "submission.json"
+    path.write_text(json.dumps(looking | {"blas": "openblas Loongson"}), encoding="utf-8")
+    found = check_submission(path)
+    assert (found.verdict, found.confirmed, found.scores) == ("not judged", False, ())
+    assert found.remarks == ("this machine does not run openblas Loongson: nothing was driven again",)
 
-    found = changed(alter)
-    assert found.difference.startswith("scores, ") and not found.confirmed
+
+def test_other_versions_are_stated_and_buy_nothing(changed):
+    def older(content):
+        content["versions"] |= {"endopilot": "0.0.1", "numpy": "1.0"}
+        content["core"] = "another"
+
+    found = changed(older)
+    assert found.confirmed and [remark.split(",")[0] for remark in found.remarks] == [
+        "made with endopilot 0.0.1", "made with numpy 1.0", "made with core another",
+    ]  # fmt: skip
 
 
 def test_a_policy_of_one_s_own_climbs_and_its_submission_is_confirmed(tmp_path, monkeypatch, capsys):
@@ -243,13 +328,20 @@ def test_a_policy_of_one_s_own_climbs_and_its_submission_is_confirmed(tmp_path, 
     assert str(file.relative_to(tmp_path)) in capsys.readouterr().out
     content = json.loads(file.read_text(encoding="utf-8"))
     assert content["origin"].startswith("hurried.py sha256:") and _first(content)["exposures"] > 1
+    assert check_submission(file, policy="hurried:Hurried").verdict == "decided again"
+    forged = json.loads(json.dumps(content))
+    _again(forged, lambda was: replace(was, exposed=np.arange(len(was.exposed)) == 0))
+    (tmp_path / "forged.json").write_text(json.dumps(forged), encoding="utf-8")
+    assert check_submission(tmp_path / "forged.json", policy="hurried:Hurried").verdict == "failed"
     Path("hurried.py").unlink()  # the check does not need the policy
     del sys.modules["hurried"]
     check = ["ladder", "--check", str(file), "--json"]
     with pytest.raises(SystemExit) as leaving:
         main(check)
     assert leaving.value.code == 0
-    assert json.loads(capsys.readouterr().out)["confirmed"] is True
+    checked = json.loads(capsys.readouterr().out)
+    assert (checked["confirmed"], checked["verdict"]) == (True, "replayed")
+    assert "exposures_as_recorded" in checked["scores"][0]  # nobody can decide again
     _first(content)["seconds"] += 0.5
     file.write_text(json.dumps(content), encoding="utf-8")
     with pytest.raises(SystemExit) as leaving:
@@ -292,7 +384,9 @@ def test_a_ladder_in_another_world_is_confirmed_in_it(written, tmp_path):
     differs = {"lumen_factor": 1.1, "ostium_mm": 1.0, "backs_out_mm": 1.0, "backs_out_after_s": 1.0}
     assert scores["world"] == {"name": str(world)} | differs
     assert _first(content)["sha256"] != _first(written)["sha256"]
-    assert check_submission(path).difference is None
+    found = check_submission(path)
+    assert found.difference is None and found.key == scores["key"]
+    assert found.key["world"] == differs and found.key != Terms().key() | {"world": {}}
     content["world"]["lumen_factor"] = 1.05
     path.write_text(json.dumps(content), encoding="utf-8")
     assert check_submission(path).difference is not None

@@ -9,7 +9,6 @@ import gymnasium
 import numpy as np
 import pytest
 
-import endopilot.env
 from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
 from endopilot.errors import InputError
 from endopilot.ladder.scores import COAXIAL
@@ -30,23 +29,26 @@ def test_there_are_twelve_tasks_one_a_level_each_with_its_environment():
         own = [path for path in FILES if path.parent.name == f"ladder_{version}"]
         assert [path.stem for path in own] == sorted(task.name for task in list_tasks(version))
         assert {task.version for task in list_tasks(version)} == {version}
-        assert {name.lower() for name in endopilot.env.TASKS} == {task.name for task in list_tasks(version)}
-    for name in endopilot.env.TASKS:
-        assert {f"endopilot/{name}-v0", f"endopilot/{name}-v2"} <= set(gymnasium.registry)
+        for each in list_tasks(version):
+            spec = gymnasium.spec(f"endopilot/{each.name.title()}-v{0 if version == 1 else 2}")
+            assert spec.max_episode_steps == round(each.seconds * 7.5)
 
 
 def test_tasks_of_version_2_and_of_wire_and_catheter_are_environments_in_their_training_patients(monkeypatch):
     asked = []
     monkeypatch.setattr(task.Task, "patient", lambda self, patients, place: asked.append((self, patients, place)))
     monkeypatch.setattr(task.Task, "navigation", lambda self, anatomy: task.reference_navigation())
-    names = [(name, 2) for name in endopilot.env.TASKS]
-    names += [(name, "coaxial") for name in endopilot.env.COAXIAL_TASKS]
-    for name, version in names:
-        given = gymnasium.spec(f"endopilot/{name}-v2").kwargs
+    for name, version in [(each.name, kind) for kind in (2, "coaxial") for each in list_tasks(kind)]:
+        given = gymnasium.spec(f"endopilot/{name.title()}-v2").kwargs
         task.training_navigations(given["task"], 1, 2, given["version"])
-        found = find_task(name.lower(), version=version)
+        found = find_task(name, version=version)
         assert asked[-2:] == [(found, found.training, 1), (found, found.training, 2)]
     assert len(asked) == 2 * 16
+
+
+def test_a_patient_is_drawn_once_however_often_its_environment_is_made():
+    straight = find_task("straight", version=1)
+    assert straight.patient(straight.training, 0) is straight.patient(straight.training, 0)
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}/{path.stem}")

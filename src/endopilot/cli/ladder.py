@@ -29,9 +29,9 @@ def command(
         mismatch: model mismatch, a share between 0 and 1 such as 0.2: friction, tip stiffness, latency and ostium
             differ by it from what the policy is given, one after another and together. The scores of each case are
             printed instead of the ladder's.
-        check: a submission.json. Its recorded controls are driven again, without the policy, and its scores confirmed
-            to the bit, or but for rounding with another kernel of linear algebra; exit code 1 if one differs. No
-            policy climbs then.
+        check: a submission.json. Its recorded controls are driven again, a shipped policy, or that of --policy, also
+            decides again, and what that gives is printed; exit code 1 if anything differs from the file, or cannot be
+            judged here. No policy climbs then.
         dataset: folder of a LeRobot data set of the navigations, with X-ray images, their recordings being driven again
             (docs/concepts/dataset.md).
         page: write index.html with pictures and replays; --no-page leaves it out.
@@ -40,7 +40,7 @@ def command(
     if dataset is not None and mismatch:
         raise InputError("dataset: with --mismatch, which writes no submission; leave one of them out")
     if check is not None:
-        return _confirmed(check, dataset)
+        return _confirmed(check, dataset, config.policy)
     from endopilot.ladder.mismatch import PICTURE_FILE, measure_mismatch
     from endopilot.ladder.submission import SUBMISSION_FILE
     from endopilot.report.ladder_page import write_page
@@ -57,13 +57,15 @@ def command(
     return Answer(rows, [rows, made])
 
 
-def _confirmed(file: Path, dataset: Path | None) -> Answer:
+def _confirmed(file: Path, dataset: Path | None, policy: str) -> Answer:
     from endopilot.ladder.submission import check_submission
 
-    checked = check_submission(file)
+    checked = check_submission(file, policy=policy)
     if checked.confirmed and dataset is not None:
         _write_dataset(file, dataset)
-    return Answer({"confirmed": checked.confirmed} | asdict(checked), passed=checked.confirmed)
+    about = {"confirmed": checked.confirmed} | asdict(checked)
+    shown = [{name: value for name, value in about.items() if name != "scores"}, checked.scores]
+    return Answer(about, shown, passed=checked.confirmed)
 
 
 def _write_dataset(file: Path, dataset: Path) -> None:

@@ -20,7 +20,7 @@ from endopilot.cockpit.session import Session
 from endopilot.cockpit.world import BY_HAND, LiveWorld, Snapshot
 from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
-from endopilot.ladder.attempt import attempt, navigation_seed, scored
+from endopilot.ladder.attempt import Terms, attempt, navigation_seed, scored
 from endopilot.parallel import Workers
 from endopilot.tasks.task import CORE, Task
 
@@ -177,5 +177,5 @@ class GameSession(Session):
 def _rival(tried: Attempt) -> dict[str, Any]:
     """Let the agent drive the same task in the same patient."""
     navigation = tried.task.ladder_navigation(tried.place)
-    scored = attempt(RIVAL, navigation, seed=tried.seed, robot=tried.robot)
+    scored = attempt(RIVAL, navigation, seed=tried.seed, terms=Terms(robot=tried.robot))
     return {name: scored[name] for name in _SHOWN}

@@ -21,6 +21,8 @@ from endopilot.simulation.trajectory_file import trajectory_signals
 _KEY = b"endopilot_key"
 _LEVEL = 5
 """Of Zstandard; higher ones take longer and save next to nothing."""
+_QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
+"""Those that LeRobot 0.4 normalises by."""
 _FEW_VALUES = {"timestamp"}
 """Columns that repeat their values: a dictionary is the smallest."""
 
@@ -110,7 +112,7 @@ def statistics(
 ) -> tuple[dict[str, dict[str, list[float]]], dict[str, float]]:
     """Return the content of `meta/stats.json`, and the share of each manoeuvre in what was driven.
 
-    The first holds min, max, mean, std and count of every numeric signal's valid samples.
+    The first holds min, max, mean, std, count and quantiles of every numeric signal's valid samples.
 
     Args:
         actuation: what the dataset's control is.
@@ -132,7 +134,7 @@ def statistics(
 
 
 class Sums:
-    """What the statistics of columns are made of, gathered part by part."""
+    """What the statistics of columns are made of, part by part; quantiles are the mean of the parts', as LeRobot's."""
 
     def __init__(self) -> None:
         self._of: dict[str, tuple[int, list[np.ndarray]]] = {}
@@ -141,14 +143,15 @@ class Sums:
         """Take values of a column, a row a sample."""
         rows = values.astype(np.float64).reshape(len(values), -1)
         parts = [rows.min(axis=0), rows.max(axis=0), rows.sum(axis=0), (rows**2).sum(axis=0)]
+        parts.append(len(rows) * np.quantile(rows, _QUANTILES, axis=0))
         count, before = self._of.get(name, (0, None))
         if before is not None:
-            joined = (np.minimum, np.maximum, np.add, np.add)
+            joined = (np.minimum, np.maximum, np.add, np.add, np.add)
             parts = [join(*pair) for join, *pair in zip(joined, before, parts, strict=True)]
         self._of[name] = count + len(rows), parts
 
     def stats(self) -> dict[str, dict[str, list[float]]]:
-        """Return min, max, mean, std and count of each column."""
+        """Return min, max, mean, std, count and quantiles of each column."""
         return {
             name: {
                 "min": low.tolist(),
@@ -156,8 +159,9 @@ class Sums:
                 "mean": (total / count).tolist(),
                 "std": np.sqrt(np.maximum(squares / count - (total / count) ** 2, 0)).tolist(),
                 "count": [count],
+                **{f"q{100 * q:02.0f}": each.tolist() for q, each in zip(_QUANTILES, sums / count, strict=True)},
             }
-            for name, (count, (low, high, total, squares)) in self._of.items()
+            for name, (count, (low, high, total, squares, sums)) in self._of.items()
         }
 
 

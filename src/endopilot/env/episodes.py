@@ -20,6 +20,7 @@ PROGRESS_REWARD, STEP_REWARD, FORCE_REWARD, SUCCESS_REWARD = 0.1, -0.01, -0.1, 5
 """A mm nearer to the target, every step, every step with too large a force, and the target."""
 EXPOSURE_REWARD = -0.05
 """Every exposure, where X-ray shows the tip."""
+_UNBEGUN = -1
 _OF_CATHETER = ("inserted_length", "rotation", "tip_abscissa", "tip_offset", "tip_branch")
 """What the info holds of each catheter."""
 
@@ -68,8 +69,13 @@ class Episodes:
         self._most_steps = np.array([navigation.periods(CONTROL_PERIOD_S) for navigation in navigations])
         self._seconds = np.array([navigation.seconds for navigation in navigations])
         self.force_limit_n = np.array([navigation.force_limit_n for navigation in navigations])
-        self.steps, self.distance = np.zeros(count, dtype=np.int64), np.zeros((count, self._counted))
+        self.steps, self.distance = np.full(count, _UNBEGUN), np.zeros((count, self._counted))
         self.safe, self.ended = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
+
+    @property
+    def unbegun(self) -> Bool[np.ndarray, "worlds"]:
+        """Which worlds have not been reset yet."""
+        return self.steps == _UNBEGUN
 
     @property
     def time_s(self) -> Float[np.ndarray, "worlds"]:

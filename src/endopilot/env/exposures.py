@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from endopilot.anatomy.projection import TipProjector
 from endopilot.devices.stack import lines_from_tips
+from endopilot.env.tips import TipFinder
 from endopilot.simulation.motion import place
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation
@@ -75,7 +76,7 @@ class CArms:
         """
         count, first = len(navigations), navigations[0]
         self._navigations, self._ostium = navigations, [np.asarray(n.anatomy.insertion.position) for n in navigations]
-        self._tips: dict[int, tuple[Fluoroscope, TipProjector]] = {}
+        arms: dict[int, Fluoroscope] = {}
         self._images: dict[tuple[int, str], Views] = {}
         self._of: list[Views] = []
         self._pixels = pixels
@@ -83,11 +84,15 @@ class CArms:
             anatomy, key = navigation.anatomy, (id(navigation), real.identity)
             if pixels and key not in self._images:
                 self._images[key] = Views(navigation, real, config, pixels)
-            elif not pixels and id(navigation) not in self._tips:
-                arm = Fluoroscope(anatomy, navigation.device.tip_radius_mm, config=config)
-                self._tips[id(navigation)] = arm, TipProjector(anatomy.tree, anatomy.insertion)
+            elif not pixels and id(navigation) not in arms:
+                arms[id(navigation)] = Fluoroscope(anatomy, navigation.device.tip_radius_mm, config=config)
             if pixels:
                 self._of.append(self._images[key])
+        if not pixels:
+            self._arm = np.array([list(arms).index(id(navigation)) for navigation in navigations])
+            self._tips = TipFinder(list(arms.values()), self._arm)
+            trees = [navigations[int(np.argmax(self._arm == number))].anatomy for number in range(len(arms))]
+            self._project = [TipProjector(anatomy.tree, anatomy.insertion) for anatomy in trees]
         views, zeros = 1 + config.biplane, np.zeros((count, 1))
         self.exposed = Exposed(
             count=np.zeros(count, dtype=np.int64),
@@ -158,13 +163,13 @@ class CArms:
         tips = tips + registration_mm[chosen]
         if maps is not None:
             tips, headings = place(maps, tips), turned(maps, headings)
-        for world, tip, heading in zip(chosen.tolist(), tips, headings, strict=True):
-            arm, project = self._tips[id(self._navigations[world])]
-            depth = float(exposed.encoders[world, 0])
-            exposed.position[world] = arm.locate(tip, heading, depth, exposed.random[world])
-            found = project(exposed.position[world : world + 1])
+        noise = np.stack([exposed.random[world].standard_normal((exposed.image.shape[1], 2)) for world in chosen])
+        exposed.position[chosen] = self._tips.locate(chosen, tips, headings, exposed.encoders[chosen, 0], noise)
+        for number, project in enumerate(self._project):
+            worlds = chosen[self._arm[chosen] == number]
+            found = project(exposed.position[worlds])
             for name in TipProjection.__dataclass_fields__:
-                getattr(exposed.tip, name)[world] = getattr(found, name)
+                getattr(exposed.tip, name)[worlds, 0] = getattr(found, name)
 
     def _take_images(
         self,

@@ -1,4 +1,4 @@
-"""What a learning agent observes of a world: `observe` or `observe_exposed`; the tables are in `NavigateVectorEnv`."""
+"""What a learning agent observes of a world, as docs/concepts/environment-specification.md has it."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ def observe(
     force_limit_n: Float[np.ndarray, "worlds"],
     time_share: Float[np.ndarray, "worlds"],
 ) -> Float[np.ndarray, "worlds features"]:
-    """Return the observations, as the tables at `NavigateVectorEnv` have them."""
+    """Return the observations, as the specification has them."""
     tip, inserted, turned = now.tip[:, 0], now.encoders[:, 0, 0], now.encoders[:, 0, 1]
     place = routes.place(tip)
     outside = np.empty((len(time_share), 3, 2))
@@ -243,7 +243,7 @@ def observe_exposed(
     time_s: Float[np.ndarray, "worlds"],
     time_share: Float[np.ndarray, "worlds"],
 ) -> Float[np.ndarray, "worlds features"]:
-    """Return what is measured, as the table at `NavigateVectorEnv` has it.
+    """Return what is measured, as the specification has it.
 
     Args:
         proximal: Δ, mm, φ, rad, and the drives' force and torque, N and N·mm, as they are measured.

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -15,6 +16,8 @@ from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Float, UInt8
 from numpy.typing import ArrayLike
 
+from endopilot.anatomy.io import read_anatomy
+from endopilot.devices.device import read_wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import RobotConfig
 from endopilot.env.episodes import CONTROL_PERIOD_S, Episodes, NavigationState
@@ -28,7 +31,9 @@ from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation
+from endopilot.tasks.targets import Place, find_target
 from endopilot.tasks.task import CORE, LadderVersion, in_catheter, reference_navigation, training_navigations
+from endopilot.types import Anatomy
 from endopilot.xray.fluoroscope import FluoroscopeConfig
 
 TRANSLATION_MM_S, ROTATION_RAD_S = 12.0, 3.14
@@ -42,165 +47,29 @@ _PIXELS = (64, 128)
 """Least and most rows of an image."""
 
 
+def refuse_options(options: dict[str, Any] | None, *known: str) -> None:
+    """Refuse what `reset` does not understand.
+
+    Raises:
+        InputError: there is such an option.
+    """
+    for name in set(options or {}) - set(known):
+        raise InputError(f"options: {name!r}; reset takes {' and '.join(known) or 'none'}, all else is given to make")
+
+
+def of_world(observations: Observations, world: int) -> Observations:
+    """Return the observation of one world."""
+    if isinstance(observations, dict):
+        return {name: values[world] for name, values in observations.items()}
+    return observations[world]
+
+
 class NavigateVectorEnv(VectorEnv):
     """Bring a guidewire to a target in a vessel tree, in many worlds at once.
 
-    ## Description
-
-    A wire with a bent tip is driven from outside the body: it is pushed, pulled and turned at its proximal end, 7.5
-    times a second. Its tip is to reach a place on the centerline of the tree. Friction delays and smooths what the tip
-    does; which branch it enters at a fork depends on where the bend points. All worlds are stepped by one `Simulator`;
-    `NavigateEnv` is this class with one world. A world's course does not depend on the others, to the last bit.
-
-    It is no `NavigationLoop`: nobody decides every 0.5 s, all is observed as it truly is unless `observation` says
-    otherwise, and the devices do as commanded unless `robot` names a robot with its latency and play. Then Δ and φ
-    are observed as its encoders have them, and each episode draws a robot anew. It shares with the loop what a
-    navigation is: start, rule of success, time and force limit (`Navigation`, `reached`, `is_safe`), how fast and how
-    far a drive goes (`DriveLimits`), and what a C-arm shows (`Fluoroscope`, `XrayImager`).
-
-    In `endopilot/NavigateXray-v0` seeing costs: encoders and loads of the drives are observed at every step, the tip
-    only where X-ray is asked for.
-
-    ## Action space
-
-    `Box(-1, 1, (2,), float32)`, a row a world; values beyond ±1 are cut off.
-
-    | index | action | unit of 1 |
-    |---|---|---|
-    | 0 | translation of the proximal end, positive inwards | 12 mm/s |
-    | 1 | rotation of the proximal end about its axis | 3.14 rad/s |
-
-    No wire is driven farther than 20 mm beyond the vessel's longest path, nor pulled out of the guiding catheter.
-
-    With a catheter around the wire it is `Box(-1, 1, (4,), float32)`: 2 and 3 are the same of the catheter's proximal
-    end, and so on for a second one. Each is driven by itself.
-
-    With `observation="xray"` or `"image"` there is one number more, the last: above 0, an exposure of every view is
-    taken at the end of the step.
-
-    ## Observation space
-
-    `Box(-10, 10, (31,), float32)`, a row a world; values beyond are cut off. The route runs along the centerline from
-    the ostium to the target; its frame is its tangent and two normals carried along it without twist, at the place
-    that is nearest to the tip along the tree. All values are true ones, as if X-ray were always on; with a robot,
-    0 to 2 are its encoders'.
-
-    | index | observation | unit of 1 |
-    |---|---|---|
-    | 0 | inserted length Δ | 100 mm |
-    | 1, 2 | cosine and sine of the rotation φ | |
-    | 3 | abscissa of the tip Δtip | 100 mm |
-    | 4 | offset of the tip from the centerline γtip | the lumen's radius |
-    | 5 | path length to the target along the tree, back out of a wrong branch first | 100 mm |
-    | 6 | 1 on the route, 0 in a wrong branch | |
-    | 7 | largest force of the wall on a node | the navigation's force limit |
-    | 8 | time that is used up | the time limit |
-    | 9 to 11 | direction of the tip in the route's frame | |
-    | 12, 13 | offset of the tip from the route along its normals | the lumen's radius |
-    | 14 to 25 | places of the route 3, 6, 12 and 24 mm ahead, in its frame | that distance |
-    | 26 to 29 | lumen radius at these places | 2 mm |
-    | 30 | slack Δ − Δtip | 10 mm |
-
-    With a catheter it is `Box(-10, 10, (39,), float32)`, with eight more for each:
-
-    | index | observation | unit of 1 |
-    |---|---|---|
-    | 31 | inserted length of the catheter | 100 mm |
-    | 32, 33 | cosine and sine of its rotation | |
-    | 34 | abscissa of its tip | 100 mm |
-    | 35 | offset of its tip from the centerline | the lumen's radius |
-    | 36 | path length from its tip to the target | 100 mm |
-    | 37 | 1 where its tip is on the route, 0 in a wrong branch | |
-    | 38 | its slack | 10 mm |
-
-    With `observation="xray"` it is `Box(-10, 10, (32,), float32)`: what a robot measures, and the last exposure, which
-    has the C-arm's errors of detection (`FluoroscopeConfig`).
-
-    | index | observation | unit of 1 |
-    |---|---|---|
-    | 0 | Δ by the encoder | 100 mm |
-    | 1, 2 | cosine and sine of φ by the encoder | |
-    | 3, 4 | force and torque of the drive | 0.5 N, 0.5 N·mm |
-    | 5 | time that is used up | the time limit |
-    | 6 | time since the last exposure | 10 s |
-    | 7, 8 | what Δ and φ have changed since, by the encoder | 10 mm, π |
-    | 9, 10 | at that exposure: abscissa of the tip, offset from the centerline | 100 mm, the lumen's radius |
-    | 11, 12 | path length to the target, 1 on the route | 100 mm |
-    | 13, 14 | offset of the tip from the route along its normals | the lumen's radius |
-    | 15 to 26 | places of the route 3, 6, 12 and 24 mm ahead of it, in the route's frame | that distance |
-    | 27 to 30 | lumen radius at these places | 2 mm |
-    | 31 | slack: Δ by the encoder less the abscissa | 10 mm |
-
-    For each catheter five more follow, which are as 0 to 4.
-
-    With `observation="image"` it is a dictionary: `measured` is 0 to 8 of these and what follows for catheters, and
-    `image` a `Box(0, 255, (views, pixels, pixels), uint8)`, the X-ray images of the last exposure. The vessel is laid
-    under them as a roadmap, light grey; the target is a white square of 3 × 3 pixels, the wire dark. An image shows the
-    whole vessel. `c_arm=FluoroscopeConfig(biplane=False)` takes one view in place of two.
-
-    ## Reward
-
-    The sum of
-
-    | what | reward |
-    |---|---|
-    | every mm by which the path to the target has become shorter (longer: negative) | 0.1 |
-    | every step | −0.01 |
-    | every step that ends with a force of the wall beyond the navigation's limit | −0.1 |
-    | the target | 5 |
-    | every exposure, except the one at the start | −0.05 |
-
-    Where the catheter's tip is to go to the target, every mm counts that the wire's tip or the catheter's comes nearer.
-
-    ## Start
-
-    Inserted lengths as the navigation says; the wire's rotation is drawn evenly over a full turn, a catheter's is 0.
-    Where seeing costs, an exposure shows the start. World i of a vector environment that is reset with seed s draws
-    what a single environment that is reset with seed s + i draws.
-
-    ## End of an episode
-
-    - *Termination:* the tip has reached the target (in its branch, within 2 mm along the centerline), or the world has
-      become invalid (the rod core failed; it then stays as it was). Where the catheter's tip is to go there, the wire's
-      may not lie more than 2 mm behind it.
-    - *Truncation:* the navigation's time is over.
-
-    A vector environment resets an ended world at the next step (`AutoresetMode.NEXT_STEP`: that step's action is
-    ignored, its reward 0), or never (`AutoresetMode.DISABLED`: call `reset` with `options={"reset_mask": ...}`).
-
-    ## Info
-
-    Arrays with an entry a world, each with its mask `_name`: `contact_force_max` (N, the largest force of the wall on
-    one node at the end of the step), `valid`, `success`, `safe` (no force beyond the limit so far), `distance_mm` (path
-    length to the target from the tip that is to arrive), `inserted_length` (mm), `rotation` (rad), `tip_abscissa` (mm),
-    `tip_offset` (mm), `tip_branch`, `time_s`; and for each catheter `catheter_1_inserted_length`,
-    `catheter_1_rotation`, `catheter_1_tip_abscissa`, `catheter_1_tip_offset`, `catheter_1_tip_branch`. With a robot
-    also what it measures of the wire, `encoder_inserted_length`, `encoder_rotation`, `load_n`, `load_nmm`. Where seeing
-    costs also `exposed` (whether the observation holds a new exposure) and `exposures` (in the episode so far). In a
-    single environment they are numbers.
-
-    ## Arguments
-
-    `endopilot/Navigate-v0`: 15 mm into the posterior descending artery of the reference right coronary artery (patient
-    0 of the textbook atlas with seed 0). `endopilot/NavigateCoaxial-v0`: the same place, to which the tip of a
-    microcatheter (`microcatheter-1.7f`) is to be brought over the wire. `endopilot/NavigateXray-v0`: the first with
-    `observation="xray"`, which any of them takes. The others are the tasks of the ladder, of its version 2 as
-    `endopilot/Crux-v2` (and `endopilot/Follow-v2`, of wire and catheter), of its version 1 as `endopilot/Crux-v0`, in
-    patients of their own, which are not those that the ladder is scored on; world i has patient (`patient` + i) modulo
-    `patients`. `version` takes a folder of tasks of your own as `endopilot ladder --version` does. With `catheter` a
-    task is to be done by the tip of that catheter. Or give `navigations` of your own. With `motion` the vessels move;
-    positions are those in the vessel as CT shows it, and every episode begins at the phase of the CT; an exposure takes
-    off what `Navigation.known_motion` says.
-
-    `world` says where reality differs from what is given: a `World`, its name or file, or several, which the worlds
-    have in turn. Where a `World` leaves something to chance, the number of the world is the seed. With "random" each
-    episode draws friction (half to twice what is given), ostium (±2.5 mm) and registration (±1 mm along each axis).
-    `robot` is one robot or several, likewise. A random one has plays of up to 2.6 mm and 0.9 turns, gains of 0.95 to
-    1.05, a latency of up to 0.1 s, and encoders at its motors or on the devices.
-
-    ## Version history
-
-    - v0: first version.
+    A wire with a bent tip is pushed, pulled and turned at its proximal end, 7.5 times a second. All worlds are stepped
+    by one `Simulator`; a world's course does not depend on the others, to the last bit. What goes in and comes out,
+    reward, start, ends, info and arguments are specified in docs/concepts/environment-specification.md.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012, as Gymnasium declares it
@@ -211,6 +80,8 @@ class NavigateVectorEnv(VectorEnv):
     def __init__(
         self,
         num_envs: int = 1,
+        anatomy: Anatomy | str | Path | None = None,
+        target: str | Place | None = None,
         *,
         navigations: Navigation | Sequence[Navigation] | None = None,
         task: str | None = None,
@@ -223,16 +94,20 @@ class NavigateVectorEnv(VectorEnv):
         c_arm: FluoroscopeConfig | None = None,
         world: World | str | Path | Sequence[World | str | Path] | None = None,
         robot: RobotConfig | str | Path | Sequence[RobotConfig | str | Path] | None = None,
-        autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         motion: Motion | None = None,
         config: SimulatorConfig = CORE,
         render_mode: str | None = None,
+        max_episode_steps: int | None = None,
     ) -> None:
         """Lay the wires out; `reset` starts the first episodes.
 
         Args:
             num_envs: number of worlds.
-            navigations: one for all worlds, or several, of which world i has number i modulo their number.
+            anatomy: a vessel of your own, or its folder, for the wire `workhorse-014`.
+            target: where the tip is to go in it, as `find_target` understands it: a section such as "LAD", or a point.
+            navigations: in place of these, one for all worlds, or several, of which world i has number i modulo their
+                number.
             task: in place of them, the name of a task of the ladder.
             patient: the first of its training patients.
             patients: number of its training patients that the worlds have.
@@ -246,33 +121,51 @@ class NavigateVectorEnv(VectorEnv):
                 world i has number i modulo their number; or "random".
             robot: what drives, likewise; the devices do as commanded if not given, or where X-ray shows the tip,
                 robots are as assumed.
-            autoreset_mode: whether an ended world is reset at the next step.
+            autoreset_mode: whether an ended world is reset at the next step, in the same step, or not by itself.
             motion: how heart and breath move all vessels and their guiding catheters; they lie still if not given.
             config: settings of the rod core.
             render_mode: "rgb_array" lets `render` return pictures.
+            max_episode_steps: of the registered environment, which Gymnasium hands on; navigations of your own may take
+                fewer steps.
 
         Raises:
-            InputError: no world, no such task or catheter, a catheter for navigations of one's own; a device that is
-                slower than an action of 1 or does not fit; navigations with different catheters; no such robot or
-                world, or worlds that cannot be stepped together.
+            InputError: no world, no such task, target or catheter, a catheter for navigations of one's own; a device
+                that is slower than an action of 1 or does not fit; navigations with different catheters; no such robot
+                or world, or worlds that cannot be stepped together.
         """
         if num_envs < 1:
             raise InputError(f"num_envs: {num_envs}; give at least 1")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InputError(f"render_mode: {render_mode!r}; give 'rgb_array' or None")
-        if autoreset_mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
-            raise InputError(f"autoreset_mode: {autoreset_mode}; give AutoresetMode.NEXT_STEP or DISABLED")
+        try:
+            autoreset_mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            modes = ", ".join(mode.value for mode in AutoresetMode)
+            raise InputError(f"autoreset_mode: {autoreset_mode!r}; give an AutoresetMode, or one of {modes}") from None
         if observation not in get_args(Observed):
             raise InputError(f"observation: {observation!r}; choose from {', '.join(get_args(Observed))}")
         if not _PIXELS[0] <= pixels <= _PIXELS[1]:
             raise InputError(f"pixels: {pixels}; give {_PIXELS[0]} to {_PIXELS[1]}")
-        if navigations is None:
+        if (anatomy is None) != (target is None):
+            raise InputError("anatomy, target: give both, such as NavigateEnv(anatomy, target='LAD'), or neither")
+        if anatomy is not None and target is not None:
+            vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
+            there = find_target(vessel.tree, target)
+            navigations = [Navigation(anatomy=vessel, device=read_wire("workhorse-014"), target=there)]
+            navigations = in_catheter(navigations, catheter) if catheter else navigations
+        elif navigations is None:
             ours = task or version != 1
             navigations = training_navigations(task, patient, patients, version) if ours else [reference_navigation()]
             navigations = in_catheter(navigations, catheter) if catheter else navigations
         elif catheter:
             raise InputError(f"catheter: {catheter}; give it to the navigations")
         given = [navigations] if isinstance(navigations, Navigation) else list(navigations)
+        longest = max((navigation.periods(CONTROL_PERIOD_S) for navigation in given), default=0)
+        if max_episode_steps is not None and longest > max_episode_steps:
+            raise InputError(
+                f"navigations: take up to {longest} steps, and the registered environment {max_episode_steps}; make "
+                "NavigateEnv(navigations=...) in its place, or give make_vec max_episode_steps"
+            )
         if robot is None and observation != "state":
             robot = RobotConfig()
         self._given = {
@@ -336,8 +229,12 @@ class NavigateVectorEnv(VectorEnv):
 
         Returns:
             Observations and info of all worlds.
+
+        Raises:
+            InputError: another option, or a mask of another shape.
         """
-        mask = self._everyone if not options else np.asarray(options.get("reset_mask", self._everyone), dtype=bool)
+        refuse_options(options, "reset_mask")
+        mask = np.asarray((options or {}).get("reset_mask", self._everyone), dtype=bool)
         if mask.shape != (self.num_envs,):
             raise InputError(f"reset_mask: shape {mask.shape}; give a boolean for each of the {self.num_envs} worlds")
         if seed is not None:
@@ -367,26 +264,53 @@ class NavigateVectorEnv(VectorEnv):
             Observations, rewards, terminations, truncations and info, as the class says.
 
         Raises:
-            InputError: actions of another shape, or not finite; no world is moved then.
+            ResetNeeded: a world has not been reset, or its episode has ended and nothing resets it by itself.
+            InputError: actions of another shape, or not finite; no world is moved in either case.
         """
+        mode, episodes = self.metadata["autoreset_mode"], self._episodes
+        over = episodes.unbegun | (episodes.ended & (mode is AutoresetMode.DISABLED))
+        if over.any():
+            worlds = ", ".join(map(str, np.flatnonzero(over)))
+            raise ResetNeeded(f"Cannot call step() before reset(): no episode goes on in worlds {worlds}")
         control = np.array(actions, dtype=float)
         if control.shape != self.action_space.shape or not np.isfinite(control).all():
             raise InputError(f"actions: shape {control.shape}; give finite numbers of shape {self.action_space.shape}")
-        fresh = self._episodes.ended & (self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP)
+        fresh = episodes.ended & (mode is AutoresetMode.NEXT_STEP)
         expose = (control[:, -1] > 0.0) & ~fresh & (self._c_arms is not None)
         control = np.minimum(np.maximum(control[:, : 2 * self._drives], -1.0), 1.0) * self._fastest
         control[fresh] = 0.0
         control = control.reshape(self.num_envs, self._drives, 2)
-        step = self._reality.drive(control, CONTROL_PERIOD_S, self._episodes.time_s)
+        step = self._reality.drive(control, CONTROL_PERIOD_S, episodes.time_s)
         now = Measured.after(step, self._simulator, self._reality.encoders)
-        self._episodes.steps += ~fresh
+        episodes.steps += ~fresh
         self._expose(expose, self._reality.encoders)
         if fresh.any():
             self._begin(fresh)
             now = Measured.current(self._simulator, self._reality.encoders)
-        distances = self._episodes.routes.distance(now.tip)
-        judged = self._episodes.judge(now, distances, fresh, expose)
-        return self._observe(now, distances), *judged, self._infos(now, expose | fresh)
+        distances = episodes.routes.distance(now.tip)
+        judged = episodes.judge(now, distances, fresh, expose)
+        observations, infos = self._observe(now, distances), self._infos(now, expose | fresh)
+        if mode is AutoresetMode.SAME_STEP and episodes.ended.any():
+            return self._begun_again(observations, infos, expose, *judged)
+        return observations, *judged, infos
+
+    def _begun_again(
+        self,
+        observations: Observations,
+        infos: dict[str, Any],
+        exposed: Bool[np.ndarray, "worlds"],
+        *judged: np.ndarray,
+    ) -> tuple[Any, ...]:
+        """Return what a step returns once the worlds that have ended are reset: their last ones are in the info."""
+        ended, last = self._episodes.ended.copy(), np.full(self.num_envs, None, dtype=object)
+        for world in np.flatnonzero(ended).tolist():
+            last[world] = of_world(observations, world)
+        final = {name: ended if name.startswith("_") else values for name, values in infos.items()}
+        self._begin(ended)
+        now = Measured.current(self._simulator, self._reality.encoders)
+        infos = self._infos(now, exposed | ended)
+        infos |= {"final_obs": last, "_final_obs": ended, "final_info": final, "_final_info": ended}
+        return self._observe(now, self._episodes.routes.distance(now.tip)), *judged, infos
 
     def _expose(self, mask: Bool[np.ndarray, "worlds"], encoders: Float[np.ndarray, "worlds devices 2"]) -> None:
         """Take exposures in the worlds of a mask."""
@@ -418,7 +342,7 @@ class NavigateVectorEnv(VectorEnv):
     def _infos(self, now: Measured, exposed: Bool[np.ndarray, "worlds"]) -> dict[str, Any]:
         infos = self._episodes.infos(now)
         if (readings := self._reality.drawn.readings) is not None:
-            infos |= zip(_MEASURED, np.moveaxis(readings[:, 0], -1, 0), strict=True)
+            infos |= zip(_MEASURED, readings[:, 0].T.copy(), strict=True)
         if self._c_arms is not None:
             infos |= {"exposed": exposed, "exposures": self._c_arms.exposed.count.copy()}
         return infos | {f"_{name}": self._everyone for name in infos}

@@ -6,7 +6,8 @@ import base64
 import binascii
 import hashlib
 import zlib
-from dataclasses import dataclass, field, replace
+from contextlib import nullcontext
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,15 +16,15 @@ from jaxtyping import Bool, Float
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.belief.adviser import AdviserConfig, count_events, near_exposures
 from endopilot.control.agent import AgentPolicy
-from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
-from endopilot.navigation.loop import LoopConfig, NavigationLoop
+from endopilot.ladder.apart import Apart
+from endopilot.ladder.terms import DRAWN, Terms
+from endopilot.navigation.loop import NavigationLoop
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import Decision, Observation, Policy
 from endopilot.navigation.record import NavigationRecord
-from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation
-from endopilot.tasks.task import CORE, Task
+from endopilot.tasks.task import Task
 from endopilot.types import TipProjection
 
 _MOST_BYTES = 1 << 20
@@ -39,16 +40,14 @@ class Recording:
         exposed: whether X-ray was on at each decision.
         believed_mm: where the agent believed the tip to be (Δtip) at each decision, mm; None for other policies.
         gave_up: whether the policy ended the navigation with its last decision.
-        robot: what drove, as it was given; not part of the text.
-        world: what reality was, likewise.
+        terms: on which it was driven; not part of the text.
     """
 
     control: Float[np.ndarray, "decisions devices 2"]
     exposed: Bool[np.ndarray, "decisions"]
     believed_mm: Float[np.ndarray, "decisions"] | None
     gave_up: bool = False
-    robot: RobotConfig = field(default_factory=RobotConfig)
-    world: World = field(default_factory=World)
+    terms: Terms = field(default_factory=Terms)
 
     def packed(self) -> dict[str, Any]:
         """Return the recording as text: little-endian arrays, compressed by zlib, in base64."""
@@ -61,9 +60,7 @@ class Recording:
         }
 
     @staticmethod
-    def unpacked(
-        text: dict[str, Any], devices: int = 1, robot: RobotConfig | None = None, world: World | None = None
-    ) -> Recording:
+    def unpacked(text: dict[str, Any], devices: int = 1, terms: Terms | None = None) -> Recording:
         """Return the recording that `packed` made a text of.
 
         Raises:
@@ -81,22 +78,15 @@ class Recording:
         if not exposed[0]:
             raise InputError("exposed: X-ray is off at the first decision, where it is always on")
         decided, gave_up = control.reshape(count, devices, 2), bool(text.get("gave_up", False))
-        return Recording(decided, exposed, believed, gave_up, robot or RobotConfig(), world or World())
+        return Recording(decided, exposed, believed, gave_up, terms or Terms())
 
 
 def navigation_seed(task: Task, place: int) -> int:
     """Return the seed of the navigation in the patient at some place of a task's list."""
-    return 100 * task.level + place
+    return place + (task.ladder.seed if task.ladder.seed >= DRAWN else 100 * task.level)
 
 
-def attempt(
-    policy: str,
-    navigation: Navigation,
-    *,
-    seed: int,
-    world: World | None = None,
-    robot: RobotConfig | None = None,
-) -> dict[str, Any]:
+def attempt(policy: str, navigation: Navigation, *, seed: int, terms: Terms | None = None) -> dict[str, Any]:
     """Let a policy drive a navigation, and return its figures, its course and its recording.
 
     Where the policy searches, `planning_s` is the processor time that its searches took, s. It is no figure: it differs
@@ -104,13 +94,14 @@ def attempt(
 
     Args:
         seed: of encoder noise, detection errors and the policy.
-        robot: what drives, as it is given; the default one if not given.
+        terms: robot and world; where its patients are drawn, the policy runs in a process of its own (`Apart`).
 
     Raises:
         InputError: there is no such policy, or the wire does not fit the vessel.
     """
-    driver = make_policy(policy)
-    record = _loop(navigation, driver, seed, world, robot or RobotConfig()).run()
+    terms = terms or Terms()
+    with Apart(policy) if terms.request else nullcontext(make_policy(policy)) as driver:
+        record = _loop(navigation, driver, seed, terms).run()
     result = {"seed": seed} | scored(navigation, record, tells=isinstance(driver, AgentPolicy))
     planning_s = getattr(driver, "planning_s", None)
     return result if planning_s is None else result | {"planning_s": round(planning_s, 2)}
@@ -154,12 +145,11 @@ def driven(recording: Recording, navigation: Navigation, *, seed: int) -> Naviga
 
 def begun(recording: Recording, navigation: Navigation, *, seed: int) -> NavigationLoop:
     """Return the loop that drives a navigation as it was recorded, at its start."""
-    return _loop(navigation, Repeated(recording), seed, recording.world, recording.robot)
+    return _loop(navigation, Repeated(recording), seed, recording.terms)
 
 
-def _loop(navigation: Navigation, policy: Policy, seed: int, world: World | None, robot: RobotConfig) -> NavigationLoop:
-    config = LoopConfig(robot=robot, simulator=replace(CORE, threads=1))
-    return NavigationLoop(navigation, policy, config=config, seed=seed, world=world)
+def _loop(navigation: Navigation, policy: Policy, seed: int, terms: Terms) -> NavigationLoop:
+    return NavigationLoop(navigation, policy, config=terms.loop, seed=seed, world=terms.world)
 
 
 class Repeated:

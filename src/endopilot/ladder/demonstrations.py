@@ -21,7 +21,7 @@ from endopilot.ladder.submission import Submission, read_submission
 from endopilot.navigation.record import NavigationRecord
 from endopilot.progress import progress
 from endopilot.runs import claim
-from endopilot.tasks.task import Task, find_task
+from endopilot.tasks.task import Task
 from endopilot.types import SAMPLE_PERIOD_S
 from endopilot.xray.fluoroscope import FluoroscopeConfig
 
@@ -48,7 +48,9 @@ def write_demonstrations(submission: str | Path, *, output: str | Path) -> dict[
     - `action`: what was decided then: velocities of each device, mm/s and rad/s, and 1 where the next sample was to be
       an exposure;
     - `exposed`: whether the images are of this moment;
-    - `contact_force_max_n`: largest wall force on a node over the period that follows.
+    - `contact_force_max_n`: largest wall force on a node over the period that follows;
+    - `next.done`: 1 at the last decision; `next.success`: 1 there if it leads to the target, and `next.reward`: 1 if
+      it does, and no force of the navigation was beyond the limit.
 
     Returns:
         `dataset` (the folder), `episodes`, `samples` and `exposures`.
@@ -59,7 +61,7 @@ def write_demonstrations(submission: str | Path, *, output: str | Path) -> dict[
     """
     path, output = Path(submission), Path(output)
     read, key = read_submission(path), sha256(path)
-    tasks = [find_task(name, version=read.version) for name in read.navigations]
+    tasks = [read.terms.task(name) for name in read.navigations]
     if len(number := {1 + bool(task.catheter) for task in tasks}) > 1:
         raise InputError(f"{path}: some tasks are of a wire alone and some have a catheter; give one kind")
     described = _features(*number)
@@ -104,7 +106,8 @@ def _features(devices: int) -> dict[str, Any]:
         **{name: {"dtype": "float32", "shape": [len(of)], "names": of} for name, of in vectors.items()},
         **dict.fromkeys(_VIEWS, image),
         "exposed": {"dtype": "bool", **scalar},
-        "contact_force_max_n": {"dtype": "float32", **scalar},
+        **{name: {"dtype": "float32", **scalar} for name in ("contact_force_max_n", "next.reward")},
+        **{name: {"dtype": "bool", **scalar} for name in ("next.done", "next.success")},
     }
 
 
@@ -112,19 +115,22 @@ def _navigation(submission: Submission, task: Task, place: int) -> tuple[Columns
     """Drive a navigation again, and return its columns and what the episode table says of it."""
     packed = submission.navigations[task.name][place].recording
     navigation, seed = task.ladder_navigation(place), navigation_seed(task, place)
-    recording = Recording.unpacked(vars(packed), len(navigation.devices), submission.robot, submission.world)
+    recording = Recording.unpacked(vars(packed), len(navigation.devices), submission.terms)
     loop = begun(recording, navigation, seed=seed)
     views = Views(navigation, loop.simulator.set_up.anatomies[0], _C_ARM, PIXELS)
     record = loop.run()
     count = len(record.control) - 1
     images, age_s = _images(record, views, np.asarray(loop.world.registration_mm), seed)
     drives = np.concatenate([record.encoders[:count], record.load[:count]], axis=-1).reshape(count, -1)
-    asked = np.append(record.exposed[1:count], False)
+    asked, last = np.append(record.exposed[1:count], False), np.arange(count) == count - 1
     columns = {
         "observation.state": np.column_stack([drives, age_s]),
         "action": np.column_stack([record.control[:count].reshape(count, -1), asked]),
         "exposed": record.exposed[:count],
         "contact_force_max_n": record.contact_force_max[1:],
+        "next.reward": last * float(record.success and record.safe),
+        "next.done": last,
+        "next.success": last & record.success,
         **{name: [shown[k] for shown in images] for k, name in enumerate(_VIEWS)},
     }
     names = ("success", "safe", "reason", "peak_force_n", "exposures")

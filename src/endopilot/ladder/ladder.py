@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import model_validator
+from pydantic import BeforeValidator, model_validator
 
 from endopilot import __version__
 from endopilot.devices.robot import ASSUMED, RobotConfig, read_robot
 from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import attempt, navigation_seed
 from endopilot.ladder.scores import score
-from endopilot.ladder.submission import MOST_PATIENTS, SUBMISSION_FILE, task_digest, write_submission
+from endopilot.ladder.submission import MOST_PATIENTS, SUBMISSION_FILE, write_submission
+from endopilot.ladder.terms import Terms, task_digest
 from endopilot.navigation.policies import POLICIES, make_policy
 from endopilot.runs import claim, make_missing
 from endopilot.settings import Text, Within, settings
@@ -23,13 +25,22 @@ from endopilot.tasks.task import NEWEST, LadderVersion, Task, find_task, list_ta
 SCORES_FILE = "ladder.json"
 
 
+def _named(policy: Any) -> Any:
+    """Return the MODULE:OBJECT of a FILE.py:OBJECT, whose folder is looked in from now on."""
+    file, found, thing = policy.partition(".py:") if isinstance(policy, str) else ("", "", "")
+    if not found:
+        return policy
+    sys.path.insert(0, str(Path(file).resolve().parent))
+    return f"{Path(file).name}:{thing}"
+
+
 @settings
 class LadderConfig:
     """What climbs the ladder, and how much of it."""
 
-    policy: str = "forward"
+    policy: Annotated[str, BeforeValidator(_named)] = "forward"
     """forward, spin, retract-rotate, cloned, agent, oracle, open-loop, with a catheter in-turn or catheter-alone,
-    the name of a policy of an installed package, or MODULE:OBJECT of a policy of your own."""
+    the name of a policy of an installed package, or MODULE:OBJECT or FILE.py:OBJECT of a policy of your own."""
     tasks: tuple[str, ...] = ()
     """Names of the tasks; all if none is given."""
     patients: Annotated[int, Within(1, MOST_PATIENTS)] | None = None
@@ -43,6 +54,9 @@ class LadderConfig:
     """Name of the robot that drives (docs/concepts/robot.md), or a YAML file."""
     world: Text = NOMINAL
     """Name of the world that reality is (docs/concepts/worlds.md), or a YAML file. The policy does not know it."""
+    drawn: Text | None = None
+    """A word, such as the commit that brings a policy: patients that nobody has seen are drawn from the hash of word,
+    policy and terms, and the policy runs in a process of its own that is handed observations alone."""
 
     @model_validator(mode="after")
     def _consistent(self) -> LadderConfig:
@@ -69,6 +83,19 @@ class LadderConfig:
         ]
 
 
+def terms_of(config: LadderConfig) -> Terms:
+    """Return on what terms a policy climbs.
+
+    Raises:
+        InputError: no such robot or world.
+    """
+    terms = Terms(config.version, read_robot(config.robot), read_world(config.world))
+    if config.drawn is None:
+        return terms
+    patients = config.patients or max(len(task.ladder.numbers) for task in config.chosen)
+    return terms.drawn(config.policy, POLICIES.origin(config.policy), config.drawn, patients)
+
+
 def climb(*, output: str | Path, config: LadderConfig | None = None) -> list[dict[str, Any]]:
     """Let a policy do the tasks in their patients, and score it.
 
@@ -88,36 +115,39 @@ def climb(*, output: str | Path, config: LadderConfig | None = None) -> list[dic
     config = config or LadderConfig()
     output = Path(output)
     make_policy(config.policy)
-    tasks = config.chosen
-    robot, world = read_robot(config.robot), read_world(config.world)
-    claim(output, "endopilot ladder", **identity(config.policy, config.version, robot, world))
+    terms = terms_of(config)
+    claim(output, "endopilot ladder", **identity(config.policy, terms.version, terms.robot, terms.world, terms.request))
     paths = config.paths(output)
-    navigate = partial(_navigate, policy=config.policy, version=config.version, robot=robot, world=world)
-    make_missing(f"Ladder, {config.policy}", paths, navigate)
+    make_missing(f"Ladder, {config.policy}", paths, partial(_navigate, policy=config.policy, terms=terms))
+    tasks = config.chosen
     results = {task.name: [read_json(path) for path in paths if path.parent.name == task.name] for task in tasks}
     rows = score(tasks, results)
     most = max(map(len, results.values()))
     content = {"policy": config.policy, "ladder": config.version, "robot": config.robot, "patients": most}
-    content |= {"world": {"name": config.world, **world.differences()}, "scores": rows}
+    content |= {"world": {"name": config.world, **terms.world.differences()}, "key": terms.key(), "scores": rows}
+    content |= {"request": terms.request} if terms.request else {}
     write_json(output / SCORES_FILE, content)
-    write_submission(output / SUBMISSION_FILE, config.policy, config.version, results, rows, robot, world)
+    write_submission(output / SUBMISSION_FILE, config.policy, terms, results, rows, drawn=config.drawn)
     return rows
 
 
 def identity(
-    policy: str, version: LadderVersion, robot: RobotConfig | None = None, world: World | None = None
+    policy: str,
+    version: LadderVersion,
+    robot: RobotConfig | None = None,
+    world: World | None = None,
+    request: str = "",
 ) -> dict[str, Any]:
     """Return what a policy's results follow from: its source, tasks, their devices, robot, world and version."""
     tasks = {task.name: task_digest(task) for task in list_tasks(version)}
-    origin = POLICIES.origin(policy)
-    found = {"policy": policy, "origin": origin, "tasks": tasks, "robot": robot or RobotConfig()}
+    found = {"policy": policy, "origin": POLICIES.origin(policy), "tasks": tasks, "robot": robot or RobotConfig()}
+    found |= {"request": request} if request else {}
     return found | {"world": (world or World()).differences(), "version": __version__}
 
 
-def _navigate(path: Path, *, policy: str, version: LadderVersion, robot: RobotConfig, world: World) -> None:
+def _navigate(path: Path, *, policy: str, terms: Terms) -> None:
     """Do one navigation and write what came of it."""
-    task, place = find_task(path.parent.name, version=version), int(path.stem)
+    task, place = terms.task(path.parent.name), int(path.stem)
     navigation = task.ladder_navigation(place)
-    result = attempt(policy, navigation, seed=navigation_seed(task, place), robot=robot, world=world)
-    about = {"task": task.name, "ladder": version, "robot": robot, "world": world, "patient": navigation.anatomy.name}
-    write_json(path, about | result)
+    result = attempt(policy, navigation, seed=navigation_seed(task, place), terms=terms)
+    write_json(path, {"task": task.name, **terms.about(), "patient": navigation.anatomy.name} | result)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,17 +10,17 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from endopilot.devices.robot import RobotConfig, read_robot
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json, writing
 from endopilot.ladder.attempt import attempt, navigation_seed
-from endopilot.ladder.ladder import LadderConfig, identity
+from endopilot.ladder.ladder import LadderConfig, identity, terms_of
 from endopilot.ladder.scores import score_navigations
+from endopilot.ladder.terms import Terms
 from endopilot.navigation.policies import make_policy
 from endopilot.runs import claim, make_missing
 from endopilot.simulation.world import NOMINAL, QUANTITIES, World, drawn_sides, world_by
 from endopilot.tasks.navigation import Navigation
-from endopilot.tasks.task import LadderVersion, Task, find_task
+from endopilot.tasks.task import Task
 
 MISMATCH_FILE, PICTURE_FILE = "mismatch.json", "mismatch.png"
 CASES = ("matched", *(f"{name}-{side}" for name in QUANTITIES for side in ("less", "more")), "all")
@@ -44,15 +45,15 @@ def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[d
     """
     if not 0 < share < 1:
         raise InputError(f"mismatch: {share} is not in (0, 1); give e.g. 0.2")
-    if config.world != NOMINAL:
-        raise InputError(f"world: {config.world}; mismatch makes worlds of its own: leave one of them out")
+    if config.world != NOMINAL or config.drawn:
+        raise InputError(f"world: {config.world}; mismatch makes worlds of its own and draws none: leave both out")
     make_policy(config.policy)
     tasks = config.chosen
-    robot = read_robot(config.robot)
-    claim(output, "endopilot ladder --mismatch", **identity(config.policy, config.version, robot), mismatch=share)
+    terms = terms_of(config)
+    claim(output, "endopilot ladder --mismatch", **identity(config.policy, terms.version, terms.robot), mismatch=share)
     paths = {case: config.paths(output / case) for case in CASES}
     every = [path for of_case in paths.values() for path in of_case]
-    navigate = partial(_navigate, policy=config.policy, version=config.version, share=share, robot=robot)
+    navigate = partial(_navigate, policy=config.policy, terms=terms, share=share)
     make_missing(f"Model mismatch, {config.policy}", every, navigate)
     rows = [{"case": case} | _scores([read_json(path) for path in paths[case]]) for case in CASES]
     with writing(output / PICTURE_FILE) as partly:
@@ -81,11 +82,11 @@ def world_of(case: str, share: float, navigation: Navigation, task: Task, place:
     return world_by(change, navigation.anatomy)
 
 
-def _navigate(path: Path, *, policy: str, version: LadderVersion, share: float, robot: RobotConfig) -> None:
-    case, task, place = path.parents[1].name, find_task(path.parent.name, version=version), int(path.stem)
+def _navigate(path: Path, *, policy: str, terms: Terms, share: float) -> None:
+    case, task, place = path.parents[1].name, terms.task(path.parent.name), int(path.stem)
     navigation = task.ladder_navigation(place)
     world = world_of(case, share, navigation, task, place)
-    result = attempt(policy, navigation, seed=navigation_seed(task, place), world=world, robot=robot)
+    result = attempt(policy, navigation, seed=navigation_seed(task, place), terms=replace(terms, world=world))
     write_json(path, {"task": task.name, "patient": navigation.anatomy.name} | result)
 
 

@@ -21,13 +21,13 @@ def score(tasks: Sequence[Task], results: Mapping[str, Sequence[Mapping[str, Any
     Several tasks are scored together where all of them were done.
 
     Each row has `level`; `task`; `safe_success`, the share of navigations that reached the target with a wall force
-    that never exceeded the task's limit; `success`, the share that reached it; of those that did, the medians of
-    `seconds` and `path_ratio` (length of the tip's path over that of the centerline); and of all the median of
-    `peak_force_n` (N) and the mean of `exposures`. Rows of `agent` have `missed_events`, the share
-    of the events of all their navigations that X-ray did not show (docs/concepts/advice.md). Rows of tasks with
-    `near_mm` have `near`, the share of navigations in which the tip came so near to the target, whatever the force.
-    Rows of policies that search have `planning_s`, the mean processor time of a navigation's searches, s; `timeless`
-    leaves it out."""
+    that never exceeded the task's limit; `safe_from` and `safe_to`, its 95 % interval over patients; `success`, the
+    share that reached it; of those that did, the medians of `seconds` and `path_ratio` (length of the tip's path over
+    that of the centerline); and of all the median of `peak_force_n` (N) and the mean of `exposures`. Rows of `agent`
+    have `missed_events`, the share of the events of all their navigations that X-ray did not show
+    (docs/concepts/advice.md). Rows of tasks with `near_mm` have `near`, the share of navigations in which the tip came
+    so near to the target, whatever the force. Rows of policies that search have `planning_s`, the mean processor time
+    of a navigation's searches, s; `submitted` leaves it and the interval out."""
     rows = [{"level": task.level, "task": task.name} | score_navigations(results[task.name]) for task in tasks]
     levels = {task.level: task.name for task in tasks}
     groups = {"lower four": range(1, 5), "upper eight": UPPER, "all twelve": range(1, 13), "all coaxial": COAXIAL}
@@ -50,8 +50,12 @@ def score_navigations(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
     events = [result["events"] for result in results if "events" in result]
     missed = round(sum(unseen for _, unseen in events) / max(sum(count for count, _ in events), 1), 4)
+    safe = sum(result["success"] and result["safe"] for result in results)
+    low, high = interval(safe, len(results))
     return {
-        "safe_success": round(float(np.mean([result["success"] and result["safe"] for result in results])), 4),
+        "safe_success": round(safe / len(results), 4),
+        "safe_from": round(low, 4),
+        "safe_to": round(high, 4),
         "success": round(len(reached) / len(results), 4),
         **({"near": round(float(np.mean([r["near"] for r in results])), 4)} if "near" in results[0] else {}),
         "seconds": median("seconds", reached, 1),
@@ -63,6 +67,14 @@ def score_navigations(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def timeless(scores: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the scores of a row that are the same in every run."""
-    return {name: value for name, value in scores.items() if name != "planning_s"}
+def interval(reached: int, count: int) -> tuple[float, float]:
+    """Return Wilson's 95 % interval of a share (J. Am. Stat. Assoc. 22, 209, 1927)."""
+    z, share = 1.959964, reached / count
+    middle, width = share + z * z / (2 * count), z * ((share * (1 - share) + z * z / (4 * count)) / count) ** 0.5
+    low, high = (max(0.0, (middle + sign * width) / (1 + z * z / count)) for sign in (-1, 1))
+    return low, high
+
+
+def submitted(scores: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the scores of a row that stand in a submission: the same in every run, and each by itself."""
+    return {name: value for name, value in scores.items() if name not in ("planning_s", "safe_from", "safe_to")}

@@ -1,15 +1,17 @@
 """The file by which others can confirm scores of the ladder: `write_submission`, `check_submission`.
 
-It holds the scores, the results and the recording of every navigation, and what they were made with. The check drives
-every recording through the same robot and simulator, without the policy, and compares all figures to the bit.
+It holds the scores, the results and the recording of every navigation, and what they were made with. The check believes
+none of it: it drives every recording through the same robot and simulator, with a kernel of linear algebra that it
+knows, compares all figures to the bit, and returns those that it drove itself.
 """
 
 from __future__ import annotations
 
-import hashlib
-import math
+import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from itertools import zip_longest
@@ -19,23 +21,23 @@ from typing import Any, Literal
 from threadpoolctl import threadpool_info
 
 from endopilot import __version__, _core
-from endopilot.devices.catheter import read_catheter
-from endopilot.devices.device import read_wire
 from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
-from endopilot.files import input_hash, json_text, manifest, read_json, write_json
-from endopilot.ladder.attempt import Recording, navigation_seed, repeat
-from endopilot.ladder.scores import score, timeless
+from endopilot.files import json_text, manifest, read_json, write_json
+from endopilot.ladder.attempt import Recording, attempt, navigation_seed, repeat
+from endopilot.ladder.scores import score, submitted
+from endopilot.ladder.terms import Terms, task_digest
 from endopilot.navigation.policies import POLICIES
-from endopilot.parallel import each
-from endopilot.settings import CountOrZero, Seed, from_record, read_settings, settings
+from endopilot.parallel import Workers, each
+from endopilot.settings import CountOrZero, Seed, read_settings, settings
 from endopilot.simulation.world import World
-from endopilot.tasks.task import LadderVersion, Task, find_task, list_tasks
+from endopilot.tasks.task import LadderVersion, Task, find_task
 
 SUBMISSION_FILE = "submission.json"
-_ROUNDING = 0.05
-"""Figures that differ by no larger share agree but for rounding. In 232 navigations with another kernel the largest
-force differed by 1e-8 in the median and by 3.4 % at most, where a tip snaps otherwise, and paths by 0.07 %."""
+KERNELS = {"openblas Haswell": "avx2", "openblas SkylakeX": "avx512"}
+"""Kernels of linear algebra that submissions are driven again with, and the processor level that each needs. Vessels
+differ by the kernel in their last bits, and so does what is driven in them: a wire that snaps makes that up to 3.4 % of
+a force."""
 MOST_PATIENTS = 100
 """Patients of each task, at most: their seeds are distinct up to there (`navigation_seed`)."""
 
@@ -89,6 +91,7 @@ class Submission:
         scores: what `endopilot.ladder.scores.score` makes of them.
         robot: what drove; a file without it has the default one.
         world: what reality was; a file without it has the nominal one.
+        drawn: the word with which patients were drawn, where they were (`Terms.drawn`).
     """
 
     format: Literal[1] = 1
@@ -103,11 +106,25 @@ class Submission:
     scores: tuple[dict[str, Any], ...]
     robot: RobotConfig = RobotConfig()
     world: World = World()
+    drawn: str | None = None
 
     @property
     def version(self) -> LadderVersion:
         """Version of the ladder."""
         return self.ladder or 1
+
+    @property
+    def terms(self) -> Terms:
+        """On what terms the policy climbed; patients follow from the file, nobody chooses them."""
+        terms = Terms(self.version, self.robot, self.world)
+        if self.drawn is None:
+            return terms
+        return terms.drawn(self.policy, self.origin, self.drawn, max(map(len, self.navigations.values()), default=0))
+
+
+Verdict = Literal["decided again", "replayed", "failed", "not judged"]
+"""What came of a check: all figures are confirmed, and a shipped policy took the same decisions again; all figures but
+the exposures are; something is not as the file says; or this machine cannot tell."""
 
 
 @dataclass(frozen=True)
@@ -115,25 +132,32 @@ class SubmissionCheck:
     """What came of the check of a submission.
 
     Attributes:
-        policy: name of the policy.
+        verdict: one of `Verdict`.
+        policy: name of the policy, as the file says.
         origin: where the policy comes from, as the file says.
+        key: scores under equal keys may be compared (`endopilot.ladder.terms.Terms.key`).
+        kernel: of linear algebra, that all was driven again with.
         navigations: their number.
-        difference: the first that differs from the file, in words; None where all scores are confirmed to the bit.
-        rounded: whether all figures agree but for rounding, in an installation with another kernel of linear algebra.
-        remarks: in what this installation differs from the one that made the file.
+        difference: the first that differs from the file, in words; None where nothing does.
+        scores: of what was driven again. A recording says when X-ray was on, and velocities do not tell whether that is
+            true: unless a policy decided again, exposures and missed events are named `..._as_recorded`.
+        remarks: what else is to be known.
     """
 
+    verdict: Verdict
     policy: str
     origin: str
+    key: Mapping[str, Any]
+    kernel: str
     navigations: int
     difference: str | None
-    rounded: bool
+    scores: Sequence[Mapping[str, Any]]
     remarks: tuple[str, ...]
 
     @property
     def confirmed(self) -> bool:
-        """Whether the scores are what the recordings give: to the bit, or, with another kernel, but for rounding."""
-        return self.difference is None or self.rounded
+        """Whether the scores are what was driven again, to the bit."""
+        return self.verdict in ("decided again", "replayed")
 
 
 def blas_kernel() -> str | None:
@@ -146,54 +170,38 @@ def blas_kernel() -> str | None:
     return ", ".join(sorted(kernels)) or None
 
 
-def task_digest(task: Task) -> str:
-    """Return the SHA-256 of what a task's navigations follow from: its definition and its devices."""
-    # Older tasks had no such fields, or named them otherwise: their hashes stay.
-    older = {"vessel": "anatomy", "start_inserted_length_mm": "start_inserted_mm"}
-    definition = {
-        older.get(name, name): value
-        for name, value in asdict(task).items()
-        if (name, value) != ("version", 1) and value is not None
-    }
-    if task.anatomies is not None:
-        hashes = [next(iter(input_hash(Path(folder)).values())) for folder in task.anatomies]
-        definition |= {"anatomies": hashes, "device": None}  # what they hold, wherever they lie
-        definition |= {"catheter": None} if task.catheter else {}
-    content = json_text(definition) + json_text(read_wire(task.device))
-    content += json_text(read_catheter(task.catheter)) if task.catheter else ""
-    return hashlib.sha256(content.encode()).hexdigest()
-
-
 def write_submission(
     path: Path,
     policy: str,
-    version: LadderVersion,
+    terms: Terms,
     results: Mapping[str, Sequence[Mapping[str, Any]]],
     scores: Sequence[Mapping[str, Any]],
-    robot: RobotConfig,
-    world: World,
+    *,
+    drawn: str | None = None,
 ) -> None:
     """Write the submission file of a policy.
 
     Args:
         results: by the task's name, the results of its navigations (`attempt`) in the order of the task's patients.
+        drawn: the word that the patients were drawn with, if they were.
     """
     known = {each.name for each in fields(NavigationEntry)}
     submission = Submission(
-        ladder=version,
+        ladder=terms.version,
         policy=policy,
         origin=POLICIES.origin(policy),
         versions=manifest(config=None)["versions"],
         core=_core.LEVEL,
         blas=blas_kernel(),
-        tasks={name: task_digest(find_task(name, version=version)) for name in results},
+        tasks={name: task_digest(find_task(name, version=terms.version)) for name in results},
         navigations={
             name: tuple(NavigationEntry(**{key: value for key, value in one.items() if key in known}) for one in done)
             for name, done in results.items()
         },
-        scores=tuple(timeless(row) for row in scores),
-        robot=robot,
-        world=world,
+        scores=tuple(submitted(row) for row in scores),
+        robot=terms.robot,
+        world=terms.world,
+        drawn=drawn,
     )
     write_json(path, submission)
 
@@ -210,29 +218,64 @@ def read_submission(path: str | Path) -> Submission:
     return submission
 
 
-def check_submission(path: str | Path) -> SubmissionCheck:
-    """Drive all recordings of a submission file again, without the policy, and compare every figure to the bit.
+def check_submission(path: str | Path, *, policy: str = "") -> SubmissionCheck:
+    """Drive all recordings of a submission file again, and compare every figure to the bit; nothing else is believed.
 
-    With another kernel of linear algebra vessels differ in their last bits, and so does what is driven in them. Figures
-    that agree but for rounding are told from others there.
+    They are driven with the file's kernel of linear algebra, one of `KERNELS`. A policy that is at hand also decides
+    again: its exposures are counted then. Where it decides otherwise, the file fails, unless it is of another version.
 
     Args:
         path: the file.
+        policy: MODULE:OBJECT of the file's policy, where you have it and trust it; shipped ones are at hand.
 
     Raises:
-        InputError: the file is no submission, or its tasks or seeds are not those of this ladder.
+        InputError: the file is no submission, its tasks or seeds are not those of this ladder, or it was made with a
+            kernel that nobody can drive it again with.
     """
     submission = read_submission(path)
-    with tempfile.TemporaryDirectory(prefix="endopilot-") as folder:
-        difference, rounding = _first_difference(submission, Path(folder))
-    return SubmissionCheck(
+    kernel, at_hand = submission.blas or "none", submission.policy in (*POLICIES.shipped, policy)
+    if kernel not in KERNELS:
+        raise InputError(
+            f"{path}: blas: {kernel}; submissions are driven again with {' or '.join(KERNELS)}: run the ladder again "
+            "with OPENBLAS_CORETYPE=Haswell"
+        )
+    judged = partial(
+        SubmissionCheck,
         policy=submission.policy,
         origin=submission.origin,
+        key=submission.terms.key(),
+        kernel=kernel,
         navigations=sum(map(len, submission.navigations.values())),
-        difference=difference,
-        rounded=rounding and submission.blas != blas_kernel(),
-        remarks=_remarks(submission),
     )
+    with _running(kernel) as (runs, pool), tempfile.TemporaryDirectory(prefix="endopilot-") as folder:
+        if not runs:
+            remark = f"this machine does not run {kernel}: nothing was driven again"
+            return judged(verdict="not judged", difference=None, scores=(), remarks=(remark,))
+        return judged(**_driven_again(submission, Path(folder), pool, at_hand))
+
+
+@contextmanager
+def _running(kernel: str) -> Iterator[tuple[bool, Workers | None]]:
+    """Yield whether this machine runs a kernel of linear algebra, and processes that do, unless this one does."""
+    if kernel == blas_kernel():
+        yield True, None
+        return
+    before = os.environ.get("OPENBLAS_CORETYPE")
+    os.environ["OPENBLAS_CORETYPE"] = kernel.partition(" ")[2]  # which OpenBLAS reads as it is loaded
+    try:
+        with Workers() as pool:
+            yield KERNELS[kernel] in _core.supported_levels() and _runs(pool, kernel), pool
+    finally:
+        del os.environ["OPENBLAS_CORETYPE"]
+        os.environ |= {} if before is None else {"OPENBLAS_CORETYPE": before}
+
+
+def _runs(pool: Workers, kernel: str) -> bool:
+    """Return whether processes run a kernel; some libraries do not let theirs be chosen."""
+    try:
+        return pool.submit(blas_kernel).result() == kernel
+    except BrokenProcessPool:
+        return False
 
 
 def _refuse_another_ladder(path: Path, submission: Submission) -> None:
@@ -240,19 +283,17 @@ def _refuse_another_ladder(path: Path, submission: Submission) -> None:
     if set(submission.tasks) != set(submission.navigations):
         raise InputError(f"{path}: tasks and navigations name different tasks; give the file as it was written")
     counts = {name: len(entries) for name, entries in submission.navigations.items()}
-    tasks = {}
-    for name in counts:
-        try:
-            tasks[name] = find_task(name, version=submission.version)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from error
+    try:
+        tasks = {name: submission.terms.task(name) for name in counts}
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
     most = max(counts.values(), default=0)
     known = max((len(task.ladder.numbers) for task in tasks.values()), default=0)
     whole = all(1 <= counts[name] == min(most, len(task.ladder.numbers)) for name, task in tasks.items())
     if not counts or not whole:
         raise InputError(f"{path}: navigations: {counts}; each task needs the same first 1 to {known} patients")
     for name, entries in submission.navigations.items():
-        if submission.tasks[name] != task_digest(tasks[name]):
+        if submission.tasks[name] != task_digest(find_task(name, version=submission.version)):
             if isinstance(submission.version, str) and Path(submission.version).is_dir():
                 raise InputError(
                     f"{path}: task {name!r} of {submission.version} is another than the file was made with: its "
@@ -267,40 +308,57 @@ def _refuse_another_ladder(path: Path, submission: Submission) -> None:
                 raise InputError(f"{path}: task {name}, patient {place}: seed {entry.seed}; the ladder's is {seed}")
 
 
-def _first_difference(submission: Submission, folder: Path) -> tuple[str | None, bool]:
-    """Return where the file first differs from its recordings driven again, in words, and whether by rounding alone."""
+def _driven_again(submission: Submission, folder: Path, pool: Workers | None, at_hand: bool) -> dict[str, Any]:
+    """Drive all recordings again, and let a policy that is at hand decide again.
+
+    Returns:
+        Verdict, first difference, scores and remarks of `SubmissionCheck`.
+    """
+    terms, policy, remarks = submission.terms, submission.policy, _remarks(submission)
+    tasks = sorted(map(terms.task, submission.navigations), key=lambda task: task.level)
     entries = {
-        folder / name / f"{place:02d}.json": entry
-        for name, done in sorted(
-            submission.navigations.items(), key=lambda item: find_task(item[0], version=submission.version).level
-        )
-        for place, entry in enumerate(done)
+        folder / task.name / f"{place:02d}.json": entry
+        for task in tasks
+        for place, entry in enumerate(submission.navigations[task.name])
     }
     for path, entry in entries.items():
         write_json(path, entry.recording)
-    again = partial(_repeat, version=submission.version, robot=submission.robot, world=submission.world)
-    bad = each(f"Checking {submission.policy}", list(entries), again)
-    differing, rounding = [], True
-    for path, entry in entries.items():
-        again = {} if path in bad else read_json(path)
-        remark = str(bad[path]) if path in bad else _difference(entry.figures(), again)
-        if remark is not None:
-            differing.append(f"task {path.parent.name}, patient {int(path.stem)}: {remark}")
-            rounding = rounding and _agree(entry.figures(), again)
-    if differing and not rounding:
-        return f"{differing[0]} ({len(differing)} of {len(entries)} navigations differ)", False
-    results = {
-        name: [read_json(folder / name / f"{place:02d}.json") for place in range(len(done))]
-        for name, done in submission.navigations.items()
+    work = partial(_repeat, terms=terms, policy=policy if at_hand else None)
+    bad = each(f"Checking {policy}", list(entries), work, pool)
+    again = {path: {} if path in bad else read_json(path) for path in entries}
+    otherwise = [path for path, figures in again.items() if not figures.pop("decided", False)]
+    if at_hand and otherwise:
+        remarks += (f"{policy} decides otherwise here in {len(otherwise)} of {len(entries)} navigations",)
+    forged = otherwise if at_hand and submission.origin == POLICIES.origin(policy) else []
+    found = {
+        path: str(bad[path]) if path in bad else _difference(entry.figures(), again[path])
+        for path, entry in entries.items()
     }
-    rows = score([task for task in list_tasks(submission.version) if task.name in results], results)
-    for given, again in zip_longest(submission.scores, rows, fillvalue={}):
-        remark = _difference(given, again)
-        if remark is not None and not (differing and _agree(given, again)):
-            return f"scores, {again.get('task') or given.get('task')}: {remark}", False
+    found |= {path: f"{policy} decides otherwise" for path in forged if found[path] is None}
+    differing = [f"task {path.parent.name}, patient {int(path.stem)}: {said}" for path, said in found.items() if said]
+    rows = []
     if differing:
-        return f"{differing[0]} ({len(differing)} of {len(entries)} navigations differ)", True
-    return None, False
+        differing[0] += f" ({len(differing)} of {len(entries)} navigations differ)"
+    else:
+        results = {task.name: [again[path] for path in entries if path.parent.name == task.name] for task in tasks}
+        rows = score(tasks, results)
+        pairs = zip_longest(submission.scores, rows, fillvalue={})
+        said = [(row.get("task") or given.get("task"), _difference(given, submitted(row))) for given, row in pairs]
+        differing = [f"scores, {task}: {remark}" for task, remark in said if remark]
+    decided = at_hand and not otherwise
+    if not decided:
+        rows = [{_claimed(name): value for name, value in row.items()} for row in rows]
+    return {
+        "verdict": "failed" if differing else "decided again" if decided else "replayed",
+        "difference": differing[0] if differing else None,
+        "scores": () if differing else rows,
+        "remarks": remarks,
+    }
+
+
+def _claimed(name: str) -> str:
+    """Return the name of a figure where nobody decided again."""
+    return f"{name}_as_recorded" if name in ("exposures", "missed_events") else name
 
 
 def recorded_navigation(path: Path, name: str | None, place: int) -> tuple[Task, int, Recording]:
@@ -323,24 +381,23 @@ def recorded_navigation(path: Path, name: str | None, place: int) -> tuple[Task,
         entries = content["navigations"][name]
         if not 0 <= place < len(entries):
             raise InputError(f"world: {place}; {path} has patients 0 to {len(entries) - 1} of this task")
-        entry = entries[place]
+        entry, terms = entries[place], read_submission(path).terms
     elif isinstance(content, dict) and "recording" in content and path.stem.isdecimal():
-        name, place, entry = path.parent.name, int(path.stem), content
+        name, place, entry, terms = path.parent.name, int(path.stem), content, Terms.of(content)
     else:
         raise InputError(f"{path}: is no file of the ladder; give a submission.json or TASK/NUMBER.json")
-    task = find_task(name, version=content.get("ladder") or 1)
-    robot = from_record(RobotConfig, content["robot"]) if "robot" in content else None
-    world = from_record(World, content["world"]) if "world" in content else None
-    return task, place, Recording.unpacked(entry["recording"], 2 if task.catheter else 1, robot, world)
+    task = terms.task(name)
+    return task, place, Recording.unpacked(entry["recording"], 2 if task.catheter else 1, terms)
 
 
-def _repeat(path: Path, *, version: LadderVersion, robot: RobotConfig, world: World) -> None:
-    """Drive the recording in a file again, and put the figures in its place."""
-    task, place = find_task(path.parent.name, version=version), int(path.stem)
-    navigation = task.ladder_navigation(place)
-    recording = Recording.unpacked(read_json(path), len(navigation.devices), robot, world)
-    figures = repeat(recording, navigation, seed=navigation_seed(task, place))
-    write_json(path, {"patient": navigation.anatomy.name} | figures)
+def _repeat(path: Path, *, terms: Terms, policy: str | None) -> None:
+    """Drive the recording in a file again, and put the figures in its place, and whether a policy decides so."""
+    task, place = terms.task(path.parent.name), int(path.stem)
+    navigation, seed = task.ladder_navigation(place), navigation_seed(task, place)
+    recording = Recording.unpacked(read_json(path), len(navigation.devices), terms)
+    figures = repeat(recording, navigation, seed=seed)
+    decided = policy is not None and attempt(policy, navigation, seed=seed, terms=terms)["sha256"] == figures["sha256"]
+    write_json(path, {"patient": navigation.anatomy.name} | figures | {"decided": decided})
 
 
 def _difference(given: Mapping[str, Any], again: Mapping[str, Any]) -> str | None:
@@ -352,16 +409,6 @@ def _difference(given: Mapping[str, Any], again: Mapping[str, Any]) -> str | Non
         if before != now:
             return f"{name} is {before} in the file and {now} when driven again"
     return None
-
-
-def _agree(given: Mapping[str, Any], again: Mapping[str, Any]) -> bool:
-    """Return whether figures agree but for rounding; the hash of what is driven does not count."""
-    names = {*given, *again} - {"sha256"}
-    if not all(name in given and name in again for name in names):
-        return False
-    floats = {name for name in names if isinstance(given[name], float) and isinstance(again[name], float)}
-    close = all(math.isclose(given[name], again[name], rel_tol=_ROUNDING) for name in floats)
-    return close and all(json_text(given[name]) == json_text(again[name]) for name in names - floats)
 
 
 def _remarks(submission: Submission) -> tuple[str, ...]:

@@ -18,11 +18,12 @@ from endopilot.files import read_json, writing
 from endopilot.ladder.attempt import driven, navigation_seed
 from endopilot.ladder.ladder import SCORES_FILE
 from endopilot.ladder.submission import recorded_navigation
+from endopilot.ladder.terms import Terms
 from endopilot.plotting import BLACK, BLUE, GREEN, ORANGE, STYLE, VERMILLION, png
 from endopilot.report.report import image, render
 from endopilot.report.scene import mark_target, navigation_scene
 from endopilot.tasks.navigation import Navigation
-from endopilot.tasks.task import Task, find_task, list_tasks
+from endopilot.tasks.task import Task, list_tasks
 
 PAGE_FILE = "index.html"
 SHOWN = 5
@@ -43,7 +44,8 @@ def write_page(output: Path) -> Path:
         InputError: the folder holds no scores.
     """
     content = read_json(output / SCORES_FILE)
-    tasks = [find_task(row["task"], version=content["ladder"]) for row in content["scores"] if row["level"] is not None]
+    terms = Terms(content["ladder"], request=content.get("request", ""), patients=content["patients"])
+    tasks = [terms.task(row["task"]) for row in content["scores"] if row["level"] is not None]
     plotly = output / "plotly.min.js"
     if not plotly.exists():
         with writing(plotly) as partial:

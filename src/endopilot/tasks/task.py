@@ -149,7 +149,7 @@ class Task:
             raise InputError(f"patient: {place}; task {self.name} has patients 0 to {len(patients.numbers) - 1}")
         if self.anatomies is not None and patients is self.ladder:
             return read_anatomy(self.anatomies[place])
-        return with_world_zero(make_patient(self.atlas(patients.seed), patients.numbers[place]))
+        return _patient(self.atlas(patients.seed), patients.numbers[place])
 
     def atlas(self, seed: int) -> AtlasConfig:
         """Return the atlas of a seed that the task's patients come from."""
@@ -208,6 +208,12 @@ class Task:
             arrives=self.arrives or "wire",
             start_catheter_mm=self.start_catheter_mm or 0.0,
         )
+
+
+@lru_cache(maxsize=8)  # each takes up to 0.12 GB, and up to 20 s to draw
+def _patient(atlas: AtlasConfig, number: int) -> Anatomy:
+    """Return a patient of an atlas."""
+    return with_world_zero(make_patient(atlas, number))
 
 
 @cache
