@@ -20,7 +20,8 @@ from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.robot.candidates import LEAST_EPISODES, UNKNOWN_SHARE, Candidates
-from endopilot.robot.log import STARTS, Courses, RobotLog
+from endopilot.robot.kinematics import Tracks, filtered, fit_noise, starts
+from endopilot.robot.log import Courses, RobotLog
 from endopilot.settings import OpenShare, Within, public, settings
 from endopilot.simulation.config import PRESETS, SimulatorConfig
 from endopilot.simulation.robots import in_grip
@@ -38,6 +39,8 @@ _TOGETHER = 8
 """Episodes that are simulated side by side, for as long as the longest of them takes."""
 _TRAVEL_MM = 1000.0
 """A drive that goes farther in an episode than this and the vessel's length is logged in another unit, mm."""
+_NOISE = (0.05, 4.0)
+"""Noise that its fit begins with: that of the public logs, mm, and in that variance a mm of travel."""
 FAR_MM = 2.0
 """No tip counts as farther from the real one than this, mm, when a world is chosen: one in a wrong branch is wrong."""
 
@@ -63,7 +66,7 @@ class EpisodeReplay:
         seen: the real tip, LPS mm.
         simulated: the simulated tip at the same times, LPS mm.
         abscissa: Δtip of both, seen and simulated, mm.
-        driven: Δ of the simulated drive without the vessel: what lag, gain and play alone make of the commands, mm.
+        driven: Δtip without the vessel: what lag, gain and play make of the commands, from the last given tip, mm.
         in_view: the difference of both tips, as the camera sees it, mm.
         along: unit vector along the vessel at the real tip.
         branch: of both tips.
@@ -200,46 +203,46 @@ def replay_prepared(
 ) -> list[EpisodeReplay]:
     """Replay episodes that are prepared, as `replay_log` does."""
     device, simulator = in_grip(device, robot, simulator or PRESETS["fast"])
-    times, course = _proximal(of, robot)
-    at_tips = _at(times, course[..., 0], of.courses.seen_s)
-    depth = np.nanmedian(np.where(of.given, of.abscissa - at_tips, np.nan), axis=1)
+    drive = robot.wire
+    values = np.array([[drive.gain_translation, drive.play_mm, robot.latency_s, 0.0]])
+    tracks = Tracks(of.courses, np.where(of.given, of.abscissa, np.nan))
+    noise = fit_noise(tracks, values[0], starts(tracks, values, _NOISE)[0][0])
+    begun = starts(tracks, values, noise)[0][0]
+    motion, travel = tracks.motion(values, begun)[0], tracks.travel(robot.latency_s)
+    depth = filtered(tracks.abscissa - motion, travel, *noise).offset  # after the last tip that is given
+    times, course = _proximal(of, robot, begun)
     angles = np.tile(2 * np.pi * np.arange(config.rotations) / config.rotations, (len(of.logs), 1))
     tried = _simulated(of, device, times, course, depth, angles, simulator)
     first = np.argmin(tried.cost, axis=1)
     rows = np.arange(len(of.logs))
     known = [_known_rotation(_far_from(of, tried.tip, int(k)), angles[k]) for k in rows]
     # Once more where the wire lay deeper, or less deep, than without the vessel, and from around the best rotation.
-    behind = np.where(of.given, of.abscissa - tried.abscissa[rows, first], np.nan)
-    depth = depth + np.nanmedian(behind, axis=1)
+    behind = filtered(tracks.abscissa - tried.abscissa[rows, first], travel, *noise).offset
     step = 2 * np.pi / config.rotations
     near = angles[rows, first][:, None] + step * np.array([-0.5, -0.25, 0.0, 0.25, 0.5])
-    tried = _simulated(of, device, times, course, depth, near, simulator)
+    tried = _simulated(of, device, times, course, depth + behind, near, simulator)
     best = np.argmin(tried.cost, axis=1)
     return [
-        _episode(of, k, tried, int(best[k]), at_tips[k] + depth[k], (float(near[k, best[k]]), known[k]), times[k, 1:])
+        _episode(of, k, tried, int(best[k]), motion[k] + depth[k], (float(near[k, best[k]]), known[k]), times[k, 1:])
         for k in range(len(best))
     ]
 
 
-def _proximal(of: Prepared, robot: RobotConfig) -> tuple[Float[np.ndarray, "episodes times"], np.ndarray]:
+def _proximal(
+    of: Prepared, robot: RobotConfig, start: Float[np.ndarray, "episodes"]
+) -> tuple[Float[np.ndarray, "episodes times"], Float[np.ndarray, "episodes times 2"]]:
     """Return equal times of each episode, and where the drive then has the wire, mm and rad, from its first place."""
     drive, courses = robot.wire, of.courses
     begin = np.maximum(courses.seen_s[:, 0] - _LEAD_S, 0.0)
     count = int(np.ceil((courses.seen_s.max(axis=1) - begin).max() / _PERIOD_S)) + 1
-    times = begin[:, None] + _PERIOD_S * np.arange(count + 1)
-    along, around = ((drive.gain_translation, drive.play_mm), (drive.gain_rotation, drive.play_rad))
+    times, late = begin[:, None] + _PERIOD_S * np.arange(count + 1), np.array([robot.latency_s])
 
-    def followed(axis: int, at_s: np.ndarray, start: float | np.ndarray) -> np.ndarray:
-        gain, play = (np.array([value]) for value in (along, around)[axis])
-        late = np.array([robot.latency_s])
-        return courses.followed(axis, at_s=at_s, latency_s=late, gain=gain, play=play, start=start)[0]
+    def followed(axis: int, gain: float, play: float, start: float | np.ndarray) -> np.ndarray:
+        gains, plays = np.array([gain]), np.array([play])
+        return courses.followed(axis, at_s=times, latency_s=late, gain=gains, play=plays, start=start)[0]
 
-    missed = []
-    for start in STARTS:
-        error = np.where(of.given, of.abscissa - followed(0, courses.seen_s, start), np.nan)
-        missed.append(np.nanmean(np.abs(error - np.nanmedian(error, axis=1, keepdims=True)), axis=1))
-    begun = np.array(STARTS)[np.argmin(missed, axis=0)]
-    return times, np.stack([followed(0, times, begun), followed(1, times, 0.0)], axis=-1)
+    along = followed(0, drive.gain_translation, drive.play_mm, start)
+    return times, np.stack([along, followed(1, drive.gain_rotation, drive.play_rad, 0.0)], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,14 +342,6 @@ def _in_view(log: RobotLog, tip: Float[np.ndarray, "*worlds tips 3"]) -> Float[n
         return apart
     _, ray = log.camera.rays(log.pixel[log.seen])
     return apart - (apart * ray).sum(axis=-1, keepdims=True) * ray
-
-
-def _at(
-    times: Float[np.ndarray, "episodes times"],
-    values: Float[np.ndarray, "episodes times"],
-    seen_s: Float[np.ndarray, "episodes tips"],
-) -> Float[np.ndarray, "episodes tips"]:
-    return np.stack([np.interp(seen_s[k], times[k], values[k]) for k in range(len(times))])
 
 
 def _episode(

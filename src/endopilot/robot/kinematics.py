@@ -1,0 +1,308 @@
+"""The tip as its drive alone leads it: gain, play, lag and an offset, fitted exactly, with intervals.
+
+The tip lies at y(t) = a(t) + g P(u(t − τ)) + s w(t) + noise, with the commanded course u, the play operator P, the gain
+g, the lag τ, and how much farther than its proximal end a simulated wire's tip goes, w, which counts by a share s that
+is fitted too. Nobody logs the offset a: it drifts as the wire slides, by equal variances in equal travel, and begins
+anew where the tip jumps, or the wire slips in its grip. So it is a state, and a Kalman filter takes it out of tip and
+model alike; what remains are innovations, independent of each other, to which g, the play, τ and s are fitted by
+Gauss and Newton. Slip costs what a jump costs and no more, whatever the play is: it does not come out as play.
+
+Standard errors are the jackknife's, over units (logs, or episodes): each left out by one step of Newton's.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.special import stdtrit
+
+from endopilot.robot.log import Courses
+
+NAMES = ("gain_translation", "play_mm", "latency_s", "slack")
+"""What is fitted; `slack` is the share s of a simulated wire's."""
+RANGES = ((-2.0, 2.0), (0.0, 10.0), (0.0, 1.0), (-2.0, 3.0))
+"""Widest values of each, as the robot's file takes them; a wire has all of its slack or none, s = 1 or 0."""
+_FIRST = ((-1.0, -0.7, 0.7, 1.0, 1.4), (0.0, 0.7, 1.5, 3.0, 5.0), (0.0, 0.06, 0.12, 0.2, 0.35, 0.6))
+"""Gains, plays and lags from the best of which the fit goes on."""
+_STEPS = np.array([0.01, 0.05, 0.005, 0.05])
+"""Steps of the derivatives: less than noise makes of each."""
+_JUMP_COST = -2 * math.log(0.01 / 10.0)
+"""What a tip costs that jumps: -2 log p where one in a hundred does, to anywhere within 10 mm."""
+_PLAYS = np.linspace(0.0, 8.0, 33)
+_SCANS, _NEWTON_STEPS = 3, 8
+"""A fit that has converged goes on from any of these plays that cost less, so often at most: commands come in steps,
+so the cost has valleys."""
+_NOISE = (0.1, 1.0)
+"""Noise that the search begins with: of a tip, mm, and drift, in that variance a mm of travel. Both are fitted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Tips of episodes along their vessel, beside what their drives were asked for.
+
+    Attributes:
+        courses: commands, and times of the tips.
+        abscissa: Δtip, mm; NaN where it is not to be used.
+        slack: how much farther than its proximal end a simulated wire's tip went, mm.
+    """
+
+    courses: Courses
+    abscissa: Float[np.ndarray, "episodes tips"]
+    slack: Float[np.ndarray, "episodes tips"] | float = 0.0
+
+    def motion(
+        self, values: Float[np.ndarray, "candidates 4"], start: float | Float[np.ndarray, "*candidates episodes"]
+    ) -> Float[np.ndarray, "candidates episodes tips"]:
+        """Return where candidates of `NAMES` lead the tips, from where each episode begins, mm."""
+        gain, play, latency, share = values.T
+        followed = self.courses.followed(
+            0, at_s=self.courses.seen_s, latency_s=latency, gain=gain, play=play, start=start
+        )
+        return followed + share[:, None, None] * np.nan_to_num(self.slack)
+
+    def travel(self, latency_s: float) -> Float[np.ndarray, "episodes tips"]:
+        """Return how far each drive goes from one tip to the next, mm."""
+        at = self.motion(np.array([[1.0, 0.0, latency_s, 0.0]]), 0.0)[0]
+        return np.abs(np.diff(at, axis=1, prepend=at[:, :1]))
+
+    def rows(self, chosen: Int[np.ndarray, "some"]) -> Tracks:
+        """Return some of the episodes."""
+        slack = self.slack[chosen] if isinstance(self.slack, np.ndarray) else self.slack
+        courses = Courses(*(array[chosen] for array in vars(self.courses).values()))
+        return Tracks(courses, self.abscissa[chosen], slack)
+
+
+@dataclass(frozen=True, eq=False)
+class Filtered:
+    """What a Kalman filter leaves of residuals.
+
+    Attributes:
+        innovation: in standard deviations; 0 where there is no tip, and where one jumps.
+        gain: weight by which each tip moves the offset.
+        spread: standard deviation of each innovation, mm.
+        cost: -2 log likelihood.
+        offset: where the offset is after the last tip, mm.
+        variance: of that offset, in variances of a tip.
+    """
+
+    innovation: Float[np.ndarray, "*of tips"]
+    gain: Float[np.ndarray, "*of tips"]
+    spread: Float[np.ndarray, "*of tips"]
+    cost: Float[np.ndarray, "*of"]
+    offset: Float[np.ndarray, "*of"]
+    variance: Float[np.ndarray, "*of"]
+
+
+def filtered(
+    residual: Float[np.ndarray, "*of tips"],
+    travel: Float[np.ndarray, "episodes tips"],
+    sd: Float[np.ndarray, "..."] | float,
+    drift: Float[np.ndarray, "..."] | float,
+) -> Filtered:
+    """Filter residuals whose mean drifts with travel and jumps now and then.
+
+    Args:
+        residual: mm; NaN where there is no tip.
+        travel: of the drive since the tip before, mm.
+        sd: standard deviation of a tip, mm, for all or to be broadcast.
+        drift: variance of the offset a mm of travel, in variances of a tip, likewise.
+    """
+    shape = np.broadcast_shapes(residual.shape[:-1], np.shape(sd))
+    offset, variance, cost = np.zeros(shape), np.full(shape, np.inf), np.zeros(shape)
+    kept = np.zeros((3, residual.shape[-1], *shape))  # by time first: much faster
+    with np.errstate(invalid="ignore"):
+        for i, (value, way) in enumerate(zip(np.moveaxis(residual, -1, 0), travel.T, strict=True)):
+            there, begun = np.isfinite(value), np.isfinite(variance)
+            variance = variance + drift * way
+            spread = sd * np.sqrt(variance + 1)
+            z = np.where(begun, value - offset, 0.0) / spread
+            ordinary = z**2 + np.log(2 * np.pi * np.where(begun, spread, 1.0) ** 2)
+            jumps = ~begun | (ordinary > _JUMP_COST)
+            cost += np.where(there & begun, np.minimum(ordinary, _JUMP_COST), 0.0)
+            gain = np.where(jumps, 1.0, variance / (variance + 1)) * there
+            kept[:, i] = np.where(there & ~jumps, z, 0.0), gain, np.where(jumps, np.inf, spread)
+            offset = np.where(there, np.where(jumps, value, offset + gain * (value - offset)), offset)
+            variance = np.where(there, np.where(jumps, 1.0, gain), variance)
+    innovation, gain, spread = np.moveaxis(kept, 1, -1)
+    return Filtered(innovation, gain, spread, cost, offset, variance)
+
+
+def _whitened(by: Filtered, columns: Float[np.ndarray, "some episodes tips"]) -> Float[np.ndarray, "..."]:
+    """Return what a filter makes of other columns, jumps where they were."""
+    offset, out = columns[..., 0] * 0.0, np.zeros_like(columns)
+    for i in range(columns.shape[-1]):
+        out[..., i] = (columns[..., i] - offset) / by.spread[..., i]
+        offset = offset + by.gain[..., i] * (columns[..., i] - offset)
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class DriveFit:
+    """Kinematics that explain tracks best, and how each episode would have them.
+
+    Attributes:
+        values: of `NAMES`.
+        noise: standard deviation of a tip, mm, and drift, variance a mm of travel, in variances of a tip.
+        start: where in its play the device of each episode begins.
+        cost: -2 log likelihood of each episode.
+        innovation: of each tip, in standard deviations.
+        slope: of the innovations, for each of `NAMES`, where it was fitted; profiled over where episodes begin.
+        unit: what each episode counts to.
+    """
+
+    values: Float[np.ndarray, "4"]
+    noise: tuple[float, float]
+    start: Float[np.ndarray, "episodes"]
+    cost: Float[np.ndarray, "episodes"]
+    innovation: Float[np.ndarray, "episodes tips"]
+    slope: Float[np.ndarray, "episodes tips 4"]
+    unit: Int[np.ndarray, "episodes"]
+
+    def without(self) -> tuple[Float[np.ndarray, "units 4"], Float[np.ndarray, "units"]]:
+        """Return by how much the values change if a unit is left out, and what that unit then costs."""
+        units = self.unit.max() + 1
+        information, score = np.zeros((units, 4, 4)), np.zeros((units, 4))
+        np.add.at(information, self.unit, np.einsum("eti,etj->eij", self.slope, self.slope))
+        np.add.at(score, self.unit, np.einsum("eti,et->ei", self.slope, self.innovation))
+        weak = np.diag([1 / (high - low) ** 2 for low, high in RANGES])  # where tracks tell nothing, ranges do
+        change = np.linalg.solve(information.sum(axis=0) - information + weak, score[..., None])[..., 0]
+        moved = self.innovation + np.einsum("eti,ei->et", self.slope, change[self.unit])
+        cost = np.zeros(units)
+        np.add.at(cost, self.unit, self.cost + (moved**2 - self.innovation**2).sum(axis=1))
+        return change, cost
+
+    @property
+    def standard_error(self) -> Float[np.ndarray, "4"]:
+        """Of each value: the jackknife's over units, and no less than innovations make it that are independent."""
+        change, _ = self.without()
+        weak = np.diag([1 / (high - low) ** 2 for low, high in RANGES])
+        information = np.einsum("eti,etj->ij", self.slope, self.slope) + weak
+        jackknife = (len(change) - 1) / len(change) * ((change - change.mean(axis=0)) ** 2).sum(axis=0)
+        return np.sqrt(np.maximum(jackknife, np.diag(np.linalg.inv(information))))
+
+    @property
+    def half_width(self) -> Float[np.ndarray, "4"]:
+        """Half the intervals of 95 %."""
+        return stdtrit(self.unit.max(), 0.975) * self.standard_error
+
+
+def earns(without: Float[np.ndarray, "units"], costs: Float[np.ndarray, "units"], level: float = 0.95) -> bool:
+    """Return whether units that were left out cost less by a model than without it, at a level (Student's t)."""
+    less = without - costs
+    return bool(less.mean() > stdtrit(len(less) - 1, level) * less.std(ddof=1) / math.sqrt(len(less)))
+
+
+def fit_drive(tracks: Tracks, unit: Int[np.ndarray, "episodes"], begin: DriveFit | None = None) -> DriveFit:
+    """Fit the kinematics to tracks.
+
+    Args:
+        tracks: of episodes; the share of slack is fitted if there is any.
+        unit: what each episode counts to: its log, or itself.
+        begin: what the fit begins with; the best of a grid if not given.
+    """
+    free = np.array([True, True, True, isinstance(tracks.slack, np.ndarray)])
+    if begin is None:
+        values, noise = _best_of_grid(tracks.rows(np.unique(np.linspace(0, len(unit) - 1, 8).astype(int)))), _NOISE
+    else:
+        values, noise = begin.values, begin.noise
+    for _ in range(_SCANS):
+        for _ in range(_NEWTON_STEPS):
+            start = starts(tracks, values[None], noise)[0][0]
+            noise = fit_noise(tracks, values, start, noise)
+            before, values = values, _newton(tracks, values, start, noise, free)
+            if (np.abs(values - before) < 0.1 * _STEPS).all():
+                break
+        scanned = np.repeat(values[None], len(_PLAYS) + 1, axis=0)
+        scanned[1:, 1] = _PLAYS
+        best = int(np.argmin(starts(tracks, scanned, noise)[1].sum(axis=1)))
+        values = scanned[best]
+        if best == 0:
+            break
+    start = starts(tracks, values[None], noise)[0][0]
+    found, slope = _sloped(tracks, values, start, noise, free)
+    return DriveFit(values, noise, start, found.cost, found.innovation, slope, unit)
+
+
+def _best_of_grid(tracks: Tracks) -> Float[np.ndarray, "4"]:
+    tried = np.array([(*row, 0.0) for row in product(*_FIRST)])
+    cost = np.full((len(tried), len(tracks.abscissa)), np.inf)
+    for start in (-1.0, 0.0, 1.0):
+        residual = tracks.abscissa - tracks.motion(tried, start)
+        cost = np.minimum(cost, filtered(residual, tracks.travel(0.1), *_NOISE).cost)
+    return tried[np.argmin(cost.sum(axis=1))]
+
+
+def starts(
+    tracks: Tracks, values: Float[np.ndarray, "candidates 4"], noise: tuple[float, float]
+) -> tuple[Float[np.ndarray, "candidates episodes"], Float[np.ndarray, "candidates episodes"]]:
+    """Return where in its play the device of each episode begins, of five places and then those between; its cost."""
+    best, travel = np.zeros((len(values), len(tracks.abscissa))), tracks.travel(values[0, 2])
+    for offsets in ((0.0, -1.0, -0.5, 0.5, 1.0), (0.0, -0.25, 0.25), (0.0, -0.125, 0.125), (0.0, -0.0625, 0.0625)):
+        around = np.clip([best + step for step in offsets], -1.0, 1.0)
+        moved = tracks.motion(np.tile(values, (len(offsets), 1)), np.concatenate(around))
+        cost = filtered(tracks.abscissa - moved, travel, *noise).cost.reshape(around.shape)
+        chosen = np.argmin(cost, axis=0)[None]
+        best, least = (np.take_along_axis(each, chosen, axis=0)[0] for each in (around, cost))
+    return best, least
+
+
+def fit_noise(
+    tracks: Tracks,
+    values: Float[np.ndarray, "4"],
+    start: Float[np.ndarray, "episodes"],
+    noise: tuple[float, float] = _NOISE,
+) -> tuple[float, float]:
+    """Return the likeliest noise of tips, mm, and drift of their offset, in variances of a tip a mm of travel."""
+    residual, travel = tracks.abscissa - tracks.motion(values[None], start)[0], tracks.travel(values[2])
+    for factor in (4.0, 2.0, 1.4, 1.2):
+        sd = noise[0] * factor ** np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+        drift = np.clip(noise[1] * factor ** (2.0 * np.arange(-2, 3)), 1e-6, 1e3)
+        pairs = np.array(list(product(sd, drift)))
+        cost = filtered(residual[None], travel, pairs[:, :1], pairs[:, 1:]).cost.sum(axis=1)
+        noise = tuple(pairs[np.argmin(cost)].tolist())
+    return noise
+
+
+def _sloped(
+    tracks: Tracks,
+    values: Float[np.ndarray, "4"],
+    start: Float[np.ndarray, "episodes"],
+    noise: tuple[float, float],
+    free: Bool[np.ndarray, "4"],
+) -> tuple[Filtered, Float[np.ndarray, "episodes tips 4"]]:
+    """Return innovations and their slopes, jumps where they are, without what other starts in the play would do."""
+    steps = np.diag(_STEPS)
+    down = np.maximum(values - steps, [-np.inf, 0.0, 0.0, -np.inf])
+    up = values + steps
+    apart = np.diag(up - down)[:, None, None]
+    of = tracks.motion(values[None], start)[0]
+    slopes = -(tracks.motion(up, start) - tracks.motion(down, start)) / apart
+    sides = [tracks.motion(values[None], np.clip(start + step, -1, 1))[0] for step in (-0.1, 0.1)]
+    found = filtered(tracks.abscissa - of, tracks.travel(values[2]), *noise)
+    missing = ~np.isfinite(tracks.abscissa)
+    white = _whitened(found, np.concatenate([slopes, [sides[1] - sides[0]]]))
+    white[:, missing] = 0.0
+    slope, begin = np.moveaxis(white[:4], 0, -1) * free, white[4]
+    share = np.einsum("et,eti->ei", begin, slope) / np.maximum((begin**2).sum(axis=1), 1e-12)[:, None]
+    return found, slope - begin[..., None] * share[:, None]
+
+
+def _newton(
+    tracks: Tracks,
+    values: Float[np.ndarray, "4"],
+    start: Float[np.ndarray, "episodes"],
+    noise: tuple[float, float],
+    free: Bool[np.ndarray, "4"],
+) -> Float[np.ndarray, "4"]:
+    """Return values after a step of Gauss and Newton, as long as it costs less."""
+    found, slope = _sloped(tracks, values, start, noise, free)
+    low, high = np.array(RANGES).T
+    information = np.einsum("eti,etj->ij", slope, slope) + np.diag(1 / (high - low) ** 2)
+    step = -np.linalg.solve(information, np.einsum("eti,et->i", slope, found.innovation))
+    tried = np.clip(values + np.outer([1.0, 0.5, 0.25, 0.1, 0.0], step), low, high)
+    _, cost = starts(tracks, tried, noise)
+    return tried[int(np.argmin(cost.sum(axis=1)))]
