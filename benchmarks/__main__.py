@@ -26,6 +26,7 @@ BENCHMARKS = {
     "published": "published.published:bench_published",
     "robot-twist": "robot.twist:bench_twist",
     "robot-blind": "robot.blind:bench_blind",
+    "robot-left-out": "robot.left_out:bench_left_out",
     "dataset": "dataset:bench_dataset",
     "cockpit": "cockpit:bench_cockpit",
     "anatomy": "anatomy.extraction:bench_anatomy",

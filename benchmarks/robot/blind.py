@@ -26,7 +26,7 @@ from endopilot.types import Anatomy
 KINDS = ("gain", "play", "lag", "offset", "negative", "slip", "wire")
 GAIN_BAR, PLAY_BAR_MM = 0.03, 0.3
 _FINE_S = 0.002
-_NAMES = ("gain_translation", "play_mm", "latency_s")
+_NAMES: tuple[str, ...] = ("gain_translation", "play_mm", "latency_s")
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ def _judged(log: RobotLog, anatomy: Anatomy, wire: Any, truth: dict[str, float],
         found = calibrate([log], anatomy, wire, config=CalibrateConfig(wires=0, seed=seed))
     except InputError as error:
         return {"refused": str(error), "passed": truth["gain_translation"] < 0}
-    row: dict[str, Any] = {"slack": found.layers["slack"]}
+    row: dict[str, Any] = dict(found.layers)
     for name, true in truth.items():
         estimate = found.estimates[name]
         row |= {name: round(true, 3), f"{name}_found": round(estimate.value, 3)}

@@ -58,7 +58,7 @@ UNITS = MappingProxyType(
     {"play_mm": "mm", "latency_s": "s", "tip_bend_deg": "°", "tip_bend_length_mm": "mm", "play_rad": "rad"}
     | {"twist_friction_n_mm_mm": "N·mm/mm", "grip_n": "N"}
 )
-RESOLUTION = MappingProxyType({"gain_translation": 0.005, "play_mm": 0.1, "latency_s": 0.01, "slack": 0.0})
+RESOLUTION = MappingProxyType({"gain_translation": 0.005, "play_mm": 0.1, "latency_s": 0.015})
 """Least half-widths of intervals. A command lasts for 0.05 to 0.2 s and moves the wire by some 0.3 mm; what it does
 within that, and how the wire lies in a vessel that is known to 0.1 mm, no log tells."""
 _BEHIND_MM = 1000.0
@@ -68,8 +68,9 @@ _TYPICAL_MM = 0.3
 """What a tip may be off by, mm: errors are counted in it."""
 _LEVEL, _LEAST_LOGS = 0.9, 3
 """Share of episodes in which the band is to hold, and logs whose differences say how much another one differs."""
-_SURE = 0.999
-"""Level at which a log is refused: of a thousand good ones, one."""
+_BETTER, _BETTER_WIRE, _SURE = 0.5, 0.95, 0.999
+"""Levels at which episodes left out must cost less: for a share that is fitted with its uncertainty, on average; for a
+wire, chosen from many; for the other sign of an axis, as a log is refused."""
 
 
 @settings
@@ -97,9 +98,10 @@ class RobotCalibration:
         wire: with the tip, friction and stiffness of the best candidate, those too that are not identified: they belong
             together. As it was known where the layer was left out.
         estimates: each constant with its interval.
-        layers: what the simulated wire's slack, and the wire, gained on episodes left out, or that they were left out.
-        band_mm: half-width within which Δtip is predicted throughout nine of ten episodes of another session (log), mm;
-            None with too few sessions.
+        layers: what slip, the simulated wire's slack and the wire gained on episodes left out, or that they were left
+            out.
+        band_mm: half-width within which Δtip is predicted throughout nine of ten episodes of another session (log), mm,
+            by the drive alone where the slack was left out; None with too few sessions.
         next_band_mm: the same of one more episode of these sessions, mm; None with too few episodes.
         band_share: share of the episodes of each log in which the band of the other logs holds; None with few logs.
         replays: of the episodes that the drive was fitted to.
@@ -144,7 +146,9 @@ def calibrate(
             f"{LEAST_EPISODES}: log more, or number them anew (`episode`) wherever the device was reset"
         )
     of, layers = prepare(_evenly(episodes, config.episodes), anatomy, config.given, robot), {}
-    drive = fit_drive(Tracks(of.courses, of.abscissa), _units(of))
+    tracks = Tracks(of.courses, of.abscissa)
+    drive = fit_drive(tracks, _units(of))
+    drive, layers["slip"] = _with_layer("slip", tracks, drive)
     check_forward(logs[0].name, drive)
     known, robot = robot, _driven(robot, drive)
     robot = replace(robot, encoders_at=where_encoders_sit(of.logs, robot) or robot.encoders_at)
@@ -153,33 +157,38 @@ def calibrate(
         some = prepare(_evenly(episodes, config.wire_episodes), anatomy, config.given, robot)
         check_clockwise(some, device, robot, config)
         tried, as_known = fit_wire(some, device, robot, config)
-        layers["wire"] = gained(as_known, tried.left_out)
+        layers["wire"] = gained(as_known, tried.left_out, _BETTER_WIRE)
         if layers["wire"] != LEFT_OUT:
             of_wire = estimates(tried, WIRE, UNITS)
             device, robot = with_found(device, robot, {name: of_wire[name].value for name in WIRE})
     replays = ReplayConfig(given=config.given)
     found = replay_prepared(of, Stack(device), robot, replays)
-    with_slack = fit_drive(Tracks(of.courses, of.abscissa, _slack(of, found)), _units(of), drive)
-    layers["slack"] = gained(drive.without()[1], with_slack.without()[1])
+    drive, layers["slack"] = _with_layer("slack", replace(tracks, slack=_slack(of, found)), drive)
     if layers["slack"] != LEFT_OUT:
-        drive, robot = with_slack, _driven(replace(robot, latency_s=known.latency_s), with_slack)
+        robot = _driven(replace(robot, latency_s=known.latency_s), drive)
         found = replay_prepared(of, Stack(device), robot, replays)
     names = [log.name for log in of.logs]
-    another, one_more = bands(worst(found), names)
-    share = left_out_share(worst(found), names)
+    errors = worst(found, alone=layers["slack"] == LEFT_OUT)
+    another, one_more = bands(errors, names)
+    share = left_out_share(errors, names)
     return RobotCalibration(robot, device, of_drive(drive) | of_wire, layers, another, one_more, share, found)
 
 
+def _with_layer(name: str, tracks: Tracks, fit: DriveFit) -> tuple[DriveFit, str]:
+    """Return a fit with one more layer, if that earns its place, and what it gained."""
+    tried = fit_drive(tracks, fit.unit, fit, name)
+    said = gained(fit.without()[1], tried.without()[1], _BETTER)
+    return (fit if said == LEFT_OUT else tried), said
+
+
 def of_drive(fit: DriveFit) -> dict[str, Estimate]:
-    """Return the constants of the drive with their intervals; `slack` where it was fitted."""
+    """Return the constants of the drive that were fitted, with their intervals."""
     found = {}
-    for name, value, half in zip(NAMES, fit.values.tolist(), fit.half_width.tolist(), strict=True):
-        if name == "slack" and not fit.slope[..., 3].any():
-            continue
-        half, (least, most) = max(half, RESOLUTION[name]), DRIVE[name]
-        found[name] = Estimate(
-            value, max(value - half, least), min(value + half, most), (least, most), UNITS.get(name, "")
-        )
+    for k in np.flatnonzero(fit.free):
+        name, value = NAMES[k], float(fit.values[k])
+        half, (least, most) = max(float(fit.half_width[k]), RESOLUTION.get(name, 0.0)), DRIVE[name]
+        low, high = max(value - half, least), min(value + half, most)
+        found[name] = Estimate(value, low, high, (least, most), UNITS.get(name, ""))
     return found
 
 
@@ -209,17 +218,17 @@ def check_clockwise(of: Prepared, device: Wire, robot: RobotConfig, config: Cali
     """
     other = [replace(log, command=log.command * [1.0, -1.0]) for log in of.logs]
     turned = replace(of, logs=other, courses=Courses.of(other, robot.wire))
-    costs = [_wire_costs(each, device, robot, config) for each in (of, turned)]
-    if earns(*costs, level=_SURE):
+    as_it_is, better = (_wire_costs(each, device, robot, config) for each in (of, turned))
+    if earns(as_it_is, better, _SURE):
         raise InputError(
             f"{of.logs[0].name}: rotation_rad: clockwise is counted negative: with the other sign tips are predicted "
             "better; change it"
         )
 
 
-def gained(without: Float[np.ndarray, "units"], costs: Float[np.ndarray, "units"]) -> str:
+def gained(without: Float[np.ndarray, "units"], costs: Float[np.ndarray, "units"], level: float) -> str:
     """Return what a layer gained on units that were left out, or that it is left out."""
-    if not earns(without, costs):
+    if not earns(without, costs, level):
         return LEFT_OUT
     return f"{(without - costs).mean() / np.abs(without).mean():.0%} less cost on episodes left out"
 
@@ -231,9 +240,10 @@ def _evenly(episodes: list[RobotLog], most: int) -> list[RobotLog]:
 
 def _driven(robot: RobotConfig, fit: DriveFit) -> RobotConfig:
     """Return a robot with what is identified of its drive."""
-    found = {name: each.value for name, each in of_drive(fit).items() if each.identified and name != "slack"}
+    found = {name: each.value for name, each in of_drive(fit).items() if each.identified}
     latency_s = found.pop("latency_s", robot.latency_s)
-    return replace(robot, latency_s=latency_s, wire=replace(robot.wire, **found))
+    of_wire = {name: value for name, value in found.items() if name in ("gain_translation", "play_mm")}
+    return replace(robot, latency_s=latency_s, wire=replace(robot.wire, **of_wire))
 
 
 def _slack(of: Prepared, found: Sequence[EpisodeReplay]) -> Float[np.ndarray, "episodes tips"]:
@@ -288,9 +298,9 @@ def with_found(device: Wire, robot: RobotConfig, found: Mapping[str, float]) -> 
     wire = replace(shaped, friction=found.get("friction", device.friction))
     behind = robot.wire.transmission
     if twist := found.get("twist_friction_n_mm_mm"):
-        behind = Transmission(behind.length_mm or _BEHIND_MM, twist)
-    of_drive = {name: found[name] for name in ("play_rad", "grip_n") if name in found}
-    return wire, replace(robot, wire=replace(robot.wire, transmission=behind, **of_drive))
+        behind = Transmission(length_mm=behind.length_mm or _BEHIND_MM, twist_friction_n_mm_mm=twist)
+    play_rad, grip_n = found.get("play_rad", robot.wire.play_rad), found.get("grip_n", robot.wire.grip_n)
+    return wire, replace(robot, wire=replace(robot.wire, play_rad=play_rad, grip_n=grip_n, transmission=behind))
 
 
 def where_encoders_sit(episodes: Sequence[RobotLog], robot: RobotConfig) -> str | None:
@@ -321,9 +331,8 @@ def where_encoders_sit(episodes: Sequence[RobotLog], robot: RobotConfig) -> str 
 def bands(errors: Float[np.ndarray, "episodes"], logs: Sequence[str]) -> tuple[float | None, float | None]:
     """Return half-widths that hold throughout nine of ten episodes: of another log, and of one more of these, mm.
 
-    The logarithm of an episode's largest error is its log's mean and a rest, both normal (a random-effects model by the
-    analysis of variance): a log that is not known yet adds the variance between logs. Degrees of freedom are
-    Satterthwaite's.
+    The logarithm of an episode's largest error is its log's median and a rest, which is drawn from all rests, each log
+    counting the same. A log that is not known yet adds the variance between logs, by Student's t.
 
     Args:
         errors: largest error of Δtip in each episode, mm.
@@ -334,21 +343,22 @@ def bands(errors: Float[np.ndarray, "episodes"], logs: Sequence[str]) -> tuple[f
     """
     size, log = np.log(np.maximum(errors, 1e-6)), np.unique(np.asarray(logs), return_inverse=True)[1]
     count = np.bincount(log)
-    free = len(size) - len(count)
-    if free < LEAST_EPISODES - 1:
-        return None, None
-    means = np.bincount(log, size) / count
-    within = float(((size - means[log]) ** 2).sum() / free)
-    usual = float(means.mean())
-    one_more = math.exp(usual + stdtrit(free, _LEVEL) * math.sqrt(within * (1 + 1 / len(size))))
-    if len(count) < _LEAST_LOGS:
+    middle = np.array([np.median(size[log == k]) for k in range(len(count))])
+    rest, weight = size - middle[log], 1 / count[log]
+
+    def width(more: Float[np.ndarray, "draws"]) -> float:
+        drawn = (rest[:, None] + more).ravel()
+        order, weights = np.argsort(drawn), np.repeat(weight, len(more))
+        at = np.searchsorted(np.cumsum(weights[order]), _LEVEL * (1 + 1 / len(size)) * weights.sum())
+        return math.exp(middle.mean() + drawn[order[min(at, len(order) - 1)]])
+
+    one_more = width(np.zeros(1)) if len(size) + 1 >= 1 / (1 - _LEVEL) else None
+    if len(count) < _LEAST_LOGS or one_more is None:
         return None, one_more
-    each = 1 / float(np.mean(1 / count))  # harmonic mean of the episodes of a log
-    between = max(float(means.var(ddof=1)), within / each)  # with what the means owe to the rests
-    rest = (1 - 1 / each) * within
-    freedom = (between + rest) ** 2 / (between**2 / (len(count) - 1) + rest**2 / free)
-    another = usual + stdtrit(freedom, _LEVEL) * math.sqrt(between * (1 + 1 / len(count)) + rest)
-    return max(math.exp(another), one_more), one_more
+    own = np.pi / 2 * np.bincount(log, rest**2) / count**2  # variance of a median
+    between = max(0.0, float(middle.var(ddof=1) - own.mean()))
+    t = stdtrit(len(count) - 1, (np.arange(200) + 0.5) / 200)
+    return max(one_more, width(t * math.sqrt(between * (1 + 1 / len(count))))), one_more
 
 
 def left_out_share(errors: Float[np.ndarray, "episodes"], logs: Sequence[str]) -> float | None:
@@ -360,9 +370,10 @@ def left_out_share(errors: Float[np.ndarray, "episodes"], logs: Sequence[str]) -
     return float(np.mean(held)) if held else None
 
 
-def worst(replays: Sequence[EpisodeReplay]) -> Float[np.ndarray, "episodes"]:
-    """Return the largest error of Δtip in what was predicted of each episode, mm."""
-    return np.array([np.abs(np.diff(each.abscissa, axis=1)[~each.given, 0]).max() for each in replays])
+def worst(replays: Sequence[EpisodeReplay], *, alone: bool) -> Float[np.ndarray, "episodes"]:
+    """Return the largest error of Δtip in what was predicted of each episode, mm, by the drive alone or the core."""
+    made = [each.driven if alone else each.abscissa[:, 1] for each in replays]
+    return np.array([np.abs(e.abscissa[:, 0] - own)[~e.given].max() for e, own in zip(replays, made, strict=True)])
 
 
 def _units(of: Prepared) -> Int[np.ndarray, "episodes"]:

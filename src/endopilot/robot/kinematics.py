@@ -20,15 +20,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import stdtrit
 
+from endopilot.devices.robot import RobotConfig
 from endopilot.robot.log import Courses
 
-NAMES = ("gain_translation", "play_mm", "latency_s", "slack")
-"""What is fitted; `slack` is the share s of a simulated wire's."""
-RANGES = ((-2.0, 2.0), (0.0, 10.0), (0.0, 1.0), (-2.0, 3.0))
+NAMES = ("gain_translation", "play_mm", "latency_s", "slip", "slack")
+"""What is fitted; `slip` is the share of pushes that the grip loses, `slack` the share s of a simulated wire's."""
+RANGES = ((-3.0, 3.0), (0.0, 10.0), (0.0, 1.0), (0.0, 1.0), (-2.0, 3.0))
 """Widest values of each, as the robot's file takes them; a wire has all of its slack or none, s = 1 or 0."""
 _FIRST = ((-1.0, -0.7, 0.7, 1.0, 1.4), (0.0, 0.7, 1.5, 3.0, 5.0), (0.0, 0.06, 0.12, 0.2, 0.35, 0.6))
 """Gains, plays and lags from the best of which the fit goes on."""
-_STEPS = np.array([0.01, 0.05, 0.005, 0.05])
+_STEPS = np.array([0.01, 0.05, 0.005, 0.02, 0.05])
 """Steps of the derivatives: less than noise makes of each."""
 _JUMP_COST = -2 * math.log(0.01 / 10.0)
 """What a tip costs that jumps: -2 log p where one in a hundred does, to anywhere within 10 mm."""
@@ -36,6 +37,8 @@ _PLAYS = np.linspace(0.0, 8.0, 33)
 _SCANS, _NEWTON_STEPS = 3, 8
 """A fit that has converged goes on from any of these plays that cost less, so often at most: commands come in steps,
 so the cost has valleys."""
+_USUAL_NOISE = (0.05, 4.0)
+"""That of the public logs (docs/evidence/reality.md)."""
 _NOISE = (0.1, 1.0)
 """Noise that the search begins with: of a tip, mm, and drift, in that variance a mm of travel. Both are fitted."""
 
@@ -55,18 +58,19 @@ class Tracks:
     slack: Float[np.ndarray, "episodes tips"] | float = 0.0
 
     def motion(
-        self, values: Float[np.ndarray, "candidates 4"], start: float | Float[np.ndarray, "*candidates episodes"]
+        self, values: Float[np.ndarray, "candidates values"], start: float | Float[np.ndarray, "*candidates episodes"]
     ) -> Float[np.ndarray, "candidates episodes tips"]:
         """Return where candidates of `NAMES` lead the tips, from where each episode begins, mm."""
-        gain, play, latency, share = values.T
+        gain, play, latency, slip, share = values.T
         followed = self.courses.followed(
             0, at_s=self.courses.seen_s, latency_s=latency, gain=gain, play=play, start=start
         )
-        return followed + share[:, None, None] * np.nan_to_num(self.slack)
+        pushed = np.cumsum(np.maximum(np.diff(followed, axis=2, prepend=followed[..., :1]), 0.0), axis=2)
+        return followed - slip[:, None, None] * pushed + share[:, None, None] * np.nan_to_num(self.slack)
 
     def travel(self, latency_s: float) -> Float[np.ndarray, "episodes tips"]:
         """Return how far each drive goes from one tip to the next, mm."""
-        at = self.motion(np.array([[1.0, 0.0, latency_s, 0.0]]), 0.0)[0]
+        at = self.motion(np.array([[1.0, 0.0, latency_s, 0.0, 0.0]]), 0.0)[0]
         return np.abs(np.diff(at, axis=1, prepend=at[:, :1]))
 
     def rows(self, chosen: Int[np.ndarray, "some"]) -> Tracks:
@@ -152,20 +156,22 @@ class DriveFit:
         innovation: of each tip, in standard deviations.
         slope: of the innovations, for each of `NAMES`, where it was fitted; profiled over where episodes begin.
         unit: what each episode counts to.
+        free: which values were fitted.
     """
 
-    values: Float[np.ndarray, "4"]
+    values: Float[np.ndarray, "values"]
     noise: tuple[float, float]
     start: Float[np.ndarray, "episodes"]
     cost: Float[np.ndarray, "episodes"]
     innovation: Float[np.ndarray, "episodes tips"]
-    slope: Float[np.ndarray, "episodes tips 4"]
+    slope: Float[np.ndarray, "episodes tips values"]
     unit: Int[np.ndarray, "episodes"]
+    free: Bool[np.ndarray, "values"]
 
-    def without(self) -> tuple[Float[np.ndarray, "units 4"], Float[np.ndarray, "units"]]:
+    def without(self) -> tuple[Float[np.ndarray, "units values"], Float[np.ndarray, "units"]]:
         """Return by how much the values change if a unit is left out, and what that unit then costs."""
         units = self.unit.max() + 1
-        information, score = np.zeros((units, 4, 4)), np.zeros((units, 4))
+        information, score = np.zeros((units, len(NAMES), len(NAMES))), np.zeros((units, len(NAMES)))
         np.add.at(information, self.unit, np.einsum("eti,etj->eij", self.slope, self.slope))
         np.add.at(score, self.unit, np.einsum("eti,et->ei", self.slope, self.innovation))
         weak = np.diag([1 / (high - low) ** 2 for low, high in RANGES])  # where tracks tell nothing, ranges do
@@ -176,7 +182,7 @@ class DriveFit:
         return change, cost
 
     @property
-    def standard_error(self) -> Float[np.ndarray, "4"]:
+    def standard_error(self) -> Float[np.ndarray, "values"]:
         """Of each value: the jackknife's over units, and no less than innovations make it that are independent."""
         change, _ = self.without()
         weak = np.diag([1 / (high - low) ** 2 for low, high in RANGES])
@@ -185,26 +191,30 @@ class DriveFit:
         return np.sqrt(np.maximum(jackknife, np.diag(np.linalg.inv(information))))
 
     @property
-    def half_width(self) -> Float[np.ndarray, "4"]:
+    def half_width(self) -> Float[np.ndarray, "values"]:
         """Half the intervals of 95 %."""
         return stdtrit(self.unit.max(), 0.975) * self.standard_error
 
 
-def earns(without: Float[np.ndarray, "units"], costs: Float[np.ndarray, "units"], level: float = 0.95) -> bool:
+def earns(without: Float[np.ndarray, "units"], costs: Float[np.ndarray, "units"], level: float) -> bool:
     """Return whether units that were left out cost less by a model than without it, at a level (Student's t)."""
     less = without - costs
     return bool(less.mean() > stdtrit(len(less) - 1, level) * less.std(ddof=1) / math.sqrt(len(less)))
 
 
-def fit_drive(tracks: Tracks, unit: Int[np.ndarray, "episodes"], begin: DriveFit | None = None) -> DriveFit:
-    """Fit the kinematics to tracks.
+def fit_drive(
+    tracks: Tracks, unit: Int[np.ndarray, "episodes"], begin: DriveFit | None = None, layer: str = ""
+) -> DriveFit:
+    """Fit gain, play and lag to tracks, and what more is asked for.
 
     Args:
-        tracks: of episodes; the share of slack is fitted if there is any.
+        tracks: of episodes.
         unit: what each episode counts to: its log, or itself.
-        begin: what the fit begins with; the best of a grid if not given.
+        begin: what the fit begins with, whose layers are fitted too; the best of a grid if not given.
+        layer: "slip" or "slack", to be fitted with them.
     """
-    free = np.array([True, True, True, isinstance(tracks.slack, np.ndarray)])
+    free = np.array([k < 3 or name == layer for k, name in enumerate(NAMES)])
+    free |= False if begin is None else begin.free
     if begin is None:
         values, noise = _best_of_grid(tracks.rows(np.unique(np.linspace(0, len(unit) - 1, 8).astype(int)))), _NOISE
     else:
@@ -224,11 +234,11 @@ def fit_drive(tracks: Tracks, unit: Int[np.ndarray, "episodes"], begin: DriveFit
             break
     start = starts(tracks, values[None], noise)[0][0]
     found, slope = _sloped(tracks, values, start, noise, free)
-    return DriveFit(values, noise, start, found.cost, found.innovation, slope, unit)
+    return DriveFit(values, noise, start, found.cost, found.innovation, slope, unit, free)
 
 
-def _best_of_grid(tracks: Tracks) -> Float[np.ndarray, "4"]:
-    tried = np.array([(*row, 0.0) for row in product(*_FIRST)])
+def _best_of_grid(tracks: Tracks) -> Float[np.ndarray, "values"]:
+    tried = np.array([(*row, 0.0, 0.0) for row in product(*_FIRST)])
     cost = np.full((len(tried), len(tracks.abscissa)), np.inf)
     for start in (-1.0, 0.0, 1.0):
         residual = tracks.abscissa - tracks.motion(tried, start)
@@ -237,7 +247,7 @@ def _best_of_grid(tracks: Tracks) -> Float[np.ndarray, "4"]:
 
 
 def starts(
-    tracks: Tracks, values: Float[np.ndarray, "candidates 4"], noise: tuple[float, float]
+    tracks: Tracks, values: Float[np.ndarray, "candidates values"], noise: tuple[float, float]
 ) -> tuple[Float[np.ndarray, "candidates episodes"], Float[np.ndarray, "candidates episodes"]]:
     """Return where in its play the device of each episode begins, of five places and then those between; its cost."""
     best, travel = np.zeros((len(values), len(tracks.abscissa))), tracks.travel(values[0, 2])
@@ -252,9 +262,9 @@ def starts(
 
 def fit_noise(
     tracks: Tracks,
-    values: Float[np.ndarray, "4"],
+    values: Float[np.ndarray, "values"],
     start: Float[np.ndarray, "episodes"],
-    noise: tuple[float, float] = _NOISE,
+    noise: tuple[float, float],
 ) -> tuple[float, float]:
     """Return the likeliest noise of tips, mm, and drift of their offset, in variances of a tip a mm of travel."""
     residual, travel = tracks.abscissa - tracks.motion(values[None], start)[0], tracks.travel(values[2])
@@ -267,16 +277,49 @@ def fit_noise(
     return noise
 
 
+@dataclass(frozen=True, eq=False)
+class Led:
+    """Where a robot's drive alone leads tips, from where they were seen last.
+
+    Attributes:
+        motion: from where each episode begins, mm.
+        offset: Δtip there, as the last tips have it, mm.
+        start: where in its play the device of each episode begins.
+        noise: of the tips that were seen, as `DriveFit` has it.
+    """
+
+    motion: Float[np.ndarray, "episodes tips"]
+    offset: Float[np.ndarray, "episodes"]
+    start: Float[np.ndarray, "episodes"]
+    noise: tuple[float, float]
+
+    @property
+    def abscissa(self) -> Float[np.ndarray, "episodes tips"]:
+        """Δtip, mm."""
+        return self.motion + self.offset[:, None]
+
+
+def led(tracks: Tracks, robot: RobotConfig) -> Led:
+    """Return where a robot's drive leads tips after those that tracks have."""
+    drive = robot.wire
+    values = np.array([drive.gain_translation, drive.play_mm, robot.latency_s, 0.0, 0.0])
+    noise = fit_noise(tracks, values, starts(tracks, values[None], _USUAL_NOISE)[0][0], _USUAL_NOISE)
+    begun = starts(tracks, values[None], noise)[0][0]
+    motion = tracks.motion(values[None], begun)[0]
+    offset = filtered(tracks.abscissa - motion, tracks.travel(robot.latency_s), *noise).offset
+    return Led(motion, offset, begun, noise)
+
+
 def _sloped(
     tracks: Tracks,
-    values: Float[np.ndarray, "4"],
+    values: Float[np.ndarray, "values"],
     start: Float[np.ndarray, "episodes"],
     noise: tuple[float, float],
-    free: Bool[np.ndarray, "4"],
-) -> tuple[Filtered, Float[np.ndarray, "episodes tips 4"]]:
+    free: Bool[np.ndarray, "values"],
+) -> tuple[Filtered, Float[np.ndarray, "episodes tips values"]]:
     """Return innovations and their slopes, jumps where they are, without what other starts in the play would do."""
     steps = np.diag(_STEPS)
-    down = np.maximum(values - steps, [-np.inf, 0.0, 0.0, -np.inf])
+    down = np.maximum(values - steps, [-np.inf, 0.0, 0.0, -1.0, -np.inf])
     up = values + steps
     apart = np.diag(up - down)[:, None, None]
     of = tracks.motion(values[None], start)[0]
@@ -286,18 +329,18 @@ def _sloped(
     missing = ~np.isfinite(tracks.abscissa)
     white = _whitened(found, np.concatenate([slopes, [sides[1] - sides[0]]]))
     white[:, missing] = 0.0
-    slope, begin = np.moveaxis(white[:4], 0, -1) * free, white[4]
+    slope, begin = np.moveaxis(white[:-1], 0, -1) * free, white[-1]
     share = np.einsum("et,eti->ei", begin, slope) / np.maximum((begin**2).sum(axis=1), 1e-12)[:, None]
     return found, slope - begin[..., None] * share[:, None]
 
 
 def _newton(
     tracks: Tracks,
-    values: Float[np.ndarray, "4"],
+    values: Float[np.ndarray, "values"],
     start: Float[np.ndarray, "episodes"],
     noise: tuple[float, float],
-    free: Bool[np.ndarray, "4"],
-) -> Float[np.ndarray, "4"]:
+    free: Bool[np.ndarray, "values"],
+) -> Float[np.ndarray, "values"]:
     """Return values after a step of Gauss and Newton, as long as it costs less."""
     found, slope = _sloped(tracks, values, start, noise, free)
     low, high = np.array(RANGES).T

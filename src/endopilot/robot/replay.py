@@ -20,7 +20,7 @@ from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.robot.candidates import LEAST_EPISODES, UNKNOWN_SHARE, Candidates
-from endopilot.robot.kinematics import Tracks, filtered, fit_noise, starts
+from endopilot.robot.kinematics import Tracks, filtered, led
 from endopilot.robot.log import Courses, RobotLog
 from endopilot.settings import OpenShare, Within, public, settings
 from endopilot.simulation.config import PRESETS, SimulatorConfig
@@ -39,8 +39,6 @@ _TOGETHER = 8
 """Episodes that are simulated side by side, for as long as the longest of them takes."""
 _TRAVEL_MM = 1000.0
 """A drive that goes farther in an episode than this and the vessel's length is logged in another unit, mm."""
-_NOISE = (0.05, 4.0)
-"""Noise that its fit begins with: that of the public logs, mm, and in that variance a mm of travel."""
 FAR_MM = 2.0
 """No tip counts as farther from the real one than this, mm, when a world is chosen: one in a wrong branch is wrong."""
 
@@ -203,27 +201,23 @@ def replay_prepared(
 ) -> list[EpisodeReplay]:
     """Replay episodes that are prepared, as `replay_log` does."""
     device, simulator = in_grip(device, robot, simulator or PRESETS["fast"])
-    drive = robot.wire
-    values = np.array([[drive.gain_translation, drive.play_mm, robot.latency_s, 0.0]])
     tracks = Tracks(of.courses, np.where(of.given, of.abscissa, np.nan))
-    noise = fit_noise(tracks, values[0], starts(tracks, values, _NOISE)[0][0])
-    begun = starts(tracks, values, noise)[0][0]
-    motion, travel = tracks.motion(values, begun)[0], tracks.travel(robot.latency_s)
-    depth = filtered(tracks.abscissa - motion, travel, *noise).offset  # after the last tip that is given
-    times, course = _proximal(of, robot, begun)
+    alone = led(tracks, robot)
+    times, course = _proximal(of, robot, alone.start)
     angles = np.tile(2 * np.pi * np.arange(config.rotations) / config.rotations, (len(of.logs), 1))
-    tried = _simulated(of, device, times, course, depth, angles, simulator)
+    tried = _simulated(of, device, times, course, alone.offset, angles, simulator)
     first = np.argmin(tried.cost, axis=1)
     rows = np.arange(len(of.logs))
     known = [_known_rotation(_far_from(of, tried.tip, int(k)), angles[k]) for k in rows]
     # Once more where the wire lay deeper, or less deep, than without the vessel, and from around the best rotation.
-    behind = filtered(tracks.abscissa - tried.abscissa[rows, first], travel, *noise).offset
+    apart = tracks.abscissa - tried.abscissa[rows, first]
+    depth = alone.offset + filtered(apart, tracks.travel(robot.latency_s), *alone.noise).offset
     step = 2 * np.pi / config.rotations
     near = angles[rows, first][:, None] + step * np.array([-0.5, -0.25, 0.0, 0.25, 0.5])
-    tried = _simulated(of, device, times, course, depth + behind, near, simulator)
+    tried = _simulated(of, device, times, course, depth, near, simulator)
     best = np.argmin(tried.cost, axis=1)
     return [
-        _episode(of, k, tried, int(best[k]), motion[k] + depth[k], (float(near[k, best[k]]), known[k]), times[k, 1:])
+        _episode(of, k, tried, int(best[k]), alone.abscissa[k], (float(near[k, best[k]]), known[k]), times[k, 1:])
         for k in range(len(best))
     ]
 
