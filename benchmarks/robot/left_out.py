@@ -85,14 +85,17 @@ def predicted(of: Prepared, robot: RobotConfig, wire: Wire) -> list[LeftOut]:
     found = []
     for k, (log, replay) in enumerate(zip(of.logs, replays, strict=True)):
         rest, count = ~replay.given, len(replay.given)
-        line = of.anatomy.tree.path(int(replay.branch[-1, 0]))
+        lines = {branch: of.anatomy.tree.path(int(branch)) for branch in np.unique(replay.branch[:, 0])}
         along = {name: np.abs(replay.abscissa[:, 0] - each[k, :count])[rest] for name, each in simple.items()}
         along["rod core"] = np.abs(np.diff(replay.abscissa, axis=1)[rest, 0])
         _, ray = log.camera.rays(np.zeros((1, 2))) if log.camera else (None, np.zeros((1, 3)))
         in_plane = {"rod core": np.linalg.norm(replay.in_view, axis=1)[rest]}
         for name, each in simple.items():
-            on = np.column_stack([np.interp(each[k, :count], line.abscissa, column) for column in line.points.T])
-            apart = on - replay.seen
+            apart = -replay.seen
+            for branch, line in lines.items():
+                there = replay.branch[:, 0] == branch
+                on = [np.interp(each[k, :count][there], line.abscissa, column) for column in line.points.T]
+                apart[there] += np.column_stack(on)
             in_plane[name] = np.linalg.norm(apart - (apart * ray).sum(axis=1, keepdims=True) * ray, axis=1)[rest]
         drive = log.command[log.commanded & (log.time_s >= replay.time_s[rest][0]), 0]
         there = [(drive[:, 0] - np.minimum.accumulate(drive[:, 0])).max(initial=0.0)]

@@ -41,6 +41,7 @@ def test_the_robot_that_logged_is_predicted(fork, wire, robot, made) -> None:
     assert ideal["error_along_of_the_drive_alone_mm"] > 2 * figures["error_along_of_the_drive_alone_mm"]
     for each in found:
         assert each.given.sum() == round(0.5 * len(each.given)) and not each.given[-1]
+        assert np.abs(each.in_view[each.given.sum() :][0]).max() < 0.5  # it goes on from where the tip was seen last
         assert np.isfinite(each.simulated).all() and len(each.force) >= len(each.time_s)
     begun = true.reshape(3, -1, 2)[:, 0, 1]
     for each, turn in zip(found, begun, strict=True):  # nobody knows where in its play a wire begins

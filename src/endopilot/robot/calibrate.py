@@ -150,7 +150,7 @@ def calibrate(
     drive = fit_drive(tracks, _units(of))
     drive, layers["slip"] = _with_layer("slip", tracks, drive)
     check_forward(logs[0].name, drive)
-    known, robot = robot, _driven(robot, drive)
+    robot = _driven(robot, drive)
     robot = replace(robot, encoders_at=where_encoders_sit(of.logs, robot) or robot.encoders_at)
     of_wire: dict[str, Estimate] = {}
     if config.wires:
@@ -165,19 +165,17 @@ def calibrate(
     found = replay_prepared(of, Stack(device), robot, replays)
     drive, layers["slack"] = _with_layer("slack", replace(tracks, slack=_slack(of, found)), drive)
     if layers["slack"] != LEFT_OUT:
-        robot = _driven(replace(robot, latency_s=known.latency_s), drive)
+        robot = _driven(robot, drive)
         found = replay_prepared(of, Stack(device), robot, replays)
-    names = [log.name for log in of.logs]
-    errors = worst(found, alone=layers["slack"] == LEFT_OUT)
-    another, one_more = bands(errors, names)
-    share = left_out_share(errors, names)
+    names, errors = [log.name for log in of.logs], worst(found, alone=layers["slack"] == LEFT_OUT)
+    (another, one_more), share = bands(errors, names), left_out_share(errors, names)
     return RobotCalibration(robot, device, of_drive(drive) | of_wire, layers, another, one_more, share, found)
 
 
 def _with_layer(name: str, tracks: Tracks, fit: DriveFit) -> tuple[DriveFit, str]:
     """Return a fit with one more layer, if that earns its place, and what it gained."""
     tried = fit_drive(tracks, fit.unit, fit, name)
-    said = gained(fit.without()[1], tried.without()[1], _BETTER)
+    said = gained(fit.left_out, tried.left_out, _BETTER)
     return (fit if said == LEFT_OUT else tried), said
 
 
@@ -313,19 +311,16 @@ def where_encoders_sit(episodes: Sequence[RobotLog], robot: RobotConfig) -> str 
     Returns:
         None where no log has readings.
     """
-    far = {"motor": [], "wire": []}
+    far, drive = [], robot.wire
     for log in episodes:
-        read = np.isfinite(log.encoders[:, 0, 0])
-        if read.sum() < 2:
-            continue
-        courses, at_s = Courses.of([log], robot.wire), (log.time_s[read] - log.time_s[0])[None]
-        late = np.array([robot.latency_s])
-        for place, gain, play in (("motor", 1.0, 0.0), ("wire", robot.wire.gain_translation, robot.wire.play_mm)):
-            motion = courses.followed(0, at_s=at_s, latency_s=late, gain=np.array([gain]), play=np.array([play]))
-            far[place].append(float(np.std(log.encoders[read, 0, 0] - motion[0, 0])))
-    if not far["motor"]:
-        return None
-    return min(far, key=lambda place: np.median(far[place]))
+        nothing = np.full_like(log.pixel, np.nan)
+        read = replace(log, tip=log.encoders[:, 0, [0, 0, 0]], pixel=nothing, used=np.ones(len(log), dtype=bool))
+        if read.seen.sum() > 1:
+            of, both = Courses.of([read], drive), np.array([[1.0, 0.0], [drive.gain_translation, drive.play_mm]])
+            late, (gain, play) = np.full(2, robot.latency_s), both.T
+            motion = of.followed(0, at_s=of.seen_s, latency_s=late, gain=gain, play=play)[:, 0]
+            far.append(np.std(read.tip[read.seen, 0] - motion, axis=1))
+    return ("motor", "wire")[int(np.argmin(np.median(far, axis=0)))] if far else None
 
 
 def bands(errors: Float[np.ndarray, "episodes"], logs: Sequence[str]) -> tuple[float | None, float | None]:

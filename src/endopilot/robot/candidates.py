@@ -1,12 +1,11 @@
 """A search for the parameters of a model by what they cost in each of many episodes, with intervals.
 
 Candidates are drawn from everywhere, then where others might be as good. A candidate is worse than the best if it costs
-more by t/2 standard errors of the sum over
-episodes of the difference, t Student's 97.5 % quantile; all that are not worse make the interval. Near the best the
-cost is c + a δ² - 2 b δ, with the sum of b over episodes 0: the rule excludes δ beyond t times the standard error that
-the spread of b between episodes gives it (the sandwich estimator). So intervals are of 95 %, and hold where the noise
-within an episode is of any kind. A parameter on which the cost does not depend keeps its whole range: the log does not
-identify it.
+more by t/2 standard errors of the sum over episodes of the difference, t Student's 97.5 % quantile; all that are not
+worse make the interval. Near the best the cost is c + a δ² - 2 b δ, with the sum of b over episodes 0: the rule
+excludes δ beyond t times the standard error that the spread of b between episodes gives it (the sandwich estimator). So
+intervals are of 95 %, and hold where the noise within an episode is of any kind. A parameter on which the cost does not
+depend keeps its whole range: the log does not identify it.
 """
 
 from __future__ import annotations

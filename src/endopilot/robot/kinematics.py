@@ -27,6 +27,8 @@ NAMES = ("gain_translation", "play_mm", "latency_s", "slip", "slack")
 """What is fitted; `slip` is the share of pushes that the grip loses, `slack` the share s of a simulated wire's."""
 RANGES = ((-3.0, 3.0), (0.0, 10.0), (0.0, 1.0), (0.0, 1.0), (-2.0, 3.0))
 """Widest values of each, as the robot's file takes them; a wire has all of its slack or none, s = 1 or 0."""
+_WEAK = np.diag([1 / (high - low) ** 2 for low, high in RANGES])
+"""Information of ranges, where tracks have none."""
 _FIRST = ((-1.0, -0.7, 0.7, 1.0, 1.4), (0.0, 0.7, 1.5, 3.0, 5.0), (0.0, 0.06, 0.12, 0.2, 0.35, 0.6))
 """Gains, plays and lags from the best of which the fit goes on."""
 _STEPS = np.array([0.01, 0.05, 0.005, 0.02, 0.05])
@@ -74,10 +76,8 @@ class Tracks:
         return np.abs(np.diff(at, axis=1, prepend=at[:, :1]))
 
     def rows(self, chosen: Int[np.ndarray, "some"]) -> Tracks:
-        """Return some of the episodes."""
-        slack = self.slack[chosen] if isinstance(self.slack, np.ndarray) else self.slack
-        courses = Courses(*(array[chosen] for array in vars(self.courses).values()))
-        return Tracks(courses, self.abscissa[chosen], slack)
+        """Return some of the episodes, without slack."""
+        return Tracks(Courses(*(array[chosen] for array in vars(self.courses).values())), self.abscissa[chosen])
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,6 @@ class Filtered:
         spread: standard deviation of each innovation, mm.
         cost: -2 log likelihood.
         offset: where the offset is after the last tip, mm.
-        variance: of that offset, in variances of a tip.
     """
 
     innovation: Float[np.ndarray, "*of tips"]
@@ -98,7 +97,6 @@ class Filtered:
     spread: Float[np.ndarray, "*of tips"]
     cost: Float[np.ndarray, "*of"]
     offset: Float[np.ndarray, "*of"]
-    variance: Float[np.ndarray, "*of"]
 
 
 def filtered(
@@ -132,7 +130,7 @@ def filtered(
             offset = np.where(there, np.where(jumps, value, offset + gain * (value - offset)), offset)
             variance = np.where(there, np.where(jumps, 1.0, gain), variance)
     innovation, gain, spread = np.moveaxis(kept, 1, -1)
-    return Filtered(innovation, gain, spread, cost, offset, variance)
+    return Filtered(innovation, gain, spread, cost, offset)
 
 
 def _whitened(by: Filtered, columns: Float[np.ndarray, "some episodes tips"]) -> Float[np.ndarray, "..."]:
@@ -146,54 +144,23 @@ def _whitened(by: Filtered, columns: Float[np.ndarray, "some episodes tips"]) ->
 
 @dataclass(frozen=True, eq=False)
 class DriveFit:
-    """Kinematics that explain tracks best, and how each episode would have them.
+    """Kinematics that explain tracks best.
 
     Attributes:
         values: of `NAMES`.
+        half_width: of their intervals of 95 %.
+        free: which of them were fitted.
         noise: standard deviation of a tip, mm, and drift, variance a mm of travel, in variances of a tip.
-        start: where in its play the device of each episode begins.
-        cost: -2 log likelihood of each episode.
-        innovation: of each tip, in standard deviations.
-        slope: of the innovations, for each of `NAMES`, where it was fitted; profiled over where episodes begin.
         unit: what each episode counts to.
-        free: which values were fitted.
+        left_out: what each unit costs, -2 log likelihood, by values that are fitted to all others.
     """
 
     values: Float[np.ndarray, "values"]
-    noise: tuple[float, float]
-    start: Float[np.ndarray, "episodes"]
-    cost: Float[np.ndarray, "episodes"]
-    innovation: Float[np.ndarray, "episodes tips"]
-    slope: Float[np.ndarray, "episodes tips values"]
-    unit: Int[np.ndarray, "episodes"]
+    half_width: Float[np.ndarray, "values"]
     free: Bool[np.ndarray, "values"]
-
-    def without(self) -> tuple[Float[np.ndarray, "units values"], Float[np.ndarray, "units"]]:
-        """Return by how much the values change if a unit is left out, and what that unit then costs."""
-        units = self.unit.max() + 1
-        information, score = np.zeros((units, len(NAMES), len(NAMES))), np.zeros((units, len(NAMES)))
-        np.add.at(information, self.unit, np.einsum("eti,etj->eij", self.slope, self.slope))
-        np.add.at(score, self.unit, np.einsum("eti,et->ei", self.slope, self.innovation))
-        weak = np.diag([1 / (high - low) ** 2 for low, high in RANGES])  # where tracks tell nothing, ranges do
-        change = np.linalg.solve(information.sum(axis=0) - information + weak, score[..., None])[..., 0]
-        moved = self.innovation + np.einsum("eti,ei->et", self.slope, change[self.unit])
-        cost = np.zeros(units)
-        np.add.at(cost, self.unit, self.cost + (moved**2 - self.innovation**2).sum(axis=1))
-        return change, cost
-
-    @property
-    def standard_error(self) -> Float[np.ndarray, "values"]:
-        """Of each value: the jackknife's over units, and no less than innovations make it that are independent."""
-        change, _ = self.without()
-        weak = np.diag([1 / (high - low) ** 2 for low, high in RANGES])
-        information = np.einsum("eti,etj->ij", self.slope, self.slope) + weak
-        jackknife = (len(change) - 1) / len(change) * ((change - change.mean(axis=0)) ** 2).sum(axis=0)
-        return np.sqrt(np.maximum(jackknife, np.diag(np.linalg.inv(information))))
-
-    @property
-    def half_width(self) -> Float[np.ndarray, "values"]:
-        """Half the intervals of 95 %."""
-        return stdtrit(self.unit.max(), 0.975) * self.standard_error
+    noise: tuple[float, float]
+    unit: Int[np.ndarray, "episodes"]
+    left_out: Float[np.ndarray, "units"]
 
 
 def earns(without: Float[np.ndarray, "units"], costs: Float[np.ndarray, "units"], level: float) -> bool:
@@ -232,9 +199,28 @@ def fit_drive(
         values = scanned[best]
         if best == 0:
             break
-    start = starts(tracks, values[None], noise)[0][0]
-    found, slope = _sloped(tracks, values, start, noise, free)
-    return DriveFit(values, noise, start, found.cost, found.innovation, slope, unit, free)
+    found, slope = _sloped(tracks, values, starts(tracks, values[None], noise)[0][0], noise, free)
+    half_width, left_out = _left_out(found, slope, unit)
+    return DriveFit(values, half_width, free, noise, unit, left_out)
+
+
+def _left_out(
+    found: Filtered, slope: Float[np.ndarray, "episodes tips values"], unit: Int[np.ndarray, "episodes"]
+) -> tuple[Float[np.ndarray, "values"], Float[np.ndarray, "units"]]:
+    """Return half the intervals of 95 %, and what each unit costs that is left out.
+
+    Standard errors are the jackknife's, and no less than innovations make them that are independent.
+    """
+    units = unit.max() + 1
+    information, score = np.zeros((units, len(NAMES), len(NAMES))), np.zeros((units, len(NAMES)))
+    np.add.at(information, unit, np.einsum("eti,etj->eij", slope, slope))
+    np.add.at(score, unit, np.einsum("eti,et->ei", slope, found.innovation))
+    whole, cost = information.sum(axis=0) + _WEAK, np.zeros(units)
+    change = np.linalg.solve(whole - information, score[..., None])[..., 0]
+    moved = found.innovation + np.einsum("eti,ei->et", slope, change[unit])
+    np.add.at(cost, unit, found.cost + (moved**2 - found.innovation**2).sum(axis=1))
+    variance = np.maximum((units - 1) * change.var(axis=0), np.diag(np.linalg.inv(whole)))
+    return stdtrit(units - 1, 0.975) * np.sqrt(variance), cost
 
 
 def _best_of_grid(tracks: Tracks) -> Float[np.ndarray, "values"]:
@@ -282,21 +268,16 @@ class Led:
     """Where a robot's drive alone leads tips, from where they were seen last.
 
     Attributes:
-        motion: from where each episode begins, mm.
-        offset: Δtip there, as the last tips have it, mm.
+        abscissa: Δtip, mm.
+        offset: that at the first command, as the last tips have it, mm.
         start: where in its play the device of each episode begins.
         noise: of the tips that were seen, as `DriveFit` has it.
     """
 
-    motion: Float[np.ndarray, "episodes tips"]
+    abscissa: Float[np.ndarray, "episodes tips"]
     offset: Float[np.ndarray, "episodes"]
     start: Float[np.ndarray, "episodes"]
     noise: tuple[float, float]
-
-    @property
-    def abscissa(self) -> Float[np.ndarray, "episodes tips"]:
-        """Δtip, mm."""
-        return self.motion + self.offset[:, None]
 
 
 def led(tracks: Tracks, robot: RobotConfig) -> Led:
@@ -307,7 +288,7 @@ def led(tracks: Tracks, robot: RobotConfig) -> Led:
     begun = starts(tracks, values[None], noise)[0][0]
     motion = tracks.motion(values[None], begun)[0]
     offset = filtered(tracks.abscissa - motion, tracks.travel(robot.latency_s), *noise).offset
-    return Led(motion, offset, begun, noise)
+    return Led(motion + offset[:, None], offset, begun, noise)
 
 
 def _sloped(
@@ -319,16 +300,13 @@ def _sloped(
 ) -> tuple[Filtered, Float[np.ndarray, "episodes tips values"]]:
     """Return innovations and their slopes, jumps where they are, without what other starts in the play would do."""
     steps = np.diag(_STEPS)
-    down = np.maximum(values - steps, [-np.inf, 0.0, 0.0, -1.0, -np.inf])
-    up = values + steps
+    down, up = np.maximum(values - steps, [-np.inf, 0.0, 0.0, -1.0, -np.inf]), values + steps
     apart = np.diag(up - down)[:, None, None]
-    of = tracks.motion(values[None], start)[0]
+    residual = tracks.abscissa - tracks.motion(values[None], start)[0]
     slopes = -(tracks.motion(up, start) - tracks.motion(down, start)) / apart
     sides = [tracks.motion(values[None], np.clip(start + step, -1, 1))[0] for step in (-0.1, 0.1)]
-    found = filtered(tracks.abscissa - of, tracks.travel(values[2]), *noise)
-    missing = ~np.isfinite(tracks.abscissa)
-    white = _whitened(found, np.concatenate([slopes, [sides[1] - sides[0]]]))
-    white[:, missing] = 0.0
+    found = filtered(residual, tracks.travel(values[2]), *noise)
+    white = _whitened(found, np.concatenate([slopes, [sides[1] - sides[0]]])) * np.isfinite(residual)
     slope, begin = np.moveaxis(white[:-1], 0, -1) * free, white[-1]
     share = np.einsum("et,eti->ei", begin, slope) / np.maximum((begin**2).sum(axis=1), 1e-12)[:, None]
     return found, slope - begin[..., None] * share[:, None]
@@ -344,7 +322,7 @@ def _newton(
     """Return values after a step of Gauss and Newton, as long as it costs less."""
     found, slope = _sloped(tracks, values, start, noise, free)
     low, high = np.array(RANGES).T
-    information = np.einsum("eti,etj->ij", slope, slope) + np.diag(1 / (high - low) ** 2)
+    information = np.einsum("eti,etj->ij", slope, slope) + _WEAK
     step = -np.linalg.solve(information, np.einsum("eti,et->i", slope, found.innovation))
     tried = np.clip(values + np.outer([1.0, 0.5, 0.25, 0.1, 0.0], step), low, high)
     _, cost = starts(tracks, tried, noise)
