@@ -114,7 +114,6 @@ class Prepared:
     logs: list[RobotLog]
     courses: Courses
     anatomy: Anatomy
-    project: TipProjector
     abscissa: Float[np.ndarray, "episodes tips"]
     branch: Float[np.ndarray, "episodes tips"]
     given: Bool[np.ndarray, "episodes tips"]
@@ -192,7 +191,7 @@ def prepare(logs: list[RobotLog], anatomy: Anatomy, given: float, robot: RobotCo
         count, tip = int(log.seen.sum()), project(log.tip[log.seen])
         abscissa[k, :count], branch[k, :count] = tip.abscissa, tip.branch
         share[k, : max(1, round(given * count))] = True
-    return Prepared(logs, courses, anatomy, project, abscissa, branch, share & courses.seen)
+    return Prepared(logs, courses, anatomy, abscissa, branch, share & courses.seen)
 
 
 def replay_prepared(
@@ -230,17 +229,16 @@ def _proximal(
     of: Prepared, robot: RobotConfig, start: Float[np.ndarray, "episodes"]
 ) -> tuple[Float[np.ndarray, "episodes times"], Float[np.ndarray, "episodes times 2"]]:
     """Return equal times of each episode, and where the drive then has the wire, mm and rad, from its first place."""
-    drive, courses = robot.wire, of.courses
-    begin = np.maximum(courses.seen_s[:, 0] - _LEAD_S, 0.0)
-    count = int(np.ceil((courses.seen_s.max(axis=1) - begin).max() / _PERIOD_S)) + 1
-    times, late = begin[:, None] + _PERIOD_S * np.arange(count + 1), np.array([robot.latency_s])
-
-    def followed(axis: int, gain: float, play: float, start: float | np.ndarray) -> np.ndarray:
-        gains, plays = np.array([gain]), np.array([play])
-        return courses.followed(axis, at_s=times, latency_s=late, gain=gains, play=plays, start=start)[0]
-
-    along = followed(0, drive.gain_translation, drive.play_mm, start)
-    return times, np.stack([along, followed(1, drive.gain_rotation, drive.play_rad, 0.0)], axis=-1)
+    drive, seen_s = robot.wire, of.courses.seen_s
+    begin = np.maximum(seen_s[:, 0] - _LEAD_S, 0.0)
+    count = int(np.ceil((seen_s.max(axis=1) - begin).max() / _PERIOD_S)) + 1
+    times, course = begin[:, None] + _PERIOD_S * np.arange(count + 1), []
+    axes = ((drive.gain_translation, drive.play_mm, start), (drive.gain_rotation, drive.play_rad, 0.0))
+    for axis, (gain, play, begun) in enumerate(axes):
+        of_one = {"latency_s": robot.latency_s, "gain": gain, "play": play}
+        constants = {name: np.array([value]) for name, value in of_one.items()}
+        course.append(of.courses.followed(axis, at_s=times, start=begun, **constants)[0])
+    return times, np.stack(course, axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,12 +300,9 @@ def _costs(of: Prepared, tip: Float[np.ndarray, "episodes worlds tips 3"]) -> Fl
 
     The last tips count most: where the wire lies when the prediction begins matters, not how it came there.
     """
-    cost = np.zeros(tip.shape[:2])
-    for k in range(len(cost)):
-        far = _far_from(of, tip, k)
-        age = np.arange(far.shape[1])[::-1] / far.shape[1]
-        cost[k] = np.average(far, axis=1, weights=np.exp(-age / _FADES))
-    return cost
+    far = [_far_from(of, tip, k) for k in range(len(tip))]
+    weights = [np.exp(-np.arange(each.shape[1])[::-1] / each.shape[1] / _FADES) for each in far]
+    return np.stack([np.average(each, axis=1, weights=w) for each, w in zip(far, weights, strict=True)])
 
 
 def _far_from(
@@ -389,7 +384,5 @@ def summary(found: Sequence[EpisodeReplay]) -> dict[str, float | int | None]:
         figures[f"error_{name}_mm"] = round(float(np.median([each[name] for each in errors])), 3)
     drive_alone = [np.median(np.abs(each.abscissa[:, 0] - each.driven)[~each.given]) for each in found]
     figures["error_along_of_the_drive_alone_mm"] = round(float(np.median(drive_alone)), 3)
-    figures["real_branch_share"] = round(
-        float(np.mean([each.branch[-1, 0] == each.branch[-1, 1] for each in found])), 3
-    )
-    return figures
+    ends = [each.branch[-1, 0] == each.branch[-1, 1] for each in found]
+    return figures | {"real_branch_share": round(float(np.mean(ends)), 3)}
