@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +17,16 @@ from endopilot.errors import InputError
 from endopilot.robot.calibrate import (
     LEFT_OUT,
     UNITS,
-    WIRE,
     CalibrateConfig,
     bands,
     calibrate,
+    check_clockwise,
     fit_wire,
     left_out_share,
 )
-from endopilot.robot.candidates import Estimate, estimates
+from endopilot.robot.candidates import Estimate
 from endopilot.robot.replay import prepare, usable_episodes
+from endopilot.tasks.task import reference_navigation
 
 sys.path.append(str(Path(__file__).parents[2] / "examples"))
 
@@ -69,12 +72,22 @@ def test_a_translation_counted_otherwise_is_refused(fork, wire, gain, said) -> N
         calibrate([log], fork, wire, config=NO_WIRE)
 
 
+def test_a_rotation_counted_otherwise_is_refused(wire) -> None:
+    anatomy, robot = reference_navigation().anatomy, drawn(1)
+    log = logged(anatomy, wire, robot, episodes=9, seconds=8.0, seed=1)
+    for sign in (1.0, -1.0):
+        turned = replace(log, command=log.command * [1.0, sign])
+        of = prepare(usable_episodes([turned], anatomy), anatomy, 0.5, robot)
+        with nullcontext() if sign > 0 else pytest.raises(InputError, match=r"^synthetic: rotation_rad: clockwise"):
+            check_clockwise(of, wire, robot, CalibrateConfig())
+
+
 def test_intervals_of_the_wire_hold_the_truth(fork, wire) -> None:
     robot = drawn(4)
     log = logged(fork, wire, robot, episodes=5, seconds=5.0, seed=4)
     prepared = prepare(usable_episodes([log], fork), fork, 0.5, robot)
     tried = fit_wire(prepared, wire, robot, CalibrateConfig(wires=32, wire_episodes=5))
-    found = estimates(tried[0], WIRE, UNITS)
+    found = tried[0].estimates(UNITS)
     truth = {
         "tip_bend_deg": np.degrees(wire.tip_bend_rad),
         "tip_bend_length_mm": wire.tip_bend_length_mm,

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from endopilot.robot.candidates import Candidates, estimates, search
+from endopilot.robot.candidates import Candidates, search
 
 RANGES = {"slope": (0.0, 5.0), "nothing": (-1.0, 1.0)}
 
@@ -23,7 +23,7 @@ def line_costs(seed: int, episodes: int = 12):
 def found(seed: int, first: int = 64):
     costs, x, y = line_costs(seed)
     tried = search(costs, RANGES, first=first, rounds=3, draws=128, seed=seed)
-    return estimates(tried, RANGES, {"slope": "mm"}), (x * y).sum() / (x**2).sum()
+    return tried.estimates({"slope": "mm"}), (x * y).sum() / (x**2).sum()
 
 
 def test_the_least_cost_is_found_with_an_interval_as_long_as_the_noise_makes_it() -> None:
@@ -48,4 +48,4 @@ def test_what_the_cost_does_not_depend_on_is_not_identified() -> None:
 
 def test_an_episode_left_out_is_judged_by_the_candidate_of_all_others() -> None:
     costs = np.array([[0.0, 0.0, 9.0], [1.0, 1.0, 1.0]])
-    assert Candidates(("x",), np.zeros((2, 1)), costs).left_out.tolist() == [1.0, 1.0, 9.0]
+    assert Candidates({"x": (0.0, 1.0)}, np.zeros((2, 1)), costs).left_out.tolist() == [1.0, 1.0, 9.0]

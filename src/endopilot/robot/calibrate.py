@@ -25,7 +25,7 @@ from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack, Transmission
 from endopilot.errors import InputError
 from endopilot.progress import Advance, progress
-from endopilot.robot.candidates import LEAST_EPISODES, Candidates, Estimate, estimates, search
+from endopilot.robot.candidates import LEAST_EPISODES, Candidates, Estimate, search
 from endopilot.robot.kinematics import NAMES, RANGES, DriveFit, Tracks, earns, fit_drive
 from endopilot.robot.log import Courses, RobotLog
 from endopilot.robot.replay import (
@@ -166,7 +166,7 @@ def calibrate(
         tried, as_known = fit_wire(some, device, robot, config)
         layers["wire"] = gained(as_known, tried.left_out, _BETTER_WIRE)
         if layers["wire"] != LEFT_OUT:
-            of_wire = estimates(tried, WIRE, UNITS)
+            of_wire = tried.estimates(UNITS)
             device, robot = with_found(device, robot, {name: of_wire[name].value for name in WIRE})
     replays = ReplayConfig(given=config.given)
     found = replay_prepared(of, Stack(device), robot, replays)

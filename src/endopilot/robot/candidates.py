@@ -67,13 +67,13 @@ class Candidates:
     """Parameters that were tried.
 
     Attributes:
-        names: of the parameters.
+        ranges: least and largest value of each parameter that was searched.
         values: of each candidate.
         costs: of each candidate in each episode.
         least: so many count as good at least: where few were tried, none of them is the best that there is.
     """
 
-    names: tuple[str, ...]
+    ranges: Mapping[str, tuple[float, float]]
     values: Float[np.ndarray, "candidates parameters"]
     costs: Float[np.ndarray, "candidates episodes"]
     least: int = 1
@@ -98,6 +98,14 @@ class Candidates:
         first = np.argsort(np.argsort(more.sum(axis=1))) < self.least
         return first | (more.sum(axis=1) <= stdtrit(count - 1, 0.975) / 2 * standard_error)
 
+    def estimates(self, units: Mapping[str, str]) -> dict[str, Estimate]:
+        """Return each parameter with its interval, and its unit if it has one."""
+        columns = zip(self.ranges, self.values[self.best].tolist(), self.values[self.as_good].T, strict=True)
+        return {
+            name: Estimate(value, float(good.min()), float(good.max()), self.ranges[name], units.get(name, ""))
+            for name, value, good in columns
+        }
+
 
 def search(
     costs: Costs, ranges: Mapping[str, tuple[float, float]], *, first: int, rounds: int, draws: int, seed: int = 0
@@ -116,31 +124,14 @@ def search(
 
     low, high = np.array(list(ranges.values()), dtype=float).T
     least = max(2 * len(ranges) + 2, round(_LEAST_SHARE * (first + rounds * draws)))
-    bottom, top, found = low, high, Candidates(tuple(ranges), np.empty((0, len(low))), np.empty((0, 0)))
+    bottom, top, found = low, high, Candidates(ranges, np.empty((0, len(low))), np.empty((0, 0)))
     for number in range(rounds + 1):
         even = qmc.Halton(len(low), seed=seed + number).random(draws if number else first)  # pyright: ignore[reportCallIssue]
         values = bottom + even * (top - bottom)
         cost = costs(values)
         cost = np.concatenate([found.costs, cost]) if number else cost
-        found = Candidates(found.names, np.concatenate([found.values, values]), cost, least)
+        found = Candidates(ranges, np.concatenate([found.values, values]), cost, least)
         as_good = found.values[found.as_good]
         spare = np.maximum(_WIDER * np.ptp(as_good, axis=0), _LEAST_SPARE * (high - low))
         bottom, top = np.clip([as_good.min(axis=0) - spare, as_good.max(axis=0) + spare], low, high)
     return found
-
-
-def estimates(
-    found: Candidates, ranges: Mapping[str, tuple[float, float]], units: Mapping[str, str]
-) -> dict[str, Estimate]:
-    """Return each parameter with its interval.
-
-    Args:
-        found: what was tried.
-        ranges: what was searched.
-        units: of the parameters.
-    """
-    as_good, best = found.values[found.as_good], found.values[found.best]
-    return {
-        name: Estimate(float(value), float(column.min()), float(column.max()), ranges[name], units.get(name, ""))
-        for name, value, column in zip(found.names, best, as_good.T, strict=True)
-    }

@@ -133,15 +133,6 @@ def filtered(
     return Filtered(innovation, gain, spread, cost, offset)
 
 
-def _whitened(by: Filtered, columns: Float[np.ndarray, "some episodes tips"]) -> Float[np.ndarray, "..."]:
-    """Return what a filter makes of other columns, jumps where they were."""
-    offset, out = columns[..., 0] * 0.0, np.zeros_like(columns)
-    for i in range(columns.shape[-1]):
-        out[..., i] = (columns[..., i] - offset) / by.spread[..., i]
-        offset = offset + by.gain[..., i] * (columns[..., i] - offset)
-    return out
-
-
 @dataclass(frozen=True, eq=False)
 class DriveFit:
     """Kinematics that explain tracks best.
@@ -306,7 +297,12 @@ def _sloped(
     slopes = -(tracks.motion(up, start) - tracks.motion(down, start)) / apart
     sides = [tracks.motion(values[None], np.clip(start + step, -1, 1))[0] for step in (-0.1, 0.1)]
     found = filtered(residual, tracks.travel(values[2]), *noise)
-    white = _whitened(found, np.concatenate([slopes, [sides[1] - sides[0]]])) * np.isfinite(residual)
+    columns = np.concatenate([slopes, [sides[1] - sides[0]]])
+    white, offset = np.zeros_like(columns), np.zeros(columns.shape[:2])
+    for i in range(columns.shape[2]):  # the filter, with jumps where they were
+        ahead = columns[..., i] - offset
+        white[..., i] = ahead / found.spread[:, i] * np.isfinite(residual[:, i])
+        offset += found.gain[:, i] * ahead
     slope, begin = np.moveaxis(white[:-1], 0, -1) * free, white[-1]
     share = np.einsum("et,eti->ei", begin, slope) / np.maximum((begin**2).sum(axis=1), 1e-12)[:, None]
     return found, slope - begin[..., None] * share[:, None]

@@ -322,7 +322,7 @@ def _known_rotation(far: Float[np.ndarray, "worlds given"], angles: Float[np.nda
         angles: equal ones, that the worlds began with, rad.
     """
     parts = [part.sum(axis=1) for part in np.array_split(far, LEAST_EPISODES, axis=1)]
-    good = Candidates(("rotation",), angles[:, None], np.stack(parts, axis=1)).as_good
+    good = Candidates({}, angles[:, None], np.stack(parts, axis=1)).as_good
     gaps = np.diff(np.flatnonzero(np.tile(good, 2))[: good.sum() + 1])
     arc = 1 - (gaps.max() - 1) / len(angles)  # of a turn, with half a step to either side
     return np.pi * arc if arc < UNKNOWN_SHARE else np.nan
