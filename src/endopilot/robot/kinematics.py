@@ -1,13 +1,11 @@
 """The tip as its drive alone leads it: gain, play, lag and an offset, fitted exactly, with intervals.
 
-The tip lies at y(t) = a(t) + g P(u(t − τ)) + s w(t) + noise, with the commanded course u, the play operator P, the gain
-g, the lag τ, and how much farther than its proximal end a simulated wire's tip goes, w, which counts by a share s that
-is fitted too. Nobody logs the offset a: it drifts as the wire slides, by equal variances in equal travel, and begins
-anew where the tip jumps, or the wire slips in its grip. So it is a state, and a Kalman filter takes it out of tip and
-model alike; what remains are innovations, independent of each other, to which g, the play, τ and s are fitted by
-Gauss and Newton. Slip costs what a jump costs and no more, whatever the play is: it does not come out as play.
-
-Standard errors are the jackknife's, over units (logs, or episodes): each left out by one step of Newton's.
+The tip lies at y(t) = a(t) + g P(u(t − τ)) + noise, with the commanded course u, the play operator P, the gain g and
+the lag τ. Nobody logs the offset a: it drifts as the wire slides, by equal variances in equal travel, and begins anew
+where the tip jumps. So it is a state, and a Kalman filter takes it out of tip and model alike; what remains are
+innovations, independent of each other, to which g, the play and τ are fitted by Gauss and Newton. Two layers may come on
+top: a share of all pushes that the grip loses, and a share of what a simulated wire's tip went farther than its
+proximal end.
 """
 
 from __future__ import annotations
