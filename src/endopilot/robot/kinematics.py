@@ -3,8 +3,8 @@
 The tip lies at y(t) = a(t) + g P(u(t − τ)) + noise, with the commanded course u, the play operator P, the gain g and
 the lag τ. Nobody logs the offset a: it drifts as the wire slides, by equal variances in equal travel, and begins anew
 where the tip jumps. So it is a state, and a Kalman filter takes it out of tip and model alike; what remains are
-innovations, independent of each other, to which g, the play and τ are fitted by Gauss and Newton. Two layers may come on
-top: a share of all pushes that the grip loses, and a share of what a simulated wire's tip went farther than its
+innovations, independent of each other, to which g, the play and τ are fitted by Gauss and Newton. Two layers may come
+on top: a share of all pushes that the grip loses, and a share of what a simulated wire's tip went farther than its
 proximal end.
 """
 
