@@ -23,11 +23,11 @@ from endopilot.robot.log import Courses
 
 NAMES = ("gain_translation", "play_mm", "latency_s", "slip", "slack")
 """What is fitted; `slip` is the share of pushes that the grip loses, `slack` the share s of a simulated wire's."""
-RANGES = ((-3.0, 3.0), (0.0, 10.0), (0.0, 1.0), (0.0, 1.0), (-2.0, 3.0))
+RANGES = ((-3.0, 3.0), (0.0, 10.0), (0.0, 2.0), (0.0, 1.0), (-2.0, 3.0))
 """Widest values of each, as the robot's file takes them; a wire has all of its slack or none, s = 1 or 0."""
 _WEAK = np.diag([1 / (high - low) ** 2 for low, high in RANGES])
 """Information of ranges, where tracks have none."""
-_FIRST = ((-1.0, -0.7, 0.7, 1.0, 1.4), (0.0, 0.7, 1.5, 3.0, 5.0), (0.0, 0.06, 0.12, 0.2, 0.35, 0.6))
+_FIRST = ((-1.0, -0.7, 0.7, 1.0, 1.4), (0.0, 0.7, 1.5, 3.0, 5.0), (0.0, 0.06, 0.12, 0.2, 0.35, 0.6, 1.0, 1.5))
 """Gains, plays and lags from the best of which the fit goes on."""
 _STEPS = np.array([0.01, 0.05, 0.005, 0.02, 0.05])
 """Steps of the derivatives: less than noise makes of each."""
@@ -184,7 +184,8 @@ def fit_drive(
                 break
         scanned = np.repeat(values[None], len(_PLAYS) + 1, axis=0)
         scanned[1:, 1] = _PLAYS
-        best = int(np.argmin(starts(tracks, scanned, noise)[1].sum(axis=1)))
+        few = np.array_split(scanned, len(scanned) // 4)  # at a time, for memory
+        best = int(np.argmin(np.concatenate([starts(tracks, some, noise)[1] for some in few]).sum(axis=1)))
         values = scanned[best]
         if best == 0:
             break
