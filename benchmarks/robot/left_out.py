@@ -211,9 +211,12 @@ def _table(tables: list[tuple[str, Bool[np.ndarray, "episodes"], dict[str, Any]]
     by_session = ", ".join(f"{each.mean():.2f}" for _, each, _ in tables[:-1])
     lines += [
         "",
-        f"The band of 90 % that the other sessions make holds throughout {held.mean():.2f} of {len(held)} episodes "
-        f"({by_session} by session; kinematics). Of the rod core, {core['passages']} passages happened as the "
-        f"real one, in time; {core['ends_in_it']} of the episodes end in the real branch; the side of the tip has r "
-        f"{core['side_r']}.",
+        "| of all sessions together | real | predicted |",
+        "|---|---|---|",
+        f"| the band of 90 % of the other sessions holds throughout an episode, kinematics ({by_session} by session) | | "
+        f"{held.mean():.2f} of {len(held)} |",
+        f"| the real branch, of forks in two, passed in time, rod core | | {core['passages']} |",
+        f"| episodes that end in the real branch, rod core | | {core['ends_in_it']} of {len(held)} |",
+        f"| side of the tip, correlation, rod core | | {core['side_r']} |",
     ]
     return lines
