@@ -213,7 +213,7 @@ def _table(tables: list[tuple[str, Bool[np.ndarray, "episodes"], dict[str, Any]]
         "",
         "| of all sessions together | real | predicted |",
         "|---|---|---|",
-        f"| the band of 90 % of the other sessions holds throughout an episode, kinematics ({by_session} by session) | | "
+        f"| the band of 90 % of the others holds throughout an episode, kinematics ({by_session} by session) | | "
         f"{held.mean():.2f} of {len(held)} |",
         f"| the real branch, of forks in two, passed in time, rod core | | {core['passages']} |",
         f"| episodes that end in the real branch, rod core | | {core['ends_in_it']} of {len(held)} |",
