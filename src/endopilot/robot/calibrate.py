@@ -204,15 +204,12 @@ def check_forward(log: str, fit: DriveFit) -> None:
         InputError: it goes back, or much farther or less.
     """
     gain, half = float(fit.values[0]), float(fit.half_width[0])
-    if gain + half < 0:
-        raise InputError(
-            f"{log}: translation_mm: forward is counted negative, {gain:.2f} mm of the tip for each mm; change its sign"
-        )
     least, most = DRIVE["gain_translation"]
     if gain + half < least or gain - half > most:
-        raise InputError(
-            f"{log}: translation_mm: the tip goes {gain:.2f} mm for each mm, and not {least:g} to {most:g}; give mm"
-        )
+        why, mend = f"not {least:g} to {most:g} mm", "give mm"
+        if gain + half < 0:
+            why, mend = "forward is counted negative", "change its sign"
+        raise InputError(f"{log}: translation_mm: {why}: the tip goes {gain:.2f} mm for each mm; {mend}")
 
 
 def check_clockwise(of: Prepared, device: Wire, robot: RobotConfig, config: CalibrateConfig) -> None:
