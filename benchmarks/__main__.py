@@ -27,6 +27,7 @@ BENCHMARKS = {
     "judges": "judges.judges:bench_judges",
     "robot-twist": "robot.twist:bench_twist",
     "robot-blind": "robot.blind:bench_blind",
+    "robot-left-out": "robot.left_out:bench_left_out",
     "dataset": "dataset:bench_dataset",
     "cockpit": "cockpit:bench_cockpit",
     "anatomy": "anatomy.extraction:bench_anatomy",

@@ -54,11 +54,17 @@ def logged_and_true(
             truth.append(drive.proximal[0].copy())
             state = drive.proximal_state()
             rows.append((episode, k * PERIOD_S, velocity.copy(), tip, state.devices[0], state.load[0]))
-    return _log(rows), np.array(truth)
+    return log_of(rows), np.array(truth)
 
 
-def _log(rows: Sequence[tuple[Any, ...]]) -> RobotLog:
-    """Return two rows for each period: the command at its start, tip, encoders and load at its end."""
+def log_of(rows: Sequence[tuple[Any, ...]], *, period_s: float = PERIOD_S, by_velocity: bool = True) -> RobotLog:
+    """Return two rows for each period: the command at its start, tip, encoders and load at its end.
+
+    Args:
+        rows: of each period its episode, time, s, velocity, mm/s and rad/s, and tip, encoders and load at its end.
+        period_s: between commands, s.
+        by_velocity: whether velocities are logged, or the positions that they lead to.
+    """
     count = 2 * len(rows)
     nothing = np.full((count, 1, 2), np.nan)
     log = RobotLog(
@@ -71,13 +77,13 @@ def _log(rows: Sequence[tuple[Any, ...]]) -> RobotLog:
         tip=np.full((count, 3), np.nan),
         pixel=np.full((count, 2), np.nan),
         used=np.ones(count, dtype=bool),
-        by_velocity=True,
+        by_velocity=by_velocity,
     )
     place = np.zeros(2)
     for k, (episode, time_s, velocity, tip, encoders, load) in enumerate(rows):
-        place = velocity * PERIOD_S + (place if k and rows[k - 1][0] == episode else 0.0)
+        place = velocity * period_s + (place if k and rows[k - 1][0] == episode else 0.0)
         began = 100.0 * episode + time_s
-        log.time_s[2 * k : 2 * k + 2] = began, began + PERIOD_S - 1e-6
+        log.time_s[2 * k : 2 * k + 2] = began, began + period_s - 1e-6
         log.episode[2 * k : 2 * k + 2] = episode
         log.command[2 * k, 0] = place
         log.tip[2 * k + 1], log.encoders[2 * k + 1, 0], log.load[2 * k + 1, 0] = tip, encoders, load

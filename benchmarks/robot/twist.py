@@ -152,9 +152,9 @@ def correlation(
 
 
 def passages(replay: EpisodeReplay, anatomy: Anatomy) -> list[bool]:
-    """Return whether the simulated tip took the real branch, of each fork in two that the real one passed.
+    """Return whether the simulated tip took the real branch in time, of each fork in two that the real one passed.
 
-    Of the predicted part. Where the simulated tip is in none of the two when the real one has passed, there is none.
+    Of the predicted part. A simulated tip that is in none of the two when the real one has passed did not take it.
     """
     branches = anatomy.tree.branches
     inside: list[set[int]] = []
@@ -178,8 +178,7 @@ def passages(replay: EpisodeReplay, anatomy: Anatomy) -> list[bool]:
             if not before[:at].any():
                 continue
             own = next((w for w in ways if w in inside[simulated[at]]), -1)
-            if own >= 0:
-                taken.append(bool(own == way[at]))
+            taken.append(bool(own == way[at]))
             break
     return taken
 

@@ -59,6 +59,13 @@ def test_what_a_camera_does_not_see_counts_for_nothing(fork, wire, robot, log) -
         np.testing.assert_allclose(each.in_view[:, [0, 2]], apart[:, [0, 2]], atol=1e-9)
 
 
+def test_a_prediction_goes_on_from_where_the_tip_was_seen_last(fork, wire, robot, log) -> None:
+    """Tips that lie 0.8 mm beside the wire's, as of another camera: the prediction lies there too."""
+    beside = dataclasses.replace(log, tip=log.tip + np.array([0.0, 0.8, 0.0]))
+    for each in replay_log([beside], fork, Stack(wire), robot=robot, config=FEW):
+        assert np.abs(each.in_view[each.given, 1]).mean() > 0.4 and abs(each.in_view[each.given.sum(), 1]) < 0.25
+
+
 def test_what_a_drive_did_before_the_first_tip_is_left_out(fork, robot, log) -> None:
     """The first twenty periods of each episode show no tip; the rest moves the wire as it did."""
     rows = np.concatenate([np.flatnonzero(log.episode == number)[:40] for number in np.unique(log.episode)])

@@ -61,8 +61,10 @@ def command(
         "start_rotation_known_in": round(known_share, 3),
         "start_rotation_known_rad": round(float(np.nanmedian(known)), 2) if known_share else None,
         "band_of_90_percent_mm": None if found.band_mm is None else round(found.band_mm, 2),
+        "band_of_another_episode_mm": None if found.next_band_mm is None else round(found.next_band_mm, 2),
         "it_holds_in_logs_left_out": None if found.band_share is None else round(found.band_share, 3),
     }
+    about |= {f"layer_{name}": said for name, said in found.layers.items()}
     inputs = {name: digest for path in (*logs, anatomy) for name, digest in input_hash(path).items()}
     intervals = {
         name: {

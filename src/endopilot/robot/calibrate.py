@@ -1,15 +1,16 @@
 """A robot and its wire from logs: what each constant is, how sure that is, and what a log does not tell.
 
-Two fits, one after the other, with the same search (`candidates`). The drive: lag, gain and play of the translation,
-from Δtip of the real tip, which follows the proximal end but for a constant in each episode. The wire: its bent tip,
-friction, stiffness and the play of the rotation, from where the real tip lies beside that of the rod core and from the
-drive's force where the log has it, with a world for each candidate, episode and rotation at the start.
+First the drive's kinematics: lag, gain and play of the translation, of Δtip alone (`kinematics`). Then two layers that
+must earn their place, for a model may be wrong: what they predict of episodes that were left out has to be better, or
+they are left out themselves. They are the slack of a simulated wire, which counts by a share that is fitted with gain
+and play, so that they are only as sure as that share; and the wire with what lies between it and its drive: bent tip,
+friction, stiffness, play or twist of the rotation, and grip, from where the real tip lies beside that of the rod core,
+and from the drive's force where the log has it.
 """
 
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -17,14 +18,16 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.special import stdtrit
 
 from endopilot.devices.device import Wire
 from endopilot.devices.robot import RobotConfig
-from endopilot.devices.stack import Stack
-from endopilot.errors import InputError, Remark
+from endopilot.devices.stack import Stack, Transmission
+from endopilot.errors import InputError
 from endopilot.progress import Advance, progress
-from endopilot.robot.candidates import LEAST_EPISODES, Candidates, Estimate, estimates, search
-from endopilot.robot.log import STARTS, Courses, RobotLog
+from endopilot.robot.candidates import LEAST_EPISODES, Candidates, Estimate, search
+from endopilot.robot.kinematics import NAMES, RANGES, DriveFit, Tracks, earns, fit_drive
+from endopilot.robot.log import Courses, RobotLog
 from endopilot.robot.replay import (
     FAR_MM,
     EpisodeReplay,
@@ -37,8 +40,8 @@ from endopilot.robot.replay import (
 from endopilot.settings import OpenShare, Seed, Within, public, settings
 from endopilot.types import Anatomy
 
-DRIVE = MappingProxyType({"gain_translation": (0.8, 1.25), "play_mm": (0.0, 6.0), "latency_s": (0.0, 0.5)})
-"""What is searched of the drive."""
+DRIVE = MappingProxyType(dict(zip(NAMES, ((0.5, 2.0), *RANGES[1:]), strict=False)))
+"""What may be of the drive: gains as a robot's file takes them."""
 WIRE = MappingProxyType(
     {
         "tip_bend_deg": (5.0, 90.0),
@@ -46,21 +49,30 @@ WIRE = MappingProxyType(
         "friction": (0.01, 0.4),
         "tip_stiffness_factor": (0.3, 3.0),
         "play_rad": (0.0, 9.0),
+        "twist_friction_n_mm_mm": (0.0, 8e-4),
+        "grip_n": (0.05, 1.0),
     }
 )
-"""What is searched of the wire, and of the drive's rotation."""
+"""What is searched of the wire, and of the drive's rotation and grip."""
 UNITS = MappingProxyType(
     {"play_mm": "mm", "latency_s": "s", "tip_bend_deg": "°", "tip_bend_length_mm": "mm", "play_rad": "rad"}
+    | {"twist_friction_n_mm_mm": "N·mm/mm", "grip_n": "N"}
 )
-RESOLUTION = MappingProxyType({"gain_translation": 0.005, "play_mm": 0.1, "latency_s": 0.01})
+RESOLUTION = MappingProxyType({"gain_translation": 0.005, "play_mm": 0.1, "latency_s": 0.015})
 """Least half-widths of intervals. A command lasts for 0.05 to 0.2 s and moves the wire by some 0.3 mm; what it does
 within that, and how the wire lies in a vessel that is known to 0.1 mm, no log tells."""
+_BEHIND_MM = 1000.0
+"""Length behind the ostium over which a wire twists, if the robot names none, mm: only m L² / 2 GJ tells in a log."""
+_AT_ONCE = 1e6
+"""Acceleration of a drive that takes no time to speed up, as the robot `ideal` has it, mm/s²."""
+LEFT_OUT = "no gain, left out"
 _TYPICAL_MM = 0.3
-"""Errors of Δtip up to this count by their squares, larger ones by their size: a tip that snaps, mm."""
-_TIMES = 2
-"""Fits of the drive with the slack that the rod core has by the fit before."""
-_LEVEL = 0.9
-"""Share of episodes in which the band is to hold."""
+"""What a tip may be off by, mm: errors are counted in it."""
+_LEVEL, _LEAST_LOGS = 0.9, 3
+"""Share of episodes in which the band is to hold, and logs whose differences say how much another one differs."""
+_BETTER, _BETTER_WIRE, _SURE = 0.5, 0.95, 0.999
+"""Levels at which episodes left out must cost less: for a share that is fitted with its uncertainty, on average; for a
+wire, chosen from many; for the other sign of an axis, as a log is refused."""
 
 
 @settings
@@ -84,19 +96,25 @@ class RobotCalibration:
     """What logs say of a robot and its wire.
 
     Attributes:
-        robot: with lag, gain and plays as they were found.
+        robot: with lag, gain and plays as they were found; what is not identified is as it was known.
         wire: with the tip, friction and stiffness of the best candidate, those too that are not identified: they belong
-            together.
+            together. As it was known where the layer was left out.
         estimates: each constant with its interval.
-        band_mm: half-width within which Δtip was predicted throughout 90 % of the episodes, mm; None with too few.
-        band_share: share of the episodes of each log in which the band of the other logs holds; None with one log.
+        layers: what slip, the simulated wire's slack and the wire gained on episodes left out, or that they were left
+            out.
+        band_mm: half-width within which Δtip is predicted throughout nine of ten episodes of another session (log), mm,
+            by the drive alone where the slack was left out; None with too few sessions.
+        next_band_mm: the same of one more episode of these sessions, mm; None with too few episodes.
+        band_share: share of the episodes of each log in which the band of the other logs holds; None with few logs.
         replays: of the episodes that the drive was fitted to.
     """
 
     robot: RobotConfig
     wire: Wire
     estimates: dict[str, Estimate]
+    layers: dict[str, str]
     band_mm: float | None
+    next_band_mm: float | None
     band_share: float | None
     replays: list[EpisodeReplay]
 
@@ -120,7 +138,7 @@ def calibrate(
         config: how they are fitted.
 
     Raises:
-        InputError: too few episodes.
+        InputError: too few episodes; an axis is counted the other way round, or in another unit.
     """
     config, robot = config or CalibrateConfig(), robot or RobotConfig()
     episodes = usable_episodes(logs, anatomy)
@@ -129,41 +147,92 @@ def calibrate(
             f"{logs[0].name}: {len(episodes)} episodes that show the tip often enough; intervals need "
             f"{LEAST_EPISODES}: log more, or number them anew (`episode`) wherever the device was reset"
         )
-    replays = ReplayConfig(given=config.given)
-    of = prepare(_evenly(episodes, config.episodes), anatomy, config.given, robot)
-    drives, estimated = fit_drive(of, seed=config.seed), {}
-    robot = _driven(robot, drives)
+    of, layers = prepare(_evenly(episodes, config.episodes), anatomy, config.given, robot), {}
+    tracks, drive = Tracks(of.courses, of.abscissa), fit_drive(Tracks(of.courses, of.abscissa), _units(of))
+    if of.logs[0].by_velocity:  # what is lost as a drive speeds up, if it needs time for that, is never caught up
+        at_once = replace(robot, wire=replace(robot.wire, max_acceleration_mm_s2=_AT_ONCE))
+        others = replace(tracks, courses=Courses.of(of.logs, at_once.wire))
+        other = fit_drive(others, drive.unit)
+        if earns(drive.left_out, other.left_out, _BETTER):
+            of, robot, tracks, drive = replace(of, courses=others.courses), at_once, others, other
+    drive, layers["slip"] = _with_layer("slip", tracks, drive)
+    check_forward(logs[0].name, drive)
+    robot = _driven(robot, drive)
     robot = replace(robot, encoders_at=where_encoders_sit(of.logs, robot) or robot.encoders_at)
+    of_wire: dict[str, Estimate] = {}
     if config.wires:
         some = prepare(_evenly(episodes, config.wire_episodes), anatomy, config.given, robot)
-        wires = fit_wire(some, device, robot, config)
-        estimated = estimates(wires, WIRE, UNITS, RESOLUTION)
-        device, robot = with_found(device, robot, {name: estimated[name].value for name in WIRE})
-    for _ in range(_TIMES):
-        slack = _slack(of, replay_prepared(of, Stack(device), robot, replays))
-        drives = fit_drive(of, slack, seed=config.seed)
-        robot = _driven(robot, drives)
-    estimated = estimates(drives, DRIVE, UNITS, RESOLUTION) | estimated
-    doubt_ends(logs[0].name, estimated)
+        check_clockwise(some, device, robot, config)
+        tried, as_known = fit_wire(some, device, robot, config)
+        layers["wire"] = gained(as_known, tried.left_out, _BETTER_WIRE)
+        if layers["wire"] != LEFT_OUT:
+            of_wire = tried.estimates(UNITS)
+            device, robot = with_found(device, robot, {name: of_wire[name].value for name in WIRE})
+    replays = ReplayConfig(given=config.given)
     found = replay_prepared(of, Stack(device), robot, replays)
-    held = left_out_share(found, [log.name for log in of.logs])
-    return RobotCalibration(robot, device, estimated, band(found), held, found)
+    drive, layers["slack"] = _with_layer("slack", replace(tracks, slack=_slack(of, found)), drive)
+    if layers["slack"] != LEFT_OUT:
+        robot = _driven(robot, drive)
+        found = replay_prepared(of, Stack(device), robot, replays)
+    names, errors = [log.name for log in of.logs], worst(found, alone=layers["slack"] == LEFT_OUT)
+    (another, one_more), share = bands(errors, names), left_out_share(errors, names)
+    return RobotCalibration(robot, device, of_drive(drive) | of_wire, layers, another, one_more, share, found)
 
 
-def doubt_ends(log: str, found: Mapping[str, Estimate]) -> None:
-    """Warn (`Remark`) of constants of the drive that fit best at an end of what was searched, as no robot's should."""
-    at_ends = [
-        name
-        for name, (least, most) in DRIVE.items()
-        if found[name].identified and (found[name].low <= least > 0 or found[name].high >= most)
-    ]
-    if at_ends:
-        warnings.warn(
-            f"{log}: the best fit has {', '.join(at_ends)} at the end of what was searched; check that forward is "
-            "counted positive, and that times are in s",
-            Remark,
-            stacklevel=3,
+def _with_layer(name: str, tracks: Tracks, fit: DriveFit) -> tuple[DriveFit, str]:
+    """Return a fit with one more layer, if that earns its place, and what it gained."""
+    tried = fit_drive(tracks, fit.unit, fit, name)
+    said = gained(fit.left_out, tried.left_out, _BETTER)
+    return (fit if said == LEFT_OUT else tried), said
+
+
+def of_drive(fit: DriveFit) -> dict[str, Estimate]:
+    """Return the constants of the drive that were fitted, with their intervals."""
+    found = {}
+    for k in np.flatnonzero(fit.free):
+        name, value = NAMES[k], float(fit.values[k])
+        half, (least, most) = max(float(fit.half_width[k]), RESOLUTION.get(name, 0.0)), DRIVE[name]
+        low, high = max(value - half, least), min(value + half, most)
+        found[name] = Estimate(value, low, high, (least, most), UNITS.get(name, ""))
+    return found
+
+
+def check_forward(log: str, fit: DriveFit) -> None:
+    """Check that the tip goes on where the translation grows, about as far.
+
+    Raises:
+        InputError: it goes back, or much farther or less.
+    """
+    gain, half = float(fit.values[0]), float(fit.half_width[0])
+    least, most = DRIVE["gain_translation"]
+    if gain + half < least or gain - half > most:
+        why, mend = f"not {least:g} to {most:g} mm", "give mm"
+        if gain + half < 0:
+            why, mend = "forward is counted negative", "change its sign"
+        raise InputError(f"{log}: translation_mm: {why}: the tip goes {gain:.2f} mm for each mm; {mend}")
+
+
+def check_clockwise(of: Prepared, device: Wire, robot: RobotConfig, config: CalibrateConfig) -> None:
+    """Check that a rotation that is turned predicts episodes no better. In a flat vessel it does as well.
+
+    Raises:
+        InputError: it does better.
+    """
+    other = [replace(log, command=log.command * [1.0, -1.0]) for log in of.logs]
+    turned = replace(of, logs=other, courses=Courses.of(other, robot.wire))
+    as_it_is, better = (_wire_costs(each, device, robot, config) for each in (of, turned))
+    if earns(as_it_is, better, _SURE):
+        raise InputError(
+            f"{of.logs[0].name}: rotation_rad: clockwise is counted negative: with the other sign tips are predicted "
+            "better; change it"
         )
+
+
+def gained(without: Float[np.ndarray, "units"], costs: Float[np.ndarray, "units"], level: float) -> str:
+    """Return what a layer gained on units that were left out, or that it is left out."""
+    if not earns(without, costs, level):
+        return LEFT_OUT
+    return f"{(without - costs).mean() / np.abs(without).mean():.0%} less cost on episodes left out"
 
 
 def _evenly(episodes: list[RobotLog], most: int) -> list[RobotLog]:
@@ -171,10 +240,12 @@ def _evenly(episodes: list[RobotLog], most: int) -> list[RobotLog]:
     return [episodes[k] for k in np.unique(np.linspace(0, len(episodes) - 1, most).round().astype(int))]
 
 
-def _driven(robot: RobotConfig, found: Candidates) -> RobotConfig:
-    """Return a robot with the best candidate of `DRIVE`."""
-    gain, play, latency = found.values[found.best].tolist()
-    return replace(robot, latency_s=latency, wire=replace(robot.wire, gain_translation=gain, play_mm=play))
+def _driven(robot: RobotConfig, fit: DriveFit) -> RobotConfig:
+    """Return a robot with what is identified of its drive."""
+    found = {name: each.value for name, each in of_drive(fit).items() if each.identified}
+    latency_s = found.pop("latency_s", robot.latency_s)
+    of_wire = {name: value for name, value in found.items() if name in ("gain_translation", "play_mm")}
+    return replace(robot, latency_s=latency_s, wire=replace(robot.wire, **of_wire))
 
 
 def _slack(of: Prepared, found: Sequence[EpisodeReplay]) -> Float[np.ndarray, "episodes tips"]:
@@ -185,49 +256,31 @@ def _slack(of: Prepared, found: Sequence[EpisodeReplay]) -> Float[np.ndarray, "e
     return slack
 
 
-def fit_drive(of: Prepared, slack: Float[np.ndarray, "episodes tips"] | float = 0.0, *, seed: int = 0) -> Candidates:
-    """Return candidates of `DRIVE`, by how far Δtip of the real tip is from what the drive made of the commands.
-
-    Args:
-        of: episodes.
-        slack: how much farther than its proximal end the tip went in the rod core, mm.
-        seed: of the search.
-    """
-    unit, abscissa = _units(of), of.abscissa - slack
-
-    def costs(values: Float[np.ndarray, "candidates 3"]) -> Float[np.ndarray, "candidates units"]:
-        gain, play, latency = values.T
-        least = np.full((len(values), len(of.logs)), np.inf)
-        for start in STARTS:
-            motion = of.courses.followed(
-                0, at_s=of.courses.seen_s, latency_s=latency, gain=gain, play=play, start=start
-            )
-            error = abscissa - motion
-            error -= np.nanmedian(error, axis=2, keepdims=True)
-            size = 2 * (np.sqrt(1 + (error / _TYPICAL_MM) ** 2) - 1)
-            least = np.minimum(least, np.nansum(size, axis=2))
-        return _summed(least, unit)
-
-    return search(costs, DRIVE, generations=12, rounds=3, draws=256, seed=seed)
-
-
-def fit_wire(of: Prepared, device: Wire, robot: RobotConfig, config: CalibrateConfig) -> Candidates:
-    """Return candidates of `WIRE`, by how far the simulated tip is from the real one, as the camera sees it."""
-    replays, unit = ReplayConfig(given=config.given), _units(of)
-    first, draws = config.wires // 2, config.wires // 4
+def fit_wire(
+    of: Prepared, device: Wire, robot: RobotConfig, config: CalibrateConfig
+) -> tuple[Candidates, Float[np.ndarray, "units"]]:
+    """Return candidates of `WIRE`, by how far simulated tips are from real ones, and what the wire as known costs."""
 
     def costs(values: Float[np.ndarray, "candidates parameters"]) -> Float[np.ndarray, "candidates units"]:
         rows = []
         for row in values:
-            wire, driven = with_found(device, robot, dict(zip(WIRE, row.tolist(), strict=True)))
-            found = replay_prepared(of, Stack(wire), driven, replays)
-            rows.append([_cost(each, robot) for each in found])
+            rows.append(_wire_costs(of, *with_found(device, robot, dict(zip(WIRE, row.tolist(), strict=True))), config))
             advance(1)
-        return _summed(np.array(rows), unit)
+        return np.array(rows)
 
+    first, draws = config.wires // 2, config.wires // 4
     advance: Advance
     with progress("Fitting the wire", total=first + 2 * draws) as advance:
-        return search(costs, WIRE, generations=0, rounds=2, draws=draws, first=first, seed=config.seed)
+        tried = search(costs, WIRE, first=first, rounds=2, draws=draws, seed=config.seed)
+    return tried, _wire_costs(of, device, robot, config)
+
+
+def _wire_costs(of: Prepared, device: Wire, robot: RobotConfig, config: CalibrateConfig) -> Float[np.ndarray, "units"]:
+    """Return what a wire costs in the episodes of each unit."""
+    unit = _units(of)
+    found, costs = replay_prepared(of, Stack(device), robot, ReplayConfig(given=config.given)), np.zeros(unit.max() + 1)
+    np.add.at(costs, unit, [_cost(each, robot) for each in found])
+    return costs
 
 
 def _cost(episode: EpisodeReplay, robot: RobotConfig) -> float:
@@ -245,8 +298,11 @@ def with_found(device: Wire, robot: RobotConfig, found: Mapping[str, float]) -> 
     shaped = device.shaped(found.get("tip_bend_deg", bend), found.get("tip_bend_length_mm", device.tip_bend_length_mm))
     shaped = shaped.with_tip(bend_rad=shaped.tip_bend_rad, stiffness_factor=found.get("tip_stiffness_factor", 1.0))
     wire = replace(shaped, friction=found.get("friction", device.friction))
-    drive = replace(robot.wire, play_rad=found.get("play_rad", robot.wire.play_rad))
-    return wire, replace(robot, wire=drive)
+    behind = robot.wire.transmission
+    if twist := found.get("twist_friction_n_mm_mm"):
+        behind = Transmission(length_mm=behind.length_mm or _BEHIND_MM, twist_friction_n_mm_mm=twist)
+    play_rad, grip_n = found.get("play_rad", robot.wire.play_rad), found.get("grip_n", robot.wire.grip_n)
+    return wire, replace(robot, wire=replace(robot.wire, play_rad=play_rad, grip_n=grip_n, transmission=behind))
 
 
 def where_encoders_sit(episodes: Sequence[RobotLog], robot: RobotConfig) -> str | None:
@@ -259,45 +315,64 @@ def where_encoders_sit(episodes: Sequence[RobotLog], robot: RobotConfig) -> str 
     Returns:
         None where no log has readings.
     """
-    far = {"motor": [], "wire": []}
+    far, drive = [], robot.wire
     for log in episodes:
-        read = np.isfinite(log.encoders[:, 0, 0])
-        if read.sum() < 2:
-            continue
-        courses, at_s = Courses.of([log], robot.wire), (log.time_s[read] - log.time_s[0])[None]
-        late = np.array([robot.latency_s])
-        for place, gain, play in (("motor", 1.0, 0.0), ("wire", robot.wire.gain_translation, robot.wire.play_mm)):
-            motion = courses.followed(0, at_s=at_s, latency_s=late, gain=np.array([gain]), play=np.array([play]))
-            far[place].append(float(np.std(log.encoders[read, 0, 0] - motion[0, 0])))
-    if not far["motor"]:
-        return None
-    return min(far, key=lambda place: np.median(far[place]))
+        nothing = np.full_like(log.pixel, np.nan)
+        read = replace(log, tip=log.encoders[:, 0, [0, 0, 0]], pixel=nothing, used=np.ones(len(log), dtype=bool))
+        if read.seen.sum() > 1:
+            of, both = Courses.of([read], drive), np.array([[1.0, 0.0], [drive.gain_translation, drive.play_mm]])
+            late, (gain, play) = np.full(2, robot.latency_s), both.T
+            motion = of.followed(0, at_s=of.seen_s, latency_s=late, gain=gain, play=play)[:, 0]
+            far.append(np.std(read.tip[read.seen, 0] - motion, axis=1))
+    return ("motor", "wire")[int(np.argmin(np.median(far, axis=0)))] if far else None
 
 
-def band(replays: Sequence[EpisodeReplay]) -> float | None:
-    """Return the half-width, mm, within which Δtip was predicted throughout most of the episodes (conformal).
+def bands(errors: Float[np.ndarray, "episodes"], logs: Sequence[str]) -> tuple[float | None, float | None]:
+    """Return half-widths that hold throughout nine of ten episodes: of another log, and of one more of these, mm.
+
+    The logarithm of an episode's largest error is its log's median and a rest, which is drawn from all rests, each log
+    counting the same. A log that is not known yet adds the variance between logs, by Student's t.
+
+    Args:
+        errors: largest error of Δtip in each episode, mm.
+        logs: name of each one's log.
 
     Returns:
-        None with too few episodes.
+        None where there are too few logs, or episodes.
     """
-    rank = math.ceil(_LEVEL * (len(replays) + 1))
-    return float(np.sort(_worst(replays))[rank - 1]) if rank <= len(replays) else None
+    size, log = np.log(np.maximum(errors, 1e-6)), np.unique(np.asarray(logs), return_inverse=True)[1]
+    count = np.bincount(log)
+    middle = np.array([np.median(size[log == k]) for k in range(len(count))])
+    rest, weight = size - middle[log], 1 / count[log]
+
+    def width(more: Float[np.ndarray, "draws"]) -> float:
+        drawn = (rest[:, None] + more).ravel()
+        order, weights = np.argsort(drawn), np.repeat(weight, len(more))
+        at = np.searchsorted(np.cumsum(weights[order]), _LEVEL * (1 + 1 / len(size)) * weights.sum())
+        return math.exp(middle.mean() + drawn[order[min(at, len(order) - 1)]])
+
+    one_more = width(np.zeros(1)) if len(size) + 1 >= 1 / (1 - _LEVEL) else None
+    if len(count) < _LEAST_LOGS or one_more is None:
+        return None, one_more
+    own = np.pi / 2 * np.bincount(log, rest**2) / count**2  # variance of a median
+    between = max(0.0, float(middle.var(ddof=1) - own.mean()))
+    t = stdtrit(len(count) - 1, (np.arange(200) + 0.5) / 200)
+    return max(one_more, width(t * math.sqrt(between * (1 + 1 / len(count))))), one_more
 
 
-def left_out_share(replays: Sequence[EpisodeReplay], logs: Sequence[str]) -> float | None:
+def left_out_share(errors: Float[np.ndarray, "episodes"], logs: Sequence[str]) -> float | None:
     """Return in which share of the episodes the band holds that is made of all other logs; None where none is."""
-    worst, held = _worst(replays), []
+    of, held = np.asarray(logs), []
     for name in dict.fromkeys(logs):
-        others = [each for each, log in zip(replays, logs, strict=True) if log != name]
-        width = band(others)
-        if width is not None:
-            held += [bool(far <= width) for far, log in zip(worst, logs, strict=True) if log == name]
-    return float(np.mean(held)) if held and len(set(logs)) > 1 else None
+        width, _ = bands(errors[of != name], of[of != name].tolist())
+        held += [] if width is None else (errors[of == name] <= width).tolist()
+    return float(np.mean(held)) if held else None
 
 
-def _worst(replays: Sequence[EpisodeReplay]) -> Float[np.ndarray, "episodes"]:
-    """Return the largest error of Δtip in what was predicted of each episode, mm."""
-    return np.array([np.abs(np.diff(each.abscissa, axis=1)[~each.given, 0]).max() for each in replays])
+def worst(replays: Sequence[EpisodeReplay], *, alone: bool) -> Float[np.ndarray, "episodes"]:
+    """Return the largest error of Δtip in what was predicted of each episode, mm, by the drive alone or the core."""
+    made = [each.driven if alone else each.abscissa[:, 1] for each in replays]
+    return np.array([np.abs(e.abscissa[:, 0] - own)[~e.given].max() for e, own in zip(replays, made, strict=True)])
 
 
 def _units(of: Prepared) -> Int[np.ndarray, "episodes"]:
@@ -305,11 +380,3 @@ def _units(of: Prepared) -> Int[np.ndarray, "episodes"]:
     names = [log.name for log in of.logs]
     logs = list(dict.fromkeys(names))
     return np.array([logs.index(name) for name in names]) if len(logs) >= LEAST_EPISODES else np.arange(len(names))
-
-
-def _summed(
-    costs: Float[np.ndarray, "candidates episodes"], unit: Int[np.ndarray, "episodes"]
-) -> Float[np.ndarray, "candidates units"]:
-    sums = np.zeros((len(costs), unit.max() + 1))
-    np.add.at(sums.T, unit, costs.T)
-    return sums

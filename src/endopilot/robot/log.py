@@ -260,10 +260,6 @@ def _command(
     return position
 
 
-STARTS = (-1.0, -0.5, 0.0, 0.5, 1.0)
-"""Where in the play a device may begin: nobody logs which way it was driven last."""
-
-
 @dataclass(frozen=True, eq=False)
 class Courses:
     """The commands of episodes, and the times at which the tip was seen, padded to one length.
@@ -317,7 +313,7 @@ class Courses:
         latency_s: Float[np.ndarray, "candidates"],
         gain: Float[np.ndarray, "candidates"],
         play: Float[np.ndarray, "candidates"],
-        start: float | Float[np.ndarray, "episodes"] = 0.0,
+        start: float | Float[np.ndarray, "*candidates episodes"] = 0.0,
     ) -> Float[np.ndarray, "candidates episodes times"]:
         """Return where the device's proximal end is, from where it was at the first command, mm or rad.
 

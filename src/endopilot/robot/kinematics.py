@@ -1,0 +1,324 @@
+"""The tip as its drive alone leads it: gain, play, lag and an offset, fitted exactly, with intervals.
+
+The tip lies at y(t) = a(t) + g P(u(t − τ)) + noise, with the commanded course u, the play operator P, the gain g and
+the lag τ. Nobody logs the offset a: it drifts as the wire slides, by equal variances in equal travel, and begins anew
+where the tip jumps. So it is a state, and a Kalman filter takes it out of tip and model alike; what remains are
+innovations, independent of each other, to which g, the play and τ are fitted by Gauss and Newton. Two layers may come
+on top: a share of all pushes that the grip loses, and a share of what a simulated wire's tip went farther than its
+proximal end.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.special import stdtrit
+
+from endopilot.devices.robot import RobotConfig
+from endopilot.robot.log import Courses
+
+NAMES = ("gain_translation", "play_mm", "latency_s", "slip", "slack")
+"""What is fitted; `slip` is the share of pushes that the grip loses, `slack` the share s of a simulated wire's."""
+RANGES = ((-3.0, 3.0), (0.0, 10.0), (0.0, 2.0), (0.0, 1.0), (-2.0, 3.0))
+"""Widest values of each, as the robot's file takes them; a wire has all of its slack or none, s = 1 or 0."""
+_WEAK = np.diag([1 / (high - low) ** 2 for low, high in RANGES])
+"""Information of ranges, where tracks have none."""
+_FIRST = ((-1.0, -0.7, 0.7, 1.0, 1.4), (0.0, 0.7, 1.5, 3.0, 5.0), (0.0, 0.06, 0.12, 0.2, 0.35, 0.6, 1.0, 1.5))
+"""Gains, plays and lags from the best of which the fit goes on."""
+_STEPS = np.array([0.01, 0.05, 0.005, 0.02, 0.05])
+"""Steps of the derivatives: less than noise makes of each."""
+_JUMP_COST = -2 * math.log(0.01 / 10.0)
+"""What a tip costs that jumps: -2 log p where one in a hundred does, to anywhere within 10 mm."""
+_PLAYS = np.linspace(0.0, 8.0, 33)
+_SCANS, _NEWTON_STEPS = 3, 8
+"""A fit that has converged goes on from any of these plays that cost less, so often at most: commands come in steps,
+so the cost has valleys."""
+_USUAL_NOISE = (0.05, 4.0)
+"""That of the public logs (docs/evidence/reality.md)."""
+_NOISE = (0.1, 1.0)
+"""Noise that the search begins with: of a tip, mm, and drift, in that variance a mm of travel. Both are fitted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Tips of episodes along their vessel, beside what their drives were asked for.
+
+    Attributes:
+        courses: commands, and times of the tips.
+        abscissa: Δtip, mm; NaN where it is not to be used.
+        slack: how much farther than its proximal end a simulated wire's tip went, mm.
+    """
+
+    courses: Courses
+    abscissa: Float[np.ndarray, "episodes tips"]
+    slack: Float[np.ndarray, "episodes tips"] | float = 0.0
+
+    def motion(
+        self, values: Float[np.ndarray, "candidates values"], start: float | Float[np.ndarray, "*candidates episodes"]
+    ) -> Float[np.ndarray, "candidates episodes tips"]:
+        """Return where candidates of `NAMES` lead the tips, from where each episode begins, mm."""
+        gain, play, latency, slip, share = values.T
+        followed = self.courses.followed(
+            0, at_s=self.courses.seen_s, latency_s=latency, gain=gain, play=play, start=start
+        )
+        pushed = np.cumsum(np.maximum(np.diff(followed, axis=2, prepend=followed[..., :1]), 0.0), axis=2)
+        return followed - slip[:, None, None] * pushed + share[:, None, None] * np.nan_to_num(self.slack)
+
+    def travel(self, latency_s: float) -> Float[np.ndarray, "episodes tips"]:
+        """Return how far each drive goes from one tip to the next, mm."""
+        at = self.motion(np.array([[1.0, 0.0, latency_s, 0.0, 0.0]]), 0.0)[0]
+        return np.abs(np.diff(at, axis=1, prepend=at[:, :1]))
+
+    def rows(self, chosen: Int[np.ndarray, "some"]) -> Tracks:
+        """Return some of the episodes, without slack."""
+        return Tracks(Courses(*(array[chosen] for array in vars(self.courses).values())), self.abscissa[chosen])
+
+
+@dataclass(frozen=True, eq=False)
+class Filtered:
+    """What a Kalman filter leaves of residuals.
+
+    Attributes:
+        innovation: in standard deviations; 0 where there is no tip, and where one jumps.
+        gain: weight by which each tip moves the offset.
+        spread: standard deviation of each innovation, mm.
+        cost: -2 log likelihood.
+        offset: where the offset is after the last tip, mm.
+    """
+
+    innovation: Float[np.ndarray, "*of tips"]
+    gain: Float[np.ndarray, "*of tips"]
+    spread: Float[np.ndarray, "*of tips"]
+    cost: Float[np.ndarray, "*of"]
+    offset: Float[np.ndarray, "*of"]
+
+
+def filtered(
+    residual: Float[np.ndarray, "*of tips"],
+    travel: Float[np.ndarray, "episodes tips"],
+    sd: Float[np.ndarray, "..."] | float,
+    drift: Float[np.ndarray, "..."] | float,
+) -> Filtered:
+    """Filter residuals whose mean drifts with travel and jumps now and then.
+
+    Args:
+        residual: mm; NaN where there is no tip.
+        travel: of the drive since the tip before, mm.
+        sd: standard deviation of a tip, mm, for all or to be broadcast.
+        drift: variance of the offset a mm of travel, in variances of a tip, likewise.
+    """
+    shape = np.broadcast_shapes(residual.shape[:-1], np.shape(sd))
+    offset, variance, cost = np.zeros(shape), np.full(shape, np.inf), np.zeros(shape)
+    kept = np.zeros((3, residual.shape[-1], *shape))  # by time first: much faster
+    with np.errstate(invalid="ignore"):
+        for i, (value, way) in enumerate(zip(np.moveaxis(residual, -1, 0), travel.T, strict=True)):
+            there, begun = np.isfinite(value), np.isfinite(variance)
+            variance = variance + drift * way
+            spread = sd * np.sqrt(variance + 1)
+            z = np.where(begun, value - offset, 0.0) / spread
+            ordinary = z**2 + np.log(2 * np.pi * np.where(begun, spread, 1.0) ** 2)
+            jumps = ~begun | (ordinary > _JUMP_COST)
+            cost += np.where(there & begun, np.minimum(ordinary, _JUMP_COST), 0.0)
+            gain = np.where(jumps, 1.0, variance / (variance + 1)) * there
+            kept[:, i] = np.where(there & ~jumps, z, 0.0), gain, np.where(jumps, np.inf, spread)
+            offset = np.where(there, np.where(jumps, value, offset + gain * (value - offset)), offset)
+            variance = np.where(there, np.where(jumps, 1.0, gain), variance)
+    innovation, gain, spread = np.moveaxis(kept, 1, -1)
+    return Filtered(innovation, gain, spread, cost, offset)
+
+
+@dataclass(frozen=True, eq=False)
+class DriveFit:
+    """Kinematics that explain tracks best.
+
+    Attributes:
+        values: of `NAMES`.
+        half_width: of their intervals of 95 %.
+        free: which of them were fitted.
+        noise: standard deviation of a tip, mm, and drift, variance a mm of travel, in variances of a tip.
+        unit: what each episode counts to.
+        left_out: what each unit costs, -2 log likelihood, by values that are fitted to all others.
+    """
+
+    values: Float[np.ndarray, "values"]
+    half_width: Float[np.ndarray, "values"]
+    free: Bool[np.ndarray, "values"]
+    noise: tuple[float, float]
+    unit: Int[np.ndarray, "episodes"]
+    left_out: Float[np.ndarray, "units"]
+
+
+def earns(without: Float[np.ndarray, "units"], costs: Float[np.ndarray, "units"], level: float) -> bool:
+    """Return whether units that were left out cost less by a model than without it, at a level (Student's t)."""
+    less = without - costs
+    return bool(less.mean() > stdtrit(len(less) - 1, level) * less.std(ddof=1) / math.sqrt(len(less)))
+
+
+def fit_drive(
+    tracks: Tracks, unit: Int[np.ndarray, "episodes"], begin: DriveFit | None = None, layer: str = ""
+) -> DriveFit:
+    """Fit gain, play and lag to tracks, and what more is asked for.
+
+    Args:
+        tracks: of episodes.
+        unit: what each episode counts to: its log, or itself.
+        begin: what the fit begins with, whose layers are fitted too; the best of a grid if not given.
+        layer: "slip" or "slack", to be fitted with them.
+    """
+    free = np.array([k < 3 or name == layer for k, name in enumerate(NAMES)])
+    free |= False if begin is None else begin.free
+    if begin is None:
+        values, noise = _best_of_grid(tracks.rows(np.unique(np.linspace(0, len(unit) - 1, 8).astype(int)))), _NOISE
+    else:
+        values, noise = begin.values, begin.noise
+    for _ in range(_SCANS):
+        for _ in range(_NEWTON_STEPS):
+            start = starts(tracks, values[None], noise)[0][0]
+            noise = fit_noise(tracks, values, start, noise)
+            before, values = values, _newton(tracks, values, start, noise, free)
+            if (np.abs(values - before) < 0.1 * _STEPS).all():
+                break
+        scanned = np.repeat(values[None], len(_PLAYS) + 1, axis=0)
+        scanned[1:, 1] = _PLAYS
+        few = np.array_split(scanned, len(scanned) // 4)  # at a time, for memory
+        best = int(np.argmin(np.concatenate([starts(tracks, some, noise)[1] for some in few]).sum(axis=1)))
+        values = scanned[best]
+        if best == 0:
+            break
+    found, slope = _sloped(tracks, values, starts(tracks, values[None], noise)[0][0], noise, free)
+    half_width, left_out = _left_out(found, slope, unit)
+    return DriveFit(values, half_width, free, noise, unit, left_out)
+
+
+def _left_out(
+    found: Filtered, slope: Float[np.ndarray, "episodes tips values"], unit: Int[np.ndarray, "episodes"]
+) -> tuple[Float[np.ndarray, "values"], Float[np.ndarray, "units"]]:
+    """Return half the intervals of 95 %, and what each unit costs that is left out.
+
+    Standard errors are the jackknife's, and no less than innovations make them that are independent.
+    """
+    units = unit.max() + 1
+    information, score = np.zeros((units, len(NAMES), len(NAMES))), np.zeros((units, len(NAMES)))
+    np.add.at(information, unit, np.einsum("eti,etj->eij", slope, slope))
+    np.add.at(score, unit, np.einsum("eti,et->ei", slope, found.innovation))
+    whole, cost = information.sum(axis=0) + _WEAK, np.zeros(units)
+    change = np.linalg.solve(whole - information, score[..., None])[..., 0]
+    moved = found.innovation + np.einsum("eti,ei->et", slope, change[unit])
+    np.add.at(cost, unit, found.cost + (moved**2 - found.innovation**2).sum(axis=1))
+    variance = np.maximum((units - 1) * change.var(axis=0), np.diag(np.linalg.inv(whole)))
+    return stdtrit(units - 1, 0.975) * np.sqrt(variance), cost
+
+
+def _best_of_grid(tracks: Tracks) -> Float[np.ndarray, "values"]:
+    tried = np.array([(*row, 0.0, 0.0) for row in product(*_FIRST)])
+    cost = np.full((len(tried), len(tracks.abscissa)), np.inf)
+    for start in (-1.0, 0.0, 1.0):
+        residual = tracks.abscissa - tracks.motion(tried, start)
+        cost = np.minimum(cost, filtered(residual, tracks.travel(0.1), *_NOISE).cost)
+    return tried[np.argmin(cost.sum(axis=1))]
+
+
+def starts(
+    tracks: Tracks, values: Float[np.ndarray, "candidates values"], noise: tuple[float, float]
+) -> tuple[Float[np.ndarray, "candidates episodes"], Float[np.ndarray, "candidates episodes"]]:
+    """Return where in its play the device of each episode begins, of five places and then those between; its cost."""
+    best, travel = np.zeros((len(values), len(tracks.abscissa))), tracks.travel(values[0, 2])
+    for offsets in ((0.0, -1.0, -0.5, 0.5, 1.0), (0.0, -0.25, 0.25), (0.0, -0.125, 0.125), (0.0, -0.0625, 0.0625)):
+        around = np.clip([best + step for step in offsets], -1.0, 1.0)
+        moved = tracks.motion(np.tile(values, (len(offsets), 1)), np.concatenate(around))
+        cost = filtered(tracks.abscissa - moved, travel, *noise).cost.reshape(around.shape)
+        chosen = np.argmin(cost, axis=0)[None]
+        best, least = (np.take_along_axis(each, chosen, axis=0)[0] for each in (around, cost))
+    return best, least
+
+
+def fit_noise(
+    tracks: Tracks,
+    values: Float[np.ndarray, "values"],
+    start: Float[np.ndarray, "episodes"],
+    noise: tuple[float, float],
+) -> tuple[float, float]:
+    """Return the likeliest noise of tips, mm, and drift of their offset, in variances of a tip a mm of travel."""
+    residual, travel = tracks.abscissa - tracks.motion(values[None], start)[0], tracks.travel(values[2])
+    for factor in (4.0, 2.0, 1.4, 1.2):
+        sd = noise[0] * factor ** np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+        drift = np.clip(noise[1] * factor ** (2.0 * np.arange(-2, 3)), 1e-6, 1e3)
+        pairs = np.array(list(product(sd, drift)))
+        cost = filtered(residual[None], travel, pairs[:, :1], pairs[:, 1:]).cost.sum(axis=1)
+        noise = tuple(pairs[np.argmin(cost)].tolist())
+    return noise
+
+
+@dataclass(frozen=True, eq=False)
+class Led:
+    """Where a robot's drive alone leads tips, from where they were seen last.
+
+    Attributes:
+        abscissa: Δtip, mm.
+        offset: that at the first command, as the last tips have it, mm.
+        start: where in its play the device of each episode begins.
+        noise: of the tips that were seen, as `DriveFit` has it.
+    """
+
+    abscissa: Float[np.ndarray, "episodes tips"]
+    offset: Float[np.ndarray, "episodes"]
+    start: Float[np.ndarray, "episodes"]
+    noise: tuple[float, float]
+
+
+def led(tracks: Tracks, robot: RobotConfig) -> Led:
+    """Return where a robot's drive leads tips after those that tracks have."""
+    drive = robot.wire
+    values = np.array([drive.gain_translation, drive.play_mm, robot.latency_s, 0.0, 0.0])
+    noise = fit_noise(tracks, values, starts(tracks, values[None], _USUAL_NOISE)[0][0], _USUAL_NOISE)
+    begun = starts(tracks, values[None], noise)[0][0]
+    motion = tracks.motion(values[None], begun)[0]
+    offset = filtered(tracks.abscissa - motion, tracks.travel(robot.latency_s), *noise).offset
+    return Led(motion + offset[:, None], offset, begun, noise)
+
+
+def _sloped(
+    tracks: Tracks,
+    values: Float[np.ndarray, "values"],
+    start: Float[np.ndarray, "episodes"],
+    noise: tuple[float, float],
+    free: Bool[np.ndarray, "values"],
+) -> tuple[Filtered, Float[np.ndarray, "episodes tips values"]]:
+    """Return innovations and their slopes, jumps where they are, without what other starts in the play would do."""
+    steps = np.diag(_STEPS)
+    down, up = np.maximum(values - steps, [-np.inf, 0.0, 0.0, -1.0, -np.inf]), values + steps
+    apart = np.diag(up - down)[:, None, None]
+    residual = tracks.abscissa - tracks.motion(values[None], start)[0]
+    slopes = -(tracks.motion(up, start) - tracks.motion(down, start)) / apart
+    sides = [tracks.motion(values[None], np.clip(start + step, -1, 1))[0] for step in (-0.1, 0.1)]
+    found = filtered(residual, tracks.travel(values[2]), *noise)
+    columns = np.concatenate([slopes, [sides[1] - sides[0]]])
+    white, offset = np.zeros_like(columns), np.zeros(columns.shape[:2])
+    for i in range(columns.shape[2]):  # the filter, with jumps where they were
+        ahead = columns[..., i] - offset
+        white[..., i] = ahead / found.spread[:, i] * np.isfinite(residual[:, i])
+        offset += found.gain[:, i] * ahead
+    slope, begin = np.moveaxis(white[:-1], 0, -1) * free, white[-1]
+    share = np.einsum("et,eti->ei", begin, slope) / np.maximum((begin**2).sum(axis=1), 1e-12)[:, None]
+    return found, slope - begin[..., None] * share[:, None]
+
+
+def _newton(
+    tracks: Tracks,
+    values: Float[np.ndarray, "values"],
+    start: Float[np.ndarray, "episodes"],
+    noise: tuple[float, float],
+    free: Bool[np.ndarray, "values"],
+) -> Float[np.ndarray, "values"]:
+    """Return values after a step of Gauss and Newton, as long as it costs less."""
+    found, slope = _sloped(tracks, values, start, noise, free)
+    low, high = np.array(RANGES).T
+    information = np.einsum("eti,etj->ij", slope, slope) + _WEAK
+    step = -np.linalg.solve(information, np.einsum("eti,et->i", slope, found.innovation))
+    tried = np.clip(values + np.outer([1.0, 0.5, 0.25, 0.1, 0.0], step), low, high)
+    _, cost = starts(tracks, tried, noise)
+    return tried[int(np.argmin(cost.sum(axis=1)))]
