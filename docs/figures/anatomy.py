@@ -40,7 +40,8 @@ def tables(rows: list[dict]) -> str:
 def touching(figures: dict) -> str:
     """Return what is said of what touches, and what large inputs cost."""
     lines = ["| lumen | as | cases | figure | value |", "|---|---|---|---|---|"]
-    lines += [f"| {r['kind']} | {r['source']} | {r['cases']} | {r['figure']} | {text(r)} |" for r in figures["touching"]]
+    for row in figures["touching"]:
+        lines.append(f"| {row['kind']} | {row['source']} | {row['cases']} | {row['figure']} | {text(row)} |")
     lines += ["", "| input | figure | value | bar |", "|---|---|---|---|"]
     lines += [f"| {r['case']} | {r['figure']} | {text(r)} | {r['bar']:g} |" for r in figures["cost"]]
     return "\n".join(lines)
