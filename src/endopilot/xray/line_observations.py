@@ -181,7 +181,6 @@ class Observations:
     Attributes:
         place: of the grid that an observation is of.
         towards: unit vector of the displacement that it observes; 0 where it observes a length.
-        longer: by how much a length grows with the scale of the pose, mm; 0 where a displacement is observed.
         value: observed, mm.
         variance: of its own noise, mm².
         used: whether it was made.
@@ -189,7 +188,6 @@ class Observations:
 
     place: Int[np.ndarray, "m r"]
     towards: Float[np.ndarray, "m r 3"]
-    longer: Float[np.ndarray, "m r"]
     value: Float[np.ndarray, "m r"]
     variance: Float[np.ndarray, "r"]
     used: Bool[np.ndarray, "m r"]
@@ -260,7 +258,6 @@ def tip_observations(seen: Sequence[SeenLine], places: Int[np.ndarray, "m"]) -> 
     return Observations(
         place=np.repeat(places[:, None], shape[1], axis=1),
         towards=np.concatenate([one.slope[places] / one.scale[places, None, None] for one in seen], axis=1),
-        longer=np.zeros(shape),
         value=np.concatenate([(one.tip - one.shown[places]) / one.scale[places, None] for one in seen], axis=1),
         variance=np.repeat([_POINT_SD_MM**2 + _END_SD_MM**2 + one.end_mm**2 for one in seen], 2),
         used=np.ones(shape, dtype=bool),
@@ -301,11 +298,9 @@ def line_observations(
     any_used = used.any(axis=1)
     last = np.where(any_used, len(seen.at) - 1 - used[:, ::-1].argmax(axis=1), 0)
     longer = seen.along[places] - seen.along[place[each, last]] - seen.at[last]
-    none = np.zeros(place.shape)
     rows = Observations(
         place=np.column_stack([place, places]),
         towards=np.concatenate([towards, np.zeros((len(places), 1, 3))], axis=1),
-        longer=np.column_stack([none, -seen.at[last]]),
         value=np.column_stack([value, longer]),
         variance=np.array(
             [*[_POINT_SD_MM**2 + seen.rough_mm**2] * len(seen.at), (_LENGTH_SD_MM + _LENGTH_SHARE * seen.at[-1]) ** 2]

@@ -1,9 +1,9 @@
 """The tip of a device in a vessel tree, followed over time through lines in images: a pose for each place of a grid.
 
 The state is the place of the tip, one of a grid along all branches, and for each place a normal distribution of the
-patient's pose: three shifts, three rotations and a scale. From frame to frame the tip travels a little, or, in a small
-share of the frames, is anywhere: so a tip in the wrong branch is found again. Heart and breath move the way smoothly,
-and anew in each frame.
+patient's pose: three shifts and three rotations. From frame to frame the tip travels a little, or, in a small share of
+the frames, is anywhere: so a tip in the wrong branch is found again. Heart and breath move the way smoothly, and anew
+in each frame.
 
 In a frame the device's line is compared with the projected way to each place (`line_observations`), with what is known
 of pose, of breathing, and of how far the device lies off its way. Lines are those of any detector; those of
@@ -78,8 +78,6 @@ class LocateConfig:
     """How far the patient may lie from where the cameras have the CT, without a landmark: standard deviation, mm."""
     turn_sd_deg: NonNegative = 4.0
     """And how far they may be turned about each axis, degrees."""
-    scale_sd: NonNegative = 0.01
-    """And the share by which the C-arm may show them larger or smaller than its distances say: standard deviation."""
     breathing_sd_mm: NonNegative = 4.0
     """How far heart and breath move the vessel about its mean place: standard deviation, mm."""
     travel_mm: Positive = 4.0
@@ -126,15 +124,15 @@ class _Fit:
 
     Attributes:
         log_density: of the observations.
-        mean, covariance: of the pose: shift, mm, rotation vector, rad, and the share by which the vessel shows larger.
+        mean, covariance: of the pose.
         moved: how far each observation's place is moved beyond the mean pose, without what lies aside of the way, mm.
         aside: how far the device lies off its way at the first observation, mm.
         aside_covariance: of that, mm².
     """
 
     log_density: Float[np.ndarray, "m"]
-    mean: Float[np.ndarray, "m 7"]
-    covariance: Float[np.ndarray, "m 7 7"]
+    mean: Float[np.ndarray, "m 6"]
+    covariance: Float[np.ndarray, "m 6 6"]
     moved: Float[np.ndarray, "m r 3"]
     aside: Float[np.ndarray, "m 3"]
     aside_covariance: Float[np.ndarray, "m 3 3"]
@@ -159,9 +157,9 @@ class TipFilter:
         self._centre = self.grid.way.mean(axis=0)
         self._aside = _ASIDE_SD_MM + _ASIDE_RADII * self.grid.radius
         turn = np.deg2rad(self.config.turn_sd_deg)
-        spread = np.array([*[self.config.registration_sd_mm] * 3, *[turn] * 3, self.config.scale_sd])
+        spread = np.array([*[self.config.registration_sd_mm] * 3, *[turn] * 3])
         self._log = np.full(count, -np.log(count))
-        self._mean = np.zeros((count, len(spread)))
+        self._mean = np.zeros((count, 6))
         self._covariance = np.tile(np.diag(spread**2), (count, 1, 1))
         self._begun = False
 
@@ -230,19 +228,16 @@ class TipFilter:
         square = self._covariance + self._mean[:, :, None] * self._mean[:, None]
         mean = flow.T @ self._mean
         square = (flow.T @ square.reshape(len(total), -1)).reshape(square.shape)
-        drift = np.array([*[_DRIFT_MM] * 3, *[_DRIFT_RAD] * 3, 0.0])
+        drift = np.array([*[_DRIFT_MM] * 3, *[_DRIFT_RAD] * 3])
         self._log, self._mean = np.log(total), mean
         self._covariance = square - mean[:, :, None] * mean[:, None] + np.diag(drift**2)
-        # Errors of the way are alike in all frames, so that frames do not add up to a knowledge of the scale.
-        self._mean[:, 6], self._covariance[:, 6], self._covariance[:, :, 6] = 0.0, 0.0, 0.0
-        self._covariance[:, 6, 6] = self.config.scale_sd**2
 
-    def _moved(self, pose: Float[np.ndarray, "7"]) -> Float[np.ndarray, "n 3"]:
+    def _moved(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "n 3"]:
         matrix = Rotation.from_rotvec(pose[3:6]).as_matrix()
-        return (1 + pose[6]) * (self.grid.way - self._centre) @ matrix.T + self._centre + pose[:3]
+        return (self.grid.way - self._centre) @ matrix.T + self._centre + pose[:3]
 
     def _compare(
-        self, seen: Sequence[SeenLine], places: Int[np.ndarray, "m"], base: Float[np.ndarray, "7"]
+        self, seen: Sequence[SeenLine], places: Int[np.ndarray, "m"], base: Float[np.ndarray, "6"]
     ) -> tuple[_Fit, Observations, Int[np.ndarray, "m"]]:
         """Return what whole lines say of some places of the tip, and how many of their points lie before the root."""
         tips = tip_observations(seen, places)
@@ -269,12 +264,11 @@ class TipFilter:
             moved = np.concatenate(kept, axis=1)
         return fit, rows, beyond
 
-    def _fit(self, places: Int[np.ndarray, "m"], rows: Observations, base: Float[np.ndarray, "7"]) -> _Fit:
+    def _fit(self, places: Int[np.ndarray, "m"], rows: Observations, base: Float[np.ndarray, "6"]) -> _Fit:
         """Return the density of observations, and the posterior of what they depend on."""
         arm = self._moved(base)[rows.place] - self._centre - base[:3]
         towards, used = rows.towards, rows.used
-        larger = (arm * towards).sum(axis=-1) + rows.longer
-        lever = np.concatenate([towards, np.cross(arm, towards), larger[..., None]], axis=-1)
+        lever = np.concatenate([towards, np.cross(arm, towards)], axis=-1)
         prior, covariance = self._mean[places] - base, self._covariance[places]
         apart = self.grid.abscissa[rows.place]
         apart = apart[:, :, None] - apart[:, None]
@@ -295,16 +289,16 @@ class TipFilter:
         log_density = -0.5 * ((error * weight).sum(axis=1) + log_size + used.sum(axis=1) * np.log(2 * np.pi))
         change = np.einsum("mri,mr->mi", of_pose, weight)
         pose = prior + change
-        across = np.cross(pose[:, None, 3:6], arm) + pose[:, None, 6:] * arm
+        across = np.cross(pose[:, None, 3:6], arm)
         moved = pose[:, None, :3] + across + smooth @ (weight[..., None] * towards)
-        own = gains[..., 8:]
+        own = gains[..., 7:]
         return _Fit(
             log_density=log_density,
             mean=base + pose,
-            covariance=covariance - gains[..., 1:8].swapaxes(1, 2) @ solved[..., 1:8],
+            covariance=covariance - gains[..., 1:7].swapaxes(1, 2) @ solved[..., 1:7],
             moved=moved,
             aside=np.einsum("mri,mr->mi", own, weight),
-            aside_covariance=aside[:, :1, :1] * np.eye(3) - own.swapaxes(1, 2) @ solved[..., 8:],
+            aside_covariance=aside[:, :1, :1] * np.eye(3) - own.swapaxes(1, 2) @ solved[..., 7:],
         )
 
     def _nowhere(self, frame: int) -> TipLocation:
@@ -312,7 +306,7 @@ class TipFilter:
         return TipLocation(frame, "not found", nothing, np.full((3, 3), np.nan), 0.0, np.nan, -1, "", nothing, np.nan)
 
     def _answer(
-        self, frame: int, places: Int[np.ndarray, "m"], fit: _Fit, rows: Observations, base: Float[np.ndarray, "7"]
+        self, frame: int, places: Int[np.ndarray, "m"], fit: _Fit, rows: Observations, base: Float[np.ndarray, "6"]
     ) -> TipLocation:
         """Return mean and covariance around the mode of the posterior."""
         grid, weight = self.grid, np.exp(self._log[places])
