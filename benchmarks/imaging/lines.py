@@ -165,7 +165,7 @@ def bench_lines(*, liver: Existing | None = None, trees: tuple[Existing, ...] = 
     """
     judged, random = [], np.random.default_rng(seed)
     if liver is not None:
-        from liver_catheter import convert, nodes_of
+        from liver_catheter import convert, nodes_of  # pyright: ignore[reportMissingImports]  (examples/)
 
         with tempfile.TemporaryDirectory() as scratch:
             whole = convert(liver / "dataset1", Path(scratch))
@@ -181,10 +181,10 @@ def bench_lines(*, liver: Existing | None = None, trees: tuple[Existing, ...] = 
                 judged.append(judge(f"liver, {part}, {name}", of, authors[[one.frame for one in of]]))
     for path in trees:
         tree = extract_anatomy(path)
-        middle = tuple(float(value) for value in tree.tree.branches[0].centerline.points.mean(axis=0))
+        x, y, z = (float(value) for value in tree.tree.branches[0].centerline.points.mean(axis=0))
         for name, guide in (("cut at the ostium", 0.0), ("into the catheter", _GUIDE_MM)):
             cameras = [
-                CArmCamera(angles_deg=a, isocenter_mm=middle, centre_px=(512.0, 512.0), geometry=CArmGeometry())
+                CArmCamera(angles_deg=a, isocenter_mm=(x, y, z), centre_px=(512.0, 512.0), geometry=CArmGeometry())
                 for a in ((-30.0, 0.0), (60.0, 0.0))
             ]
             frames, tips = wire_into_catheter(tree, cameras, random, guide_mm=guide)

@@ -138,7 +138,7 @@ _POINT_SD_MM, _END_SD_MM = 0.4, 1.0
 that made the first half of the frames of a real patient's catheter likeliest; docs/evidence/locate.md names them."""
 _SMOOTH_MM, _SMOOTH_ROUNDS, _SAMPLES = 2.0, 4, 4.0
 """A line is blurred along itself by a Gaussian of this standard deviation, mm, in so many rounds, with so many samples
-to it. Of the published catheter with 3 px of noise 97 % are right so; with 1 mm, blurred once, 73 % (frames 37 to 73)."""
+to it. With 3 px of noise 97 % of the published catheter's frames 37 to 73 are right so; with 1 mm, blurred once, 73."""
 _LENGTH_SD_MM, _LENGTH_SHARE = 2.0, 0.01
 """By how much, and by which share of the line, the way to the tip is longer than the line in an image, mm."""
 _WINDOW, _SLACK_MM, _SLACK_SHARE = 30, 3.0, 0.25
