@@ -208,12 +208,3 @@ def test_an_estimate_that_is_not_sure_is_ambiguous_and_its_region_holds_the_rest
     np.testing.assert_array_equal(sure.position, strict.position)
     np.testing.assert_allclose(strict.covariance, sure.covariance + sure.elsewhere)
     assert np.trace(sure.elsewhere) > 0
-
-
-def test_a_wire_beside_the_registered_vessel_is_ambiguous_and_as_uncertain_as_it_lies_off(imager, planes, fork):
-    off = np.array([1.6, 1.6, 0.0])
-    signals = exposed(imager, planes, wire_to(fork, 2) + off)
-    found = found_in(imager, planes, signals, TIP[2])
-    error = found.position - wire_to(fork, 2)[0]
-    assert found.status == "ambiguous"
-    assert error @ np.linalg.solve(found.covariance, error) < 9.0  # 3 standard deviations

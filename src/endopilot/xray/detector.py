@@ -173,9 +173,6 @@ _KEPT_LINES = 8
 """Lines of so many images from before, or doses, are kept for the next exposures."""
 _HIDDEN_MM = 1.5
 """Standard deviation that a tip on such a line has more, mm."""
-_OFF_MM, _LIKELIER = 2.0, 10.0
-"""A wire is also looked for this much farther outside the lumen, mm: registration or motion may be off. It lies there
-if the images are likelier so by this logarithm."""
 _BELIEVABLE = 3.0
 """An end farther than this many standard deviations from the followed wire's is another line's."""
 
@@ -262,26 +259,6 @@ class TipDetector:
     ) -> TipEstimate:
         """Return where the tip is if there is a wire, and how likely that is; the arguments are those of `find`."""
         slack_mm = self.config.slack_mm if slack_mm is None else slack_mm
-        exposure = views, signals, photons, inserted_length
-        found, off = self._within(*exposure, slack_mm, before), self._within(*exposure, slack_mm + _OFF_MM, before)
-        if off.status == "not found" or off.log_odds < found.log_odds + _LIKELIER:
-            return found
-        # The wire is as far off as the vessel is, in a direction that the images do not show.
-        outside = np.linalg.norm(off.wire - off.middle, axis=1) - (off.room - slack_mm - _OFF_MM)
-        wider = float(np.maximum(outside, 0.0).max()) ** 2 * np.eye(3)
-        covariance = off.covariance + wider + (off.elsewhere if off.status == "found" else 0.0)
-        return replace(off, status="ambiguous", covariance=covariance)
-
-    def _within(
-        self,
-        views: Sequence[View],
-        signals: Sequence[Signal],
-        photons: Sequence[float],
-        inserted_length: float,
-        slack_mm: float,
-        before: Sequence[Signal] | None,
-    ) -> TipEstimate:
-        """Return where the tip is if the wire lies within the lumen and so far outside it, mm."""
         corridor = make_corridor(self._anatomy, self._radius_mm, slack_mm, longest_mm(inserted_length))
         shown = [CorridorView(corridor, *one) for one in zip(views, map(len, signals), strict=True)]
         seen = [self._look(*one) for one in zip(shown, signals, photons, strict=True)]

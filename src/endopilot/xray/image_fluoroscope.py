@@ -18,17 +18,21 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import surroundings
 from endopilot.xray.carm import Pose, view_at
-from endopilot.xray.detector import TipDetector
+from endopilot.xray.detector import Signal, TipDetector
 from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement, measurement_at
 from endopilot.xray.image import ImageConfig, Plane, XrayImager
 from endopilot.xray.motion_registration import register_motion, take_run
 from endopilot.xray.moving_patient import seen_wire
 from endopilot.xray.pose_refinement import PoseRefiner
 from endopilot.xray.registration import Registration, register, vessel_error_mm
+from endopilot.xray.tip_posterior import TipEstimate
 
 _NO_WIRE = np.zeros((0, 3))
 _MOVED_MM = 0.1
 """A tip is looked for again where its image has moved the vessel by more than this, mm."""
+_MOVING_SLACK_MM, _LIKELIER = 2.0, 10.0
+"""In a patient who moves, a wire is also looked for this far outside the lumen, mm: their motion is not quite the known
+one. It is there if the images are likelier so by this logarithm."""
 
 
 class NotRegistered(InputError):
@@ -142,6 +146,8 @@ class ImageFluoroscope:
         image = signals, photons, inserted_length
         empty = self._before
         found = self._detector.find(self.refiner.views(self._views), *image, self._slack_mm, empty)
+        if self.known_motion is not None and (beside := self._beside(found, image)) is not None:
+            return self._measured(beside)
         if found is None:
             return None
         before, moved_mm = self.refiner.pose, 0.0
@@ -149,7 +155,18 @@ class ImageFluoroscope:
             moved_mm = vessel_error_mm(self._anatomy, before, self.refiner.refine(self._views, found, self._slack_mm))
         if moved_mm > _MOVED_MM or self._slack_mm > self._detector.config.slack_mm:
             found = self._detector.find(self.refiner.views(self._views), *image, before=empty) or found
+        return self._measured(found)
+
+    def _measured(self, found: TipEstimate) -> TipMeasurement:
         return measurement_at(self._project, self._anatomy, found.position[None], found.covariance[None])
+
+    def _beside(self, found: TipEstimate | None, image: tuple[list[Signal], list[float], float]) -> TipEstimate | None:
+        """Return the tip of a wire that lies where the known motion does not take the vessel; None if it does not."""
+        slack_mm = max(_MOVING_SLACK_MM, self._slack_mm)
+        beside = self._detector.find(self.refiner.views(self._views), *image, slack_mm=slack_mm, before=self._before)
+        if beside is None or (found is not None and beside.log_odds < found.log_odds + _LIKELIER):
+            return None
+        return beside
 
     def _signal(
         self, plane: Plane, nodes: Float[np.ndarray, "n 3"], random: np.random.Generator, contrast: float = 0.0
