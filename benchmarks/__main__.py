@@ -39,6 +39,7 @@ BENCHMARKS = {
     "xray-wires": "imaging.wires:bench_wires",
     "xray-processing": "imaging.processing:compare_processing",
     "angiograms": "imaging.angiograms:bench_angiograms",
+    "lines": "imaging.lines:bench_lines",
     "wire-evidence": "imaging.wire_evidence:train_evidence",
     "agent-calibration": "agent.calibration:calibrate_agent",
     "agent-replanning": "agent.replanning:compare_replanning",

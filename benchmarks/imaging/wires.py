@@ -19,7 +19,7 @@ from endopilot.angiograms.draw import view_text
 from endopilot.cli.arguments import OutputFolder
 from endopilot.files import read_json, write_json
 from endopilot.runs import claim
-from endopilot.settings import Seed, Within, settings
+from endopilot.settings import NonNegative, Seed, Within, settings
 from endopilot.simulation.motion import place
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import wire_points
@@ -62,6 +62,8 @@ class WiresConfig:
     """Wires of random navigations in each patient and pair of views; every other lies among other metal."""
     seed: Seed = 1
     """Seed of patients, poses, wires, metal and noise."""
+    registration_off_mm: NonNegative = 0.0
+    """How far the registered vessel is displaced, each pair of views in a direction of its own, mm."""
     image: ImageConfig = field(default_factory=ImageConfig)
     """Detector, beam and processing."""
 
@@ -111,7 +113,8 @@ def bench_wires(
     Raises:
         InputError: a folder holds no anatomy, or the output belongs to another run.
     """
-    claim(output, "benchmarks xray-wires", wires=config.wires, seed=config.seed, image=config.image)
+    off = {"registration_off_mm": config.registration_off_mm} if config.registration_off_mm else {}
+    claim(output, "benchmarks xray-wires", wires=config.wires, seed=config.seed, image=config.image, **off)
     rows: list[Search] = []
     scenes = SceneConfig(patients=config.patients, seed=config.seed, given=config.given)
     for index in range(len(config.given) or config.patients):
@@ -133,6 +136,9 @@ def _searches(scene: Scene, config: WiresConfig) -> Iterator[Search]:
         lit, before = seen.signals(None, contrast=1.0, seed=900_001), seen.signals(None, seed=900_002)
         registered = register(seen.anatomy, [seen.view(0), seen.view(1)], lit, before)
         views = registered.views([seen.view(0), seen.view(1)], seen.imager.isocenter)
+        off = np.random.default_rng([config.seed, pair, 0x6F6666]).standard_normal(3)
+        off *= config.registration_off_mm / np.linalg.norm(off)
+        views = [replace(view, source=view.source + off) for view in views]
         among = replace(seen, planes=tuple(with_metal(plane, *metal) for plane in planes))
         masks = before, among.signals(None, seed=900_004)
         wires: list[int | None] = [*range(pair * config.wires, (pair + 1) * config.wires), None, None]

@@ -55,11 +55,20 @@ def course(anatomy: Anatomy, leaf: int, frames: int = 12) -> tuple[list[np.ndarr
     return devices, moved
 
 
-def frames_of(devices, moved, cameras) -> list[DeviceFrame]:
+def chain(line: np.ndarray) -> np.ndarray:
+    """Return the pixels that a line passes, each beside the one before, as a skeleton gives them."""
+    at = np.linspace(0, len(line) - 1, 20 * len(line))
+    whole = np.stack([np.rint(np.interp(at, np.arange(len(line)), axis)) for axis in line.T], axis=-1)
+    return whole[np.concatenate([[True], np.any(np.diff(whole, axis=0) != 0, axis=1)])]
+
+
+def frames_of(devices, moved, cameras, noise_px=0.5) -> list[DeviceFrame]:
     random, frames = np.random.default_rng(0), []
     for number, (device, shift) in enumerate(zip(devices, moved, strict=True)):
         lines = [camera.project(device + shift) for camera in cameras]
-        frames.append(DeviceFrame(number, tuple(line + 0.5 * random.standard_normal(line.shape) for line in lines)))
+        frames.append(
+            DeviceFrame(number, tuple(line + noise_px * random.standard_normal(line.shape) for line in lines))
+        )
     return frames
 
 
@@ -75,6 +84,18 @@ def test_the_tip_is_followed_in_a_patient_who_breathes_and_is_not_registered(ana
         assert np.mean(np.array(off) < OF_95) >= 0.9
         assert np.median([one.residual_mm for one in found]) < 0.5
         assert found[-1].status == "found" and found[-1].branch == leaf
+
+
+def test_a_chain_of_pixels_is_located_as_the_line_that_it_was_drawn_from(anatomy) -> None:
+    """A chain of whole pixels, each beside the one before, is up to 8 % longer than its line."""
+    devices, moved = course(anatomy, anatomy.tree.leaves()[0])
+    chains = [
+        DeviceFrame(frame.number, tuple(chain(line) for line in frame.lines if line is not None))
+        for frame in frames_of(devices, moved, CAMERAS[:1], noise_px=0.0)
+    ]
+    found = locate(anatomy, frames=chains, cameras=CAMERAS[:1])
+    errors = [float(np.linalg.norm(one.position - device[0])) for one, device in zip(found, devices, strict=True)]
+    assert np.median(errors) < 3.0 and max(errors) < 5.0
 
 
 def test_a_landmark_registers_the_first_frame(anatomy) -> None:

@@ -25,7 +25,6 @@ from endopilot.types import VesselTree
 from endopilot.xray.camera import Camera
 from endopilot.xray.carm import View
 from endopilot.xray.line_observations import (
-    POINT_SD_MM,
     Line,
     Observations,
     SeenLine,
@@ -321,7 +320,7 @@ class TipFilter:
         here = self._tree.branches[grid.branch[place]]
         section = here.section[np.abs(here.centerline.abscissa - grid.abscissa[place]).argmin()]
         left = np.abs(rows.value - np.einsum("mri,mri->mr", rows.towards, fit.moved))[best]
-        of_line = rows.used[best] & (rows.variance == POINT_SD_MM**2)
+        of_line = rows.used[best] & (rows.place[best] != places[best])
         moved = self._moved(base)[places[best]] - grid.way[places[best]] + fit.moved[best, 0]
         return TipLocation(
             frame=frame,
