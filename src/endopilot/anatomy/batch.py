@@ -56,7 +56,6 @@ def extract_all(
 def _made(
     folders: dict[Path, Path], output: Path, reading: dict[str, Any], config: AnatomyConfig
 ) -> tuple[list[Path], dict[str, str]]:
-    """Make the anatomies, and return their folders and why others were rejected."""
     sources = list(folders)
     bad = each("Anatomies", sources, partial(_make, folders=folders, reading=reading, config=config))
     rejected = {str(source): str(bad[source]) for source in sources if source in bad}

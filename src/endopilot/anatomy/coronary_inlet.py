@@ -156,13 +156,11 @@ def _doubt(ranking: OstiumRanking, counterpart: OstiumRanking, side: Side, coord
 
 
 def _rival_axes(axes: str, side: Side) -> str:
-    """Say that an artery may as well be the other one in other axes."""
     other: Side = "lca" if side == "rca" else "rca"
     return f"{_exchanged(axes)}, this would be a {_NAMES[other]}: check the axes of the file"
 
 
 def _exchanged(axes: str) -> str:
-    """Name the directions that other axes exchange."""
     return f"with {', '.join(w for w, sign in zip(_SIDES, OTHER_AXES[axes][0], strict=True) if sign < 0)} exchanged"
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import re
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -34,10 +36,9 @@ from endopilot.anatomy.sources import AnatomySource, Polylines, transformed
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.anatomy.topology import parted, touch_remarks
 from endopilot.anatomy.tree import tree_from_lines
-from endopilot.anatomy.understood import understood
-from endopilot.anatomy.units import SMALLEST_RADIUS_MM, check_unit
+from endopilot.anatomy.units import ANSWERED, ASSUMED, BY_ARRAYS, SMALLEST_RADIUS_MM, check_unit, unit_name
 from endopilot.anatomy.walls import without_wall
-from endopilot.errors import InputError
+from endopilot.errors import InputError, place_text
 from endopilot.imaging.grid import connected_components
 from endopilot.progress import progress
 from endopilot.settings import Finite, Within, public, settings
@@ -55,6 +56,16 @@ atlas and 2 real ones its own is the nearer one by 16° at least."""
 
 SHORTEST_IN_DIAMETERS = 1.5
 """A lumen whose longest path is shorter than this many of its own mean diameters is no vessel."""
+
+_DONE = {
+    "joined": r"bridged|united|capped|closed by filling|joined by|joined to one",
+    "parted": r"parted|is cut|cut at|cut there|are cut",
+    "widened": r"was widened|were widened",
+    "left out": r"left out|not in the tree|not part of this|apart and|were not joined",
+}
+"""What a remark says was done, by its words."""
+
+_KNOWN = {ASSUMED: " (not stated)", BY_ARRAYS: " (SimVascular's arrays)", ANSWERED: " (--scale)"}
 
 
 @settings
@@ -164,7 +175,7 @@ def extract_anatomy(
         "catheter_tilt_deg": round(catheter_tilt_deg(ostium_radius, radius), 1),
         "dominance": _dominance(tree, inlet, short),
         "coverage": balance,
-        "notes": [understood(tree, wrapped, config.coordinates, notes), *doubts, *notes],
+        "notes": [_understood(tree, wrapped, config.coordinates, notes), *doubts, *notes],
     }
     return Anatomy(name, tree, distance_map, insertion, radius, provenance)
 
@@ -334,13 +345,11 @@ def _tree(
 
 def _final_map(surface: Surface, tree: VesselTree, config: AnatomyConfig) -> DistanceMap:
     """Return the distance map at its final spacing, without lumens that the tree does not reach."""
-    radius = np.concatenate([branch.centerline.radius for branch in tree.branches])
-    points = np.concatenate([branch.centerline.points for branch in tree.branches])
-    spacing = config.spacing_mm or automatic_spacing(radius, np.ptp(surface.vertices, axis=0) + 5.0)
+    spacing = config.spacing_mm or automatic_spacing(tree.line.radius, np.ptp(surface.vertices, axis=0) + 5.0)
     result = distance_map_from_surface(surface, spacing_mm=spacing)
     labels = connected_components(result.values > 0, corners=True)
     if labels.max() > 1:
-        index = np.rint((points - result.origin_mm) / spacing).astype(int)[:, ::-1]
+        index = np.rint((tree.line.points - result.origin_mm) / spacing).astype(int)[:, ::-1]
         index = np.clip(index, 0, np.array(result.values.shape) - 1)
         reached = np.unique(labels[tuple(index.T)])
         foreign = (labels > 0) & ~np.isin(labels, reached)
@@ -357,3 +366,39 @@ def _insertion(tree: VesselTree, given: Insertion | None) -> Insertion:
     if given is not None and float(given.direction @ direction) > 0.5:
         direction = given.direction / np.linalg.norm(given.direction)
     return Insertion(position=line.points[0].copy(), direction=direction)
+
+
+def _understood(tree: VesselTree, source: AnatomySource, coordinates: str | None, remarks: Sequence[str]) -> str:
+    """Return what was understood: inlet, extent and narrowest place, unit and axes as taken, and what was done.
+
+    Args:
+        tree: what was made.
+        source: in mm, as it was taken.
+        coordinates: axes that the user stated, if any.
+        remarks: what each step did, a sentence each.
+    """
+    lines = [branch.centerline for branch in tree.branches]
+    farthest = max(float(line.abscissa[-1]) for line in lines)
+    narrowest = min((line for line in lines), key=lambda line: float(line.radius.min()))
+    if isinstance(source.content, LumenMask) or not source.file:
+        read = "mm in LPS"
+    else:
+        axes = source.coordinates or coordinates
+        stated = " (--coordinates)" if coordinates and not source.coordinates else "" if axes else " (not stated)"
+        read = f"{unit_name(source.factor)}{_KNOWN.get(source.odds, '')} in {(axes or 'lps').upper()}{stated}"
+    done = [_done(verb, [text for text in remarks if re.search(words, text)]) for verb, words in _DONE.items()]
+    wall = [text for text in remarks if text.startswith("what is given is a wall")]
+    return (
+        f"Understood: enters at {place_text(lines[0].points[0])}, {2 * lines[0].radius[0]:.1f} mm wide; "
+        f"{farthest:.0f} mm to the farthest end, {2 * narrowest.radius.min():.1f} mm wide at the narrowest; "
+        + "; ".join([f"read as {read}", *wall, *filter(None, done)])
+    )
+
+
+def _done(verb: str, remarks: list[str]) -> str:
+    """Return how many things were done, and the largest length that their remarks name beside places."""
+    if not remarks:
+        return ""
+    bare = re.sub(r"\([^()]*\) mm", "", " ".join(remarks))
+    sizes = [float(size) for size in re.findall(r"(\d+(?:\.\d+)?) mm", bare)]
+    return f"{verb}: {len(remarks)}" + (f" (up to {max(sizes):.0f} mm)" if sizes else "")
