@@ -10,10 +10,10 @@ from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt, find_objects, minimum_filter
 
 from endopilot.anatomy import parent_vessel, repair, repair_surface
-from endopilot.anatomy.coronary_crux import Crux, find_crux
 from endopilot.anatomy.coronary_ends import OpenEnd, Skeleton, open_ends, skeleton_of
 from endopilot.anatomy.coronary_ostia import OTHER_AXES, OstiumCandidate, OstiumRanking, Side, rank_ostia
 from endopilot.anatomy.distance import distance_map_from_surface
+from endopilot.anatomy.labels_tree import Crux, find_crux
 from endopilot.anatomy.surface import Surface, filled_box, surface_from_mask
 from endopilot.anatomy.units import check_unit
 from endopilot.errors import InputError, place_text

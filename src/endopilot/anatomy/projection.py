@@ -44,12 +44,7 @@ class TipProjector:
     """`project_tip` for one vessel, prepared once: for callers that project a few tips at a time, again and again."""
 
     def __init__(self, tree: VesselTree, insertion: Insertion) -> None:
-        """Prepare the segments of a tree.
-
-        Args:
-            tree: centerlines.
-            insertion: the ostium and the catheter's axis.
-        """
+        """Prepare the segments of a tree."""
         lines = [branch.centerline for branch in tree.branches]
         whole = tree.line
         points = whole.points
