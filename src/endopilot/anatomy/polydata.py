@@ -44,10 +44,11 @@ _AXES = {"LPS": "lps", "LEFT-POSTERIOR-SUPERIOR": "lps", "RAS": "ras", "RIGHT-AN
 _FEWEST_BYTES = 16
 """No format holds a vessel in fewer bytes."""
 
-_PLY_COUNTS = {"char": "i1", "uchar": "u1", "int8": "i1", "uint8": "u1", "short": "i2", "ushort": "u2", "int16": "i2",
-               "uint16": "u2", "int": "i4", "uint": "u4", "int32": "i4", "uint32": "u4"}  # fmt: skip
-_PLY_SIZES = {name: int(kind[1]) for name, kind in _PLY_COUNTS.items()} | {"float": 4, "float32": 4}
-_PLY_SIZES |= {"double": 8, "float64": 8}
+_PLY_KINDS = {"char": "i1", "uchar": "u1", "int8": "i1", "uint8": "u1", "short": "i2", "ushort": "u2", "int16": "i2",
+              "uint16": "u2", "int": "i4", "uint": "u4", "int32": "i4", "uint32": "u4", "float": "f4", "float32": "f4",
+              "double": "f8", "float64": "f8"}  # fmt: skip
+_PLY_SIZES = {name: np.dtype(kind).itemsize for name, kind in _PLY_KINDS.items()}
+_PLY_COUNTS = {name: kind for name, kind in _PLY_KINDS.items() if not kind.startswith("f")}
 
 
 def read_polydata(path: Path) -> AnatomySource:
