@@ -416,11 +416,7 @@ for _tag, _pattern, _first in (
 
 
 def _written_out(node: Any, known: dict[int, int]) -> int:
-    """Return how many values a node of YAML stands for; aliases of a node share it.
-
-    Raises:
-        ComposerError: the node holds itself.
-    """
+    """Return how many values a node of YAML stands for; aliases of a node share it."""
     if id(node) not in known:
         known[id(node)] = -1
         inner = [part for pair in node.value for part in pair] if isinstance(node, yaml.MappingNode) else node.value
@@ -431,11 +427,7 @@ def _written_out(node: Any, known: dict[int, int]) -> int:
 
 
 def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the object of a JSON file.
-
-    Raises:
-        ValueError: a name stands in it twice.
-    """
+    """Return the object of a JSON file."""
     content = dict(pairs)
     if len(content) < len(pairs):
         names = [name for name, _ in pairs]
@@ -444,7 +436,6 @@ def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _kind(value: Any) -> str:
-    """Return what a value of a JSON file is, in words."""
     kinds = {list: "a list", str: "text", bool: "true or false", type(None): "null", dict: "an object"}
     return kinds.get(type(value), "a number")
 

@@ -97,7 +97,6 @@ class Registry:
         return next(iter(points.values()), None) if name not in self.shipped else None
 
     def _import(self, name: str, target: str) -> Any:
-        """Return an object of a module that is not the package's own."""
         module_name, _, attribute = target.partition(":")
         if not attribute or not all(part.isidentifier() for part in (*module_name.split("."), attribute)):
             raise InputError(

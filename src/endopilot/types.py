@@ -21,6 +21,7 @@ indexed `voxels[k, j, i]`, where (i, j, k) count voxels along the first, second 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -138,6 +139,12 @@ class Centerline:
     abscissa: Float[np.ndarray, "n"]
     normals: Float[np.ndarray, "n 3"]
 
+    @staticmethod
+    def joined(lines: Iterable[Centerline]) -> Centerline:
+        """Return the points of several lines as those of one, in their order."""
+        parts = [(line.points, line.radius, line.abscissa, line.normals) for line in lines]
+        return Centerline(*map(np.concatenate, zip(*parts, strict=True)))
+
 
 @dataclass(frozen=True, eq=False)
 class Branch:
@@ -167,6 +174,11 @@ class VesselTree:
 
     branches: tuple[Branch, ...]
     section_names: tuple[str, ...]
+
+    @property
+    def line(self) -> Centerline:
+        """The points of all branches as those of one line, in their order."""
+        return Centerline.joined(branch.centerline for branch in self.branches)
 
     @property
     def sections_present(self) -> tuple[str, ...]:
@@ -207,13 +219,7 @@ class VesselTree:
     def path(self, branch: int) -> Centerline:
         """Return the connected line from the ostium to the end of `branch`."""
         lines = [self.branches[i].centerline for i in self.route(branch)]
-        pieces = [lines[0], *(_without_first_point(line) for line in lines[1:])]
-        return Centerline(
-            points=np.concatenate([piece.points for piece in pieces]),
-            radius=np.concatenate([piece.radius for piece in pieces]),
-            abscissa=np.concatenate([piece.abscissa for piece in pieces]),
-            normals=np.concatenate([piece.normals for piece in pieces]),
-        )
+        return Centerline.joined([lines[0], *(_without_first_point(line) for line in lines[1:])])
 
     def longest_path(self) -> Centerline:
         """Return the path from the ostium to the farthest distal end."""
@@ -221,8 +227,7 @@ class VesselTree:
 
     def widest_axes(self) -> tuple[int, int]:
         """Return the world axes to the right and up for an eye that looks along the one of least extent."""
-        points = np.concatenate([branch.centerline.points for branch in self.branches])
-        return list(_VIEWS.values())[int(np.argmin(np.ptp(points, axis=0)))]
+        return list(_VIEWS.values())[int(np.argmin(np.ptp(self.line.points, axis=0)))]
 
     def rotation_zero(self, insertion: Insertion) -> Float[np.ndarray, "3"]:
         """Return where a tip's bend points at φ = 0: to the side of the catheter's axis on which the vessel lies.

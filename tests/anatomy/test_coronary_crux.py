@@ -7,11 +7,10 @@ import itertools
 import numpy as np
 import pytest
 
-from endopilot.anatomy.coronary_crux import CRUX_FROM_OSTIUM_MM, Crux, find_crux
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.labels import dominance as tree_dominance
 from endopilot.anatomy.labels import label_tree
-from endopilot.anatomy.labels_tree import LCA_SECTIONS
+from endopilot.anatomy.labels_tree import CRUX_FROM_OSTIUM_MM, LCA_SECTIONS, Crux, find_crux
 from endopilot.anatomy.sources import Polylines
 from endopilot.anatomy.tree import Line, tree_from_lines
 from endopilot.atlas.atlas import AtlasConfig, make_patient_tree

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -129,20 +128,6 @@ def test_flaws_of_masks_are_repaired(fork_mask):
     assert any("left out" in note for note in anatomy.provenance["notes"])
 
 
-def test_loop_becomes_a_tree():
-    def ring_with_stem(points):
-        stem = 2.0 - np.hypot(points[..., 0], points[..., 1] - BEND_MM - 15)
-        stem = np.where(np.abs(points[..., 2]) < 0, stem, -1.0)
-        axis = np.clip(points[..., 1], BEND_MM, BEND_MM + 14)
-        handle = 2.5 - np.sqrt(points[..., 0] ** 2 + (points[..., 1] - axis) ** 2 + points[..., 2] ** 2)
-        return np.maximum(torus_distance(points, 1.5), handle)
-
-    anatomy = extract_anatomy(mask_of(ring_with_stem, (24, 38, 4), (0.6, 0.6, 0.6)), name="loop")
-    assert is_sound(anatomy)
-    total = sum(b.centerline.abscissa[-1] - b.centerline.abscissa[0] for b in anatomy.tree.branches)
-    assert total > 0.85 * (2 * np.pi * BEND_MM + 14)
-
-
 def save_stl(surface, path):
     import pyvista
 
@@ -191,17 +176,6 @@ def test_the_guiding_catheter_is_one_of_6_french_or_as_wide_as_a_narrower_ostium
     assert abs(extract_anatomy(narrow, name="narrow").catheter_radius_mm - 0.5) < 1e-6
 
 
-def test_units_and_axes_of_surfaces(fork_mask, tmp_path):
-    wall = surface_from_mask(fork_mask.volume)
-    save_stl(Surface(wall.vertices * [-0.001, -0.001, 0.001], wall.faces), tmp_path / "metres.stl")
-    source = read_source(tmp_path / "metres.stl")
-    with pytest.raises(InputError, match="--scale 1000"):
-        extract_anatomy(source, name="m")
-    anatomy = extract_anatomy(source, name="m", config=AnatomyConfig(scale=1000.0, coordinates="ras"))
-    tips = np.array([anatomy.tree.branches[i].centerline.points[-1] for i in anatomy.tree.leaves()])
-    assert tips[:, 0].max() > 14
-
-
 def save_lines(path, lines, radii):
     import pyvista
 
@@ -223,27 +197,6 @@ def test_overlapping_centerlines_become_one_tree(tmp_path):
     anatomy = extract_anatomy(read_source(tmp_path / "cl.vtp"), name="cl")
     assert len(anatomy.tree.branches) == 3 and is_sound(anatomy)
     assert abs(anatomy.tree.branches[0].centerline.abscissa[-1] - 20) < 2.0
-
-
-def test_slicer_markups(tmp_path):
-    tree = forked_tree()
-    markups = [
-        {
-            "type": "Curve", "coordinateSystem": "RAS",
-            "controlPoints": [{"position": (p * [-1, -1, 1]).tolist()} for p in branch.centerline.points],
-            "measurements": [{"name": "Radius", "controlPointValues": branch.centerline.radius.tolist()}],
-        }
-        for branch in tree.branches
-    ]  # fmt: skip
-    (tmp_path / "cl.mrk.json").write_text(json.dumps({"markups": markups}))
-    anatomy = extract_anatomy(read_source(tmp_path / "cl.mrk.json"), name="cl")
-    assert len(anatomy.tree.leaves()) == 2
-    tips = np.array([anatomy.tree.branches[i].centerline.points[-1] for i in anatomy.tree.leaves()])
-    assert tips[:, 0].max() > 14
-    del markups[1]["measurements"]
-    (tmp_path / "cl.mrk.json").write_text(json.dumps({"markups": markups}))
-    with pytest.raises(InputError, match="no radius measurement"):
-        read_source(tmp_path / "cl.mrk.json")
 
 
 def empty(volume):

@@ -4,57 +4,24 @@ from __future__ import annotations
 
 import json
 import shutil
-import warnings
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from make_fuzz import bounded, damaged, outcome
 from make_meshes import arc
 
 from endopilot.anatomy.extract import extract_anatomy
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.anatomy.sources import Polylines
-from endopilot.errors import InputError
-
-
-def bounded(examples: int) -> settings:
-    return settings(
-        max_examples=examples,
-        deadline=None,
-        derandomize=True,
-        suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-    )
-
 
 FLIPS = st.lists(st.tuples(st.integers(0, 1 << 16), st.integers(0, 255)), max_size=4)
 CUT = st.one_of(st.none(), st.integers(0, 4000))
 ODD = st.one_of(
     st.none(), st.booleans(), st.integers(-(10**20), 10**20), st.floats(), st.text(max_size=4), st.just([]), st.just({})
 )
-
-
-def outcome(read: Callable[[], object], capfd: pytest.CaptureFixture[str]) -> object:
-    """Return what a reader returns, None where it refuses in one line; it says nothing on the screen."""
-    found = None
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        try:
-            found = read()
-        except InputError as error:
-            assert "\n" not in str(error) and len(str(error)) < 1000
-    captured = capfd.readouterr()
-    assert captured.err == captured.out == ""
-    return found
-
-
-def damaged(content: bytes, flips: list[tuple[int, int]], cut: int | None) -> bytes:
-    result = bytearray(content)
-    for place, value in flips:
-        result[place % len(result)] = value
-    return bytes(result[:cut])
 
 
 def replaced(content: object, steps: list[int], value: object) -> object:

@@ -9,21 +9,16 @@ from typing import Any
 
 import pytest
 import yaml
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from make_devices import catheter, wire
+from make_fuzz import bounded
 
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 
-BOUNDED = settings(
-    max_examples=50,
-    deadline=None,
-    database=None,
-    derandomize=True,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
+BOUNDED = bounded(50)
 SCALARS = (
     st.none()
     | st.booleans()

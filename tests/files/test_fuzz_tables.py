@@ -6,20 +6,15 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from make_fuzz import bounded
 
 from endopilot.control.plan import read_tips
 from endopilot.errors import InputError
 from endopilot.simulation.controls import PERIODS_S, ScriptedControls, read_controls_csv
 
-BOUNDED = settings(
-    max_examples=80,
-    deadline=None,
-    database=None,
-    derandomize=True,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
+BOUNDED = bounded(80)
 NAMES = ["time_s", "translation_mm_s", "rotation_rad_s", "world", "inserted_length_mm", "rotation_rad", "branch", ""]
 NUMBERS = st.floats(-50, 50).map(lambda value: round(value, 3))
 ODD = ["0.5", "1.0", "1.5", "0", "", "nan", "1e400", "0,5", '"', "x", " 2 ", "1_0", "#N/A"]

@@ -43,26 +43,6 @@ def test_a_volume_survives_writing_and_reading(tmp_path, suffix):
     np.testing.assert_allclose(again.direction, volume.direction, atol=1e-5)
 
 
-def test_ras_becomes_lps(tmp_path):
-    """A NIfTI affine of diag(2, 2, 2) with offset (10, 20, 30) is RAS: its x and y change sign in LPS."""
-    voxels = np.zeros((4, 4, 4), dtype="<i2")
-    header = np.zeros(352, dtype=np.uint8)
-    header[0:4] = np.frombuffer(np.int32(348).tobytes(), np.uint8)
-    header[40:56] = np.frombuffer(np.array([3, 4, 4, 4, 1, 1, 1, 1], "<i2").tobytes(), np.uint8)
-    header[70:74] = np.frombuffer(np.array([4, 16], "<i2").tobytes(), np.uint8)
-    header[76:108] = np.frombuffer(np.array([1, 2, 2, 2, 1, 1, 1, 1], "<f4").tobytes(), np.uint8)
-    header[108:120] = np.frombuffer(np.array([352, 3, -1024], "<f4").tobytes(), np.uint8)
-    header[123] = 2
-    header[254:256] = np.frombuffer(np.int16(1).tobytes(), np.uint8)
-    affine = np.array([[2, 0, 0, 10], [0, 2, 0, 20], [0, 0, 2, 30]], "<f4")
-    header[280:328] = np.frombuffer(affine.tobytes(), np.uint8)
-    header[344:348] = np.frombuffer(b"n+1\0", np.uint8)
-    (tmp_path / "ras.nii").write_bytes(header.tobytes() + voxels.tobytes())
-    volume = read_volume(tmp_path / "ras.nii")
-    np.testing.assert_allclose(volume.index_to_world(np.array([1.0, 2.0, 3.0])), [-12.0, -24.0, 36.0])
-    assert np.all(volume.voxels == -1024)  # slope 3 and intercept −1024 are applied
-
-
 def test_a_fraction_of_a_hu_is_kept(tmp_path):
     write_volume(_oblique_volume(np.float32), tmp_path / "ct.nrrd")
     assert read_volume(tmp_path / "ct.nrrd").voxels.dtype == np.float32

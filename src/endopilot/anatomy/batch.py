@@ -50,22 +50,14 @@ def extract_all(
     folders = {source: output / name for source, name in zip(sources, _names(sources), strict=True)}
     reading = {"label": label, "threshold": threshold}
     with claiming(output, "endopilot anatomy", sources=list(folders), **reading, config=config, version=__version__):
-        return _made(folders, output, reading, config)
-
-
-def _made(
-    folders: dict[Path, Path], output: Path, reading: dict[str, Any], config: AnatomyConfig
-) -> tuple[list[Path], dict[str, str]]:
-    """Make the anatomies, and return their folders and why others were rejected."""
-    sources = list(folders)
-    bad = each("Anatomies", sources, partial(_make, folders=folders, reading=reading, config=config))
-    rejected = {str(source): str(bad[source]) for source in sources if source in bad}
-    if len(rejected) == len(sources):
-        raise InputError(
-            f"none of the {len(sources)} files gives an anatomy; the first: {next(iter(rejected.values()))}"
-        )
-    files.write_json(output / "manifest.json", files.manifest(config=config, rejected=rejected))
-    return [folders[source] for source in sources if source not in bad], rejected
+        bad = each("Anatomies", list(folders), partial(_make, folders=folders, reading=reading, config=config))
+        rejected = {str(source): str(bad[source]) for source in folders if source in bad}
+        if len(rejected) == len(folders):
+            raise InputError(
+                f"none of the {len(folders)} files gives an anatomy; the first: {next(iter(rejected.values()))}"
+            )
+        files.write_json(output / "manifest.json", files.manifest(config=config, rejected=rejected))
+    return [folder for source, folder in folders.items() if source not in bad], rejected
 
 
 def claim_anatomy(

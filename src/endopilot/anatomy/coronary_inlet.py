@@ -10,10 +10,10 @@ from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt, find_objects, minimum_filter
 
 from endopilot.anatomy import parent_vessel, repair, repair_surface
-from endopilot.anatomy.coronary_crux import Crux, find_crux
 from endopilot.anatomy.coronary_ends import OpenEnd, Skeleton, open_ends, skeleton_of
 from endopilot.anatomy.coronary_ostia import OTHER_AXES, OstiumCandidate, OstiumRanking, Side, rank_ostia
 from endopilot.anatomy.distance import distance_map_from_surface
+from endopilot.anatomy.labels_tree import Crux, find_crux
 from endopilot.anatomy.surface import Surface, filled_box, surface_from_mask
 from endopilot.anatomy.units import check_unit
 from endopilot.errors import InputError, place_text
@@ -156,13 +156,11 @@ def _doubt(ranking: OstiumRanking, counterpart: OstiumRanking, side: Side, coord
 
 
 def _rival_axes(axes: str, side: Side) -> str:
-    """Say that an artery may as well be the other one in other axes."""
     other: Side = "lca" if side == "rca" else "rca"
     return f"{_exchanged(axes)}, this would be a {_NAMES[other]}: check the axes of the file"
 
 
 def _exchanged(axes: str) -> str:
-    """Name the directions that other axes exchange."""
     return f"with {', '.join(w for w, sign in zip(_SIDES, OTHER_AXES[axes][0], strict=True) if sign < 0)} exchanged"
 
 

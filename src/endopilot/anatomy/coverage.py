@@ -225,7 +225,6 @@ def _thin(mask: Volume, lines: MedialLines, enough: float) -> Bool[np.ndarray, "
 
 
 def _with_neighbours(lines: MedialLines, nodes: Int[np.ndarray, "n"]) -> Int[np.ndarray, "m"]:
-    """Return points of the middle with those next to them."""
     chosen = np.zeros(len(lines.points), dtype=bool)
     chosen[nodes] = True
     touching = lines.edges[chosen[lines.edges].any(axis=1)]

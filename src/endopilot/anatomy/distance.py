@@ -74,16 +74,15 @@ def distance_map_from_spheres(
     lumens = [[branch.centerline] for branch in tree.branches]
     for own, others in zip(lumens, beside, strict=False):
         own.extend(others)
-    points = np.concatenate([line.points for own in lumens for line in own])
-    radius = np.concatenate([line.radius for own in lumens for line in own])
-    margin = radius[:, None] + BAND_MM
-    lower, upper = (points - margin).min(axis=0), (points + margin).max(axis=0)
-    spacing = automatic_spacing(radius, upper - lower) if spacing_mm is None else float(spacing_mm)
+    whole = Centerline.joined(line for own in lumens for line in own)
+    margin = whole.radius[:, None] + BAND_MM
+    lower, upper = (whole.points - margin).min(axis=0), (whole.points + margin).max(axis=0)
+    spacing = automatic_spacing(whole.radius, upper - lower) if spacing_mm is None else float(spacing_mm)
     shape, origin = _grid(lower, upper, spacing)
     values = np.full(shape, -BAND_MM, dtype=np.float32)
     for own in lumens:
         line = own[0]
-        window = _window(_joined(own), origin, spacing, shape, BAND_MM)
+        window = _window(Centerline.joined(own), origin, spacing, shape, BAND_MM)
         corner = origin + spacing * np.array([window[2].start, window[1].start, window[0].start])
         fields = [_tube_field(part, values[window].shape, corner, spacing, BAND_MM) for part in own]
         field = np.maximum.reduce(fields)
@@ -252,12 +251,6 @@ def sample(distance_map: DistanceMap, points: Float[np.ndarray, "n 3"], *, order
 
     index = (points - distance_map.origin_mm) / distance_map.spacing_mm
     return map_coordinates(distance_map.values, index[:, ::-1].T, order=order, mode="nearest", output=np.float64)
-
-
-def _joined(lines: Sequence[Centerline]) -> Centerline:
-    """Return all lines' points and radii as one."""
-    parts = [[getattr(line, name) for line in lines] for name in ("points", "radius", "abscissa", "normals")]
-    return Centerline(*(np.concatenate(part) for part in parts))
 
 
 def _grid(lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"], spacing: float) -> Grid:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict, dataclass, replace
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from endopilot import __version__
 from endopilot.anatomy import coverage, polylines, repair, repair_surface
@@ -28,16 +30,14 @@ from endopilot.anatomy.inlet import beyond_parent, component, entrance, grid_poi
 from endopilot.anatomy.labels import dominance, label_tree, missing_main_vessel
 from endopilot.anatomy.labels_coronary import SHORT_MM
 from endopilot.anatomy.lumen_graph import lumen_graph, trace_branches
-from endopilot.anatomy.medial_lines import MedialLines
 from endopilot.anatomy.read_source import read_source
 from endopilot.anatomy.sources import AnatomySource, Polylines, transformed
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.anatomy.topology import parted, touch_remarks
 from endopilot.anatomy.tree import tree_from_lines
-from endopilot.anatomy.understood import understood
-from endopilot.anatomy.units import SMALLEST_RADIUS_MM, check_unit
+from endopilot.anatomy.units import ANSWERED, ASSUMED, BY_ARRAYS, SMALLEST_RADIUS_MM, check_unit, unit_name
 from endopilot.anatomy.walls import without_wall
-from endopilot.errors import InputError
+from endopilot.errors import InputError, place_text
 from endopilot.imaging.grid import connected_components
 from endopilot.progress import progress
 from endopilot.settings import Finite, Within, public, settings
@@ -55,6 +55,16 @@ atlas and 2 real ones its own is the nearer one by 16° at least."""
 
 SHORTEST_IN_DIAMETERS = 1.5
 """A lumen whose longest path is shorter than this many of its own mean diameters is no vessel."""
+
+_DONE = {
+    "joined": r"bridged|united|capped|closed by filling|joined by|joined to one",
+    "parted": r"parted|is cut|cut at|cut there|are cut",
+    "widened": r"was widened|were widened",
+    "left out": r"left out|not in the tree|not part of this|apart and|were not joined",
+}
+"""What a remark says was done, by its words."""
+
+_KNOWN = {ASSUMED: " (not stated)", BY_ARRAYS: " (SimVascular's arrays)", ANSWERED: " (--scale)"}
 
 
 @settings
@@ -130,20 +140,22 @@ def extract_anatomy(
             unstated = wrapped.coordinates is None and isinstance(content, Surface)
             if isinstance(content, Surface):  # before grids of its size are made
                 check_unit(content.vertices, None, config.vessel, source_name, **unit)
-            wall = _wall(content, given, config, source_name, config.coordinates if unstated else None)
-            surface, inlet = wall.surface, wall.inlet
+            axes = config.coordinates if unstated else None
+            surface, lumen, widened, inlet = _wall(content, given, config, source_name, axes)
+            voxels_mm = lumen.mask.spacing_mm
             check_unit(surface.vertices, surface.mean_radius, config.vessel, source_name, **unit)
-            notes += [*wall.notes, *(inlet.notes if inlet is not None else ())]
+            notes += [*lumen.notes, *(inlet.notes if inlet is not None else ())]
             advance()
-            tree, rule, rivals = _tree(surface, wall.finest_mm, given, inlet, config, source_name)
+            finest = float(voxels_mm.min()) if isinstance(content, LumenMask) else 0.0
+            tree, rule, rivals = _tree(surface, finest, given, inlet, config, source_name)
             advance()
             distance_map = _final_map(surface, tree, config)
             notes += rivals
-            left = coverage.unreached(wall.lines, tree, wall.voxel_mm)
-            balance = coverage.record(wall.lines, wall.widened, left)
-            left = [stretch for stretch in left if wall.told is None or not wall.told[stretch.nodes].all()]
+            left = coverage.unreached(lumen.before, tree, float(voxels_mm.max()))
+            balance = coverage.record(lumen.before, widened, left)
+            left = [stretch for stretch in left if not lumen.told[stretch.nodes].all()]
             line = tree.branches[0].centerline
-            notes += coverage.left_out_text(left, line.points[0], 3.0 * float(line.radius[0]) + wall.voxel_mm)
+            notes += coverage.left_out_text(left, line.points[0], 3.0 * float(line.radius[0]) + float(voxels_mm.max()))
         advance()
         crux = None if inlet is None else inlet.crux
         tree = label_tree(tree, config.vessel, crux=crux)
@@ -164,40 +176,18 @@ def extract_anatomy(
         "catheter_tilt_deg": round(catheter_tilt_deg(ostium_radius, radius), 1),
         "dominance": _dominance(tree, inlet, short),
         "coverage": balance,
-        "notes": [understood(tree, wrapped, config.coordinates, notes), *doubts, *notes],
+        "notes": [_understood(tree, wrapped, config.coordinates, notes), *doubts, *notes],
     }
     return Anatomy(name, tree, distance_map, insertion, radius, provenance)
 
 
-@dataclass(frozen=True, eq=False)
-class _Wall:
-    """The closed wall of the wanted vessel, and what it was made from.
-
-    Attributes:
-        surface: the wall.
-        finest_mm: the voxels' shortest edge, mm; 0 where there are none.
-        voxel_mm: their longest edge, mm.
-        inlet: where the coronary artery begins, if that was looked for.
-        lines: middle of all that the file connects with it: what the tree should reach.
-        widened: places of parts that were too thin and were widened, LPS mm.
-        notes: remarks on what was repaired.
-        told: which points of `lines` a remark names as another vessel; None where there are none.
-    """
-
-    surface: Surface
-    finest_mm: float
-    voxel_mm: float
-    inlet: CoronaryInlet | None
-    lines: MedialLines
-    widened: Float[np.ndarray, "wide 3"]
-    notes: list[str]
-    told: Bool[np.ndarray, "n"] | None = None
-
-
 def _wall(
     content: LumenMask | Surface, given: Insertion | None, config: AnatomyConfig, label: str, axes: str | None
-) -> _Wall:
-    """Return the closed wall of the wanted vessel, with repairs stated."""
+) -> tuple[Surface, repair.Lumen, Float[np.ndarray, "wide 3"], CoronaryInlet | None]:
+    """Return the closed wall of the wanted vessel, its voxels, where they were widened, LPS mm, and an artery's inlet.
+
+    The notes of the voxels state all repairs.
+    """
     inlet, remarks = None, list[str]()
     repair.pieces_of.cache_clear()  # what a caller's mask held before may be another vessel
     if isinstance(content, LumenMask):
@@ -210,21 +200,20 @@ def _wall(
     if isinstance(content, LumenMask):
         lumen = repair.connected_mask(content.volume, given, label, config.vessel, other)
         mask, wide, thin = coverage.widened(lumen.mask, lumen.lines, config.minimum_branch_length_mm)
-        finest, longest = float(mask.spacing_mm.min()), float(mask.spacing_mm.max())
-        surface = surface_from_mask(mask)
+        finest, surface = float(mask.spacing_mm.min()), surface_from_mask(mask)
         if surface.mean_radius < min(SMALLEST_RADIUS_MM, finest):
             raise InputError(
                 f"{label}: the lumen is about one voxel thick (mean radius {surface.mean_radius:.2g} mm, voxels of "
                 f"{finest:.2g} mm), too thin to follow; segment on a finer grid"
             )
-        notes = [*remarks, *lumen.notes, *thin]
-        return _Wall(surface, finest, longest, inlet, lumen.before, wide, notes, lumen.told)
+        return surface, replace(lumen, notes=[*remarks, *lumen.notes, *thin]), wide, inlet
     surface, notes = repair_surface.closed_surface(content, given, label, config.vessel, other)
     step = min(surface.mean_radius, CORONARY_RADIUS_MM) / 5.0
     voxels = coverage.voxelised(surface, max(step, SMALLEST_RADIUS_MM))
     _, touches, lines, _ = parted(voxels)
     notes += touch_remarks(touches, parted=False)
-    return _Wall(surface, 0.0, float(voxels.spacing_mm.max()), inlet, lines, np.empty((0, 3)), notes)
+    lumen = repair.Lumen(voxels, lines, lines, np.zeros(len(lines.points), dtype=bool), notes)
+    return surface, lumen, np.empty((0, 3)), inlet
 
 
 def _short(tree: VesselTree, vessel: str) -> list[str]:
@@ -334,13 +323,11 @@ def _tree(
 
 def _final_map(surface: Surface, tree: VesselTree, config: AnatomyConfig) -> DistanceMap:
     """Return the distance map at its final spacing, without lumens that the tree does not reach."""
-    radius = np.concatenate([branch.centerline.radius for branch in tree.branches])
-    points = np.concatenate([branch.centerline.points for branch in tree.branches])
-    spacing = config.spacing_mm or automatic_spacing(radius, np.ptp(surface.vertices, axis=0) + 5.0)
+    spacing = config.spacing_mm or automatic_spacing(tree.line.radius, np.ptp(surface.vertices, axis=0) + 5.0)
     result = distance_map_from_surface(surface, spacing_mm=spacing)
     labels = connected_components(result.values > 0, corners=True)
     if labels.max() > 1:
-        index = np.rint((points - result.origin_mm) / spacing).astype(int)[:, ::-1]
+        index = np.rint((tree.line.points - result.origin_mm) / spacing).astype(int)[:, ::-1]
         index = np.clip(index, 0, np.array(result.values.shape) - 1)
         reached = np.unique(labels[tuple(index.T)])
         foreign = (labels > 0) & ~np.isin(labels, reached)
@@ -357,3 +344,39 @@ def _insertion(tree: VesselTree, given: Insertion | None) -> Insertion:
     if given is not None and float(given.direction @ direction) > 0.5:
         direction = given.direction / np.linalg.norm(given.direction)
     return Insertion(position=line.points[0].copy(), direction=direction)
+
+
+def _understood(tree: VesselTree, source: AnatomySource, coordinates: str | None, remarks: Sequence[str]) -> str:
+    """Return what was understood: inlet, extent and narrowest place, unit and axes as taken, and what was done.
+
+    Args:
+        tree: what was made.
+        source: in mm, as it was taken.
+        coordinates: axes that the user stated, if any.
+        remarks: what each step did, a sentence each.
+    """
+    lines = [branch.centerline for branch in tree.branches]
+    farthest = max(float(line.abscissa[-1]) for line in lines)
+    narrowest = min((line for line in lines), key=lambda line: float(line.radius.min()))
+    if isinstance(source.content, LumenMask) or not source.file:
+        read = "mm in LPS"
+    else:
+        axes = source.coordinates or coordinates
+        stated = " (--coordinates)" if coordinates and not source.coordinates else "" if axes else " (not stated)"
+        read = f"{unit_name(source.factor)}{_KNOWN.get(source.odds, '')} in {(axes or 'lps').upper()}{stated}"
+    done = [_done(verb, [text for text in remarks if re.search(words, text)]) for verb, words in _DONE.items()]
+    wall = [text for text in remarks if text.startswith("what is given is a wall")]
+    return (
+        f"Understood: enters at {place_text(lines[0].points[0])}, {2 * lines[0].radius[0]:.1f} mm wide; "
+        f"{farthest:.0f} mm to the farthest end, {2 * narrowest.radius.min():.1f} mm wide at the narrowest; "
+        + "; ".join([f"read as {read}", *wall, *filter(None, done)])
+    )
+
+
+def _done(verb: str, remarks: list[str]) -> str:
+    """Return how many things were done, and the largest length that their remarks name beside places."""
+    if not remarks:
+        return ""
+    bare = re.sub(r"\([^()]*\) mm", "", " ".join(remarks))
+    sizes = [float(size) for size in re.findall(r"(\d+(?:\.\d+)?) mm", bare)]
+    return f"{verb}: {len(remarks)}" + (f" (up to {max(sizes):.0f} mm)" if sizes else "")

@@ -118,7 +118,6 @@ def read_anatomy(folder: str | Path) -> Anatomy:
 
 
 def _insertion(record: Any, version: int) -> Insertion:
-    """Return the insertion that a record of some schema version holds."""
     zero = record["rotation_zero"] if version > 1 else "world axes"
     vectors = (record["position_mm"], record["direction"], *([zero] if zero != "world axes" else []))
     position, direction, *given = (np.array(vector, dtype=float) for vector in vectors)
@@ -133,10 +132,9 @@ def _write_tree(tree: VesselTree, path: Path) -> None:
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
-    lines = [branch.centerline for branch in tree.branches]
-    counts = np.array([len(line.points) for line in lines])
+    whole, counts = tree.line, [len(branch.section) for branch in tree.branches]
     polydata, points, cells = vtkPolyData(), vtkPoints(), vtkCellArray()
-    points.SetData(numpy_to_vtk(np.concatenate([line.points for line in lines]).astype(float), deep=True))
+    points.SetData(numpy_to_vtk(whole.points.astype(float), deep=True))
     offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     cells.SetData(
         numpy_to_vtkIdTypeArray(offsets, deep=True),
@@ -145,11 +143,11 @@ def _write_tree(tree: VesselTree, path: Path) -> None:
     polydata.SetPoints(points)
     polydata.SetLines(cells)
     columns: dict[str, tuple[Any, np.ndarray]] = {
-        "MaximumInscribedSphereRadius": (polydata.GetPointData(), np.concatenate([line.radius for line in lines])),
-        "Abscissa": (polydata.GetPointData(), np.concatenate([line.abscissa for line in lines])),
-        "Normals": (polydata.GetPointData(), np.concatenate([line.normals for line in lines])),
+        "MaximumInscribedSphereRadius": (polydata.GetPointData(), whole.radius),
+        "Abscissa": (polydata.GetPointData(), whole.abscissa),
+        "Normals": (polydata.GetPointData(), whole.normals),
         "Section": (polydata.GetPointData(), np.concatenate([branch.section for branch in tree.branches])),
-        "Branch": (polydata.GetCellData(), np.arange(len(lines))),
+        "Branch": (polydata.GetCellData(), np.arange(len(counts))),
         "Parent": (polydata.GetCellData(), np.array([branch.parent for branch in tree.branches])),
     }
     for name, (attributes, values) in columns.items():

@@ -12,7 +12,6 @@ from typing import Literal
 
 import numpy as np
 
-from endopilot.anatomy.coronary_crux import Crux
 from endopilot.anatomy.labels_coronary import LONGEST_LEFT_MAIN_MM, NEAREST_CRUX_MM, label_lca, label_rca
 from endopilot.anatomy.labels_tree import (
     ARCH_SECTIONS,
@@ -20,6 +19,7 @@ from endopilot.anatomy.labels_tree import (
     LCA_SECTIONS,
     PORTAL_SECTIONS,
     RCA_SECTIONS,
+    Crux,
     Labeller,
 )
 from endopilot.anatomy.labels_vessels import label_arch, label_cerebral, label_portal

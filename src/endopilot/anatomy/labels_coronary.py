@@ -94,7 +94,6 @@ def _end_of_distal(line: Centerline, passed: float | None) -> float:
 
 
 def _turns_forwards(line: Centerline, crux_mm: float) -> bool:
-    """Return whether a line runs forwards beyond the crux, as the posterior descending artery does."""
     behind = line.points[line.abscissa >= crux_mm, 1]
     return len(behind) > 0 and float(behind.max() - behind[-1]) > FORWARDS_MM
 

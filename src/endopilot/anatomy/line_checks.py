@@ -38,9 +38,8 @@ def left_out(
         piece: connected piece of each kept node.
         root_piece: the piece that the tree was made from.
     """
-    points, radius, *_ = _tree_points(tree)
-    gap, nearest = KDTree(points).query(nodes.points)
-    inside = gap <= np.maximum(radius[nearest], STEP_MM)
+    gap, nearest = KDTree(tree.line.points).query(nodes.points)
+    inside = gap <= np.maximum(tree.line.radius[nearest], STEP_MM)
     covered = float(nodes.share[inside].sum())
     lost = np.flatnonzero(~inside)
     if len(lost) == 0:
@@ -101,7 +100,8 @@ def closures(tree: VesselTree) -> list[str]:
 
     Spheres of two places meet there, while on the way from one to the other along the tree some do not.
     """
-    points, radius, abscissa, branch = _tree_points(tree)
+    points, radius, abscissa = tree.line.points, tree.line.radius, tree.line.abscissa
+    branch = np.repeat(np.arange(len(tree.branches)), [len(own.section) for own in tree.branches])
     pairs = KDTree(points).query_pairs(2 * float(radius.max()), output_type="ndarray")
     one, two = pairs.T
     overlap = radius[one] + radius[two] - np.linalg.norm(points[one] - points[two], axis=1)
@@ -139,17 +139,6 @@ def closures(tree: VesselTree) -> list[str]:
     notes.sort(key=lambda note: -note[0])
     texts = [text for _, text in notes[:_MOST_NOTES]]
     return texts + ([f"{len(notes) - _MOST_NOTES} shorter loops are cut too"] if len(notes) > _MOST_NOTES else [])
-
-
-def _tree_points(tree: VesselTree) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return position, radius, abscissa and branch of all points of a tree."""
-    lines = [branch.centerline for branch in tree.branches]
-    return (
-        np.concatenate([line.points for line in lines]),
-        np.concatenate([line.radius for line in lines]),
-        np.concatenate([line.abscissa for line in lines]),
-        np.concatenate([np.full(len(line.points), number) for number, line in enumerate(lines)]),
-    )
 
 
 def _way(

@@ -139,13 +139,7 @@ def likely_inlets(
 
 
 def _bulge(points: Float[np.ndarray, "n 3"], clearance: Float[np.ndarray, "n"], own: int) -> tuple[int, float, float]:
-    """Return where a vessel that is followed inwards from an end is widest against the neck behind: index, ratio, neck.
-
-    Args:
-        points: the way inwards.
-        clearance: distance to the wall, mm.
-        own: as many points belong to the branch that ends there.
-    """
+    """Return where a vessel, followed inwards, is widest against the neck behind: index, ratio, neck."""
     length = length_along(points)
     best = (0, 1.0, float(clearance[0]))
     for i in np.flatnonzero((length[:own] <= _DOME * clearance[:own]) & (clearance[:own] > 0)):

@@ -102,7 +102,6 @@ def _first(unit: Any) -> Any:
 
 
 def _positions(control: list[Any], name: str, path: Path) -> tuple[Float[np.ndarray, "n 3"], np.ndarray]:
-    """Return the positions of the control points that have one, and which have."""
     try:
         given = np.array([point.get("positionStatus", "defined") == "defined" for point in control])
         line = [[float(value) for value in control[i]["position"]] for i in np.flatnonzero(given)]
@@ -120,7 +119,6 @@ def _positions(control: list[Any], name: str, path: Path) -> tuple[Float[np.ndar
 
 
 def _radii(markup: dict[str, Any], given: np.ndarray, factor: float, name: str, path: Path) -> np.ndarray:
-    """Return the radii in mm of the control points that have a position."""
     found = markup.get("measurements")
     found = [m for m in found if isinstance(m, dict)] if isinstance(found, list) else []
     measurements = {str(m.get("name", "")).lower(): m for m in found if m.get("controlPointValues")}

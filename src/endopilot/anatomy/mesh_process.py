@@ -106,7 +106,6 @@ def _fields(field_data: Any) -> str:
 
 
 def _triangles(data: Any) -> np.ndarray:
-    """Return the corners of all triangles, polygons and strips cut into them."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkCommonDataModel import vtkPolyData
     from vtkmodules.vtkFiltersCore import vtkTriangleFilter

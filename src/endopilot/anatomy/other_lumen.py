@@ -43,12 +43,7 @@ def with_radii(anatomy: Anatomy, radii: Sequence[Float[np.ndarray, "_"]]) -> Ana
 
 
 def _moved(anatomy: Anatomy, grown: Float[np.ndarray, "n"]) -> DistanceMap:
-    """Return the map of an anatomy whose wall moves outwards by what the sphere grows that each point belongs to, mm.
-
-    Args:
-        anatomy: the vessel.
-        grown: of the spheres, and last of the catheter's.
-    """
+    """Return the map of an anatomy whose wall moves outwards by what each point's sphere grows, the catheter's last."""
     field = anatomy.distance_map
     values, (where, owner) = field.values.copy(), _owners(anatomy)
     at = tuple(where.T)

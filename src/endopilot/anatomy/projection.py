@@ -44,14 +44,10 @@ class TipProjector:
     """`project_tip` for one vessel, prepared once: for callers that project a few tips at a time, again and again."""
 
     def __init__(self, tree: VesselTree, insertion: Insertion) -> None:
-        """Prepare the segments of a tree.
-
-        Args:
-            tree: centerlines.
-            insertion: the ostium and the catheter's axis.
-        """
+        """Prepare the segments of a tree."""
         lines = [branch.centerline for branch in tree.branches]
-        points = np.concatenate([line.points for line in lines])
+        whole = tree.line
+        points = whole.points
         self._places = KDTree(points)
         counts = np.array([len(line.points) for line in lines])
         branch = np.repeat(np.arange(len(lines)), counts)
@@ -61,8 +57,8 @@ class TipProjector:
         self._core = _core.make_projector(
             point=points,
             tangent=np.concatenate(_shared_tangents(tree, insertion)),
-            abscissa=np.concatenate([line.abscissa for line in lines]),
-            radius=np.concatenate([line.radius for line in lines]),
+            abscissa=whole.abscissa,
+            radius=whole.radius,
             first=first[branch],
             last=last[branch],
             branch=branch,
@@ -99,7 +95,6 @@ def _rivals(
         nearest to this one.
     """
     lines = [branch.centerline for branch in tree.branches]
-    radius = np.concatenate([line.radius for line in lines])
     spacing = np.concatenate([_spacing(line.points) for line in lines])
     rival = np.full((len(points), len(lines)), np.inf)
     entry = np.zeros((len(points), len(lines)), dtype=np.int64)
@@ -107,7 +102,7 @@ def _rivals(
         distance, nearest = (np.asarray(found) for found in KDTree(line.points).query(points))
         entry[:, index] = first[index] + nearest
         # To win, offset < |p − v|·R is needed, with R the ratio of radii; and distance ≤ |p − v| + offset.
-        ratio = _TAPER * line.radius[nearest] / radius
+        ratio = _TAPER * line.radius[nearest] / tree.line.radius
         wider = (ratio > 1.0) | (distance < 2.0 * spacing)  # the nearest line loses only to a wider one
         rival[wider & (owner != index), index] = ((distance - spacing) / (1.0 + ratio))[wider & (owner != index)]
     return rival, entry

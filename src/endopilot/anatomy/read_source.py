@@ -67,11 +67,7 @@ def read_source(path: str | Path, *, label: int | str | None = None, threshold: 
 
 
 def _read_curves(folder: Path) -> AnatomySource:
-    """Return all markups curves of a folder as the lines of one tree.
-
-    Raises:
-        InputError: the folder holds none, or one cannot be read.
-    """
+    """Return all markups curves of a folder as the lines of one tree."""
     entries = sorted(folder.iterdir())
     curves = [path for path in entries if path.name.lower().endswith(".mrk.json")]
     if (folder / "anatomy.json").exists():

@@ -171,7 +171,6 @@ def _holds(mask: Volume, voxels: Bool[np.ndarray, "nz ny nx"], place: Float[np.n
 
 
 def _filled(voxels: Bool[np.ndarray, "nz ny nx"]) -> Bool[np.ndarray, "nz ny nx"]:
-    """Return voxels with the cavities inside them."""
     outside = connected_components(np.pad(~voxels, 1, constant_values=True))
     return (outside != outside[0, 0, 0])[1:-1, 1:-1, 1:-1]
 
@@ -325,7 +324,6 @@ def _draw_tube(voxels: np.ndarray, start: np.ndarray, end: np.ndarray, width: fl
 
 
 def _piece_on_side(mask: Volume, labels: np.ndarray, sizes: np.ndarray, vessel: Vessel) -> tuple[int, list[int]]:
-    """Return the label of the wanted piece of a mask, and those of the others that are nearly as large."""
     large = np.flatnonzero(sizes >= COMPARABLE * sizes.max())
     index = np.argwhere(mask.voxels)
     own = labels[tuple(index.T)]

@@ -218,7 +218,6 @@ def _regions_left_out(
 
 
 def _region_on_side(regions, ids: np.ndarray, vessel: Vessel) -> tuple[int, list[int]]:
-    """Return the wanted piece of a surface and the others that are nearly as large, by their boxes' diagonals."""
     pieces = [regions.points[ids == i] for i in range(min(int(ids.max()) + 1, 100))]
     sizes = np.array([np.linalg.norm(np.ptp(points, axis=0)) * len(points) ** 0.5 for points in pieces])
     return piece_on_side(sizes, np.array([points.mean(axis=0) for points in pieces]), vessel)

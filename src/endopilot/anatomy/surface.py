@@ -293,7 +293,6 @@ def _blur_matrix(width: float) -> Float[np.ndarray, "block wide"]:
 def _blurred(
     part: Float[np.ndarray, "wz wy wx"], kernels: list[Float[np.ndarray, "block wide"]]
 ) -> Float[np.ndarray, "block block block"]:
-    """Return a block, given with its halo, blurred along all axes."""
     along_z = (kernels[0] @ np.ascontiguousarray(part).reshape(part.shape[0], -1)).reshape(-1, *part.shape[1:])
     return (kernels[1] @ along_z) @ kernels[2].T
 

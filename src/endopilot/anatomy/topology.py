@@ -287,7 +287,6 @@ class _Parting:
 
 
 def _count(mask: Volume) -> int:
-    """Return how many pieces a mask has, without specks."""
     return int((np.bincount(piece_labels(mask)[mask.voxels]) >= SMALLEST_PIECE).sum())
 
 
@@ -404,7 +403,6 @@ def _crossing(arms: list[_Arm]) -> _Crossing | None:
 
 
 def _carried_on(one: _Arm, two: _Arm) -> Float[np.ndarray, "n 3"]:
-    """Return the cubic that carries one arm on into another."""
     start, end = one.points[0], two.points[0]
     size = float(np.linalg.norm(end - start))
     at = np.linspace(0.0, 1.0, 24)[:, None]
@@ -445,7 +443,6 @@ def _between(
 
 
 def _window(shape: tuple[int, ...], edges: Float[np.ndarray, "3"], crossing: _Crossing) -> tuple[slice, ...]:
-    """Return the part of a grid around two lines that run past each other."""
     points = np.concatenate(crossing.lines)
     margin = max(crossing.radii) + 3.0 * edges
     low, high = (points.min(axis=0) - margin) / edges, (points.max(axis=0) + margin) / edges
@@ -453,7 +450,6 @@ def _window(shape: tuple[int, ...], edges: Float[np.ndarray, "3"], crossing: _Cr
 
 
 def _are_apart(mask: Volume, edges: Float[np.ndarray, "3"], crossing: _Crossing) -> bool:
-    """Return whether two lines that were parted are connected no more, where they touched."""
     window = _window(mask.voxels.shape, edges, crossing)
     labels = connected_components(mask.voxels[window], corners=True)
     index = np.argwhere(labels)

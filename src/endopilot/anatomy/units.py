@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.errors import InputError
+from endopilot.imaging.geometry import MM_PER_UNIT
 
 SMALLEST_RADIUS_MM = 0.25
 """Vessels that a guidewire enters have mean radii from this on."""
@@ -45,14 +46,7 @@ _CERTAIN, _FITS = 0.9, 0.05
 _NONE = 1e-6
 """Likelihood of sizes that are no vessel's; those of a kind's medians have 1."""
 
-_NAMES = {
-    **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1.0),
-    **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), 10.0),
-    **dict.fromkeys(("dm", "decimeter", "decimeters", "decimetre", "decimetres"), 100.0),
-    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1000.0),
-    **dict.fromkeys(("um", "µm", "μm", "micron", "microns", "micrometer", "micrometers", "micrometre"), 0.001),
-    **dict.fromkeys(("in", "inch", "inches", "[in_i]"), 25.4),
-}
+_NAMES = {**MM_PER_UNIT, "[in_i]": 25.4}
 """mm in each unit of length, by its names; `[in_i]` is the inch of UCUM, which Slicer writes."""
 
 

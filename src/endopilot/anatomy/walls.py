@@ -81,7 +81,6 @@ def wall_text(thickness_mm: float) -> str:
 
 
 def _blocks(solid: Bool[np.ndarray, "nz ny nx"], factor: int) -> Bool[np.ndarray, "a b c"]:
-    """Return a mask of blocks of voxels that hold some of a mask."""
     padded = np.pad(solid, [(0, -size % factor) for size in solid.shape])
     shape = [part for size in padded.shape for part in (size // factor, factor)]
     return np.asarray(padded.reshape(shape).any(axis=(1, 3, 5)))
@@ -102,7 +101,6 @@ def enclosed(solid: Bool[np.ndarray, "nz ny nx"]) -> Bool[np.ndarray, "nz ny nx"
 
 
 def _or_shifted(met: Bool[np.ndarray, "nz ny nx"], by: np.ndarray) -> None:
-    """Add to a mask what lies `by` voxels on."""
     if (np.abs(by) >= met.shape).any():
         return
     here = tuple(slice(max(0, -step), met.shape[axis] - max(0, step)) for axis, step in enumerate(by))

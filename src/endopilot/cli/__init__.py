@@ -106,7 +106,6 @@ def overview() -> str:
 
 
 def _work(name: str, arguments: Sequence[str]) -> None:
-    """Read the arguments and do what they ask for."""
     for word in arguments:
         if any("\ud800" <= letter <= "\udfff" for letter in word):  # so Python has bytes that are no UTF-8
             raise InputError(f"{word}: the name is not UTF-8; rename it, and give the new name")

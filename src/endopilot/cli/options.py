@@ -282,7 +282,6 @@ class Command:
 
 
 def _options(values: Any, meanings: Mapping[str, str], required: Collection[str]) -> Iterator[Option]:
-    """Yield the options that settings hold, in the order of their fields."""
     kinds = get_type_hints(type(values), include_extras=True)
     for name, value in _contents(values).items():
         kind, meaning = kinds[name], meanings.get(name, "")
@@ -327,11 +326,7 @@ def _part(one: Option, *, incomplete: bool) -> tuple[str, Any, Any]:
 
 
 def _taken(words: list[str], flag: str) -> str | None:
-    """Take a flag and its value out of words, and return the value; None if the flag is not there.
-
-    Raises:
-        InputError: the flag is the last word.
-    """
+    """Take a flag and its value out of words, and return the value; None if the flag is not there."""
     for i, word in enumerate(words):
         name, sign, value = word.partition("=")
         if name == flag:
@@ -370,7 +365,6 @@ def _takes(kind: Any) -> str:
 
 
 def _words(value: Any) -> str:
-    """Return a value as the command line has it; nothing for None."""
     return " ".join(map(_words, value)) if isinstance(value, tuple) else "" if value is None else str(value)
 
 
@@ -394,6 +388,5 @@ def _line(text: str | None) -> str:
 
 
 def _wrapped(text: str) -> str:
-    """Return paragraphs as wide as the terminal."""
     width = min(shutil.get_terminal_size().columns, 120) - 2
     return "\n\n".join(textwrap.fill(_line(part), width) for part in text.split("\n\n"))

@@ -80,7 +80,6 @@ def check_memory_limit() -> None:
 
 
 def _code_of(work: Callable[[], object]) -> int:
-    """Do some work and return the code that it leaves with."""
     try:
         work()
     except Stopped:

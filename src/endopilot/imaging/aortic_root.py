@@ -121,7 +121,6 @@ def find_aortic_roots(grid: Volume) -> list[AorticRoot]:
 
 
 def _overlaps(disc: _Disc, taken: dict[int, _Disc]) -> bool:
-    """Return whether a disc's middle lies in the disc that is taken in its slice."""
     other = taken.get(disc.k)
     return other is not None and float(np.hypot(disc.j - other.j, disc.i - other.i)) < other.radius
 
@@ -137,7 +136,6 @@ def _within(plane: np.ndarray, j: float, i: float, radius: float) -> np.ndarray:
 
 
 def _discs(plane: Float[np.ndarray, "ny nx"], k: int, level: float, spacing: float) -> list[_Disc]:
-    """Return the round discs above a level in one slice."""
     depth = np.asarray(ndimage.distance_transform_edt(plane > level))
     low, high = (radius / spacing for radius in _RADIUS_MM)
     peaks = (depth >= 0.8 * low) & (depth <= high) & (depth == ndimage.maximum_filter(depth, round(6.0 / spacing)))

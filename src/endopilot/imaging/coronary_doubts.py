@@ -168,7 +168,6 @@ def _over_usual(change: Float[np.ndarray, "_"]) -> Float[np.ndarray, "_"]:
 
 
 def _metal(found: FoundTree) -> list[str]:
-    """Tell metal beside the tree."""
     label = connected_components(found.grid.voxels > _METAL_HU, corners=True)
     if label.max() == 0:
         return []

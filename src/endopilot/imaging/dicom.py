@@ -149,11 +149,7 @@ def read_series(path: Path, series: str | None, phase: str | None = None) -> Vol
 
 
 def _files(folder: Path, *, deep: bool) -> list[Path]:
-    """Return all that lies in a folder, and in its subfolders if `deep`: links to folders are not followed.
-
-    Raises:
-        InputError: a folder may not be read.
-    """
+    """Return all that lies in a folder, and in its subfolders if `deep`: links to folders are not followed."""
 
     def refuse(error: OSError) -> None:
         raise InputError(f"{error.filename}: may not be read ({error.strerror}); ask for access to it") from error

@@ -171,16 +171,7 @@ def _frames(content: Dataset) -> tuple[list[int], np.ndarray, tuple[float, ...],
 
 
 def _slots(heights: Float[np.ndarray, "frames"], step_mm: float, path: Path) -> Integer[np.ndarray, "frames"]:
-    """Return the slice of each frame from its height along the normal, mm; empty slices may be left out.
-
-    Args:
-        heights: along the slices' normal, mm.
-        step_mm: SpacingBetweenSlices; 0 where it is absent: then the least distance is the step.
-        path: the file, for messages.
-
-    Raises:
-        InputError: all frames are of one slice, or at multiples of the step.
-    """
+    """Return the slice of each frame from its height along the normal, mm; empty slices may be left out."""
     order = np.argsort(heights, kind="stable")
     begins = np.diff(heights[order], prepend=-np.inf) > _SAME_MM
     place_of = (np.cumsum(begins) - 1)[np.argsort(order)]
@@ -199,7 +190,6 @@ def _slots(heights: Float[np.ndarray, "frames"], step_mm: float, path: Path) -> 
 
 
 def _present(pixels: np.ndarray, half: int, numbers: list[int], kind: str) -> set[int]:
-    """Return the numbers of the segments that hold a voxel."""
     if kind == "LABELMAP":
         return {int(number) for number in np.unique(pixels) if number > 0}
     return {number for number, pixel in zip(numbers, pixels, strict=True) if pixel.max() >= half}

@@ -46,7 +46,7 @@ def check_covers(ct: Volume, anatomy: Anatomy) -> None:
     Raises:
         InputError: more of the vessel lies outside the CT than in it.
     """
-    points = np.concatenate([branch.centerline.points for branch in anatomy.tree.branches])
+    points = anatomy.tree.line.points
     shape = np.array(ct.voxels.shape[::-1])
     index = ct.world_to_index(points)
     outside = ((index < -1) | (index > shape)).any(axis=1).mean()  # a voxel beyond: a surface may end there

@@ -129,7 +129,6 @@ def _header(content: bytes, path: Path) -> dict[str, Any]:
 
 
 def _size(header: dict[str, Any], path: Path) -> tuple[int, int, int]:
-    """Return the numbers of voxels along i, j and k."""
     count, *extents = header["dim"]
     if not 1 <= count <= 7 or min(extents[:count]) < 1:
         shown = " ".join(map(str, header["dim"]))
@@ -184,7 +183,6 @@ def _named_labels(content: bytes, order: str) -> tuple[Segment, ...]:
 
 
 def _geometry(header: dict[str, Any], size: tuple[int, int, int], path: Path) -> Geometry:
-    """Return where the voxels lie, by sform or qform."""
     qform_code, sform_code = header["codes"]
     if max(qform_code, sform_code) <= 0:
         raise InputError(f"{path}: has no orientation (its sform and qform codes are 0); export it with its affine")
@@ -238,11 +236,7 @@ def _qform(header: dict[str, Any], size: tuple[int, int, int], path: Path, facto
 def _agreement(
     chosen: Geometry, other: Geometry, size: tuple[int, int, int], header: dict[str, Any], path: Path
 ) -> tuple[str, ...]:
-    """Say so where sform and qform put a corner of the volume half a voxel apart or more.
-
-    Raises:
-        InputError: they do, and not exactly one of them is in the scanner's coordinates.
-    """
+    """Say so where sform and qform put a corner of the volume half a voxel apart or more."""
     apart = farthest_apart_mm(chosen, other, size)
     if apart < chosen.spacing_mm.min() / 2.0:
         return ()

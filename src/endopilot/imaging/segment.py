@@ -141,7 +141,6 @@ def segment(volume: Volume | str | Path, *, config: SegmentConfig | None = None)
 
 
 def _refuse_no_mask(mask: object, volume: Volume, name: str) -> None:
-    """Refuse what a method of one's own may return in place of a mask of the volume."""
     if not isinstance(mask, LumenMask):
         raise InputError(f"method: {name!r} returned {type(mask).__name__}; return a LumenMask")
     voxels = mask.volume.voxels

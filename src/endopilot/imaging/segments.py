@@ -130,7 +130,6 @@ def choose(
 
 
 def _shown(number: int, name: str) -> str:
-    """Return a segment's number, and its name as one short line."""
     words = " ".join(name.split())[:_LONGEST_NAME]
     return f"{number} ({words})" if words else str(number)
 

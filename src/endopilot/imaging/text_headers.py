@@ -277,7 +277,6 @@ def _meta_header(stream: BufferedIOBase, path: Path) -> dict[str, str]:
 
 
 def _meta_size(fields: dict[str, str], path: Path) -> tuple[int, int, int]:
-    """Return the numbers of voxels along i, j and k."""
     try:
         extents = [int(word) for word in fields.get("DimSize", "").split()]
         count, channels = int(fields.get("NDims", "")), int(fields.get("ElementNumberOfChannels", "1"))

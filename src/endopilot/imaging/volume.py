@@ -227,7 +227,6 @@ def _sidecar(path: Path) -> Path:
 
 
 def _read_file(path: Path) -> ImageFile:
-    """Read one file by its suffix, refusing what is not a scalar volume."""
     try:
         image = _decoded(path)
     except OSError as error:
@@ -288,7 +287,6 @@ def _read_sidecar(mask: Path) -> tuple[Insertion | None, str, tuple[str, ...]]:
 
 
 def _insertion(given: Any, path: Path) -> Insertion:
-    """Return the ostium of a sidecar."""
     try:
         position, direction = (np.array(given[name], dtype=float) for name in ("position_mm", "direction"))
     except (KeyError, TypeError, ValueError):

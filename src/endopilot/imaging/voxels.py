@@ -84,11 +84,7 @@ def read_voxels(
 
 
 def _unpacked(stream: BufferedIOBase, packing: str, most: int) -> bytearray:
-    """Return the rest of a stream, unpacked, or its first `most` bytes: a header's size alone allocates nothing.
-
-    Raises:
-        EOFError: what is packed is cut short.
-    """
+    """Return the rest of a stream, unpacked, or its first `most` bytes: a header's size alone allocates nothing."""
     content = bytearray()
     if packing == "raw":
         while (most < 0 or len(content) < most) and (part := stream.read(1 << 24)):

@@ -87,13 +87,11 @@ def _nearest_voxel(grid: Volume, seed: tuple[float, float, float]) -> tuple[int,
 
 
 def _around(shape: tuple[int, ...], centre: tuple[int, int, int], radius_mm: float) -> tuple[slice, ...]:
-    """Return the slices of the cube around a voxel, clipped to the volume."""
     reach = round(radius_mm / _GRID_MM)
     return tuple(slice(max(c - reach, 0), min(c + reach + 1, n)) for c, n in zip(centre, shape, strict=True))
 
 
 def _blood_hu(grid: Volume, centre: tuple[int, int, int], seed: tuple[float, float, float]) -> float:
-    """Return the median HU around a seed."""
     found = float(np.median(grid.voxels[_around(grid.voxels.shape, centre, 2 * _GRID_MM)]))
     if found < LEAST_BLOOD_HU:
         raise InputError(
@@ -132,7 +130,6 @@ def _widest_nearby(wall_distance: np.ndarray, seed: tuple[int, int, int]) -> tup
 
 
 def _far_end(wall_distance: np.ndarray, start: tuple[int, int, int]) -> tuple[int, int, int]:
-    """Return the voxel farthest from `start` inside its lumen."""
     label = connected_components(wall_distance > _GRID_MM)
     lumen = label == label[start]
     if wall_distance[lumen].max() > _WIDEST_MM:

@@ -205,7 +205,6 @@ def _inside(distance: Float[np.ndarray, "k j i"], body: Volume, grid: Volume) ->
 
 
 def _aorta(scan: Scan, root: AorticRoot) -> Bool[np.ndarray, "nz ny nx"]:
-    """Return the pool voxels around the aorta's axis."""
     reach = 1.15 * root.radius + 1.0
     box = box_around(
         scan.grid.world_to_index(root.centres)[:, ::-1], np.full(3, reach.max() / _GRID_MM), scan.pools.shape
@@ -223,7 +222,6 @@ _Tree = tuple[Scan, Bool[np.ndarray, "nz ny nx"], Bool[np.ndarray, "nz ny nx"], 
 
 
 def _seeded_tree(volume: Volume, grid: Volume, roots: list[AorticRoot], seed: tuple[float, float, float]) -> _Tree:
-    """Return the vessel at a seed."""
     scan = _find_vessels(grid, roots[0].blood_hu if roots else _hu_at(volume, seed))
     aorta = _aorta(scan, roots[0]) if roots else np.zeros(scan.pools.shape, dtype=bool)
     return scan, aorta, *_tree_at_seed(scan, aorta, seed)
@@ -319,7 +317,6 @@ def _on_side(scan: Scan, root: AorticRoot, voxels: Int[np.ndarray, "n 3"], vesse
 
 
 def _vessel_near(scan: Scan, vessels: np.ndarray, seed: tuple[float, float, float]) -> Int[np.ndarray, "3"]:
-    """Return the vessel voxel nearest a seed."""
     voxels = np.argwhere(vessels)
     if len(voxels) == 0:
         raise InputError("seeds: the volume holds no vessel-like structure; give a CT angiogram in HU")
