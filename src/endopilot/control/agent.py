@@ -21,7 +21,9 @@ from endopilot.belief.states import State
 from endopilot.control.agent_config import AgentConfig, read_agent_calibration
 from endopilot.control.course import Course
 from endopilot.control.follow import Follower
+from endopilot.control.push import stand_off
 from endopilot.control.search import Search, check_devices
+from endopilot.control.trials import Budget
 from endopilot.devices.stack import Proximals
 from endopilot.navigation.policy import Decision, Observation
 from endopilot.progress import Advance
@@ -83,6 +85,7 @@ class _PlanningPolicy:
         self.monitor, self._seed = self._monitored(), seed
         self.belief, self._believed = self.monitor.belief, BelievedTip(np.nan, np.nan)
         self._back_mm, self._arrived, self._shows = np.inf, False, False
+        self._retreat_mm, self._retreats = np.inf, False
         self._crept = self.plans = 0
         self.planning_s = 0.0
         self._begin_anew()
@@ -135,7 +138,9 @@ class _PlanningPolicy:
         """
         self._harder, given = self.monitor.load_ratio, self.belief.navigation
         navigation = replace(given, force_limit_n=given.force_limit_n / self._harder)
-        self._search = Search(navigation, self.route, self.belief, config=self.config.search, seed=self._seed)
+        budget = Budget(self.config.planning_s or np.inf, self.config.evaluations)
+        search, seed = self.config.search, self._seed
+        self._search = Search(navigation, self.route, self.belief, config=search, seed=seed, budget=budget)
         devices, turn_rad_s = len(self.navigation.devices), self.config.search.turn_rad_s
         self._follower = Follower(self.belief.drives, devices=devices, turn_rad_s=turn_rad_s)
         self._failed = 0
@@ -200,6 +205,10 @@ class _PlanningPolicy:
     def _go_on(self, observation: Observation) -> Proximals:
         """Return the velocities that lead to the next place of the course."""
         arriving = self.navigation.arriving
+        if self._retreats:
+            self._retreats = bool(self.belief.drives.proximal[0, 0] > self._retreat_mm)
+            self._shows = not self._retreats  # another course is searched from there, by what an image shows
+            return self._pull_back() if self._retreats else self._follower.move([0.0] * len(self.navigation.devices))
         if self._off_course() or (self._follower.ended and not (self._follower.reached and arriving)):
             self._plan(observation)
         self._arrived = self._follower.reached and self._follower.ended
@@ -243,12 +252,33 @@ class _PlanningPolicy:
         seconds = self.navigation.seconds - observation.time_s
         if self._failed >= self.config.tries:
             self._follower.begin(None)
+            self._retreat(seconds)
             return
         self._crept, self.plans, worked = 0, self.plans + 1, time.process_time()
         horizon_mm = self.config.horizon_mm or np.inf
-        self._follower.begin(self.find_course(seconds, horizon_mm=horizon_mm) if seconds >= DECISION_PERIOD_S else None)
+        course = self.find_course(seconds, horizon_mm=horizon_mm) if seconds >= DECISION_PERIOD_S else None
+        self._follower.begin(course)
         self.planning_s += time.process_time() - worked
-        self._failed = self._failed + 1 if self._follower.course is not None and self.halt else 0
+        if course is None or not self.halt:
+            self._failed = 0
+        elif not (self._search.budget.over and len(course.control)):  # what came on in its time has not failed
+            self._failed += 1
+
+    def _retreat(self, seconds: float) -> None:
+        """Let devices be pulled back for one more search, to before the last fork, and then to where they began.
+
+        That takes time, s, of which twice as much has to be left. Devices that move together draw anew, and stay.
+        """
+        inserted, config = float(self.belief.drives.proximal[0, 0]), self.config.search
+        begin = self.navigation.start_inserted_length_mm
+        if config.manoeuvres.together or self.monitor.may_return or self._retreat_mm <= begin:
+            return
+        came = float(self.route.progress(self.belief.likeliest_tip())[0])
+        fork = float(self.route.junctions[self.route.junctions < came].max(initial=0.0))
+        place = max(inserted - came + fork - stand_off(self.route, fork, config.lead_mm), begin)
+        place = begin if np.isfinite(self._retreat_mm) else place
+        if seconds > 2 * (inserted - place) / config.speed_mm_s:
+            self._retreat_mm, self._retreats, self._failed = place, True, self.config.tries - 1
 
 
 class OraclePolicy(_PlanningPolicy):
