@@ -40,7 +40,7 @@ class AgentConfig:
     horizon_mm: Positive | None = None
     """A course may end when it leads this far on, mm, and is searched on from there; all the way if not given."""
     planning_s: Positive | None = 60.0
-    """Wall time after which a search ends with the course that it has, s; without end if not given."""
+    """Processor time after which a search ends with the course that it has, s; without end if not given."""
     evaluations: Annotated[int, Within(1, 10**12)] | None = None
     """The same in simulated decision periods of a world, in place of the time: then the bits of a navigation repeat on
     machines of any speed."""

@@ -112,7 +112,7 @@ class Search:
         random = np.random.default_rng([seed, 0x5EA])
         self._population = Population(navigation, route, drawn, config, random)
         motions = ConstantMotions(navigation, route, drawn, config, random)
-        self._together = Together(navigation, route, self._course, self._population, motions, config, random)
+        self._together = Together(navigation, route, self._course, config, random, self._population, motions)
         self.halt = ""
 
     @property

@@ -95,7 +95,7 @@ class Budget:
         """Give a budget.
 
         Args:
-            seconds: wall time, s.
+            seconds: processor time of this thread, s: wall time where nothing else takes the processor.
             evaluations: simulated decision periods of a world, in place of the time: the bits of a search repeat then.
         """
         self._seconds, self._evaluations = np.inf if evaluations else seconds, evaluations or np.inf
@@ -103,7 +103,7 @@ class Budget:
 
     def begin(self) -> None:
         """Begin another search."""
-        self.over, self._until, self._left = False, time.perf_counter() + self._seconds, self._evaluations
+        self.over, self._until, self._left = False, time.thread_time() + self._seconds, self._evaluations
 
     def spend(self, worlds: int) -> None:
         """Take a decision period of some worlds off.
@@ -111,7 +111,7 @@ class Budget:
         Raises:
             OutOfBudgetError: nothing is left.
         """
-        if self._left < worlds or time.perf_counter() > self._until:
+        if self._left < worlds or time.thread_time() > self._until:
             self.over = True
             raise OutOfBudgetError
         self._left -= worlds
