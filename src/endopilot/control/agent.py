@@ -19,8 +19,7 @@ from endopilot.belief.bands import Calibration
 from endopilot.belief.monitor import BelievedTip, Monitor
 from endopilot.belief.states import State
 from endopilot.control.agent_config import AgentConfig, read_agent_calibration
-from endopilot.control.course import Course
-from endopilot.control.follow import Follower
+from endopilot.control.course import Course, Follower
 from endopilot.control.push import stand_off
 from endopilot.control.search import Search, check_devices
 from endopilot.control.trials import Budget
