@@ -84,7 +84,7 @@ class _PlanningPolicy:
         self.monitor, self._seed = self._monitored(), seed
         self.belief, self._believed = self.monitor.belief, BelievedTip(np.nan, np.nan)
         self._back_mm, self._arrived, self._shows = np.inf, False, False
-        self._retreat_mm, self._retreats = np.inf, False
+        self._retreat_mm = np.inf
         self._crept = self.plans = 0
         self.planning_s = 0.0
         self._begin_anew()
@@ -103,7 +103,7 @@ class _PlanningPolicy:
     def watch(self, observation: Observation) -> None:
         """Follow what somebody else does; a new course is searched at the next decision."""
         self._follower.begin(None)
-        self._failed = 0
+        self._failed, self._retreats = 0, False
         self._observe(observation)
 
     def believed(self) -> BelievedTip:
@@ -142,7 +142,7 @@ class _PlanningPolicy:
         self._search = Search(navigation, self.route, self.belief, config=search, seed=seed, budget=budget)
         devices, turn_rad_s = len(self.navigation.devices), self.config.search.turn_rad_s
         self._follower = Follower(self.belief.drives, devices=devices, turn_rad_s=turn_rad_s)
-        self._failed = 0
+        self._failed, self._retreats = 0, False
 
     def _observe(self, observation: Observation) -> None:
         monitor, before = self.monitor, self.monitor.lost
@@ -264,13 +264,14 @@ class _PlanningPolicy:
             self._failed += 1
 
     def _retreat(self, seconds: float) -> None:
-        """Let devices be pulled back for one more search, to before the last fork, and then to where they began.
+        """Let a wire alone be pulled back for one more search, to before the last fork, and then to where it began.
 
-        That takes time, s, of which twice as much has to be left. Devices that move together draw anew, and stay.
+        That takes time, s, of which twice as much has to be left. A wire in a catheter stays: pulled back it took three
+        times the exposures, and came no farther.
         """
         inserted, config = float(self.belief.drives.proximal[0, 0]), self.config.search
         begin = self.navigation.start_inserted_length_mm
-        if config.manoeuvres.together or self.monitor.may_return or self._retreat_mm <= begin:
+        if self.navigation.catheters or self.monitor.may_return or self._retreat_mm <= begin:
             return
         came = float(self.route.progress(self.belief.likeliest_tip())[0])
         fork = float(self.route.junctions[self.route.junctions < came].max(initial=0.0))
