@@ -266,12 +266,13 @@ class _PlanningPolicy:
     def _retreat(self, seconds: float) -> None:
         """Let a wire alone be pulled back for one more search, to before the last fork, and then to where it began.
 
-        That takes time, s, of which twice as much has to be left. A wire in a catheter stays: pulled back it took three
-        times the exposures, and came no farther.
+        That takes time, s, of which twice as much has to be left. A wire in a catheter stays, and one that would press
+        too hard: pulled back they took two and three times the exposures, and came no farther.
         """
         inserted, config = float(self.belief.drives.proximal[0, 0]), self.config.search
         begin = self.navigation.start_inserted_length_mm
-        if self.navigation.catheters or self.monitor.may_return or self._retreat_mm <= begin:
+        stays = self.navigation.catheters or self._search.presses or self.monitor.may_return
+        if stays or self._retreat_mm <= begin:
             return
         came = float(self.route.progress(self.belief.likeliest_tip())[0])
         fork = float(self.route.junctions[self.route.junctions < came].max(initial=0.0))
