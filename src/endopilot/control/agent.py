@@ -267,7 +267,7 @@ class _PlanningPolicy:
         """Let a wire alone be pulled back for one more search, to before the last fork, and then to where it began.
 
         That takes time, s, of which twice as much has to be left. A wire in a catheter stays, and one that would press
-        too hard: pulled back they took two and three times the exposures, and came no farther.
+        too hard: pulled back, one of each took two and three times the exposures, and did not arrive either.
         """
         inserted, config = float(self.belief.drives.proximal[0, 0]), self.config.search
         begin = self.navigation.start_inserted_length_mm
