@@ -267,14 +267,9 @@ def test_an_agent_tells_what_it_believes_and_goes_on_after_hands(side_branch) ->
 
 
 def test_an_agent_gives_up_early_and_names_the_fork(side_branch) -> None:
-    """Two searches fail, and where there is time another one, from where the wire began."""
     straight = replace(side_branch.device, tip_bend_rad=0.0, tip_bend_length_mm=0.0)
     config = replace(QUICK, search=replace(QUICK.search, attempts=1, rounds=2), tries=2)
-    hurried, patient = AgentPolicy(config), AgentPolicy(config)
-    short = NavigationLoop(replace(side_branch, device=straight, seconds=9.0), hurried, seed=2).run()
-    record = NavigationLoop(replace(side_branch, device=straight), patient, seed=2).run()
-    assert (hurried.plans, patient.plans) == (2, 3) and short.reason == "gave up"
-    assert record.inserted_length[14:, 0].min() < side_branch.start_inserted_length_mm + 0.5
+    record = NavigationLoop(replace(side_branch, device=straight), AgentPolicy(config), seed=2).run()
     assert record.reason == "gave up" and not record.success
     assert record.seconds < 0.5 * side_branch.seconds
     assert "at the fork into section vessel (branch 2) at 20.0 mm" in record.gives_up

@@ -25,13 +25,13 @@ def test_seconds_or_evaluations_end_a_budget() -> None:
 
 def test_a_search_ends_with_what_it_has(side_branch) -> None:
     """With little it comes to before the fork, and with less nowhere; the words say why."""
-    free, few, none = (OraclePolicy(config=replace(QUICK, evaluations=each)) for each in (None, 40, 1))
+    free, few, none = (OraclePolicy(config=replace(QUICK, evaluations=each)) for each in (10**6, 40, 1))
     lengths = []
     for policy in (free, few, none):
         policy.start(side_branch, 0)
         lengths.append(len(policy.find_course(side_branch.seconds).control))
     assert lengths[0] > lengths[1] >= 0 == lengths[2] and free.halt == ""
-    assert "in its time; give more (AgentConfig.planning_s)" in few.halt
+    assert "in its budget; give more (AgentConfig.evaluations)" in few.halt
 
 
 def test_by_evaluations_a_navigation_repeats(side_branch) -> None:

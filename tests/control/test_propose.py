@@ -15,8 +15,8 @@ from endopilot.tasks.targets import find_target
 def test_a_tip_that_enters_the_fork_is_named_and_nothing_where_nothing_does(side_branch) -> None:
     straight = replace(side_branch.device, tip_bend_rad=0.0, tip_bend_length_mm=0.0)
     given = replace(side_branch, device=straight)
-    assert propose_devices(given, evaluations=200_000).startswith(f"{straight.name} with a tip of ")
-    assert propose_devices(replace(given, force_limit_n=1e-4), evaluations=1) == ""
+    assert propose_devices(given).startswith(f"{straight.name} with a tip of ")
+    assert propose_devices(replace(given, force_limit_n=1e-4), seconds=1e-6) == ""
 
 
 def test_the_outcome_names_it_and_each_decision_is_timed(side_branch) -> None:

@@ -20,7 +20,6 @@ from endopilot.belief.monitor import BelievedTip, Monitor
 from endopilot.belief.states import State
 from endopilot.control.agent_config import AgentConfig, read_agent_calibration
 from endopilot.control.course import Course, Follower
-from endopilot.control.push import stand_off
 from endopilot.control.search import Search, check_devices
 from endopilot.control.trials import Budget
 from endopilot.devices.stack import Proximals
@@ -84,7 +83,6 @@ class _PlanningPolicy:
         self.monitor, self._seed = self._monitored(), seed
         self.belief, self._believed = self.monitor.belief, BelievedTip(np.nan, np.nan)
         self._back_mm, self._arrived, self._shows = np.inf, False, False
-        self._retreat_mm = np.inf
         self._crept = self.plans = 0
         self.planning_s = 0.0
         self._begin_anew()
@@ -103,7 +101,7 @@ class _PlanningPolicy:
     def watch(self, observation: Observation) -> None:
         """Follow what somebody else does; a new course is searched at the next decision."""
         self._follower.begin(None)
-        self._failed, self._retreats = 0, False
+        self._failed = 0
         self._observe(observation)
 
     def believed(self) -> BelievedTip:
@@ -142,7 +140,7 @@ class _PlanningPolicy:
         self._search = Search(navigation, self.route, self.belief, config=search, seed=seed, budget=budget)
         devices, turn_rad_s = len(self.navigation.devices), self.config.search.turn_rad_s
         self._follower = Follower(self.belief.drives, devices=devices, turn_rad_s=turn_rad_s)
-        self._failed, self._retreats = 0, False
+        self._failed = 0
 
     def _observe(self, observation: Observation) -> None:
         monitor, before = self.monitor, self.monitor.lost
@@ -204,10 +202,6 @@ class _PlanningPolicy:
     def _go_on(self, observation: Observation) -> Proximals:
         """Return the velocities that lead to the next place of the course."""
         arriving = self.navigation.arriving
-        if self._retreats:
-            self._retreats = bool(self.belief.drives.proximal[0, 0] > self._retreat_mm)
-            self._shows = not self._retreats  # another course is searched from there, by what an image shows
-            return self._pull_back() if self._retreats else self._follower.move([0.0] * len(self.navigation.devices))
         if self._off_course() or (self._follower.ended and not (self._follower.reached and arriving)):
             self._plan(observation)
         self._arrived = self._follower.reached and self._follower.ended
@@ -251,7 +245,6 @@ class _PlanningPolicy:
         seconds = self.navigation.seconds - observation.time_s
         if self._failed >= self.config.tries:
             self._follower.begin(None)
-            self._retreat(seconds)
             return
         self._crept, self.plans, worked = 0, self.plans + 1, time.process_time()
         horizon_mm = self.config.horizon_mm or np.inf
@@ -262,24 +255,6 @@ class _PlanningPolicy:
             self._failed = 0
         elif not (self._search.budget.over and len(course.control)):  # what came on in its time has not failed
             self._failed += 1
-
-    def _retreat(self, seconds: float) -> None:
-        """Let a wire alone be pulled back for one more search, to before the last fork, and then to where it began.
-
-        That takes time, s, of which twice as much has to be left. A wire in a catheter stays, and one that would press
-        too hard: pulled back, one of each took two and three times the exposures, and did not arrive either.
-        """
-        inserted, config = float(self.belief.drives.proximal[0, 0]), self.config.search
-        begin = self.navigation.start_inserted_length_mm
-        stays = self.navigation.catheters or self._search.presses or self.monitor.may_return
-        if stays or self._retreat_mm <= begin:
-            return
-        came = float(self.route.progress(self.belief.likeliest_tip())[0])
-        fork = float(self.route.junctions[self.route.junctions < came].max(initial=0.0))
-        place = max(inserted - came + fork - stand_off(self.route, fork, config.lead_mm), begin)
-        place = begin if np.isfinite(self._retreat_mm) else place
-        if seconds > 2 * (inserted - place) / config.speed_mm_s:
-            self._retreat_mm, self._retreats, self._failed = place, True, self.config.tries - 1
 
 
 class OraclePolicy(_PlanningPolicy):

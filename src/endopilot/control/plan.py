@@ -202,8 +202,7 @@ def _search(navigation: Navigation, config: PlanConfig, trial: int) -> tuple[Con
     speed_mm_s = min(agent.search.speed_mm_s, config.speed_mm_s) if navigation.catheters else config.speed_mm_s
     search = replace(agent.search, speed_mm_s=speed_mm_s, cost=config.cost)
     fine_belief = replace(agent.belief, element_mm=fine.element_mm, time_step_s=fine.time_step_s)
-    belief = fine_belief if trial else agent.belief
-    policy = OraclePolicy(config=replace(agent, search=search, belief=belief, planning_s=None))
+    policy = OraclePolicy(config=replace(agent, search=search, belief=fine_belief if trial else agent.belief))
     policy.start(navigation, config.seed + trial)
     with progress("plan: searching in the rod core", total=navigation.target.abscissa) as advance:
         course = policy.find_course(navigation.seconds, advance)

@@ -16,7 +16,7 @@ from endopilot.errors import InputError
 from endopilot.tasks.navigation import Navigation
 
 
-def propose_devices(navigation: Navigation, *, seconds: float = 60.0, evaluations: int | None = None) -> str:
+def propose_devices(navigation: Navigation, *, seconds: float = 60.0) -> str:
     """Return the first shipped devices, and their tip, that a search brings to the target; empty if it finds none.
 
     The wire with a tip for the forks of the route comes first, then the other wires, then the wire in each catheter.
@@ -25,11 +25,10 @@ def propose_devices(navigation: Navigation, *, seconds: float = 60.0, evaluation
     Args:
         navigation: that was given up, with the time that there was.
         seconds: wall time for all searches, s, of which each has a quarter at most.
-        evaluations: of each search, in place of the time; see `AgentConfig`.
     """
     until = time.perf_counter() + seconds
     for stack in _stacks(navigation):
-        if evaluations is None and time.perf_counter() > until:
+        if time.perf_counter() > until:
             return ""
         try:
             stack.check(navigation.anatomy)
@@ -37,7 +36,7 @@ def propose_devices(navigation: Navigation, *, seconds: float = 60.0, evaluation
             chosen = choose_tip(given, catheter_tilt_deg=0.0)
             if chosen.refused is not None and not stack.catheters:
                 continue
-            config = replace(AgentConfig.of(chosen.navigation), planning_s=seconds / 4, evaluations=evaluations)
+            config = replace(AgentConfig.of(chosen.navigation), planning_s=seconds / 4)
             policy = OraclePolicy(config=config)
             policy.start(chosen.navigation, 0)
         except InputError:  # they do not fit into one another, or into the lumen

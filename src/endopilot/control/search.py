@@ -74,7 +74,6 @@ class Search:
 
     Attributes:
         halt: where and why the last search ended before the target, in words; empty if it arrived.
-        presses: whether it ended where the devices would press on the wall too hard.
         budget: of a search, which ends with what it has once that is spent.
     """
 
@@ -114,7 +113,7 @@ class Search:
         self._population = Population(navigation, route, drawn, config, random)
         motions = ConstantMotions(navigation, route, drawn, config, random)
         self._together = Together(navigation, route, self._course, config, random, self._population, motions)
-        self.halt, self.presses = "", False
+        self.halt = ""
 
     @property
     def draws(self) -> bool:
@@ -184,14 +183,14 @@ class Search:
         source, weight = belief.likeliest()
         course.put(source, belief.simulator, weight)
         self._behind_mm, self._kept = self._before_fork(), course.kept()
-        self.halt, self._at_fork, self.presses = "", False, False
+        self.halt, self._at_fork = "", False
         self._together.most_periods = self._most_periods(seconds, horizon_mm)
         try:
             self._set_out(angle, out=out)
             self._lead(settled, horizon_mm, advance)
         except OutOfBudgetError:
             course.restore(self._kept)
-            self.halt = f"the search came to {self._here:.0f} mm in its time; give more (AgentConfig.planning_s)"
+            self.halt = f"the search came to {self._here:.0f} mm in its budget; give more (AgentConfig.evaluations)"
         reached = self._reached()
         if reached <= 0.5:
             self._cut_hard()
@@ -462,7 +461,7 @@ class Search:
     def _halted(self, halt: Halt, waypoint: float) -> None:
         """Say where and why no course goes on."""
         at_mm = self._hard if self._alone and halt != "late" else waypoint
-        self.halt, self.presses = describe_halt(halt, at_mm, self.route, self._navigation), halt == "pressed"
+        self.halt = describe_halt(halt, at_mm, self.route, self._navigation)
         fork = near_fork(at_mm, self.route, self._navigation)
         self._at_fork = halt in ("off", "stalled") and fork is not None
 

@@ -91,14 +91,14 @@ class Budget:
         over: whether it is spent.
     """
 
-    def __init__(self, seconds: float = np.inf, evaluations: int | None = None) -> None:
+    def __init__(self, seconds: float = np.inf, evaluations: float | int = np.inf) -> None:
         """Give a budget.
 
         Args:
             seconds: processor time of this thread, s: wall time where nothing else takes the processor.
-            evaluations: simulated decision periods of a world, in place of the time: the bits of a search repeat then.
+            evaluations: simulated decision periods of a world: by them alone the bits of a search repeat.
         """
-        self._seconds, self._evaluations = np.inf if evaluations else seconds, evaluations or np.inf
+        self._seconds, self._evaluations = seconds, evaluations
         self.begin()
 
     def begin(self) -> None:
