@@ -135,6 +135,14 @@ def test_a_wire_that_is_lost_again_and_again_ends_with_the_cause(side_branch) ->
     assert "lost 4 times: no wire, lumen or ostium explains what X-ray shows" in said
 
 
+def test_a_wire_that_is_out_and_still_seen_ends_the_navigation(side_branch) -> None:
+    policy = AgentPolicy(QUICK)
+    policy.start(side_branch, 0)
+    far = replace(measured(policy.belief, 0), position=np.full(3, 50.0))
+    said = [policy.decide(Observation(0.5 * k, ((mm, 0.0),), far)).gives_up for k, mm in enumerate((4.0, 2.0, 0.0))]
+    assert said[:2] == ["", ""] and said[2].startswith("pulled out, the wire is still seen: no wire")
+
+
 def test_a_lost_wire_that_is_back_in_its_catheter_unseen_sets_out_again(side_branch) -> None:
     policy = AgentPolicy(QUICK)
     policy.start(side_branch, 0)

@@ -31,7 +31,7 @@ def only(motions: ConstantMotions, *controls: list[list[float]], monkeypatch: py
     """Let candidates draw some controls alone."""
 
     def draw(_: ConstantMotions) -> Control:
-        return np.resize(np.array(controls), (motions._trials.count, 2, 2))
+        return np.resize(np.array(controls), (motions.trials.count, 2, 2))
 
     monkeypatch.setattr(ConstantMotions, "_draw", draw)
 
@@ -88,7 +88,7 @@ def test_in_the_second_look_the_wire_counts_alone_and_full_loops_are_not_pushed(
     motions, one = begin(pair)
     only(motions, [[-2.0, 0.0], [0.0, 0.0]], [[2.0, 0.0], [0.0, 0.0]], monkeypatch=monkeypatch)
     monkeypatch.setattr(Route, "progress", lambda _, tip: np.full(tip.abscissa.shape, -44.0))
-    motions._trials.copy_of(one)
+    motions.trials.copy_of(one)
     made = motions._unless_full(motions._draw())
     assert made[0, WIRE, 0] == -2.0 and made[1, WIRE, 0] == 0.0
     only(motions, [[2.0, 0.0], [0.0, 0.0]], monkeypatch=monkeypatch)
@@ -107,8 +107,8 @@ def test_what_was_best_is_tried_again_and_so_is_a_straight_push(pair) -> None:
     best = motions.best(one, 0.0, -np.inf)[0][0]
     drawn = motions._draw()
     assert np.array_equal(drawn[0], best)
-    assert np.array_equal(drawn[1], [[motions._config.speed_mm_s, 0.0], [0.0, 0.0]])
+    assert np.array_equal(drawn[1], [[motions.config.speed_mm_s, 0.0], [0.0, 0.0]])
     rests, along = (drawn[2:, CATHETER] == 0).all(axis=1), drawn[2:, CATHETER, 0] == drawn[2:, WIRE, 0]
     assert 0.4 < rests.mean() < 0.65 and 0.2 < (along & ~rests).mean() < 0.35
     assert (drawn[:, WIRE, 1] > 0).any() and (drawn[:, WIRE, 1] < 0).any() and (drawn[:, WIRE, 0] < 0).any()
-    assert np.abs(drawn[..., 1]).max() <= motions._trials.fastest[1]
+    assert np.abs(drawn[..., 1]).max() <= motions.trials.fastest[1]

@@ -6,6 +6,7 @@ model is wrong, not the prediction unlucky: the bands widen, and X-ray is due ev
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +17,8 @@ from endopilot.belief.belief import Belief, BeliefConfig, Past
 from endopilot.belief.drives import UNKNOWN
 from endopilot.belief.identification import Identified, identify
 from endopilot.belief.patient_motion import FoundMotion, find_motion
-from endopilot.belief.watch import Watch
+from endopilot.belief.states import SEEKS, Event, States
+from endopilot.belief.watch import Innovations, Watch
 from endopilot.devices.stack import Proximals
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.xray.fluoroscope import TipMeasurement
@@ -103,7 +105,7 @@ class Monitor:
 
     Attributes:
         belief: about the wire; another one once the model was taken to be wrong and another was identified.
-        lost: whether no wire explains the last exposure.
+        states: whether it is followed, sought, lost or changed.
         sought: whether one was sought for this exposure, and found.
         identified: what was found when the belief was last changed; None before.
         moves: how the vessel was found to move; None if it was not.
@@ -114,28 +116,38 @@ class Monitor:
     def __init__(
         self,
         navigation: Navigation,
-        calibration: Calibration,
+        calibration: Calibration | None,
         *,
         config: BeliefConfig | None = None,
         advice: AdviserConfig | None = None,
+        members: Sequence[World] | None = None,
     ) -> None:
         """Lay out the simulated wires at the start of a navigation.
 
         Args:
-            calibration: of the bands around what the simulated wires predict.
+            calibration: of the bands around what the simulated wires predict; None for a monitor that never doubts: it
+                neither asks for X-ray nor changes its belief.
+            members: what the simulated wires take reality to be; around what is given if not given.
         """
         self._navigation, self._config = navigation, config or BeliefConfig()
-        self._given = Belief.around(self._config)
+        self._given = Belief.around(self._config) if members is None else tuple(members)
         self.belief = Belief(navigation, self._given, self._config)
-        self.past, self.lost, self.sought = Past(), False, False
+        self.past, self.states, self.sought = Past(), States(SEEKS * bool(self._config.copies)), False
         self.identified: Identified | None = None
         self.moves: FoundMotion | None = None
         self.seen: TipMeasurement | None = None
-        self._tests, self._loads = not navigation.catheters, LoadRatio()
+        self._tests, self._loads = calibration is not None and not navigation.catheters, LoadRatio()
         self.changes_left, self._since, self._returned = _MOST, 0, False
-        tip_radius_mm, at = navigation.device.tip_radius_mm, predicted_tip(self.belief)
-        self._watch = Watch(calibration, advice or AdviserConfig(), tip_radius_mm, at, alone=self._tests)
-        self._innovations = self._watch.innovations
+        self._watch, self._innovations = None, Innovations()
+        if calibration is not None:
+            tip_radius_mm, at = navigation.device.tip_radius_mm, predicted_tip(self.belief)
+            self._watch = Watch(calibration, advice or AdviserConfig(), tip_radius_mm, at, alone=self._tests)
+            self._innovations = self._watch.innovations
+
+    @property
+    def lost(self) -> bool:
+        """Whether no wire explains what X-ray showed last."""
+        return self.states.lost
 
     @property
     def alarm(self) -> bool:
@@ -166,31 +178,39 @@ class Monitor:
         else:
             self.belief.drives.begin(encoders)
         self.past.proximal.append(self.belief.drives.proximal.copy())
-        at = predicted_tip(self.belief)
-        self._watch.move(at)
-        self.seen, self.sought = None, False
+        self.seen, self.sought, at, watch = None, False, predicted_tip(self.belief), self._watch
+        if watch is not None:
+            watch.move(at)
+        back = self.belief.drives.proximal[0, 0] <= self._navigation.start_inserted_length_mm
         if exposure is not None:
-            self.seen = seen = self.belief.in_vessel(exposure, period)
-            if self._tests:
-                self._watch.compare(seen.less(at.tip), exposure.tip_sd_mm)
-            self.past.exposures[period] = exposure
-            self.belief.weigh(seen)
-            self.sought = not self.belief.explains and self.belief.seek(seen)
-            self.lost = not self.belief.explains
-            self._innovations.alarm |= self.lost and self._tests
-            self._since += 1
-            if self.alarm and self._finds_motion():
-                self._renew()
-            elif self._is_to_change():
-                self._identify()
+            self._see(exposure, period, at)
             at = predicted_tip(self.belief)
-            self._watch.exposed(float((at.tip + self.seen.less(at.tip))[1]), at)
-        elif self.belief.drives.proximal[0, 0] <= self._navigation.start_inserted_length_mm:
-            self.lost = False  # back where it began, the wire lies as it did, unseen in its catheter
+        explained = self.belief.explains if exposure is not None else True
+        event = Event.UNEXPLAINED if not explained else Event.DOUBTED if self.alarm else Event.TRUSTED
+        self.states.take(event if exposure is not None or back else None)
+        if watch is None:
+            return BelievedTip(float(at.tip[0]), float(at.tip[1]))
+        if self.seen is not None:
+            watch.exposed(float((at.tip + self.seen.less(at.tip))[1]), at)
         motion = _MOTION_SD_MM * (self.belief.motion is not None)
         changed = self.identified is not None or self.moves is not None or self.belief.drives.unknown
-        due = self._watch.advise(at, self.belief.play_spread() ** 2 + motion**2, changed=changed)
-        return self._believed(at.tip, due)
+        due = watch.advise(at, self.belief.play_spread() ** 2 + motion**2, changed=changed)
+        return self._believed(watch, at.tip, due)
+
+    def _see(self, exposure: TipMeasurement, period: int, at: Predicted) -> None:
+        """Weigh the belief by what X-ray shows, and change it where the model is taken to be wrong."""
+        self.seen = seen = self.belief.in_vessel(exposure, period)
+        if self._tests and self._watch is not None:
+            self._watch.compare(seen.less(at.tip), exposure.tip_sd_mm)
+        self.past.exposures[period] = exposure
+        self.belief.weigh(seen)
+        self.sought = not self.belief.explains and self.belief.seek(seen)
+        self._innovations.alarm |= self._tests and not self.belief.explains
+        self._since += 1
+        if self.alarm and self._finds_motion():
+            self._renew()
+        elif self._is_to_change():
+            self._identify()
 
     @property
     def may_return(self) -> bool:
@@ -223,7 +243,7 @@ class Monitor:
         if self.changes_left == 0 or not self.alarm:
             return False
         first = self.identified is None and self.moves is None and not self.belief.drives.unknown
-        return first or (self._since >= _EVERY and (self.lost or self._innovations.outside))
+        return first or (self._since >= _EVERY and (not self.belief.explains or self._innovations.outside))
 
     def _identify(self) -> None:
         """Change the belief to what explains all exposures."""
@@ -245,7 +265,6 @@ class Monitor:
         self._innovations.renew()
         period = len(self.past.proximal) - 1
         self.seen = self.belief.in_vessel(self.past.exposures[period], period)
-        self.lost = not self.belief.explains
 
     def _finds_motion(self) -> bool:
         """Return whether a motion of the vessel explains the exposures, and take it into the belief then."""
@@ -255,7 +274,8 @@ class Monitor:
         members, past = self.belief.members, self.past
         if self.moves is None and given.known_motion is None and self._farthest_outside_mm() < _OUTSIDE_MM:
             return False
-        if self.moves is not None and not (self.lost or self._innovations.outside or self._since >= _EVERY):
+        wrong = not self.belief.explains or self._innovations.outside
+        if self.moves is not None and not wrong and self._since < _EVERY:
             return False
         if self.moves is None:
             members = self._given
@@ -289,15 +309,15 @@ class Monitor:
             for seen in self.past.exposures.values()
         )
 
-    def _believed(self, tip: np.ndarray, due: bool) -> BelievedTip:
+    def _believed(self, watch: Watch, tip: np.ndarray, due: bool) -> BelievedTip:
         abscissa, offset = tip.tolist()
         words = [each.words for each in (self.moves, self.belief.drives, self.identified) if each is not None]
         found = "; ".join(each for each in words if each)
         if self.lost:
             asks = "no simulated wire explains the last image" if due or not self._tests else ""
             return BelievedTip(abscissa, offset, (np.inf, np.inf), asks, found)
-        along, across = self._watch.half_width.tolist()
-        asks = self._watch.reason if due else ""
+        along, across = watch.half_width.tolist()
+        asks = watch.reason if due else ""
         return BelievedTip(abscissa, offset, (along, across), asks, found)
 
 

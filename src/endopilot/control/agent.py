@@ -16,12 +16,12 @@ from jaxtyping import Float
 
 from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import Calibration
-from endopilot.belief.belief import Belief
 from endopilot.belief.monitor import BelievedTip, Monitor
+from endopilot.belief.states import State
 from endopilot.control.agent_config import AgentConfig, read_agent_calibration
-from endopilot.control.course import Course
-from endopilot.control.follow import Follower
+from endopilot.control.course import Course, Follower
 from endopilot.control.search import Search, check_devices
+from endopilot.control.trials import Budget
 from endopilot.devices.stack import Proximals
 from endopilot.navigation.policy import Decision, Observation
 from endopilot.progress import Advance
@@ -34,8 +34,8 @@ _WIRE_CREEP_MM_S = 2.0
 """Fastest translation of a wire that should have arrived, and that X-ray shows beside its target, mm/s."""
 _CLEAR_MM = 4.0
 """A wire that is lost is pulled back by this much at least before it is looked at again, mm."""
-_SEEKS = 6
-"""Exposures at which other simulated devices are sought before lost ones are pulled back."""
+_OUT_MM = 0.5
+"""A wire that is inserted no deeper is out, but for the noise of encoders; X-ray shows none then that is believed."""
 _HARDER = 1.1
 """Another course is searched where the drive pushes this many times harder than the last one was searched for."""
 _CREEP_MM_S, _CREEP_PERIODS = 1.0, 6
@@ -59,8 +59,8 @@ class _PlanningPolicy:
         """
         self._given_config = config
 
-    def _believe(self) -> Belief:
-        """Return the belief at the start of the navigation."""
+    def _monitored(self) -> Monitor:
+        """Return the monitor at the start of the navigation."""
         raise NotImplementedError
 
     def wants_xray(self) -> bool:
@@ -80,32 +80,23 @@ class _PlanningPolicy:
         for device in navigation.devices:
             check_passable(self.route, device)
         check_devices(navigation)
-        self.belief, self._seed = self._believe(), seed
-        self._search = self._new_search()
-        self._follower = self._new_follower()
-        self._back_mm, self._measured = np.inf, None
-        self._lost = self._began = self._arrived = self._shows = False
-        self._rested = self._crept = self.plans = self._failed = 0
+        self.monitor, self._seed = self._monitored(), seed
+        self.belief, self._believed = self.monitor.belief, BelievedTip(np.nan, np.nan)
+        self._back_mm, self._arrived, self._shows = np.inf, False, False
+        self._crept = self.plans = 0
         self.planning_s = 0.0
+        self._begin_anew()
 
     def decide(self, observation: Observation) -> Decision:
         """Follow the course, search another one, or pull back, as the module describes."""
-        self._measured = None
         self._observe(observation)
-        if observation.tip is None and self.belief.drives.proximal[0, 0] <= self.navigation.start_inserted_length_mm:
-            self._lost = False  # back where it began, the wire lies as it did, unseen in its catheter
-        self._shows = False
-        self._rested = self._rested if self._lost else 0
-        wanted = self._pull_back() if self._lost else self._go_on(observation)
+        self._shows, lost = False, self.monitor.lost
+        wanted = self._pull_back() if lost else self._go_on(observation)
         self.belief.drives.sent(wanted)
-        ends = self._failed >= self.config.tries and self._follower.course is None and not self._lost
-        ends = ends and not self._tries_another()
-        expose = self._back_far_enough() if self._lost else self.wants_xray()
+        ends = self._failed >= self.config.tries and self._follower.course is None and not lost
+        ends = ends and not self.monitor.may_return
+        expose = self._back_far_enough() if lost else self.wants_xray()
         return Decision(wanted, expose=expose, gives_up=self._search.halt if ends else "")
-
-    def _tries_another(self) -> bool:
-        """Return whether another belief is left to search in."""
-        return False
 
     def watch(self, observation: Observation) -> None:
         """Follow what somebody else does; a new course is searched at the next decision."""
@@ -115,8 +106,7 @@ class _PlanningPolicy:
 
     def believed(self) -> BelievedTip:
         """Return where the likeliest wire has its tip."""
-        tip = self.belief.likeliest_tip()
-        return BelievedTip(float(tip.abscissa[0]), float(tip.offset[0]))
+        return self._believed
 
     def believed_wires(self) -> Float[np.ndarray, "wires nodes 3"]:
         """Return the simulated wires, the likeliest first: nodes from the foremost tip on, LPS mm."""
@@ -138,35 +128,45 @@ class _PlanningPolicy:
         """Where and why the last search ended before the target, in words; empty if it arrived."""
         return self._search.halt
 
-    def _new_search(self) -> Search:
-        return Search(self.belief.navigation, self.route, self.belief, config=self.config.search, seed=self._seed)
+    def _begin_anew(self) -> None:
+        """Forget course and failed searches: what they were made with is no longer believed.
 
-    def _new_follower(self) -> Follower:
+        Walls press as much harder in the search as the drive is felt to push.
+        """
+        self._harder, given = self.monitor.load_ratio, self.belief.navigation
+        navigation = replace(given, force_limit_n=given.force_limit_n / self._harder)
+        budget = Budget(self.config.planning_s or np.inf, self.config.evaluations)
+        search, seed = self.config.search, self._seed
+        self._search = Search(navigation, self.route, self.belief, config=search, seed=seed, budget=budget)
         devices, turn_rad_s = len(self.navigation.devices), self.config.search.turn_rad_s
-        return Follower(self.belief.drives, devices=devices, turn_rad_s=turn_rad_s)
+        self._follower = Follower(self.belief.drives, devices=devices, turn_rad_s=turn_rad_s)
+        self._failed = 0
 
     def _observe(self, observation: Observation) -> None:
-        if self._began:
-            self.belief.follow(observation.devices, observation.load)
-        else:
-            self.belief.drives.begin(observation.devices)
-        self._began = True
-        if observation.tip is not None:
-            self._update(observation.tip)
+        monitor, before = self.monitor, self.monitor.lost
+        self._believed = monitor.step(observation.devices, observation.load, self._shown(observation))
+        if self._failed >= self.config.tries:  # what was identified leads nowhere
+            monitor.return_to_given()
+        if self.belief is not monitor.belief:  # another wire, lumen or ostium: another course
+            self.belief = monitor.belief
+            self._begin_anew()
+        self._limit_load()
+        if monitor.sought or (monitor.seen is not None and (before or monitor.lost)):
+            self._follower.begin(None)  # they lie otherwise than the course was searched for
+        if monitor.seen is not None:
+            self._back_mm = self.belief.drives.proximal[0, 0] - self._way_back(monitor.seen)
 
-    def _update(self, measured: TipMeasurement) -> None:
-        """Weight the simulated wires by a measurement, and note whether all are wrong."""
-        self.belief.weigh(measured)
-        if not self.belief.explains and self.belief.seek(measured):
-            self._follower.begin(None)
-        self._located(measured, lost=not self.belief.explains)
+    def _shown(self, observation: Observation) -> TipMeasurement | None:
+        """Return what the belief is weighed by."""
+        return observation.tip
 
-    def _located(self, measured: TipMeasurement, *, lost: bool) -> None:
-        """Note whether the wire is lost, and how far it is then pulled back."""
-        if lost or self._lost:
-            self._follower.begin(None)
-        self._lost, self._measured = lost, measured
-        self._back_mm = self.belief.drives.proximal[0, 0] - self._way_back(measured)
+    def _limit_load(self) -> None:
+        """Search another course where the drive pushes so hard that the wall would press with more than is safe."""
+        course, ratio = self._follower.course, self.monitor.load_ratio
+        if course is None or ratio < _HARDER * self._harder:
+            return
+        if course.force[self._follower.at :].max(initial=0.0) * ratio > self.navigation.force_limit_n:
+            self._begin_anew()
 
     def _way_back(self, measured: TipMeasurement) -> float:
         """Return how far a wire that is lost is pulled back before it is looked at again, mm.
@@ -194,8 +194,7 @@ class _PlanningPolicy:
         other simulated ones are sought that explain the image.
         """
         config, inserted = self.config.search, self.belief.drives.proximal[:, 0].tolist()
-        self._rested += 1
-        if self.config.belief.copies and self._rested <= _SEEKS:
+        if self.monitor.states.now is State.SEEKING:
             return self._follower.move([0.0 for _ in inserted])
         pulled = [config.manoeuvres.together or inserted[0] <= each for each in inserted]
         return self._follower.move([-config.speed_mm_s if each else 0.0 for each in pulled])
@@ -208,8 +207,8 @@ class _PlanningPolicy:
         self._arrived = self._follower.reached and self._follower.ended
         if self._arrived and arriving:
             return self._creep()
-        if self._arrived and self._measured is not None:  # no wire says what is wrong; the image does
-            along_mm = self.navigation.target.abscissa - self._measured.abscissa
+        if self._arrived and self.monitor.seen is not None:  # no wire says what is wrong; the image does
+            along_mm = self.navigation.target.abscissa - self.monitor.seen.abscissa
             if self.navigation.target.near_mm and abs(along_mm) <= NEAR_MM:  # beside the target: another course
                 self._follower.begin(None)
             left = along_mm / DECISION_PERIOD_S
@@ -249,9 +248,13 @@ class _PlanningPolicy:
             return
         self._crept, self.plans, worked = 0, self.plans + 1, time.process_time()
         horizon_mm = self.config.horizon_mm or np.inf
-        self._follower.begin(self.find_course(seconds, horizon_mm=horizon_mm) if seconds >= DECISION_PERIOD_S else None)
+        course = self.find_course(seconds, horizon_mm=horizon_mm) if seconds >= DECISION_PERIOD_S else None
+        self._follower.begin(course)
         self.planning_s += time.process_time() - worked
-        self._failed = self._failed + 1 if self._follower.course is not None and self.halt else 0
+        if course is None or not self.halt:
+            self._failed = 0
+        elif not (self._search.budget.over and len(course.control)):  # what came on in its time has not failed
+            self._failed += 1
 
 
 class OraclePolicy(_PlanningPolicy):
@@ -274,8 +277,9 @@ class OraclePolicy(_PlanningPolicy):
         stack, anatomy = world.stack(navigation.stack), world.anatomy(navigation.anatomy)
         super().start(replace(navigation, anatomy=anatomy, device=stack.wire, catheters=stack.catheters), seed)
 
-    def _believe(self) -> Belief:
-        return Belief(self.navigation, [World(ostium_mm=self._world.ostium_mm)], self.config.belief)
+    def _monitored(self) -> Monitor:
+        members = [World(ostium_mm=self._world.ostium_mm)]
+        return Monitor(self.navigation, None, config=self.config.belief, members=members)
 
     def wants_xray(self) -> bool:
         """X-ray is always on."""
@@ -285,7 +289,7 @@ class OraclePolicy(_PlanningPolicy):
 class OpenLoopPolicy(OraclePolicy):
     """Plans once with the given parameters, and follows the plan by the encoders without X-ray."""
 
-    def _update(self, measured: TipMeasurement) -> None:
+    def _shown(self, observation: Observation) -> None:
         """Ignore the first exposure."""
 
     def wants_xray(self) -> bool:
@@ -315,13 +319,11 @@ class AgentPolicy(_PlanningPolicy):
         super().__init__(config)
         self._given, self._advice = calibration, advice or AdviserConfig()
 
-    def _believe(self) -> Belief:
+    def _monitored(self) -> Monitor:
         navigation = self.navigation
         self._calibration = self._given or read_agent_calibration(navigation.xray, len(navigation.devices))
-        self.monitor = Monitor(navigation, self._calibration, config=self.config.belief, advice=self._advice)
-        self._believed, self._losses = BelievedTip(np.nan, np.nan), 0
         self._exposures = 1  # a navigation begins with one
-        return self.monitor.belief
+        return Monitor(navigation, self._calibration, config=self.config.belief, advice=self._advice)
 
     def decide(self, observation: Observation) -> Decision:
         """Follow the course as the module describes; end where belief after belief was lost."""
@@ -330,13 +332,13 @@ class AgentPolicy(_PlanningPolicy):
             given = f"{self.navigation.force_limit_n:g} N is given"
             harder = f"the drive pushes {self._harder:.1f} times as hard as simulated wires"
             return replace(decision, gives_up=f"{decision.gives_up}: {given}, and {harder}")
-        if self._losses < self.config.losses or decision.gives_up:
+        losses, seen = self.monitor.states.losses, self.monitor.seen
+        out = self.belief.drives.proximal[0, 0] <= _OUT_MM and self.monitor.states.now is State.LOST
+        if decision.gives_up or not (losses >= self.config.losses or (out and seen is not None)):
             return self._within_dose(decision)
-        seen = self.monitor.seen
         at = "" if seen is None else f" at {seen.abscissa:.0f} mm"
-        return replace(
-            decision, gives_up=f"lost {self._losses} times: no wire, lumen or ostium explains what X-ray shows{at}"
-        )
+        how = "pulled out, the wire is still seen" if out else f"lost {losses} times"
+        return replace(decision, gives_up=f"{how}: no wire, lumen or ostium explains what X-ray shows{at}")
 
     def _within_dose(self, decision: Decision) -> Decision:
         """Return a decision, or one that gives up where it asks for more exposures than the agent may take."""
@@ -349,43 +351,6 @@ class AgentPolicy(_PlanningPolicy):
             gives_up=decision.gives_up or f"{most} exposures did not suffice; AgentConfig.most_exposures allows more",
         )
 
-    def _observe(self, observation: Observation) -> None:
-        monitor, before = self.monitor, self.monitor.lost
-        self._believed = monitor.step(observation.devices, observation.load, observation.tip)
-        if self._failed >= self.config.tries:  # what was identified leads nowhere
-            monitor.return_to_given()
-        if self.belief is not monitor.belief:  # another wire, lumen or ostium: another course
-            self.belief = monitor.belief
-            self._begin_anew()
-        self._limit_load()
-        if monitor.sought:  # they lie otherwise than the course was searched for
-            self._follower.begin(None)
-        if monitor.seen is not None:
-            self._located(monitor.seen, lost=monitor.lost)
-        self._lost = monitor.lost
-        self._losses += self._lost and not before
-
-    def _limit_load(self) -> None:
-        """Search another course where the drive pushes so hard that the wall would press with more than is safe."""
-        course, ratio = self._follower.course, self.monitor.load_ratio
-        if course is None or ratio < _HARDER * self._harder:
-            return
-        if course.force[self._follower.at :].max(initial=0.0) * ratio > self.navigation.force_limit_n:
-            self._begin_anew()
-
-    def _begin_anew(self) -> None:
-        """Forget course and failed searches: what they were made with is no longer believed."""
-        self._search, self._follower, self._failed = self._new_search(), self._new_follower(), 0
-
-    def _new_search(self) -> Search:
-        """Return a search in which walls press as much harder as the drive is felt to push."""
-        self._harder, given = self.monitor.load_ratio, self.belief.navigation
-        navigation = replace(given, force_limit_n=given.force_limit_n / self._harder)
-        return Search(navigation, self.route, self.belief, config=self.config.search, seed=self._seed)
-
-    def _tries_another(self) -> bool:
-        return self.monitor.may_return
-
     def wants_xray(self) -> bool:
         """Ask the monitor; a device that should have arrived, and the end of a manoeuvre, are looked at."""
         return bool(self._believed.asks) or self._arrived or self._shows
@@ -393,7 +358,7 @@ class AgentPolicy(_PlanningPolicy):
     def believed(self) -> BelievedTip:
         """Return where the likeliest wire has its tip, the adviser's bands around it, and why it asks for X-ray."""
         asks = self._believed.asks
-        if not self._lost:
+        if not self.monitor.lost:
             asks = "a manoeuvre is over" if self._shows else asks
             asks = "the tip should be at the target" if self._arrived else asks
         return replace(self._believed, asks=asks)

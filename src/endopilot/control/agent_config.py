@@ -39,6 +39,11 @@ class AgentConfig:
     """Times that the devices may be lost, after which the agent gives up: each time another belief was sought."""
     horizon_mm: Positive | None = None
     """A course may end when it leads this far on, mm, and is searched on from there; all the way if not given."""
+    evaluations: Annotated[int, Within(1, 10**12)] = 100_000
+    """Decision periods of a world that a search may simulate; it then ends with the course that it has. Some 30 s of a
+    core in coronary arteries, where the longest of 21 navigations' decisions took 21 s; minutes with long devices."""
+    planning_s: Positive | None = None
+    """Processor time after which a search ends likewise, s: then its bits hang on the machine's speed."""
     most_exposures: Annotated[int, Within(1, 10**6)] = 40
     """Exposures that an agent which looks when its adviser asks may take; it gives up where it needs more."""
 

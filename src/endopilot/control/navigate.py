@@ -7,6 +7,7 @@ believed it to be.
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -16,7 +17,8 @@ from jaxtyping import Float
 
 from endopilot.anatomy.catheter_axis import lean_between, with_axis
 from endopilot.anatomy.io import read_anatomy
-from endopilot.control.agent import OraclePolicy
+from endopilot.control.agent import AgentPolicy, OraclePolicy
+from endopilot.control.propose import propose_devices
 from endopilot.control.set_up import TILT_DEG, TipChoice, choose_tip
 from endopilot.devices.device import Wire
 from endopilot.devices.robot import ASSUMED, RobotConfig, read_robot
@@ -140,6 +142,8 @@ class PatientNavigation:
             tip on, LPS mm; None for a policy that does not tell.
         plans: how often the policy searched a course; None for one that does not count.
         planning_s: processor time that its searches took, s; None likewise.
+        decision_s: wall time that each decision took, s.
+        proposal: shipped devices that a search brings to the target where the agent gave up; empty if there are none.
     """
 
     set_up: SetUp
@@ -148,6 +152,8 @@ class PatientNavigation:
     wires: tuple[Float[np.ndarray, "wires nodes 3"], ...] | None
     plans: int | None
     planning_s: float | None
+    decision_s: Float[np.ndarray, "decisions"]
+    proposal: str
 
 
 @public
@@ -242,9 +248,13 @@ def drive(set_up: SetUp) -> PatientNavigation:
     )
     loop = NavigationLoop(navigation, policy, config=config, seed=set_up.config.seed, world=set_up.world)
     wires: list[Float[np.ndarray, "wires nodes 3"]] = []
+    decision_s: list[float] = []
     with progress(f"Navigating, {set_up.policy_name}", total=navigation.seconds) as advance:
         while loop.reason is None:
-            loop.step()
+            began = time.perf_counter()
+            loop.begin()
+            decision_s.append(time.perf_counter() - began)
+            loop.advance(DECISION_PERIOD_S)
             if loop.gives_up:
                 loop.stop()
             advance(DECISION_PERIOD_S, f"{loop.simulator.inserted_length[0, 0]:.0f} mm inserted")
@@ -266,6 +276,8 @@ def drive(set_up: SetUp) -> PatientNavigation:
         wires=tuple(wires) if wires else None,
         plans=getattr(policy, "plans", None),
         planning_s=getattr(policy, "planning_s", None),
+        decision_s=np.array(decision_s),
+        proposal=propose_devices(navigation) if loop.gives_up and isinstance(policy, AgentPolicy) else "",
     )
 
 

@@ -59,7 +59,8 @@ def why_not(found: PatientNavigation) -> str:
     else:
         where += f", {navigation.target.abscissa - at:.1f} mm before the target"
     if record.gives_up:
-        return f"{where}; the policy gave up: {record.gives_up}"
+        proposal = f"; in a search {found.proposal} reaches it" if found.proposal else ""
+        return f"{where}; the policy gave up: {record.gives_up}{proposal}"
     return f"{where}: {_held_up(found, route)}"
 
 
@@ -102,6 +103,12 @@ def _narrowest(route: Route, came_mm: float, wire_radius_mm: float) -> tuple[flo
     if wire_radius_mm < _TIGHT_RATIO * line.radius[at]:
         return None
     return float(line.abscissa[at]), 2 * float(line.radius[at])
+
+
+def decision_times(found: PatientNavigation) -> dict[str, float]:
+    """Return how long decisions took, wall time, s: the median, the 99th percentile and the longest."""
+    median, most, longest = np.quantile(found.decision_s, [0.5, 0.99, 1.0]).tolist()
+    return {"median": round(median, 3), "p99": round(most, 3), "longest": round(longest, 3)}
 
 
 def worst_ratio(found: PatientNavigation) -> float:

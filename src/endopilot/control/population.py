@@ -12,6 +12,7 @@ radius. So devices that are too soft to be pushed on are turned on.
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -38,30 +39,29 @@ _OFF_ROUTE = 0.5
 """Cost of each mm that a tip lies off the route, mm."""
 
 
-class Population:
+@dataclass(eq=False)
+class Sampler:
+    """Trials by which motions are drawn.
+
+    Attributes:
+        navigation: with the wire and the force limit.
+        route: to the target.
+        trials: a candidate each.
+        config: settings of the search.
+        random: what is drawn from.
+    """
+
+    navigation: Navigation
+    route: Route
+    trials: Trials
+    config: SearchConfig
+    random: np.random.Generator
+
+
+class Population(Sampler):
     """Candidates of a wire, alone or with a catheter around it that rests, follows or goes along."""
 
-    def __init__(
-        self,
-        navigation: Navigation,
-        route: Route,
-        trials: Trials,
-        config: SearchConfig,
-        random: np.random.Generator,
-    ) -> None:
-        """Take the candidates.
-
-        Args:
-            navigation: with the wire and the force limit.
-            route: to the target.
-            trials: a candidate each.
-            config: settings of the search.
-            random: what is drawn from.
-        """
-        self._navigation, self._route, self._trials = navigation, route, trials
-        self._config, self._random = config, random
-        self._wire_radius = navigation.device.tip_radius_mm
-        self._rests = False
+    _rests = False
 
     def find(
         self, one: Trials, waypoint: float, *, rounds: int, spare_share: float, rests: bool = False
@@ -78,7 +78,7 @@ class Population:
             rests: whether a catheter rests.
         """
         self._rests = rests
-        attempts, nearest, best = self._config.attempts, np.inf, np.zeros((0, one.devices, 2))
+        attempts, nearest, best = self.config.attempts, np.inf, np.zeros((0, one.devices, 2))
         for attempt in range(attempts):
             share = spare_share if 2 * attempt < attempts else 1.0
             score, controls, won = self.attempt(one, waypoint, rounds, attempt, share)
@@ -92,17 +92,17 @@ class Population:
         self, one: Trials, waypoint: float, rounds: int, attempt: int, force_share: float
     ) -> tuple[float, Controls, bool]:
         """Search once; return the least cost so far and to go, its controls, and whether they pass the place."""
-        trials, count = self._trials.copy_of(one), self._trials.count
+        trials, count = self.trials.copy_of(one), self.trials.count
         begun = np.zeros((count, trials.devices, 2))
         history, spent, peak = begun[None][:0], np.zeros(count), np.zeros(trials.simulator.worlds)
-        most_n = force_share * self._navigation.force_limit_n
+        most_n = force_share * self.navigation.force_limit_n
         nearest, best = np.inf, history[:, 0]
         for number in range(rounds):
             before = history[-1] if number else begun
             drawn = self._draw(before, number, attempt)
-            drawn = trials.possible(drawn, alike=True, periods=self._config.round_periods)
+            drawn = trials.possible(drawn, alike=True, periods=self.config.round_periods)
             spent += self._run_round(drawn, before, waypoint, peak)
-            history = np.concatenate([history, np.repeat(drawn[None], self._config.round_periods, axis=0)])
+            history = np.concatenate([history, np.repeat(drawn[None], self.config.round_periods, axis=0)])
             score, share = self._judge(waypoint, spent, peak <= most_n)
             won = share >= max(1 - _LEFT_BEHIND * attempt, _LEAST_SHARE) - 1e-9
             if won.any():
@@ -123,7 +123,7 @@ class Population:
         In the first round they turn the tip to all sides, and pull back, in later attempts farther; in the second most
         go straight on; then they move at random, and a few go on with what they did.
         """
-        count, config, random = self._trials.count, self._config, self._random
+        count, config, random = self.trials.count, self.config, self.random
         turn = np.where(random.random(count) < 0.25, 0.0, random.uniform(-1.0, 1.0, count)) * config.turn_rad_s
         if number == 0:
             sides = (np.arange(count) + random.random(count)) / count
@@ -135,8 +135,8 @@ class Population:
         else:
             back = random.random(count) < 0.45
             speed = np.where(back, random.uniform(-0.8, 0.0, count), random.uniform(0.1, 0.8, count))
-        drawn = self._trials.control(Move(WIRE, np.clip(speed, -1.0, 1.0) * config.speed_mm_s, turn))
-        if self._trials.devices > 1 and not self._rests:
+        drawn = self.trials.control(Move(WIRE, np.clip(speed, -1.0, 1.0) * config.speed_mm_s, turn))
+        if self.trials.devices > 1 and not self._rests:
             way = random.random(count)
             alike = np.where(way < _RESTS + _FOLLOWS, random.uniform(0.0, 1.0, count), speed)
             drawn[:, CATHETER, 0] = np.where(way < _RESTS, 0.0, np.clip(alike, -1.0, 1.0)) * config.speed_mm_s
@@ -146,26 +146,26 @@ class Population:
 
     def _run_round(self, control: Control, before: Control, waypoint: float, peak: Float[np.ndarray, "worlds"]) -> Each:
         """Drive all candidates for a round; return what it cost each, and note the largest forces."""
-        trials, cost = self._trials, self._config.cost
+        trials, cost = self.trials, self.config.cost
         spent = cost.roughness(before[:, WIRE], control[:, WIRE], trials.fastest)
-        for _ in range(self._config.round_periods):
+        for _ in range(self.config.round_periods):
             step = trials.drive(control)
             tip = trials.tips[:, WIRE]
             running = cost.running(
                 error=self._distance(step.tip_position[:, WIRE], waypoint),
-                ratio=safety_ratio(tip.offset, tip.radius, self._wire_radius),
-                force_share=step.contact_force_max / self._navigation.force_limit_n,
+                ratio=safety_ratio(tip.offset, tip.radius, self.navigation.device.tip_radius_mm),
+                force_share=step.contact_force_max / self.navigation.force_limit_n,
             )
             spent += DECISION_PERIOD_S * trials.mean(np.where(step.valid, running, _FAILED_MM_S))
             np.maximum(peak, np.where(step.valid, step.contact_force_max, np.inf), out=peak)
         return spent
 
     def _distance(self, position: Float[np.ndarray, "n 3"], waypoint: float) -> Float[np.ndarray, "n"]:
-        return np.linalg.norm(position - self._route.position(waypoint), axis=-1)
+        return np.linalg.norm(position - self.route.position(waypoint), axis=-1)
 
     def _judge(self, waypoint: float, spent: Each, gentle: Bool[np.ndarray, "worlds"]) -> tuple[Each, Each]:
         """Return each candidate's cost so far and to go, and the share of its wires that passed gently."""
-        trials, route = self._trials, self._route
+        trials, route = self.trials, self.route
         tip = trials.tips[:, WIRE]
         to_go = self._distance(trials.simulator.tip_position[:, WIRE], waypoint) + _OFF_ROUTE * route.off_route(tip)
         passed = route.passed(tip, waypoint) & trials.simulator.valid & gentle
@@ -173,8 +173,8 @@ class Population:
 
     def _select(self, score: Each) -> Int[np.ndarray, "candidates"]:
         """Return whose copy each candidate becomes: the best stay and are copied over the others."""
-        best = np.argsort(score)[: max(1, round(self._config.keep_share * len(score)))]
-        others = self._random.choice(best, len(score) - len(best))
+        best = np.argsort(score)[: max(1, round(self.config.keep_share * len(score)))]
+        others = self.random.choice(best, len(score) - len(best))
         return np.concatenate([best, others])
 
 
@@ -201,35 +201,21 @@ _LOOPS_MM, _LOOPS_COST = 40.0, 0.4
 is pushed then is laid into loops."""
 
 
-class ConstantMotions:
+class ConstantMotions(Sampler):
     """Candidates of a wire and its catheter, each with a motion of its own."""
 
-    def __init__(
-        self,
-        navigation: Navigation,
-        route: Route,
-        trials: Trials,
-        config: SearchConfig,
-        random: np.random.Generator,
-    ) -> None:
-        """Take the candidates.
+    _last: Float[np.ndarray, "devices 2"] | float = 0.0
+    """The motion that was best before."""
 
-        Args:
-            navigation: with the force limit.
-            route: to the target.
-            trials: a candidate each.
-            config: settings of the search.
-            random: what is drawn from.
-        """
-        self._navigation, self._route, self._trials = navigation, route, trials
-        self._config, self._random = config, random
-        self._last = np.zeros((trials.devices, 2))
-        self._free_mm = config.manoeuvres.behind_mm + navigation.device.tip_bend_length_mm
+    @property
+    def _free_mm(self) -> float:
+        """How far behind the wire's tip a catheter stays, mm: behind its bend."""
+        return self.config.manoeuvres.behind_mm + self.navigation.device.tip_bend_length_mm
 
     @cached_property
     def _loops_mm(self) -> float:
         """Slack beyond which devices are laid into loops, mm."""
-        return max(self._route.outer_mm(self._route.narrow_from()), _LOOPS_MM)
+        return max(self.route.outer_mm(self.route.narrow_from()), _LOOPS_MM)
 
     def best(self, one: Trials, held_at: float, least_mm: float) -> tuple[Controls, float]:
         """Return the best of the motions that were drawn, and how far it brings the devices on, mm.
@@ -242,7 +228,7 @@ class ConstantMotions:
             held_at: where along the route the catheter's tip is to be held, mm.
             least_mm: a motion that brings them on so far will do, mm.
         """
-        trials, limit_n = self._trials.copy_of(one), self._navigation.force_limit_n
+        trials, limit_n = self.trials.copy_of(one), self.navigation.force_limit_n
         control = trials.possible(self._draw(), alike=True, periods=_LOOK_PERIODS)
         gentle, arrives = np.ones(trials.count, dtype=bool), np.full(trials.count, sys.maxsize)
         gain, kept = np.zeros(trials.count), 0
@@ -250,7 +236,7 @@ class ConstantMotions:
             kept += _KEPT_PERIODS
             for _ in range(_LOOK_PERIODS):
                 gentle &= ~trials.move(self._unless_full(control) if catheter_gain == 0 else control, force_n=limit_n)
-                there = gentle & ~trials.still & trials.all(self._navigation.reached(trials.tips))
+                there = gentle & ~trials.still & trials.all(self.navigation.reached(trials.tips))
                 arrives[there] = len(trials.rows)
                 trials.still |= there
             come = self._come(trials, held_at, catheter_gain) - float(self._come(one, held_at, catheter_gain)[0])
@@ -266,18 +252,18 @@ class ConstantMotions:
 
     def _unless_full(self, control: Control) -> Control:
         """Return a control that does not push devices whose loops are full: they come forward as they unbend."""
-        full = self._slack(self._trials) > self._loops_mm
+        full = self._slack(self.trials) > self._loops_mm
         made = control.copy()
         made[full, :, 0] = np.minimum(made[full, :, 0], 0.0)
         return made
 
     def _slack(self, trials: Trials) -> Each:
-        return trials.deepest - trials.progress(self._route)
+        return trials.deepest - trials.progress(self.route)
 
     def _draw(self) -> Control:
         """Draw a motion for each candidate; the first goes on as was best before, the second is pushed straight."""
-        trials, random, fast = self._trials, self._random, self._config.speed_mm_s
-        turn = min(self._config.turn_rad_s, float(trials.fastest[1]))
+        trials, random, fast = self.trials, self.random, self.config.speed_mm_s
+        turn = min(self.config.turn_rad_s, float(trials.fastest[1]))
 
         def draw(speeds: tuple[float, ...], turns: tuple[float, ...]) -> tuple[Each, Each]:
             return fast * random.choice(speeds, trials.count), turn * random.choice(turns, trials.count)
@@ -297,8 +283,8 @@ class ConstantMotions:
 
         Loops make it less, and a catheter that is not yet where it is to be held, behind the bent tip of the wire.
         """
-        tips, target = trials.tips, self._route.target.abscissa
-        along = self._route.progress(tips) - self._route.off_route(tips)
+        tips, target = trials.tips, self.route.target.abscissa
+        along = self.route.progress(tips) - self.route.off_route(tips)
         wire, catheter = trials.mean(along[:, WIRE]), trials.mean(along[:, CATHETER])
         deeper = np.maximum(catheter - held_at - _DEEPER_MM, 0.0)
         catheter = np.minimum(np.minimum(catheter, held_at), wire - self._free_mm) - deeper

@@ -42,7 +42,7 @@ from endopilot.control.push import (
 from endopilot.control.search_config import SearchConfig
 from endopilot.control.set_up import SPARE_SHARE, describe_halt, near_fork
 from endopilot.control.together import STRAIGHT, Grid, Repertoire, Together, place, retract
-from endopilot.control.trials import STALL_PERIODS, WIRE, Kept, Move, Trials
+from endopilot.control.trials import STALL_PERIODS, WIRE, Budget, Kept, Move, OutOfBudgetError, Trials
 from endopilot.errors import InputError
 from endopilot.progress import Advance
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
@@ -74,10 +74,18 @@ class Search:
 
     Attributes:
         halt: where and why the last search ended before the target, in words; empty if it arrived.
+        budget: of a search, which ends with what it has once that is spent.
     """
 
     def __init__(
-        self, navigation: Navigation, route: Route, belief: Belief, *, config: SearchConfig, seed: int
+        self,
+        navigation: Navigation,
+        route: Route,
+        belief: Belief,
+        *,
+        config: SearchConfig,
+        seed: int,
+        budget: Budget | None = None,
     ) -> None:
         """Lay out the trials.
 
@@ -87,6 +95,7 @@ class Search:
             belief: whose wires they are, and whose settings of the rod core are taken.
             config: settings of the search.
             seed: of what is drawn at random.
+            budget: of each call of `find`; none if not given.
 
         Raises:
             InputError: there is more than one catheter.
@@ -95,14 +104,15 @@ class Search:
         self._navigation, self.route, self.config = navigation, route, config
         self._alone, wide = not navigation.catheters, route.is_wide(route.target.abscissa)
         self._repertoire = Repertoire.of(navigation.catheters, config, wide=wide)
-        trials_of = partial(Trials.of, navigation, belief.kinds, like=belief.simulator)
+        self.budget = budget or Budget()
+        trials_of = partial(Trials.of, navigation, belief.kinds, like=belief.simulator, budget=self.budget)
         self._course, self._many = trials_of(count=1), trials_of(count=self._repertoire.trials)
         self._few = self._course if self._alone else trials_of(count=len(self._repertoire.leads))
         drawn = trials_of(count=config.candidates) if config.manoeuvres.together else self._many
         random = np.random.default_rng([seed, 0x5EA])
         self._population = Population(navigation, route, drawn, config, random)
         motions = ConstantMotions(navigation, route, drawn, config, random)
-        self._together = Together(navigation, route, self._course, self._population, motions, config, random)
+        self._together = Together(navigation, route, self._course, config, random, self._population, motions)
         self.halt = ""
 
     @property
@@ -135,14 +145,19 @@ class Search:
         gentle_n = SPARE_SHARE * self._navigation.force_limit_n
         best: Course | None = None
         halt = ""
+        self.budget.begin()
         for angle in _TURNS if first and self._alone else _TURNS[:1]:
             course = self.find_turned(belief, angle, seconds=seconds, horizon_mm=horizon_mm, advance=advance)
             if best is None or _merit(course) > _merit(best):
                 best, halt = course, self.halt
-            if (course.reached > 0.5 and course.force.max(initial=0.0) <= gentle_n) or self._at_fork:
+            if (
+                (course.reached > 0.5 and course.force.max(initial=0.0) <= gentle_n)
+                or self._at_fork
+                or self.budget.over
+            ):
                 break
         assert best is not None
-        if best.reached <= 0.5 and self._behind_mm > 0:
+        if best.reached <= 0.5 and self._behind_mm > 0 and not self.budget.over:
             course = self.find_turned(belief, 0.0, seconds=seconds, advance=advance, out=True)
             if course.reached > 0.5:
                 return course
@@ -164,26 +179,48 @@ class Search:
         Args:
             out: whether a wire alone is first pulled back to before the last fork that it has passed.
         """
-        course, reported, settled = self._course, 0.0, []
-        pair, together = self._together, self.config.manoeuvres.together
+        course, settled = self._course, list[int]()
         source, weight = belief.likeliest()
         course.put(source, belief.simulator, weight)
-        self._behind_mm = self._before_fork()
+        self._behind_mm, self._kept = self._before_fork(), course.kept()
         self.halt, self._at_fork = "", False
-        most_periods = pair.most_periods = self._most_periods(seconds, horizon_mm)
+        self._together.most_periods = self._most_periods(seconds, horizon_mm)
+        try:
+            self._set_out(angle, out=out)
+            self._lead(settled, horizon_mm, advance)
+        except OutOfBudgetError:
+            course.restore(self._kept)
+            self.halt = f"the search came to {self._here:.0f} mm in its budget; give more (AgentConfig.evaluations)"
+        reached = self._reached()
+        if reached <= 0.5:
+            self._cut_hard()
+        return course.as_course(
+            reached=reached,
+            ostium_mm=float(belief.ostium_mm[source[0]]),
+            settled=None if self._alone else settled,
+        )
+
+    def _set_out(self, angle: float, *, out: bool) -> None:
+        """Turn the devices, rad, and pull a wire alone back to before the last fork that it has passed, if wanted."""
+        course = self._course
         if angle:
-            turn(course, np.array([angle]), periods=most_periods)
+            turn(course, np.array([angle]), periods=self._left)
         while out and self._here > self._behind_mm and course.lengths[:, WIRE].min() > 1.0 and self._left > 0:
             course.move(course.control(Move(WIRE, -self.config.speed_mm_s)))
-        begun = self._here
+
+    def _lead(self, settled: list[int], horizon_mm: float, advance: Advance | None) -> None:
+        """Lead the course from place to place, and note the periods at whose ends a manoeuvre is over."""
+        course, pair, together = self._course, self._together, self.config.manoeuvres.together
+        reported, begun = 0.0, self._here
         places = places_of(self.route, begun, alone=self._alone, together=together)
-        while len(course.rows) < most_periods:
+        while self._left > 0:
             here = self._here
             if advance is not None:
                 advance(max(here - reported, 0.0))
                 reported = max(here, reported)
             pair.set_out()
             waypoint, kept, self._tried = next_place(places, here, alone=self._alone), course.kept(), {}
+            self._kept = kept
             halt = "stalled" if pair.ahead else self._straight(waypoint)
             if halt is None:
                 if together:
@@ -217,14 +254,6 @@ class Search:
                 break
         else:
             self._halted("late", 0.0)
-        reached = self._reached()
-        if reached <= 0.5:
-            self._cut_hard()
-        return course.as_course(
-            reached=reached,
-            ostium_mm=float(belief.ostium_mm[source[0]]),
-            settled=None if self._alone else settled,
-        )
 
     def _most_periods(self, seconds: float, horizon_mm: float) -> int:
         """Return how many decision periods a course may take in some time, s.

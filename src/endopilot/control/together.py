@@ -20,14 +20,13 @@ from typing import NamedTuple
 import numpy as np
 
 from endopilot.control.course import Controls
-from endopilot.control.population import ConstantMotions, Population
+from endopilot.control.population import ConstantMotions, Population, Sampler
 from endopilot.control.push import ALL_ALONG_MM, REST_MM, Each
 from endopilot.control.search_config import SearchConfig
 from endopilot.control.set_up import SPARE_SHARE
 from endopilot.control.trials import CATHETER, WIRE, Kept, Move, Trials
 from endopilot.devices.catheter import Catheter
-from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
-from endopilot.tasks.route import Route
+from endopilot.tasks.navigation import DECISION_PERIOD_S
 
 _LOOKOUT_MM = 12.0
 """Motions are drawn that lead to a place no farther ahead than this, mm."""
@@ -50,81 +49,65 @@ _RETREAT_MM = 10.0, 40.0
 """A wire that is stuck is pulled back by between these two, mm."""
 
 
-class Together:
+@dataclass(eq=False)
+class Together(Sampler):
     """What the course of a wire and its catheter does where a straight push fails, and in narrow lumens.
 
     Attributes:
+        trials: the course.
+        population: by which motions are drawn one after another.
+        motions: by which motions are drawn that stay the same.
         ahead: whether the wire goes ahead of its catheter now, in a narrow lumen to which its own tip is to go.
         most_periods: decision periods that the course may take.
     """
 
-    def __init__(
-        self,
-        navigation: Navigation,
-        route: Route,
-        course: Trials,
-        population: Population,
-        motions: ConstantMotions,
-        config: SearchConfig,
-        random: np.random.Generator,
-    ) -> None:
-        """Take a course.
-
-        Args:
-            navigation: with the force limit.
-            route: to its target.
-            course: the devices.
-            population: by which motions are drawn one after another.
-            motions: by which motions are drawn that stay the same.
-            config: settings of the search.
-            random: what is drawn from.
-        """
-        self._navigation, self._route, self._course = navigation, route, course
-        self._population, self._motions, self._config, self._random = population, motions, config, random
-        self.ahead, self.most_periods = False, 0
+    population: Population
+    motions: ConstantMotions
+    ahead: bool = False
+    most_periods: int = 0
 
     @cached_property
     def _held_at(self) -> float:
         """How far along the route the catheter's tip is held, mm."""
-        return self._route.bends_from(self._route.narrow_from(_HELD_MM), _TIGHT_MM) - _BEFORE_MM
+        return self.route.bends_from(self.route.narrow_from(_HELD_MM), _TIGHT_MM) - _BEFORE_MM
 
     @cached_property
     def _loose_mm(self) -> float:
         """Slack with which devices lie in loops, mm."""
-        return max(self._route.outer_mm(self._route.narrow_from()), _LOOSE_MM)
+        return max(self.route.outer_mm(self.route.narrow_from()), _LOOSE_MM)
 
     def set_out(self) -> None:
         """Note whether the wire goes ahead from where the devices are."""
-        soft = self._config.manoeuvres.together and not self._navigation.arriving
-        self.ahead = soft and self.here >= self._route.narrow_from()
+        soft = self.config.manoeuvres.together and not self.navigation.arriving
+        self.ahead = soft and self.here >= self.route.narrow_from()
 
     @property
     def here(self) -> float:
         """How far along the route the devices have come, mm."""
-        return float(self._course.progress(self._route)[0])
+        return float(self.trials.progress(self.route)[0])
 
     @property
     def slack_mm(self) -> float:
         """How much deeper than that the foremost of them is inserted, mm: what lies in loops."""
-        return float(self._course.deepest[0]) - self.here
+        return float(self.trials.deepest[0]) - self.here
 
     @property
     def lead_mm(self) -> float:
         """How much deeper the wire is inserted than its catheter, mm."""
-        return float((self._course.inserted(WIRE) - self._course.inserted(CATHETER))[0])
+        return float((self.trials.inserted(WIRE) - self.trials.inserted(CATHETER))[0])
 
     @property
     def left(self) -> int:
         """Decision periods that the course may still take."""
-        return self.most_periods - len(self._course.rows)
+        return self.most_periods - len(self.trials.rows)
 
     def pull_taut(self, waypoint: float) -> None:
         """Pull devices back that have passed a place with slack: what lies in loops comes out, and the tip stays.
 
         A device in loops presses forward with EI / 2R² as it unbends, R being the radius of the wide lumen.
         """
-        course, speed = self._course, self._config.speed_mm_s
-        if self.slack_mm <= _SLACK_MM or waypoint >= self._route.target.abscissa:
+        course, speed = self.trials, self.config.speed_mm_s
+        if self.slack_mm <= _SLACK_MM or waypoint >= self.route.target.abscissa:
             return
         kept, passed = course.kept(), self.here
         back = course.control(*(Move(device, -speed) for device in range(course.devices)))
@@ -143,17 +126,17 @@ class Together:
             waypoint: the place that is to be passed, mm.
             kept: where the devices lay.
         """
-        self._course.restore(kept)
+        self.trials.restore(kept)
         begun = self.here
         if self.ahead:
-            controls, gain_mm = self._motions.best(self._course, self._held_at, self._step_mm(begun))
+            controls, gain_mm = self.motions.best(self.trials, self._held_at, self._step_mm(begun))
             if gain_mm >= self._step_mm(begun):
                 self._follow(controls)
                 return True
-        goal = min(self._route.next_waypoint(begun), begun + _LOOKOUT_MM)
-        rounds = min(self._config.rounds, self.left // self._config.round_periods)
-        course, share = self._course, SPARE_SHARE
-        self._follow(self._population.find(course, goal, rounds=rounds, spare_share=share, rests=self.ahead)[0])
+        goal = min(self.route.next_waypoint(begun), begun + _LOOKOUT_MM)
+        rounds = min(self.config.rounds, self.left // self.config.round_periods)
+        course, share = self.trials, SPARE_SHARE
+        self._follow(self.population.find(course, goal, rounds=rounds, spare_share=share, rests=self.ahead)[0])
         if self.here < begun + self._step_mm(begun) or self.slack_mm > self._loose_mm:
             return False
         if not self.ahead:
@@ -162,11 +145,11 @@ class Together:
 
     def _step_mm(self, here: float) -> float:
         """Return how far devices have to come forward in a step, mm: half the distance to the target, near to it."""
-        return min(_GAIN_MM, _NEARER * abs(self._route.target.abscissa - here))
+        return min(_GAIN_MM, _NEARER * abs(self.route.target.abscissa - here))
 
     def _follow(self, controls: Controls) -> None:
         """Let the devices do what was found, until they are at the target."""
-        course, navigation = self._course, self._navigation
+        course, navigation = self.trials, self.navigation
         for control in controls[: self.left]:
             course.move(control[None])
             if course.all(navigation.reached(course.tips))[0]:
@@ -177,12 +160,12 @@ class Together:
 
         Its catheter comes back too where its tip lies beyond a fork at which the wire has left it.
         """
-        course, random = self._course, self._random
+        course, random = self.trials, self.random
         course.restore(kept)
-        astray = bool((self._route.off_route(course.tips[:, CATHETER]) > 0).any())
+        astray = bool((self.route.off_route(course.tips[:, CATHETER]) > 0).any())
         leads, wire_mm = self.lead_mm > 0, random.uniform(*_RETREAT_MM)
         catheter_mm = random.uniform(*_RETREAT_MM) if astray or not leads else 0.0
-        periods = int(np.ceil(max(wire_mm, catheter_mm) / (self._config.speed_mm_s * DECISION_PERIOD_S)))
+        periods = int(np.ceil(max(wire_mm, catheter_mm) / (self.config.speed_mm_s * DECISION_PERIOD_S)))
         back = [-mm / (periods * DECISION_PERIOD_S) for mm in (wire_mm, catheter_mm)]
         for _ in range(min(periods, self.left)):
             if course.lengths.min() < 1.0 or self.slack_mm < -_TAUT_MM or (leads and self.lead_mm <= 0):

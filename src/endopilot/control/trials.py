@@ -1,7 +1,8 @@
-"""Trials of a stack of devices that are driven side by side: `Trials`."""
+"""Trials of a stack of devices that are driven side by side: `Trials`, within the `Budget` of a search."""
 
 from __future__ import annotations
 
+import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -79,6 +80,43 @@ class Kept(NamedTuple):
         return len(self.rows)
 
 
+class OutOfBudgetError(Exception):
+    """A search has spent its budget."""
+
+
+class Budget:
+    """What a search may spend, by which it ends whatever it is at: all that it does is to drive trials.
+
+    Attributes:
+        over: whether it is spent.
+    """
+
+    def __init__(self, seconds: float = np.inf, evaluations: float | int = np.inf) -> None:
+        """Give a budget.
+
+        Args:
+            seconds: processor time of this thread, s: wall time where nothing else takes the processor.
+            evaluations: simulated decision periods of a world: by them alone the bits of a search repeat.
+        """
+        self._seconds, self._evaluations = seconds, evaluations
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin another search."""
+        self.over, self._until, self._left = False, time.thread_time() + self._seconds, self._evaluations
+
+    def spend(self, worlds: int) -> None:
+        """Take a decision period of some worlds off.
+
+        Raises:
+            OutOfBudgetError: nothing is left.
+        """
+        if self._left < worlds or time.thread_time() > self._until:
+            self.over = True
+            raise OutOfBudgetError
+        self._left -= worlds
+
+
 class Trials:
     """Trials of a stack that are driven side by side.
 
@@ -95,22 +133,32 @@ class Trials:
         rows: what they have done, period by period.
     """
 
-    def __init__(self, simulator: Simulator, limits: Sequence[DriveLimits], *, wires: int = 1) -> None:
+    def __init__(
+        self, simulator: Simulator, limits: Sequence[DriveLimits], *, wires: int = 1, budget: Budget | None = None
+    ) -> None:
         """Take worlds as trials.
 
         Args:
             simulator: the worlds.
             limits: of the drive of each device.
             wires: number of wires among the worlds, see `Trials`.
+            budget: that driving takes off; none if not given.
         """
-        self.simulator, self.wires = simulator, wires
+        self.simulator, self.wires, self._budget = simulator, wires, budget or Budget()
         self.count, self.devices = simulator.worlds // wires, simulator.devices
         self._limits, self.fastest = list(limits), limits[0].fastest
         self._seen: tuple[np.ndarray, TipProjection] | None = None
         self._forget(np.full(wires, 1 / wires))
 
     @staticmethod
-    def of(navigation: Navigation, kinds: Sequence[tuple[Anatomy, Stack]], count: int, *, like: Simulator) -> Trials:
+    def of(
+        navigation: Navigation,
+        kinds: Sequence[tuple[Anatomy, Stack]],
+        count: int,
+        *,
+        like: Simulator,
+        budget: Budget | None = None,
+    ) -> Trials:
         """Return trials of a navigation's devices.
 
         Args:
@@ -118,13 +166,15 @@ class Trials:
             kinds: vessels and devices that are held possible.
             count: number of trials.
             like: a simulator of the same anatomies, whose settings are taken.
+            budget: as above.
         """
         anatomies, stacks = zip(*(kind for kind in kinds for _ in range(count)), strict=True)
         simulator = Simulator(anatomies, stacks, motion=navigation.known_motion, config=like.config, sharing=[like])
         limits = [DriveLimits.of(device, navigation.anatomy) for device in stacks[0].devices]
         first, last = limits[0].travel_mm
         travel = first, last - _SHORT_MM
-        return Trials(simulator, [replace(each, travel_mm=travel) for each in limits], wires=len(kinds))
+        limits = [replace(each, travel_mm=travel) for each in limits]
+        return Trials(simulator, limits, wires=len(kinds), budget=budget)
 
     def put(self, source: Int[np.ndarray, "wires"], of: Simulator, weight: Float[np.ndarray, "wires"]) -> None:
         """Put all trials of each wire where a world of a simulator of equal stacks is, and forget what they have done.
@@ -232,7 +282,12 @@ class Trials:
         return ~self.all(step.valid & (step.contact_force_max <= force_n))
 
     def drive(self, control: Control) -> Step:
-        """Drive for a decision period; return the worlds at its end, with the largest force within it."""
+        """Drive for a decision period; return the worlds at its end, with the largest force within it.
+
+        Raises:
+            OutOfBudgetError: the search has spent its budget.
+        """
+        self._budget.spend(self.simulator.worlds)
         step = drive_period(self.simulator, np.tile(control, (self.wires, 1, 1)))
         self._seen = None
         proximal, tips = self._see()

@@ -15,7 +15,7 @@ from endopilot import __version__
 from endopilot.anatomy.io import write_anatomy
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.navigate import NavigateConfig, PatientNavigation, SetUp, drive, set_up_navigation
-from endopilot.control.outcome import name_target, slipped_s, tell_outcome, worst_ratio
+from endopilot.control.outcome import decision_times, name_target, slipped_s, tell_outcome, worst_ratio
 from endopilot.control.set_up import tip_name
 from endopilot.devices.stack import Stack
 from endopilot.extras import require_extras
@@ -219,6 +219,7 @@ def _manifest(found: PatientNavigation, output: Path) -> dict[str, Any]:
         "drive_slipped_s": round(slipped_s(found), 2),
         "courses_searched": found.plans,
         "planning_processor_s": None if found.planning_s is None else round(found.planning_s, 2),
+        "decision_s": decision_times(found),
         "page": str(output / PAGE_FILE),
     }
     return manifest(
