@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Annotated
 
@@ -17,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import model_validator
 
-from endopilot.devices.device import Device, Sourced, Wire
+from endopilot.devices.device import Device, Sourced, Wire, check_built, file_constants
 from endopilot.devices.device_files import named_file
 from endopilot.devices.device_ranges import (
     MOST_VALUES,
@@ -30,7 +29,6 @@ from endopilot.devices.device_ranges import (
     Torque,
     Velocity,
     Width,
-    check_built,
 )
 from endopilot.errors import InputError
 from endopilot.files import read_text
@@ -114,15 +112,9 @@ def read_catheter(name_or_path: str | Path) -> Catheter:
     """
     path = named_file("catheter", name_or_path, (_SHIPPED,), list_catheters)
     content = read_settings(path, CatheterFile)
-    entries = {field.name: getattr(content, field.name) for field in fields(content)}
-    constants = {name: entry.value for name, entry in entries.items() if isinstance(entry, Sourced)}
+    shape = tuple((length, math.radians(angle)) for length, angle in content.shape.arcs)
     try:
-        catheter = Catheter(
-            name=content.name,
-            **constants,
-            sources={name: entry.source for name, entry in entries.items() if name != "name"},
-            shape=tuple((length, math.radians(angle)) for length, angle in content.shape.arcs),
-        )
+        catheter = Catheter(**file_constants(content), shape=shape)
         check_built(catheter, bore_mm=catheter.inner_diameter_mm, arcs=catheter.shape, catheter=True)
         return catheter
     except InputError as error:
