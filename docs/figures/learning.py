@@ -61,7 +61,7 @@ def measured(folder: Path) -> Iterator[tuple[str, Dataset]]:
     for patients, name in PATIENTS.items():
         if (folder / name / "meta" / "manifest.json").is_file():
             data = read_dataset(folder / name).of_split("test")
-            yield patients, data.select(data.valid.all(axis=1))
+            yield patients, data[data.valid.all(axis=1)]
 
 
 def p1_rows(folder: Path) -> tuple[list[str], list[str]]:
@@ -118,7 +118,7 @@ def speed_rows(folder: Path) -> Iterator[str]:
     run = load_model(PRETRAINED)
     assert isinstance(run, CausalPredictor)
     for count, repeats in ((1, 5), (256, 1)):
-        few = data.select(np.arange(count) % len(data))
+        few = data[np.arange(count) % len(data)]
         run.rollout_forward(few)  # prepares the patients
         start = time.process_time()
         for _ in range(repeats):

@@ -143,8 +143,8 @@ def _parted(dataset: Dataset, known: Collection[str]) -> tuple[dict[str, Dataset
     valid, of_known = dataset.valid.all(axis=1), np.isin(dataset.anatomy, sorted(known))
     trained = of_known & (dataset.split == "train")
     masks = dict(zip(SPLITS, (valid & of_known & ~trained, valid & ~of_known), strict=True))
-    held_out = {split: dataset.select(mask) for split, mask in masks.items() if mask.any()}
-    return held_out, dataset.select(valid & trained) if (valid & trained).any() else None
+    held_out = {split: dataset[mask] for split, mask in masks.items() if mask.any()}
+    return held_out, dataset[valid & trained] if (valid & trained).any() else None
 
 
 def _chosen(data: Dataset, sequences: int | None) -> Dataset:
@@ -155,7 +155,7 @@ def _chosen(data: Dataset, sequences: int | None) -> Dataset:
     for name in np.unique(data.anatomy):
         of_anatomy = np.flatnonzero(data.anatomy == name)
         rank[of_anatomy] = np.arange(len(of_anatomy))
-    return data.select(np.sort(np.lexsort((data.anatomy, rank))[:sequences]))
+    return data[np.sort(np.lexsort((data.anatomy, rank))[:sequences])]
 
 
 def _own_dataset(run: Path, record: Mapping[str, Any]) -> Path:

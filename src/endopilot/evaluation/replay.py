@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.dataset.again import simulate_again
 from endopilot.dataset.loader import Dataset
 from endopilot.devices.device import Wire
 from endopilot.devices.drive_limits import DriveLimits
@@ -99,11 +98,11 @@ class Recorded:
         """
         for index, anatomy in enumerate(self.anatomies):
             mine = np.flatnonzero(self.anatomy_of == index)
-            worlds = self.data.select(np.tile(mine, len(controls)))
+            worlds = self.data[np.tile(mine, len(controls))]
             after = np.concatenate([control[mine] for control in controls.values()])
             driven = np.nan_to_num(np.concatenate([worlds.command[:, :WINDOW, 0], after], axis=1))
             friction = np.concatenate([REPLAYED.get(name, 1.0) * self.data.friction[mine] for name in controls])
-            yield mine, simulate_again(worlds, anatomy, driven[:, :, None], friction=friction)
+            yield mine, worlds.driven(driven[:, :, None], anatomy=anatomy, friction=friction)
             if advance:
                 advance(1, anatomy.name)
 

@@ -6,21 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from endopilot.dataset.loader import Dataset
+from endopilot.dataset.loader import Dataset, check_same_wire
 from endopilot.errors import InputError
 from endopilot.files import reading
-
-_WIRE = (
-    "diameter_mm",
-    "abscissa_mm",
-    "bend_stiffness_n_mm2",
-    "twist_stiffness_n_mm2",
-    "tip_bend_rad",
-    "tip_bend_length_mm",
-)
-"""What makes a wire another one; friction is the navigation's own, and limits are the drive's."""
 
 
 def check_wire(run: Path, record: Mapping[str, Any], dataset: Dataset) -> None:
@@ -30,15 +18,8 @@ def check_wire(run: Path, record: Mapping[str, Any], dataset: Dataset) -> None:
         InputError: it was made with another wire, or with catheters.
     """
     dataset.check_wire_alone("a model")
-    ours, theirs = record["device"], dataset.manifest["device"]
-    for name in _WIRE:
-        with reading(run, "train anew"):
-            same = np.array_equal(ours[name], theirs[name])
-        if not same:
-            raise InputError(
-                f"{dataset.folder}: its wire is {theirs['name']}, and that of {run} is {ours['name']}, with another "
-                f"{name}; make a dataset with the run's wire"
-            )
+    with reading(run, "train anew"):
+        check_same_wire(dataset, record["device"], run, "make a dataset with the run's wire")
 
 
 def trained_patients(run: Path, record: Mapping[str, Any], dataset: Dataset) -> frozenset[str]:

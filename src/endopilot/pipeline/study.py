@@ -25,7 +25,6 @@ from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.anatomy.read_source import read_source
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.control.navigate import NavigateConfig
-from endopilot.dataset.again import episode_set_up
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.loader import read_dataset
 from endopilot.devices.device import Wire, read_wire
@@ -42,7 +41,6 @@ from endopilot.pipeline.stages import Stages
 from endopilot.progress import progress
 from endopilot.runs import claim
 from endopilot.settings import Seconds, Seed, Within, settings
-from endopilot.simulation.simulate import run_set_up
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import Volume
 
@@ -409,8 +407,7 @@ def _replay(output: Path) -> tuple[Path, Trajectory]:
     held_out = dataset.of_split("test" if "test" in dataset.split else "seen_test")
     best = int(np.ptp(held_out.tip_abscissa[:, :, 0], axis=1).argmax())
     folder = dataset.anatomy_folder(str(held_out.anatomy[best]))
-    set_up, command = episode_set_up(held_out, best), held_out.command[best : best + 1]
-    return folder, run_set_up(set_up, command, period_s=held_out.sample_period_s, record_shape=True)
+    return folder, held_out.trajectory(best, record_shape=True)
 
 
 def _finish(run: _Run) -> dict[str, Any]:
