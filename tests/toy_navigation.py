@@ -21,7 +21,7 @@ from endopilot.dataset.generate import generate_dataset
 from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
 from endopilot.files import read_json, write_json
-from endopilot.simulation.set_up import SimulationSetUp
+from endopilot.simulation.state import SimulationSetUp
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import (
     SAMPLE_PERIOD_S,

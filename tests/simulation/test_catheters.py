@@ -19,7 +19,6 @@ from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import read_controls_csv
 from endopilot.simulation.trajectory import Trajectory
-from endopilot.simulation.trajectory_file import write_trajectory
 from endopilot.types import Anatomy
 
 SHIPPED = Path(endopilot.__file__).parent / "devices/catheters"
@@ -268,7 +267,7 @@ def test_a_trajectory_written_as_csv_is_simulated_again(vessel: Anatomy, cathete
     start, control = random_drives(2, 4, 8)
     stack = Stack(read_wire("workhorse-014"), (catheter,))
     first = endopilot.simulate(vessel, stack, control, initial=start)
-    write_trajectory(first, tmp_path / "trajectory.csv")
+    first.write(tmp_path / "trajectory.csv")
     script = read_controls_csv(tmp_path / "trajectory.csv", devices=2)
     second = endopilot.simulate(vessel, stack, script.control, initial=script.initial, period_s=script.period_s)
     assert second.tip_position[:, :, 1] == pytest.approx(first.tip_position[:, :, 1], abs=1e-3)

@@ -18,8 +18,8 @@ from endopilot.simulation.core import run_core
 from endopilot.simulation.groups import make_wall
 from endopilot.simulation.rod import lay_out
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.trajectory_file import read_trajectory
-from endopilot.simulation.transmission import lay_out_transmission
+from endopilot.simulation.trajectory import read_trajectory
+from endopilot.simulation.tubes import lay_out_transmission
 
 CONFIG = SimulatorConfig(element_mm=1.25, time_step_s=0.025, threads=1)
 BEHIND = Transmission(length_mm=1000.0, twist_friction_n_mm_mm=2e-4)

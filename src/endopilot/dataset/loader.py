@@ -26,9 +26,9 @@ from endopilot.runs import RECORD_FILE
 from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
-from endopilot.simulation.set_up import SimulationSetUp
 from endopilot.simulation.signals import SIGNALS, Outputs, described
 from endopilot.simulation.simulate import run_set_up
+from endopilot.simulation.state import SimulationSetUp
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.simulation.world import World
 from endopilot.types import Anatomy

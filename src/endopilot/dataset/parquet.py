@@ -15,8 +15,7 @@ from endopilot.errors import InputError
 from endopilot.files import regular
 from endopilot.progress import Advance
 from endopilot.simulation.config import Actuation
-from endopilot.simulation.trajectory import Trajectory
-from endopilot.simulation.trajectory_file import trajectory_signals
+from endopilot.simulation.trajectory import Trajectory, trajectory_signals
 
 _KEY = b"endopilot_key"
 _LEVEL = 5

@@ -18,9 +18,9 @@ from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
-from endopilot.simulation.set_up import SimulationSetUp
 from endopilot.simulation.simulate import run_set_up
 from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.state import SimulationSetUp
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 NOMINAL = np.array([1.0, 1.0, 0.0])

@@ -22,7 +22,7 @@ from endopilot.extras import require_extras
 from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.runs import claim
 from endopilot.simulation.signals import table_columns
-from endopilot.simulation.trajectory_file import TRAJECTORY
+from endopilot.simulation.trajectory import TRAJECTORY
 from endopilot.tasks.targets import section_at
 from endopilot.types import TipProjection
 

@@ -24,8 +24,7 @@ from endopilot.simulation.core import make_lumen, make_simulation
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.processor import CoreMotion, Lumen, Simulation, core_for
 from endopilot.simulation.rod import LONGEST_ELEMENTS, RodLayout, lay_out
-from endopilot.simulation.transmission import lay_out_transmission
-from endopilot.simulation.tubes import lay_out_tubes
+from endopilot.simulation.tubes import lay_out_transmission, lay_out_tubes
 from endopilot.types import Anatomy, DistanceMap, VesselTree
 
 FINE_MM = 0.2
