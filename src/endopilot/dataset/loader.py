@@ -297,8 +297,8 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
     from endopilot.dataset.parquet import column_values, read_table
 
     samples, total = manifest["samples_per_episode"], info["total_episodes"]
-    actuation, devices = schema.actuation_of(info["features"]), schema.devices_of(info["features"])
-    by_robot = schema.made_by_robot(info["features"])
+    columns = schema.signals_in(info["features"])
+    devices, by_robot = int(info["features"]["branch"]["shape"][0]), "encoders" in columns
     episodes: dict[str, list[np.ndarray]] = {}
     signal: dict[str, np.ndarray] = {}
     filled = 0
@@ -316,7 +316,7 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
         end = filled + table.num_rows
         if end > total:
             break
-        for name in schema.signal_columns(actuation, devices, by_robot=by_robot):
+        for name in columns:
             values = column_values(data, name)
             values = values.reshape(table.num_rows, samples, *values.shape[1:])
             if name not in signal:  # in place, so that a large dataset is never held twice
@@ -334,7 +334,7 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
     vectors = {name: signal[name].reshape(*shape, -1) for name in ("action", "velocity") if name in signal}
     recorded = {name: _of_signal(name, signal[column], devices) for column, (name, *_) in schema.OWN_COLUMNS.items()}
     recorded |= {name: signal["observation.state"].reshape(*shape, -1)[..., k] for k, name in enumerate(schema.STATE)}
-    if actuation == "force":
+    if "velocity" in vectors:
         control = vectors["velocity"]
     else:
         slip = np.stack([recorded["slip"], recorded["rotation_slip"]], axis=-1)
