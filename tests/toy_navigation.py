@@ -173,7 +173,7 @@ def make_untrained_run(dataset_folder, run_folder):
 
     size = TransformerConfig(d_model=24, encoder_layers=1, decoder_layers=1)
     for name, network in NETWORKS.items():
-        write_network(run_folder / f"{name}.safetensors", name, network(size), size, {})
+        write_network(run_folder / f"{name}.safetensors", name, network(size), size)
     device = read_json(dataset_folder / "meta" / "manifest.json")["device"]
     record = {
         "config": {"model": "paper"},

@@ -19,7 +19,7 @@ from torch import Tensor
 from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.evaluation.protocols import hold_slack
 from endopilot.models import play
-from endopilot.models.causal import CausalNetwork, ForwardNetwork, InverseNetwork, Mixture
+from endopilot.models.causal import CausalForward, CausalInverse, CausalNetwork, Mixture
 from endopilot.models.config import WINDOW, CausalConfig
 from endopilot.models.episodes import Episodes
 from endopilot.models.sequences import N_INPUTS, N_WIRE_INPUTS, Sequences, play_tables, unfold
@@ -39,7 +39,7 @@ VARIANTS: dict[str, np.ndarray] = {
 """Inputs that a network does not get, by the name of the row."""
 
 
-class WithoutWires(InverseNetwork):
+class WithoutWires(CausalInverse):
     """A forward network that knows no simulated wire: its only guess is the play operator's."""
 
     def forward(self, inputs: Tensor, others: Tensor) -> Tensor:
@@ -92,7 +92,7 @@ def variant_rows(training: Dataset, held_out: Dataset) -> Iterator[str]:
 def _trained(
     made: Sequences,
     test: Sequences,
-    network_of: type[CausalNetwork] = ForwardNetwork,
+    network_of: type[CausalNetwork] = CausalForward,
     *,
     width: int = CausalConfig.width,
     hidden: np.ndarray = VARIANTS["all"],

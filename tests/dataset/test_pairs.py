@@ -24,8 +24,7 @@ from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import read_json
-from endopilot.models.episodes import Episodes
-from endopilot.models.provenance import check_wire
+from endopilot.models.episodes import Episodes, check_wire
 from endopilot.simulation.signals import Outputs
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.trajectory import Trajectory

@@ -28,7 +28,7 @@ from endopilot.evaluation.summary import SPLIT_TITLES, findings, generalisation_
 from endopilot.extras import extra_named
 from endopilot.files import manifest, sha256, write_json
 from endopilot.models.config import PRETRAINED, read_run, run_path
-from endopilot.models.provenance import trained_patients
+from endopilot.models.episodes import trained_patients
 from endopilot.progress import progress
 from endopilot.runs import claim
 from endopilot.settings import Count, Seed, settings
