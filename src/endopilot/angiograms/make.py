@@ -105,7 +105,6 @@ def describe(layout: Layout) -> None:
 
 
 def _counts(layout: Layout, records: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]:
-    """Return the numbers of patients, cines and frames of each split."""
     patients, cines = Counter(layout.splits), Counter(record["split"] for record in records)
     return {
         split: {"patients": patients[split], "cines": cines[split], "frames": cines[split] * layout.config.frames}

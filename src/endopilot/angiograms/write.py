@@ -155,7 +155,6 @@ def write_cine(layout: Layout, folder: Path) -> None:
 
 
 def _imager(layout: Layout, name: str) -> XrayImager:
-    """Return what makes a patient's images."""
     key = f"{layout.key} {name}"
     imager = _kept.get(key)
     if imager is None:
@@ -205,7 +204,6 @@ def _padded(lines: Sequence[Float[np.ndarray, "_ d"]]) -> Float[np.ndarray, "fra
 
 
 def _record(cine: Cine, layout: Layout, patient: int, number: int) -> dict[str, Any]:
-    """Return what a cine shows, as JSON has it."""
     draw, anatomy = cine.draw, cine.imager.anatomy
     motion = motion_of(cine.config, anatomy.name)
     return {

@@ -141,7 +141,6 @@ def _session(path: Path) -> Film:
 
 
 def _of_the_ladder(task: Task, place: int, recording: Recording) -> Film:
-    """Return a film of a navigation of the ladder, of which its decisions were recorded."""
     navigation, periods = task.ladder_navigation(place), len(recording.control)
 
     def make() -> Iterator[FilmFrame]:

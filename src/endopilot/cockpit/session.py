@@ -102,7 +102,6 @@ class Session:
         self._record(stop="resumed")
 
     def _relive(self, events: Sequence[dict[str, Any]]) -> None:
-        """Take over the events of a cycle that has passed."""
         for event in events:
             if "target" in event:
                 self.world.loop.aim(Target(branch=event["target"][0], abscissa=event["target"][1]))
@@ -203,7 +202,6 @@ class Session:
             self._stopped = ""
 
     def _aim(self, message: messages.Target) -> None:
-        """Set the target, in the middle of a section or at a place."""
         tree = self.world.navigation.anatomy.tree
         if message.section is not None:
             self.world.loop.aim(find_target(tree, message.section))
@@ -214,7 +212,6 @@ class Session:
         self._record(target=[self.target.branch, self.target.abscissa])
 
     def _steer(self, message: messages.Autopilot) -> None:
-        """Hand the wheel to a policy or back, or let it pause."""
         if message.action == "start":
             self.autopilot.start(check_policy(message.policy, self._policies), self.target)
             if self._moving:
@@ -235,11 +232,9 @@ class Session:
         self.autopilot.stop()
 
     def _move(self, devices: Proximals) -> None:
-        """Command the robot by hand."""
         self._note(self.world.command(devices), devices)
 
     def _note(self, taken: Proximals, asked: Proximals) -> None:
-        """Note and write down what the robot has taken, and of what."""
         self._command, self._asked = taken, asked
         self._record(move=list(chain.from_iterable(self._command)))
 

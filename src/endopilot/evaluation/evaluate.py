@@ -159,7 +159,6 @@ def _chosen(data: Dataset, sequences: int | None) -> Dataset:
 
 
 def _own_dataset(run: Path, record: Mapping[str, Any]) -> Path:
-    """Return the dataset that a run was trained on."""
     if str(run) == PRETRAINED:
         raise InputError(f"{run}: the dataset that it was trained on is not in the package; name one with --dataset")
     own = Path(run) / record["dataset"]

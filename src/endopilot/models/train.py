@@ -310,7 +310,6 @@ class Job:
         return whole
 
     def _window(self, examples: Examples, targets: torch.Tensor) -> list[torch.Tensor]:
-        """Return the network's inputs of some targets, and the truth, where this process computes."""
         return [part.to(self.group.device) for part in examples.window(self.name, targets)]
 
     def _steps(self, network: AnyNetwork, state: dict[str, Any]) -> int:

@@ -306,7 +306,6 @@ class TransformerPredictor:
 def _rollout_batch(
     forward: Network | None, inverse: Network | None, limits: DriveLimits, batch: Windows, begin: int
 ) -> tuple[Steps2, Steps2, Steps2]:
-    """Return tip, x^prox and control of one batch from a sample on."""
     desired = batch.tip
     tip, control = desired.clone(), batch.control.clone()
     proximal = batch.proximal.double()  # float64, so that x^prox stays the integral of the controls

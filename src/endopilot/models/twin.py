@@ -210,7 +210,6 @@ class TwinPredictor:
         return self.predicted[episodes]
 
     def _track(self, episodes: Episodes, likeliest: Float[np.ndarray, "episodes 3"], begin: int) -> OpenLoop:
-        """Drive wires of these parameters along the desired tips from a sample on."""
         desired = episodes.tip[:, begin:].astype(float)
         tip, control = np.empty(desired.shape), np.empty(desired.shape)
         wires = with_stiffnesses(self.device, likeliest[:, 1])

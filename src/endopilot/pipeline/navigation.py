@@ -238,7 +238,6 @@ def _manifest(found: PatientNavigation, output: Path) -> dict[str, Any]:
 
 
 def _world(set_up: SetUp) -> dict[str, Any]:
-    """Return the world's name and what in it is not as given."""
     return {"name": set_up.config.world, **set_up.world.differences()}
 
 

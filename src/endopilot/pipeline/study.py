@@ -308,7 +308,6 @@ def _drive(run: _Run, anatomy: Path) -> None:
 
 
 def _study(run: _Run, anatomies: Sequence[Path]) -> dict[str, Any]:
-    """Run the stages that follow the anatomies, up to the report."""
     if run.evaluates:
         _learn(run, anatomies)
     run.stages.do("report", lambda: _report(run, [folder.name for folder in anatomies]))
@@ -351,7 +350,6 @@ def _learn(run: _Run, anatomies: Sequence[Path]) -> None:
 
 
 def _report(run: _Run, names: Sequence[str]) -> None:
-    """Write report.html from what the other stages left in the run's folder."""
     from endopilot.report.report import PatientContent, ReportContent, write_report  # matplotlib and plotly
 
     output = run.output

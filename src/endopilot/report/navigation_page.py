@@ -49,7 +49,6 @@ def write_navigation_page(
 
 
 def _tiles(found: PatientNavigation) -> list[tuple[str, str, str]]:
-    """Return figure, meaning and comparison of each tile."""
     record, navigation = found.record, found.set_up.navigation
     minutes, whose = max(record.seconds, 0.5) / 60, "wire's " if navigation.catheters else ""
     tiles = [
@@ -94,7 +93,6 @@ def _facts(found: PatientNavigation) -> list[tuple[str, str]]:
 
 
 def _robot(set_up: SetUp) -> str:
-    """Return what drives, in words."""
     robot = set_up.world.real_robot(set_up.robot)
     wire = robot.wire
     where = "motors" if robot.encoders_at == "motor" else "devices"
@@ -103,7 +101,6 @@ def _robot(set_up: SetUp) -> str:
 
 
 def _scene(found: PatientNavigation) -> Markup:
-    """Return the replay in space as HTML."""
     record, navigation = found.record, found.set_up.navigation
     figure = navigation_scene(
         navigation.anatomy, found.record.trajectory, devices=navigation.devices, believed=found.wires

@@ -164,7 +164,6 @@ def group_key(anatomy: Anatomy, stack: Stack) -> GroupKey:
 
 
 def _wall_key(anatomy: Anatomy, stack: Stack) -> tuple[str, float, bool]:
-    """Return what worlds with the same wall have in common."""
     return anatomy.identity, stack.outer_radius_mm, bool(stack.catheters)
 
 

@@ -268,7 +268,6 @@ class Readout:
         return self._merge(parts)
 
     def _of_groups(self, values: np.ndarray) -> list[tuple[Group, np.ndarray]]:
-        """Return the rows of each group."""
         return [(group, values[group.index]) for group in self._groups]
 
     def _merge(self, parts: Sequence[np.ndarray]) -> np.ndarray:

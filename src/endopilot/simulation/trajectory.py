@@ -200,7 +200,6 @@ class Trajectory(SolvedOutputs):
         )
 
     def _each(self, take: Callable[[np.ndarray], np.ndarray]) -> Trajectory:
-        """Return the trajectory with every array of samples taken from."""
         chosen: dict[str, Any] = {
             each.name: take(value)
             for each in fields(self)
