@@ -31,6 +31,7 @@ from .dataset.loader import read_dataset as read_dataset
 from .devices.catheter import Catheter as Catheter
 from .devices.catheter import list_catheters as list_catheters
 from .devices.catheter import read_catheter as read_catheter
+from .devices.catheter import write_device as write_device
 from .devices.device import Device as Device
 from .devices.device import TipShaping as TipShaping
 from .devices.device import Wire as Wire
@@ -41,7 +42,6 @@ from .devices.robot import RobotConfig as RobotConfig
 from .devices.robot import read_robot as read_robot
 from .devices.stack import Stack as Stack
 from .devices.stack import Transmission as Transmission
-from .devices.write import write_device as write_device
 from .env.episodes import NavigationState as NavigationState
 from .env.single import NavigateEnv as NavigateEnv
 from .env.vector import NavigateVectorEnv as NavigateVectorEnv

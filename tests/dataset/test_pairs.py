@@ -13,11 +13,10 @@ from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.cli import main
 from endopilot.dataset import loader
 from endopilot.dataset.config import DatasetConfig
-from endopilot.dataset.draw import draw_navigations
 from endopilot.dataset.generate import generate_dataset, write_episode
 from endopilot.dataset.info import describe_dataset
 from endopilot.dataset.loader import Dataset, read_dataset, read_joined
-from endopilot.dataset.navigations import STOP_SHORT_MM, simulate_navigations
+from endopilot.dataset.navigations import STOP_SHORT_MM, draw_navigations, simulate_navigations
 from endopilot.dataset.schema import OF_ROBOT
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire

@@ -11,15 +11,21 @@ import pytest
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.config import DatasetConfig
-from endopilot.dataset.draw import TIP_GROUP, draw_navigations, patient_motion
 from endopilot.dataset.generate import generate_dataset, write_episode
 from endopilot.dataset.loader import read_dataset
-from endopilot.dataset.navigations import PULL_BACK_MM, STOP_SHORT_MM, simulate_navigations
+from endopilot.dataset.navigations import (
+    PULL_BACK_MM,
+    STOP_SHORT_MM,
+    TIP_GROUP,
+    draw_navigations,
+    patient_motion,
+    simulate_navigations,
+)
 from endopilot.devices.device import read_wire
 from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
-from endopilot.evaluation.replay import Recorded
+from endopilot.evaluation.protocols import Recorded
 from endopilot.models.config import WINDOW
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import motion_named

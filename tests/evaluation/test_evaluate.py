@@ -15,8 +15,7 @@ from endopilot.devices.drive_limits import SPARE_MM
 from endopilot.devices.robot import read_robot
 from endopilot.errors import InputError
 from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
-from endopilot.evaluation.protocols import count_steps, run_protocols
-from endopilot.evaluation.replay import Recorded
+from endopilot.evaluation.protocols import Recorded, count_steps, run_protocols
 from endopilot.evaluation.results import read_results
 from endopilot.files import read_json, write_json
 from endopilot.models.config import WINDOW

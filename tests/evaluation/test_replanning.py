@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from endopilot.dataset.loader import read_dataset
-from endopilot.evaluation.replay import EXPOSURE_PERIOD_S, Recorded, exposures, replanned, replay
+from endopilot.evaluation.protocols import EXPOSURE_PERIOD_S, Recorded, exposures, replanned, replay
 from endopilot.models.episodes import Episodes, OpenLoop, begin_after, given_states
 from toy_navigation import toy_run
 

@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from endopilot.angiograms.config import AngiogramsConfig
+from endopilot.angiograms.config import CARD_FILE, MANIFEST_FILE, SAMPLES_FILE, AngiogramsConfig, Layout, lay_out
 from endopilot.angiograms.draw import view_text
-from endopilot.angiograms.layout import CARD_FILE, MANIFEST_FILE, SAMPLES_FILE, Layout, lay_out
 from endopilot.angiograms.masks import CLASSES
 from endopilot.angiograms.write import COCO_FILE, RECORD_FILE, coco, write_cine, write_patient
 from endopilot.dataset.layout import SPLITS

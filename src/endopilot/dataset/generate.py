@@ -22,8 +22,8 @@ import pyarrow.parquet as pq
 
 from endopilot.dataset import parquet, schema
 from endopilot.dataset.config import DatasetConfig
-from endopilot.dataset.draw import Draw
 from endopilot.dataset.layout import SPLITS, Block, Layout, make_layout
+from endopilot.dataset.navigations import Draw
 from endopilot.dataset.workers import run_locally, run_on_cluster, store_block, write_timed
 from endopilot.devices.device import Wire
 from endopilot.devices.robot import RobotConfig

@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import model_validator
 
-from endopilot.devices.device_files import device_file
-from endopilot.devices.device_ranges import (
+from endopilot.devices.device_files import (
     GRAM_FORCE_N,
     MOST_VALUES,
     TIP_LENGTH_MM,
@@ -35,6 +34,7 @@ from endopilot.devices.device_ranges import (
     Torque,
     Velocity,
     Width,
+    device_file,
 )
 from endopilot.errors import InputError
 from endopilot.settings import NonNegative, Positive, Text, Within, public, read_settings, settings

@@ -19,12 +19,16 @@ from endopilot.evaluation.results import (
     METRICS_FILE,
     REPORT_FILE,
     RESULTS_FILE,
+    SPLIT_TITLES,
     SPLITS,
     SplitResult,
+    findings,
+    generalisation_gap,
+    over_seeds,
+    summarize,
     tip_series,
     write_results,
 )
-from endopilot.evaluation.summary import SPLIT_TITLES, findings, generalisation_gap, over_seeds, summarize
 from endopilot.extras import extra_named
 from endopilot.files import manifest, sha256, write_json
 from endopilot.models.config import PRETRAINED, read_run, run_path

@@ -116,8 +116,7 @@ def _write(found: PatientNavigation, output: Path, asked: Mapping[str, Any] | No
         asked: the names that `endopilot navigate` was given; None where it was not called.
     """
     from endopilot.plotting import png  # matplotlib and plotly are slow to import
-    from endopilot.report.navigation_figure import navigation_figure
-    from endopilot.report.navigation_page import write_navigation_page
+    from endopilot.report.navigation_page import navigation_figure, write_navigation_page
 
     set_up = found.set_up
     driven_in, real = set_up.folder, set_up.true_anatomy

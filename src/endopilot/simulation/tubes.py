@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.devices.stack import Stack
-from endopilot.simulation.processor import CoreTransmission, Processor, Tubes, core_for
+from endopilot.simulation.config import CoreTransmission, Processor, Tubes, core_for
 from endopilot.simulation.rod import POISSON_RATIO, SHEAR_CORRECTION
 
 _SPACING_MM, _BEHIND_SPACING_MM = 0.25, 1.0
