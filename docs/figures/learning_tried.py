@@ -79,13 +79,13 @@ def variant_rows(training: Dataset, held_out: Dataset) -> Iterator[str]:
     """Yield what short trainings reach, each without some of the inputs, another size or fewer data."""
     names = np.random.default_rng(0).permutation(np.unique(training.anatomy))
     test = _sequences(held_out)
-    made = _sequences(training.select(np.isin(training.anatomy, names[:PATIENTS])))
+    made = _sequences(training[np.isin(training.anatomy, names[:PATIENTS])])
     for name, hidden in VARIANTS.items():
         yield row(f"network: {name}", _trained(made, test, hidden=hidden))
     yield row("network: without the simulated wires", _trained(made, test, WithoutWires))
     yield row("network: half as wide", _trained(made, test, width=48))
     yield row("network: no mirror images, as many steps", _trained(made, test, forms=2))
-    made = _sequences(training.select(np.isin(training.anatomy, names[: PATIENTS // 3])))
+    made = _sequences(training[np.isin(training.anatomy, names[: PATIENTS // 3])])
     yield row("network: a third of the patients, as many steps", _trained(made, test, longer=3))
 
 
