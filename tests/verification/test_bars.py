@@ -18,7 +18,7 @@ GROUPS = {
     for group in module.CASES
 }
 LARGEST_BAR = 0.02
-WIDER = {"tube.sinusoidal_buckling": 0.05, "tube.helical_buckling": 0.05, "order.order_in_element_length": 0.1}
+WIDER = {"tube.sinusoidal_buckling": 0.05, "tube.helical_buckling": 0.05, "order.order_in_element_length": 0.05}
 WIDER |= {"order.order_in_navigation": 0.2, "order.order_in_time_step": 0.05, "motion.order_in_a_beating_heart": 0.2}
 
 
