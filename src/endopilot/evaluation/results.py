@@ -1,4 +1,4 @@
-"""What an evaluation predicted, as arrays from which figures and tables are drawn, and the metrics.json made of them."""
+"""What an evaluation predicted, as arrays from which figures and tables are drawn, and metrics.json made of them."""
 
 from __future__ import annotations
 
