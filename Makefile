@@ -70,6 +70,7 @@ readme: $(INSTALLED)
 	$(BIN)/python docs/readme.py
 	$(BIN)/python docs/commands.py
 	$(BIN)/python docs/signals.py
+	$(BIN)/python docs/claims.py
 
 # docs/evidence/learning.md's figures, sized for two cores and an hour. What is there already is not made again.
 LEARNING := runs/causal

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -137,6 +138,51 @@ def markdown_table(head: Iterable[object], rows: Iterable[Iterable[object]]) -> 
     lines = [titles, *([str(cell) for cell in row] for row in rows)]
     first, *others = ["| " + " | ".join(line) + " |" for line in lines]
     return [first, "|" + "---|" * len(titles), *others]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of a table of the documentation.
+
+    Attributes:
+        head: the table's headings.
+        cells: the row's cells.
+        made: when and on what machine the table was made, as the page says below it; empty if the page does not say.
+    """
+
+    head: list[str]
+    cells: list[str]
+    made: str
+
+
+def find_row(page: str, mark: str, first: str, *others: str) -> Row:
+    """Return the first row of a page's tables whose first cell begins so, and that has the other cells.
+
+    Args:
+        page: the page's path in `docs`.
+        mark: name of the marks between which the table stands; empty for anywhere in the page.
+        first: beginning of the first cell.
+        others: beginnings of other cells of the row.
+
+    Raises:
+        LookupError: there is no such row.
+    """
+    text = (DOCS / page).read_text(encoding="utf-8")
+    if mark:
+        text = text.partition(f"<!-- {mark}:begin -->")[2].partition(f"<!-- {mark}:end -->")[0]
+    head, rest = [], iter(text.splitlines())
+    for line in rest:
+        cells = [cell.strip() for cell in line.strip("|").split("|")] if line.startswith("|") else []
+        if not (head and cells):
+            head = cells
+        elif cells[0].startswith(first) and all(any(map(_begins(one), cells[1:])) for one in others):
+            made = re.search(r"^Made on (.+)\.$|on (\d+ cores \(.+\)):", "\n".join(rest), re.MULTILINE)
+            return Row(head, cells, "" if made is None else made[1] or made[2])
+    raise LookupError(f"{page}: no row {' & '.join((first, *others))!r} in the table {mark!r}")
+
+
+def _begins(text: str) -> Callable[[str], bool]:
+    return lambda cell: cell.startswith(text)
 
 
 def fill(page: str, mark: str, lines: str | Iterable[str], *, dated: bool = True) -> None:

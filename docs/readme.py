@@ -6,8 +6,12 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from pathlib import Path
 
+sys.path.append(str(Path(__file__).parents[1]))  # where `benchmarks` is
+
+from benchmarks.figures import find_row
 from endopilot.files import read_json
 from endopilot.report.report_text import tip_rows
 
@@ -119,10 +123,10 @@ def stands() -> str:
     theirs = {task: _row("ladder", "benchmark", task.lower()) for task in ("ArchVariety", "DualDeviceNav")}
     ours = {task: _row("ladder", "benchmark", task.lower(), "`agent`") for task in theirs}
     plane = _row("reality", "reality", "error in the camera")[-1]
-    share, forks = _row("reality", None, "the real branch, of forks in two")[1].split(" of ")
+    share, forks = _row("reality", "", "the real branch, of forks in two")[1].split(" of ")
     band, kept = _row("reality", "calibration", "band of Δtip")
     straight, leaning, play = (
-        _row("planning", None, row)[0] for row in ("as it is believed", "leans by", "as believed;")
+        _row("planning", "", row)[0] for row in ("as it is believed", "leans by", "as believed;")
     )
     rows = [
         (
@@ -141,7 +145,7 @@ def stands() -> str:
         (
             "tasks of others",
             "stEVE_bench, within 5 mm, in our simulator: "
-            + ", ".join(f"{task} {_of_ours(row)}" for task, row in ours.items())
+            + ", ".join(f"{task} {row[2]} % of {row[-1]}" for task, row in ours.items())
             + f"; learned controllers in its own {' and '.join(theirs[task][2] for task in ours)} %",
             "in its simulator; with hospital devices",
             [("ladder", "#tasks-of-a-public-benchmark")],
@@ -165,42 +169,14 @@ def stands() -> str:
     ]
     lines = ["| beside | measured | not measured | page |", "| --- | --- | --- | --- |"]
     for beside, measured, missing, pages in rows:
-        links = ", ".join(f"[{name}]({_path(name).relative_to(ROOT)}{anchor})" for name, anchor in pages)
+        links = ", ".join(f"[{name}](docs/evidence/{name}.md{anchor})" for name, anchor in pages)
         lines.append(f"| {beside} | {measured} | {missing} | {links} |")
     return "\n".join(lines)
 
 
-def _of_ours(row: list[str]) -> str:
-    """Return the agent's share of a benchmark's row, in words."""
-    return f"{row[2]} % of {row[-1]}" if row else "not measured yet"
-
-
-def _path(name: str) -> Path:
-    """Return the file of a page of the documentation."""
-    evidence = ROOT / "docs" / "evidence" / f"{name}.md"
-    return evidence if evidence.exists() else ROOT / "docs" / f"{name}.md"
-
-
-def _row(page: str, block: str | None, begin: str, also: str = "") -> list[str]:
-    """Return the cells after the first of a table's row.
-
-    Args:
-        page: name of the page.
-        block: between whose marks the table stands; None for the whole page.
-        begin: of the row's first cell.
-        also: what another cell holds.
-
-    Returns:
-        The cells, none if there is no such row.
-    """
-    text = _path(page).read_text(encoding="utf-8")
-    if block is not None:
-        text = text.split(f"<!-- {block}:begin -->")[1].split(f"<!-- {block}:end -->")[0]
-    for line in text.splitlines():
-        cells = [cell.strip() for cell in line.strip("|").split("|")]
-        if cells[0].startswith(begin) and (not also or also in cells):
-            return cells[1:]
-    return []
+def _row(page: str, mark: str, begin: str, *others: str) -> list[str]:
+    """Return the cells after the first of a row of a page of evidence."""
+    return find_row(f"evidence/{page}.md", mark, begin, *others).cells[1:]
 
 
 if __name__ == "__main__":

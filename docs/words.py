@@ -7,21 +7,51 @@ from collections.abc import Iterator
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
-BOUNDS = {"guide": 1000, "concepts": 1500, "evidence": 1500}
-"""Most words of a page, by its shelf. What stands between marks is generated, and does not count."""
+BOUNDS = {"guide": 400, "concepts": 1000, "evidence": 200}
+"""Most words of a page's prose, by its shelf."""
+LONGER = {
+    "concepts/advice.md": 1050,
+    "concepts/detection.md": 1200,
+    "concepts/mismatch.md": 1400,
+    "concepts/search.md": 1150,
+    "evidence/anatomy.md": 450,
+    "evidence/detection.md": 550,
+    "evidence/environments.md": 700,
+    "evidence/leaderboard.md": 350,
+    "evidence/navigation.md": 350,
+    "evidence/planning.md": 600,
+    "evidence/reality.md": 750,
+    "evidence/robustness.md": 400,
+    "evidence/worlds.md": 600,
+}
+"""Pages that are still longer than their shelf allows, and their own bounds: a ratchet, lowered as they get shorter."""
+_GENERATED = r"<!-- (.+?):begin -->.*?<!-- \1:end -->"
+_NO_PROSE = (
+    r"^```.*?^```",  # commands, code
+    r"^(?:\||#).*?$",  # tables, headings
+    r"!\[[^\]]*\]\([^)]*\)",  # pictures
+)
+
+
+def own(text: str) -> str:
+    """Return a page without what scripts write into it."""
+    return re.sub(_GENERATED, "", text, flags=re.DOTALL)
 
 
 def words(text: str) -> int:
-    """Return how many words a page has, without what generators write into it."""
-    own = re.sub(r"<!-- (.+?):begin -->.*?<!-- \1:end -->", "", text, flags=re.DOTALL)
-    return sum(bool(re.search(r"\w", word)) for word in own.split())
+    """Return how many words of prose a page has."""
+    text = own(text)
+    for pattern in _NO_PROSE:
+        text = re.sub(pattern, "", text, flags=re.DOTALL | re.MULTILINE)
+    return sum(bool(re.search(r"\w", word)) for word in text.split())
 
 
 def pages() -> Iterator[tuple[Path, int, int]]:
     """Yield the pages of the shelves, each with its words and the bound."""
     for shelf, bound in BOUNDS.items():
         for page in sorted((FOLDER / shelf).glob("*.md")):
-            yield page.relative_to(FOLDER), words(page.read_text(encoding="utf-8")), bound
+            name = page.relative_to(FOLDER)
+            yield name, words(page.read_text(encoding="utf-8")), LONGER.get(str(name), bound)
 
 
 if __name__ == "__main__":

@@ -91,7 +91,7 @@ def extraction_errors(centerlines: Path | None = None) -> list[dict[str, Any]]:
     """
     files = _centerline_files(centerlines)
     rows: list[dict[str, Any]] = []
-    shapes = _shapes()
+    shapes = moved_shapes()
     with progress("Anatomy", 2 * len(shapes) * len(VOXELS_MM) + 1 + len(files)) as advance:
         for name, tree in shapes.items():
             for voxel in VOXELS_MM:
@@ -121,7 +121,8 @@ def _centerline_files(folder: Path | None) -> list[Path]:
     return files
 
 
-def _shapes() -> dict[str, VesselTree]:
+def moved_shapes() -> dict[str, VesselTree]:
+    """Return tubes and forks whose axes are known, turned and shifted against the voxels."""
     shapes = {"straight": analytic.straight_tree(), "torus": analytic.torus_tree(), "helix": analytic.helix_tree()}
     for angle in FORK_DEG:
         middle = np.array([0.0, 0.0, -20.0])

@@ -1,7 +1,8 @@
 """Measure extraction, write the figures into docs/evidence/anatomy.md and draw its picture.
 
 `python docs/figures/anatomy.py [FOLDER]`, where the folder holds rca_cl.vtp and lca_cl.vtp of a real patient; takes
-some five minutes. With `--from FILE` it takes the figures from what `python -m benchmarks anatomy --json` printed.
+some five minutes. With `--from FILE` it takes the figures from what `python -m benchmarks anatomy --json` printed, with
+`--touching FILE` those of `python -m benchmarks touching --json`.
 """
 
 from __future__ import annotations
@@ -36,6 +37,15 @@ def tables(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
+def touching(figures: dict) -> str:
+    """Return what is said of what touches, and what large inputs cost."""
+    lines = ["| lumen | as | cases | figure | value |", "|---|---|---|---|---|"]
+    lines += [f"| {r['kind']} | {r['source']} | {r['cases']} | {r['figure']} | {text(r)} |" for r in figures["touching"]]
+    lines += ["", "| input | figure | value | bar |", "|---|---|---|---|"]
+    lines += [f"| {r['case']} | {r['figure']} | {text(r)} | {r['bar']:g} |" for r in figures["cost"]]
+    return "\n".join(lines)
+
+
 def text(row: dict) -> str:
     """Return a value, in bold where it exceeds its bar."""
     return f"**{row['value']:.3g}**" if row["passed"] is False else f"{row['value']:.3g}"
@@ -43,6 +53,9 @@ def text(row: dict) -> str:
 
 def main(arguments: list[str]) -> None:
     """Measure, write and draw."""
+    if arguments[:1] == ["--touching"]:
+        fill("evidence/anatomy.md", "touching", touching(json.loads(Path(arguments[1]).read_text(encoding="utf-8"))))
+        return
     if arguments[:1] == ["--from"]:
         rows = json.loads(Path(arguments[1]).read_text(encoding="utf-8"))
     else:

@@ -1,7 +1,7 @@
 """Write what the models reach into the tables of docs/evidence/learning.md.
 
 `python docs/figures/learning.py FOLDER`: FOLDER holds the dataset, the runs and the evaluations that the page's
-commands make; what is not there is left out. The table of what was tried is that of `learning_tried.py`.
+commands make; what is not there is left out.
 """
 
 from __future__ import annotations
@@ -173,13 +173,6 @@ def depth_rows(folder: Path) -> Iterator[str]:
             yield f"| {model} | {series} | {cells[0]} | {cells[1]} | {worst:.3f} | {figures['diverged_share']:.0%} |"
 
 
-def event_rows(folder: Path) -> Iterator[str]:
-    """Yield the share of the samples in which the recorded tip sticks, slips or whips."""
-    for split, result in read_json(folder / "evaluation" / "metrics.json")["splits"].items():
-        shares = " | ".join(f"{result['event_shares'][name]:.2%}" for name in ("stick", "slip", "whip"))
-        yield f"| {split} | {shares} |"
-
-
 def control_rows(folder: Path) -> Iterator[str]:
     """Yield the errors of the controls that every model's IF asks for."""
     for path in sorted(folder.glob("evaluation*/metrics.json")):
@@ -211,6 +204,5 @@ if __name__ == "__main__":
     page = written(page, "speed", list(speed_rows(folder)))
     page = written(page, "results", list(result_rows(folder)))
     page = written(page, "depth", list(depth_rows(folder)))
-    page = written(page, "events", list(event_rows(folder)))
     page = written(page, "controls", list(control_rows(folder)))
     PAGE.write_text(page, encoding="utf-8")

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
+CLAIMS = runpy.run_path(str(ROOT / "docs/claims.py"))
 WORDS = runpy.run_path(str(ROOT / "docs/words.py"))
 PAGES = sorted((ROOT / "docs").glob("*.md")) + [
     page for shelf in WORDS["BOUNDS"] for page in sorted((ROOT / "docs" / shelf).glob("*.md"))
@@ -31,8 +32,9 @@ def test_pages_are_within_the_bound_of_their_shelf() -> None:
     assert [str(page) for page, count, bound in WORDS["pages"]() if count > bound] == []
 
 
-def test_what_is_generated_is_not_counted() -> None:
-    assert WORDS["words"]("# One\n<!-- a:begin -->\n| two | three |\n<!-- a:end -->\n| four | – |\n") == 2
+def test_prose_alone_is_counted() -> None:
+    page = "# A\n<!-- a:begin -->\nb\n<!-- a:end -->\n| c | – |\n```\nd\n```\n![e](f.png)\nOne – two.\n"
+    assert WORDS["words"](page) == 2
 
 
 @pytest.mark.parametrize("page", [*PAGES, *AROUND], ids=lambda page: str(page.relative_to(ROOT)))
@@ -47,6 +49,26 @@ def test_links_lead_somewhere(page: Path) -> None:
         if not target.exists() or (anchor and target.suffix == ".md" and anchor not in headings(target)):
             lost.append(f"{path}#{anchor}")
     assert lost == []
+
+
+def test_the_table_of_claims_is_that_of_the_pages() -> None:
+    text = (ROOT / "docs/evidence/index.md").read_text(encoding="utf-8")
+    table = text.partition("<!-- claims:begin -->\n")[2].partition("\n<!-- claims:end -->")[0]
+    assert table == "\n".join(CLAIMS["table"]()), "run: python docs/claims.py"
+
+
+@pytest.mark.parametrize("page", sorted((ROOT / "docs/evidence").glob("*.md")), ids=lambda page: page.stem)
+def test_a_page_of_evidence_claims_something_and_has_the_command(page: Path) -> None:
+    claimed = CLAIMS["claims"]().get(page.stem, [])
+    assert claimed or page.stem == "index"
+    text = " ".join(page.read_text(encoding="utf-8").split())
+    assert [each["command"] for each in claimed if each["command"] not in text] == []
+
+
+def test_a_figure_that_no_page_has_is_named() -> None:
+    for place in ("bench | no such row | mean", "bench | Dice | no such column", "none | Dice | mean"):
+        with pytest.raises(LookupError, match=r"evidence/imaging\.md: no (row|column)"):
+            CLAIMS["cell"]("imaging", place)
 
 
 def test_pages_that_code_and_messages_name_exist() -> None:
@@ -90,5 +112,6 @@ def test_measured_tables_say_when_they_were_made() -> None:
         if not re.search(r"^Made on \d{4}-\d\d-\d\d", text, re.MULTILINE)
     }
     made_of_files = {("ladder.md", "tasks"), ("ladder.md", "coaxial tasks"), ("leaderboard.md", "scores")}
+    made_of_files |= {("index.md", "claims")}
     by_make = {("demo.md", "demo-table"), ("performance.md", "gpu"), ("performance.md", "gpu-recipe")}
     assert undated <= made_of_files | by_make

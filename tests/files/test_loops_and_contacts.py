@@ -10,6 +10,7 @@ from make_vessels import hairpin, length_of, line, lumen, tubes, with_voxels
 from scipy.ndimage import label
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
+from endopilot.anatomy.surface import surface_from_mask
 from endopilot.anatomy.topology import parted, touch_remarks
 from endopilot.errors import InputError
 from endopilot.types import Volume
@@ -89,6 +90,27 @@ def test_two_vessels_that_touch_along_their_walls_are_never_one_tree_unsaid(angl
     balance = anatomy.provenance["coverage"]
     assert balance["length_mm"] > 95.0  # of both, as the file holds them
     assert balance["left_out_mm"] < 5.0 or "another vessel that touches this one left out" in notes_of(anatomy)
+
+
+@pytest.mark.parametrize(
+    ("vessels", "said", "place"),
+    [
+        ([(hairpin(50, 3.5), 1.8)], "two vessels may touch", (1.75, 0, 25)),
+        ([(line((0, 0, -28), (0, 0, 28)), 1.9), (line((3.0, -20, -20), (3.0, 20, 20)), 1.5)], "may touch", (1.7, 0, 0)),
+        (
+            [(line((0, 0, 0), (0, 0, 60)), 1.8), (line((0, 0, 10), (10, 0, 20), (10, 0, 40), (0, 0, 50)), 1.2)],
+            "loop",
+            (),
+        ),
+        ([(line((0, 0, 0), (0, 0, 60)), 1.8), (line((0, 0, 20), (15, 0, 45)), 1.4)], "", ()),
+    ],
+)
+def test_what_touches_in_a_surface_is_said_too(vessels, said, place):
+    wall = surface_from_mask(tubes(*vessels, voxel_mm=(0.4, 0.4, 0.4)))
+    notes = notes_of(anatomy := extract_anatomy(wall, name="wall"))
+    assert "parted" not in notes
+    assert said in notes if said else "touch" not in notes and "loop" not in notes
+    assert not place or any(np.linalg.norm((found - place)[:2]) < 3.0 for found in places_of(anatomy))
 
 
 @pytest.mark.parametrize("angles", [(12.0, -12.0), (25.0, -70.0), (40.0, 0.0, -40.0), (20.0, 120.0)])

@@ -16,7 +16,7 @@ from endopilot.anatomy.distance import MAXIMUM_GRID_POINTS
 from endopilot.anatomy.lumen_graph import pieces
 from endopilot.anatomy.medial_lines import MedialLines
 from endopilot.anatomy.repair import NOTED_MM
-from endopilot.anatomy.surface import Surface, blur_voxels, level_function
+from endopilot.anatomy.surface import Surface, blur_voxels, smooth_level
 from endopilot.anatomy.topology import MOST_LISTED
 from endopilot.anatomy.tree import sampled
 from endopilot.errors import place_text
@@ -32,7 +32,9 @@ Between two wide faces it may have: there the radius grows by a quarter until th
 
 _MOST_GROWTHS = 4
 
-_MOST_VOXELS = 10_000_000
+_MOST_VOXELS, _MOST_INSIDE = 10_000_000, 300_000
+"""A wall becomes at most as many voxels, and as many inside it: their middle is found in 4 s. Thin vessels stay whole
+in coarser voxels, since all that the wall touches are kept."""
 
 _DIAGONAL = 0.87
 """A ball of this many grid steps in radius holds a grid point wherever it lies (√3/2)."""
@@ -60,10 +62,11 @@ def voxelised(surface: Surface, step_mm: float) -> Volume:
 
     Args:
         surface: the wall.
-        step_mm: edge of the voxels, mm; larger where there would be more than `_MOST_VOXELS`.
+        step_mm: edge of the voxels, mm; larger where there would be too many.
     """
     extent = np.ptp(surface.vertices, axis=0)
-    step = max(step_mm, float(np.prod(extent + 4 * step_mm) / _MOST_VOXELS) ** (1 / 3))
+    most = max(float(np.prod(extent + 4 * step_mm)) / _MOST_VOXELS, abs(surface.volume) / _MOST_INSIDE)
+    step = max(step_mm, most ** (1 / 3))
     origin = surface.vertices.min(axis=0) - 2 * step
     size = np.ceil(extent / step).astype(int) + 5
     voxels = surface.inside((int(size[2]), int(size[1]), int(size[0])), origin, step)
@@ -90,20 +93,21 @@ def widened(mask: Volume, lines: MedialLines, minimum_mm: float) -> tuple[Volume
     wanted = [s for s in stretches(lines, thin) if s.length_mm + s.beyond_mm >= minimum_mm]
     if not wanted:
         return mask, np.empty((0, 3)), []
-    voxels = mask.voxels.copy()
+    result = mask
     narrowest = _NARROWEST * blur_voxels(edges[::-1])
     reach = narrowest = np.maximum(narrowest, _NARROWEST_STEPS * step / edges[::-1])
     asked = np.concatenate([s.nodes for s in wanted])
     nodes = _with_neighbours(lines, asked)
     for growth in range(_MOST_GROWTHS):
         if growth:
-            nodes = asked[_thin(replace(mask, voxels=voxels), lines, enough)[asked]]
+            nodes = asked[_thin(result, lines, enough)[asked]]
             reach = 1.25 * reach
         if len(nodes) == 0:
             break
-        _draw_balls(voxels, lines.index[nodes], reach)
+        result = replace(mask, voxels=result.voxels.copy())
+        _draw_balls(result.voxels, lines.index[nodes], reach)
     radius = float((narrowest * edges[::-1]).mean())
-    return replace(mask, voxels=voxels), lines.points[asked], _widened_text(wanted, radius)
+    return result, lines.points[asked], _widened_text(wanted, radius)
 
 
 def unreached(lines: MedialLines, tree: VesselTree, voxel_mm: float) -> list[Stretch]:
@@ -209,9 +213,9 @@ def _thin(mask: Volume, lines: MedialLines, enough: float) -> Bool[np.ndarray, "
 
     Voxel centres lie up to half a diagonal off the axis, so that the deepest one around a point stands for it.
     """
-    level = level_function(np.pad(mask.voxels, 4), mask.spacing_mm[::-1])[3:-3, 3:-3, 3:-3]
+    level, corner = smooth_level(mask)
     core = connected_components(level > enough, corners=True)
-    around = (lines.index[:, None, :] + np.array(list(np.ndindex(3, 3, 3)))).reshape(-1, 3)
+    around = (lines.index[:, None, :] - corner - 1 + np.array(list(np.ndindex(3, 3, 3)))).reshape(-1, 3)
     depth = level[tuple(around.T)].reshape(-1, 27)
     part = core[tuple(around.T)].reshape(-1, 27)[np.arange(len(depth)), depth.argmax(axis=1)]
     thin = part == 0

@@ -28,10 +28,11 @@ from endopilot.anatomy.inlet import beyond_parent, component, entrance, grid_poi
 from endopilot.anatomy.labels import dominance, label_tree, missing_main_vessel
 from endopilot.anatomy.labels_coronary import SHORT_MM
 from endopilot.anatomy.lumen_graph import lumen_graph, trace_branches
-from endopilot.anatomy.medial_lines import MedialLines, traced_lines
+from endopilot.anatomy.medial_lines import MedialLines
 from endopilot.anatomy.read_source import read_source
 from endopilot.anatomy.sources import AnatomySource, Polylines, transformed
 from endopilot.anatomy.surface import Surface, surface_from_mask
+from endopilot.anatomy.topology import parted, touch_remarks
 from endopilot.anatomy.tree import tree_from_lines
 from endopilot.anatomy.understood import understood
 from endopilot.anatomy.units import SMALLEST_RADIUS_MM, check_unit
@@ -221,7 +222,9 @@ def _wall(
     surface, notes = repair_surface.closed_surface(content, given, label, config.vessel, other)
     step = min(surface.mean_radius, CORONARY_RADIUS_MM) / 5.0
     voxels = coverage.voxelised(surface, max(step, SMALLEST_RADIUS_MM))
-    return _Wall(surface, 0.0, float(voxels.spacing_mm.max()), inlet, traced_lines(voxels), np.empty((0, 3)), notes)
+    _, touches, lines, _ = parted(voxels)
+    notes += touch_remarks(touches, parted=False)
+    return _Wall(surface, 0.0, float(voxels.spacing_mm.max()), inlet, lines, np.empty((0, 3)), notes)
 
 
 def _short(tree: VesselTree, vessel: str) -> list[str]:

@@ -10,7 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import center_of_mass, distance_transform_edt, find_objects
+from scipy.ndimage import distance_transform_edt, find_objects
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.medial_lines import MedialLines, piece_labels
@@ -234,7 +234,8 @@ def _left_out(
         piece = lost[number]
         own = np.argwhere(labels[boxes[piece - 1]] == piece) + corners[number, :, 0]
         place = mask.index_to_world(own[:, ::-1].astype(float))
-        gap = np.asarray(reach.query(place)[0])
+        some = np.asarray(reach.query(place[:: len(place) // 64 + 1])[0]).min()  # so that far voxels end a search early
+        gap = np.asarray(reach.query(place, distance_upper_bound=some + 1e-6)[0])
         at, apart = place_text(place[gap.argmin()]), "apart from the lumen"
         begins = f"begins {gap.min():.1f} mm away at {at}"
         kind = "a piece"
@@ -326,8 +327,10 @@ def _draw_tube(voxels: np.ndarray, start: np.ndarray, end: np.ndarray, width: fl
 def _piece_on_side(mask: Volume, labels: np.ndarray, sizes: np.ndarray, vessel: Vessel) -> tuple[int, list[int]]:
     """Return the label of the wanted piece of a mask, and those of the others that are nearly as large."""
     large = np.flatnonzero(sizes >= COMPARABLE * sizes.max())
-    index = np.array(center_of_mass(labels > 0, labels, large))[:, ::-1]
-    chosen, others = piece_on_side(sizes[large].astype(float), mask.index_to_world(index), vessel)
+    index = np.argwhere(mask.voxels)
+    own = labels[tuple(index.T)]
+    centres = np.array([index[own == piece].mean(axis=0) for piece in large])[:, ::-1]
+    chosen, others = piece_on_side(sizes[large].astype(float), mask.index_to_world(centres), vessel)
     return int(large[chosen]), [int(large[other]) for other in others]
 
 

