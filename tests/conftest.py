@@ -138,7 +138,7 @@ def evaluated(toy_dataset, tmp_path_factory):
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # small batches gain nothing from two, and lose much where cores are shared
     make_untrained_run(toy_dataset, folder / "run")
-    with patch("endopilot.dataset.again.run_set_up", toy_run):
+    with patch("endopilot.dataset.loader.run_set_up", toy_run):
         settings = EvaluateConfig(sequences=8)
         metrics = evaluate(folder / "run", output=folder / "evaluation", config=settings, other_seeds=[folder / "run"])
     torch.set_num_threads(threads)

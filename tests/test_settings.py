@@ -116,7 +116,7 @@ def range_of(hint: Any) -> Within:
 
 
 UNBOUNDED = {"Wire", "Catheter", "DriveLimits"}
-"""What code gives in the units that it likes; files hold them within `device_ranges`."""
+"""What code gives in the units that it likes; files hold them within the ranges of `device_files`."""
 
 
 def test_no_number_that_a_user_gives_is_large_enough_to_run_for_ever() -> None:

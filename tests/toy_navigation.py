@@ -21,7 +21,7 @@ from endopilot.dataset.generate import generate_dataset
 from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
 from endopilot.files import read_json, write_json
-from endopilot.simulation.set_up import SimulationSetUp
+from endopilot.simulation.state import SimulationSetUp
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import (
     SAMPLE_PERIOD_S,
@@ -173,7 +173,7 @@ def make_untrained_run(dataset_folder, run_folder):
 
     size = TransformerConfig(d_model=24, encoder_layers=1, decoder_layers=1)
     for name, network in NETWORKS.items():
-        write_network(run_folder / f"{name}.safetensors", name, network(size), size, {})
+        write_network(run_folder / f"{name}.safetensors", name, network(size), size)
     device = read_json(dataset_folder / "meta" / "manifest.json")["device"]
     record = {
         "config": {"model": "paper"},

@@ -10,10 +10,9 @@ import numpy as np
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.device import read_wire
-from endopilot.simulation.config import FREE_BEHIND_MM, PRESETS, Preset, SimulatorConfig
+from endopilot.simulation.config import FREE_BEHIND_MM, PRESETS, Preset, SimulatorConfig, core_for
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.core import make_lumen, run_core
-from endopilot.simulation.processor import core_for
 from endopilot.simulation.rod import lay_out
 from endopilot.types import SAMPLE_PERIOD_S
 

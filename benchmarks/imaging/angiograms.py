@@ -13,8 +13,7 @@ from typing import Annotated, Any
 
 from benchmarks.figures import Bar, judged
 from endopilot.anatomy.io import write_anatomy
-from endopilot.angiograms.config import AngiogramsConfig
-from endopilot.angiograms.layout import lay_out
+from endopilot.angiograms.config import AngiogramsConfig, lay_out
 from endopilot.angiograms.make import make_angiograms
 from endopilot.angiograms.write import write_cine
 from endopilot.atlas.atlas import AtlasConfig, make_patient

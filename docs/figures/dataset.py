@@ -40,7 +40,7 @@ def main(folders: list[str]) -> None:
     rows = [HEAD, ["---"] * len(HEAD)]
     for folder in map(Path, folders):
         data = read_dataset(folder)
-        episodes = Episodes.of_dataset(data.select(data.sequence < NAVIGATIONS))
+        episodes = Episodes.of_dataset(data[data.sequence < NAVIGATIONS])
         truth, _ = _simulated(episodes, REFERENCE)
         rows += [[folder.name, name, *_compared(episodes, truth, config)] for name, config in SETTINGS.items()]
         rows.append([folder.name, "reference: 0.3 mm, 0.001 mm", "", "", "", _held(episodes, truth), ""])

@@ -61,7 +61,7 @@ def measured(folder: Path) -> Iterator[tuple[str, Dataset]]:
     for patients, name in PATIENTS.items():
         if (folder / name / "meta" / "manifest.json").is_file():
             data = read_dataset(folder / name).of_split("test")
-            yield patients, data.select(data.valid.all(axis=1))
+            yield patients, data[np.flatnonzero(data.valid.all(axis=1))]
 
 
 def p1_rows(folder: Path) -> tuple[list[str], list[str]]:

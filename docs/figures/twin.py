@@ -44,7 +44,7 @@ def rows(episodes: Dataset, sequences: int, deeper_mm: float) -> Iterator[str]:
     """Yield the rows of the table for the first navigations of every patient."""
     along, off, found = [], [], []
     for index, name in enumerate(np.unique(episodes.anatomy)):
-        one = episodes.select(np.flatnonzero(episodes.anatomy == name)[:sequences])
+        one = episodes[np.flatnonzero(episodes.anatomy == name)[:sequences]]
         given = Episodes.of_dataset(replace(one, initial=one.initial - np.array([deeper_mm, 0.0])))
         twin = believed(one, index)
         predicted = twin.predict(given, np.arange(one.valid.shape[1]) < WINDOW)

@@ -31,6 +31,7 @@ from .dataset.loader import read_dataset as read_dataset
 from .devices.catheter import Catheter as Catheter
 from .devices.catheter import list_catheters as list_catheters
 from .devices.catheter import read_catheter as read_catheter
+from .devices.catheter import write_device as write_device
 from .devices.device import Device as Device
 from .devices.device import TipShaping as TipShaping
 from .devices.device import Wire as Wire
@@ -41,7 +42,6 @@ from .devices.robot import RobotConfig as RobotConfig
 from .devices.robot import read_robot as read_robot
 from .devices.stack import Stack as Stack
 from .devices.stack import Transmission as Transmission
-from .devices.write import write_device as write_device
 from .env.episodes import NavigationState as NavigationState
 from .env.single import NavigateEnv as NavigateEnv
 from .env.vector import NavigateVectorEnv as NavigateVectorEnv
@@ -91,16 +91,16 @@ from .robot.replay import replay_log as replay_log
 from .simulation.config import SimulatorConfig as SimulatorConfig
 from .simulation.controls import ControlConfig as ControlConfig
 from .simulation.motion import Motion as Motion
-from .simulation.set_up import SimulationSetUp as SimulationSetUp
 from .simulation.simulate import simulate as simulate
 from .simulation.simulator import Simulator as Simulator
+from .simulation.state import SimulationSetUp as SimulationSetUp
 from .simulation.state import SimulatorState as SimulatorState
 from .simulation.state import Step as Step
 from .simulation.state import SupportsDLPack as SupportsDLPack
 from .simulation.tip_load import TipLoadTest as TipLoadTest
 from .simulation.tip_load import simulate_tip_load as simulate_tip_load
 from .simulation.trajectory import Trajectory as Trajectory
-from .simulation.trajectory_file import read_trajectory as read_trajectory
+from .simulation.trajectory import read_trajectory as read_trajectory
 from .simulation.world import Stenosis as Stenosis
 from .simulation.world import World as World
 from .simulation.world import list_worlds as list_worlds

@@ -53,7 +53,7 @@ def dataset(tmp_path, monkeypatch):
     )
     monkeypatch.setattr(module, "ImageFluoroscope", Arm)
     monkeypatch.setattr(parallel, "CORES", 1)
-    monkeypatch.setattr("endopilot.dataset.again.run_set_up", toy_run)
+    monkeypatch.setattr("endopilot.dataset.loader.run_set_up", toy_run)
     Arm.made.clear()
     Arm.refined.clear()
     return read_dataset(tmp_path / "data").of_split("test")
@@ -63,7 +63,7 @@ def test_each_sample_is_measured_by_the_wire_driven_again_and_kept_for_the_next_
     found, left_out = image_exposures(dataset, SETTINGS)
     assert left_out == ("patient-1x",) and sorted(found) == ["patient-0", "patient-2xx"]
     for name, shown in found.items():
-        truth = dataset.select(dataset.anatomy == name)
+        truth = dataset[dataset.anatomy == name]
         assert shown.found.shape == truth.valid.shape
         assert shown.found[:, :5].tolist() == [[True, True, False, True, False]] * 2
         seen = [0, 1, 3]
@@ -91,7 +91,7 @@ def test_where_the_patient_moves_the_wire_is_seen_displaced_by_what_was_not_meas
     assert still["patient-0"].known_motion is None and known == replace(motion, breathing_caudal_mm=6.5)
     maps = seen_in_episodes(motion, known, np.zeros(3), 4, 0.5)
     assert maps is not None
-    before = dataset.select(dataset.anatomy == "patient-0").tip_position[:, 3, 0].astype(float)
+    before = dataset[dataset.anatomy == "patient-0"].tip_position[:, 3, 0].astype(float)
     after = before @ maps[3, :, :3].T + maps[3, :, 3]
     np.testing.assert_allclose(moving["patient-0"].tip[:, 3, 0], after[:, 0], atol=1e-4)
     assert np.abs(moving["patient-0"].tip[:, 3] - still["patient-0"].tip[:, 3]).max() > 1e-3
@@ -99,4 +99,4 @@ def test_where_the_patient_moves_the_wire_is_seen_displaced_by_what_was_not_meas
 
 def test_a_split_of_which_nobody_can_be_registered_is_told(dataset) -> None:
     with pytest.raises(InputError, match="no patient of its split 'test' can be registered; the first: X-ray images"):
-        image_exposures(dataset.select(dataset.anatomy == "patient-1x"), SETTINGS)
+        image_exposures(dataset[dataset.anatomy == "patient-1x"], SETTINGS)

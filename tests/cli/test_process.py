@@ -23,7 +23,7 @@ from endopilot.errors import InputError, Remark
 from endopilot.files import sha256
 from endopilot.imaging.volume import read_volume
 from endopilot.robot.log import read_log
-from endopilot.simulation.trajectory_file import read_trajectory
+from endopilot.simulation.trajectory import read_trajectory
 
 _SLOW = """
 import os, signal, sys, threading, time

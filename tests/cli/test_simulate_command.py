@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from endopilot.cli import main
-from endopilot.simulation.trajectory_file import read_trajectory
+from endopilot.simulation.trajectory import read_trajectory
 
 
 @pytest.mark.parametrize(("option", "deepest_mm"), [((), 35.0), (("--no-stop-short",), 39.0)])

@@ -15,7 +15,6 @@ from endopilot.files import write_json
 from endopilot.ladder.attempt import attempt, navigation_seed
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
-from endopilot.simulation.trajectory_file import write_trajectory
 from endopilot.tasks.task import find_task
 
 
@@ -54,7 +53,7 @@ def test_a_rollout_is_driven_again(fork, wire, vessel, tmp_path):
     rollout = simulate(
         fork, wire, control, initial=np.array([[2.0, 0.1], [2.0, 0.1]]), config=SimulatorConfig(threads=1)
     )
-    write_trajectory(rollout, tmp_path / "r.npz")
+    rollout.write(tmp_path / "r.npz")
     film = driven(open_film(tmp_path / "r.npz", vessel, world=1))
     assert len(film.frames) == 31
     last = film.frames[-1].snapshot

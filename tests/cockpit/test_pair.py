@@ -27,7 +27,6 @@ from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.trajectory_file import write_trajectory
 from endopilot.tasks.task import task_by_hand
 
 NAME = "microcatheter-1.7f"
@@ -217,7 +216,7 @@ def test_a_rollout_of_a_pair_is_driven_again(fork, vessel, navigation, tmp_path)
         initial=initial.reshape(1, 2, 2),
         config=config,
     )
-    write_trajectory(rollout, tmp_path / "r.npz")
+    rollout.write(tmp_path / "r.npz")
     film = open_film(tmp_path / "r.npz", vessel)
     film._drive()
     last = film.frames[-1].snapshot

@@ -26,7 +26,6 @@ from endopilot.models.episodes import Episodes, Observed, OpenLoop
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import read_controls_csv
 from endopilot.simulation.simulate import simulate
-from endopilot.simulation.trajectory_file import write_trajectory
 
 SLACK = 0.9
 
@@ -115,7 +114,7 @@ def test_a_plan_for_another_vessel_or_wire_is_refused(found, vessel, tmp_path):
         read_plan(folder, anatomy, Stack(replace(device, friction=0.2)))
     read_plan(folder, anatomy, Stack(replace(device, sources={})))  # the same wire with other sources
     path = folder / "trajectory.npz"
-    write_trajectory(replace(found.trajectory, period_s=0.4), path)
+    replace(found.trajectory, period_s=0.4).write(path)
     with pytest.raises(InputError, match=r"trajectory\.npz.* differs"):
         read_plan(folder, anatomy)
     path.unlink()

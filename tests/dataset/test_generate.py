@@ -66,7 +66,7 @@ def test_motion_is_the_integral_of_the_control(toy_dataset):
 
 def test_an_episode_repeats_exactly_from_the_disk(toy_dataset):
     data = read_dataset(toy_dataset)
-    chosen = data.select(data.anatomy == data.anatomy[0])
+    chosen = data[data.anatomy == data.anatomy[0]]
     options = {"initial": chosen.initial, "config": SimulatorConfig(), "friction": chosen.friction}
     again = toy_simulate(toy_anatomy(str(chosen.anatomy[0])), data.stack, chosen.control.astype(float), **options)
     assert (again.tip.abscissa.astype(np.float32) == chosen.tip_abscissa).all()

@@ -12,23 +12,20 @@ from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.cli import main
 from endopilot.dataset import loader
-from endopilot.dataset.again import episode_set_up, simulate_again
 from endopilot.dataset.config import DatasetConfig
-from endopilot.dataset.draw import draw_navigations
 from endopilot.dataset.generate import generate_dataset, write_episode
 from endopilot.dataset.info import describe_dataset
 from endopilot.dataset.loader import Dataset, read_dataset, read_joined
-from endopilot.dataset.navigations import STOP_SHORT_MM, simulate_navigations
+from endopilot.dataset.navigations import STOP_SHORT_MM, draw_navigations, simulate_navigations
 from endopilot.dataset.schema import OF_ROBOT
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import read_json
-from endopilot.models.episodes import Episodes
-from endopilot.models.provenance import check_wire
+from endopilot.models.episodes import Episodes, check_wire
 from endopilot.simulation.signals import Outputs
-from endopilot.simulation.simulate import run_set_up, simulate
+from endopilot.simulation.simulate import simulate
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.simulation.world import World
 
@@ -61,7 +58,7 @@ def test_the_commands_of_both_devices_repeat_an_episode_to_the_bit(pairs, patien
     data = read_dataset(pairs)
     assert data.valid.all() and data.command.shape == (3, 20, 2, 2)
     assert (data.slip[:, :, 1] != 0).any()
-    again = simulate_again(data, read_anatomy(patient), data.command)
+    again = data.driven()
     _assert_same(data, again)
     first = data.inserted_length[:, 0] - 0.5 * data.control[:, 0, :, 0]
     assert np.abs(first - data.initial[..., 0])[:, 1].max() > 0.01  # one is carried along before the first period
@@ -90,7 +87,7 @@ def test_every_number_of_every_device_is_read_back(patient, tmp_path):
     kept = {field.name for field in fields(data)} - set(OF_EPISODES)
     assert kept == {*OF_TRAJECTORY, *OF_TIP, *OF_ROBOT}
     assert all(getattr(data, name) is None for name in OF_ROBOT)  # no robot drove
-    again = simulate_again(data, read_anatomy(patient), data.command)
+    again = data.driven()
     for name in OF_TRAJECTORY:
         np.testing.assert_array_equal(getattr(again, name), getattr(made, name), err_msg=name)
 
@@ -198,10 +195,9 @@ def test_a_dataset_is_made_in_a_world_and_simulated_again_in_it(patient, tmp_pat
     line = anatomy.tree.branches[data.branch[0, 0, 0]].centerline
     given_mm = np.interp(data.tip_abscissa[0, 0, 0], line.abscissa, line.radius)
     assert data.lumen_radius[0, 0, 0] == pytest.approx(1.1 * given_mm, rel=1e-4)
-    again = simulate_again(data, anatomy, data.command)
+    again = data.driven()
     _assert_same(data, again)
-    one = episode_set_up(data, 0)
-    _assert_same(data.select(np.array([0])), run_set_up(one, data.command[:1], period_s=0.5, record_shape=False))
+    _assert_same(data[1], data.trajectory(1))
     deeper = World(ostium_mm=1.5, robot="ideal")
     generate_dataset([patient], output=tmp_path / "deeper", device="workhorse-014", config=config, world=deeper)
     counted = read_dataset(tmp_path / "deeper")

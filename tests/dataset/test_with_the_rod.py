@@ -11,15 +11,21 @@ import pytest
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.config import DatasetConfig
-from endopilot.dataset.draw import TIP_GROUP, draw_navigations, patient_motion
 from endopilot.dataset.generate import generate_dataset, write_episode
 from endopilot.dataset.loader import read_dataset
-from endopilot.dataset.navigations import PULL_BACK_MM, STOP_SHORT_MM, simulate_navigations
+from endopilot.dataset.navigations import (
+    PULL_BACK_MM,
+    STOP_SHORT_MM,
+    TIP_GROUP,
+    draw_navigations,
+    patient_motion,
+    simulate_navigations,
+)
 from endopilot.devices.device import read_wire
 from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
-from endopilot.evaluation.replay import Recorded
+from endopilot.evaluation.protocols import Recorded
 from endopilot.models.config import WINDOW
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import motion_named
@@ -47,7 +53,7 @@ def test_an_episode_simulated_from_the_disk_repeats_to_the_bit(tmp_path, patient
     tips = list(zip(data.tip_bend.tolist(), data.tip_stiffness_factor.tolist(), strict=True))
     assert [tip == tips[0] for tip in tips] == [True] * TIP_GROUP + [False] * 2
     for tip in set(tips):
-        one = data.select(np.array([other == tip for other in tips]))
+        one = data[np.array([other == tip for other in tips])]
         again = simulate(
             read_anatomy(data.anatomy_folder(str(data.anatomy[0]))),
             DEVICE.with_tip(bend_rad=tip[0], stiffness_factor=tip[1]),
@@ -170,7 +176,7 @@ def test_a_dataset_driven_by_force(tmp_path, patient):
     assert np.array_equal(load, samples[["drive_force_n", "drive_torque_nmm"]].to_numpy())
     assert 0.05 < np.abs(load[:, 0]).max() < DEVICE.push_limit_n
     data = read_dataset(tmp_path / "dataset")
-    one = data.select(np.array([1]))
+    one = data[1]
     assert np.array_equal(one.command[0, :, 0], load)
     assert np.array_equal(one.control[0, :, 0], velocity)
     travel = 0.5 * np.cumsum(one.control.astype(float), axis=1)

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 import endopilot
-from endopilot.devices.catheter import read_catheter
+from endopilot.devices.catheter import read_catheter, write_device
 from endopilot.devices.device import Wire, read_wire
 from endopilot.devices.device_files import list_wires
 from endopilot.devices.stack import Stack
-from endopilot.devices.write import write_device
 from endopilot.errors import InputError
 
 SHIPPED = Path(endopilot.__file__).parent / "devices/wires"

@@ -22,9 +22,9 @@ from endopilot.devices.stack import Stack
 from endopilot.files import read_json
 from endopilot.navigation.policy import Decision, Observation
 from endopilot.pipeline import navigation
-from endopilot.report.navigation_figure import navigation_figure
+from endopilot.report.navigation_page import navigation_figure
 from endopilot.simulation.motion import motion_named
-from endopilot.simulation.trajectory_file import read_trajectory
+from endopilot.simulation.trajectory import read_trajectory
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation
 

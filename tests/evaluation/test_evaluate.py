@@ -15,8 +15,7 @@ from endopilot.devices.drive_limits import SPARE_MM
 from endopilot.devices.robot import read_robot
 from endopilot.errors import InputError
 from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
-from endopilot.evaluation.protocols import count_steps, run_protocols
-from endopilot.evaluation.replay import Recorded
+from endopilot.evaluation.protocols import Recorded, count_steps, run_protocols
 from endopilot.evaluation.results import read_results
 from endopilot.files import read_json, write_json
 from endopilot.models.config import WINDOW
@@ -79,9 +78,9 @@ class Parroting:
 
 def test_patients_are_predicted_one_after_the_other_with_the_error_so_far(toy_dataset):
     data = read_dataset(toy_dataset)
-    data = data.select(np.random.default_rng(0).permutation(len(data)))
+    data = data[np.random.default_rng(0).permutation(len(data))]
     remarks, predictor = [], Parroting()
-    with patch("endopilot.dataset.again.run_set_up", toy_run):
+    with patch("endopilot.dataset.loader.run_set_up", toy_run):
         result = run_protocols(predictor, data, None, lambda amount=1, remark="": remarks.append(remark))
     np.testing.assert_array_equal(result.tips["P1"].abscissa, result.true.abscissa)
     assert len(remarks) == count_steps(data)
@@ -109,7 +108,7 @@ def test_the_core_is_replayed_with_other_friction(toy_dataset, evaluated):
         asked[set_up.anatomies[0].name] = set_up.friction
         return toy_run(set_up, command, **how)
 
-    with patch("endopilot.dataset.again.run_set_up", watched):
+    with patch("endopilot.dataset.loader.run_set_up", watched):
         metrics = evaluate(evaluated[0] / "run", output=evaluated[0] / "again", config=EvaluateConfig(sequences=2))
     true = read_dataset(toy_dataset).friction[0]
     for friction in asked.values():
@@ -157,7 +156,7 @@ def chosen(dataset, mask) -> set[tuple[str, int]]:
 
 def test_all_navigations_of_a_dataset_of_new_patients_are_evaluated(elsewhere, trained_on, tmp_path):
     dataset, out = read_dataset(elsewhere), tmp_path / "out"
-    with patch("endopilot.dataset.again.run_set_up", toy_run):
+    with patch("endopilot.dataset.loader.run_set_up", toy_run):
         metrics = evaluate(trained_on(elsewhere, set()), output=out, config=EvaluateConfig(), dataset=elsewhere)
     results = read_results(out / "evaluation.npz")
     assert {"train", "calibrate", "test"} <= set(dataset.split.tolist())
@@ -177,7 +176,7 @@ def test_known_patients_among_new_ones_stay_known(elsewhere, trained_on, tmp_pat
     dataset = read_dataset(elsewhere)
     names = {str(dataset.anatomy[dataset.split == split][0]) for split in ("train", "calibrate", "test")}
     known, training = np.isin(dataset.anatomy, sorted(names)), dataset.split == "train"
-    with patch("endopilot.dataset.again.run_set_up", toy_run):
+    with patch("endopilot.dataset.loader.run_set_up", toy_run):
         metrics = evaluate(
             trained_on(elsewhere, names), output=tmp_path / "out", config=EvaluateConfig(), dataset=elsewhere
         )
@@ -187,7 +186,7 @@ def test_known_patients_among_new_ones_stay_known(elsewhere, trained_on, tmp_pat
     assert [metrics["splits"][split]["known_patients"] for split in ("seen_test", "test")] == [3, 0]
     assert "P1" in metrics["generalisation_gap"]
     # the mean is taken where the run was trained, not over what is evaluated
-    trained = dataset.select(known & training)
+    trained = dataset[known & training]
     assert metrics["training_mean"] == {"navigations": len(trained), "patients": 1}
     for result in results.values():
         mean = trained.control.mean(axis=(0, 1, 2), dtype=float)
@@ -245,7 +244,7 @@ def test_replayed_controls_are_simulated_from_the_start_of_the_episode(evaluated
     result = read_results(evaluated[0] / "evaluation" / "evaluation.npz")["test"]
     data = read_dataset(toy_dataset)
     name, sequence = result.anatomies[result.anatomy[0]], result.sequence[0]
-    episode = data.select(np.flatnonzero((data.anatomy == name) & (data.sequence == sequence)))
+    episode = data[np.flatnonzero((data.anatomy == name) & (data.sequence == sequence))]
     held = np.repeat(episode.control[:, 29:30, 0], 90, axis=1)
     inserted = episode.inserted_length[:, 29] + 0.5 * np.cumsum(held[..., 0], axis=1)
     inserted = np.minimum(np.maximum(inserted, 0.0), LENGTH_MM + SPARE_MM)
@@ -257,8 +256,8 @@ def test_replayed_controls_are_simulated_from_the_start_of_the_episode(evaluated
 
 def test_controls_pass_the_drives_of_a_robot(toy_dataset):
     data = read_dataset(toy_dataset)
-    data = data.select((data.inserted_length[:, WINDOW - 1, 0] > 10) & (data.inserted_length[:, WINDOW - 1, 0] < 30))
-    data = data.select(np.arange(3))
+    data = data[(data.inserted_length[:, WINDOW - 1, 0] > 10) & (data.inserted_length[:, WINDOW - 1, 0] < 30)]
+    data = data[:3]
     control = np.tile([2.0, 0.5], (3, 12, 1))
     control[:, 6:, 0] = -2.0
     control[1, 9:] = np.nan

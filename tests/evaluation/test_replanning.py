@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from endopilot.dataset.loader import read_dataset
-from endopilot.evaluation.replay import EXPOSURE_PERIOD_S, Recorded, exposures, replanned, replay
+from endopilot.evaluation.protocols import EXPOSURE_PERIOD_S, Recorded, exposures, replanned, replay
 from endopilot.models.episodes import Episodes, OpenLoop, begin_after, given_states
 from toy_navigation import toy_run
 
@@ -37,7 +37,7 @@ class HoldSlack:
 
 @pytest.fixture(scope="module")
 def recorded(toy_dataset) -> Recorded:
-    return Recorded.of(read_dataset(toy_dataset).of_split("test").select(np.arange(12)))
+    return Recorded.of(read_dataset(toy_dataset).of_split("test")[:12])
 
 
 def planned(recorded, predictor):
@@ -49,7 +49,7 @@ def planned(recorded, predictor):
 
 def test_each_plan_is_given_the_drive_and_what_was_exposed_and_nothing_else(recorded) -> None:
     predictor, data = HoldSlack(), recorded.data
-    with patch("endopilot.dataset.again.run_set_up", toy_run):
+    with patch("endopilot.dataset.loader.run_set_up", toy_run):
         _, control = planned(recorded, predictor)
         done = replay(recorded, {"P4": recorded.drivable(control)}, lambda *_: None)["P4"]
     assert (
@@ -79,7 +79,7 @@ def test_each_plan_is_given_the_drive_and_what_was_exposed_and_nothing_else(reco
 
 def test_x_ray_brings_the_tip_back_to_its_desired_path(recorded) -> None:
     predictor, data = HoldSlack(), recorded.data
-    with patch("endopilot.dataset.again.run_set_up", toy_run):
+    with patch("endopilot.dataset.loader.run_set_up", toy_run):
         first, control = planned(recorded, predictor)
         series = {"P4": recorded.drivable(first.control), "P4_replanned": recorded.drivable(control)}
         done = replay(recorded, series, lambda *_: None)
@@ -96,7 +96,7 @@ def test_a_world_that_fails_has_no_controls_from_there_on(recorded) -> None:
         valid[0, 60:] = False  # first episode of each patient
         return replace(rollout, valid=valid)
 
-    with patch("endopilot.dataset.again.run_set_up", failing):
+    with patch("endopilot.dataset.loader.run_set_up", failing):
         _, control = planned(recorded, HoldSlack())
     firsts = [int(np.flatnonzero(recorded.anatomy_of == i)[0]) for i in range(len(recorded.anatomies))]
     lost = np.isnan(control).any(axis=-1)

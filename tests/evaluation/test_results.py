@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 
 from endopilot.errors import InputError
-from endopilot.evaluation.results import read_results, write_results
-from endopilot.evaluation.summary import findings, generalisation_gap, over_seeds, summarize
+from endopilot.evaluation.results import (
+    findings,
+    generalisation_gap,
+    over_seeds,
+    read_results,
+    summarize,
+    write_results,
+)
 from endopilot.report import tables
 
 

@@ -14,7 +14,7 @@ from endopilot.dataset.loader import read_manifest
 from endopilot.errors import InputError
 from endopilot.models.checkpoint import load_model
 from endopilot.models.config import read_run
-from endopilot.pipeline.stages import Stages
+from endopilot.pipeline.study import Stages
 from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
 

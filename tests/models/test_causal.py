@@ -19,7 +19,7 @@ from endopilot.devices.drive_limits import DriveLimits
 from endopilot.errors import InputError
 from endopilot.evaluation.protocols import follow_slack, hold_slack, mean_control
 from endopilot.files import read_json, sha256
-from endopilot.models.causal import CausalPredictor, ForwardNetwork, InverseNetwork, Mixture
+from endopilot.models.causal import CausalForward, CausalInverse, CausalPredictor, Mixture
 from endopilot.models.checkpoint import load_model
 from endopilot.models.config import CausalConfig, TrainConfig
 from endopilot.models.episodes import JUMP_MM, Episodes, Predictor, ProbabilisticPredictor, jumps
@@ -79,7 +79,7 @@ def packaged() -> CausalPredictor:
 
 def untrained() -> CausalPredictor:
     torch.manual_seed(1)
-    networks = ForwardNetwork(SMALL).eval(), InverseNetwork(SMALL).eval()
+    networks = CausalForward(SMALL).eval(), CausalInverse(SMALL).eval()
     for network in networks:
         torch.nn.init.normal_(network.output.weight, std=0.5)
     limits = DriveLimits(max_velocity_mm_s=40.0, max_rotation_rad_s=12.6)

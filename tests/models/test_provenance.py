@@ -12,7 +12,7 @@ from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.files import read_json
 from endopilot.models.config import PRETRAINED, TrainConfig, TransformerConfig, run_path
-from endopilot.models.provenance import trained_patients
+from endopilot.models.episodes import trained_patients
 from endopilot.models.train import train
 from toy_navigation import make_toy_dataset
 

@@ -36,7 +36,7 @@ def learnt(toy_dataset, tmp_path_factory):
 @pytest.fixture(scope="module")
 def episodes(toy_dataset):
     """Return navigations of patients that were not trained on."""
-    return Episodes.of_dataset(read_dataset(toy_dataset).of_split("test").select(np.arange(16)))
+    return Episodes.of_dataset(read_dataset(toy_dataset).of_split("test")[:16])
 
 
 def untrained(limits=(1e9, 1e9)) -> TransformerPredictor:

@@ -190,7 +190,7 @@ def test_the_first_bad_loss_stops_and_the_last_good_checkpoint_stays(toy_dataset
     monkeypatch.undo()
     _, facts = read_tensors(tmp_path / "run/checkpoints/ff.safetensors")
     assert [entry["epoch"] for entry in facts["curve"]] == [1]
-    network, _ = read_network(tmp_path / "run/ff.safetensors")
+    network = read_network(tmp_path / "run/ff.safetensors")
     assert all(torch.isfinite(tensor).all() for tensor in network.state_dict().values())
 
 

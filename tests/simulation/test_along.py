@@ -75,19 +75,6 @@ def test_what_is_rough_ahead_holds_the_wire_once_it_is_there(pushed):
     np.testing.assert_allclose(force[:3], before[:3], rtol=0.05)
 
 
-def test_a_state_is_gone_on_from_with_the_same_friction(bend):
-    config = replace(CORE, friction_along=(1.0, 4.0))
-    once, again = (Simulator(bend, WIRE, config=config) for _ in range(2))
-    once.reset(inserted_length=[35.0], rotation=[0.0])
-    again.set_state(once.state)
-    for _ in range(4):
-        np.testing.assert_array_equal(
-            once.step([[5.0, 0.3]], 0.5).tip_position, again.step([[5.0, 0.3]], 0.5).tip_position
-        )
-    with pytest.raises(InputError, match="state: made with other"):
-        Simulator(bend, WIRE, config=CORE).set_state(once.state)
-
-
 def test_the_wall_yields_where_it_is_soft(bend):
     soft = replace(CORE, compliant_wall_n_mm2=0.04)
 

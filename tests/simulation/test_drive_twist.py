@@ -9,7 +9,6 @@ import bend
 import numpy as np
 import pytest
 
-from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import Wire, read_wire
 from endopilot.devices.stack import Stack, Transmission
 from endopilot.errors import InputError
@@ -18,8 +17,8 @@ from endopilot.simulation.core import run_core
 from endopilot.simulation.groups import make_wall
 from endopilot.simulation.rod import lay_out
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.trajectory_file import read_trajectory
-from endopilot.simulation.transmission import lay_out_transmission
+from endopilot.simulation.trajectory import read_trajectory
+from endopilot.simulation.tubes import lay_out_transmission
 
 CONFIG = SimulatorConfig(element_mm=1.25, time_step_s=0.025, threads=1)
 BEHIND = Transmission(length_mm=1000.0, twist_friction_n_mm_mm=2e-4)
@@ -86,23 +85,6 @@ def test_a_drive_slips_at_its_own_torque(vessel, wire: Wire) -> None:
     assert 0.1 <= held < 0.11  # with the introducer's valve
     assert world.drive_rotation[0, 0] < 2.0  # of 24 rad that were commanded
     assert world.rotation[0, 0] == pytest.approx(0.0, abs=0.05)
-
-
-@pytest.mark.parametrize("catheters", [(), ("microcatheter-1.7f",)])
-def test_the_same_bits_from_a_restored_state(vessel, wire: Wire, catheters: tuple[str, ...]) -> None:
-    around = tuple(read_catheter(name) for name in catheters)
-    stack = Stack(wire, around, (BEHIND,) * (1 + len(around)))
-    control = commands(3, 6, len(stack))
-    one, other = simulator(vessel, stack), simulator(vessel, stack)
-    one.run(control[:, :3])
-    kept = one.state
-    once = one.run(control[:, 3:])
-    other.set_state(kept)
-    again = other.run(control[:, 3:])
-    assert once.valid.all()
-    assert np.array_equal(once.tip_position, again.tip_position)
-    assert np.array_equal(one.drive_rotation, other.drive_rotation)
-    assert (one.drive_rotation != one.rotation).all()
 
 
 def test_the_same_bits_for_any_number_of_lanes(vessel, wire: Wire) -> None:

@@ -16,9 +16,8 @@ from endopilot.errors import InputError
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Hand
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.engine_simulator import EngineSimulator
+from endopilot.simulation.engine_simulator import SHELL_MM, EngineSimulator, wall_triangles
 from endopilot.simulation.motion import Motion
-from endopilot.simulation.other_engine import SHELL_MM, wall_triangles
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation, Target

@@ -14,7 +14,6 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import of_device, run_core
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import SimulatorState
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 from endopilot.verification.case import STATIC, X_AXIS, straight_rod
 
@@ -136,38 +135,6 @@ def test_what_slips_in_a_vessel_is_told_and_the_limits_hold(anatomy: Anatomy) ->
     np.testing.assert_allclose(SAMPLE_PERIOD_S * trajectory.control + slip, asked, atol=1e-12)
     made = trajectory.start[:, None] + SAMPLE_PERIOD_S * np.cumsum(trajectory.control, axis=1)
     np.testing.assert_allclose(trajectory.proximal, made, atol=1e-9)
-
-
-def test_what_was_made_is_where_the_wire_is(anatomy: Anatomy) -> None:
-    initial, control = navigation()
-    trajectory = simulate(anatomy, WEAK, control, initial=initial, config=CONFIG)
-    simulator = Simulator(anatomy, WEAK, worlds=len(control), config=CONFIG)
-    simulator.reset(inserted_length=initial[:, 0], rotation=initial[:, 1])
-    for sample in np.moveaxis(control, 1, 0):
-        simulator.step(sample, SAMPLE_PERIOD_S)
-    np.testing.assert_array_equal(simulator.proximal, trajectory.proximal[:, -1])
-    np.testing.assert_array_equal(simulator.position[:, :1], trajectory.tip_position[:, -1])
-
-
-def test_a_drive_that_slips_gives_the_same_bits_in_any_company_and_from_any_state(anatomy: Anatomy, tmp_path) -> None:
-    initial, control = navigation()
-    names = ("tip_position", "base_force", "base_torque", "slip", "rotation_slip", "iterations", "inserted_length")
-    one = simulate(anatomy, WEAK, control, initial=initial, config=CONFIG)
-    order = np.array([3, 0, 4, 1, 2])
-    shuffled = simulate(anatomy, WEAK, control[order], initial=initial[order], config=replace(CONFIG, threads=2))
-    alone = simulate(anatomy, WEAK, control[[4]], initial=initial[[4]], config=CONFIG)
-    simulator = Simulator(anatomy, WEAK, worlds=len(control), config=CONFIG)
-    simulator.reset(inserted_length=initial[:, 0], rotation=initial[:, 1])
-    for t in range(control.shape[1]):
-        step = simulator.step(control[:, t], SAMPLE_PERIOD_S)
-        for name in ("tip_position", "slip", "rotation_slip"):
-            np.testing.assert_array_equal(getattr(step, name), getattr(one, name)[:, t])
-        simulator.state.write(tmp_path / "state.npz")
-        simulator = Simulator(anatomy, WEAK, worlds=len(control), config=CONFIG)
-        simulator.set_state(SimulatorState.read(tmp_path / "state.npz"))
-    for name in names:
-        np.testing.assert_array_equal(getattr(shuffled, name), getattr(one, name)[order])
-        np.testing.assert_array_equal(getattr(alone, name), getattr(one, name)[[4]])
 
 
 def test_a_wire_that_was_not_pulled_back_is_pushed_on_from_there(anatomy: Anatomy) -> None:

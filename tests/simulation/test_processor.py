@@ -17,8 +17,7 @@ from benchmarks.core.gpu import bench_gpu
 from endopilot import _core
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
-from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.processor import core_for
+from endopilot.simulation.config import SimulatorConfig, core_for
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy

@@ -42,19 +42,6 @@ def same(a, b, rows) -> None:
         assert np.array_equal(getattr(a, name), getattr(b, name)[rows]), name
 
 
-def test_bitwise_equal_whatever_the_company(anatomy: Anatomy) -> None:
-    initial, control = drive()
-    one = simulate(anatomy, DEVICE, control, initial=initial, config=SimulatorConfig(threads=1))
-    two = simulate(anatomy, DEVICE, control, initial=initial, config=SimulatorConfig(threads=2))
-    order = np.array([3, 0, 5, 1, 4, 2])
-    shuffled = simulate(anatomy, DEVICE, control[order], initial=initial[order])
-    alone = simulate(anatomy, DEVICE, control[[4]], initial=initial[[4]])
-    assert one.valid.all()
-    same(two, one, slice(None))
-    same(shuffled, one, order)
-    same(alone, one, [4])
-
-
 def test_kinematics_and_forces(anatomy: Anatomy) -> None:
     initial, control = drive()
     trajectory = simulate(anatomy, DEVICE, control, initial=initial, record_shape=True)

@@ -54,19 +54,6 @@ def begun(simulator: Simulator, worlds: int) -> Simulator:
     return simulator
 
 
-def test_steps_are_those_of_simulate_to_the_bit(anatomy: Anatomy) -> None:
-    control = controls(4, 3)
-    whole = simulate(anatomy, DEVICE, control.transpose(1, 0, 2).copy(), initial=start(3))
-    simulator = begun(Simulator(anatomy, DEVICE, worlds=3), 3)
-    for t in range(4):
-        step = simulator.step(control[t], PERIOD)
-        assert np.array_equal(step.tip_position, whole.tip_position[:, t])
-        assert np.array_equal(simulator.base_load[..., 0], whole.base_force[:, t])
-        assert np.array_equal(simulator.contacts.max(axis=1), whole.contact_force_max[:, t])
-        assert np.array_equal(simulator.project().abscissa, whole.tip.abscissa[:, t])
-    assert np.array_equal(simulator.inserted_length, whole.inserted_length[:, -1])
-
-
 def test_steps_of_another_length_are_those_of_simulate_to_the_bit(anatomy: Anatomy) -> None:
     control, period_s = controls(12, 3), 0.06  # no multiple of the time step
     whole = simulate(anatomy, DEVICE, control.transpose(1, 0, 2).copy(), initial=start(3), period_s=period_s)
@@ -101,16 +88,6 @@ def test_every_world_has_its_own_anatomy_and_device(anatomy: Anatomy, wider: Ana
         assert np.isnan(together.position[world, nodes:]).all()
         assert np.array_equal(together.contacts[world, :nodes], alone.contacts[0])
     assert len({tuple(tip) for tip in step.tip_position[:, 0]}) == 4
-
-
-def test_threads_change_no_bit(anatomy: Anatomy) -> None:
-    tips = []
-    for threads in (1, 2):
-        simulator = begun(Simulator(anatomy, DEVICE, worlds=9, config=SimulatorConfig(threads=threads)), 9)
-        for control in controls(3, 9):
-            step = simulator.step(control, 0.25)
-        tips.append(step.tip_position)
-    assert np.array_equal(*tips)
 
 
 @pytest.mark.parametrize("worlds", [1, 5])
@@ -413,18 +390,3 @@ def test_every_public_name_has_an_example_that_runs(anatomy: Anatomy) -> None:
     for test in examples:
         runner.run(test)
     assert runner.failures == 0 and runner.tries > 20
-
-
-def test_driven_by_force_a_world_is_the_same_in_any_company() -> None:
-    anatomy, worlds = vessel(), 6
-    random = np.random.default_rng(4)
-    start, load = random.uniform(3, 40, worlds), random.uniform([0.0, -0.02], [0.15, 0.02], (6, worlds, 2))
-
-    def drive(chosen: list[int]) -> np.ndarray:
-        simulator = Simulator(anatomy, DEVICE, worlds=len(chosen), actuation="force")
-        simulator.reset(inserted_length=start[chosen], rotation=np.zeros(len(chosen)))
-        return np.stack([simulator.step(row[chosen], 0.1).tip_position for row in load])
-
-    together = drive(list(range(worlds)))
-    for chosen in ([3], [5, 0, 2]):
-        np.testing.assert_array_equal(drive(chosen), together[:, chosen])

@@ -18,8 +18,7 @@ from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.robots import Recorder
-from endopilot.simulation.trajectory import Trajectory
-from endopilot.simulation.trajectory_file import read_trajectory, write_trajectory
+from endopilot.simulation.trajectory import Trajectory, read_trajectory
 from endopilot.types import Anatomy, TipProjection
 
 WIRE, CATHETER = read_wire("workhorse-014"), read_catheter("microcatheter-1.7f")
@@ -130,7 +129,7 @@ def test_every_third_sample_has_the_means_and_sums_of_its_period(vessel) -> None
 
 
 def test_a_file_gives_every_array_back_to_the_bit_and_is_replayed(vessel, moving_pair, tmp_path) -> None:
-    write_trajectory(moving_pair, tmp_path / "pair.npz")
+    moving_pair.write(tmp_path / "pair.npz")
     read = read_trajectory(tmp_path / "pair.npz", anatomy=vessel)
     assert_same(read, moving_pair)
     assert [each.identity for each in read.set_up.anatomies] == [vessel.identity] * 2
@@ -140,7 +139,7 @@ def test_a_file_gives_every_array_back_to_the_bit_and_is_replayed(vessel, moving
 
 
 def test_a_trajectory_without_its_vessel_is_read_and_not_replayed(wire_alone, tmp_path) -> None:
-    write_trajectory(wire_alone, tmp_path / "wire.npz")
+    wire_alone.write(tmp_path / "wire.npz")
     read = read_trajectory(tmp_path / "wire.npz")
     assert_same(read, wire_alone)
     with pytest.raises(InputError, match="the vessel is not given; read the trajectory with its anatomy"):
@@ -148,7 +147,7 @@ def test_a_trajectory_without_its_vessel_is_read_and_not_replayed(wire_alone, tm
 
 
 def test_a_file_says_what_its_arrays_mean(moving_pair, tmp_path) -> None:
-    write_trajectory(moving_pair, tmp_path / "pair.npz")
+    moving_pair.write(tmp_path / "pair.npz")
     with np.load(tmp_path / "pair.npz", allow_pickle=False) as stored:
         about = json.loads(str(stored["about"]))
         shapes = {name: stored[name].shape for name in stored.files if name != "about"}
@@ -166,7 +165,7 @@ def test_a_file_says_what_its_arrays_mean(moving_pair, tmp_path) -> None:
 
 def test_what_is_no_trajectory_of_the_vessel_is_refused_in_one_line(vessel, wire_alone, tmp_path) -> None:
     path = tmp_path / "wire.npz"
-    write_trajectory(wire_alone, path)
+    wire_alone.write(path)
     with np.load(path) as stored:
         arrays = dict(stored)
     newer = json.loads(str(arrays["about"])) | {"version": 99}
@@ -184,7 +183,7 @@ def test_what_is_no_trajectory_of_the_vessel_is_refused_in_one_line(vessel, wire
     _refused(path, make_patient(AtlasConfig(count=2), 1), f"world 0 is of another vessel, '{vessel.name}'")
     _refused(path, [vessel], f"world 1 is of another vessel, '{vessel.name}'")
     with pytest.raises(InputError, match=r"written as \.parquet, \.csv or \.npz"):
-        write_trajectory(wire_alone, tmp_path / "wire.txt")
+        wire_alone.write(tmp_path / "wire.txt")
 
 
 def _refused(path: Path, anatomy, message: str) -> None:

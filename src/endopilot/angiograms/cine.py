@@ -175,7 +175,6 @@ class Cine:
     def _device_masks(
         self, lines_mm: dict[str, Float[np.ndarray, "_ 3"]], lines_px: dict[str, Float[np.ndarray, "_ 2"]], number: int
     ) -> dict[str, Bool[np.ndarray, "rows columns"]]:
-        """Return the masks of the devices at a frame."""
         stack = self.imager.stack
         radius_mm = {"guide": self.imager.anatomy.catheter_radius_mm + GUIDE_WALL_MM, "wire": stack.wire.tip_radius_mm}
         driven = [name for name in lines_mm if name.startswith("catheter")]

@@ -1,10 +1,19 @@
-"""Settings of a data set of angiograms: `AngiogramsConfig`."""
+"""Settings of a data set of angiograms, `AngiogramsConfig`, and what stands where in it: `Layout`, from `lay_out`."""
 
 from __future__ import annotations
 
-from dataclasses import field
-from typing import Annotated
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
 
+from endopilot import __version__
+from endopilot.dataset.layout import assign_splits, identify
+from endopilot.devices.stack import Stack
+from endopilot.errors import InputError
+from endopilot.files import input_hash, json_text, sha256
 from endopilot.imaging.segment import SegmentConfig
 from endopilot.settings import Ascending, Finite, Positive, Seed, Share, Text, Within, settings
 from endopilot.simulation.motion import MotionName
@@ -58,3 +67,98 @@ class AngiogramsConfig:
     def frames(self) -> int:
         """Number of frames of a cine."""
         return max(round(self.seconds * self.frames_per_second), 1)
+
+
+FORMAT_VERSION = 1
+"""Counts changes of the files or of their meaning."""
+ANATOMY_FILE = "anatomy.json"
+CT_FILE = "ct.nii.gz"
+"""The CT in a patient's folder, HU."""
+SAMPLES_FILE, MANIFEST_FILE, CARD_FILE = "samples.png", "manifest.json", "README.md"
+_SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha", ".mhd")
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """The patients of a data set, and where everything stands.
+
+    Attributes:
+        sources: where each patient comes from: a folder of an anatomy, or a CT.
+        splits: of each: train, calibrate or test.
+        settings: what a resumed run must share with the run that it continues.
+        key: marks all of that.
+    """
+
+    output: Path
+    config: AngiogramsConfig
+    stack: Stack
+    sources: tuple[Path, ...]
+    names: tuple[str, ...]
+    splits: tuple[str, ...]
+    settings: dict[str, Any]
+    key: str
+
+    @property
+    def patients(self) -> list[Path]:
+        """The patients' folders."""
+        return [self.output / "patients" / name for name in self.names]
+
+    @property
+    def cines(self) -> list[Path]:
+        """The cines' folders, those of one patient after each other."""
+        return [
+            self.output / "cines" / f"{name}-{number:04d}" for name in self.names for number in range(self.config.cines)
+        ]
+
+    def annotations(self, split: str) -> Path:
+        """Return the path of a split's COCO file."""
+        return self.output / "annotations" / f"{split}.json"
+
+
+def lay_out(sources: Sequence[Path], output: Path, stack: Stack, config: AngiogramsConfig) -> Layout:
+    """Read who the patients are, and share them among the splits.
+
+    Raises:
+        InputError: no source, or one that cannot be read; two of one name; too few for the splits.
+    """
+    if not sources:
+        raise InputError("anatomies: none given; name folders made by `endopilot anatomy` or `endopilot atlas`, or CTs")
+    found = [_identified(path) for path in sources]
+    names = tuple(name for name, _ in found)
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"anatomies: {names.count(name)} are named '{name}'; give each patient a name of its own")
+        if Path(name).name != name or name.startswith("."):
+            raise InputError(f"anatomies: '{name}' names no folder; give the patient another name")
+    splits = assign_splits(names, 1, anatomy_shares=config.anatomy_shares, seen_test_share=0.0)[:, 0]
+    settings = {
+        "config": asdict(config),
+        "device": asdict(stack.wire),
+        "catheters": [asdict(catheter) for catheter in stack.catheters],
+        "patients": dict(found),
+        "version": f"endopilot {__version__}, format {FORMAT_VERSION}",
+    }
+    settings = json.loads(json_text(settings))  # as JSON gives them back, so that they compare equal
+    key = hashlib.sha256(json_text(settings).encode()).hexdigest()
+    return Layout(Path(output), config, stack, tuple(sources), names, tuple(splits.tolist()), settings, key)
+
+
+def is_anatomy(path: Path) -> bool:
+    """Return whether this is the folder of an anatomy, and not a CT."""
+    return (path / ANATOMY_FILE).exists()
+
+
+def _identified(path: Path) -> tuple[str, str]:
+    """Return a patient's name, and the hash of the vessel and of its CT.
+
+    Raises:
+        InputError: there is no such file or folder, or the folder is empty or holds a damaged anatomy.
+    """
+    if is_anatomy(path):
+        name, identity = identify(path)
+        ct = path / CT_FILE
+        return name, f"{identity} {sha256(ct)}" if ct.exists() else identity
+    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+        raise InputError(f"{path}: is no anatomy and no CT; give a folder made by `endopilot atlas`, or a CT angiogram")
+    name = next((path.name.removesuffix(end) for end in _SUFFIXES if path.name.endswith(end)), path.name)
+    return name, next(iter(input_hash(path).values()))

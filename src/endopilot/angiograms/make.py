@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from endopilot.angiograms.config import AngiogramsConfig
+from endopilot.angiograms.config import CARD_FILE, MANIFEST_FILE, SAMPLES_FILE, AngiogramsConfig, Layout, lay_out
 from endopilot.angiograms.draw import view_text
-from endopilot.angiograms.layout import CARD_FILE, MANIFEST_FILE, SAMPLES_FILE, Layout, lay_out
 from endopilot.angiograms.masks import CLASSES
 from endopilot.angiograms.write import COCO_FILE, RECORD_FILE, coco, write_cine, write_patient
 from endopilot.dataset.layout import SPLITS
@@ -105,7 +104,6 @@ def describe(layout: Layout) -> None:
 
 
 def _counts(layout: Layout, records: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]:
-    """Return the numbers of patients, cines and frames of each split."""
     patients, cines = Counter(layout.splits), Counter(record["split"] for record in records)
     return {
         split: {"patients": patients[split], "cines": cines[split], "frames": cines[split] * layout.config.frames}

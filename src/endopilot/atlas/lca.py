@@ -144,7 +144,6 @@ def _draw(
 
 @cache
 def _templates() -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:
-    """Return the mean courses of the anterior descending artery, and of circumflex and left posterior descending."""
     lcx = np.concatenate([LCX, INFERIOR[1:]])
     return shape.curve_through(LAD, 1.0), shape.curve_through(lcx, 1.0)
 
@@ -189,7 +188,6 @@ def _bent(
     plans: Sequence[branching.SidePlan],
     population: Population,
 ) -> _Trunk:
-    """Return the main vessels with a patient's bends beyond the left main's fork."""
     if not population.bends_vessels:
         return trunk
     beyond = round(2.5 * float(vessels[0].radius[trunk.fork]) / shape.STEP_MM)

@@ -115,7 +115,6 @@ def vessel_data(vessel: str) -> dict[str, Any]:
 
 
 def _frozen(value: Any) -> Any:
-    """Return read values with tuples in place of lists."""
     if isinstance(value, dict):
         return {name: _frozen(each) for name, each in value.items()}
     return tuple(map(_frozen, value)) if isinstance(value, list) else value

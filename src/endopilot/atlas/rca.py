@@ -189,7 +189,6 @@ def _plan_branches(
     calibre: float,
     population: Population,
 ) -> list[branching.SidePlan]:
-    """Draw which branches there are, where they leave, how long and how wide they are."""
     plans: list[branching.SidePlan] = []
     end_mm = (len(radius) - 1) * shape.STEP_MM
     presence = factor(generator, population.side_share)

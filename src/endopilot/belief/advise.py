@@ -17,7 +17,7 @@ from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.errors import InputError
 from endopilot.files import manifest, sha256, write_json, writing
 from endopilot.models.config import PRETRAINED, WINDOW, read_run, run_path
-from endopilot.models.provenance import check_wire
+from endopilot.models.episodes import check_wire
 from endopilot.progress import progress
 from endopilot.runs import claim
 

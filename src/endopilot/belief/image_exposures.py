@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.dataset.again import simulate_again
 from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.errors import InputError
 from endopilot.files import json_text, writing
@@ -119,7 +118,7 @@ def _expose_patient(path: Path, *, dataset: Path, split: str, settings: ImageSet
         InputError: the anatomy is missing or damaged.
     """
     data, name = read_dataset(dataset).of_split(split), path.stem
-    data = data.select(data.anatomy == name)
+    data = data[data.anatomy == name]
     made = expose_navigations(data, read_anatomy(data.anatomy_folder(name)), settings)
     with writing(path) as partial_path, partial_path.open("wb") as stream:
         np.savez_compressed(stream, **{field.name: getattr(made, field.name) for field in fields(Exposures)})  # pyright: ignore[reportArgumentType]
@@ -152,7 +151,7 @@ def expose_navigations(data: Dataset, anatomy: Anatomy, settings: ImageSettings)
     encoder = data.inserted_length[:, :, 0].astype(float) - deeper_ostium_mm(name, settings.ostium_mm, seed)
     encoder = encoder - world.ostium_mm
     measured: list[list[TipMeasurement | None]] = [[] for _ in data.sequence]
-    again = simulate_again(data, anatomy, data.command, record_shape=True)
+    again = data.driven(anatomy=anatomy, record_shape=True)
     assert again.shape is not None
     for index, nodes in enumerate(again.shape):
         arm.forget_wires()

@@ -138,7 +138,7 @@ def monitor(predictor: Predictor, dataset: Dataset, config: AdviseConfig, *, sam
         count = dataset.valid.shape[1] if samples is None else samples
         settings = ImageSettings(config.fluoroscope, config.ostium_mm, config.seed, count)
         images, unregistered = image_exposures(dataset, settings)
-        dataset = dataset.select(~np.isin(dataset.anatomy, unregistered))
+        dataset = dataset[~np.isin(dataset.anatomy, unregistered)]
     names, owner = np.unique(dataset.anatomy, return_inverse=True)
     wire_radius = from_record(Wire, dataset.manifest["device"]).tip_radius_mm
     world = dataset.world
@@ -164,7 +164,7 @@ def monitor(predictor: Predictor, dataset: Dataset, config: AdviseConfig, *, sam
                 arm = Fluoroscope(
                     anatomy, wire_radius, config=config.fluoroscope, registration_mm=world.registration_mm
                 )
-                shown = arm.expose_episodes(dataset.select(mine), proximal[mine, :, 0], config.seed)
+                shown = arm.expose_episodes(dataset[mine], proximal[mine, :, 0], config.seed)
                 tip[mine], branch[mine] = np.stack([shown.abscissa, shown.offset], axis=-1), shown.branch
             advance()
     measured = {"proximal": proximal, "tip": tip, "branch": branch, "tip_sd": sd_mm}

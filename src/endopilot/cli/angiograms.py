@@ -33,7 +33,7 @@ def command(
             the cores of this machine if not given.
         config: how many cines, and what they show.
     """
-    from endopilot.angiograms.layout import MANIFEST_FILE, SAMPLES_FILE  # slow to import; --help needs none
+    from endopilot.angiograms.config import MANIFEST_FILE, SAMPLES_FILE  # slow to import; --help needs none
     from endopilot.angiograms.make import make_angiograms
 
     make_angiograms(patients, output=output, device=Stack.of(device, *catheter), config=config, scheduler=scheduler)

@@ -10,9 +10,9 @@ from tyro.conf import Positional
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cli.arguments import Answer, Existing, OutputFile
+from endopilot.devices.catheter import write_device
 from endopilot.devices.device import read_wire
 from endopilot.devices.robot import read_robot
-from endopilot.devices.write import write_device
 from endopilot.files import input_hash, manifest, write_json
 from endopilot.robot.calibrate import CalibrateConfig, RobotCalibration, calibrate
 from endopilot.robot.log import read_log

@@ -22,8 +22,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls, read_controls_csv
 from endopilot.simulation.motion import Motion, MotionName, motion_named
 from endopilot.simulation.simulate import simulate, wall_force_events
-from endopilot.simulation.trajectory import Trajectory
-from endopilot.simulation.trajectory_file import read_trajectory
+from endopilot.simulation.trajectory import Trajectory, read_trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 

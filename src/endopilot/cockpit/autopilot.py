@@ -152,7 +152,6 @@ class Autopilot:
         return isinstance(self._policy, Led)
 
     def _collect(self) -> Proximals | None:
-        """Take the decision that was pending, if it has been made."""
         pending = self._pending
         assert pending is not None
         if not pending.done():
@@ -176,7 +175,6 @@ class Autopilot:
         return self._world.loop.take(decision).devices
 
     def _let_go(self, status: str) -> None:
-        """Let the hand drive from now on."""
         self.status = status
         self._world.loop.hand_over(self._world.hand)
 

@@ -21,16 +21,14 @@ from endopilot.cockpit.frames import device_arrays, encode, motion_values, targe
 from endopilot.cockpit.recording import SUFFIX, read_session, replayed
 from endopilot.cockpit.world import Snapshot, loop_snapshot, take_snapshot
 from endopilot.control.plan_file import read_plan
-from endopilot.dataset.again import episode_set_up
 from endopilot.dataset.loader import read_dataset
 from endopilot.errors import InputError
 from endopilot.files import reading
 from endopilot.ladder.attempt import Recording, begun, navigation_seed
 from endopilot.ladder.submission import recorded_navigation
-from endopilot.simulation.set_up import SimulationSetUp
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.trajectory import Trajectory
-from endopilot.simulation.trajectory_file import TRAJECTORY, read_trajectory
+from endopilot.simulation.state import SimulationSetUp
+from endopilot.simulation.trajectory import TRAJECTORY, Trajectory, read_trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.tasks.task import Task
 
@@ -100,9 +98,8 @@ def open_film(path: Path, patient: Path | None = None, *, world: int = 0, task: 
         return _session(path)
     if (path / "meta").is_dir():
         with reading(path, "make the data set again"):
-            data = read_dataset(path)
-            set_up, title = episode_set_up(data, world), f"episode {world} of {path.name}"
-            return _film(set_up, data.command[world], data.sample_period_s, {}, title)
+            data = read_dataset(path)[world]
+            return _film(data.set_up(), data.command[0], data.sample_period_s, {}, f"episode {world} of {path.name}")
     if path.suffix == ".json":
         with reading(path, "give a file of the ladder as it was written"):
             return _of_the_ladder(*recorded_navigation(path, task, world))
@@ -144,7 +141,6 @@ def _session(path: Path) -> Film:
 
 
 def _of_the_ladder(task: Task, place: int, recording: Recording) -> Film:
-    """Return a film of a navigation of the ladder, of which its decisions were recorded."""
     navigation, periods = task.ladder_navigation(place), len(recording.control)
 
     def make() -> Iterator[FilmFrame]:

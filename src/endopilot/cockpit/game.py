@@ -143,7 +143,6 @@ class GameSession(Session):
             self.phase = "waits"
 
     def _relive(self, events: Sequence[dict[str, Any]]) -> None:
-        """Take over the events of a cycle that has passed; the world's loop counts as it did."""
         super()._relive(events)
         if self.phase == "on" and self.world.loop.reason is not None:
             self._end()
@@ -175,7 +174,6 @@ class GameSession(Session):
 
 
 def _rival(tried: Attempt) -> dict[str, Any]:
-    """Let the agent drive the same task in the same patient."""
     navigation = tried.task.ladder_navigation(tried.place)
     scored = attempt(RIVAL, navigation, seed=tried.seed, terms=Terms(robot=tried.robot))
     return {name: scored[name] for name in _SHOWN}

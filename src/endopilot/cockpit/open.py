@@ -15,9 +15,8 @@ from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.cockpit.film import FRAME_S
 from endopilot.cockpit.fluoroscopy import XrayUnit
 from endopilot.cockpit.frames import scene
-from endopilot.cockpit.loop import Stage
 from endopilot.cockpit.recording import SUFFIX, Recorder, Where, read_session, replayed
-from endopilot.cockpit.session import Session
+from endopilot.cockpit.session import Session, Stage
 from endopilot.cockpit.world import BY_HAND, LiveWorld
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack

@@ -144,7 +144,6 @@ def read_session(path: Path) -> RecordedSession:
 
 
 def _between_checks(config: LoopConfig) -> int:
-    """Return the number of cycles from one check to the next."""
     return max(1, round(CHECK_S / config.cycle_s))
 
 

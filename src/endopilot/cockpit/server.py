@@ -28,8 +28,8 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from endopilot.cockpit.frames import encode
-from endopilot.cockpit.loop import Loop, Stage
 from endopilot.cockpit.messages import LONGEST_MESSAGE, Ping, Wheel, read_message
+from endopilot.cockpit.session import Loop, Stage
 from endopilot.errors import InputError
 
 WEB = Path(__file__).parent / "web"

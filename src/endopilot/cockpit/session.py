@@ -1,13 +1,16 @@
 """A session: what happens in a cycle. Messages come in, the world moves on, X-ray pulses, frames go out.
 
-Everything here runs in one thread, by the world's clock. The only real time in it is the watchdog's.
+Everything in `Session` runs in one thread, `Loop`, by the world's clock. The only real time in it is the watchdog's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
 from itertools import chain
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -15,6 +18,7 @@ from endopilot.cockpit import messages
 from endopilot.cockpit.autopilot import Autopilot, check_policy
 from endopilot.cockpit.fluoroscopy import XrayUnit
 from endopilot.cockpit.frames import device_arrays, encode, motion_values, target_values, tip_values
+from endopilot.cockpit.messages import Message
 from endopilot.cockpit.recording import Recorder
 from endopilot.cockpit.world import LiveWorld, Snapshot
 from endopilot.devices.stack import Proximals
@@ -102,7 +106,6 @@ class Session:
         self._record(stop="resumed")
 
     def _relive(self, events: Sequence[dict[str, Any]]) -> None:
-        """Take over the events of a cycle that has passed."""
         for event in events:
             if "target" in event:
                 self.world.loop.aim(Target(branch=event["target"][0], abscissa=event["target"][1]))
@@ -203,7 +206,6 @@ class Session:
             self._stopped = ""
 
     def _aim(self, message: messages.Target) -> None:
-        """Set the target, in the middle of a section or at a place."""
         tree = self.world.navigation.anatomy.tree
         if message.section is not None:
             self.world.loop.aim(find_target(tree, message.section))
@@ -214,7 +216,6 @@ class Session:
         self._record(target=[self.target.branch, self.target.abscissa])
 
     def _steer(self, message: messages.Autopilot) -> None:
-        """Hand the wheel to a policy or back, or let it pause."""
         if message.action == "start":
             self.autopilot.start(check_policy(message.policy, self._policies), self.target)
             if self._moving:
@@ -235,11 +236,9 @@ class Session:
         self.autopilot.stop()
 
     def _move(self, devices: Proximals) -> None:
-        """Command the robot by hand."""
         self._note(self.world.command(devices), devices)
 
     def _note(self, taken: Proximals, asked: Proximals) -> None:
-        """Note and write down what the robot has taken, and of what."""
         self._command, self._asked = taken, asked
         self._record(move=list(chain.from_iterable(self._command)))
 
@@ -273,3 +272,117 @@ class Session:
 
 def _images(images: list[bytes]) -> list[tuple[str, bytes]]:
     return [(f"image{number}", image) for number, image in enumerate(images)]
+
+
+_LATE_S = 0.25
+"""A loop that is later than this lets the time go, s."""
+
+
+@runtime_checkable
+class Stage(Protocol):
+    """What the loop runs: a session that is driven, or one that is replayed."""
+
+    def handle(self, message: Message, now_s: float) -> None:
+        """Do what a page asks for, at a real time, s."""
+        ...
+
+    def halt(self, why: str) -> None:
+        """Stop the wire."""
+        ...
+
+    def cycle(self, now_s: float) -> list[tuple[str, bytes]]:
+        """Let one cycle pass at a real time, s, and return messages for the pages by channel."""
+        ...
+
+    def close(self) -> None:
+        """End it."""
+        ...
+
+
+class Loop:
+    """Runs a stage in a thread of its own. What pages send goes through a queue; what they get, to `publish`.
+
+    Attributes:
+        late_cycles: how often time was let go because a cycle took too long.
+    """
+
+    def __init__(self, stage: Stage, cycle_s: float, publish: Callable[[str, bytes], None]) -> None:
+        """Take the stage.
+
+        Args:
+            publish: called in the thread with a channel's name and a message.
+        """
+        self._stage, self._cycle_s, self._publish = stage, cycle_s, publish
+        self._inbox: queue.SimpleQueue[Message | str] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="cockpit", daemon=True)
+        self._wanted, self._over = threading.Event(), threading.Event()
+        self.late_cycles = 0
+
+    def start(self) -> None:
+        """Start the thread; time passes while `run` is set."""
+        self._thread.start()
+
+    def pause(self, paused: bool) -> None:
+        """Let time stand still, as while nobody looks, or go on."""
+        if paused:
+            self._wanted.clear()
+        else:
+            self._wanted.set()
+
+    def send(self, message: Message) -> None:
+        """Give the stage a message of who drives."""
+        self._inbox.put(message)
+
+    def halt(self, why: str) -> None:
+        """Let the stage stop the wire in its next cycle."""
+        self._inbox.put(why)
+
+    def stop(self) -> None:
+        """End the thread and the stage."""
+        self._over.set()
+        self._wanted.set()
+        if self._thread.ident is not None:
+            self._thread.join(timeout=10)
+
+    def _run(self) -> None:
+        try:
+            self._cycles()
+        except Exception as error:
+            text = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            self._publish("error", encode("error", {"text": f"The simulation has stopped. {text}", "fatal": True}))
+            raise  # which the command line tells, too
+        finally:
+            self._stage.close()
+
+    def _cycles(self) -> None:
+        due = time.perf_counter()
+        while not self._over.is_set():
+            if not self._wanted.is_set():
+                self._read(time.perf_counter())
+                if not self._wanted.wait(timeout=0.05):
+                    continue
+                due = time.perf_counter()
+            now = time.perf_counter()
+            self._read(now)
+            for channel, message in self._stage.cycle(now):
+                self._publish(channel, message)
+            due += self._cycle_s
+            done = time.perf_counter()
+            if done - due > _LATE_S:
+                due, self.late_cycles = done, self.late_cycles + 1
+            if due > done:
+                time.sleep(due - done)
+
+    def _read(self, now: float) -> None:
+        while True:
+            try:
+                message = self._inbox.get_nowait()
+            except queue.Empty:
+                return
+            try:
+                if isinstance(message, str):
+                    self._stage.halt(message)
+                else:
+                    self._stage.handle(message, now)
+            except InputError as error:
+                self._publish("notice", encode("notice", {"text": str(error)}))

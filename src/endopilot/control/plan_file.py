@@ -44,7 +44,7 @@ from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, reading, sha256, writing_folder
 from endopilot.settings import from_record
 from endopilot.simulation.signals import table_columns
-from endopilot.simulation.trajectory_file import TRAJECTORY, read_trajectory
+from endopilot.simulation.trajectory import TRAJECTORY, read_trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.types import Anatomy, TipProjection
 

@@ -22,8 +22,8 @@ import pyarrow.parquet as pq
 
 from endopilot.dataset import parquet, schema
 from endopilot.dataset.config import DatasetConfig
-from endopilot.dataset.draw import Draw
 from endopilot.dataset.layout import SPLITS, Block, Layout, make_layout
+from endopilot.dataset.navigations import Draw
 from endopilot.dataset.workers import run_locally, run_on_cluster, store_block, write_timed
 from endopilot.devices.device import Wire
 from endopilot.devices.robot import RobotConfig
@@ -157,11 +157,10 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
     files = [schema.paths_of_file(context.output, block.number) for block in blocks]
     columns = ("episode_index", "anatomy", "sequence", "split", "stopped_short", "valid", "invalid_reason")
     episodes = [row for _, path in files for row in parquet.read_table(path, context.key).select(columns).to_pylist()]
-    started, devices = time.process_time(), len(context.stack)
+    started = time.process_time()
+    described = schema.features(context.config.control, len(context.stack), by_robot=context.robot is not None)
     with progress("Describing the dataset", total=len(files)) as advance:
-        stats, shares = parquet.statistics(
-            context.config.control, [path for path, _ in files], context.key, advance, devices
-        )
+        stats, shares = parquet.statistics(described, [path for path, _ in files], context.key, advance)
     work = read_work(context.output)
     work["processor_seconds"] += time.process_time() - started
     write_json(context.output / schema.STATS_PATH, stats)
@@ -169,7 +168,6 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
     with writing(context.output / schema.TASKS_PATH) as partial:
         tasks.to_parquet(partial)
     samples = context.config.samples
-    described = schema.features(context.config.control, devices, by_robot=context.robot is not None)
     info = schema.info(described, episodes=len(episodes), samples=len(episodes) * samples)
     write_json(context.output / schema.INFO_PATH, info)
     reported = ("episode_index", "anatomy", "sequence", "invalid_reason")

@@ -12,14 +12,11 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.dataset import parquet, schema
-from endopilot.dataset.loader import read_manifest
-from endopilot.files import read_json, reading, writing
-from endopilot.progress import progress
+from endopilot.dataset.loader import Dataset, read_dataset
+from endopilot.files import reading, writing
 from endopilot.types import SAMPLE_PERIOD_S
 
 BINS = 400
-_TIP = ("tip_bend_rad", "tip_stiffness_factor")
 _QUANTILES = {"p5": 0.05, "median": 0.5, "p95": 0.95, "p99": 0.99}
 
 
@@ -37,11 +34,6 @@ class Histogram:
     unit: str
     edges: Float[np.ndarray, "bins_1"]
     counts: Float[np.ndarray, "bins"]
-
-    def add(self, values: Float[np.ndarray, "n"]) -> None:
-        """Count some more values."""
-        inside = np.clip(values, self.edges[0], self.edges[-1])
-        self.counts[:] += np.histogram(inside, self.edges)[0]
 
     def quantiles(self) -> dict[str, float]:
         """Return the 5th, 50th, 95th and 99th percentile, to within a bin."""
@@ -66,93 +58,67 @@ class Description:
 
 
 def describe_dataset(folder: Path) -> Description:
-    """Count what a dataset holds, one file at a time.
+    """Count what a dataset holds.
 
     γ/r is the paper's offset ratio; a wire of radius r_w touches the wall where γ/(r − r_w) is 1.
 
     Raises:
         InputError: the folder holds no finished dataset, or a file of it is missing, damaged or of another version.
     """
-    folder = Path(folder)
-    with reading(folder, "make the dataset again"):
-        return _described(folder, *read_manifest(folder))
+    data = read_dataset(folder)
+    with reading(data.folder, "make the dataset again"):
+        return _described(data)
 
 
-def _described(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> Description:
-    stats = read_json(folder / schema.STATS_PATH)
-    wire_mm = manifest["device"]["diameter_mm"] / 2
-    histograms = _empty(float(stats["observation.state"]["max"][0]))
-    episodes: dict[str, list[Any]] = {}
-    visits = Counter[int]()
-    with progress("Reading the dataset", total=manifest["files"]) as advance:
-        for number in range(manifest["files"]):
-            data_path, episodes_path = schema.paths_of_file(folder, number)
-            for name, values in parquet.read_table(episodes_path, manifest["key"]).to_pydict().items():
-                episodes.setdefault(name, []).extend(values)
-            table = parquet.read_table(data_path, manifest["key"])
-            _count(table, wire_mm, histograms, visits, manifest["samples_per_episode"])
-            advance()
-    total = max(sum(visits.values()), 1)
-    branch_visits = np.array([visits[n] / total for n in range(max(visits, default=0) + 1)])
-    pairs = set(zip(episodes["split"], episodes["anatomy"], strict=True))
-    reasons = Counter(re.sub(r" after .*", "", reason) for reason in episodes["invalid_reason"] if reason)
-    files = [file for file in folder.rglob("*") if file.is_file()]
-    catheters = [catheter["name"] for catheter in manifest.get("catheters", ())]
+def _described(data: Dataset) -> Description:
+    manifest, valid = data.manifest, data.valid
+    deepest, offset, radius, force = (
+        signal[valid].astype(float).reshape(valid.sum(), -1)[:, 0]
+        for signal in (data.inserted_length, data.tip_offset, data.lumen_radius, data.contact_force_max)
+    )
+    wall_ratio = safety_ratio(offset, radius, manifest["device"]["diameter_mm"] / 2)
+    length_mm, ratios = np.linspace(0.0, max(deepest.max(initial=0.0), 1.0), BINS + 1), np.linspace(0.0, 1.2, BINS + 1)
+    forces = np.append(0.0, np.geomspace(1e-4, 10.0, BINS))
+    histograms = {
+        "insertion": _counted("inserted length Δ", "mm", length_mm, deepest),
+        "offset-ratio": _counted("offset ratio γ/r", "", ratios, offset / radius),
+        "wall-ratio": _counted("offset ratio γ/(r − r_w)", "", ratios, wall_ratio),
+        "contact-force": _counted("largest contact force", "N", forces, force),
+    }
+    visited = 1 + (np.diff(np.sort(data.branch[valid.all(axis=1), :, 0], axis=1), axis=1) != 0).sum(axis=1)
+    branch_visits = np.bincount(visited, minlength=1) / max(len(visited), 1)
+    pairs = set(zip(data.split.tolist(), data.anatomy.tolist(), strict=True))
+    reasons = Counter(re.sub(r" after .*", "", each["invalid_reason"]) for each in manifest["invalid"]["which"])
+    files = [file for file in data.folder.rglob("*") if file.is_file()]
+    catheters = [catheter.name for catheter in data.stack.catheters]
+    of_wire = {"friction": data.friction[:, 0], "tip_bend_rad": data.tip_bend}
+    of_wire["tip_stiffness_factor"] = data.tip_stiffness_factor
     figures = {
         "anatomies": len(manifest["anatomies"]),
-        "navigations": info["total_episodes"],
-        "samples": info["total_frames"],
-        "hours": round(info["total_frames"] * SAMPLE_PERIOD_S / 3600, 2),
+        "navigations": len(data),
+        "samples": valid.size,
+        "hours": round(valid.size * SAMPLE_PERIOD_S / 3600, 2),
         "megabytes": round(sum(file.stat().st_size for file in files) / 1e6, 2),
         "device": manifest["device"]["name"],
         **({"catheters": catheters} if catheters else {}),
-        "control": schema.actuation_of(info["features"]),
+        "control": manifest["config"]["control"],
         "made_by": manifest["settings"]["version"],
-        "splits": dict(Counter(episodes["split"])),
+        "splits": dict(Counter(data.split.tolist())),
         "anatomies_by_split": dict(Counter(split for split, _ in sorted(pairs))),
         "manoeuvres": {name: round(share, 4) for name, share in manifest["manoeuvres"].items()},
-        "stopped_short": sum(episodes["stopped_short"]),
+        "stopped_short": manifest["stopped_short"],
         "invalid": len(manifest["invalid"]["which"]),
         "invalid_reasons": dict(reasons),
         **{f"{h.title} {h.unit}".strip(): h.quantiles() for h in histograms.values()},
         "branches visited": {str(n): round(float(share), 4) for n, share in enumerate(branch_visits) if share},
-        **{name: [round(of(episodes[name]), 4) for of in (min, max)] for name in ("friction", *_TIP)},
+        **{name: [round(float(of(values)), 4) for of in (np.min, np.max)] for name, values in of_wire.items()},
     }
     return Description(figures, histograms, branch_visits, manifest["manoeuvres"])
 
 
-def _empty(deepest_mm: float) -> dict[str, Histogram]:
-    """Return the quantities that are counted, with nothing counted yet."""
-    ratio, force = np.linspace(0.0, 1.2, BINS + 1), np.append(0.0, np.geomspace(1e-4, 10.0, BINS))
-
-    def empty(title: str, unit: str, edges: np.ndarray) -> Histogram:
-        return Histogram(title, unit, edges, np.zeros(len(edges) - 1))
-
-    return {
-        "insertion": empty("inserted length Δ", "mm", np.linspace(0.0, max(deepest_mm, 1.0), BINS + 1)),
-        "offset-ratio": empty("offset ratio γ/r", "", ratio),
-        "wall-ratio": empty("offset ratio γ/(r − r_w)", "", ratio),
-        "contact-force": empty("largest contact force", "N", force),
-    }
-
-
-def _count(table, wire_mm: float, histograms: dict[str, Histogram], visits: Counter[int], samples: int) -> None:
-    """Count one file's valid samples, and the branches that each valid navigation reached."""
-    valid = parquet.column_values(table, "valid")
-    state = parquet.column_values(table, "observation.state")[valid].astype(float)
-    radius = _of_wire(table, "lumen_radius_mm")[valid].astype(float)
-    histograms["insertion"].add(state[:, 0])
-    histograms["offset-ratio"].add(state[:, 3] / radius)
-    histograms["wall-ratio"].add(safety_ratio(state[:, 3], radius, wire_mm))
-    histograms["contact-force"].add(parquet.column_values(table, "contact_force_max_n")[valid].astype(float))
-    branch = np.sort(_of_wire(table, "branch").reshape(-1, samples), axis=1)
-    distinct = 1 + (np.diff(branch, axis=1) != 0).sum(axis=1)
-    visits.update(distinct[valid.reshape(-1, samples).all(axis=1)].tolist())
-
-
-def _of_wire(table, name: str) -> np.ndarray:
-    """Return the wire's number in each row of a column that holds one of each device."""
-    return parquet.column_values(table, name).reshape(len(table), -1)[:, 0]
+def _counted(title: str, unit: str, edges: Float[np.ndarray, "bins_1"], values: Float[np.ndarray, "n"]) -> Histogram:
+    counts = np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0]
+    return Histogram(title, unit, edges, counts.astype(float))
 
 
 def draw_pictures(description: Description, folder: Path) -> list[Path]:

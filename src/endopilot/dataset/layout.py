@@ -16,7 +16,7 @@ from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset import schema
 from endopilot.dataset.config import DatasetConfig
-from endopilot.dataset.draw import patient_motion
+from endopilot.dataset.navigations import patient_motion
 from endopilot.devices.catheter import check_nested
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack

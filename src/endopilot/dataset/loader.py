@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
+from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset import schema
 from endopilot.dataset.layout import identify, version
 from endopilot.devices.catheter import Catheter
@@ -23,9 +24,14 @@ from endopilot.extras import extra_named
 from endopilot.files import read_json, reading
 from endopilot.runs import RECORD_FILE
 from endopilot.settings import from_record
+from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.signals import SIGNALS, Outputs, described
+from endopilot.simulation.simulate import run_set_up
+from endopilot.simulation.state import SimulationSetUp
+from endopilot.simulation.trajectory import Trajectory
 from endopilot.simulation.world import World
+from endopilot.types import Anatomy
 
 _MEND = "make the dataset again"
 
@@ -110,11 +116,75 @@ class Dataset(Outputs):
                 "make a dataset without --catheter"
             )
 
-    def select(self, episodes: Shaped[np.ndarray, "chosen"]) -> Dataset:
-        """Return the chosen episodes, given as a mask or as indices."""
+    def __getitem__(self, episodes: int | slice | Shaped[np.ndarray, "chosen"]) -> Dataset:
+        """Return one episode, by its number, or several, by a mask or their numbers; one may stand there several times.
+
+        Raises:
+            InputError: there is no episode of that number.
+        """
+        if isinstance(episodes, int):
+            if not 0 <= episodes < len(self):
+                raise InputError(f"world: {episodes}; {self.folder} has episodes 0 to {len(self) - 1}")
+            episodes = slice(episodes, episodes + 1)
         arrays = {each.name: getattr(self, each.name) for each in fields(self)}
         chosen = {name: values[episodes] for name, values in arrays.items() if isinstance(values, np.ndarray)}
         return replace(self, **chosen)
+
+    def set_up(self, anatomy: Anatomy | None = None) -> SimulationSetUp:
+        """Return what episodes of one anatomy were simulated with; their `command` then gives them again to the bit.
+
+        Args:
+            anatomy: it; read from its folder if not given.
+
+        Raises:
+            InputError: the anatomy is missing, or is another one than the dataset was made in.
+        """
+        anatomy = anatomy or read_anatomy(self.anatomy_folder(str(self.anatomy[0])))
+        world, given, config = self.world, self.stack, self.manifest["config"]
+        tips = list(zip(self.tip_bend.tolist(), self.tip_stiffness_factor.tolist(), strict=True))
+        drawn = {tip: given.wire.with_tip(bend_rad=tip[0], stiffness_factor=tip[1]) for tip in tips}
+        stacks = {tip: world.stack(replace(given, wire=wire)) for tip, wire in drawn.items()}
+        return SimulationSetUp(
+            anatomies=[world.anatomy(anatomy)] * len(self),
+            stacks=[stacks[tip] for tip in tips],
+            initial=self.initial,
+            friction=self.friction,
+            actuation=config["control"],
+            motion=self.motion(anatomy.name),
+            config=world.core(SimulatorConfig(**config["simulator"])),
+        )
+
+    def trajectory(self, episode: int, *, record_shape: bool = False) -> Trajectory:
+        """Return an episode as it was recorded, to the bit: its commands simulated again.
+
+        Args:
+            record_shape: record the positions of all nodes too.
+
+        Raises:
+            InputError: there is no such episode, or its anatomy is missing or another.
+        """
+        return self[episode].driven(record_shape=record_shape)
+
+    def driven(
+        self,
+        velocity: Float[np.ndarray, "episodes samples devices 2"] | None = None,
+        *,
+        anatomy: Anatomy | None = None,
+        friction: Float[np.ndarray, "episodes devices"] | None = None,
+        record_shape: bool = False,
+    ) -> Trajectory:
+        """Simulate episodes of one anatomy again, a world each.
+
+        Args:
+            velocity: of the drives, mm/s and rad/s; the recorded commands if not given.
+            anatomy: theirs; read from its folder if not given.
+            friction: Coulomb coefficients of the devices on the wall; as recorded if not given.
+            record_shape: record the positions of all nodes too.
+        """
+        set_up, command = self.set_up(anatomy), self.command if velocity is None else velocity
+        set_up = set_up if velocity is None else replace(set_up, actuation="velocity")
+        set_up = set_up if friction is None else replace(set_up, friction=friction)
+        return run_set_up(set_up, command, period_s=self.sample_period_s, record_shape=record_shape)
 
     def of_split(self, split: str) -> Dataset:
         """Return the episodes of one split that are valid to the end.
@@ -129,7 +199,7 @@ class Dataset(Outputs):
                 f"{self.folder}: no valid episode in split '{split}' (it has {held}); "
                 "make the dataset with more anatomies or sequences"
             )
-        return self.select(chosen)
+        return self[chosen]
 
     @property
     def robot(self) -> RobotConfig | None:
@@ -227,8 +297,8 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
     from endopilot.dataset.parquet import column_values, read_table
 
     samples, total = manifest["samples_per_episode"], info["total_episodes"]
-    actuation, devices = schema.actuation_of(info["features"]), schema.devices_of(info["features"])
-    by_robot = schema.made_by_robot(info["features"])
+    columns = schema.signals_in(info["features"])
+    devices, by_robot = int(info["features"]["branch"]["shape"][0]), "encoders" in columns
     episodes: dict[str, list[np.ndarray]] = {}
     signal: dict[str, np.ndarray] = {}
     filled = 0
@@ -246,7 +316,7 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
         end = filled + table.num_rows
         if end > total:
             break
-        for name in schema.signal_columns(actuation, devices, by_robot=by_robot):
+        for name in columns:
             values = column_values(data, name)
             values = values.reshape(table.num_rows, samples, *values.shape[1:])
             if name not in signal:  # in place, so that a large dataset is never held twice
@@ -264,7 +334,7 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
     vectors = {name: signal[name].reshape(*shape, -1) for name in ("action", "velocity") if name in signal}
     recorded = {name: _of_signal(name, signal[column], devices) for column, (name, *_) in schema.OWN_COLUMNS.items()}
     recorded |= {name: signal["observation.state"].reshape(*shape, -1)[..., k] for k, name in enumerate(schema.STATE)}
-    if actuation == "force":
+    if "velocity" in vectors:
         control = vectors["velocity"]
     else:
         slip = np.stack([recorded["slip"], recorded["rotation_slip"]], axis=-1)
@@ -299,9 +369,31 @@ def _of_signal(name: str, values: np.ndarray, devices: int) -> np.ndarray:
     return values.reshape(*values.shape[:2], devices, *([-1] if len(SIGNALS[name].columns) > 1 else []))
 
 
-_DRIVE = ("max_velocity_mm_s", "max_rotation_rad_s", "push_limit_n", "pull_limit_n", "torque_limit_n_mm")
-_OTHER = ("name", "friction", "tip_load_n", "tip_shaping", "sources", *_DRIVE)
-"""What does not make another wire: names and sources, limits of the drive, and friction, which is the navigation's."""
+_WIRE = (
+    *("diameter_mm", "abscissa_mm", "bend_stiffness_n_mm2", "twist_stiffness_n_mm2"),
+    *("tip_bend_rad", "tip_bend_length_mm"),
+)
+"""What makes a wire another one; friction is the navigation's own, and limits are the drive's."""
+
+
+def check_same_wire(dataset: Dataset, other: Mapping[str, Any], of: Path, mend: str) -> None:
+    """Check that a dataset was made with the wire that another dataset, or a run, was made with.
+
+    Args:
+        other: that wire, as its record has it.
+        of: the other dataset, or the run.
+        mend: what to do else.
+
+    Raises:
+        InputError: it was made with another wire.
+    """
+    ours = dataset.manifest["device"]
+    for name in _WIRE:
+        if not np.array_equal(ours[name], other[name]):
+            raise InputError(
+                f"{dataset.folder}: its wire is {ours['name']}, and that of {of} is {other['name']}, with another "
+                f"{name}; {mend}"
+            )
 
 
 def read_joined(folders: Sequence[Path]) -> Dataset:
@@ -352,13 +444,7 @@ def _joined(first: Dataset, other: Dataset) -> Dataset:
 
 
 def _check_alike(first: Dataset, other: Dataset) -> None:
-    ours, theirs = first.manifest["device"], other.manifest["device"]
-    for name in ours.keys() - set(_OTHER):
-        if not np.array_equal(ours[name], theirs[name]):
-            raise InputError(
-                f"{other.folder}: its wire is {theirs['name']}, and that of {first.folder} is {ours['name']}, with "
-                f"another {name}; join datasets of one wire"
-            )
+    check_same_wire(other, first.manifest["device"], first.folder, "join datasets of one wire")
     if first.stack.catheters != other.stack.catheters:
         around = [", ".join(each.name for each in data.stack.catheters) or "no catheter" for data in (other, first)]
         raise InputError(

@@ -14,9 +14,7 @@ from endopilot.dataset import schema
 from endopilot.errors import InputError
 from endopilot.files import regular
 from endopilot.progress import Advance
-from endopilot.simulation.config import Actuation
-from endopilot.simulation.trajectory import Trajectory
-from endopilot.simulation.trajectory_file import trajectory_signals
+from endopilot.simulation.trajectory import Trajectory, trajectory_signals
 
 _KEY = b"endopilot_key"
 _LEVEL = 5
@@ -43,12 +41,11 @@ def sample_table(trajectory: Trajectory, first_episode: int, key: str) -> pa.Tab
         "observation.state": np.stack([signals[name] for name in schema.STATE], axis=-1),
         **{own: signals[name] for own, (name, *_) in schema.OWN_COLUMNS.items()},
     }
-    kinds = dict.fromkeys(schema.INDEX_COLUMNS, ("int64", None)) | {"timestamp": ("float32", None)}
     columns |= trajectory.columns
     by_robot = set(schema.OF_ROBOT) <= set(trajectory.columns)
-    kinds |= schema.signal_columns(trajectory.set_up.actuation, trajectory.devices, by_robot=by_robot)
-    arrays = {name: column(columns[name], *kinds[name]) for name in columns if name in kinds}
-    return marked_table(arrays, key)
+    described = schema.features(trajectory.set_up.actuation, trajectory.devices, by_robot=by_robot)
+    kinds = {name: (described[name]["dtype"], described[name]["names"]) for name in columns if name in described}
+    return marked_table({name: column(columns[name], *kind) for name, kind in kinds.items()}, key)
 
 
 def marked_table(columns: Mapping[str, Any], key: str) -> pa.Table:
@@ -108,26 +105,24 @@ def column_values(table: pa.Table, name: str) -> np.ndarray:
 
 
 def statistics(
-    actuation: Actuation, paths: Iterable[Path], key: str, advance: Advance, devices: int = 1
+    described: Mapping[str, Any], paths: Iterable[Path], key: str, advance: Advance
 ) -> tuple[dict[str, dict[str, list[float]]], dict[str, float]]:
     """Return the content of `meta/stats.json`, and the share of each manoeuvre in what was driven.
 
     The first holds min, max, mean, std, count and quantiles of every numeric signal's valid samples.
 
     Args:
-        actuation: what the dataset's control is.
-        devices: their number; the manoeuvres are the wire's.
+        described: the dataset's `schema.features`; the manoeuvres are the wire's.
     """
     sums, count, driven = Sums(), 0, np.zeros(len(schema.MANOEUVRES))
     for path in paths:
         table = read_table(path, key)
         valid = column_values(table, "valid")
         count += int(valid.sum())
-        velocity = column_values(table, "velocity" if actuation == "force" else "action")[valid]
+        velocity = column_values(table, "velocity" if "velocity" in described else "action")[valid]
         driven += np.bincount(schema.manoeuvres(velocity), minlength=len(driven))
-        by_robot = set(schema.OF_ROBOT) <= set(table.column_names)
-        for name, (dtype, _) in schema.signal_columns(actuation, devices, by_robot=by_robot).items():
-            if dtype != "bool" and valid.any():
+        for name in schema.signals_in(described):
+            if described[name]["dtype"] != "bool" and valid.any():
                 sums.add(name, column_values(table, name)[valid])
         advance()
     return sums.stats(), dict(zip(schema.MANOEUVRES, (driven / max(count, 1)).tolist(), strict=True))

@@ -60,10 +60,8 @@ _MOVES_MM_S, _TURNS_RAD_S = 0.1, 0.02
 """Below these a drive rests: mm/s, rad/s."""
 
 
-def signal_columns(
-    actuation: Actuation, devices: int = 1, *, by_robot: bool = False
-) -> dict[str, tuple[str, list[str] | None]]:
-    """Return the name of each simulated column, its type, and the names of its components if it is a vector.
+def features(actuation: Actuation, devices: int = 1, *, by_robot: bool = False) -> dict[str, dict[str, Any]]:
+    """Return the `features` entry of `meta/info.json`: type, shape and component names of every column.
 
     `action` is what the drives were commanded, with all its digits: simulated again it gives the same navigation to the
     bit. Under force control, `velocity` is the resulting velocity. The load of a drive is always in `drive_force_n` and
@@ -77,26 +75,25 @@ def signal_columns(
     }
     if by_robot:
         vectors |= {name: ("float32", list(SIGNALS[name].columns)) for name in OF_ROBOT}
-    found = {column: (kind, _components(names, devices)) for column, (kind, names) in vectors.items()}
+    found = {"timestamp": ("float32", None)} | dict.fromkeys(INDEX_COLUMNS, ("int64", None))
+    found |= {column: (kind, _components(names, devices)) for column, (kind, names) in vectors.items()}
     for column, (name, kind, names) in OWN_COLUMNS.items():
         found[column] = (kind, _components(names, devices) if SIGNALS[name].of_devices else names)
-    return found
+    return {
+        name: {"dtype": dtype, "shape": [len(names) if names else 1], "names": names}
+        for name, (dtype, names) in found.items()
+    }
+
+
+def signals_in(described: Mapping[str, Any]) -> list[str]:
+    """Return the columns of signals among those that `meta/info.json` describes: neither indices nor the clock."""
+    return [name for name in described if name not in (*INDEX_COLUMNS, "timestamp")]
 
 
 def _components(names: list[str] | None, devices: int) -> list[str] | None:
     if names is None:
         return None if devices == 1 else ["wire", *(prefix[:-1] for prefix in column_prefixes(devices)[1:])]
     return [prefix + name for prefix in column_prefixes(devices) for name in names]
-
-
-def devices_of(described: Mapping[str, Any]) -> int:
-    """Return how many devices a dataset has, from the `features` of its `meta/info.json`."""
-    return int(described["branch"]["shape"][0])
-
-
-def actuation_of(described: Mapping[str, Any]) -> Actuation:
-    """Return what the control of a dataset is, from the `features` of its `meta/info.json`."""
-    return "force" if "velocity" in described else "velocity"
 
 
 def manoeuvres(velocity: np.ndarray) -> np.ndarray:
@@ -106,20 +103,6 @@ def manoeuvres(velocity: np.ndarray) -> np.ndarray:
     """
     along, turn = velocity[..., 0], np.abs(velocity[..., 1])
     return np.select([along > _MOVES_MM_S, along < -_MOVES_MM_S, turn > _TURNS_RAD_S], [0, 1, 2], 3)
-
-
-def made_by_robot(described: Mapping[str, Any]) -> bool:
-    """Return whether a robot made the motions of a dataset, from the `features` of its `meta/info.json`."""
-    return "encoders" in described
-
-
-def features(actuation: Actuation, devices: int = 1, *, by_robot: bool = False) -> dict[str, dict[str, Any]]:
-    """Return the `features` entry of `meta/info.json`: type, shape and component names of every column."""
-    described = {"timestamp": {"dtype": "float32", "shape": [1], "names": None}}
-    described |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in INDEX_COLUMNS}
-    for name, (dtype, names) in signal_columns(actuation, devices, by_robot=by_robot).items():
-        described[name] = {"dtype": dtype, "shape": [len(names) if names else 1], "names": names}
-    return described
 
 
 def paths_of_file(folder: Path, number: int) -> tuple[Path, Path]:

@@ -17,9 +17,8 @@ from jaxtyping import Bool
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset import parquet, schema
-from endopilot.dataset.draw import Draw, draw_navigations, patient_motion
 from endopilot.dataset.layout import Block, BlockContext, version
-from endopilot.dataset.navigations import simulate_navigations
+from endopilot.dataset.navigations import Draw, draw_navigations, patient_motion, simulate_navigations
 from endopilot.devices.stack import column_prefixes
 from endopilot.errors import InputError
 from endopilot.files import writing

@@ -11,15 +11,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
 from pydantic import model_validator
 
-from endopilot.devices.device import Device, Sourced, Wire
-from endopilot.devices.device_files import named_file
-from endopilot.devices.device_ranges import (
+from endopilot.devices.device import Device, Sourced, Wire, WireFile, check_built, file_constants
+from endopilot.devices.device_files import (
     MOST_VALUES,
     Abscissa,
     ArcLength,
@@ -30,10 +29,10 @@ from endopilot.devices.device_ranges import (
     Torque,
     Velocity,
     Width,
-    check_built,
+    named_file,
 )
 from endopilot.errors import InputError
-from endopilot.files import read_text
+from endopilot.files import read_text, write_yaml
 from endopilot.settings import NonNegative, Positive, Text, Within, read_settings, settings
 
 _SHIPPED = Path(__file__).parent / "catheters"
@@ -114,15 +113,9 @@ def read_catheter(name_or_path: str | Path) -> Catheter:
     """
     path = named_file("catheter", name_or_path, (_SHIPPED,), list_catheters)
     content = read_settings(path, CatheterFile)
-    entries = {field.name: getattr(content, field.name) for field in fields(content)}
-    constants = {name: entry.value for name, entry in entries.items() if isinstance(entry, Sourced)}
+    shape = tuple((length, math.radians(angle)) for length, angle in content.shape.arcs)
     try:
-        catheter = Catheter(
-            name=content.name,
-            **constants,
-            sources={name: entry.source for name, entry in entries.items() if name != "name"},
-            shape=tuple((length, math.radians(angle)) for length, angle in content.shape.arcs),
-        )
+        catheter = Catheter(**file_constants(content), shape=shape)
         check_built(catheter, bore_mm=catheter.inner_diameter_mm, arcs=catheter.shape, catheter=True)
         return catheter
     except InputError as error:
@@ -155,3 +148,46 @@ def check_nested(wire: Wire, catheters: Sequence[Catheter]) -> None:
                 f"{catheter.name}, {catheter.inner_diameter_mm:g} mm; choose a thinner device or a wider catheter"
             )
         inner = catheter
+
+
+def write_device(device: Wire | Catheter, *, output: str | Path) -> None:
+    """Write a wire or a catheter as a YAML file that `read_wire` or `read_catheter` reads, with the same constants.
+
+    Args:
+        device: the wire or the catheter.
+        output: the file.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    content = _wire(device) if isinstance(device, Wire) else _catheter(device)
+    write_yaml(Path(output), content)
+
+
+def _wire(wire: Wire) -> dict[str, Any]:
+    content = _sourced(wire, WireFile, but=("tip_bend", "tip_shaping"))
+    angle_deg = round(math.degrees(wire.tip_bend_rad), 10)
+    if math.radians(angle_deg) != wire.tip_bend_rad:
+        angle_deg = math.degrees(wire.tip_bend_rad)
+    source = wire.sources["tip_bend"]
+    content["tip_bend"] = {"angle_deg": angle_deg, "length_mm": wire.tip_bend_length_mm, "source": source}
+    shaping = wire.tip_shaping
+    if shaping is not None:
+        limits = {"angle_deg": list(shaping.angle_deg), "length_mm": list(shaping.length_mm)}
+        content["tip_shaping"] = limits | {"source": wire.sources["tip_shaping"]}
+    return content
+
+
+def _catheter(catheter: Catheter) -> dict[str, Any]:
+    arcs = [[length, round(math.degrees(angle), 10)] for length, angle in catheter.shape]
+    shape = {"arcs": arcs, "source": catheter.sources["shape"]}
+    return _sourced(catheter, CatheterFile, but=("shape",)) | {"shape": shape}
+
+
+def _sourced(device: Wire | Catheter, file: type, *, but: tuple[str, ...]) -> dict[str, Any]:
+    """Return name and constants as a file has them, each with its source, but for those of other form."""
+    content: dict[str, Any] = {"name": device.name}
+    for name in (field.name for field in fields(file) if field.name not in ("name", *but)):
+        value = getattr(device, name)
+        content[name] = {"value": list(value) if isinstance(value, tuple) else value, "source": device.sources[name]}
+    return content

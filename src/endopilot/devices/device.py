@@ -8,6 +8,7 @@ beyond the last one.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from itertools import pairwise
 from pathlib import Path
@@ -17,8 +18,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import model_validator
 
-from endopilot.devices.device_files import device_file
-from endopilot.devices.device_ranges import (
+from endopilot.devices.device_files import (
     GRAM_FORCE_N,
     MOST_VALUES,
     TIP_LENGTH_MM,
@@ -34,14 +34,31 @@ from endopilot.devices.device_ranges import (
     Torque,
     Velocity,
     Width,
-    check_built,
-    check_tip,
+    device_file,
 )
 from endopilot.errors import InputError
 from endopilot.settings import NonNegative, Positive, Text, Within, public, read_settings, settings
 from endopilot.types import Anatomy
 
 Value = TypeVar("Value")
+
+_MODULUS_MPA = (0.1, 250e3)
+"""Young's modulus that EI and the section may imply, MPa: from a tenth of the softest published rod's, 1 MPa, to just
+above that of cobalt alloys, 233 GPa; steel has 200 GPa."""
+_WIRE_RATIO = (0.63, 1.05)
+"""GJ/EI of a wire: 1/(1 + ν) of a round section, ν from 0 to 0.5, and 5 % for rounding."""
+_CATHETER_RATIO = (0.63, 3.0)
+"""The same of a catheter, whose braid may raise GJ."""
+_FALL = 3.0
+"""Factor by which EI may fall from the tip on; devices stiffen towards the shaft."""
+_STIFFENING = 1e5
+"""Largest ratio of EI along a device."""
+_LOAD_FACTOR = 10.0
+"""Factor between a catalogue's tip load and that of the tip's EI: protocols differ, and 1 gf is 1/102 N."""
+_STRENGTH_MPA = 3000.0
+"""Tensile strength of the strongest steel wire, MPa: EN 10270-1 has up to 3000 for patented wire of 0.3 mm."""
+_LEAST_DEG = math.degrees(math.pi) / 57
+"""A bend up to this, some 3.16 °, is one in rad: half a turn has π of them."""
 
 
 @settings
@@ -251,6 +268,14 @@ class WireFile:
     tip_shaping: _Shaping | None = None
 
 
+def file_constants(content: Any) -> dict[str, Any]:
+    """Return name, constants and sources that a device's file holds, as the device takes them."""
+    entries = {field.name: getattr(content, field.name) for field in fields(content) if field.name != "name"}
+    constants = {name: entry.value for name, entry in entries.items() if isinstance(entry, Sourced)}
+    sources = {name: entry.source for name, entry in entries.items() if entry is not None}
+    return {"name": content.name, **constants, "sources": sources}
+
+
 @public
 def read_wire(name_or_path: str | Path) -> Wire:
     """Read a device by its name (`endopilot.devices.device_files`), or from a YAML file.
@@ -260,17 +285,12 @@ def read_wire(name_or_path: str | Path) -> Wire:
     """
     path = device_file(name_or_path)
     content = read_settings(path, WireFile)
-    entries = {field.name: getattr(content, field.name) for field in fields(content) if field.name != "name"}
-    entries = {name: entry for name, entry in entries.items() if entry is not None}
     shaping = content.tip_shaping
-    constants = {name: entry.value for name, entry in entries.items() if isinstance(entry, Sourced)}
     try:
         device = Wire(
-            name=content.name,
-            **constants,
+            **file_constants(content),
             tip_bend_rad=math.radians(content.tip_bend.angle_deg),
             tip_bend_length_mm=content.tip_bend.length_mm,
-            sources={name: entry.source for name, entry in entries.items()},
             tip_shaping=shaping and TipShaping(angle_deg=shaping.angle_deg, length_mm=shaping.length_mm),
         )
         check_built(device)
@@ -278,6 +298,111 @@ def read_wire(name_or_path: str | Path) -> Wire:
         return device
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def check_built(
+    device: Device, *, bore_mm: float = 0.0, arcs: Sequence[tuple[float, float]] = (), catheter: bool = False
+) -> None:
+    """Check that the constants of a device can be those of one and the same thing.
+
+    Args:
+        device: what its file says.
+        bore_mm: diameter of its bore, mm; 0 for a wire.
+        arcs: the arcs of a catheter's shape: mm, rad.
+        catheter: whether it is a catheter.
+
+    Raises:
+        InputError: two of them contradict each other; the line names field, value and what to give.
+    """
+    _check_stiffness(device, bore_mm, catheter)
+    shears = _STRENGTH_MPA / math.sqrt(3) * math.pi / 16 * device.diameter_mm**3  # yields in shear by von Mises
+    if (torque := device.torque_limit_n_mm) > shears:
+        raise InputError(
+            f"torque_limit_n_mm: {torque:g} N·mm shears off {device.diameter_mm:g} mm of the strongest steel, at "
+            f"{shears:.3g} N·mm; give N·mm at which the drive slips ({torque:g} mN·mm is {torque / 1000:g} N·mm)"
+        )
+    _check_bends("shape", [each for each in arcs if each[1]], device)
+
+
+def check_tip(device: Wire) -> None:
+    """Check that the tip of a wire can be one: its load, its bend, and the bends that a hand can give it.
+
+    Args:
+        device: what its file says.
+
+    Raises:
+        InputError: it cannot; the line names field, value and what to give.
+    """
+    if device.tip_load_n is not None:
+        _check_tip_load(device.tip_load_n, device)
+    if device.tip_bend_rad:
+        _check_bends("tip_bend", [(device.tip_bend_length_mm, device.tip_bend_rad)], device)
+    shaping = device.tip_shaping
+    if shaping is not None and 0 < shaping.angle_deg[1] <= _LEAST_DEG:
+        high = shaping.angle_deg[1]
+        raise InputError(f"tip_shaping.angle_deg: {high:g}; give degrees ({high:g} rad is {math.degrees(high):.4g}°)")
+
+
+def _check_stiffness(device: Device, bore_mm: float, catheter: bool) -> None:
+    end, bend, twist = device.abscissa_mm[-1], device.bend_stiffness_n_mm2, device.twist_stiffness_n_mm2
+    if 0 < end < 1:
+        raise InputError(f"abscissa_mm: ends at {end:g} mm; give the abscissae in mm ({end:g} m is {1000 * end:g} mm)")
+    section = math.pi / 64 * (device.diameter_mm**4 - bore_mm**4)
+    low, high = _CATHETER_RATIO if catheter else _WIRE_RATIO
+    for place, (ei, gj) in enumerate(zip(bend, twist, strict=True)):
+        modulus, which = ei / section, f"bend_stiffness_n_mm2.value[{place}]: {ei:g}"
+        thick = f"with diameter_mm = {device.diameter_mm:g} takes a Young's modulus of"
+        if modulus > _MODULUS_MPA[1]:
+            raise InputError(
+                f"{which} {thick} {modulus / 1000:.3g} GPa; "
+                f"metals have at most {_MODULUS_MPA[1] / 1000:g}: give N·mm², and the diameter, not the radius, in mm"
+            )
+        if modulus < _MODULUS_MPA[0]:
+            raise InputError(
+                f"{which} {thick} {modulus:.2g} MPa; the softest devices have "
+                f"{_MODULUS_MPA[0]:g}: give mm, and N·mm² ({ei:g} N·m² is {1e6 * ei:.4g} N·mm²)"
+            )
+        if not low <= gj / ei <= high:
+            raise InputError(
+                f"twist_stiffness_n_mm2.value[{place}]: {gj:g} is {gj / ei:.3g} times EI; give {low:g} to {high:g} "
+                f"times (a round section has GJ = EI/(1 + ν), {ei / 1.3:.3g} for ν = 0.3)"
+            )
+        if ei > _STIFFENING * min(bend):
+            raise InputError(
+                f"{which} is more than {_STIFFENING:g} times the least, {min(bend):g}; correct one of them"
+            )
+        if ei * _FALL < max(bend[: place + 1]):
+            raise InputError(
+                f"{which}, and {max(bend[:place]):g} nearer to the tip; list the tip first, and let EI rise from it"
+            )
+
+
+def _check_tip_load(load_n: float, device: Device) -> None:
+    middle = float(device.bend_stiffness(np.linspace(0, TIP_LENGTH_MM, 101)).mean())
+    buckles = math.pi**2 * middle / (4 * TIP_LENGTH_MM**2)
+    if not 1 / _LOAD_FACTOR <= load_n / buckles <= _LOAD_FACTOR:
+        force = load_n * GRAM_FORCE_N
+        meant = f" ({load_n:g} gf is {force:.3g} N)" if 1 / _LOAD_FACTOR <= force / buckles <= _LOAD_FACTOR else ""
+        raise InputError(
+            f"tip_load_n: {load_n:g}; a tip of this EI buckles at {buckles:.3g} N (π² EI/4L², L = {TIP_LENGTH_MM:g} mm)"
+            f"; give N within a factor of {_LOAD_FACTOR:g} of it, or null{meant}"
+        )
+
+
+def _check_bends(name: str, bends: Sequence[tuple[float, float]], device: Device) -> None:
+    """Check bends of the tip, or of a catheter: lengths in mm, angles in rad, none of them 0."""
+    angles = [abs(math.degrees(angle)) for _, angle in bends]
+    if bends and max(angles) <= _LEAST_DEG:
+        angle = max(angles)
+        raise InputError(
+            f"{name}: bends by {angle:.4g}°; give degrees ({angle:.4g} rad is {math.degrees(angle):.4g}°), or 0"
+        )
+    for length, angle in bends:
+        if length < abs(angle) * device.diameter_mm / 2:
+            raise InputError(
+                f"{name}: {math.degrees(angle):g}° over {length:g} mm has a radius of {length / abs(angle):.2g} mm, "
+                f"less than the device's own; give lengths in mm ({length:g} m is {1000 * length:g} mm)"
+            )
 
 
 def check_fits(device: Device, anatomy: Anatomy) -> None:

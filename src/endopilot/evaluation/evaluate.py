@@ -19,16 +19,20 @@ from endopilot.evaluation.results import (
     METRICS_FILE,
     REPORT_FILE,
     RESULTS_FILE,
+    SPLIT_TITLES,
     SPLITS,
     SplitResult,
+    findings,
+    generalisation_gap,
+    over_seeds,
+    summarize,
     tip_series,
     write_results,
 )
-from endopilot.evaluation.summary import SPLIT_TITLES, findings, generalisation_gap, over_seeds, summarize
 from endopilot.extras import extra_named
 from endopilot.files import manifest, sha256, write_json
 from endopilot.models.config import PRETRAINED, read_run, run_path
-from endopilot.models.provenance import trained_patients
+from endopilot.models.episodes import trained_patients
 from endopilot.progress import progress
 from endopilot.runs import claim
 from endopilot.settings import Count, Seed, settings
@@ -143,8 +147,8 @@ def _parted(dataset: Dataset, known: Collection[str]) -> tuple[dict[str, Dataset
     valid, of_known = dataset.valid.all(axis=1), np.isin(dataset.anatomy, sorted(known))
     trained = of_known & (dataset.split == "train")
     masks = dict(zip(SPLITS, (valid & of_known & ~trained, valid & ~of_known), strict=True))
-    held_out = {split: dataset.select(mask) for split, mask in masks.items() if mask.any()}
-    return held_out, dataset.select(valid & trained) if (valid & trained).any() else None
+    held_out = {split: dataset[mask] for split, mask in masks.items() if mask.any()}
+    return held_out, dataset[valid & trained] if (valid & trained).any() else None
 
 
 def _chosen(data: Dataset, sequences: int | None) -> Dataset:
@@ -155,11 +159,10 @@ def _chosen(data: Dataset, sequences: int | None) -> Dataset:
     for name in np.unique(data.anatomy):
         of_anatomy = np.flatnonzero(data.anatomy == name)
         rank[of_anatomy] = np.arange(len(of_anatomy))
-    return data.select(np.sort(np.lexsort((data.anatomy, rank))[:sequences]))
+    return data[np.sort(np.lexsort((data.anatomy, rank))[:sequences])]
 
 
 def _own_dataset(run: Path, record: Mapping[str, Any]) -> Path:
-    """Return the dataset that a run was trained on."""
     if str(run) == PRETRAINED:
         raise InputError(f"{run}: the dataset that it was trained on is not in the package; name one with --dataset")
     own = Path(run) / record["dataset"]

@@ -1,21 +1,228 @@
-"""The protocols P1 to P4 and their baselines on the episodes of one split."""
+"""The protocols P1 to P4 and their baselines on the episodes of one split, and their controls simulated: `replay`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
+from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.loader import Dataset
+from endopilot.devices.device import Wire
+from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.drive_motion import DriveMotion
 from endopilot.devices.robot import RobotConfig
 from endopilot.evaluation.metrics import tip_events
-from endopilot.evaluation.replay import Control, Recorded, exposures, replanned, replay
 from endopilot.evaluation.results import REPLAYED, SplitResult, TipSeries
 from endopilot.models.config import WINDOW
-from endopilot.models.episodes import Episodes, OpenLoop, Predictor
+from endopilot.models.episodes import Episodes, OpenLoop, Predictor, begin_after, given_states
 from endopilot.progress import Advance
-from endopilot.types import VesselTree
+from endopilot.simulation.trajectory import Trajectory
+from endopilot.types import Anatomy, VesselTree
+
+Control = Float[np.ndarray, "episodes samples 2"]
+Samples = Float[np.ndarray, "episodes samples"]
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """Recorded episodes, with the patients and the wire that they were recorded with.
+
+    Attributes:
+        anatomies: in the order of their names.
+        anatomy_of: index of each episode's anatomy.
+        robot: what controls pass before they move the wire; None where a drive does exactly what it can.
+    """
+
+    data: Dataset
+    names: tuple[str, ...]
+    anatomies: tuple[Anatomy, ...]
+    anatomy_of: Int[np.ndarray, "episodes"]
+    device: Wire
+    robot: RobotConfig | None = None
+
+    @staticmethod
+    def of(data: Dataset, robot: RobotConfig | None = None) -> Recorded:
+        """Read what the episodes of a dataset were recorded with.
+
+        Raises:
+            InputError: an anatomy is missing or damaged.
+        """
+        names, anatomy_of = np.unique(data.anatomy, return_inverse=True)
+        anatomies = tuple(read_anatomy(data.anatomy_folder(str(name))) for name in names)
+        return Recorded(data, tuple(map(str, names)), anatomies, anatomy_of, data.stack.wire, robot)
+
+    def drivable(self, control: Control) -> Control:
+        """Return what a drive makes of controls: no faster than it can, nor out of the catheter or beyond the vessel.
+
+        Controls that are not finite stay so. A robot's drives begin at rest, in the middle of their play, after the
+        given states; their mean over a sample moves the wire.
+        """
+        driven, inserted = np.empty(control.shape), self.data.inserted_length[:, WINDOW - 1, 0].astype(float)
+        for index, anatomy in enumerate(self.anatomies):
+            mine, limits = self.anatomy_of == index, DriveLimits.of(self.device, anatomy)
+            driven[mine] = limits.clip_sequence(control[mine], inserted[mine], self.data.sample_period_s)
+            if self.robot is not None:
+                driven[mine] = self._by_robot(self.robot, driven[mine], np.flatnonzero(mine), limits)
+        return driven
+
+    def _by_robot(
+        self, robot: RobotConfig, control: Control, episodes: Int[np.ndarray, "episodes"], limits: DriveLimits
+    ) -> Control:
+        """Return what a robot makes of controls; each episode has one of its own."""
+        held = (self.data.inserted_length, self.data.rotation)
+        start = np.stack([each[episodes, WINDOW - 1, :1] for each in held], axis=-1).astype(float)
+        seeds = [(int(self.data.sequence[each]), 7) for each in episodes]
+        motion = DriveMotion(robot, [[limits]] * len(episodes), start, seeds=seeds)
+        made, period = np.empty_like(control), self.data.sample_period_s
+        for sample in range(control.shape[1]):
+            motion.command(np.nan_to_num(control[:, sample, None]))
+            made[:, sample] = motion.advance(period)[:, 0] / period
+        lost = ~np.isfinite(control).all(axis=-1).cumprod(axis=1).astype(bool)
+        made[lost] = np.nan
+        return made
+
+    def simulated(
+        self, controls: Mapping[str, Control], advance: Advance | None = None
+    ) -> Iterator[tuple[Int[np.ndarray, "chosen"], Trajectory]]:
+        """Drive episodes as they were driven while states are given, and by each series of controls after.
+
+        Series of `REPLAYED` with another friction have it from the start.
+
+        Args:
+            controls: after the given states, by series, all of one length.
+
+        Yields:
+            The episodes of one anatomy, and their simulation: a world for each series and episode, series by series.
+        """
+        for index, anatomy in enumerate(self.anatomies):
+            mine = np.flatnonzero(self.anatomy_of == index)
+            worlds = self.data[np.tile(mine, len(controls))]
+            after = np.concatenate([control[mine] for control in controls.values()])
+            driven = np.nan_to_num(np.concatenate([worlds.command[:, :WINDOW, 0], after], axis=1))
+            friction = np.concatenate([REPLAYED.get(name, 1.0) * self.data.friction[mine] for name in controls])
+            yield mine, worlds.driven(driven[:, :, None], anatomy=anatomy, friction=friction)
+            if advance:
+                advance(1, anatomy.name)
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """One series of controls, simulated: its tip, the drive's load, and the tip's distance from the recorded one, mm.
+
+    NaN from where the simulation fails, or the series holds no finite control.
+    """
+
+    abscissa: Samples
+    offset: Samples
+    radius: Samples
+    base_force: Samples
+    base_torque: Samples
+    distance: Samples
+
+    @property
+    def tip(self) -> TipSeries:
+        """Where the tip went."""
+        return TipSeries(self.abscissa, self.offset, self.radius)
+
+
+def replay(recorded: Recorded, controls: Mapping[str, Control], advance: Advance) -> dict[str, Replay]:
+    """Simulate every episode again with each series of controls (mm/s and rad/s) after the given states.
+
+    `advance` is called after each anatomy.
+    """
+    shape, signals = recorded.data.valid[:, WINDOW:].shape, [field.name for field in fields(Replay)]
+    out = {name: Replay(*np.full((len(signals), *shape), np.nan)) for name in controls}
+    for chosen, rollout in recorded.simulated(controls, advance):
+        commanded = np.concatenate([control[chosen] for control in controls.values()])
+        usable = rollout.valid[:, WINDOW:] & np.isfinite(commanded).all(axis=-1).cumprod(axis=1).astype(bool)
+        true_tip = recorded.data.tip_position[np.tile(chosen, len(controls))]
+        distance = np.linalg.norm(rollout.tip_position - true_tip, axis=-1)[:, :, 0]
+        tip, load = rollout.tip, (rollout.base_force, rollout.base_torque)
+        of_wire = [each[:, :, 0] for each in (tip.abscissa, tip.offset, tip.radius, *load)]
+        for key, signal in zip(signals, (*of_wire, distance), strict=True):
+            values = np.where(usable, signal[:, WINDOW:], np.nan)
+            for name, part in zip(controls, values.reshape(len(controls), len(chosen), -1), strict=True):
+                getattr(out[name], key)[chosen] = part
+    return out
+
+
+EXPOSURE_PERIOD_S = 10.0
+"""Time between X-ray images after the given states, s."""
+
+
+def exposures(data: Dataset) -> list[int]:
+    """Return the samples after the given states at which an X-ray image shows the tip."""
+    every = round(EXPOSURE_PERIOD_S / data.sample_period_s)
+    return list(range(WINDOW - 1 + every, data.valid.shape[1] - 1, every))
+
+
+def replanned(
+    predictor: Predictor, recorded: Recorded, episodes: Episodes, first: OpenLoop, advance: Advance
+) -> Control:
+    """Return controls (mm/s, rad/s) after the given states that are planned anew at each of `exposures`.
+
+    Each plan is driven in the simulator up to the next exposure. For the next one the predictor is given the motion of
+    the drive, the given tips, the observed tips, and in between the tips that it predicted itself; the desired tips
+    stay the same. Where the simulation fails, or no finite control is planned, controls are NaN from there on.
+
+    Args:
+        episodes: the same as the predictor is given them; their tips are the desired ones.
+    """
+    control, under_way, observed = first.control.copy(), _planned(episodes, first, WINDOW), given_states(episodes)
+    for now in exposures(recorded.data):
+        commanded = recorded.drivable(control)[:, : now + 1 - WINDOW]
+        failed = ~np.isfinite(commanded).all(axis=(1, 2))
+        under_way, lost = _driven(recorded, under_way, commanded, begin_after(observed) - 1)
+        observed = observed.copy()
+        observed[now] = True
+        plan = predictor.rollout_dual(_desired(under_way, episodes, now + 1), observed)
+        control[:, now + 1 - WINDOW :] = np.where((failed | lost)[:, None, None], np.nan, plan.control)
+        under_way = _planned(under_way, plan, now + 1)
+        advance(1, "replanning")
+    return control
+
+
+def _driven(
+    recorded: Recorded, under_way: Episodes, commanded: Control, last: int
+) -> tuple[Episodes, Bool[np.ndarray, "episodes"]]:
+    """Return episodes after the drive was commanded, and which of them a simulation lost.
+
+    Known are the motion of the drive and, at the end, the tip in an X-ray image. It was observed before at sample
+    `last`.
+    """
+    now = WINDOW + commanded.shape[1] - 1
+    names = ("control", "command", "proximal", "tip", "branch")
+    made = {name: getattr(under_way, name).copy() for name in names}
+    lost = np.zeros(len(under_way), dtype=bool)
+    for chosen, rollout in recorded.simulated({"P4": commanded}):
+        ok = rollout.valid[:, now]
+        lost[chosen] = ~ok
+        kept, moved = chosen[ok], slice(WINDOW, now + 1)
+        made["control"][kept, moved] = rollout.control[ok, moved, 0]
+        made["command"][kept, moved] = rollout.command[ok, moved, 0]
+        made["proximal"][kept, moved] = rollout.proximal[ok, moved, 0]
+        made["tip"][kept, now] = np.stack([rollout.tip.abscissa, rollout.tip.offset], axis=-1)[ok, now, 0]
+        made["branch"][kept, last + 1 : now] = made["branch"][kept, last, None]  # not observed since
+        made["branch"][kept, now] = rollout.tip.branch[ok, now, 0]
+    return replace(under_way, **made), lost
+
+
+def _planned(under_way: Episodes, plan: OpenLoop, begin: int) -> Episodes:
+    """Return episodes with the tips from a sample on as a plan predicts them, where it does."""
+    tip = under_way.tip.copy()
+    finite = np.isfinite(plan.tip).all(axis=-1, keepdims=True)
+    tip[:, begin:] = np.where(finite, plan.tip, tip[:, begin:])
+    return replace(under_way, tip=tip)
+
+
+def _desired(under_way: Episodes, desired: Episodes, begin: int) -> Episodes:
+    """Return episodes under way with everything from a sample on as it is desired."""
+    names = ("control", "command", "proximal", "tip", "branch")
+    parts = {name: (getattr(under_way, name)[:, :begin], getattr(desired, name)[:, begin:]) for name in names}
+    return replace(under_way, **{name: np.concatenate(both, axis=1) for name, both in parts.items()})
 
 
 def hold_slack(data: Dataset, given: int) -> Float[np.ndarray, "episodes samples 2"]:

@@ -29,7 +29,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from endopilot.devices.drive_limits import DriveLimits
-from endopilot.errors import InputError
 from endopilot.models.config import WINDOW, CausalConfig
 from endopilot.models.episodes import (
     EachObserved,
@@ -41,6 +40,7 @@ from endopilot.models.episodes import (
     Steps2,
     begin_after,
     given_states,
+    needed,
 )
 from endopilot.models.play import Direction, PlayTables
 from endopilot.models.sequences import N_INPUTS, N_WIRE_INPUTS, Unfolded, play_tables, unfold
@@ -136,21 +136,21 @@ class CausalNetwork(nn.Module):
         return (weight * (0.5 * (likely + absolute) + jump)).mean()
 
 
-class ForwardNetwork(CausalNetwork):
+class CausalForward(CausalNetwork):
     """FF: guesses of the play operator and of the simulated wires."""
 
     n_inputs = N_INPUTS + N_WIRE_INPUTS
     n_guesses = 1 + len(FRICTION_FACTORS)
 
 
-class InverseNetwork(CausalNetwork):
+class CausalInverse(CausalNetwork):
     """IF: the play operator's guess alone."""
 
     n_inputs = N_INPUTS
     n_guesses = 1
 
 
-CAUSAL_NETWORKS: dict[str, type[CausalNetwork]] = {"ff": ForwardNetwork, "if": InverseNetwork}
+CAUSAL_NETWORKS: dict[str, type[CausalNetwork]] = {"ff": CausalForward, "if": CausalInverse}
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +214,7 @@ class CausalPredictor:
 
     def predict(self, episodes: Episodes, observed: Observed | EachObserved) -> Prediction:
         """Predict the tips of episodes from their controls and from the observed tips: see `ProbabilisticPredictor`."""
-        network = _needed(self.forward, "forward")
+        network = needed(self.forward, "forward")
         given = np.broadcast_to(observed, episodes.branch.shape)
         unfolded, found = self._run(network, "forward", episodes, given)
         median = found.median()
@@ -259,7 +259,7 @@ class CausalPredictor:
 
     def _wanted_motion(self, episodes: Episodes, begin: int) -> tuple[np.ndarray, np.ndarray]:
         """Return IF's inserted length (mm) and turn (rad) of every sample from `begin` on."""
-        network = _needed(self.inverse, "inverse")
+        network = needed(self.inverse, "inverse")
         given = np.broadcast_to(np.arange(episodes.samples) < begin, episodes.branch.shape)
         unfolded, found = self._run(network, "inverse", episodes, given)
         wanted = (unfolded.guess + found.location[..., 0, :].double().numpy())[:, begin:]
@@ -287,12 +287,6 @@ class CausalPredictor:
             names, vessels = tuple(np.unique(episodes.anatomy).tolist()), play_tables(episodes)
             self.prepared[episodes.setup] = names, vessels
         return vessels, np.searchsorted(names, episodes.anatomy)
-
-
-def _needed(network: CausalNetwork | None, role: str) -> CausalNetwork:
-    if network is None:
-        raise InputError(f"the run has no {role} network; train it with --network both")
-    return network
 
 
 def _driven(

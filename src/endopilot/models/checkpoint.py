@@ -38,16 +38,14 @@ def make_network(name: str, size: Size) -> Network | CausalNetwork:
     return CAUSAL_NETWORKS[name](size) if isinstance(size, CausalConfig) else NETWORKS[name](size)
 
 
-def write_network(
-    path: Path, name: str, network: Network | CausalNetwork, config: Size, facts: Mapping[str, Any]
-) -> None:
+def write_network(path: Path, name: str, network: Network | CausalNetwork, config: Size) -> None:
     """Write weights and scales of a network, whole or not at all."""
     kind = "causal" if isinstance(config, CausalConfig) else "paper"
-    write_tensors(path, network.state_dict(), {"network": name, "kind": kind, "size": asdict(config), **facts})
+    write_tensors(path, network.state_dict(), {"network": name, "kind": kind, "size": asdict(config)})
 
 
-def read_network(path: Path) -> tuple[Network | CausalNetwork, dict[str, Any]]:
-    """Return a network and the facts in its header.
+def read_network(path: Path) -> Network | CausalNetwork:
+    """Return a network that `write_network` wrote.
 
     Raises:
         InputError: the file is missing, damaged or of another version.
@@ -59,7 +57,7 @@ def read_network(path: Path) -> tuple[Network | CausalNetwork, dict[str, Any]]:
         network.load_state_dict(tensors)
     except (KeyError, TypeError, RuntimeError, InputError) as error:
         raise InputError(f"{path}: holds no network of this version ({error}); train it again") from error
-    return network.eval(), facts
+    return network.eval()
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> None:
@@ -125,10 +123,6 @@ def _predictor(record: dict[str, Any], run_folder: Path) -> Predictor:
             config=TwinConfig(**record["config"]["twin"]),
         )
     files = {name: run_folder / f"{name}.safetensors" for name in record["networks"]}
-    networks: dict[str, Any] = {name: read_network(file)[0] for name, file in files.items()}
+    networks: dict[str, Any] = {name: read_network(file) for name, file in files.items()}
     kind = CausalPredictor if record["config"]["model"] == "causal" else TransformerPredictor
-    return kind(
-        forward=networks.get("ff"),
-        inverse=networks.get("if"),
-        limits=DriveLimits.of(device),
-    )
+    return kind(forward=networks.get("ff"), inverse=networks.get("if"), limits=DriveLimits.of(device))

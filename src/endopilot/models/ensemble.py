@@ -18,9 +18,9 @@ from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
-from endopilot.simulation.set_up import SimulationSetUp
 from endopilot.simulation.simulate import run_set_up
 from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.state import SimulationSetUp
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 NOMINAL = np.array([1.0, 1.0, 0.0])
@@ -53,10 +53,7 @@ class Ensemble:
         """
         stack, self.parameters = Stack.of(device), parameters
         wire = stack.wire
-        self.wires = {
-            factor: wire.with_tip(bend_rad=wire.tip_bend_rad, stiffness_factor=float(factor))
-            for factor in np.unique(parameters[:, 1])
-        }
+        self.wires = with_stiffnesses(wire, parameters[:, 1])
         self.set_up = SimulationSetUp(
             anatomies=[anatomy] * len(parameters),
             stacks=[replace(stack, wire=self.wires[factor]) for factor in parameters[:, 1]],
@@ -94,6 +91,13 @@ class Ensemble:
             made = run_set_up(self.set_up, command[:, :, None], period_s=SAMPLE_PERIOD_S, record_shape=False)
         tip = made.tip[:, :, 0]
         return np.where(made.valid[..., None], np.stack([tip.abscissa, tip.offset], axis=-1), np.nan)
+
+
+def with_stiffnesses(wire: Wire, factors: Float[np.ndarray, "n"]) -> dict[float, Wire]:
+    """Return a wire with its tip as many times as stiff as some factors say, by the factor; equal ones are one wire."""
+    return {
+        each: wire.with_tip(bend_rad=wire.tip_bend_rad, stiffness_factor=each) for each in np.unique(factors).tolist()
+    }
 
 
 def likelihoods(score: Float[np.ndarray, "members *n"]) -> Float[np.ndarray, "members *n"]:

@@ -1,6 +1,7 @@
 """What a predictor is given of navigations, `Episodes`, and what it returns, `OpenLoop` or `Prediction`.
 
-A dataset gives them by `Episodes.of_dataset`, a plan by `Episodes.of_controls`. A navigation under way fills the fields
+A dataset gives them by `Episodes.of_dataset`, a plan by `Episodes.of_controls`; `trained_patients` says which of them a
+run was trained on. A navigation under way fills the fields
 with what its encoder and its X-ray images have measured so far; `EpisodeSetUp.of_anatomy` holds its vessel in memory.
 """
 
@@ -10,13 +11,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.dataset.loader import Dataset
+from endopilot.dataset.loader import Dataset, check_same_wire
 from endopilot.devices.device import Wire
 from endopilot.errors import InputError
 from endopilot.files import reading
@@ -27,6 +28,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion, published_mean
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
+AnyNetwork = TypeVar("AnyNetwork")
 PATIENTS_FOLDER = "patients"
 """Folder of a dataset in which its patients are kept as they were prepared for its device."""
 
@@ -302,6 +304,17 @@ def given_states(episodes: Episodes) -> Observed:
     return np.arange(episodes.samples) < WINDOW
 
 
+def needed(network: AnyNetwork | None, role: str) -> AnyNetwork:
+    """Return a network of a run, which must be there.
+
+    Raises:
+        InputError: it was not trained.
+    """
+    if network is None:
+        raise InputError(f"the run has no {role} network; train it with --network both")
+    return network
+
+
 def begin_after(observed: Observed) -> int:
     """Return the first sample that is to be predicted: the one after the last observed one."""
     return int(np.flatnonzero(observed)[-1]) + 1
@@ -313,3 +326,34 @@ def jumps(
     """Return the samples in which a tip at abscissas Δtip jumps: it moves otherwise than the drive by `JUMP_MM`."""
     slack = inserted_length_mm - tip_mm
     return np.abs(np.diff(slack, axis=1, prepend=slack[:, :1])) > JUMP_MM
+
+
+def check_wire(run: Path, record: Mapping[str, Any], dataset: Dataset) -> None:
+    """Check that a dataset was made with the wire that a run was trained with.
+
+    Raises:
+        InputError: it was made with another wire, or with catheters.
+    """
+    dataset.check_wire_alone("a model")
+    with reading(run, "train anew"):
+        check_same_wire(dataset, record["device"], run, "make a dataset with the run's wire")
+
+
+def trained_patients(run: Path, record: Mapping[str, Any], dataset: Dataset) -> frozenset[str]:
+    """Return the names of the patients of a dataset that a run was trained on.
+
+    A patient is known by the SHA-256 of the anatomy.
+
+    Raises:
+        InputError: the run is too old to name its patients, or the dataset was made with another wire.
+    """
+    check_wire(run, record, dataset)
+    if "patients" in record:
+        return frozenset(name for name, sha in dataset.patients.items() if sha in set(record["patients"]))
+    if record["config"]["model"] == "twin":
+        return frozenset()
+    if record.get("inputs", {}).get("dataset") == dataset.manifest["key"]:
+        return frozenset(dataset.of_split("train").anatomy.tolist())
+    raise InputError(
+        f"{run}: does not name the patients that it was trained on, as it was made by an older version; train it again"
+    )

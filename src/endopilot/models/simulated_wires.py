@@ -174,17 +174,14 @@ class Course:
                 self.states[end] = [simulator.state for _, simulator in self._parts]
 
 
-def _each_patient(
-    episodes: Episodes, what: str, of_one, *, parts: int = 1
-) -> list[tuple[Int[np.ndarray, "chosen"], np.ndarray]]:
-    """Return what a function of episodes of one patient returns, with their rows, on all cores.
+def _each_patient(episodes: Episodes, what: str, found: np.ndarray, of_one, *, parts: int = 1) -> np.ndarray:
+    """Fill the rows of an array, one an episode, by a function of rows of one patient, on all cores.
 
     Args:
         parts: into which each patient's episodes are split; fewer if there are fewer episodes.
     """
     patients = [np.flatnonzero(episodes.anatomy == name) for name in np.unique(episodes.anatomy)]
     each = [part for rows in patients for part in np.array_split(rows, min(parts, len(rows)))]
-    found = []
     with (
         progress(what, total=len(each)) as advance,
         warnings.catch_warnings(),  # around the threads, which change what all of them see
@@ -192,7 +189,7 @@ def _each_patient(
     ):
         warnings.simplefilter("ignore")  # a wire that fails is left out
         for chosen, made in zip(each, pool.map(of_one, each), strict=True):
-            found.append((chosen, made))
+            found[chosen] = made
             advance(1)
     return found
 
@@ -212,10 +209,7 @@ def fitted_wires(episodes: Episodes, observed: EachObserved) -> Wires:
     def of_one(chosen: Int[np.ndarray, "chosen"]) -> Wires:
         return fitted(episodes.select(chosen), observed[chosen, :WINDOW])
 
-    wires = np.ones((len(episodes), 4))
-    for chosen, found in _each_patient(episodes, "Fitted wires", of_one, parts=_parts(episodes)):
-        wires[chosen] = found
-    return wires
+    return _each_patient(episodes, "Fitted wires", np.ones((len(episodes), 4)), of_one, parts=_parts(episodes))
 
 
 def simulated_tips(
@@ -239,9 +233,7 @@ def simulated_tips(
     def of_one(chosen: Int[np.ndarray, "chosen"]) -> np.ndarray:
         return _of_one_patient(episodes.select(chosen), wires[chosen], courses)
 
-    for chosen, found in _each_patient(episodes, "Simulated wires", of_one, parts=_parts(episodes)):
-        tips[chosen] = found
-    return tips
+    return _each_patient(episodes, "Simulated wires", tips, of_one, parts=_parts(episodes))
 
 
 def _of_one_patient(
@@ -301,9 +293,7 @@ def read_or_simulate(folder: Path | None, episodes: Episodes, observed: EachObse
         return tips
 
     tips = np.empty((*episodes.branch.shape, len(FRICTION_FACTORS) + 1, 2))
-    for chosen, found in _each_patient(episodes, "Fitted and simulated wires", of_one):
-        tips[chosen] = found
-    return WireTips.of(tips)
+    return WireTips.of(_each_patient(episodes, "Fitted and simulated wires", tips, of_one))
 
 
 def _key(episodes: Episodes, each: list[bytes]) -> str:

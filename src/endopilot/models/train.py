@@ -310,7 +310,6 @@ class Job:
         return whole
 
     def _window(self, examples: Examples, targets: torch.Tensor) -> list[torch.Tensor]:
-        """Return the network's inputs of some targets, and the truth, where this process computes."""
         return [part.to(self.group.device) for part in examples.window(self.name, targets)]
 
     def _steps(self, network: AnyNetwork, state: dict[str, Any]) -> int:
@@ -346,7 +345,7 @@ class Job:
     def _save(self, network: AnyNetwork, optimizer: torch.optim.Adam, state: dict[str, Any]) -> None:
         tensors = {f"network.{key}": value for key, value in network.state_dict().items()}
         write_tensors(self._checkpoint, tensors | optimizer_tensors(optimizer), {"network": self.name, **state})
-        write_network(self.run_folder / f"{self.name}.safetensors", self.name, network, self.config.network_size, {})
+        write_network(self._file, self.name, network, self.config.network_size)
 
     def _resume(self, network: AnyNetwork, optimizer: torch.optim.Adam) -> dict[str, Any] | None:
         if not self._checkpoint.exists():
@@ -357,10 +356,12 @@ class Job:
         restore_optimizer(optimizer, tensors)
         # A kill between the two files of an epoch leaves the second one behind by an epoch.
         if self.group.writes:
-            write_network(
-                self.run_folder / f"{self.name}.safetensors", self.name, network, self.config.network_size, {}
-            )
+            write_network(self._file, self.name, network, self.config.network_size)
         return {key: facts[key] for key in ("seconds", "curve")}
+
+    @property
+    def _file(self) -> Path:
+        return self.run_folder / f"{self.name}.safetensors"
 
     @property
     def _checkpoint(self) -> Path:

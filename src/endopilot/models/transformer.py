@@ -33,9 +33,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from endopilot.devices.drive_limits import DriveLimits
-from endopilot.errors import InputError
 from endopilot.models.config import WINDOW, TransformerConfig
-from endopilot.models.episodes import Episodes, Observed, OpenLoop, Steps2, begin_after
+from endopilot.models.episodes import Episodes, Observed, OpenLoop, Steps2, begin_after, needed
 from endopilot.types import SAMPLE_PERIOD_S
 
 N_FEATURES = 9
@@ -291,7 +290,10 @@ class TransformerPredictor:
     @torch.inference_mode()
     def _rollout(self, episodes: Episodes, begin: int, *, forward: bool, inverse: bool) -> OpenLoop:
         """Roll out from a sample on: controls by IF or the true ones, tips by FF or the true ones."""
-        networks = self._network("forward", forward), self._network("inverse", inverse)
+        networks = (
+            needed(self.forward, "forward") if forward else None,
+            needed(self.inverse, "inverse") if inverse else None,
+        )
         parts = []
         for first in range(0, len(episodes), self.batch_size):
             chosen = np.arange(first, min(first + self.batch_size, len(episodes)))
@@ -300,17 +302,10 @@ class TransformerPredictor:
         tip, proximal, control = (np.concatenate(signal) for signal in zip(*parts, strict=True))
         return OpenLoop(tip=tip, proximal=proximal, control=control)
 
-    def _network(self, role: str, needed: bool) -> Network | None:
-        network = getattr(self, role)
-        if needed and network is None:
-            raise InputError(f"the run has no {role} network; train it with --network both")
-        return network if needed else None
-
 
 def _rollout_batch(
     forward: Network | None, inverse: Network | None, limits: DriveLimits, batch: Windows, begin: int
 ) -> tuple[Steps2, Steps2, Steps2]:
-    """Return tip, x^prox and control of one batch from a sample on."""
     desired = batch.tip
     tip, control = desired.clone(), batch.control.clone()
     proximal = batch.proximal.double()  # float64, so that x^prox stays the integral of the controls

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from endopilot.devices.device import Wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.models.config import WINDOW, TwinConfig
-from endopilot.models.ensemble import NOMINAL, Ensemble, likelihoods
+from endopilot.models.ensemble import NOMINAL, Ensemble, likelihoods, with_stiffnesses
 from endopilot.models.episodes import (
     EachObserved,
     Episodes,
@@ -210,11 +210,9 @@ class TwinPredictor:
         return self.predicted[episodes]
 
     def _track(self, episodes: Episodes, likeliest: Float[np.ndarray, "episodes 3"], begin: int) -> OpenLoop:
-        """Drive wires of these parameters along the desired tips from a sample on."""
         desired = episodes.tip[:, begin:].astype(float)
         tip, control = np.empty(desired.shape), np.empty(desired.shape)
-        wire, stiffnesses = self.device, np.unique(likeliest[:, 1]).tolist()
-        wires = {each: wire.with_tip(bend_rad=wire.tip_bend_rad, stiffness_factor=each) for each in stiffnesses}
+        wires = with_stiffnesses(self.device, likeliest[:, 1])
         for anatomy, chosen in _by_anatomy(episodes):
             data, ours = episodes.select(chosen), likeliest[chosen]
             tip[chosen], control[chosen] = track(

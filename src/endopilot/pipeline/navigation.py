@@ -22,7 +22,7 @@ from endopilot.extras import require_extras
 from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.runs import claim
 from endopilot.simulation.signals import table_columns
-from endopilot.simulation.trajectory_file import TRAJECTORY
+from endopilot.simulation.trajectory import TRAJECTORY
 from endopilot.tasks.targets import section_at
 from endopilot.types import TipProjection
 
@@ -116,8 +116,7 @@ def _write(found: PatientNavigation, output: Path, asked: Mapping[str, Any] | No
         asked: the names that `endopilot navigate` was given; None where it was not called.
     """
     from endopilot.plotting import png  # matplotlib and plotly are slow to import
-    from endopilot.report.navigation_figure import navigation_figure
-    from endopilot.report.navigation_page import write_navigation_page
+    from endopilot.report.navigation_page import navigation_figure, write_navigation_page
 
     set_up = found.set_up
     driven_in, real = set_up.folder, set_up.true_anatomy
@@ -239,7 +238,6 @@ def _manifest(found: PatientNavigation, output: Path) -> dict[str, Any]:
 
 
 def _world(set_up: SetUp) -> dict[str, Any]:
-    """Return the world's name and what in it is not as given."""
     return {"name": set_up.config.world, **set_up.world.differences()}
 
 

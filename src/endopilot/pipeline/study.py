@@ -10,7 +10,8 @@ from __future__ import annotations
 import hashlib
 import re
 import sys
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +26,6 @@ from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.anatomy.read_source import read_source
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.control.navigate import NavigateConfig
-from endopilot.dataset.again import episode_set_up
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.loader import read_dataset
 from endopilot.devices.device import Wire, read_wire
@@ -36,13 +36,12 @@ from endopilot.files import input_hash, manifest, read_json, write_json
 from endopilot.imaging.segment import METHODS, SegmentConfig, segment
 from endopilot.imaging.volume import read_mask, read_volume, write_mask, write_volume
 from endopilot.models.config import PRETRAINED, TrainConfig, run_path
+from endopilot.parallel import each
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.pipeline.navigation import navigate_into
-from endopilot.pipeline.stages import Stages
 from endopilot.progress import progress
 from endopilot.runs import claim
 from endopilot.settings import Seconds, Seed, Within, settings
-from endopilot.simulation.simulate import run_set_up
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import Volume
 
@@ -63,6 +62,45 @@ UNKNOWN_WIRE = (
     "know."
 )
 RUN_ORIGIN = "One CT angiogram, given by the user; everything is made from it alone."
+
+
+class Stages:
+    """The finished stages of a run, their seconds and the rejected patients, kept in `stages.json`.
+
+    Args:
+        folder: the run's folder, which the run has claimed.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / "stages.json"
+        record = read_json(self._path, keys=()) if self._path.exists() else {}
+        self.finished: list[str] = record.get("finished", [])
+        self.seconds: dict[str, float] = record.get("seconds", {})
+        self.rejected: dict[str, str] = record.get("rejected", {})
+
+    def do(self, name: str, work: Callable[[], None]) -> None:
+        """Do the work of a stage unless it is finished; time spent before an interruption counts too."""
+        if name in self.finished:
+            return
+        start = time.perf_counter()
+        try:
+            work()
+            self.finished.append(name)
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+            record = {"finished": self.finished, "seconds": self.seconds, "rejected": self.rejected}
+            write_json(self._path, record)
+
+    def do_each(self, name: str, title: str, items: Sequence[Path], work: Callable[[Path], None]) -> None:
+        """Do a stage's work for every item. A bad item is rejected and recorded; a bad only item ends the run."""
+
+        def work_on_all() -> None:
+            bad = each(title, items, work)
+            if len(items) == 1 and bad:
+                raise bad[items[0]]
+            self.rejected.update({item.name: str(error) for item, error in bad.items()})
+
+        self.do(name, work_on_all)
 
 
 @settings
@@ -310,7 +348,6 @@ def _drive(run: _Run, anatomy: Path) -> None:
 
 
 def _study(run: _Run, anatomies: Sequence[Path]) -> dict[str, Any]:
-    """Run the stages that follow the anatomies, up to the report."""
     if run.evaluates:
         _learn(run, anatomies)
     run.stages.do("report", lambda: _report(run, [folder.name for folder in anatomies]))
@@ -353,7 +390,6 @@ def _learn(run: _Run, anatomies: Sequence[Path]) -> None:
 
 
 def _report(run: _Run, names: Sequence[str]) -> None:
-    """Write report.html from what the other stages left in the run's folder."""
     from endopilot.report.report import PatientContent, ReportContent, write_report  # matplotlib and plotly
 
     output = run.output
@@ -409,8 +445,7 @@ def _replay(output: Path) -> tuple[Path, Trajectory]:
     held_out = dataset.of_split("test" if "test" in dataset.split else "seen_test")
     best = int(np.ptp(held_out.tip_abscissa[:, :, 0], axis=1).argmax())
     folder = dataset.anatomy_folder(str(held_out.anatomy[best]))
-    set_up, command = episode_set_up(held_out, best), held_out.command[best : best + 1]
-    return folder, run_set_up(set_up, command, period_s=held_out.sample_period_s, record_shape=True)
+    return folder, held_out.trajectory(best, record_shape=True)
 
 
 def _finish(run: _Run) -> dict[str, Any]:

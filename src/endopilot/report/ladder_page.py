@@ -100,7 +100,6 @@ def _replay_scene(task: Task, navigation: Navigation, result: dict[str, Any], pa
 
 
 def _outcome(result: dict[str, Any]) -> str:
-    """Return one of `OUTCOMES`."""
     if not result["success"]:
         return "not reached"
     return "safe success" if result["safe"] else "success, but too large a force"

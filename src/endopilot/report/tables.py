@@ -76,7 +76,6 @@ def drive_difference_table(results: Mapping[str, SplitResult]) -> pd.DataFrame:
 
 
 def _of_sequences(split: str, series: str, result: SplitResult) -> dict[str, Any]:
-    """Return the first columns of a table with one row a sequence."""
     anatomy = [result.anatomies[index] for index in result.anatomy]
     return {"split": split, "series": series, "anatomy": anatomy, "sequence": result.sequence}
 

@@ -16,13 +16,18 @@ from endopilot.simulation.config import (
     FREE_BEHIND_MM,
     LANES,
     Actuation,
+    CoreMotion,
+    Lumen,
+    Options,
+    Processor,
+    Simulation,
     SimulatorConfig,
+    core_for,
+    gpu_errors,
     wall_stiffness,
 )
-from endopilot.simulation.processor import CoreMotion, Lumen, Options, Processor, Simulation, core_for, gpu_errors
 from endopilot.simulation.rod import RodLayout
-from endopilot.simulation.transmission import TransmissionLayout
-from endopilot.simulation.tubes import TubeLayout
+from endopilot.simulation.tubes import TransmissionLayout, TubeLayout
 from endopilot.types import SAMPLE_PERIOD_S, DistanceMap, Insertion
 
 _LARGEST_NEWTON_STEP = 0.3

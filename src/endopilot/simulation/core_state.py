@@ -1,9 +1,17 @@
-"""Where the numbers stand of which a state of the core is made: `World` in src/core/world.hpp."""
+"""Where the numbers stand of which a state of the core is made: `World` in src/core/world.hpp.
+
+Through them friction varies along the vessel: `run_along` prepares each step, as the core has one coefficient a device.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 from jaxtyping import Float
+
+from endopilot.progress import Advance
+from endopilot.simulation.groups import Group, factor_at
 
 SCALARS, DEVICE, NODE = 10, 27, 35
 """Numbers of a world, then of each device, then of each node."""
@@ -36,3 +44,53 @@ def with_nodes(
     changed, first = values.copy(), SCALARS + devices * DEVICE
     changed[:, first : first + numbers[0].size] = numbers.reshape(len(values), -1)
     return changed
+
+
+_SUMMED = ("iterations", "node_iterations", "slip", "rotation_slip", "approach_slip")
+"""What adds up over the steps of a sample; of all else the last step's counts."""
+
+
+def run_along(
+    group: Group,
+    control: Float[np.ndarray, "worlds samples devices 2"],
+    steps: int,
+    factors: Sequence[float],
+    run: Callable[..., dict[str, np.ndarray]],
+    advance: Advance | None = None,
+) -> dict[str, np.ndarray]:
+    """Run worlds step by step, and before each multiply the friction of every contact by the factor where it lies.
+
+    A step that the core shortens, as in a snap, ends with the friction that the devices have by themselves.
+
+    Args:
+        group: the worlds.
+        control: of each sample.
+        steps: of a sample.
+        factors: as in `factor_at`.
+        run: runs the worlds, as the core's `run` does.
+        advance: called with the number of samples of all worlds that were simulated since the last call.
+    """
+    samples = []
+    for sample in range(control.shape[1]):
+        now, results = np.ascontiguousarray(control[:, sample : sample + 1]), []
+        for _ in range(steps):
+            _scale_friction(group, control.shape[2], factors)
+            results.append(run(control=now, steps_per_sample=1, progress=None))
+        summed = {name: sum(one[name] for one in results) for name in _SUMMED if name in results[-1]}
+        samples.append(results[-1] | summed)
+        if advance is not None:
+            advance(len(control))
+    return {name: np.concatenate([one[name] for one in samples], axis=1) for name in samples[0]}
+
+
+def _scale_friction(group: Group, devices: int, factors: Sequence[float]) -> None:
+    """Multiply the limits of friction in the coming step by the factors where the contact points lie."""
+    values, position = group.simulation.state(), group.simulation.positions()
+    numbers = nodes_of(values, position.shape[1], devices)
+    middle = 0.5 * (position + np.roll(position, -1, axis=1))
+    for first, points in zip(CONTACTS, (position, middle), strict=True):
+        rubs = numbers[..., first + LIMIT] > 0
+        if rubs.any():
+            abscissa = group.project(points[rubs]).abscissa
+            numbers[rubs, first + LIMIT] *= factor_at(abscissa, group.anatomy.tree, factors)
+    group.simulation.set_state(with_nodes(values, numbers, devices))

@@ -19,13 +19,11 @@ from endopilot.anatomy.projection import TipProjector
 from endopilot.devices.drive_limits import far_end_mm
 from endopilot.devices.stack import Stack
 from endopilot.simulation.checks import check_distance_map, check_memory
-from endopilot.simulation.config import FREE_BEHIND_MM, SimulatorConfig
+from endopilot.simulation.config import FREE_BEHIND_MM, CoreMotion, Lumen, Simulation, SimulatorConfig, core_for
 from endopilot.simulation.core import make_lumen, make_simulation
 from endopilot.simulation.motion import Motion
-from endopilot.simulation.processor import CoreMotion, Lumen, Simulation, core_for
 from endopilot.simulation.rod import LONGEST_ELEMENTS, RodLayout, lay_out
-from endopilot.simulation.transmission import lay_out_transmission
-from endopilot.simulation.tubes import lay_out_tubes
+from endopilot.simulation.tubes import lay_out_transmission, lay_out_tubes
 from endopilot.types import Anatomy, DistanceMap, VesselTree
 
 FINE_MM = 0.2
@@ -165,7 +163,6 @@ def group_key(anatomy: Anatomy, stack: Stack) -> GroupKey:
 
 
 def _wall_key(anatomy: Anatomy, stack: Stack) -> tuple[str, float, bool]:
-    """Return what worlds with the same wall have in common."""
     return anatomy.identity, stack.outer_radius_mm, bool(stack.catheters)
 
 

@@ -18,7 +18,7 @@ from scipy.interpolate import PchipInterpolator
 
 from endopilot.atlas.heart_reference import LEFT_VENTRICLE_AXIS
 from endopilot.settings import Finite, Within, settings
-from endopilot.simulation.processor import CoreMotion, Processor, core_for
+from endopilot.simulation.config import CoreMotion, Processor, core_for
 
 MotionName = Literal["still", "breathing", "heartbeat", "both"]
 """Names of motions: see `motion_named`."""

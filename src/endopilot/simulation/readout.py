@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.simulation.groups import Group
-from endopilot.simulation.set_up import SimulationSetUp
+from endopilot.simulation.state import SimulationSetUp
 from endopilot.types import TipProjection
 
 
@@ -268,7 +268,6 @@ class Readout:
         return self._merge(parts)
 
     def _of_groups(self, values: np.ndarray) -> list[tuple[Group, np.ndarray]]:
-        """Return the rows of each group."""
         return [(group, values[group.index]) for group in self._groups]
 
     def _merge(self, parts: Sequence[np.ndarray]) -> np.ndarray:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.optimize import brentq
 
 from endopilot.devices.device import Wire
-from endopilot.simulation.processor import Processor, RodModel, core_for
+from endopilot.simulation.config import Processor, RodModel, core_for
 
 POISSON_RATIO = 0.3
 """Of steel and nitinol; it ties shear to bending stiffness."""

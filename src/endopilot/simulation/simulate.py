@@ -17,8 +17,8 @@ from endopilot.settings import public
 from endopilot.simulation.checks import check_control, check_memory, check_shape_memory, with_device_axis
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.motion import Motion, MotionName, motion_named
-from endopilot.simulation.set_up import SimulationSetUp
 from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.state import SimulationSetUp
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 

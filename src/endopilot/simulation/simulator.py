@@ -24,14 +24,12 @@ from endopilot.errors import InputError
 from endopilot.progress import Advance
 from endopilot.settings import public
 from endopilot.simulation.checks import ROUNDING_MM, check_control, check_memory, check_travel, with_device_axis
-from endopilot.simulation.config import FREE_BEHIND_MM, LANES, Actuation, SimulatorConfig
-from endopilot.simulation.friction_along import run_along
+from endopilot.simulation.config import FREE_BEHIND_MM, LANES, Actuation, SimulatorConfig, gpu_errors
+from endopilot.simulation.core_state import run_along
 from endopilot.simulation.groups import Group, group_key, make_groups
 from endopilot.simulation.motion import Motion
-from endopilot.simulation.processor import gpu_errors
 from endopilot.simulation.readout import Readout
-from endopilot.simulation.set_up import SimulationSetUp
-from endopilot.simulation.state import SimulatorState, Step, SupportsDLPack
+from endopilot.simulation.state import SimulationSetUp, SimulatorState, Step, SupportsDLPack
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 

@@ -1,7 +1,8 @@
-"""What `Simulator` takes and returns: a control array, a step's results and a saved state."""
+"""What `Simulator` takes and returns: its worlds' set-up, a control array, a step's results and a saved state."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -10,9 +11,13 @@ from zipfile import BadZipFile
 import numpy as np
 from jaxtyping import Float
 
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import regular, writing
+from endopilot.simulation.config import Actuation, SimulatorConfig
+from endopilot.simulation.motion import Motion
 from endopilot.simulation.signals import SolvedOutputs, described
+from endopilot.types import Anatomy
 
 FORMAT_VERSION = 4
 """Of `SimulatorState`: raised when its values or its fingerprint come to mean something else."""
@@ -24,6 +29,36 @@ class SupportsDLPack(Protocol):
 
     def __dlpack__(self, **arguments: Any) -> Any: ...
     def __dlpack_device__(self) -> tuple[int, int]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class SimulationSetUp:
+    """What worlds are simulated with. A `Simulator` made of it and the same commands give the same bits.
+
+    Attributes:
+        anatomies: the vessel of each world.
+        stacks: the devices of each world.
+        initial: Δ (mm) and φ (rad) that the devices are brought to before the first command; NaN in a world that was
+            on its way already.
+        friction: Coulomb coefficient of each device on the wall.
+        actuation: what commands are: "velocity" (mm/s, rad/s) or "force" (N, N·mm).
+        motion: how every vessel moves with time; None where they lie still.
+        config: settings of the rod core.
+    """
+
+    anatomies: Sequence[Anatomy]
+    stacks: Sequence[Stack]
+    initial: Float[np.ndarray, "worlds devices 2"]
+    friction: Float[np.ndarray, "worlds devices"]
+    actuation: Actuation
+    motion: Motion | None
+    config: SimulatorConfig
+
+    @property
+    def largest(self) -> Float[np.ndarray, "worlds devices 2"]:
+        """Largest magnitudes that commands may have: mm/s and rad/s, or N and N·mm, with a hair for rounding."""
+        fastest = np.array([stack.fastest for stack in self.stacks]) * (1 + 1e-6)
+        return np.full_like(fastest, np.finfo(float).max) if self.actuation == "force" else fastest
 
 
 @described

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from endopilot.simulation.config import CoreMotion
 from endopilot.simulation.motion import Motion, place, relative
-from endopilot.simulation.processor import CoreMotion
 from endopilot.simulation.simulator import Simulator
 
 
