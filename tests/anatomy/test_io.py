@@ -126,6 +126,8 @@ def test_other_versions_and_missing_fields_are_refused(anatomy, tmp_path):
         read_anatomy(tmp_path / "a")
     with pytest.raises(InputError, match="no such folder"):
         read_anatomy(tmp_path / "nowhere")
+    with pytest.raises(InputError, match=r"it holds anatomies, so give .*/\*$"):
+        read_anatomy(tmp_path)
 
 
 def test_the_zero_of_the_rotation_is_kept_and_decides_the_identity(anatomy, tmp_path):

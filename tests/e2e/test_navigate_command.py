@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
@@ -280,6 +281,15 @@ def test_a_finished_folder_is_left_alone_and_another_run_is_refused(driven, pati
     line = refused(capsys, "navigate", patient, "--target", "3", "-o", folder, *SHORT, *same)
     assert "was begun with target = 2, now it is 3" in line
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+
+
+def test_without_the_extras_a_navigation_writes_what_it_can_and_says_what_is_left_out(patient, tmp_path):
+    config = NavigateConfig(tip="own", seconds=5.0)
+    with patch.object(navigation, "extras_present", lambda: {"learn": False, "report": False}):
+        figures = navigation.navigate_into(patient, "1", output=tmp_path / "bare", policy="forward", config=config)
+    written = ["manifest.json", "navigation.csv", "run.json", "trajectory.npz"]
+    assert sorted(path.name for path in (tmp_path / "bare").iterdir()) == written and figures["page"] is None
+    assert figures["left_out"] == "files that need: pip install 'endopilot[learn,report]'"
 
 
 def test_an_interrupted_navigation_is_finished_by_the_same_command(patient, capsys, tmp_path, monkeypatch):

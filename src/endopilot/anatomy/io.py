@@ -80,7 +80,9 @@ def read_anatomy(folder: str | Path) -> Anatomy:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give an anatomy made by `endopilot anatomy` or `endopilot atlas`")
     if not (folder / _RECORD).exists():
-        raise InputError(f"{folder}: holds no {_RECORD}, so it is not an anatomy; make one with `endopilot anatomy`")
+        held = any(folder.glob(f"*/{_RECORD}"))
+        mend = f"it holds anatomies, so give {folder}/*" if held else "make one with `endopilot anatomy`"
+        raise InputError(f"{folder}: holds no {_RECORD}, so it is not an anatomy; {mend}")
     record = files.read_json(folder / _RECORD)
     version = record.get("schema_version") if isinstance(record, dict) else None
     if version not in (1, SCHEMA_VERSION):

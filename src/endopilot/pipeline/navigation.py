@@ -18,7 +18,7 @@ from endopilot.control.navigate import NavigateConfig, PatientNavigation, SetUp,
 from endopilot.control.outcome import decision_times, name_target, slipped_s, tell_outcome, worst_ratio
 from endopilot.control.set_up import tip_name
 from endopilot.devices.stack import Stack
-from endopilot.extras import require_extras
+from endopilot.extras import extras_present
 from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.runs import claim
 from endopilot.simulation.signals import table_columns
@@ -57,10 +57,8 @@ def navigate_into(
         The outcome in one line, and figures.
 
     Raises:
-        InputError: the navigation cannot be begun (see `navigate`), a library is missing, or the folder belongs to
-            another run.
+        InputError: the navigation cannot be begun (see `navigate`), or the folder belongs to another run.
     """
-    require_extras("learn", "report")
     stack = Stack.of(device, *catheter)
     set_up = set_up_navigation(anatomy, target, policy=policy, device=stack, config=config)
     _claim(Path(output), set_up)
@@ -83,9 +81,8 @@ def write_navigation(driven: PatientNavigation, *, output: str | Path) -> dict[s
         The outcome in one line, and figures.
 
     Raises:
-        InputError: a library is missing, or the folder belongs to another run.
+        InputError: the folder belongs to another run.
     """
-    require_extras("learn", "report")
     _claim(Path(output), driven.set_up)
     return _write(driven, Path(output), None)
 
@@ -108,17 +105,14 @@ def _claim(output: Path, set_up: SetUp) -> None:
 
 
 def _write(found: PatientNavigation, output: Path, asked: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Write all files, the manifest last, and return the figures.
+    """Write all files that installed libraries make, the manifest last, and return the figures.
 
     Args:
         found: the navigation.
         output: the folder.
         asked: the names that `endopilot navigate` was given; None where it was not called.
     """
-    from endopilot.plotting import png  # matplotlib and plotly are slow to import
-    from endopilot.report.navigation_page import navigation_figure, write_navigation_page
-
-    set_up = found.set_up
+    set_up, present = found.set_up, extras_present()
     driven_in, real = set_up.folder, set_up.true_anatomy
     if driven_in is None or real is not set_up.anatomy:  # the catheter lies otherwise: an anatomy of its own
         driven_in = output / ANATOMY_FOLDER
@@ -131,15 +125,26 @@ def _write(found: PatientNavigation, output: Path, asked: Mapping[str, Any] | No
     about = {"policy": set_up.policy_name, "seed": set_up.config.seed, "world": _world(set_up)}
     about["robot"] = asdict(set_up.world.real_robot(set_up.robot))
     replace(cycles, about=cycles.about | about).write(output / TRAJECTORY)
-    _write_episode(found, driven_in, output / EPISODE_FOLDER)
+    record = _manifest(found, output)
+    if missing := [extra for extra in ("learn", "report") if not present[extra]]:
+        record["figures"]["page"] = str(output / PAGE_FILE) if present["report"] else None
+        record["figures"]["left_out"] = f"files that need: pip install 'endopilot[{','.join(missing)}]'"
+    if present["learn"]:
+        _write_episode(found, driven_in, output / EPISODE_FOLDER)
+    if present["report"]:
+        _write_page(found, output, _commands(found, driven_in, output, asked), record)
+    write_json(output / MANIFEST_FILE, record)
+    return read_json(output / MANIFEST_FILE)["figures"]
+
+
+def _write_page(found: PatientNavigation, output: Path, commands: Mapping[str, str], record: dict[str, Any]) -> None:
+    from endopilot.plotting import png  # matplotlib and plotly are slow to import
+    from endopilot.report.navigation_page import navigation_figure, write_navigation_page
+
     picture = png(navigation_figure(found))
     with writing(output / PICTURE_FILE) as partial:
         partial.write_bytes(picture)
-    record = _manifest(found, output)
-    commands = _commands(found, driven_in, output, asked)
     write_navigation_page(output / PAGE_FILE, found, picture=picture, commands=commands, manifest=record)
-    write_json(output / MANIFEST_FILE, record)
-    return read_json(output / MANIFEST_FILE)["figures"]
 
 
 def navigation_table(found: PatientNavigation) -> pd.DataFrame:
