@@ -10,6 +10,7 @@ from tyro.conf import Positional
 from endopilot.cli.arguments import Existing, ListenConfig
 from endopilot.devices.robot import ASSUMED, read_robot
 from endopilot.errors import InputError
+from endopilot.extras import require_extras
 from endopilot.settings import CountOrZero
 
 
@@ -54,6 +55,7 @@ def command(
     if episode is not None:
         _write_episode(replay, episode)
         return
+    require_extras("cockpit", "learn")
     from endopilot.cockpit.open import open_replay, open_session, open_task, resume_session
     from endopilot.cockpit.server import serve
 
