@@ -208,7 +208,7 @@ def _make(
 ) -> None:
     """Make the folders that are not there yet, in processes of this machine or on the cluster of a scheduler."""
     if isinstance(where, Workers):
-        make_missing(title, paths, partial(work, layout), where)
+        make_missing(title, paths, partial(work, layout), where if len(paths) > 1 else None)
         return
     from endopilot.dataset.workers import run_on_cluster  # brings the libraries of data sets
 

@@ -42,7 +42,7 @@ class AgentConfig:
     evaluations: Annotated[int, Within(1, 10**12)] = 100_000
     """Decision periods of a world that a search may simulate; it then ends with the course that it has. Some 30 s of a
     core in coronary arteries, where the longest of 21 navigations' decisions took 21 s; minutes with long devices."""
-    planning_s: Positive | None = None
+    planning_s: Annotated[float, Within(0, 86_400, above_low=True)] | None = None
     """Processor time after which a search ends likewise, s: then its bits hang on the machine's speed."""
     most_exposures: Annotated[int, Within(1, 10**6)] = 40
     """Exposures that an agent which looks when its adviser asks may take; it gives up where it needs more."""
