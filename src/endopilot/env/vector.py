@@ -242,7 +242,7 @@ class NavigateVectorEnv(VectorEnv):
             for world in np.flatnonzero(mask).tolist():
                 self._generators[world] = seeding.np_random(seeds[world])[0]
         self._begin(mask)
-        now = Measured.current(self._simulator, self._reality.encoders)
+        now = Measured.of(self._simulator, self._reality.encoders)
         distances = self._episodes.routes.distance(now.tip)
         return self._observe(now, distances), self._infos(now, mask)
 
@@ -268,7 +268,7 @@ class NavigateVectorEnv(VectorEnv):
             InputError: actions of another shape, or not finite; no world is moved in either case.
         """
         mode, episodes = self.metadata["autoreset_mode"], self._episodes
-        over = episodes.unbegun | (episodes.ended & (mode is AutoresetMode.DISABLED))
+        over = (episodes.steps < 0) | (episodes.ended & (mode is AutoresetMode.DISABLED))
         if over.any():
             worlds = ", ".join(map(str, np.flatnonzero(over)))
             raise ResetNeeded(f"Cannot call step() before reset(): no episode goes on in worlds {worlds}")
@@ -281,12 +281,12 @@ class NavigateVectorEnv(VectorEnv):
         control[fresh] = 0.0
         control = control.reshape(self.num_envs, self._drives, 2)
         step = self._reality.drive(control, CONTROL_PERIOD_S, episodes.time_s)
-        now = Measured.after(step, self._simulator, self._reality.encoders)
+        now = Measured.of(self._simulator, self._reality.encoders, step)
         episodes.steps += ~fresh
         self._expose(expose, self._reality.encoders)
         if fresh.any():
             self._begin(fresh)
-            now = Measured.current(self._simulator, self._reality.encoders)
+            now = Measured.of(self._simulator, self._reality.encoders)
         distances = episodes.routes.distance(now.tip)
         judged = episodes.judge(now, distances, fresh, expose)
         observations, infos = self._observe(now, distances), self._infos(now, expose | fresh)
@@ -307,7 +307,7 @@ class NavigateVectorEnv(VectorEnv):
             last[world] = of_world(observations, world)
         final = {name: ended if name.startswith("_") else values for name, values in infos.items()}
         self._begin(ended)
-        now = Measured.current(self._simulator, self._reality.encoders)
+        now = Measured.of(self._simulator, self._reality.encoders)
         infos = self._infos(now, exposed | ended)
         infos |= {"final_obs": last, "_final_obs": ended, "final_info": final, "_final_info": ended}
         return self._observe(now, self._episodes.routes.distance(now.tip)), *judged, infos
@@ -350,13 +350,10 @@ class NavigateVectorEnv(VectorEnv):
     @property
     def state(self) -> NavigationState:
         """All that the future depends on, to be kept and given to `set_state`."""
-        return NavigationState(
-            self._simulator.state,
-            **self._episodes.arrays(),
-            generators=tuple(dict(copy.deepcopy(generator.bit_generator.state)) for generator in self._generators),
-            drawn=copy.deepcopy(self._reality.drawn),
-            exposed=None if self._c_arms is None else copy.deepcopy(self._c_arms.exposed),
-        )
+        kept = {"episodes": self._episodes.changing, "drawn": self._reality.drawn}
+        kept["generators"] = [generator.bit_generator.state for generator in self._generators]
+        kept["exposed"] = self._c_arms and self._c_arms.exposed
+        return NavigationState(self._simulator.state, copy.deepcopy(kept))
 
     def set_state(self, state: NavigationState) -> None:
         """Go back to a state, bit by bit.
@@ -365,12 +362,12 @@ class NavigateVectorEnv(VectorEnv):
             InputError: it is that of other navigations or settings.
         """
         self._simulator.set_state(state.simulator)
-        self._episodes.set_arrays(state.steps, state.distance, state.safe, state.ended)
-        self._reality.drawn = copy.deepcopy(state.drawn)
+        kept = copy.deepcopy(state.kept)
+        self._episodes.changing, self._reality.drawn = kept["episodes"], kept["drawn"]
         if self._c_arms is not None:
-            self._c_arms.exposed = copy.deepcopy(state.exposed)
-        for generator, kept in zip(self._generators, state.generators, strict=True):
-            generator.bit_generator.state = copy.deepcopy(kept)
+            self._c_arms.exposed = kept["exposed"]
+        for generator, before in zip(self._generators, kept["generators"], strict=True):
+            generator.bit_generator.state = before
 
     def render(self) -> tuple[UInt8[np.ndarray, "256 256 3"], ...] | None:
         """Return a picture of each world with `render_mode="rgb_array"`: vessel, target, wire and catheters."""
