@@ -152,15 +152,16 @@ class Measured:
         cls, simulator: Simulator, encoders: Float[np.ndarray, "worlds devices 2"], step: Step | None = None
     ) -> Measured:
         """Return the worlds as they are now, with what encoders say, and the force over the step that led there."""
+        now = simulator if step is None else step
         return cls(
             tip=simulator.project(),
-            position=simulator.tip_position,
-            direction=simulator.tip_direction,
+            position=now.tip_position,
+            direction=now.tip_direction,
             contact_force=simulator.contacts.max(axis=1) if step is None else step.contact_force_max,
-            inserted_length=simulator.inserted_length,
-            rotation=simulator.rotation,
+            inserted_length=now.inserted_length,
+            rotation=now.rotation,
             encoders=encoders,
-            valid=simulator.valid,
+            valid=now.valid,
         )
 
 

@@ -239,19 +239,19 @@ def check_submission(path: str | Path, *, policy: str = "") -> SubmissionCheck:
             f"{path}: blas: {kernel}; submissions are driven again with {' or '.join(KERNELS)}: run the ladder again "
             "with OPENBLAS_CORETYPE=Haswell"
         )
-    judged = partial(
-        SubmissionCheck,
+    remark = f"this machine does not run {kernel}: nothing was driven again"
+    found = {"verdict": "not judged", "difference": None, "scores": (), "remarks": (remark,)}
+    with _running(kernel) as (runs, pool), tempfile.TemporaryDirectory(prefix="endopilot-") as folder:
+        if runs:
+            found = _driven_again(submission, Path(folder), pool, at_hand)
+    return SubmissionCheck(
         policy=submission.policy,
         origin=submission.origin,
         key=submission.terms.key(),
         kernel=kernel,
         navigations=sum(map(len, submission.navigations.values())),
+        **found,
     )
-    with _running(kernel) as (runs, pool), tempfile.TemporaryDirectory(prefix="endopilot-") as folder:
-        if not runs:
-            remark = f"this machine does not run {kernel}: nothing was driven again"
-            return judged(verdict="not judged", difference=None, scores=(), remarks=(remark,))
-        return judged(**_driven_again(submission, Path(folder), pool, at_hand))
 
 
 @contextmanager
@@ -314,7 +314,10 @@ def _driven_again(submission: Submission, folder: Path, pool: Workers | None, at
     Returns:
         Verdict, first difference, scores and remarks of `SubmissionCheck`.
     """
-    terms, policy, remarks = submission.terms, submission.policy, _remarks(submission)
+    terms, policy = submission.terms, submission.policy
+    here = {**manifest(config=None)["versions"], "core": _core.LEVEL, "blas": blas_kernel()}
+    made = {**submission.versions, "core": submission.core, "blas": submission.blas}
+    remarks = [f"made with {of} {made.get(of)}, checked with {now}" for of, now in here.items() if made.get(of) != now]
     tasks = sorted(map(terms.task, submission.navigations), key=lambda task: task.level)
     entries = {
         folder / task.name / f"{place:02d}.json": entry
@@ -328,7 +331,7 @@ def _driven_again(submission: Submission, folder: Path, pool: Workers | None, at
     again = {path: {} if path in bad else read_json(path) for path in entries}
     otherwise = [path for path, figures in again.items() if not figures.pop("decided", False)]
     if at_hand and otherwise:
-        remarks += (f"{policy} decides otherwise here in {len(otherwise)} of {len(entries)} navigations",)
+        remarks.append(f"{policy} decides otherwise here in {len(otherwise)} of {len(entries)} navigations")
     forged = otherwise if at_hand and submission.origin == POLICIES.origin(policy) else []
     found = {
         path: str(bad[path]) if path in bad else _difference(entry.figures(), again[path])
@@ -347,18 +350,14 @@ def _driven_again(submission: Submission, folder: Path, pool: Workers | None, at
         differing = [f"scores, {task}: {remark}" for task, remark in said if remark]
     decided = at_hand and not otherwise
     if not decided:
-        rows = [{_claimed(name): value for name, value in row.items()} for row in rows]
+        claimed = {name: f"{name}_as_recorded" for name in ("exposures", "missed_events")}
+        rows = [{claimed.get(name, name): value for name, value in row.items()} for row in rows]
     return {
         "verdict": "failed" if differing else "decided again" if decided else "replayed",
         "difference": differing[0] if differing else None,
         "scores": () if differing else rows,
-        "remarks": remarks,
+        "remarks": tuple(remarks),
     }
-
-
-def _claimed(name: str) -> str:
-    """Return the name of a figure where nobody decided again."""
-    return f"{name}_as_recorded" if name in ("exposures", "missed_events") else name
 
 
 def recorded_navigation(path: Path, name: str | None, place: int) -> tuple[Task, int, Recording]:
@@ -409,14 +408,3 @@ def _difference(given: Mapping[str, Any], again: Mapping[str, Any]) -> str | Non
         if before != now:
             return f"{name} is {before} in the file and {now} when driven again"
     return None
-
-
-def _remarks(submission: Submission) -> tuple[str, ...]:
-    """Return in what this installation differs from the one that made the file."""
-    here = {**manifest(config=None)["versions"], "core": _core.LEVEL, "blas": blas_kernel()}
-    made = {**submission.versions, "core": submission.core, "blas": submission.blas}
-    return tuple(
-        f"made with {name} {made.get(name)}, checked with {value}"
-        for name, value in here.items()
-        if made.get(name) != value
-    )
