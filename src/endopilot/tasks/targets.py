@@ -6,11 +6,11 @@ import re
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import Target
-from endopilot.types import Centerline, VesselTree
+from endopilot.types import VesselTree
 
 OUTSIDE_MM = 2.0
 """A point this far outside the lumen is no target, mm."""
@@ -84,15 +84,9 @@ def _section(tree: VesselTree, name: str) -> int:
 
 def _middle(tree: VesselTree, label: int) -> Target:
     """Return the middle of a section, on the branch that holds most of it."""
-    length = [_length(branch.centerline, branch.section == label) for branch in tree.branches]
-    branch = int(np.argmax(length))
-    own = tree.branches[branch].centerline.abscissa[tree.branches[branch].section == label]
-    return Target(branch=branch, abscissa=float((own[0] + own[-1]) / 2))
-
-
-def _length(line: Centerline, own: Bool[np.ndarray, "n"]) -> float:
-    at = line.abscissa[own]
-    return float(at[-1] - at[0]) if len(at) else -1.0
+    own = [branch.centerline.abscissa[branch.section == label] for branch in tree.branches]
+    branch = int(np.argmax([at[-1] - at[0] if len(at) else -1.0 for at in own]))
+    return Target(branch=branch, abscissa=float((own[branch][0] + own[branch][-1]) / 2))
 
 
 def _beyond(tree: VesselTree, label: int, depth_mm: float) -> Target:

@@ -121,10 +121,8 @@ class Task:
 
     @model_validator(mode="after")
     def _consistent(self) -> Task:
-        known: dict[str, tuple[str | None, ...]] = {}
-        if self.anatomies is None:
-            known = {"vessel": VESSELS, "device": list_wires(), "catheter": (*list_catheters(), None)}
-        for name, choices in known.items():
+        known = {"vessel": VESSELS, "device": list_wires(), "catheter": (*list_catheters(), None)}
+        for name, choices in known.items() if self.anatomies is None else ():
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name}: {getattr(self, name)!r}; choose from {', '.join(filter(None, choices))}")
         count = len(self.ladder.numbers)
@@ -165,12 +163,6 @@ class Task:
         turn = np.random.default_rng([self.ladder.seed, self.ladder.numbers[place]]).uniform(0.0, 2 * np.pi)
         point = None if self.targets_mm is None else self.targets_mm[place]
         return self.navigation(self.patient(self.ladder, place), start_rotation_rad=turn, target_mm=point)
-
-    def learning_navigation(self, place: int) -> Navigation:
-        """Return the task in one of the patients to learn on, or where it has none, in one of the ladder's."""
-        if self.training is None:
-            return self.ladder_navigation(place)
-        return self.navigation(self.patient(self.training, place))
 
     def target(self, tree: VesselTree) -> Target:
         """Return the target in its section of a tree.
@@ -289,7 +281,11 @@ def training_navigations(name: str | None, first: int, count: int, version: Ladd
         InputError: the ladder has no such task, or the task fewer patients.
     """
     tasks = list_tasks(version) if name is None else (find_task(name, version=version),)
-    return [task.learning_navigation(first + place) for task in tasks for place in range(count)]
+    return [
+        task.navigation(task.patient(task.training, place)) if task.training else task.ladder_navigation(place)
+        for task in tasks
+        for place in range(first, first + count)
+    ]
 
 
 def in_catheter(navigations: Sequence[Navigation], name: str) -> list[Navigation]:
@@ -314,7 +310,7 @@ def without_catheter(navigation: Navigation) -> Navigation:
 @lru_cache(maxsize=1)
 def reference_navigation() -> Navigation:
     """Return `endopilot/Navigate-v0`'s navigation: into the posterior descending artery of the reference anatomy."""
-    anatomy = with_world_zero(make_patient(AtlasConfig(population="textbook"), 0))
+    anatomy = _patient(AtlasConfig(population="textbook"), 0)
     return Navigation(
         anatomy=anatomy,
         device=read_wire("workhorse-014"),
