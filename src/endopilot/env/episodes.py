@@ -21,7 +21,6 @@ PROGRESS_REWARD, STEP_REWARD, FORCE_REWARD, SUCCESS_REWARD = 0.1, -0.01, -0.1, 5
 """A mm nearer to the target, every step, every step with too large a force, and the target."""
 EXPOSURE_REWARD = -0.05
 """Every exposure, where X-ray shows the tip."""
-_CHANGING = ("steps", "distance", "safe", "ended")
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,12 +126,3 @@ class Episodes:
                 f"{prefix}tip_branch": tip.branch,
             }
         return infos
-
-    @property
-    def changing(self) -> dict[str, np.ndarray]:
-        """All that changes as episodes go on."""
-        return {name: getattr(self, name) for name in _CHANGING}
-
-    @changing.setter
-    def changing(self, kept: dict[str, np.ndarray]) -> None:
-        vars(self).update(kept)

@@ -75,7 +75,8 @@ class CArms:
             pixels: columns and rows of an image; 0 for exposures that say where the tip is.
         """
         count, own = len(navigations), list(dict.fromkeys(navigations))
-        self._navigations, self._pixels = navigations, pixels
+        self._pixels, motions = pixels, [(each.known_motion, each.anatomy.insertion.position) for each in navigations]
+        self._known = [motion and motion.core(np.asarray(ostium)) for motion, ostium in motions]
         self._of: list[Views] = []
         if pixels:
             made: dict[tuple[int, str], Views] = {}
@@ -129,7 +130,9 @@ class CArms:
         exposed.time_s[chosen], exposed.encoders[chosen] = time_s[chosen], encoders[chosen, 0]
         maps = None
         if simulator.set_up.motion is not None:
-            maps = self._maps(simulator.vessel_to_laboratory[chosen], chosen, time_s)
+            placed = simulator.vessel_to_laboratory
+            one = ((slice(world, world + 1), self._known[world]) for world in chosen.tolist())
+            maps = np.concatenate([seen(placed[of], known, time_s[of]) for of, known in one])
         if self._pixels:
             nodes = simulator.position[chosen] + registration_mm[chosen, None]
             nodes = nodes if maps is None else place(maps[:, None], nodes)
@@ -148,18 +151,6 @@ class CArms:
             found = project(exposed.position[worlds])
             for name in TipProjection.__dataclass_fields__:
                 getattr(exposed.tip, name)[worlds, 0] = getattr(found, name)
-
-    def _maps(
-        self, placed: Float[np.ndarray, "chosen 3 4"], chosen: Int[np.ndarray, "chosen"], time_s: np.ndarray
-    ) -> Float[np.ndarray, "chosen 3 4"]:
-        """Return how the C-arms see points of the moving vessels displaced."""
-        maps = []
-        for world, one in zip(chosen.tolist(), placed, strict=True):
-            navigation = self._navigations[world]
-            motion, ostium = navigation.known_motion, np.asarray(navigation.anatomy.insertion.position)
-            known = None if motion is None else motion.core(ostium)
-            maps.append(seen(one[None], known, time_s[world : world + 1])[0])
-        return np.stack(maps)
 
 
 @cache

@@ -43,6 +43,8 @@ Observations = Any
 
 _MEASURED = ("encoder_inserted_length", "encoder_rotation", "load_n", "load_nmm")
 """What the info holds of what a robot measures of the wire."""
+_CHANGING = ("steps", "distance", "safe", "ended")
+"""What of `Episodes` changes as they go on."""
 _PIXELS = (64, 128)
 """Least and most rows of an image."""
 
@@ -350,7 +352,7 @@ class NavigateVectorEnv(VectorEnv):
     @property
     def state(self) -> NavigationState:
         """All that the future depends on, to be kept and given to `set_state`."""
-        kept = {"episodes": self._episodes.changing, "drawn": self._reality.drawn}
+        kept = {"episodes": {name: getattr(self._episodes, name) for name in _CHANGING}, "drawn": self._reality.drawn}
         kept["generators"] = [generator.bit_generator.state for generator in self._generators]
         kept["exposed"] = self._c_arms and self._c_arms.exposed
         return NavigationState(self._simulator.state, copy.deepcopy(kept))
@@ -363,7 +365,8 @@ class NavigateVectorEnv(VectorEnv):
         """
         self._simulator.set_state(state.simulator)
         kept = copy.deepcopy(state.kept)
-        self._episodes.changing, self._reality.drawn = kept["episodes"], kept["drawn"]
+        self._reality.drawn = kept["drawn"]
+        vars(self._episodes).update(kept["episodes"])
         if self._c_arms is not None:
             self._c_arms.exposed = kept["exposed"]
         for generator, before in zip(self._generators, kept["generators"], strict=True):
