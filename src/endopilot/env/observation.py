@@ -51,8 +51,8 @@ class RouteTables:
         made = [_tables(Route.to(navigation.anatomy, navigation.target)) for navigation in own]
         places, branches = max(len(row[0]) for row in made), max(len(row[1]) for row in made)
         return cls(
-            places=np.stack([_padded(row[0], places) for row in made]),
-            leave=np.stack([_padded(row[1], branches, np.inf) for row in made]),
+            places=np.stack([np.pad(row[0], [(0, places - len(row[0])), (0, 0)], mode="edge") for row in made]),
+            leave=np.stack([np.pad(row[1], (0, branches - len(row[1])), constant_values=np.inf) for row in made]),
             route=np.array([own.index(navigation) for navigation in navigations]),
             target=np.array([navigation.target.abscissa for navigation in navigations]),
         )
@@ -97,12 +97,6 @@ def _tables(route: Route) -> tuple[np.ndarray, np.ndarray]:
     away = np.einsum("pij,pkj->pki", frame, (point[index] - point[:, None]) / AHEAD_MM[:, None])
     table = [point, frame.reshape(-1, 9), radius, away.reshape(len(along), -1), radius[index] / 2.0]
     return np.column_stack(table), route.leaves_at
-
-
-def _padded(rows: np.ndarray, count: int, value: float | None = None) -> np.ndarray:
-    """Return `rows` with more of them, of `value` or like the last one."""
-    more = np.repeat(rows[-1:], count - len(rows), axis=0)
-    return np.concatenate([rows, more if value is None else np.full_like(more, value)])
 
 
 _BOUND = 10.0

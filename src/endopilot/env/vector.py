@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 import numpy as np
 from gymnasium.error import ResetNeeded
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -170,24 +170,19 @@ class NavigateVectorEnv(VectorEnv):
             )
         if robot is None and observation != "state":
             robot = RobotConfig()
-        self._given = {
-            "navigations": [given[number % len(given)] for number in range(num_envs)],
-            "observation": observation,
-            "pixels": pixels if observation == "image" else 0,
-            "c_arm": c_arm or FluoroscopeConfig(),
-            "autoreset_mode": autoreset_mode,
-            "reality": {"world": world, "robot": robot, "motion": motion, "config": config},
-        }
-        self._prepare(**self._given)
+        every = [given[number % len(given)] for number in range(num_envs)]
+        arms = {"config": c_arm or FluoroscopeConfig(), "pixels": pixels if observation == "image" else 0}
+        reality = {"world": world, "robot": robot, "motion": motion, "config": config}
+        self._given = (every, observation, autoreset_mode, arms, reality)
+        self._prepare(*self._given)
         self.render_mode = render_mode
 
     def _prepare(
         self,
         navigations: list[Navigation],
         observation: Observed,
-        pixels: int,
-        c_arm: FluoroscopeConfig,
         autoreset_mode: AutoresetMode,
+        arms: dict[str, Any],
         reality: dict[str, Any],
     ) -> None:
         first = navigations[0]
@@ -208,15 +203,14 @@ class NavigateVectorEnv(VectorEnv):
         self._drives = len(first.devices)
         self._fastest = np.tile([TRANSLATION_MM_S, ROTATION_RAD_S], self._drives)
         self.single_action_space = Box(-1.0, 1.0, (2 * self._drives + (observation != "state"),), np.float32)
-        self.single_observation_space = space(observation, len(first.catheters), (1 + c_arm.biplane, pixels, pixels))
+        images = (1 + arms["config"].biplane, arms["pixels"], arms["pixels"])
+        self.single_observation_space = space(observation, len(first.catheters), images)
         self.action_space = batch_space(self.single_action_space, count)
         self.observation_space = batch_space(self.single_observation_space, count)
         self._reality = Reality(navigations, **reality)
         self._simulator = self._reality.simulator
         self._episodes = Episodes(navigations)
-        self._c_arms: CArms | None = None
-        if observation != "state":
-            self._c_arms = CArms(navigations, self._simulator, config=c_arm, pixels=pixels)
+        self._c_arms = None if observation == "state" else CArms(navigations, self._simulator, **arms)
         self._everyone = np.ones(count, dtype=bool)
         self._generators = [seeding.np_random()[0] for _ in range(count)]
 
@@ -323,7 +317,7 @@ class NavigateVectorEnv(VectorEnv):
     def _observe(self, now: Measured, distances: Float[np.ndarray, "worlds devices"]) -> Observations:
         episodes = self._episodes
         if self._c_arms is not None:
-            exposed, images = self._c_arms.exposed, self._given["observation"] == "image"
+            exposed, images = self._c_arms.exposed, isinstance(self.single_observation_space, Dict)
             routes = None if images else episodes.routes
             measured = observe_exposed(self._reality.proximal, exposed, routes, episodes.time_s, episodes.time_share)
             return {"image": exposed.image.copy(), "measured": measured} if images else measured
@@ -393,6 +387,6 @@ class NavigateVectorEnv(VectorEnv):
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
         self._given = kept["given"]
-        self._prepare(**self._given)
+        self._prepare(*self._given)
         self.set_state(kept["state"])
         self.spec, self.render_mode = kept["spec"], kept["render_mode"]

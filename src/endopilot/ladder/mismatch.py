@@ -55,7 +55,12 @@ def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[d
     every = [path for of_case in paths.values() for path in of_case]
     navigate = partial(_navigate, policy=config.policy, terms=terms, share=share)
     make_missing(f"Model mismatch, {config.policy}", every, navigate)
-    rows = [{"case": case} | _scores([read_json(path) for path in paths[case]]) for case in CASES]
+    rows = []
+    for case, of_case in paths.items():
+        results = [read_json(path) for path in of_case]
+        exposures, seconds = (sum(result[name] for result in results) for name in ("exposures", "seconds"))
+        row = {"case": case, "navigations": len(results)} | score_navigations(results)
+        rows.append(row | {"exposures_per_minute": round(exposures / (seconds / 60), 1)})
     with writing(output / PICTURE_FILE) as partly:
         partly.write_bytes(_picture(rows, config.policy, share))
     content = {
@@ -72,10 +77,9 @@ def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[d
 
 def world_of(case: str, share: float, navigation: Navigation, task: Task, place: int) -> World:
     """Return what reality is in one case and one patient."""
-    change: dict[str, float] = {}
+    change = {}
     if case == "all":
-        random = np.random.default_rng([task.ladder.seed, task.ladder.numbers[place], 1])
-        change = drawn_sides(share, random)
+        change = drawn_sides(share, np.random.default_rng([task.ladder.seed, task.ladder.numbers[place], 1]))
     elif case != "matched":
         name, side = case.split("-")
         change = {name: share if side == "more" else -share}
@@ -88,16 +92,6 @@ def _navigate(path: Path, *, policy: str, terms: Terms, share: float) -> None:
     world = world_of(case, share, navigation, task, place)
     result = attempt(policy, navigation, seed=navigation_seed(task, place), terms=replace(terms, world=world))
     write_json(path, {"task": task.name, "patient": navigation.anatomy.name} | result)
-
-
-def _scores(results: list[dict[str, Any]]) -> dict[str, Any]:
-    minutes = sum(result["seconds"] for result in results) / 60
-    exposures = sum(result["exposures"] for result in results)
-    return (
-        {"navigations": len(results)}
-        | score_navigations(results)
-        | {"exposures_per_minute": round(exposures / minutes, 1)}
-    )
 
 
 def _picture(rows: list[dict[str, Any]], policy: str, share: float) -> bytes:
@@ -126,7 +120,6 @@ def _picture(rows: list[dict[str, Any]], policy: str, share: float) -> bytes:
 
 def title_of(case: str, share: float) -> str:
     """Return a case in words."""
-    if case in ("matched", "all"):
-        return {"matched": "matched", "all": f"all, ±{100 * share:g} %"}[case]
-    name, side = case.split("-")
-    return f"{name} {'+' if side == 'more' else '−'}{100 * share:g} %"
+    name, _, side = case.partition("-")
+    sign = {"more": " +", "less": " −"}.get(side, ", ±")
+    return case if case == "matched" else f"{name}{sign}{100 * share:g} %"

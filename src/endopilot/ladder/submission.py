@@ -11,7 +11,7 @@ import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from itertools import zip_longest
@@ -214,72 +214,6 @@ def read_submission(path: str | Path) -> Submission:
     """
     path = Path(path)
     submission = read_settings(path, Submission, remedy="give a submission.json of `endopilot ladder`")
-    _refuse_another_ladder(path, submission)
-    return submission
-
-
-def check_submission(path: str | Path, *, policy: str = "") -> SubmissionCheck:
-    """Drive all recordings of a submission file again, and compare every figure to the bit; nothing else is believed.
-
-    They are driven with the file's kernel of linear algebra, one of `KERNELS`. A policy that is at hand also decides
-    again: its exposures are counted then. Where it decides otherwise, the file fails, unless it is of another version.
-
-    Args:
-        path: the file.
-        policy: MODULE:OBJECT of the file's policy, where you have it and trust it; shipped ones are at hand.
-
-    Raises:
-        InputError: the file is no submission, its tasks or seeds are not those of this ladder, or it was made with a
-            kernel that nobody can drive it again with.
-    """
-    submission = read_submission(path)
-    kernel, at_hand = submission.blas or "none", submission.policy in (*POLICIES.shipped, policy)
-    if kernel not in KERNELS:
-        raise InputError(
-            f"{path}: blas: {kernel}; submissions are driven again with {' or '.join(KERNELS)}: run the ladder again "
-            "with OPENBLAS_CORETYPE=Haswell"
-        )
-    remark = f"this machine does not run {kernel}: nothing was driven again"
-    found = {"verdict": "not judged", "difference": None, "scores": (), "remarks": (remark,)}
-    with _running(kernel) as (runs, pool), tempfile.TemporaryDirectory(prefix="endopilot-") as folder:
-        if runs:
-            found = _driven_again(submission, Path(folder), pool, at_hand)
-    return SubmissionCheck(
-        policy=submission.policy,
-        origin=submission.origin,
-        key=submission.terms.key(),
-        kernel=kernel,
-        navigations=sum(map(len, submission.navigations.values())),
-        **found,
-    )
-
-
-@contextmanager
-def _running(kernel: str) -> Iterator[tuple[bool, Workers | None]]:
-    """Yield whether this machine runs a kernel of linear algebra, and processes that do, unless this one does."""
-    if kernel == blas_kernel():
-        yield True, None
-        return
-    before = os.environ.get("OPENBLAS_CORETYPE")
-    os.environ["OPENBLAS_CORETYPE"] = kernel.partition(" ")[2]  # which OpenBLAS reads as it is loaded
-    try:
-        with Workers() as pool:
-            yield KERNELS[kernel] in _core.supported_levels() and _runs(pool, kernel), pool
-    finally:
-        del os.environ["OPENBLAS_CORETYPE"]
-        os.environ |= {} if before is None else {"OPENBLAS_CORETYPE": before}
-
-
-def _runs(pool: Workers, kernel: str) -> bool:
-    """Return whether processes run a kernel; some libraries do not let theirs be chosen."""
-    try:
-        return pool.submit(blas_kernel).result() == kernel
-    except BrokenProcessPool:
-        return False
-
-
-def _refuse_another_ladder(path: Path, submission: Submission) -> None:
-    """Refuse tasks, patients or seeds that are not those of this ladder: the replay alone would not show a seed."""
     if set(submission.tasks) != set(submission.navigations):
         raise InputError(f"{path}: tasks and navigations name different tasks; give the file as it was written")
     counts = {name: len(entries) for name, entries in submission.navigations.items()}
@@ -306,14 +240,67 @@ def _refuse_another_ladder(path: Path, submission: Submission) -> None:
         for place, entry in enumerate(entries):
             if entry.seed != (seed := navigation_seed(tasks[name], place)):
                 raise InputError(f"{path}: task {name}, patient {place}: seed {entry.seed}; the ladder's is {seed}")
+    return submission
+
+
+def check_submission(path: str | Path, *, policy: str = "") -> SubmissionCheck:
+    """Drive all recordings of a submission file again, and compare every figure to the bit; nothing else is believed.
+
+    They are driven with the file's kernel of linear algebra, one of `KERNELS`. A policy that is at hand also decides
+    again: its exposures are counted then. Where it decides otherwise, the file fails, unless it is of another version.
+
+    Args:
+        path: the file.
+        policy: MODULE:OBJECT of the file's policy, where you have it and trust it; shipped ones are at hand.
+
+    Raises:
+        InputError: the file is no submission, its tasks or seeds are not those of this ladder, or it was made with a
+            kernel that nobody can drive it again with.
+    """
+    submission = read_submission(path)
+    kernel, at_hand = submission.blas or "none", submission.policy in (*POLICIES.shipped, policy)
+    if kernel not in KERNELS:
+        raise InputError(
+            f"{path}: blas: {kernel}; submissions are driven again with {' or '.join(KERNELS)}: run the ladder again "
+            "with OPENBLAS_CORETYPE=Haswell"
+        )
+    remark = f"this machine does not run {kernel}: nothing was driven again"
+    found: dict[str, Any] = {"verdict": "not judged", "difference": None, "scores": (), "remarks": (remark,)}
+    with _running(kernel) as (runs, pool), tempfile.TemporaryDirectory(prefix="endopilot-") as folder:
+        if runs:
+            found = _driven_again(submission, Path(folder), pool, at_hand)
+    return SubmissionCheck(
+        policy=submission.policy,
+        origin=submission.origin,
+        key=submission.terms.key(),
+        kernel=kernel,
+        navigations=sum(map(len, submission.navigations.values())),
+        **found,
+    )
+
+
+@contextmanager
+def _running(kernel: str) -> Iterator[tuple[bool, Workers | None]]:
+    """Yield whether this machine runs a kernel of linear algebra, and processes that do, unless this one does."""
+    if kernel == blas_kernel():
+        yield True, None
+        return
+    before = os.environ.get("OPENBLAS_CORETYPE")
+    os.environ["OPENBLAS_CORETYPE"] = kernel.partition(" ")[2]  # which OpenBLAS reads as it is loaded
+    try:
+        with Workers() as pool:
+            runs = False
+            if KERNELS[kernel] in _core.supported_levels():
+                with suppress(BrokenProcessPool):  # some libraries do not let their kernel be chosen
+                    runs = pool.submit(blas_kernel).result() == kernel
+            yield runs, pool
+    finally:
+        del os.environ["OPENBLAS_CORETYPE"]
+        os.environ |= {} if before is None else {"OPENBLAS_CORETYPE": before}
 
 
 def _driven_again(submission: Submission, folder: Path, pool: Workers | None, at_hand: bool) -> dict[str, Any]:
-    """Drive all recordings again, and let a policy that is at hand decide again.
-
-    Returns:
-        Verdict, first difference, scores and remarks of `SubmissionCheck`.
-    """
+    """Return verdict, first difference, scores and remarks of `SubmissionCheck`."""
     terms, policy = submission.terms, submission.policy
     here = {**manifest(config=None)["versions"], "core": _core.LEVEL, "blas": blas_kernel()}
     made = {**submission.versions, "core": submission.core, "blas": submission.blas}
