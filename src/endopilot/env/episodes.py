@@ -55,7 +55,7 @@ class Episodes:
         self._target_abscissa = np.array([target.abscissa for target in targets])
         self._near_mm = np.array([target.near_mm or np.inf for target in targets])
         self._most_steps = np.array([navigation.periods(CONTROL_PERIOD_S) for navigation in navigations])
-        self._seconds = np.array([navigation.seconds for navigation in navigations])
+        self.seconds = np.array([navigation.seconds for navigation in navigations])
         self.force_limit_n = np.array([navigation.force_limit_n for navigation in navigations])
         self.steps, self.distance = np.full(count, -1), np.zeros((count, self._counted))
         self.safe, self.ended = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
@@ -65,11 +65,6 @@ class Episodes:
         """Time since each world's reset, s."""
         return self.steps * CONTROL_PERIOD_S
 
-    @property
-    def time_share(self) -> Float[np.ndarray, "worlds"]:
-        """Share of each navigation's time that is used up."""
-        return self.time_s / self._seconds
-
     def begin(self, mask: Bool[np.ndarray, "worlds"], tip: TipProjection) -> None:
         """Start an episode in the worlds of a mask."""
         self.steps[mask], self.safe[mask], self.ended[mask] = 0, True, False
@@ -78,20 +73,12 @@ class Episodes:
     def judge(
         self,
         now: Measured,
-        distances: Float[np.ndarray, "worlds devices"],
         fresh: Bool[np.ndarray, "worlds"],
         exposed: Bool[np.ndarray, "worlds"],
     ) -> tuple[Float[np.ndarray, "worlds"], Bool[np.ndarray, "worlds"], Bool[np.ndarray, "worlds"]]:
-        """Score what the worlds did in a step, of which those of `fresh` have only begun.
-
-        Args:
-            distances: path length from every tip to its target, mm.
-
-        Returns:
-            Rewards, terminations and truncations.
-        """
+        """Return rewards, terminations and truncations of a step, in which the worlds of `fresh` have only begun."""
         going, before = ~fresh, self.distance
-        self.distance = distances[:, : self._counted]
+        self.distance = now.distance_mm[:, : self._counted]
         unsafe = ~is_safe(now.contact_force, self.force_limit_n) & going
         self.safe &= ~unsafe
         success = self._success(now) & going

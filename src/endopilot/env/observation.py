@@ -130,6 +130,7 @@ class Measured:
         rotation: φ, rad.
         encoders: both as they are measured: by a robot's encoders where there is a robot.
         valid: false for a world that has failed.
+        distance_mm: path length from every tip to its target, mm.
     """
 
     tip: TipProjection
@@ -140,15 +141,20 @@ class Measured:
     rotation: Float[np.ndarray, "worlds devices"]
     encoders: Float[np.ndarray, "worlds devices 2"]
     valid: Bool[np.ndarray, "worlds"]
+    distance_mm: Float[np.ndarray, "worlds devices"]
 
     @classmethod
     def of(
-        cls, simulator: Simulator, encoders: Float[np.ndarray, "worlds devices 2"], step: Step | None = None
+        cls,
+        simulator: Simulator,
+        encoders: Float[np.ndarray, "worlds devices 2"],
+        routes: RouteTables,
+        step: Step | None = None,
     ) -> Measured:
         """Return the worlds as they are now, with what encoders say, and the force over the step that led there."""
-        now = simulator if step is None else step
+        now, tip = simulator if step is None else step, simulator.project()
         return cls(
-            tip=simulator.project(),
+            tip=tip,
             position=now.tip_position,
             direction=now.tip_direction,
             contact_force=simulator.contacts.max(axis=1) if step is None else step.contact_force_max,
@@ -156,13 +162,13 @@ class Measured:
             rotation=now.rotation,
             encoders=encoders,
             valid=now.valid,
+            distance_mm=routes.distance(tip),
         )
 
 
 def observe(
     now: Measured,
     routes: RouteTables,
-    distances_mm: Float[np.ndarray, "worlds devices"],
     force_limit_n: Float[np.ndarray, "worlds"],
     time_share: Float[np.ndarray, "worlds"],
 ) -> Float[np.ndarray, "worlds features"]:
@@ -171,7 +177,7 @@ def observe(
     for device in range(now.rotation.shape[1]):
         tip, (inserted, turned) = now.tip[:, device], now.encoders[:, device].T
         out += [inserted / 100.0, np.cos(turned), np.sin(turned), tip.abscissa / 100.0, tip.offset / tip.radius]
-        out += [distances_mm[:, device] / 100.0, on_route[:, device]]
+        out += [now.distance_mm[:, device] / 100.0, on_route[:, device]]
         if device == 0:
             out += [now.contact_force / force_limit_n, time_share]
             out += [routes.place(tip, now.position[:, 0], now.direction[:, 0])]

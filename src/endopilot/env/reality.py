@@ -236,7 +236,6 @@ def _spread(given: Any, count: int, read: Any) -> list[Any]:
 
 
 def _common(worlds: Sequence[World], names: str, values: Sequence[Any]) -> Any:
-    """Return what all worlds have in common."""
     if any(value != values[0] for value in values):
         raise InputError(
             f"world: worlds differ in {names}, which all in an environment have in common; give worlds that agree"

@@ -29,6 +29,7 @@ from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.state import Step
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.targets import Place, find_target
@@ -238,9 +239,8 @@ class NavigateVectorEnv(VectorEnv):
             for world in np.flatnonzero(mask).tolist():
                 self._generators[world] = seeding.np_random(seeds[world])[0]
         self._begin(mask)
-        now = Measured.of(self._simulator, self._reality.encoders)
-        distances = self._episodes.routes.distance(now.tip)
-        return self._observe(now, distances), self._infos(now, mask)
+        now = self._now()
+        return self._observe(now), self._infos(now, mask)
 
     def step(
         self, actions: ArrayLike
@@ -277,58 +277,47 @@ class NavigateVectorEnv(VectorEnv):
         control[fresh] = 0.0
         control = control.reshape(self.num_envs, self._drives, 2)
         step = self._reality.drive(control, CONTROL_PERIOD_S, episodes.time_s)
-        now = Measured.of(self._simulator, self._reality.encoders, step)
+        now = self._now(step)
         episodes.steps += ~fresh
         self._expose(expose, self._reality.encoders)
         if fresh.any():
             self._begin(fresh)
-            now = Measured.of(self._simulator, self._reality.encoders)
-        distances = episodes.routes.distance(now.tip)
-        judged = episodes.judge(now, distances, fresh, expose)
-        observations, infos = self._observe(now, distances), self._infos(now, expose | fresh)
+            now = self._now()
+        judged = episodes.judge(now, fresh, expose)
+        observations, infos = self._observe(now), self._infos(now, expose | fresh)
         if mode is AutoresetMode.SAME_STEP and episodes.ended.any():
-            return self._begun_again(observations, infos, expose, *judged)
+            ended, last = episodes.ended.copy(), np.full(self.num_envs, None, dtype=object)
+            for world in np.flatnonzero(ended).tolist():
+                last[world] = of_world(observations, world)
+            final = {name: ended if name.startswith("_") else values for name, values in infos.items()}
+            self._begin(ended)
+            now = self._now()
+            observations, infos = self._observe(now), self._infos(now, expose | ended)
+            infos |= {"final_obs": last, "_final_obs": ended, "final_info": final, "_final_info": ended}
         return observations, *judged, infos
 
-    def _begun_again(
-        self,
-        observations: Observations,
-        infos: dict[str, Any],
-        exposed: Bool[np.ndarray, "worlds"],
-        *judged: np.ndarray,
-    ) -> tuple[Any, ...]:
-        """Return what a step returns once the worlds that have ended are reset: their last ones are in the info."""
-        ended, last = self._episodes.ended.copy(), np.full(self.num_envs, None, dtype=object)
-        for world in np.flatnonzero(ended).tolist():
-            last[world] = of_world(observations, world)
-        final = {name: ended if name.startswith("_") else values for name, values in infos.items()}
-        self._begin(ended)
-        now = Measured.of(self._simulator, self._reality.encoders)
-        infos = self._infos(now, exposed | ended)
-        infos |= {"final_obs": last, "_final_obs": ended, "final_info": final, "_final_info": ended}
-        return self._observe(now, self._episodes.routes.distance(now.tip)), *judged, infos
+    def _now(self, step: Step | None = None) -> Measured:
+        return Measured.of(self._simulator, self._reality.encoders, self._episodes.routes, step)
 
     def _expose(self, mask: Bool[np.ndarray, "worlds"], encoders: Float[np.ndarray, "worlds devices 2"]) -> None:
-        """Take exposures in the worlds of a mask."""
         if self._c_arms is not None:
             registration_mm = self._reality.drawn.registration_mm
             self._c_arms.expose(mask, self._simulator, encoders, registration_mm, self._episodes.time_s)
 
-    def _observe(self, now: Measured, distances: Float[np.ndarray, "worlds devices"]) -> Observations:
-        episodes = self._episodes
+    def _observe(self, now: Measured) -> Observations:
+        episodes, share = self._episodes, self._episodes.time_s / self._episodes.seconds
         if self._c_arms is not None:
             exposed, images = self._c_arms.exposed, isinstance(self.single_observation_space, Dict)
             routes = None if images else episodes.routes
-            measured = observe_exposed(self._reality.proximal, exposed, routes, episodes.time_s, episodes.time_share)
+            measured = observe_exposed(self._reality.proximal, exposed, routes, episodes.time_s, share)
             return {"image": exposed.image.copy(), "measured": measured} if images else measured
-        return observe(now, episodes.routes, distances, episodes.force_limit_n, episodes.time_share)
+        return observe(now, episodes.routes, episodes.force_limit_n, share)
 
     def draw_from(self, *generators: np.random.Generator) -> None:
         """Let each world draw its starts from a generator that the caller holds."""
         self._generators = list(generators)
 
     def _begin(self, mask: Bool[np.ndarray, "worlds"]) -> None:
-        """Start an episode in the worlds of a mask."""
         self._reality.begin(mask, self._generators)
         self._episodes.begin(mask, self._simulator.project())
         if self._c_arms is not None:

@@ -112,7 +112,17 @@ def scored(navigation: Navigation, record: NavigationRecord, *, tells: bool = Fa
     """
     believed = record.believed[:-1, 0] if tells and record.believed is not None else None
     recording = Recording(record.control[:-1], record.exposed[:-1], believed, record.reason == "gave up")
-    return _figures(navigation, record, recording) | {"course": _course(record), "recording": recording.packed()}
+    course = {
+        "time_s": record.time_s.tolist(),
+        "inserted_length": record.inserted_length[:, 0].round(4).tolist(),
+        "rotation": record.rotation[:, 0].round(4).tolist(),
+        "catheter_inserted_length": record.inserted_length[:, 1:].round(4).tolist(),
+        "catheter_rotation": record.rotation[:, 1:].round(4).tolist(),
+        "tip_position": record.tip_position[:, 0].round(3).tolist(),
+        "contact_force_max": record.contact_force_max.round(5).tolist(),
+        "exposed": record.exposed.tolist(),
+    }
+    return _figures(navigation, record, recording) | {"course": course, "recording": recording.packed()}
 
 
 def repeat(recording: Recording, navigation: Navigation, *, seed: int) -> dict[str, Any]:
@@ -184,7 +194,14 @@ def _figures(navigation: Navigation, record: NavigationRecord, recording: Record
     if recording.believed_mm is not None:
         radius = navigation.device.tip_radius_mm
         scored["events"] = list(navigation_events(record.tip[:, 0], record.exposed, recording.believed_mm, radius))
-    return scored | {"sha256": _digest(record, recording)}
+    digest = hashlib.sha256(f"{len(record.time_s)}".encode())
+    inserted, turned = record.inserted_length, record.rotation
+    course = (inserted[:, 0], turned[:, 0], record.tip_position[:, 0], record.contact_force_max)
+    course += (inserted[:, 1:], turned[:, 1:])
+    for array in (recording.control, recording.exposed, recording.believed_mm, record.exposed, *course):
+        if array is not None:
+            digest.update(array.astype(array.dtype.newbyteorder("<")).tobytes())
+    return scored | {"sha256": digest.hexdigest()}
 
 
 def navigation_events(
@@ -205,32 +222,6 @@ def navigation_events(
     errs = np.abs(believed_mm - tip.abscissa[:count]) >= advice.abscissa_mm
     found = np.array([count_events(state, near_exposures(exposed[:count])) for state in (at_wall, errs)])
     return int(found[:, 0].sum()), int(found[:, 1].sum())
-
-
-def _digest(record: NavigationRecord, recording: Recording) -> str:
-    """Return the SHA-256 of the decisions and of the wire's course under them, to the bit."""
-    digest = hashlib.sha256(f"{len(record.time_s)}".encode())
-    inserted, turned = record.inserted_length, record.rotation
-    course = (inserted[:, 0], turned[:, 0], record.tip_position[:, 0], record.contact_force_max)
-    course += (inserted[:, 1:], turned[:, 1:])
-    for array in (recording.control, recording.exposed, recording.believed_mm, record.exposed, *course):
-        if array is not None:
-            digest.update(array.astype(array.dtype.newbyteorder("<")).tobytes())
-    return digest.hexdigest()
-
-
-def _course(record: NavigationRecord) -> dict[str, list]:
-    """Return how a navigation went, for pictures: a value at the start and one after each decision period."""
-    return {
-        "time_s": record.time_s.tolist(),
-        "inserted_length": record.inserted_length[:, 0].round(4).tolist(),
-        "rotation": record.rotation[:, 0].round(4).tolist(),
-        "catheter_inserted_length": record.inserted_length[:, 1:].round(4).tolist(),
-        "catheter_rotation": record.rotation[:, 1:].round(4).tolist(),
-        "tip_position": record.tip_position[:, 0].round(3).tolist(),
-        "contact_force_max": record.contact_force_max.round(5).tolist(),
-        "exposed": record.exposed.tolist(),
-    }
 
 
 def _pack(values: np.ndarray, kind: str) -> str:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-from jaxtyping import UInt8
 
 from endopilot.dataset import parquet, schema
 from endopilot.devices.stack import column_prefixes, lines_from_tips
@@ -18,7 +17,6 @@ from endopilot.errors import InputError
 from endopilot.files import manifest, png_image, sha256, write_json, writing
 from endopilot.ladder.attempt import Recording, begun, navigation_seed
 from endopilot.ladder.submission import Submission, read_submission
-from endopilot.navigation.record import NavigationRecord
 from endopilot.progress import progress
 from endopilot.runs import claim
 from endopilot.tasks.task import Task
@@ -91,7 +89,7 @@ def write_demonstrations(submission: str | Path, *, output: str | Path) -> dict[
                 sums.add(name, np.asarray(values) if white is None else white)
             samples, exposures = samples + count, exposures + int(columns["exposed"].sum())
             advance()
-    stats = sums.stats()
+    stats: dict[str, Any] = sums.stats()
     for name in _VIEWS:  # a row and a column, both of 1, for each channel
         low_to_std = {key: [[value] for value in values] for key, values in stats[name].items() if key != "count"}
         stats[name] |= {key: [value] * _CHANNELS for key, value in low_to_std.items()}
@@ -133,7 +131,14 @@ def _navigation(submission: Submission, task: Task, place: int) -> tuple[dict[st
     views = Views(navigation, loop.simulator.set_up.anatomies[0], _C_ARM, PIXELS)
     record = loop.run()
     count = len(record.control) - 1
-    images, age_s = _images(record, views, np.asarray(loop.world.registration_mm), seed)
+    random, images = np.random.default_rng([seed, 7]), []
+    exposed = np.flatnonzero(record.exposed[:count] | (np.arange(count) == 0))
+    for at in exposed.tolist():
+        nodes = record.shape[at] + np.asarray(loop.world.registration_mm)
+        devices = lines_from_tips(nodes[np.isfinite(nodes[:, 0])], record.inserted_length[at])
+        images.append(views.image(devices, random))
+    shown = np.searchsorted(exposed, np.arange(count), side="right") - 1
+    age_s = (np.arange(count) - exposed[shown]) * SAMPLE_PERIOD_S
     drives = np.concatenate([record.encoders[:count], record.load[:count]], axis=-1).reshape(count, -1)
     asked, last = np.append(record.exposed[1:count], False), np.arange(count) == count - 1
     columns = {
@@ -144,27 +149,11 @@ def _navigation(submission: Submission, task: Task, place: int) -> tuple[dict[st
         "next.reward": last * float(record.success and record.safe),
         "next.done": last,
         "next.success": last & record.success,
-        **{name: [shown[k] for shown in images] for k, name in enumerate(_VIEWS)},
+        **{name: [images[of][k] for of in shown] for k, name in enumerate(_VIEWS)},
     }
     names = ("success", "safe", "reason", "peak_force_n", "exposures")
     about = {"ladder_task": task.name, "anatomy": navigation.anatomy.name, "seed": seed}
     return columns, about | {name: getattr(record, name) for name in names}
-
-
-def _images(
-    record: NavigationRecord, views: Views, registration_mm: np.ndarray, seed: int
-) -> tuple[list[UInt8[np.ndarray, "views rows columns"]], list[float]]:
-    """Return the images of the last exposure at each decision, and its age, s; the first decision has one."""
-    random = np.random.default_rng([seed, 7])
-    images, ages, shown, since = [], [], None, 0
-    for at in range(len(record.control) - 1):
-        if record.exposed[at] or shown is None:
-            nodes = record.shape[at] + registration_mm
-            devices = lines_from_tips(nodes[np.isfinite(nodes[:, 0])], record.inserted_length[at])
-            shown, since = views.image(devices, random), at
-        images.append(shown)
-        ages.append((at - since) * SAMPLE_PERIOD_S)
-    return images, ages
 
 
 def _write(path: Path, table: Mapping[str, Any], key: str) -> None:

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json, writing
 from endopilot.ladder.attempt import attempt, navigation_seed
-from endopilot.ladder.ladder import LadderConfig, identity, terms_of
+from endopilot.ladder.ladder import LadderConfig, terms_of
 from endopilot.ladder.scores import score_navigations
 from endopilot.ladder.terms import Terms
 from endopilot.navigation.policies import make_policy
@@ -50,7 +50,7 @@ def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[d
     make_policy(config.policy)
     tasks = config.chosen
     terms = terms_of(config)
-    claim(output, "endopilot ladder --mismatch", **identity(config.policy, terms.version, terms.robot), mismatch=share)
+    claim(output, "endopilot ladder --mismatch", **terms.identity(config.policy), mismatch=share)
     paths = {case: config.paths(output / case) for case in CASES}
     every = [path for of_case in paths.values() for path in of_case]
     navigate = partial(_navigate, policy=config.policy, terms=terms, share=share)
@@ -95,7 +95,6 @@ def _navigate(path: Path, *, policy: str, terms: Terms, share: float) -> None:
 
 
 def _picture(rows: list[dict[str, Any]], policy: str, share: float) -> bytes:
-    """Draw safe success and exposures of each case."""
     import matplotlib
 
     from endopilot.plotting import BLUE, ORANGE, STYLE, png

@@ -53,8 +53,15 @@ def find_target(tree: VesselTree, place: Place, *, depth_mm: float | None = None
     if len(numbers) > 1 and not re.sub(r"[-+0-9.e,;\s]", "", place):
         mend = f"write it as {','.join(numbers)}" if len(numbers) == 3 else f"these are {len(numbers)} numbers"
         raise InputError(f"target: {place!r}; a point is X,Y,Z in LPS mm, three numbers with commas: {mend}")
-    label = _section(tree, place)
-    return _middle(tree, label) if depth_mm is None else _beyond(tree, label, depth_mm)
+    present = {present.lower(): present for present in tree.sections_present}
+    for known in _ALIASES.get(place.lower(), (place.lower(),)):
+        if known in present:
+            label = tree.section_names.index(present[known])
+            return _middle(tree, label) if depth_mm is None else _beyond(tree, label, depth_mm)
+    raise InputError(
+        f"target: {place!r}; the vessel has no such section (it has {', '.join(tree.sections_present)}); "
+        "give one of them, or a point X,Y,Z in LPS mm"
+    )
 
 
 def section_at(tree: VesselTree, branch: int, abscissa: float) -> str:
@@ -68,18 +75,6 @@ def section_at(tree: VesselTree, branch: int, abscissa: float) -> str:
     line = tree.branches[branch].centerline
     at = int(np.argmin(np.abs(line.abscissa - abscissa)))
     return tree.section_names[int(tree.branches[branch].section[at])]
-
-
-def _section(tree: VesselTree, name: str) -> int:
-    """Return the index of a section that a vessel has."""
-    present = {present.lower(): present for present in tree.sections_present}
-    for known in _ALIASES.get(name.lower(), (name.lower(),)):
-        if known in present:
-            return tree.section_names.index(present[known])
-    raise InputError(
-        f"target: {name!r}; the vessel has no such section (it has {', '.join(tree.sections_present)}); "
-        "give one of them, or a point X,Y,Z in LPS mm"
-    )
 
 
 def _middle(tree: VesselTree, label: int) -> Target:

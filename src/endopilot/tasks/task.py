@@ -45,9 +45,6 @@ LadderVersion = ShippedVersion | str
 NEWEST: LadderVersion = 2
 """The ladder's versions: 1 in textbook patients of the atlas, 2 in patients that resemble real ones, coaxial for four
 tasks of wire and catheter in patients of the latter kind; or a folder of tasks of one's own, a YAML file each."""
-_FOLDERS: dict[LadderVersion, Path] = {
-    version: Path(__file__).parent / f"ladder_{version}" for version in get_args(ShippedVersion)
-}
 
 
 @settings
@@ -204,7 +201,6 @@ class Task:
 
 @lru_cache(maxsize=8)  # each takes up to 0.12 GB, and up to 20 s to draw
 def _patient(atlas: AtlasConfig, number: int) -> Anatomy:
-    """Return a patient of an atlas."""
     return with_world_zero(make_patient(atlas, number))
 
 
@@ -215,10 +211,11 @@ def list_tasks(version: LadderVersion = NEWEST) -> tuple[Task, ...]:
     Raises:
         InputError: there is no such version or folder, or a file in the folder is no task.
     """
-    folder = _FOLDERS.get(version) or Path(str(version))
+    shipped = get_args(ShippedVersion)
+    folder = Path(__file__).parent / f"ladder_{version}" if version in shipped else Path(str(version))
     tasks = [_read_task(path) for path in folder.glob("*.yaml")]
     if not tasks:
-        known = ", ".join(map(str, _FOLDERS))
+        known = ", ".join(map(str, shipped))
         raise InputError(f"version: {version!r}; choose from {known}, or give a folder of tasks (*.yaml)")
     return tuple(sorted(tasks, key=lambda task: task.level))
 
