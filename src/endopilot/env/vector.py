@@ -279,7 +279,7 @@ class NavigateVectorEnv(VectorEnv):
         step = self._reality.drive(control, CONTROL_PERIOD_S, episodes.time_s)
         now = self._now(step)
         episodes.steps += ~fresh
-        self._expose(expose, self._reality.encoders)
+        self._expose(expose)
         if fresh.any():
             self._begin(fresh)
             now = self._now()
@@ -299,9 +299,9 @@ class NavigateVectorEnv(VectorEnv):
     def _now(self, step: Step | None = None) -> Measured:
         return Measured.of(self._simulator, self._reality.encoders, self._episodes.routes, step)
 
-    def _expose(self, mask: Bool[np.ndarray, "worlds"], encoders: Float[np.ndarray, "worlds devices 2"]) -> None:
+    def _expose(self, mask: Bool[np.ndarray, "worlds"]) -> None:
         if self._c_arms is not None:
-            registration_mm = self._reality.drawn.registration_mm
+            encoders, registration_mm = self._reality.encoders, self._reality.drawn.registration_mm
             self._c_arms.expose(mask, self._simulator, encoders, registration_mm, self._episodes.time_s)
 
     def _observe(self, now: Measured) -> Observations:
@@ -322,7 +322,7 @@ class NavigateVectorEnv(VectorEnv):
         self._episodes.begin(mask, self._simulator.project())
         if self._c_arms is not None:
             self._c_arms.begin(mask, self._generators)
-            self._expose(mask, self._reality.encoders)
+            self._expose(mask)
 
     def _infos(self, now: Measured, exposed: Bool[np.ndarray, "worlds"]) -> dict[str, Any]:
         infos = self._episodes.infos(now)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -225,17 +225,9 @@ def _read_task(path: Path) -> Task:
     task = read_settings(path, Task)
     if task.anatomies is None:
         return task
-
-    def seen(device: str) -> str:
-        beside = path.parent / device
-        return str(beside) if beside.is_file() else device
-
-    return replace(
-        task,
-        device=seen(task.device),
-        catheter=task.catheter and seen(task.catheter),
-        anatomies=tuple(str(path.parent / folder) for folder in task.anatomies),
-    )
+    devices = {name: path.parent / (getattr(task, name) or "") for name in ("device", "catheter")}
+    beside: dict[str, Any] = {name: str(file) for name, file in devices.items() if file.is_file()}
+    return replace(task, **beside, anatomies=tuple(str(path.parent / folder) for folder in task.anatomies))
 
 
 def find_task(name: str, *, version: LadderVersion = NEWEST) -> Task:
