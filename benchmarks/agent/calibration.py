@@ -26,7 +26,7 @@ from endopilot.belief.monitor import predicted_tip
 from endopilot.control.agent import AgentPolicy
 from endopilot.control.agent_config import CALIBRATIONS, IN_CATHETER, AgentConfig
 from endopilot.files import read_json, write_json
-from endopilot.ladder.ladder import identity
+from endopilot.ladder.terms import Terms
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Decision, Observation
 from endopilot.runs import claim, make_missing
@@ -261,7 +261,7 @@ def calibrate_agent(kind: Positional[KindName] = "assumed", /, *, write: bool = 
         for place in places
         for task in chosen.tasks
     ]
-    found = identity("agent", chosen.version)
+    found = Terms(chosen.version).identity("agent")
     claim(folder, f"python -m benchmarks agent-calibration {kind}", **found, agent=chosen.config)
     make_missing("Calibrating the agent's adviser", wanted, partial(measure, name=kind))
     calibration, lines = calibrate(folder, chosen)

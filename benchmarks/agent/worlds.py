@@ -31,7 +31,7 @@ from endopilot.control.agent import AgentPolicy
 from endopilot.control.agent_config import AgentConfig, read_agent_calibration
 from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import navigation_events
-from endopilot.ladder.ladder import identity
+from endopilot.ladder.terms import Terms
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Decision, Observation
 from endopilot.navigation.record import NavigationRecord
@@ -320,7 +320,8 @@ def drive_in_worlds(
     chosen = {Path(name).stem: read_world(name) for name in worlds or shipped}
     paths: dict[tuple[str, Drive], list[Path]] = {}
     for name, world in chosen.items():
-        claim(output / name, "python -m benchmarks worlds", **identity("agent", NEWEST, world=world), patients=patients)
+        identity = Terms(NEWEST, world=world).identity("agent")
+        claim(output / name, "python -m benchmarks worlds", **identity, patients=patients)
         first = zlib.crc32(name.encode())
         counts: dict[Drive, int] = {"planned": planned, "random": random}
         for drive, count in counts.items():

@@ -20,7 +20,7 @@ from endopilot.control.agent import AgentPolicy
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import navigation_events, navigation_seed
-from endopilot.ladder.ladder import identity
+from endopilot.ladder.terms import Terms
 from endopilot.navigation.loop import LoopConfig, NavigationLoop, XrayKind
 from endopilot.runs import claim, make_missing
 from endopilot.settings import Count
@@ -115,7 +115,7 @@ def drive_under_conditions(
         name: [FOLDER / name / task.name / f"{place:02d}.json" for place in range(patients) for task in tasks]
         for name in only
     }
-    claim(FOLDER, "python -m benchmarks xray-conditions", **identity("agent", NEWEST))
+    claim(FOLDER, "python -m benchmarks xray-conditions", **Terms(NEWEST).identity("agent"))
     make_missing("The agent under X-ray", [path for paths in wanted.values() for path in paths], measure)
     before = (DOCS / "evidence/advice.md").read_text(encoding="utf-8").split("<!-- conditions:")[1]
     rows = {title: line for line in before.splitlines() for title, *_ in CONDITIONS.values() if f"| {title} |" in line}

@@ -380,7 +380,7 @@ def test_a_wrong_branch_lengthens_the_route():
     )
     length = env._worlds._episodes.routes.distance(tip)
     assert length == pytest.approx(7.0 + navigation.target.abscissa - fork)
-    assert not env._worlds._episodes.routes.place(tip[:, 0]).on_route.any()
+    assert not env._worlds._episodes.routes.on_route(tip).any()
 
 
 @pytest.mark.parametrize("action", [np.full((WORLDS, 2), np.nan), np.zeros((WORLDS, 3)), np.zeros(2)])

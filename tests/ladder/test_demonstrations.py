@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from endopilot.cli import main
-from endopilot.ladder.attempt import Recording, driven
+from endopilot.ladder.attempt import Recording, begun
 from endopilot.ladder.demonstrations import PIXELS, write_demonstrations
 from endopilot.ladder.ladder import LadderConfig, climb
 from endopilot.tasks.task import find_task
@@ -56,7 +56,8 @@ def test_samples_are_what_was_measured_and_decided(made):
     task = find_task("along", version=content["ladder"])
     for place, samples in enumerate(_samples(folder)):
         entry = content["navigations"]["along"][place]
-        record = driven(Recording.unpacked(entry["recording"]), task.ladder_navigation(place), seed=entry["seed"])
+        recording = Recording.unpacked(entry["recording"])
+        record = begun(recording, task.ladder_navigation(place), seed=entry["seed"]).run()
         state, action = np.stack(samples["observation.state"]), np.stack(samples["action"])
         np.testing.assert_array_equal(state[:, :2], np.float32(record.encoders[:-1, 0]))
         np.testing.assert_array_equal(state[:, 2:4], np.float32(record.load[:-1, 0]))

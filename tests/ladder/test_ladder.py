@@ -13,7 +13,7 @@ from endopilot import __version__, runs
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.ladder import attempt as attempts
-from endopilot.ladder import ladder, terms
+from endopilot.ladder import terms
 from endopilot.ladder.attempt import attempt
 from endopilot.ladder.ladder import LadderConfig, climb
 from endopilot.ladder.scores import score
@@ -74,7 +74,7 @@ def test_a_folder_of_another_policy_or_of_something_else_is_refused(climbed, tmp
 def test_a_folder_of_another_task_is_refused(climbed, monkeypatch):
     folder, _ = climbed
     changed = tuple(replace(task, seconds=1.0) for task in list_tasks())
-    monkeypatch.setattr(ladder, "list_tasks", lambda version: changed)
+    monkeypatch.setattr(terms, "list_tasks", lambda version: changed)
     with pytest.raises(InputError, match=r"was begun with tasks\.straight = "):
         climb(output=folder, config=LadderConfig(policy="forward", tasks=("straight",), patients=1))
 
@@ -93,7 +93,7 @@ def test_another_wire_of_the_same_name_or_another_version_is_refused(climbed, mo
     with pytest.raises(InputError, match=r"was begun with tasks\.straight = "):
         climb(output=folder, config=one)
     monkeypatch.undo()
-    monkeypatch.setattr(ladder, "__version__", "99.0")
+    monkeypatch.setattr(terms, "__version__", "99.0")
     with pytest.raises(InputError, match=rf"was begun with version = {__version__}, now it is 99\.0"):
         climb(output=folder, config=one)
 

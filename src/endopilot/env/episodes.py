@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from endopilot.devices.stack import column_prefixes
 from endopilot.env.observation import Measured, RouteTables
 from endopilot.simulation.state import SimulatorState
 from endopilot.tasks.navigation import Navigation, is_safe, reached
@@ -20,9 +21,6 @@ PROGRESS_REWARD, STEP_REWARD, FORCE_REWARD, SUCCESS_REWARD = 0.1, -0.01, -0.1, 5
 """A mm nearer to the target, every step, every step with too large a force, and the target."""
 EXPOSURE_REWARD = -0.05
 """Every exposure, where X-ray shows the tip."""
-_UNBEGUN = -1
-_OF_CATHETER = ("inserted_length", "rotation", "tip_abscissa", "tip_offset", "tip_branch")
-"""What the info holds of each catheter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,29 +29,19 @@ class NavigationState:
 
     Attributes:
         simulator: the worlds.
-        steps: steps of each world since its reset.
-        distance: path length from each tip that counts to its target at the last step, mm, a row a device.
-        safe: worlds whose force has not been too large since their reset.
-        ended: worlds whose episode has ended, which the next step resets.
-        generators: state of each world's random generator.
-        drawn: robots and what else differs from episode to episode, as it is kept within the environment.
-        exposed: the last exposures, likewise; None where all is observed as it truly is.
+        kept: all else, as it is kept within the environment: how far the episodes are, the random generators, robots
+            and what else differs from episode to episode, and the last exposures.
     """
 
     simulator: SimulatorState
-    steps: np.ndarray
-    distance: np.ndarray
-    safe: np.ndarray
-    ended: np.ndarray
-    generators: tuple[dict[str, Any], ...]
-    drawn: Any
-    exposed: Any
+    kept: dict[str, Any]
 
 
 class Episodes:
     """The episodes that many worlds are in; row i belongs to world i.
 
     Attributes:
+        steps: of each world since its reset; -1 before the first.
         distance: path length from each tip that counts to its target at the last step, mm.
         safe: worlds whose force has not been too large since their reset.
     """
@@ -67,25 +55,15 @@ class Episodes:
         self._target_abscissa = np.array([target.abscissa for target in targets])
         self._near_mm = np.array([target.near_mm or np.inf for target in targets])
         self._most_steps = np.array([navigation.periods(CONTROL_PERIOD_S) for navigation in navigations])
-        self._seconds = np.array([navigation.seconds for navigation in navigations])
+        self.seconds = np.array([navigation.seconds for navigation in navigations])
         self.force_limit_n = np.array([navigation.force_limit_n for navigation in navigations])
-        self.steps, self.distance = np.full(count, _UNBEGUN), np.zeros((count, self._counted))
+        self.steps, self.distance = np.full(count, -1), np.zeros((count, self._counted))
         self.safe, self.ended = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
-
-    @property
-    def unbegun(self) -> Bool[np.ndarray, "worlds"]:
-        """Which worlds have not been reset yet."""
-        return self.steps == _UNBEGUN
 
     @property
     def time_s(self) -> Float[np.ndarray, "worlds"]:
         """Time since each world's reset, s."""
         return self.steps * CONTROL_PERIOD_S
-
-    @property
-    def time_share(self) -> Float[np.ndarray, "worlds"]:
-        """Share of each navigation's time that is used up."""
-        return self.time_s / self._seconds
 
     def begin(self, mask: Bool[np.ndarray, "worlds"], tip: TipProjection) -> None:
         """Start an episode in the worlds of a mask."""
@@ -95,20 +73,12 @@ class Episodes:
     def judge(
         self,
         now: Measured,
-        distances: Float[np.ndarray, "worlds devices"],
         fresh: Bool[np.ndarray, "worlds"],
         exposed: Bool[np.ndarray, "worlds"],
     ) -> tuple[Float[np.ndarray, "worlds"], Bool[np.ndarray, "worlds"], Bool[np.ndarray, "worlds"]]:
-        """Score what the worlds did in a step, of which those of `fresh` have only begun.
-
-        Args:
-            distances: path length from every tip to its target, mm.
-
-        Returns:
-            Rewards, terminations and truncations.
-        """
+        """Return rewards, terminations and truncations of a step, in which the worlds of `fresh` have only begun."""
         going, before = ~fresh, self.distance
-        self.distance = distances[:, : self._counted]
+        self.distance = now.distance_mm[:, : self._counted]
         unsafe = ~is_safe(now.contact_force, self.force_limit_n) & going
         self.safe &= ~unsafe
         success = self._success(now) & going
@@ -125,30 +95,21 @@ class Episodes:
 
     def infos(self, now: Measured) -> dict[str, Any]:
         """Return what stands in the info of every world, as `NavigateVectorEnv` names it."""
-        wire = now.tip[:, 0]
         infos: dict[str, Any] = {
             "contact_force_max": now.contact_force,
             "valid": now.valid,
             "success": self._success(now),
             "safe": self.safe.copy(),
             "distance_mm": self.distance[:, -1],
-            "inserted_length": now.inserted_length[:, 0],
-            "rotation": now.rotation[:, 0],
-            "tip_abscissa": wire.abscissa,
-            "tip_offset": wire.offset,
-            "tip_branch": wire.branch,
             "time_s": self.time_s,
         }
-        for k in range(1, now.rotation.shape[1]):
+        for k, prefix in enumerate(column_prefixes(now.rotation.shape[1])):
             tip = now.tip[:, k]
-            values = (now.inserted_length[:, k], now.rotation[:, k], tip.abscissa, tip.offset, tip.branch)
-            infos |= {f"catheter_{k}_{name}": value for name, value in zip(_OF_CATHETER, values, strict=True)}
+            infos |= {
+                f"{prefix}inserted_length": now.inserted_length[:, k],
+                f"{prefix}rotation": now.rotation[:, k],
+                f"{prefix}tip_abscissa": tip.abscissa,
+                f"{prefix}tip_offset": tip.offset,
+                f"{prefix}tip_branch": tip.branch,
+            }
         return infos
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Return copies of all that changes, by the names of `NavigationState`."""
-        return {name: getattr(self, name).copy() for name in ("steps", "distance", "safe", "ended")}
-
-    def set_arrays(self, steps: np.ndarray, distance: np.ndarray, safe: np.ndarray, ended: np.ndarray) -> None:
-        """Go back to what `arrays` returned."""
-        self.steps, self.distance, self.safe, self.ended = (array.copy() for array in (steps, distance, safe, ended))

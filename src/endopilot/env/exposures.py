@@ -74,31 +74,27 @@ class CArms:
         Args:
             pixels: columns and rows of an image; 0 for exposures that say where the tip is.
         """
-        count, first = len(navigations), navigations[0]
-        self._navigations, self._ostium = navigations, [np.asarray(n.anatomy.insertion.position) for n in navigations]
-        arms: dict[int, Fluoroscope] = {}
-        self._images: dict[tuple[int, str], Views] = {}
+        count, own = len(navigations), list(dict.fromkeys(navigations))
+        self._pixels, motions = pixels, [(each.known_motion, each.anatomy.insertion.position) for each in navigations]
+        self._known = [motion and motion.core(np.asarray(ostium)) for motion, ostium in motions]
         self._of: list[Views] = []
-        self._pixels = pixels
-        for navigation, real in zip(navigations, simulator.set_up.anatomies, strict=True):
-            anatomy, key = navigation.anatomy, (id(navigation), real.identity)
-            if pixels and key not in self._images:
-                self._images[key] = Views(navigation, real, config, pixels)
-            elif not pixels and id(navigation) not in arms:
-                arms[id(navigation)] = Fluoroscope(anatomy, navigation.device.tip_radius_mm, config=config)
-            if pixels:
-                self._of.append(self._images[key])
-        if not pixels:
-            self._arm = np.array([list(arms).index(id(navigation)) for navigation in navigations])
-            self._tips = TipFinder(list(arms.values()), self._arm)
-            trees = [navigations[int(np.argmax(self._arm == number))].anatomy for number in range(len(arms))]
-            self._project = [TipProjector(anatomy.tree, anatomy.insertion) for anatomy in trees]
+        if pixels:
+            made: dict[tuple[int, str], Views] = {}
+            for navigation, real in zip(navigations, simulator.set_up.anatomies, strict=True):
+                key = (id(navigation), real.identity)
+                made[key] = made.get(key) or Views(navigation, real, config, pixels)
+                self._of.append(made[key])
+        else:
+            arms = [Fluoroscope(each.anatomy, each.device.tip_radius_mm, config=config) for each in own]
+            self._arm = np.array([own.index(navigation) for navigation in navigations])
+            self._tips = TipFinder(arms, self._arm)
+            self._project = [TipProjector(each.anatomy.tree, each.anatomy.insertion) for each in own]
         views, zeros = 1 + config.biplane, np.zeros((count, 1))
         self.exposed = Exposed(
             count=np.zeros(count, dtype=np.int64),
             time_s=np.zeros(count),
             encoders=np.zeros((count, 2)),
-            position=np.tile(np.asarray(first.anatomy.insertion.position, dtype=float), (count, 1)),
+            position=np.tile(np.asarray(navigations[0].anatomy.insertion.position, dtype=float), (count, 1)),
             tip=TipProjection(
                 abscissa=zeros.copy(), offset=zeros.copy(), branch=zeros.astype(np.int64), radius=zeros + 1.0
             ),
@@ -132,33 +128,18 @@ class CArms:
         exposed = self.exposed
         exposed.count[chosen] += 1
         exposed.time_s[chosen], exposed.encoders[chosen] = time_s[chosen], encoders[chosen, 0]
-        maps = self._maps(simulator, chosen, time_s)
+        maps = None
+        if simulator.set_up.motion is not None:
+            placed = simulator.vessel_to_laboratory
+            one = ((slice(world, world + 1), self._known[world]) for world in chosen.tolist())
+            maps = np.concatenate([seen(placed[of], known, time_s[of]) for of, known in one])
         if self._pixels:
-            self._take_images(chosen, simulator, registration_mm, maps)
-        else:
-            self._find_tips(chosen, simulator, registration_mm, maps)
-
-    def _maps(
-        self, simulator: Simulator, chosen: Int[np.ndarray, "chosen"], time_s: Float[np.ndarray, "worlds"]
-    ) -> Float[np.ndarray, "chosen 3 4"] | None:
-        """Return how the C-arms see points of the moving vessels displaced; None where they lie still."""
-        if simulator.set_up.motion is None:
-            return None
-        placed, maps = simulator.vessel_to_laboratory[chosen], []
-        for world, one in zip(chosen.tolist(), placed, strict=True):
-            known = self._navigations[world].known_motion
-            core = None if known is None else known.core(self._ostium[world])
-            maps.append(seen(one[None], core, time_s[world : world + 1])[0])
-        return np.stack(maps)
-
-    def _find_tips(
-        self,
-        chosen: Int[np.ndarray, "chosen"],
-        simulator: Simulator,
-        registration_mm: Float[np.ndarray, "worlds 3"],
-        maps: Float[np.ndarray, "chosen 3 4"] | None,
-    ) -> None:
-        exposed = self.exposed
+            nodes = simulator.position[chosen] + registration_mm[chosen, None]
+            nodes = nodes if maps is None else place(maps[:, None], nodes)
+            for world, line in zip(chosen.tolist(), nodes, strict=True):
+                devices = lines_from_tips(line[np.isfinite(line[:, 0])], simulator.inserted_length[world])
+                exposed.image[world] = self._of[world].image(devices, exposed.random[world])
+            return
         tips, headings = simulator.tip_position[chosen, 0], simulator.tip_direction[chosen, 0]
         tips = tips + registration_mm[chosen]
         if maps is not None:
@@ -171,25 +152,9 @@ class CArms:
             for name in TipProjection.__dataclass_fields__:
                 getattr(exposed.tip, name)[worlds, 0] = getattr(found, name)
 
-    def _take_images(
-        self,
-        chosen: Int[np.ndarray, "chosen"],
-        simulator: Simulator,
-        registration_mm: Float[np.ndarray, "worlds 3"],
-        maps: Float[np.ndarray, "chosen 3 4"] | None,
-    ) -> None:
-        exposed, inserted = self.exposed, simulator.inserted_length
-        nodes = simulator.position[chosen] + registration_mm[chosen, None]
-        if maps is not None:
-            nodes = place(maps[:, None], nodes)
-        for world, line in zip(chosen.tolist(), nodes, strict=True):
-            devices = lines_from_tips(line[np.isfinite(line[:, 0])], inserted[world])
-            exposed.image[world] = self._of[world].image(devices, exposed.random[world])
-
 
 @cache
 def _noise() -> Float32[np.ndarray, "n"]:
-    """Return a table of noise of standard deviation 1."""
     return np.random.default_rng(0).standard_normal(_NOISE, dtype=np.float32)
 
 
@@ -197,7 +162,6 @@ class Views:
     """The views of one navigation: what stays the same, and the roadmap with the target that lies under every image."""
 
     def __init__(self, navigation: Navigation, real: Anatomy, config: FluoroscopeConfig, pixels: int) -> None:
-        """Compute what stays the same."""
         geometry = replace(config.geometry, pixel_mm=config.geometry.pixel_mm * _FULL_PIXELS / pixels)
         self._imager = XrayImager(real, navigation.stack, config=ImageConfig(geometry=geometry, pixels=pixels))
         given = navigation.anatomy

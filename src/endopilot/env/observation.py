@@ -25,33 +25,14 @@ AHEAD_MM = np.array([3.0, 6.0, 12.0, 24.0])
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
-    """A place on the route of each world, and what lies ahead of it.
-
-    Attributes:
-        point: the place, LPS mm.
-        frame: rows are the route's tangent there, and two normals that are carried along without twist.
-        radius: lumen radius there, mm.
-        ahead: the places `AHEAD_MM` farther on, in that frame and in units of that distance, one after another.
-        radius_ahead: lumen radius at these, mm.
-        on_route: whether the tip that it is nearest to lies in a branch of the route.
-    """
-
-    point: Float[np.ndarray, "worlds 3"]
-    frame: Float[np.ndarray, "worlds 3 3"]
-    radius: Float[np.ndarray, "worlds"]
-    ahead: Float[np.ndarray, "worlds 12"]
-    radius_ahead: Float[np.ndarray, "worlds 4"]
-    on_route: Bool[np.ndarray, "worlds"]
-
-
-@dataclass(frozen=True, eq=False)
 class RouteTables:
     """The route of each world, from the ostium to the end of the target's branch.
 
     Attributes:
-        places: of each route, a row for each place, every `STEP_MM` along it, as `Place` has it; a shorter route is
-            padded with its last place.
+        places: of each route, a row for each place, every `STEP_MM` along it, LPS mm: the place; the route's tangent
+            there and two normals that are carried along without twist; the lumen's radius; the places `AHEAD_MM`
+            farther on, in that frame and in units of that distance; half the radii at these. A shorter route is padded
+            with its last place.
         leave: of each route, for each branch of the tree, the abscissa where the path into it leaves the route, mm;
             infinite for the branches of the route and for those that the tree does not have.
         route: which of these routes each world has.
@@ -66,15 +47,13 @@ class RouteTables:
     @classmethod
     def of(cls, navigations: Sequence[Navigation]) -> RouteTables:
         """Make the tables, once for worlds that have the same navigation."""
-        numbers = {key: number for number, key in enumerate(dict.fromkeys(map(id, navigations)))}
-        route = np.array([numbers[id(navigation)] for navigation in navigations])
-        ends = (navigations[world] for world in np.unique(route, return_index=True)[1])
-        made = [_tables(Route.to(navigation.anatomy, navigation.target)) for navigation in ends]
+        own = list(dict.fromkeys(navigations))
+        made = [_tables(Route.to(navigation.anatomy, navigation.target)) for navigation in own]
         places, branches = max(len(row[0]) for row in made), max(len(row[1]) for row in made)
         return cls(
-            places=np.stack([_padded(row[0], places) for row in made]),
-            leave=np.stack([_padded(row[1], branches, np.inf) for row in made]),
-            route=route,
+            places=np.stack([np.pad(row[0], [(0, places - len(row[0])), (0, 0)], mode="edge") for row in made]),
+            leave=np.stack([np.pad(row[1], (0, branches - len(row[1])), constant_values=np.inf) for row in made]),
+            route=np.array([own.index(navigation) for navigation in navigations]),
             target=np.array([navigation.target.abscissa for navigation in navigations]),
         )
 
@@ -88,19 +67,22 @@ class RouteTables:
         """Return which tips lie in a branch of the route."""
         return np.isinf(self.leave[self.route[:, None], tip.branch])
 
-    def place(self, tip: TipProjection) -> Place:
-        """Return the place of each world's route that is nearest to its wire's tip along the tree."""
-        leave = self.leave[self.route, tip.branch]
-        along = np.rint(np.minimum(leave, tip.abscissa) / STEP_MM).astype(np.int64)
+    def place(
+        self,
+        tip: TipProjection,
+        position: Float[np.ndarray, "worlds 3"],
+        direction: Float[np.ndarray, "worlds 3"] | None = None,
+    ) -> Float[np.ndarray, "worlds columns"]:
+        """Return what is observed at the place of each world's route that is nearest to its wire's tip along the tree.
+
+        The columns are the wire's direction in the route's frame, if it is given; the tip's distances along both
+        normals, in radii of the lumen; the places ahead and half the radii there.
+        """
+        along = np.rint(np.minimum(self.leave[self.route, tip.branch], tip.abscissa) / STEP_MM).astype(np.int64)
         row = self.places[self.route, np.minimum(np.maximum(along, 0), self.places.shape[1] - 1)]
-        return Place(
-            point=row[:, :3],
-            frame=row[:, 3:12].reshape(-1, 3, 3),
-            radius=row[:, 12],
-            ahead=row[:, 13:25],
-            radius_ahead=row[:, 25:],
-            on_route=np.isinf(leave),
-        )
+        frame, away = row[:, 3:12].reshape(-1, 3, 3), (position - row[:, :3]) / row[:, 12:13]
+        columns = [(frame[:, 1:] @ away[..., None])[..., 0], row[:, 13:]]
+        return np.column_stack(columns if direction is None else [(frame @ direction[..., None])[..., 0], *columns])
 
 
 def _tables(route: Route) -> tuple[np.ndarray, np.ndarray]:
@@ -113,14 +95,8 @@ def _tables(route: Route) -> tuple[np.ndarray, np.ndarray]:
     index = np.arange(len(along))[:, None] + np.rint(AHEAD_MM / STEP_MM).astype(np.int64)
     index = np.minimum(index, len(along) - 1)
     away = np.einsum("pij,pkj->pki", frame, (point[index] - point[:, None]) / AHEAD_MM[:, None])
-    table = [point, frame.reshape(-1, 9), radius, away.reshape(len(along), -1), radius[index]]
+    table = [point, frame.reshape(-1, 9), radius, away.reshape(len(along), -1), radius[index] / 2.0]
     return np.column_stack(table), route.leaves_at
-
-
-def _padded(rows: np.ndarray, count: int, value: float | None = None) -> np.ndarray:
-    """Return `rows` with more of them, of `value` or like the last one."""
-    more = np.repeat(rows[-1:], count - len(rows), axis=0)
-    return np.concatenate([rows, more if value is None else np.full_like(more, value)])
 
 
 _BOUND = 10.0
@@ -154,6 +130,7 @@ class Measured:
         rotation: φ, rad.
         encoders: both as they are measured: by a robot's encoders where there is a robot.
         valid: false for a world that has failed.
+        distance_mm: path length from every tip to its target, mm.
     """
 
     tip: TipProjection
@@ -164,76 +141,48 @@ class Measured:
     rotation: Float[np.ndarray, "worlds devices"]
     encoders: Float[np.ndarray, "worlds devices 2"]
     valid: Bool[np.ndarray, "worlds"]
+    distance_mm: Float[np.ndarray, "worlds devices"]
 
     @classmethod
-    def after(cls, step: Step, simulator: Simulator, encoders: Float[np.ndarray, "worlds devices 2"]) -> Measured:
-        """Return the worlds at the end of a step, with what encoders say."""
+    def of(
+        cls,
+        simulator: Simulator,
+        encoders: Float[np.ndarray, "worlds devices 2"],
+        routes: RouteTables,
+        step: Step | None = None,
+    ) -> Measured:
+        """Return the worlds as they are now, with what encoders say, and the force over the step that led there."""
+        now, tip = simulator if step is None else step, simulator.project()
         return cls(
-            tip=simulator.project(),
-            position=step.tip_position,
-            direction=step.tip_direction,
-            contact_force=step.contact_force_max,
-            inserted_length=step.inserted_length,
-            rotation=step.rotation,
+            tip=tip,
+            position=now.tip_position,
+            direction=now.tip_direction,
+            contact_force=simulator.contacts.max(axis=1) if step is None else step.contact_force_max,
+            inserted_length=now.inserted_length,
+            rotation=now.rotation,
             encoders=encoders,
-            valid=step.valid,
-        )
-
-    @classmethod
-    def current(cls, simulator: Simulator, encoders: Float[np.ndarray, "worlds devices 2"]) -> Measured:
-        """Return the worlds as they are now, with what encoders say."""
-        return cls(
-            tip=simulator.project(),
-            position=simulator.tip_position,
-            direction=simulator.tip_direction,
-            contact_force=simulator.contacts.max(axis=1),
-            inserted_length=simulator.inserted_length,
-            rotation=simulator.rotation,
-            encoders=encoders,
-            valid=simulator.valid,
+            valid=now.valid,
+            distance_mm=routes.distance(tip),
         )
 
 
 def observe(
     now: Measured,
     routes: RouteTables,
-    distances_mm: Float[np.ndarray, "worlds devices"],
     force_limit_n: Float[np.ndarray, "worlds"],
     time_share: Float[np.ndarray, "worlds"],
 ) -> Float[np.ndarray, "worlds features"]:
     """Return the observations, as the specification has them."""
-    tip, inserted, turned = now.tip[:, 0], now.encoders[:, 0, 0], now.encoders[:, 0, 1]
-    place = routes.place(tip)
-    outside = np.empty((len(time_share), 3, 2))
-    outside[:, :, 0] = now.direction[:, 0]
-    outside[:, :, 1] = (now.position[:, 0] - place.point) / place.radius[:, None]
-    inside = place.frame @ outside
-    out = np.empty((len(time_share), _OF_WIRE + _OF_CATHETER * (now.rotation.shape[1] - 1)))
-    out[:, 0] = inserted / 100.0
-    out[:, 1], out[:, 2] = np.cos(turned), np.sin(turned)
-    out[:, 3] = tip.abscissa / 100.0
-    out[:, 4] = tip.offset / tip.radius
-    out[:, 5] = distances_mm[:, 0] / 100.0
-    out[:, 6] = place.on_route
-    out[:, 7] = now.contact_force / force_limit_n
-    out[:, 8] = time_share
-    out[:, 9:12] = inside[:, :, 0]
-    out[:, 12:14] = inside[:, 1:, 1]
-    out[:, 14:26] = place.ahead
-    out[:, 26:30] = place.radius_ahead / 2.0
-    out[:, 30] = (inserted - tip.abscissa) / 10.0
-    on_route = routes.on_route(now.tip)
-    for device in range(1, now.rotation.shape[1]):
-        begin = _OF_WIRE + _OF_CATHETER * (device - 1)
+    out, on_route = list[np.ndarray](), routes.on_route(now.tip)
+    for device in range(now.rotation.shape[1]):
         tip, (inserted, turned) = now.tip[:, device], now.encoders[:, device].T
-        out[:, begin] = inserted / 100.0
-        out[:, begin + 1], out[:, begin + 2] = np.cos(turned), np.sin(turned)
-        out[:, begin + 3] = tip.abscissa / 100.0
-        out[:, begin + 4] = tip.offset / tip.radius
-        out[:, begin + 5] = distances_mm[:, device] / 100.0
-        out[:, begin + 6] = on_route[:, device]
-        out[:, begin + 7] = (inserted - tip.abscissa) / 10.0
-    return _bounded(out)
+        out += [inserted / 100.0, np.cos(turned), np.sin(turned), tip.abscissa / 100.0, tip.offset / tip.radius]
+        out += [now.distance_mm[:, device] / 100.0, on_route[:, device]]
+        if device == 0:
+            out += [now.contact_force / force_limit_n, time_share]
+            out += [routes.place(tip, now.position[:, 0], now.direction[:, 0])]
+        out += [(inserted - tip.abscissa) / 10.0]
+    return _bounded(np.column_stack(out))
 
 
 def observe_exposed(
@@ -249,31 +198,18 @@ def observe_exposed(
         proximal: Δ, mm, φ, rad, and the drives' force and torque, N and N·mm, as they are measured.
         routes: the paths to the targets; not given where exposures are images.
     """
-    around = proximal.shape[1] - 1
-    of_tip = 0 if routes is None else _OF_TIP
-    out = np.empty((len(time_s), _AT_DRIVES + of_tip + _DRIVE_OF_CATHETER * around))
-    begins = (0, *(_AT_DRIVES + of_tip + _DRIVE_OF_CATHETER * k for k in range(around)))
-    for begin, (inserted, turned, force, torque) in zip(begins, proximal.transpose(1, 2, 0), strict=True):
-        out[:, begin] = inserted / 100.0
-        out[:, begin + 1], out[:, begin + 2] = np.cos(turned), np.sin(turned)
-        out[:, begin + 3], out[:, begin + 4] = force / 0.5, torque / 0.5
-    out[:, 5] = time_share
-    out[:, 6] = (time_s - exposed.time_s) / 10.0
-    since = proximal[:, 0, :2] - exposed.encoders
-    out[:, 7], out[:, 8] = since[:, 0] / 10.0, since[:, 1] / np.pi
+    wire, *catheters = (
+        [inserted / 100.0, np.cos(turned), np.sin(turned), force / 0.5, torque / 0.5]
+        for inserted, turned, force, torque in proximal.transpose(1, 2, 0)
+    )
+    since = (proximal[:, 0, :2] - exposed.encoders) / [10.0, np.pi]
+    out = [*wire, time_share, (time_s - exposed.time_s) / 10.0, since]
     if routes is not None:
         tip = exposed.tip[:, 0]
-        place, begin = routes.place(tip), _AT_DRIVES
-        out[:, begin] = tip.abscissa / 100.0
-        out[:, begin + 1] = tip.offset / tip.radius
-        out[:, begin + 2] = routes.distance(exposed.tip)[:, 0] / 100.0
-        out[:, begin + 3] = place.on_route
-        away = (exposed.position - place.point) / place.radius[:, None]
-        out[:, begin + 4 : begin + 6] = (place.frame[:, 1:] @ away[..., None])[..., 0]
-        out[:, begin + 6 : begin + 18] = place.ahead
-        out[:, begin + 18 : begin + 22] = place.radius_ahead / 2.0
-        out[:, begin + 22] = (exposed.encoders[:, 0] - tip.abscissa) / 10.0
-    return _bounded(out)
+        out += [tip.abscissa / 100.0, tip.offset / tip.radius, routes.distance(exposed.tip) / 100.0]
+        out += [routes.on_route(exposed.tip), routes.place(tip, exposed.position)]
+        out += [(exposed.encoders[:, 0] - tip.abscissa) / 10.0]
+    return _bounded(np.column_stack([*out, *(column for catheter in catheters for column in catheter)]))
 
 
 def _bounded(values: Float[np.ndarray, "worlds features"]) -> Float[np.ndarray, "worlds features"]:

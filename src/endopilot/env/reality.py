@@ -114,7 +114,12 @@ class Reality:
             each.check_engine("environments")
         motion = _common(fixed, "motion", [each.motion or motion for each in fixed])
         config = _common(fixed, "core or wall", [each.core(config) for each in fixed])
-        self._robots = self._all_robots(robot, fixed)
+        self._robots: list[RobotConfig | None] | None = None  # where devices do as commanded; None of one that is drawn
+        if robot is not None or any(each.robot for each in fixed):
+            self._robots = [
+                None if own is None and each.robot is None else each.real_robot(own or RobotConfig())
+                for each, own in zip(fixed, _spread(IDEAL if robot is None else robot, count, read_robot), strict=True)
+            ]
         stacks = [each.stack(navigation.stack) for each, navigation in zip(fixed, navigations, strict=True)]
         if self._robots is not None:
             held = [in_grip(s, r or RobotConfig(), config) for s, r in zip(stacks, self._robots, strict=True)]
@@ -123,9 +128,8 @@ class Reality:
                 raise InputError(
                     "robot: its grip is weaker than devices of different push limits; give config a wall stiffness"
                 )
-        made = {
-            id(each.anatomy): SharedVessels(each.anatomy) for each in navigations
-        }  # the same differences, one vessel
+        # the same differences, one vessel
+        made = {id(each.anatomy): SharedVessels(each.anatomy) for each in navigations}
         vessels = [made[id(each.anatomy)].of(world) for each, world in zip(navigations, fixed, strict=True)]
         self.simulator = Simulator(vessels, stacks, motion=motion, config=config)
         self._friction = np.array([[device.friction for device in stack.devices] for stack in stacks])
@@ -199,12 +203,16 @@ class Reality:
             time_s: since each episode's start, s.
         """
         simulator, drawn = self.simulator, self.drawn
-        back = self._back_mm(period_s, time_s)
+        back = np.zeros(len(time_s))  # by how much each guiding catheter backs out
+        if drawn.backs_out_mm.any():
+            room = np.maximum(simulator.inserted_length.min(axis=1), 0.0)
+            due = time_s >= self._backs_out_s - period_s / 2
+            most = np.minimum(np.minimum(BACKS_OUT_MM_S * period_s, drawn.backs_out_mm), room)
+            back = np.where(due, most, 0.0)
+            drawn.backs_out_mm -= back
         if drawn.robots is None:
-            inserted = simulator.inserted_length
-            # it stops by itself at the ostium
-            travel_mm = (-np.inf, self._far_ends)
-            control[..., 0] = within_travel(control[..., 0], inserted, period_s, travel_mm=travel_mm)
+            travel_mm = (-np.inf, self._far_ends)  # it stops by itself at the ostium
+            control[..., 0] = within_travel(control[..., 0], simulator.inserted_length, period_s, travel_mm=travel_mm)
             drawn.ostium_mm -= back
             control[..., 0] -= back[:, None] / period_s
             return simulator.step(control, period_s)
@@ -217,30 +225,6 @@ class Reality:
         drawn.readings = drawn.robots.read(simulator)
         return step
 
-    def _back_mm(self, period_s: float, time_s: Float[np.ndarray, "worlds"]) -> Float[np.ndarray, "worlds"]:
-        """Return by how much each guiding catheter backs out in a while, mm."""
-        left = self.drawn.backs_out_mm
-        if not left.any():
-            return np.zeros(len(left))
-        room = np.maximum(self.simulator.inserted_length.min(axis=1), 0.0)
-        due = time_s >= self._backs_out_s - period_s / 2
-        back = np.where(due, np.minimum(np.minimum(BACKS_OUT_MM_S * period_s, left), room), 0.0)
-        left -= back
-        return back
-
-    @staticmethod
-    def _all_robots(
-        given: RobotConfig | str | Path | Sequence[RobotConfig | str | Path] | None, worlds: Sequence[World]
-    ) -> list[RobotConfig | None] | None:
-        """Return the robot of each world, None for one that is drawn; none at all where devices do as commanded."""
-        if given is None and all(each.robot is None for each in worlds):
-            return None
-        robots = _spread(IDEAL if given is None else given, len(worlds), read_robot)
-        return [
-            None if robot is None and world.robot is None else world.real_robot(robot or RobotConfig())
-            for world, robot in zip(worlds, robots, strict=True)
-        ]
-
 
 def _spread(given: Any, count: int, read: Any) -> list[Any]:
     """Return of each world what is given for all, or for world i number i modulo how many are; None if it is drawn."""
@@ -252,7 +236,6 @@ def _spread(given: Any, count: int, read: Any) -> list[Any]:
 
 
 def _common(worlds: Sequence[World], names: str, values: Sequence[Any]) -> Any:
-    """Return what all worlds have in common."""
     if any(value != values[0] for value in values):
         raise InputError(
             f"world: worlds differ in {names}, which all in an environment have in common; give worlds that agree"

@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 import numpy as np
 from gymnasium.error import ResetNeeded
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -29,6 +29,7 @@ from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.state import Step
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.targets import Place, find_target
@@ -43,6 +44,8 @@ Observations = Any
 
 _MEASURED = ("encoder_inserted_length", "encoder_rotation", "load_n", "load_nmm")
 """What the info holds of what a robot measures of the wire."""
+_CHANGING = ("steps", "distance", "safe", "ended")
+"""What of `Episodes` changes as they go on."""
 _PIXELS = (64, 128)
 """Least and most rows of an image."""
 
@@ -168,24 +171,19 @@ class NavigateVectorEnv(VectorEnv):
             )
         if robot is None and observation != "state":
             robot = RobotConfig()
-        self._given = {
-            "navigations": [given[number % len(given)] for number in range(num_envs)],
-            "observation": observation,
-            "pixels": pixels if observation == "image" else 0,
-            "c_arm": c_arm or FluoroscopeConfig(),
-            "autoreset_mode": autoreset_mode,
-            "reality": {"world": world, "robot": robot, "motion": motion, "config": config},
-        }
-        self._prepare(**self._given)
+        every = [given[number % len(given)] for number in range(num_envs)]
+        arms = {"config": c_arm or FluoroscopeConfig(), "pixels": pixels if observation == "image" else 0}
+        reality = {"world": world, "robot": robot, "motion": motion, "config": config}
+        self._given = (every, observation, autoreset_mode, arms, reality)
+        self._prepare(*self._given)
         self.render_mode = render_mode
 
     def _prepare(
         self,
         navigations: list[Navigation],
         observation: Observed,
-        pixels: int,
-        c_arm: FluoroscopeConfig,
         autoreset_mode: AutoresetMode,
+        arms: dict[str, Any],
         reality: dict[str, Any],
     ) -> None:
         first = navigations[0]
@@ -206,15 +204,14 @@ class NavigateVectorEnv(VectorEnv):
         self._drives = len(first.devices)
         self._fastest = np.tile([TRANSLATION_MM_S, ROTATION_RAD_S], self._drives)
         self.single_action_space = Box(-1.0, 1.0, (2 * self._drives + (observation != "state"),), np.float32)
-        self.single_observation_space = space(observation, len(first.catheters), (1 + c_arm.biplane, pixels, pixels))
+        images = (1 + arms["config"].biplane, arms["pixels"], arms["pixels"])
+        self.single_observation_space = space(observation, len(first.catheters), images)
         self.action_space = batch_space(self.single_action_space, count)
         self.observation_space = batch_space(self.single_observation_space, count)
         self._reality = Reality(navigations, **reality)
         self._simulator = self._reality.simulator
         self._episodes = Episodes(navigations)
-        self._c_arms: CArms | None = None
-        if observation != "state":
-            self._c_arms = CArms(navigations, self._simulator, config=c_arm, pixels=pixels)
+        self._c_arms = None if observation == "state" else CArms(navigations, self._simulator, **arms)
         self._everyone = np.ones(count, dtype=bool)
         self._generators = [seeding.np_random()[0] for _ in range(count)]
 
@@ -242,9 +239,8 @@ class NavigateVectorEnv(VectorEnv):
             for world in np.flatnonzero(mask).tolist():
                 self._generators[world] = seeding.np_random(seeds[world])[0]
         self._begin(mask)
-        now = Measured.current(self._simulator, self._reality.encoders)
-        distances = self._episodes.routes.distance(now.tip)
-        return self._observe(now, distances), self._infos(now, mask)
+        now = self._now()
+        return self._observe(now), self._infos(now, mask)
 
     def step(
         self, actions: ArrayLike
@@ -268,7 +264,7 @@ class NavigateVectorEnv(VectorEnv):
             InputError: actions of another shape, or not finite; no world is moved in either case.
         """
         mode, episodes = self.metadata["autoreset_mode"], self._episodes
-        over = episodes.unbegun | (episodes.ended & (mode is AutoresetMode.DISABLED))
+        over = (episodes.steps < 0) | (episodes.ended & (mode is AutoresetMode.DISABLED))
         if over.any():
             worlds = ", ".join(map(str, np.flatnonzero(over)))
             raise ResetNeeded(f"Cannot call step() before reset(): no episode goes on in worlds {worlds}")
@@ -281,63 +277,52 @@ class NavigateVectorEnv(VectorEnv):
         control[fresh] = 0.0
         control = control.reshape(self.num_envs, self._drives, 2)
         step = self._reality.drive(control, CONTROL_PERIOD_S, episodes.time_s)
-        now = Measured.after(step, self._simulator, self._reality.encoders)
+        now = self._now(step)
         episodes.steps += ~fresh
-        self._expose(expose, self._reality.encoders)
+        self._expose(expose)
         if fresh.any():
             self._begin(fresh)
-            now = Measured.current(self._simulator, self._reality.encoders)
-        distances = episodes.routes.distance(now.tip)
-        judged = episodes.judge(now, distances, fresh, expose)
-        observations, infos = self._observe(now, distances), self._infos(now, expose | fresh)
+            now = self._now()
+        judged = episodes.judge(now, fresh, expose)
+        observations, infos = self._observe(now), self._infos(now, expose | fresh)
         if mode is AutoresetMode.SAME_STEP and episodes.ended.any():
-            return self._begun_again(observations, infos, expose, *judged)
+            ended, last = episodes.ended.copy(), np.full(self.num_envs, None, dtype=object)
+            for world in np.flatnonzero(ended).tolist():
+                last[world] = of_world(observations, world)
+            final = {name: ended if name.startswith("_") else values for name, values in infos.items()}
+            self._begin(ended)
+            now = self._now()
+            observations, infos = self._observe(now), self._infos(now, expose | ended)
+            infos |= {"final_obs": last, "_final_obs": ended, "final_info": final, "_final_info": ended}
         return observations, *judged, infos
 
-    def _begun_again(
-        self,
-        observations: Observations,
-        infos: dict[str, Any],
-        exposed: Bool[np.ndarray, "worlds"],
-        *judged: np.ndarray,
-    ) -> tuple[Any, ...]:
-        """Return what a step returns once the worlds that have ended are reset: their last ones are in the info."""
-        ended, last = self._episodes.ended.copy(), np.full(self.num_envs, None, dtype=object)
-        for world in np.flatnonzero(ended).tolist():
-            last[world] = of_world(observations, world)
-        final = {name: ended if name.startswith("_") else values for name, values in infos.items()}
-        self._begin(ended)
-        now = Measured.current(self._simulator, self._reality.encoders)
-        infos = self._infos(now, exposed | ended)
-        infos |= {"final_obs": last, "_final_obs": ended, "final_info": final, "_final_info": ended}
-        return self._observe(now, self._episodes.routes.distance(now.tip)), *judged, infos
+    def _now(self, step: Step | None = None) -> Measured:
+        return Measured.of(self._simulator, self._reality.encoders, self._episodes.routes, step)
 
-    def _expose(self, mask: Bool[np.ndarray, "worlds"], encoders: Float[np.ndarray, "worlds devices 2"]) -> None:
-        """Take exposures in the worlds of a mask."""
+    def _expose(self, mask: Bool[np.ndarray, "worlds"]) -> None:
         if self._c_arms is not None:
-            registration_mm = self._reality.drawn.registration_mm
+            encoders, registration_mm = self._reality.encoders, self._reality.drawn.registration_mm
             self._c_arms.expose(mask, self._simulator, encoders, registration_mm, self._episodes.time_s)
 
-    def _observe(self, now: Measured, distances: Float[np.ndarray, "worlds devices"]) -> Observations:
-        episodes = self._episodes
+    def _observe(self, now: Measured) -> Observations:
+        episodes, share = self._episodes, self._episodes.time_s / self._episodes.seconds
         if self._c_arms is not None:
-            exposed, images = self._c_arms.exposed, self._given["observation"] == "image"
+            exposed, images = self._c_arms.exposed, isinstance(self.single_observation_space, Dict)
             routes = None if images else episodes.routes
-            measured = observe_exposed(self._reality.proximal, exposed, routes, episodes.time_s, episodes.time_share)
+            measured = observe_exposed(self._reality.proximal, exposed, routes, episodes.time_s, share)
             return {"image": exposed.image.copy(), "measured": measured} if images else measured
-        return observe(now, episodes.routes, distances, episodes.force_limit_n, episodes.time_share)
+        return observe(now, episodes.routes, episodes.force_limit_n, share)
 
     def draw_from(self, *generators: np.random.Generator) -> None:
         """Let each world draw its starts from a generator that the caller holds."""
         self._generators = list(generators)
 
     def _begin(self, mask: Bool[np.ndarray, "worlds"]) -> None:
-        """Start an episode in the worlds of a mask."""
         self._reality.begin(mask, self._generators)
         self._episodes.begin(mask, self._simulator.project())
         if self._c_arms is not None:
             self._c_arms.begin(mask, self._generators)
-            self._expose(mask, self._reality.encoders)
+            self._expose(mask)
 
     def _infos(self, now: Measured, exposed: Bool[np.ndarray, "worlds"]) -> dict[str, Any]:
         infos = self._episodes.infos(now)
@@ -350,13 +335,10 @@ class NavigateVectorEnv(VectorEnv):
     @property
     def state(self) -> NavigationState:
         """All that the future depends on, to be kept and given to `set_state`."""
-        return NavigationState(
-            self._simulator.state,
-            **self._episodes.arrays(),
-            generators=tuple(dict(copy.deepcopy(generator.bit_generator.state)) for generator in self._generators),
-            drawn=copy.deepcopy(self._reality.drawn),
-            exposed=None if self._c_arms is None else copy.deepcopy(self._c_arms.exposed),
-        )
+        kept = {"episodes": {name: getattr(self._episodes, name) for name in _CHANGING}, "drawn": self._reality.drawn}
+        kept["generators"] = [generator.bit_generator.state for generator in self._generators]
+        kept["exposed"] = self._c_arms and self._c_arms.exposed
+        return NavigationState(self._simulator.state, copy.deepcopy(kept))
 
     def set_state(self, state: NavigationState) -> None:
         """Go back to a state, bit by bit.
@@ -365,12 +347,13 @@ class NavigateVectorEnv(VectorEnv):
             InputError: it is that of other navigations or settings.
         """
         self._simulator.set_state(state.simulator)
-        self._episodes.set_arrays(state.steps, state.distance, state.safe, state.ended)
-        self._reality.drawn = copy.deepcopy(state.drawn)
+        kept = copy.deepcopy(state.kept)
+        self._reality.drawn = kept["drawn"]
+        vars(self._episodes).update(kept["episodes"])
         if self._c_arms is not None:
-            self._c_arms.exposed = copy.deepcopy(state.exposed)
-        for generator, kept in zip(self._generators, state.generators, strict=True):
-            generator.bit_generator.state = copy.deepcopy(kept)
+            self._c_arms.exposed = kept["exposed"]
+        for generator, before in zip(self._generators, kept["generators"], strict=True):
+            generator.bit_generator.state = before
 
     def render(self) -> tuple[UInt8[np.ndarray, "256 256 3"], ...] | None:
         """Return a picture of each world with `render_mode="rgb_array"`: vessel, target, wire and catheters."""
@@ -393,6 +376,6 @@ class NavigateVectorEnv(VectorEnv):
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
         self._given = kept["given"]
-        self._prepare(**self._given)
+        self._prepare(*self._given)
         self.set_state(kept["state"])
         self.spec, self.render_mode = kept["spec"], kept["render_mode"]

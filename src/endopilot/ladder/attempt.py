@@ -7,7 +7,7 @@ import binascii
 import hashlib
 import zlib
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from endopilot.ladder.apart import Apart
 from endopilot.ladder.terms import DRAWN, Terms
 from endopilot.navigation.loop import NavigationLoop
 from endopilot.navigation.policies import make_policy
-from endopilot.navigation.policy import Decision, Observation, Policy
+from endopilot.navigation.policy import Decision, Observation
 from endopilot.navigation.record import NavigationRecord
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import Task
@@ -68,11 +68,8 @@ class Recording:
         """
         control, exposed = _unpack(text, "control", "<f8"), _unpack(text, "exposed", "|u1") != 0
         believed = None if text["believed_mm"] is None else _unpack(text, "believed_mm", "<f8")
-        count = len(exposed)
-        for name, size in (
-            ("control", len(control) / (2 * devices)),
-            ("believed_mm", count if believed is None else len(believed)),
-        ):
+        count, sizes = len(exposed), {"control": len(control) / (2 * devices)}
+        for name, size in (sizes if believed is None else sizes | {"believed_mm": len(believed)}).items():
             if size != count or count == 0:
                 raise InputError(f"{name}: {size:g} decisions, exposed: {count}; each must have one value a decision")
         if not exposed[0]:
@@ -101,7 +98,7 @@ def attempt(policy: str, navigation: Navigation, *, seed: int, terms: Terms | No
     """
     terms = terms or Terms()
     with Apart(policy) if terms.request else nullcontext(make_policy(policy)) as driver:
-        record = _loop(navigation, driver, seed, terms).run()
+        record = NavigationLoop(navigation, driver, config=terms.loop, seed=seed, world=terms.world).run()
     result = {"seed": seed} | scored(navigation, record, tells=isinstance(driver, AgentPolicy))
     planning_s = getattr(driver, "planning_s", None)
     return result if planning_s is None else result | {"planning_s": round(planning_s, 2)}
@@ -115,7 +112,17 @@ def scored(navigation: Navigation, record: NavigationRecord, *, tells: bool = Fa
     """
     believed = record.believed[:-1, 0] if tells and record.believed is not None else None
     recording = Recording(record.control[:-1], record.exposed[:-1], believed, record.reason == "gave up")
-    return _figures(navigation, record, recording) | {"course": _course(record), "recording": recording.packed()}
+    course = {
+        "time_s": record.time_s.tolist(),
+        "inserted_length": record.inserted_length[:, 0].round(4).tolist(),
+        "rotation": record.rotation[:, 0].round(4).tolist(),
+        "catheter_inserted_length": record.inserted_length[:, 1:].round(4).tolist(),
+        "catheter_rotation": record.rotation[:, 1:].round(4).tolist(),
+        "tip_position": record.tip_position[:, 0].round(3).tolist(),
+        "contact_force_max": record.contact_force_max.round(5).tolist(),
+        "exposed": record.exposed.tolist(),
+    }
+    return _figures(navigation, record, recording) | {"course": course, "recording": recording.packed()}
 
 
 def repeat(recording: Recording, navigation: Navigation, *, seed: int) -> dict[str, Any]:
@@ -127,38 +134,30 @@ def repeat(recording: Recording, navigation: Navigation, *, seed: int) -> dict[s
     Raises:
         InputError: the recording is longer or shorter than the navigation.
     """
-    record = driven(recording, navigation, seed=seed)
+    record = begun(recording, navigation, seed=seed).run()
     given, needed = len(recording.control), len(record.control) - 1
     if given != needed:
         raise InputError(f"control: holds {given} decisions, and the navigation ends after {needed}")
     return _figures(navigation, record, recording)
 
 
-def driven(recording: Recording, navigation: Navigation, *, seed: int) -> NavigationRecord:
-    """Return how a navigation goes under what was recorded: its trajectory is the recorded one to the bit.
-
-    Raises:
-        InputError: the recording is shorter than the navigation.
-    """
-    return begun(recording, navigation, seed=seed).run()
-
-
 def begun(recording: Recording, navigation: Navigation, *, seed: int) -> NavigationLoop:
-    """Return the loop that drives a navigation as it was recorded, at its start."""
-    return _loop(navigation, Repeated(recording), seed, recording.terms)
+    """Return the loop that drives a navigation as it was recorded, at its start; its `run` is as recorded, to the bit.
 
-
-def _loop(navigation: Navigation, policy: Policy, seed: int, terms: Terms) -> NavigationLoop:
-    return NavigationLoop(navigation, policy, config=terms.loop, seed=seed, world=terms.world)
+    `run` raises `InputError` where the recording is shorter than the navigation.
+    """
+    terms = recording.terms
+    return NavigationLoop(navigation, Repeated(recording), config=terms.loop, seed=seed, world=terms.world)
 
 
 class Repeated:
     """A policy that decides what was recorded."""
 
     def __init__(self, recording: Recording) -> None:
-        self._control = [tuple((v, w) for v, w in devices) for devices in recording.control.tolist()]
-        self._expose_next = [*recording.exposed[1:].tolist(), False]
-        self._gave_up = recording.gave_up
+        devices = [tuple((v, w) for v, w in each) for each in recording.control.tolist()]
+        self._decisions = list(map(Decision, devices, [*recording.exposed[1:].tolist(), False]))
+        if recording.gave_up:
+            self._decisions[-1] = replace(self._decisions[-1], gives_up="as recorded")
         self._at = 0
 
     def start(self, navigation: Navigation, seed: int) -> None:
@@ -171,13 +170,10 @@ class Repeated:
         Raises:
             InputError: there is none.
         """
-        if self._at == len(self._control):
+        if self._at == len(self._decisions):
             raise InputError(f"control: holds {self._at} decisions, and the navigation goes on")
-        devices, expose = self._control[self._at], self._expose_next[self._at]
         self._at += 1
-        last = self._gave_up and self._at == len(self._control)
-        gives_up = "as recorded" if last else ""
-        return Decision(devices, expose=expose, gives_up=gives_up)
+        return self._decisions[self._at - 1]
 
 
 def _figures(navigation: Navigation, record: NavigationRecord, recording: Recording) -> dict[str, Any]:
@@ -198,7 +194,14 @@ def _figures(navigation: Navigation, record: NavigationRecord, recording: Record
     if recording.believed_mm is not None:
         radius = navigation.device.tip_radius_mm
         scored["events"] = list(navigation_events(record.tip[:, 0], record.exposed, recording.believed_mm, radius))
-    return scored | {"sha256": _digest(record, recording)}
+    digest = hashlib.sha256(f"{len(record.time_s)}".encode())
+    inserted, turned = record.inserted_length, record.rotation
+    course = (inserted[:, 0], turned[:, 0], record.tip_position[:, 0], record.contact_force_max)
+    course += (inserted[:, 1:], turned[:, 1:])
+    for array in (recording.control, recording.exposed, recording.believed_mm, record.exposed, *course):
+        if array is not None:
+            digest.update(array.astype(array.dtype.newbyteorder("<")).tobytes())
+    return scored | {"sha256": digest.hexdigest()}
 
 
 def navigation_events(
@@ -221,42 +224,11 @@ def navigation_events(
     return int(found[:, 0].sum()), int(found[:, 1].sum())
 
 
-def _digest(record: NavigationRecord, recording: Recording) -> str:
-    """Return the SHA-256 of the decisions and of the wire's course under them, to the bit."""
-    digest = hashlib.sha256(f"{len(record.time_s)}".encode())
-    inserted, turned = record.inserted_length, record.rotation
-    course = (inserted[:, 0], turned[:, 0], record.tip_position[:, 0], record.contact_force_max)
-    course += (inserted[:, 1:], turned[:, 1:])
-    for array in (recording.control, recording.exposed, recording.believed_mm, record.exposed, *course):
-        if array is not None:
-            digest.update(array.astype(array.dtype.newbyteorder("<")).tobytes())
-    return digest.hexdigest()
-
-
-def _course(record: NavigationRecord) -> dict[str, list]:
-    """Return how a navigation went, for pictures: a value at the start and one after each decision period."""
-    return {
-        "time_s": record.time_s.tolist(),
-        "inserted_length": record.inserted_length[:, 0].round(4).tolist(),
-        "rotation": record.rotation[:, 0].round(4).tolist(),
-        "catheter_inserted_length": record.inserted_length[:, 1:].round(4).tolist(),
-        "catheter_rotation": record.rotation[:, 1:].round(4).tolist(),
-        "tip_position": record.tip_position[:, 0].round(3).tolist(),
-        "contact_force_max": record.contact_force_max.round(5).tolist(),
-        "exposed": record.exposed.tolist(),
-    }
-
-
 def _pack(values: np.ndarray, kind: str) -> str:
     return base64.b64encode(zlib.compress(values.astype(kind).tobytes(), 9)).decode("ascii")
 
 
 def _unpack(text: dict[str, str | None], name: str, kind: str) -> np.ndarray:
-    """Return an array of a recording, flat.
-
-    Raises:
-        InputError: it cannot be read, or holds what is not finite.
-    """
     try:
         packed = base64.b64decode(text[name] or "", validate=True)
         values = np.frombuffer(zlib.decompressobj().decompress(packed, _MOST_BYTES), kind)

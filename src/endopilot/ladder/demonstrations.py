@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-from jaxtyping import UInt8
 
 from endopilot.dataset import parquet, schema
 from endopilot.devices.stack import column_prefixes, lines_from_tips
@@ -18,7 +17,6 @@ from endopilot.errors import InputError
 from endopilot.files import manifest, png_image, sha256, write_json, writing
 from endopilot.ladder.attempt import Recording, begun, navigation_seed
 from endopilot.ladder.submission import Submission, read_submission
-from endopilot.navigation.record import NavigationRecord
 from endopilot.progress import progress
 from endopilot.runs import claim
 from endopilot.tasks.task import Task
@@ -32,8 +30,6 @@ _VIEWS = tuple(f"observation.images.view_{1 + k}" for k in range(1 + _C_ARM.bipl
 _AT_DRIVE = ("inserted_length_mm", "rotation_rad", "drive_force_n", "drive_torque_nmm")
 _CHANNELS = 3
 """Of an image, all alike: networks that were trained on photographs take three."""
-
-Columns = dict[str, Any]
 
 
 def write_demonstrations(submission: str | Path, *, output: str | Path) -> dict[str, Any]:
@@ -80,13 +76,28 @@ def write_demonstrations(submission: str | Path, *, output: str | Path) -> dict[
                 "frame_index": np.arange(count),
                 "task_index": np.full(count, titles.index(task.title)),
             }
-            _write_episode(output, episode, task.title, columns, about, described, key)
+            data_path, episodes_path = schema.paths_of_file(output, episode)
+            chunk, file = divmod(episode, schema.FILES_PER_CHUNK)
+            row = {"episode_index": episode, "tasks": [task.title], "length": count}
+            row |= {"dataset_from_index": samples, "dataset_to_index": samples + count}
+            row |= {"data/chunk_index": chunk, "data/file_index": file} | about
+            row |= {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
+            _write(episodes_path, {name: [value] for name, value in row.items()}, key)
+            _write(data_path, {name: _column(columns[name], each) for name, each in described.items()}, key)
             for name, values in columns.items():
                 white = np.concatenate([image.reshape(-1) for image in values]) / 255 if name in _VIEWS else None
                 sums.add(name, np.asarray(values) if white is None else white)
             samples, exposures = samples + count, exposures + int(columns["exposed"].sum())
             advance()
-    _describe(output, described, titles, sums.stats(), len(chosen), samples)
+    stats: dict[str, Any] = sums.stats()
+    for name in _VIEWS:  # a row and a column, both of 1, for each channel
+        low_to_std = {key: [[value] for value in values] for key, values in stats[name].items() if key != "count"}
+        stats[name] |= {key: [value] * _CHANNELS for key, value in low_to_std.items()}
+    write_json(output / schema.STATS_PATH, stats)
+    with writing(output / schema.TASKS_PATH) as partial:
+        pd.DataFrame({"task_index": range(len(titles))}, index=pd.Index(titles, name="task")).to_parquet(partial)
+    about = schema.info(described, episodes=len(chosen), samples=samples, tasks=len(titles))
+    write_json(output / schema.INFO_PATH, about)
     write_json(output / schema.MANIFEST_PATH, manifest(config=None, inputs={path.name: key}, policy=read.policy))
     return {"dataset": output, "episodes": len(chosen), "samples": samples, "exposures": exposures}
 
@@ -111,7 +122,7 @@ def _features(devices: int) -> dict[str, Any]:
     }
 
 
-def _navigation(submission: Submission, task: Task, place: int) -> tuple[Columns, dict[str, Any]]:
+def _navigation(submission: Submission, task: Task, place: int) -> tuple[dict[str, Any], dict[str, Any]]:
     """Drive a navigation again, and return its columns and what the episode table says of it."""
     packed = submission.navigations[task.name][place].recording
     navigation, seed = task.ladder_navigation(place), navigation_seed(task, place)
@@ -120,7 +131,14 @@ def _navigation(submission: Submission, task: Task, place: int) -> tuple[Columns
     views = Views(navigation, loop.simulator.set_up.anatomies[0], _C_ARM, PIXELS)
     record = loop.run()
     count = len(record.control) - 1
-    images, age_s = _images(record, views, np.asarray(loop.world.registration_mm), seed)
+    random, images = np.random.default_rng([seed, 7]), []
+    exposed = np.flatnonzero(record.exposed[:count] | (np.arange(count) == 0))
+    for at in exposed.tolist():
+        nodes = record.shape[at] + np.asarray(loop.world.registration_mm)
+        devices = lines_from_tips(nodes[np.isfinite(nodes[:, 0])], record.inserted_length[at])
+        images.append(views.image(devices, random))
+    shown = np.searchsorted(exposed, np.arange(count), side="right") - 1
+    age_s = (np.arange(count) - exposed[shown]) * SAMPLE_PERIOD_S
     drives = np.concatenate([record.encoders[:count], record.load[:count]], axis=-1).reshape(count, -1)
     asked, last = np.append(record.exposed[1:count], False), np.arange(count) == count - 1
     columns = {
@@ -131,58 +149,19 @@ def _navigation(submission: Submission, task: Task, place: int) -> tuple[Columns
         "next.reward": last * float(record.success and record.safe),
         "next.done": last,
         "next.success": last & record.success,
-        **{name: [shown[k] for shown in images] for k, name in enumerate(_VIEWS)},
+        **{name: [images[of][k] for of in shown] for k, name in enumerate(_VIEWS)},
     }
     names = ("success", "safe", "reason", "peak_force_n", "exposures")
     about = {"ladder_task": task.name, "anatomy": navigation.anatomy.name, "seed": seed}
     return columns, about | {name: getattr(record, name) for name in names}
 
 
-def _images(
-    record: NavigationRecord, views: Views, registration_mm: np.ndarray, seed: int
-) -> tuple[list[UInt8[np.ndarray, "views rows columns"]], list[float]]:
-    """Return the images of the last exposure at each decision, and its age, s; the first decision has one."""
-    random = np.random.default_rng([seed, 7])
-    images, ages, shown, since = [], [], None, 0
-    for at in range(len(record.control) - 1):
-        if record.exposed[at] or shown is None:
-            nodes = record.shape[at] + registration_mm
-            devices = lines_from_tips(nodes[np.isfinite(nodes[:, 0])], record.inserted_length[at])
-            shown, since = views.image(devices, random), at
-        images.append(shown)
-        ages.append((at - since) * SAMPLE_PERIOD_S)
-    return images, ages
+def _write(path: Path, table: Mapping[str, Any], key: str) -> None:
+    with writing(path) as partial:
+        partial.write_bytes(parquet.parquet_bytes(parquet.marked_table(table, key)))
 
 
-def _write_episode(
-    output: Path,
-    episode: int,
-    title: str,
-    columns: Columns,
-    about: Mapping[str, Any],
-    described: Mapping[str, Any],
-    key: str,
-) -> None:
-    """Write a navigation: its row of the episode table, then its samples."""
-    data_path, episodes_path = schema.paths_of_file(output, episode)
-    chunk, file = divmod(episode, schema.FILES_PER_CHUNK)
-    begins, count = int(columns["index"][0]), len(columns["index"])
-    row = {
-        "episode_index": episode,
-        "tasks": [title],
-        "length": count,
-        "dataset_from_index": begins,
-        "dataset_to_index": begins + count,
-        "data/chunk_index": chunk,
-        "data/file_index": file,
-        **about,
-        "meta/episodes/chunk_index": chunk,
-        "meta/episodes/file_index": file,
-    }
-    samples = {name: _column(columns[name], each) for name, each in described.items()}
-    for path, table in ((episodes_path, {name: [value] for name, value in row.items()}), (data_path, samples)):
-        with writing(path) as partial:
-            partial.write_bytes(parquet.parquet_bytes(parquet.marked_table(table, key)))
+_IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 
 
 def _column(values: Any, feature: Mapping[str, Any]) -> pa.Array:
@@ -190,20 +169,3 @@ def _column(values: Any, feature: Mapping[str, Any]) -> pa.Array:
         files = {id(image): png_image(np.repeat(image[..., None], 3, axis=-1)) for image in values}
         return pa.array([{"bytes": files[id(image)], "path": None} for image in values], _IMAGE)
     return parquet.column(np.asarray(values), feature["dtype"], feature["names"])
-
-
-_IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-
-
-def _describe(
-    output: Path, described: Mapping[str, Any], titles: Sequence[str], stats: Mapping[str, Any], episodes: int, n: int
-) -> None:
-    """Write statistics, tasks and the columns."""
-    for name in _VIEWS:  # a row and a column, both of 1, for each channel
-        low_to_std = {key: [[value] for value in values] for key, values in stats[name].items() if key != "count"}
-        stats = {**stats, name: {**stats[name], **{key: [value] * _CHANNELS for key, value in low_to_std.items()}}}
-    write_json(output / schema.STATS_PATH, stats)
-    tasks = pd.DataFrame({"task_index": range(len(titles))}, index=pd.Index(titles, name="task"))
-    with writing(output / schema.TASKS_PATH) as partial:
-        tasks.to_parquet(partial)
-    write_json(output / schema.INFO_PATH, schema.info(described, episodes=episodes, samples=n, tasks=len(titles)))

@@ -9,17 +9,16 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, model_validator
 
-from endopilot import __version__
-from endopilot.devices.robot import ASSUMED, RobotConfig, read_robot
+from endopilot.devices.robot import ASSUMED, read_robot
 from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import attempt, navigation_seed
 from endopilot.ladder.scores import score
 from endopilot.ladder.submission import MOST_PATIENTS, SUBMISSION_FILE, write_submission
-from endopilot.ladder.terms import Terms, task_digest
+from endopilot.ladder.terms import Terms
 from endopilot.navigation.policies import POLICIES, make_policy
 from endopilot.runs import claim, make_missing
 from endopilot.settings import Text, Within, settings
-from endopilot.simulation.world import NOMINAL, World, read_world
+from endopilot.simulation.world import NOMINAL, read_world
 from endopilot.tasks.task import NEWEST, LadderVersion, Task, find_task, list_tasks
 
 SCORES_FILE = "ladder.json"
@@ -116,7 +115,7 @@ def climb(*, output: str | Path, config: LadderConfig | None = None) -> list[dic
     output = Path(output)
     make_policy(config.policy)
     terms = terms_of(config)
-    claim(output, "endopilot ladder", **identity(config.policy, terms.version, terms.robot, terms.world, terms.request))
+    claim(output, "endopilot ladder", **terms.identity(config.policy))
     paths = config.paths(output)
     make_missing(f"Ladder, {config.policy}", paths, partial(_navigate, policy=config.policy, terms=terms))
     tasks = config.chosen
@@ -131,22 +130,7 @@ def climb(*, output: str | Path, config: LadderConfig | None = None) -> list[dic
     return rows
 
 
-def identity(
-    policy: str,
-    version: LadderVersion,
-    robot: RobotConfig | None = None,
-    world: World | None = None,
-    request: str = "",
-) -> dict[str, Any]:
-    """Return what a policy's results follow from: its source, tasks, their devices, robot, world and version."""
-    tasks = {task.name: task_digest(task) for task in list_tasks(version)}
-    found = {"policy": policy, "origin": POLICIES.origin(policy), "tasks": tasks, "robot": robot or RobotConfig()}
-    found |= {"request": request} if request else {}
-    return found | {"world": (world or World()).differences(), "version": __version__}
-
-
 def _navigate(path: Path, *, policy: str, terms: Terms) -> None:
-    """Do one navigation and write what came of it."""
     task, place = terms.task(path.parent.name), int(path.stem)
     navigation = task.ladder_navigation(place)
     result = attempt(policy, navigation, seed=navigation_seed(task, place), terms=terms)

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json, writing
 from endopilot.ladder.attempt import attempt, navigation_seed
-from endopilot.ladder.ladder import LadderConfig, identity, terms_of
+from endopilot.ladder.ladder import LadderConfig, terms_of
 from endopilot.ladder.scores import score_navigations
 from endopilot.ladder.terms import Terms
 from endopilot.navigation.policies import make_policy
@@ -50,12 +50,17 @@ def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[d
     make_policy(config.policy)
     tasks = config.chosen
     terms = terms_of(config)
-    claim(output, "endopilot ladder --mismatch", **identity(config.policy, terms.version, terms.robot), mismatch=share)
+    claim(output, "endopilot ladder --mismatch", **terms.identity(config.policy), mismatch=share)
     paths = {case: config.paths(output / case) for case in CASES}
     every = [path for of_case in paths.values() for path in of_case]
     navigate = partial(_navigate, policy=config.policy, terms=terms, share=share)
     make_missing(f"Model mismatch, {config.policy}", every, navigate)
-    rows = [{"case": case} | _scores([read_json(path) for path in paths[case]]) for case in CASES]
+    rows = []
+    for case, of_case in paths.items():
+        results = [read_json(path) for path in of_case]
+        exposures, seconds = (sum(result[name] for result in results) for name in ("exposures", "seconds"))
+        row = {"case": case, "navigations": len(results)} | score_navigations(results)
+        rows.append(row | {"exposures_per_minute": round(exposures / (seconds / 60), 1)})
     with writing(output / PICTURE_FILE) as partly:
         partly.write_bytes(_picture(rows, config.policy, share))
     content = {
@@ -72,10 +77,9 @@ def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[d
 
 def world_of(case: str, share: float, navigation: Navigation, task: Task, place: int) -> World:
     """Return what reality is in one case and one patient."""
-    change: dict[str, float] = {}
+    change = {}
     if case == "all":
-        random = np.random.default_rng([task.ladder.seed, task.ladder.numbers[place], 1])
-        change = drawn_sides(share, random)
+        change = drawn_sides(share, np.random.default_rng([task.ladder.seed, task.ladder.numbers[place], 1]))
     elif case != "matched":
         name, side = case.split("-")
         change = {name: share if side == "more" else -share}
@@ -90,18 +94,7 @@ def _navigate(path: Path, *, policy: str, terms: Terms, share: float) -> None:
     write_json(path, {"task": task.name, "patient": navigation.anatomy.name} | result)
 
 
-def _scores(results: list[dict[str, Any]]) -> dict[str, Any]:
-    minutes = sum(result["seconds"] for result in results) / 60
-    exposures = sum(result["exposures"] for result in results)
-    return (
-        {"navigations": len(results)}
-        | score_navigations(results)
-        | {"exposures_per_minute": round(exposures / minutes, 1)}
-    )
-
-
 def _picture(rows: list[dict[str, Any]], policy: str, share: float) -> bytes:
-    """Draw safe success and exposures of each case."""
     import matplotlib
 
     from endopilot.plotting import BLUE, ORANGE, STYLE, png
@@ -126,7 +119,6 @@ def _picture(rows: list[dict[str, Any]], policy: str, share: float) -> bytes:
 
 def title_of(case: str, share: float) -> str:
     """Return a case in words."""
-    if case in ("matched", "all"):
-        return {"matched": "matched", "all": f"all, ±{100 * share:g} %"}[case]
-    name, side = case.split("-")
-    return f"{name} {'+' if side == 'more' else '−'}{100 * share:g} %"
+    name, _, side = case.partition("-")
+    sign = {"more": " +", "less": " −"}.get(side, ", ±")
+    return case if case == "matched" else f"{name}{sign}{100 * share:g} %"

@@ -11,7 +11,7 @@ import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from itertools import zip_longest
@@ -214,72 +214,6 @@ def read_submission(path: str | Path) -> Submission:
     """
     path = Path(path)
     submission = read_settings(path, Submission, remedy="give a submission.json of `endopilot ladder`")
-    _refuse_another_ladder(path, submission)
-    return submission
-
-
-def check_submission(path: str | Path, *, policy: str = "") -> SubmissionCheck:
-    """Drive all recordings of a submission file again, and compare every figure to the bit; nothing else is believed.
-
-    They are driven with the file's kernel of linear algebra, one of `KERNELS`. A policy that is at hand also decides
-    again: its exposures are counted then. Where it decides otherwise, the file fails, unless it is of another version.
-
-    Args:
-        path: the file.
-        policy: MODULE:OBJECT of the file's policy, where you have it and trust it; shipped ones are at hand.
-
-    Raises:
-        InputError: the file is no submission, its tasks or seeds are not those of this ladder, or it was made with a
-            kernel that nobody can drive it again with.
-    """
-    submission = read_submission(path)
-    kernel, at_hand = submission.blas or "none", submission.policy in (*POLICIES.shipped, policy)
-    if kernel not in KERNELS:
-        raise InputError(
-            f"{path}: blas: {kernel}; submissions are driven again with {' or '.join(KERNELS)}: run the ladder again "
-            "with OPENBLAS_CORETYPE=Haswell"
-        )
-    judged = partial(
-        SubmissionCheck,
-        policy=submission.policy,
-        origin=submission.origin,
-        key=submission.terms.key(),
-        kernel=kernel,
-        navigations=sum(map(len, submission.navigations.values())),
-    )
-    with _running(kernel) as (runs, pool), tempfile.TemporaryDirectory(prefix="endopilot-") as folder:
-        if not runs:
-            remark = f"this machine does not run {kernel}: nothing was driven again"
-            return judged(verdict="not judged", difference=None, scores=(), remarks=(remark,))
-        return judged(**_driven_again(submission, Path(folder), pool, at_hand))
-
-
-@contextmanager
-def _running(kernel: str) -> Iterator[tuple[bool, Workers | None]]:
-    """Yield whether this machine runs a kernel of linear algebra, and processes that do, unless this one does."""
-    if kernel == blas_kernel():
-        yield True, None
-        return
-    before = os.environ.get("OPENBLAS_CORETYPE")
-    os.environ["OPENBLAS_CORETYPE"] = kernel.partition(" ")[2]  # which OpenBLAS reads as it is loaded
-    try:
-        with Workers() as pool:
-            yield KERNELS[kernel] in _core.supported_levels() and _runs(pool, kernel), pool
-    finally:
-        del os.environ["OPENBLAS_CORETYPE"]
-        os.environ |= {} if before is None else {"OPENBLAS_CORETYPE": before}
-
-
-def _runs(pool: Workers, kernel: str) -> bool:
-    """Return whether processes run a kernel; some libraries do not let theirs be chosen."""
-    try:
-        return pool.submit(blas_kernel).result() == kernel
-    except BrokenProcessPool:
-        return False
-
-
-def _refuse_another_ladder(path: Path, submission: Submission) -> None:
-    """Refuse tasks, patients or seeds that are not those of this ladder: the replay alone would not show a seed."""
     if set(submission.tasks) != set(submission.navigations):
         raise InputError(f"{path}: tasks and navigations name different tasks; give the file as it was written")
     counts = {name: len(entries) for name, entries in submission.navigations.items()}
@@ -306,15 +240,71 @@ def _refuse_another_ladder(path: Path, submission: Submission) -> None:
         for place, entry in enumerate(entries):
             if entry.seed != (seed := navigation_seed(tasks[name], place)):
                 raise InputError(f"{path}: task {name}, patient {place}: seed {entry.seed}; the ladder's is {seed}")
+    return submission
+
+
+def check_submission(path: str | Path, *, policy: str = "") -> SubmissionCheck:
+    """Drive all recordings of a submission file again, and compare every figure to the bit; nothing else is believed.
+
+    They are driven with the file's kernel of linear algebra, one of `KERNELS`. A policy that is at hand also decides
+    again: its exposures are counted then. Where it decides otherwise, the file fails, unless it is of another version.
+
+    Args:
+        path: the file.
+        policy: MODULE:OBJECT of the file's policy, where you have it and trust it; shipped ones are at hand.
+
+    Raises:
+        InputError: the file is no submission, its tasks or seeds are not those of this ladder, or it was made with a
+            kernel that nobody can drive it again with.
+    """
+    submission = read_submission(path)
+    kernel, at_hand = submission.blas or "none", submission.policy in (*POLICIES.shipped, policy)
+    if kernel not in KERNELS:
+        raise InputError(
+            f"{path}: blas: {kernel}; submissions are driven again with {' or '.join(KERNELS)}: run the ladder again "
+            "with OPENBLAS_CORETYPE=Haswell"
+        )
+    remark = f"this machine does not run {kernel}: nothing was driven again"
+    found: dict[str, Any] = {"verdict": "not judged", "difference": None, "scores": (), "remarks": (remark,)}
+    with _running(kernel) as (runs, pool), tempfile.TemporaryDirectory(prefix="endopilot-") as folder:
+        if runs:
+            found = _driven_again(submission, Path(folder), pool, at_hand)
+    return SubmissionCheck(
+        policy=submission.policy,
+        origin=submission.origin,
+        key=submission.terms.key(),
+        kernel=kernel,
+        navigations=sum(map(len, submission.navigations.values())),
+        **found,
+    )
+
+
+@contextmanager
+def _running(kernel: str) -> Iterator[tuple[bool, Workers | None]]:
+    """Yield whether this machine runs a kernel of linear algebra, and processes that do, unless this one does."""
+    if kernel == blas_kernel():
+        yield True, None
+        return
+    before = os.environ.get("OPENBLAS_CORETYPE")
+    os.environ["OPENBLAS_CORETYPE"] = kernel.partition(" ")[2]  # which OpenBLAS reads as it is loaded
+    try:
+        with Workers() as pool:
+            runs = False
+            if KERNELS[kernel] in _core.supported_levels():
+                with suppress(BrokenProcessPool):  # some libraries do not let their kernel be chosen
+                    runs = pool.submit(blas_kernel).result() == kernel
+            yield runs, pool
+    finally:
+        del os.environ["OPENBLAS_CORETYPE"]
+        os.environ |= {} if before is None else {"OPENBLAS_CORETYPE": before}
 
 
 def _driven_again(submission: Submission, folder: Path, pool: Workers | None, at_hand: bool) -> dict[str, Any]:
-    """Drive all recordings again, and let a policy that is at hand decide again.
-
-    Returns:
-        Verdict, first difference, scores and remarks of `SubmissionCheck`.
-    """
-    terms, policy, remarks = submission.terms, submission.policy, _remarks(submission)
+    """Return verdict, first difference, scores and remarks of `SubmissionCheck`."""
+    terms, policy = submission.terms, submission.policy
+    here = {**manifest(config=None)["versions"], "core": _core.LEVEL, "blas": blas_kernel()}
+    made = {**submission.versions, "core": submission.core, "blas": submission.blas}
+    remarks = [f"made with {of} {made.get(of)}, checked with {now}" for of, now in here.items() if made.get(of) != now]
     tasks = sorted(map(terms.task, submission.navigations), key=lambda task: task.level)
     entries = {
         folder / task.name / f"{place:02d}.json": entry
@@ -328,7 +318,7 @@ def _driven_again(submission: Submission, folder: Path, pool: Workers | None, at
     again = {path: {} if path in bad else read_json(path) for path in entries}
     otherwise = [path for path, figures in again.items() if not figures.pop("decided", False)]
     if at_hand and otherwise:
-        remarks += (f"{policy} decides otherwise here in {len(otherwise)} of {len(entries)} navigations",)
+        remarks.append(f"{policy} decides otherwise here in {len(otherwise)} of {len(entries)} navigations")
     forged = otherwise if at_hand and submission.origin == POLICIES.origin(policy) else []
     found = {
         path: str(bad[path]) if path in bad else _difference(entry.figures(), again[path])
@@ -347,18 +337,14 @@ def _driven_again(submission: Submission, folder: Path, pool: Workers | None, at
         differing = [f"scores, {task}: {remark}" for task, remark in said if remark]
     decided = at_hand and not otherwise
     if not decided:
-        rows = [{_claimed(name): value for name, value in row.items()} for row in rows]
+        claimed = {name: f"{name}_as_recorded" for name in ("exposures", "missed_events")}
+        rows = [{claimed.get(name, name): value for name, value in row.items()} for row in rows]
     return {
         "verdict": "failed" if differing else "decided again" if decided else "replayed",
         "difference": differing[0] if differing else None,
         "scores": () if differing else rows,
-        "remarks": remarks,
+        "remarks": tuple(remarks),
     }
-
-
-def _claimed(name: str) -> str:
-    """Return the name of a figure where nobody decided again."""
-    return f"{name}_as_recorded" if name in ("exposures", "missed_events") else name
 
 
 def recorded_navigation(path: Path, name: str | None, place: int) -> tuple[Task, int, Recording]:
@@ -409,14 +395,3 @@ def _difference(given: Mapping[str, Any], again: Mapping[str, Any]) -> str | Non
         if before != now:
             return f"{name} is {before} in the file and {now} when driven again"
     return None
-
-
-def _remarks(submission: Submission) -> tuple[str, ...]:
-    """Return in what this installation differs from the one that made the file."""
-    here = {**manifest(config=None)["versions"], "core": _core.LEVEL, "blas": blas_kernel()}
-    made = {**submission.versions, "core": submission.core, "blas": submission.blas}
-    return tuple(
-        f"made with {name} {made.get(name)}, checked with {value}"
-        for name, value in here.items()
-        if made.get(name) != value
-    )

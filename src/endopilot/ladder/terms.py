@@ -11,6 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from endopilot import __version__
 from endopilot.atlas.atlas import make_patient_tree
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
@@ -18,6 +19,7 @@ from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
 from endopilot.files import input_hash, json_text
 from endopilot.navigation.loop import LoopConfig
+from endopilot.navigation.policies import POLICIES
 from endopilot.settings import from_record
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S
@@ -89,17 +91,26 @@ class Terms:
 
     def key(self) -> dict[str, Any]:
         """Return what must be equal for two scores to be compared, and what differs from the ladder's own terms."""
-        tasks = {task.name: task_digest(task) for task in list_tasks(self.version)}
         usual, robot = asdict(RobotConfig()), asdict(self.robot)
         return {
             "ladder": self.version,
-            "tasks": _digest(tasks),
+            "tasks": _digest(self._tasks),
             "patients": "drawn" if self.request else "the ladder's",
             "robot": {name: value for name, value in robot.items() if value != usual[name]},
             "world": self.world.differences(),
             "settings": _digest(self.loop),
             "decision_period_s": DECISION_PERIOD_S,
         }
+
+    def identity(self, policy: str) -> dict[str, Any]:
+        """Return what a policy's results follow from: its source, tasks, their devices, robot, world and version."""
+        found = {"policy": policy, "origin": POLICIES.origin(policy), "tasks": self._tasks, "robot": self.robot}
+        found |= {"request": self.request} if self.request else {}
+        return found | {"world": self.world.differences(), "version": __version__}
+
+    @property
+    def _tasks(self) -> dict[str, str]:
+        return {task.name: task_digest(task) for task in list_tasks(self.version)}
 
 
 def task_digest(task: Task) -> str:

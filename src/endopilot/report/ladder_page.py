@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from plotly.offline import get_plotlyjs
 
 from endopilot.files import read_json, writing
-from endopilot.ladder.attempt import driven, navigation_seed
+from endopilot.ladder.attempt import begun, navigation_seed
 from endopilot.ladder.ladder import SCORES_FILE
 from endopilot.ladder.submission import recorded_navigation
 from endopilot.ladder.terms import Terms
@@ -88,7 +88,7 @@ def _replay_scene(task: Task, navigation: Navigation, result: dict[str, Any], pa
     """Return a navigation replayed in space, with its target, what X-ray showed, and what came of it."""
     course = result["course"]
     *_, recording = recorded_navigation(path, task.name, 0)
-    record = driven(recording, navigation, seed=navigation_seed(task, 0))
+    record = begun(recording, navigation, seed=navigation_seed(task, 0)).run()
     figure = navigation_scene(navigation.anatomy, record.trajectory, devices=navigation.devices)
     exposed = np.array(course["exposed"])
     observed, seconds = np.array(course["tip_position"])[exposed], np.array(course["time_s"])[exposed]

@@ -25,7 +25,6 @@ Arrives = Literal["wire", "catheter"]
 """Whose tip is to reach the target: the wire's, or that of the catheter next to it."""
 XrayKind = Literal["assumed", "images"]
 """How an exposure finds the tip: with assumed errors of detection, or in X-ray images."""
-_ARRIVING: dict[Arrives, int] = {"wire": 0, "catheter": 1}
 
 
 @settings
@@ -122,7 +121,7 @@ class Navigation:
     @property
     def arriving(self) -> int:
         """Place among `devices` of the one whose tip is to go to the target."""
-        return _ARRIVING[self.arrives]
+        return int(self.arrives == "catheter")
 
     @property
     def stack(self) -> Stack:

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from endopilot.devices.device import Device
 from endopilot.devices.drive_limits import WIDE_MM
 from endopilot.errors import InputError
+from endopilot.lines import places_on
 from endopilot.tasks.navigation import Target
 from endopilot.types import Anatomy, Centerline, TipProjection, VesselTree
 
@@ -144,7 +145,7 @@ class Route:
     def _curvature(self) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
         """Abscissae along the route, mm, and the curvature of its smoothed line there, 1/mm."""
         at = np.arange(self.line.abscissa[0], self.line.abscissa[-1], _EVERY_MM)
-        points = np.column_stack([np.interp(at, self.line.abscissa, axis) for axis in self.line.points.T])
+        points = places_on(self.line.points, self.line.abscissa, at)
         weight = np.exp(-(((at[:, None] - at) / self.radius(at)[:, None]) ** 2) / 2)
         smooth = weight @ points / weight.sum(axis=1, keepdims=True)
         along = np.gradient(smooth, axis=0)

@@ -6,11 +6,11 @@ import re
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import Target
-from endopilot.types import Centerline, VesselTree
+from endopilot.types import VesselTree
 
 OUTSIDE_MM = 2.0
 """A point this far outside the lumen is no target, mm."""
@@ -53,8 +53,15 @@ def find_target(tree: VesselTree, place: Place, *, depth_mm: float | None = None
     if len(numbers) > 1 and not re.sub(r"[-+0-9.e,;\s]", "", place):
         mend = f"write it as {','.join(numbers)}" if len(numbers) == 3 else f"these are {len(numbers)} numbers"
         raise InputError(f"target: {place!r}; a point is X,Y,Z in LPS mm, three numbers with commas: {mend}")
-    label = _section(tree, place)
-    return _middle(tree, label) if depth_mm is None else _beyond(tree, label, depth_mm)
+    present = {present.lower(): present for present in tree.sections_present}
+    for known in _ALIASES.get(place.lower(), (place.lower(),)):
+        if known in present:
+            label = tree.section_names.index(present[known])
+            return _middle(tree, label) if depth_mm is None else _beyond(tree, label, depth_mm)
+    raise InputError(
+        f"target: {place!r}; the vessel has no such section (it has {', '.join(tree.sections_present)}); "
+        "give one of them, or a point X,Y,Z in LPS mm"
+    )
 
 
 def section_at(tree: VesselTree, branch: int, abscissa: float) -> str:
@@ -70,29 +77,11 @@ def section_at(tree: VesselTree, branch: int, abscissa: float) -> str:
     return tree.section_names[int(tree.branches[branch].section[at])]
 
 
-def _section(tree: VesselTree, name: str) -> int:
-    """Return the index of a section that a vessel has."""
-    present = {present.lower(): present for present in tree.sections_present}
-    for known in _ALIASES.get(name.lower(), (name.lower(),)):
-        if known in present:
-            return tree.section_names.index(present[known])
-    raise InputError(
-        f"target: {name!r}; the vessel has no such section (it has {', '.join(tree.sections_present)}); "
-        "give one of them, or a point X,Y,Z in LPS mm"
-    )
-
-
 def _middle(tree: VesselTree, label: int) -> Target:
     """Return the middle of a section, on the branch that holds most of it."""
-    length = [_length(branch.centerline, branch.section == label) for branch in tree.branches]
-    branch = int(np.argmax(length))
-    own = tree.branches[branch].centerline.abscissa[tree.branches[branch].section == label]
-    return Target(branch=branch, abscissa=float((own[0] + own[-1]) / 2))
-
-
-def _length(line: Centerline, own: Bool[np.ndarray, "n"]) -> float:
-    at = line.abscissa[own]
-    return float(at[-1] - at[0]) if len(at) else -1.0
+    own = [branch.centerline.abscissa[branch.section == label] for branch in tree.branches]
+    branch = int(np.argmax([at[-1] - at[0] if len(at) else -1.0 for at in own]))
+    return Target(branch=branch, abscissa=float((own[branch][0] + own[branch][-1]) / 2))
 
 
 def _beyond(tree: VesselTree, label: int, depth_mm: float) -> Target:

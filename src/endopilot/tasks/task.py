@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -45,9 +45,6 @@ LadderVersion = ShippedVersion | str
 NEWEST: LadderVersion = 2
 """The ladder's versions: 1 in textbook patients of the atlas, 2 in patients that resemble real ones, coaxial for four
 tasks of wire and catheter in patients of the latter kind; or a folder of tasks of one's own, a YAML file each."""
-_FOLDERS: dict[LadderVersion, Path] = {
-    version: Path(__file__).parent / f"ladder_{version}" for version in get_args(ShippedVersion)
-}
 
 
 @settings
@@ -121,10 +118,8 @@ class Task:
 
     @model_validator(mode="after")
     def _consistent(self) -> Task:
-        known: dict[str, tuple[str | None, ...]] = {}
-        if self.anatomies is None:
-            known = {"vessel": VESSELS, "device": list_wires(), "catheter": (*list_catheters(), None)}
-        for name, choices in known.items():
+        known = {"vessel": VESSELS, "device": list_wires(), "catheter": (*list_catheters(), None)}
+        for name, choices in known.items() if self.anatomies is None else ():
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name}: {getattr(self, name)!r}; choose from {', '.join(filter(None, choices))}")
         count = len(self.ladder.numbers)
@@ -166,12 +161,6 @@ class Task:
         point = None if self.targets_mm is None else self.targets_mm[place]
         return self.navigation(self.patient(self.ladder, place), start_rotation_rad=turn, target_mm=point)
 
-    def learning_navigation(self, place: int) -> Navigation:
-        """Return the task in one of the patients to learn on, or where it has none, in one of the ladder's."""
-        if self.training is None:
-            return self.ladder_navigation(place)
-        return self.navigation(self.patient(self.training, place))
-
     def target(self, tree: VesselTree) -> Target:
         """Return the target in its section of a tree.
 
@@ -212,7 +201,6 @@ class Task:
 
 @lru_cache(maxsize=8)  # each takes up to 0.12 GB, and up to 20 s to draw
 def _patient(atlas: AtlasConfig, number: int) -> Anatomy:
-    """Return a patient of an atlas."""
     return with_world_zero(make_patient(atlas, number))
 
 
@@ -223,10 +211,11 @@ def list_tasks(version: LadderVersion = NEWEST) -> tuple[Task, ...]:
     Raises:
         InputError: there is no such version or folder, or a file in the folder is no task.
     """
-    folder = _FOLDERS.get(version) or Path(str(version))
+    shipped = get_args(ShippedVersion)
+    folder = Path(__file__).parent / f"ladder_{version}" if version in shipped else Path(str(version))
     tasks = [_read_task(path) for path in folder.glob("*.yaml")]
     if not tasks:
-        known = ", ".join(map(str, _FOLDERS))
+        known = ", ".join(map(str, shipped))
         raise InputError(f"version: {version!r}; choose from {known}, or give a folder of tasks (*.yaml)")
     return tuple(sorted(tasks, key=lambda task: task.level))
 
@@ -236,17 +225,9 @@ def _read_task(path: Path) -> Task:
     task = read_settings(path, Task)
     if task.anatomies is None:
         return task
-
-    def seen(device: str) -> str:
-        beside = path.parent / device
-        return str(beside) if beside.is_file() else device
-
-    return replace(
-        task,
-        device=seen(task.device),
-        catheter=task.catheter and seen(task.catheter),
-        anatomies=tuple(str(path.parent / folder) for folder in task.anatomies),
-    )
+    devices = {name: path.parent / (getattr(task, name) or "") for name in ("device", "catheter")}
+    beside: dict[str, Any] = {name: str(file) for name, file in devices.items() if file.is_file()}
+    return replace(task, **beside, anatomies=tuple(str(path.parent / folder) for folder in task.anatomies))
 
 
 def find_task(name: str, *, version: LadderVersion = NEWEST) -> Task:
@@ -289,7 +270,11 @@ def training_navigations(name: str | None, first: int, count: int, version: Ladd
         InputError: the ladder has no such task, or the task fewer patients.
     """
     tasks = list_tasks(version) if name is None else (find_task(name, version=version),)
-    return [task.learning_navigation(first + place) for task in tasks for place in range(count)]
+    return [
+        task.navigation(task.patient(task.training, place)) if task.training else task.ladder_navigation(place)
+        for task in tasks
+        for place in range(first, first + count)
+    ]
 
 
 def in_catheter(navigations: Sequence[Navigation], name: str) -> list[Navigation]:
@@ -314,7 +299,7 @@ def without_catheter(navigation: Navigation) -> Navigation:
 @lru_cache(maxsize=1)
 def reference_navigation() -> Navigation:
     """Return `endopilot/Navigate-v0`'s navigation: into the posterior descending artery of the reference anatomy."""
-    anatomy = with_world_zero(make_patient(AtlasConfig(population="textbook"), 0))
+    anatomy = _patient(AtlasConfig(population="textbook"), 0)
     return Navigation(
         anatomy=anatomy,
         device=read_wire("workhorse-014"),
