@@ -81,7 +81,7 @@ def predicted(of: Prepared, robot: RobotConfig, wire: Wire) -> list[LeftOut]:
         "kinematics": robot,
     }
     tracks = Tracks(of.courses, np.where(of.given, of.abscissa, np.nan))
-    simple = {name: led(tracks, each).abscissa for name, each in robots.items()}
+    simple = {name: led(tracks, each)[0] for name, each in robots.items()}
     found = []
     for k, (log, replay) in enumerate(zip(of.logs, replays, strict=True)):
         rest, count = ~replay.given, len(replay.given)

@@ -253,32 +253,20 @@ def fit_noise(
     return noise
 
 
-@dataclass(frozen=True, eq=False)
-class Led:
-    """Where a robot's drive alone leads tips, from where they were seen last.
+def led(
+    tracks: Tracks, robot: RobotConfig
+) -> tuple[Float[np.ndarray, "episodes tips"], Filtered, Float[np.ndarray, "episodes"], tuple[float, float]]:
+    """Return where a robot's drive alone leads tips after those that tracks have, Δtip, mm, with what made it so.
 
-    Attributes:
-        abscissa: Δtip, mm.
-        offset: that at the first command, as the last tips have it, mm.
-        start: where in its play the device of each episode begins.
-        noise: of the tips that were seen, as `DriveFit` has it.
+    That is the filter of the tips that were seen, where in its play each device begins, and the noise of the tips.
     """
-
-    abscissa: Float[np.ndarray, "episodes tips"]
-    offset: Float[np.ndarray, "episodes"]
-    start: Float[np.ndarray, "episodes"]
-    noise: tuple[float, float]
-
-
-def led(tracks: Tracks, robot: RobotConfig) -> Led:
-    """Return where a robot's drive leads tips after those that tracks have."""
     drive = robot.wire
     values = np.array([drive.gain_translation, drive.play_mm, robot.latency_s, 0.0, 0.0])
     noise = fit_noise(tracks, values, starts(tracks, values[None], _USUAL_NOISE)[0][0], _USUAL_NOISE)
     begun = starts(tracks, values[None], noise)[0][0]
     motion = tracks.motion(values[None], begun)[0]
-    offset = filtered(tracks.abscissa - motion, tracks.travel(robot.latency_s), *noise).offset
-    return Led(motion + offset[:, None], offset, begun, noise)
+    seen = filtered(tracks.abscissa - motion, tracks.travel(robot.latency_s), *noise)
+    return motion + seen.offset[:, None], seen, begun, noise
 
 
 def _sloped(

@@ -151,7 +151,6 @@ def replay_log(
     *,
     robot: RobotConfig,
     config: ReplayConfig | None = None,
-    simulator: SimulatorConfig | None = None,
 ) -> list[EpisodeReplay]:
     """Replay logs.
 
@@ -161,14 +160,13 @@ def replay_log(
         device: the wire.
         robot: latency, gains and plays of the drive.
         config: what is given, and which starts are tried.
-        simulator: settings of the rod core; the preset `fast` if not given.
 
     Raises:
         InputError: no episode shows the tip often enough.
     """
     config = config or ReplayConfig()
     prepared = prepare(usable_episodes(logs, anatomy), anatomy, config.given, robot)
-    return replay_prepared(prepared, device, robot, config, simulator=simulator)
+    return replay_prepared(prepared, device, robot, config)
 
 
 def prepare(logs: list[RobotLog], anatomy: Anatomy, given: float, robot: RobotConfig) -> Prepared:
@@ -199,28 +197,26 @@ def replay_prepared(
     device: Stack,
     robot: RobotConfig,
     config: ReplayConfig,
-    *,
-    simulator: SimulatorConfig | None = None,
 ) -> list[EpisodeReplay]:
     """Replay episodes that are prepared, as `replay_log` does."""
-    device, simulator = in_grip(device, robot, simulator or PRESETS["fast"])
+    device, simulator = in_grip(device, robot, PRESETS["fast"])
     tracks = Tracks(of.courses, np.where(of.given, of.abscissa, np.nan))
-    alone = led(tracks, robot)
-    times, course = _proximal(of, robot, alone.start)
+    driven, seen, start, noise = led(tracks, robot)
+    times, course = _proximal(of, robot, start)
     angles = np.tile(2 * np.pi * np.arange(config.rotations) / config.rotations, (len(of.logs), 1))
-    tried = _simulated(of, device, times, course, alone.offset, angles, simulator)
+    tried = _simulated(of, device, times, course, seen.offset, angles, simulator)
     first = np.argmin(tried.cost, axis=1)
     rows = np.arange(len(of.logs))
     known = [_known_rotation(_far_from(of, tried.tip, int(k)), angles[k]) for k in rows]
     # Once more where the wire lay deeper, or less deep, than without the vessel, and from around the best rotation.
     apart = tracks.abscissa - tried.abscissa[rows, first]
-    depth = alone.offset + filtered(apart, tracks.travel(robot.latency_s), *alone.noise).offset
+    depth = seen.offset + filtered(apart, tracks.travel(robot.latency_s), *noise).offset
     step = 2 * np.pi / config.rotations
     near = angles[rows, first][:, None] + step * np.array([-0.5, -0.25, 0.0, 0.25, 0.5])
     tried = _simulated(of, device, times, course, depth, near, simulator)
     best = np.argmin(tried.cost, axis=1)
     return [
-        _episode(of, k, tried, int(best[k]), alone.abscissa[k], (float(near[k, best[k]]), known[k]), times[k, 1:])
+        _episode(of, k, tried, int(best[k]), driven[k], (float(near[k, best[k]]), known[k]), times[k, 1:])
         for k in range(len(best))
     ]
 
