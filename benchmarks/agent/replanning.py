@@ -16,6 +16,7 @@ from tyro.conf import Positional
 from endopilot.control.agent import AgentPolicy
 from endopilot.ladder.mismatch import CASES, world_of
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
+from endopilot.navigation.policy import Observation
 from endopilot.settings import Count
 from endopilot.tasks.task import CORE, find_task
 from endopilot.xray.fluoroscope import TipMeasurement
@@ -27,9 +28,10 @@ MISMATCH = 0.2
 class AlwaysReplanning(AgentPolicy):
     """The agent, but it drops its course at every exposure."""
 
-    def _update(self, measured: TipMeasurement) -> None:
-        super()._update(measured)
-        self._course = None
+    def _shown(self, observation: Observation) -> TipMeasurement | None:
+        if observation.tip is not None:
+            self._follower.begin(None)
+        return super()._shown(observation)
 
 
 RULES: dict[str, type[AgentPolicy]] = {"where off course": AgentPolicy, "at every exposure": AlwaysReplanning}
