@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import marshal
 import os
 import resource
 import shutil
@@ -134,6 +135,20 @@ LIMIT = 5_000
 """Bytes that a file may have: fewer than any of these results have, and more than the record of a run."""
 
 
+def test_a_limit_on_files_leaves_no_compiled_module_cut_short(tmp_path):
+    limit = 16_000  # more than the command's first module, which is there before the limit is known
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    subprocess.run(
+        [sys.executable, "-m", "endopilot.cli", "plan", "--help"],
+        capture_output=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+        env=environment | {"PYTHONPYCACHEPREFIX": str(tmp_path)},
+        check=True,
+    )
+    compiled = list(tmp_path.rglob("endopilot/**/*.pyc"))
+    assert compiled and all(marshal.loads(path.read_bytes()[16:]) for path in compiled)
+
+
 @pytest.mark.parametrize(
     "words",
     [
@@ -156,7 +171,7 @@ def test_what_does_not_fit_is_told_in_one_line_and_is_not_there(words, mask, pat
         capture_output=True,
         text=True,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (LIMIT, LIMIT)),
-        env={**os.environ, "TMPDIR": str(tmp_path)},
+        env={**os.environ, "TMPDIR": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"},
         check=False,
     )
     lines = [line for line in ended.stderr.splitlines() if ": done in" not in line]

@@ -9,6 +9,7 @@ import functools
 import gc
 import importlib
 import os
+import resource
 import signal
 import sys
 from collections.abc import Sequence
@@ -62,6 +63,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         for number in STOPPING if is_process else ():
             signal.signal(number, stop)
+        if resource.getrlimit(resource.RLIMIT_FSIZE)[0] != resource.RLIM_INFINITY:
+            sys.dont_write_bytecode = True  # Python keeps compiled modules that such a limit cuts short
         from endopilot.cli.process import carry_out, leave, own_streams  # slow to import: a signal may come before
 
         name = arguments[0] if arguments and arguments[0] in COMMANDS else ""
