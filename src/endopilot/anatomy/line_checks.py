@@ -38,8 +38,9 @@ def left_out(
         piece: connected piece of each kept node.
         root_piece: the piece that the tree was made from.
     """
-    gap, nearest = KDTree(tree.line.points).query(nodes.points)
-    inside = gap <= np.maximum(tree.line.radius[nearest], STEP_MM)
+    whole = tree.line
+    gap, nearest = KDTree(whole.points).query(nodes.points)
+    inside = gap <= np.maximum(whole.radius[nearest], STEP_MM)
     covered = float(nodes.share[inside].sum())
     lost = np.flatnonzero(~inside)
     if len(lost) == 0:
@@ -100,7 +101,8 @@ def closures(tree: VesselTree) -> list[str]:
 
     Spheres of two places meet there, while on the way from one to the other along the tree some do not.
     """
-    points, radius, abscissa = tree.line.points, tree.line.radius, tree.line.abscissa
+    whole = tree.line
+    points, radius, abscissa = whole.points, whole.radius, whole.abscissa
     branch = np.repeat(np.arange(len(tree.branches)), [len(own.section) for own in tree.branches])
     pairs = KDTree(points).query_pairs(2 * float(radius.max()), output_type="ndarray")
     one, two = pairs.T

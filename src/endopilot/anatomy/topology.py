@@ -193,7 +193,6 @@ def touch_remarks(found: list[Touch], *, parted: bool = True) -> list[str]:
         own = sorted(
             (touch for touch, told in zip(found, kinds, strict=True) if told == kind), key=lambda t: -t.size_mm
         )
-        size = size if kind != "perhaps" else ""
         places = [place_text(touch.place) + size.format(touch.size_mm) * (touch.size_mm > 0) for touch in own]
         if places:
             more = f" and {len(places) - MOST_LISTED} places more" if len(places) > MOST_LISTED else ""

@@ -293,10 +293,8 @@ def catheter_direction(
     there = _unit(path.points[at + 1] - path.points[at - 1])
     across = first - (first @ there) * there
     across = _unit(across if np.linalg.norm(across) > 0.05 else path.normals[at])
-    points = np.concatenate([branch.centerline.points for branch in tree.branches])
-    radii = np.concatenate([branch.centerline.radius for branch in tree.branches])
-    beyond = np.concatenate([branch.centerline.abscissa for branch in tree.branches])
-    beyond = beyond > 10.0 + 2.0 * float(path.radius[0])
+    whole = tree.line
+    beyond = whole.abscissa > 10.0 + 2.0 * float(path.radius[0])
     tube = np.linspace(2.0, length_mm, 60)
     angle = 0.0
     for attempt in range(5 * _TRIES):
@@ -307,7 +305,7 @@ def catheter_direction(
         tilted = Rotation.from_rotvec(scatter * there).apply(across)
         direction = np.cos(angle) * there + np.sin(angle) * tilted
         line = path.points[0] - tube[:, None] * direction
-        gap = np.linalg.norm(points[beyond, None] - line, axis=2) - radii[beyond, None] - radius_mm
+        gap = np.linalg.norm(whole.points[beyond, None] - line, axis=2) - whole.radius[beyond, None] - radius_mm
         clear = gap.size == 0 or gap.min() > 0.0
         if clear and direction @ first > np.cos(np.deg2rad(_STEEPEST_DEG)):
             return direction, {"catheter_angle_deg": float(np.rad2deg(angle)), "catheter_redrawn": attempt}

@@ -166,7 +166,7 @@ class Views:
         self._imager = XrayImager(real, navigation.stack, config=ImageConfig(geometry=geometry, pixels=pixels))
         given = navigation.anatomy
         roadmaps = self._imager if given is real else XrayImager(given, navigation.stack, config=self._imager.config)
-        lines = np.concatenate([branch.centerline.points for branch in given.tree.branches])
+        lines = given.tree.line.points
         self._planes, self._roadmaps, self._targets, self._size = [], [], [], pixels
         for angles in config.view_angles_deg[: 1 + config.biplane]:
             farthest = np.abs(view_at(angles, isocenter_of(given), geometry).project(lines)).max()

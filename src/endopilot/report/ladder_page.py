@@ -125,7 +125,7 @@ def _courses(navigations: list[Navigation], results: list[dict[str, Any]]) -> Fi
 
 def _draw(ax: Axes, navigation: Navigation, result: dict[str, Any]) -> None:
     tree = navigation.anatomy.tree
-    everything = np.concatenate([branch.centerline.points for branch in tree.branches])
+    everything = tree.line.points
     centre = everything.mean(axis=0)
     axes = np.linalg.svd(everything - centre, full_matrices=False)[2][:2]
     axes *= np.where(np.abs(axes).max(axis=1) == axes.max(axis=1), 1.0, -1.0)[:, None]

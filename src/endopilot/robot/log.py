@@ -105,10 +105,10 @@ class RobotLog:
         Raises:
             InputError: half of the tips lie beside the vessel: they are of another vessel, frame or unit.
         """
-        points = np.concatenate([branch.centerline.points for branch in tree.branches])
+        vessel = KDTree(tree.line.points)
 
         def beside_mm(tips: Float[np.ndarray, "n 3"]) -> float:
-            return float(np.median(KDTree(points).query(tips)[0])) if len(tips) else 0.0
+            return float(np.median(vessel.query(tips)[0])) if len(tips) else 0.0
 
         tip = self.tip if self.camera is None else points_in_vessel(self.camera, self.pixel, tree)
         if (away_mm := beside_mm(tip[self.seen])) > _BESIDE_MM:
@@ -118,7 +118,7 @@ class RobotLog:
                 if beside_mm(points_in_vessel(self.camera, self.pixel[self.seen, ::-1], tree)) < _BESIDE_MM:
                     mend = "with columns and rows exchanged they are there: exchange tip_column_px and tip_row_px"
             seen = f"tips were seen at {box_text(tip[self.seen])}, half of them {away_mm:.0f} mm or more from the"
-            raise InputError(f"{self.name}: {seen} vessel at {box_text(points)}; {mend}")
+            raise InputError(f"{self.name}: {seen} vessel at {box_text(tree.line.points)}; {mend}")
         return replace(self, tip=tip)
 
     def episodes(self) -> Iterator[RobotLog]:

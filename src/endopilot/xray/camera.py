@@ -151,7 +151,7 @@ def points_in_vessel(camera: Camera, pixels: Float[np.ndarray, "n 2"], tree: Ves
 
     NaN stays NaN. Where two branches cover each other in the image, it is that which lies nearer to the ray.
     """
-    lines = np.concatenate([branch.centerline.points for branch in tree.branches])
+    lines = tree.line.points
     found = np.full((len(pixels), 3), np.nan)
     seen = np.isfinite(pixels).all(axis=1)
     _, nearest = KDTree(camera.project(lines)).query(pixels[seen])

@@ -219,7 +219,7 @@ class TipDetector:
         near = np.linalg.norm(behind - anatomy.insertion.position, axis=1) <= 1.25 * CATHETER_MM
         points, volume = lumen_points(anatomy)
         self._known_lines: list[tuple[Signal, float, Bool[np.ndarray, "rows columns"]]] = []
-        self._vessel = np.concatenate([branch.centerline.points for branch in anatomy.tree.branches])
+        self._vessel = anatomy.tree.line.points
         self._filled = np.concatenate([points, behind[near]]), np.concatenate([volume, size[near]])
 
     def find(

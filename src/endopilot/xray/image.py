@@ -431,4 +431,4 @@ class XrayImager:
 
 def isocenter_of(anatomy: Anatomy) -> Float[np.ndarray, "3"]:
     """Return the middle of a vessel, about which the C-arm turns, LPS mm."""
-    return np.concatenate([branch.centerline.points for branch in anatomy.tree.branches]).mean(axis=0)
+    return anatomy.tree.line.points.mean(axis=0)

@@ -118,7 +118,7 @@ def motion_error_mm(anatomy: Anatomy, true: Motion, taken: Motion) -> float:
 
     The mean is taken over its centerlines and over two breaths.
     """
-    points = np.concatenate([branch.centerline.points for branch in anatomy.tree.branches])
+    points = anatomy.tree.line.points
     ostium, times_s = np.asarray(anatomy.insertion.position), np.linspace(0, 2 * true.breathing_period_s, 49)
     lies, taken_to_lie = (
         np.stack([place(maps, points) for maps in one.core(ostium).placements(times_s)[0]]) for one in (true, taken)

@@ -232,6 +232,6 @@ def sampled_lumen(anatomy: Anatomy) -> tuple[Float[np.ndarray, "n 3"], Float[np.
 
 def vessel_error_mm(anatomy: Anatomy, true: Pose, found: Pose) -> float:
     """Return how far a vessel in one pose lies from itself in another: the mean over its centerlines, mm."""
-    points = np.concatenate([branch.centerline.points for branch in anatomy.tree.branches])
+    points = anatomy.tree.line.points
     isocenter = isocenter_of(anatomy)
     return float(np.linalg.norm(true.move(points, isocenter) - found.move(points, isocenter), axis=1).mean())
