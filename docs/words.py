@@ -14,8 +14,6 @@ LONGER = {
     "concepts/detection.md": 1200,
     "concepts/environment-specification.md": 1040,
     "concepts/ladder.md": 1020,
-    "concepts/mismatch.md": 1450,
-    "concepts/search.md": 1200,
     "evidence/anatomy.md": 450,
     "evidence/detection.md": 820,
     "evidence/environments.md": 720,
