@@ -12,7 +12,6 @@ BOUNDS = {"guide": 400, "concepts": 1000, "evidence": 200}
 LONGER = {
     "concepts/advice.md": 1050,
     "concepts/detection.md": 1200,
-    "concepts/environment-specification.md": 1040,
     "concepts/ladder.md": 1020,
     "evidence/anatomy.md": 450,
     "evidence/detection.md": 820,

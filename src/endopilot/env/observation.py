@@ -1,4 +1,4 @@
-"""What a learning agent observes of a world, as docs/concepts/environment-specification.md has it."""
+"""What a learning agent observes of a world, as docs/concepts/environments.md has it."""
 
 from __future__ import annotations
 

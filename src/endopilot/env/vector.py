@@ -72,7 +72,7 @@ class NavigateVectorEnv(VectorEnv):
 
     A wire with a bent tip is pushed, pulled and turned at its proximal end, 7.5 times a second. All worlds are stepped
     by one `Simulator`; a world's course does not depend on the others, to the last bit. What goes in and comes out,
-    reward, start, ends, info and arguments are specified in docs/concepts/environment-specification.md.
+    reward, start, ends, info and arguments are specified in docs/concepts/environments.md.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012, as Gymnasium declares it
