@@ -11,8 +11,6 @@ BOUNDS = {"guide": 400, "concepts": 1000, "evidence": 200}
 """Most words of a page's prose, by its shelf."""
 LONGER = {
     "concepts/advice.md": 1050,
-    "concepts/detection.md": 1200,
-    "concepts/ladder.md": 1020,
     "evidence/anatomy.md": 450,
     "evidence/detection.md": 820,
     "evidence/environments.md": 720,
