@@ -2,8 +2,8 @@
 
 A page is read block by block. All pages share one folder, so a command finds what the commands before it have made.
 
-- A block of `bash` is run, unless the line before it is `<!-- not run: WHY -->`. After `<!-- until Ctrl-C -->` its last
-  command is stopped once it has printed an address.
+- A block of `bash` or `python` is run, unless the line before it is `<!-- not run: WHY -->`. After `<!-- until Ctrl-C -->`
+  its last command is stopped once it has printed an address.
 - A block of `text` after it shows some of the lines that it printed; a line that ends in `…` is cut.
 - A block of `console` shows a command that is refused (`$ endopilot ...`) and the line that it ends with.
 - `<!-- columns: FILE -->` stands before a table that names columns of a CSV file.
@@ -27,7 +27,7 @@ from pathlib import Path
 
 FOLDER = Path(__file__).with_suffix("")
 BLOCK = re.compile(
-    r"^```(?P<kind>bash|text|console)\n(?P<text>.*?)^```$"
+    r"^```(?P<kind>bash|python|text|console)\n(?P<text>.*?)^```$"
     r"|^<!-- (?P<mark>not run|until Ctrl-C|columns|picture)(?:: (?P<file>[^\n]*?))? -->\n(?P<next>(?:\|[^\n]*\n)*)",
     re.MULTILINE | re.DOTALL,
 )
@@ -70,6 +70,8 @@ def walk(page: Path, folder: Path) -> Iterator[tuple[Block, str]]:
     for block in blocks(page):
         if block.kind == "bash":
             printed = run(block.text, folder)
+        elif block.kind == "python":
+            printed = _in_shell(f"python - <<'EOF'\n{block.text}EOF", folder)
         elif block.kind == "until Ctrl-C":
             printed = run_until_ready(block.text, folder)
         elif block.kind == "text":
