@@ -2,8 +2,8 @@
 
 A page is read block by block. All pages share one folder, so a command finds what the commands before it have made.
 
-- A block of `bash` or `python` is run, unless the line before it is `<!-- not run: WHY -->`. After `<!-- until Ctrl-C -->`
-  its last command is stopped once it has printed an address.
+- A block of `bash` or `python` is run, unless the line before it is `<!-- not run: WHY -->`. After
+  `<!-- until Ctrl-C -->` its last command is stopped once it has printed an address.
 - A block of `text` after it shows some of the lines that it printed; a line that ends in `…` is cut.
 - A block of `console` shows a command that is refused (`$ endopilot ...`) and the line that it ends with.
 - `<!-- columns: FILE -->` stands before a table that names columns of a CSV file.

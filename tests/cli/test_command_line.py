@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from endopilot import cli
-from endopilot.cli import COMMANDS, main, process
+from endopilot.cli import COMMANDS, GROUPS, main, process
 from endopilot.cli.arguments import show
 
 
@@ -44,6 +44,18 @@ def test_the_overview_names_every_command(capsys: pytest.CaptureFixture[str]) ->
     for name, summary in COMMANDS.items():
         assert name in printed
         assert summary in printed
+    for first, heading in GROUPS.items():
+        assert f"\n\n{heading}\n  {first} " in printed
+
+
+@pytest.mark.parametrize("arguments", [["devices"], ["devices", "workhorse-014", "--tip-load"]])
+def test_tables_fit_a_terminal_of_80_columns(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        main(arguments)
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    row = next(line.split() for line in lines if line.startswith("workhorse-014 "))
+    assert "0.0074" in row  # whole, in one line
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -50,6 +50,9 @@ COMMANDS = {
     "info": "versions and machine",
 }
 """Name of each command: what it takes -> what it makes. `module_of` names its module."""
+GROUPS = {"demo": "All stages", "segment": "Patients", "simulate": "Simulation, data, models", "plan": "Navigation"}
+GROUPS |= {"xray": "X-ray", "drive": "Robots", "cockpit": "By hand, and scored", "verify": "Checks and samples"}
+"""The heading above a group's first command in `endopilot --help`."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -93,19 +96,15 @@ def command_of(name: str) -> Command:
 
 def overview() -> str:
     """Return the text of `endopilot --help`."""
-    lines = [f"  {name:<12} {summary}" for name, summary in COMMANDS.items()]
-    return "\n".join(
-        [
-            "usage: endopilot COMMAND ...",
-            "",
-            "From a CT angiogram to an agent that drives an endovascular guidewire. For research; no medical device.",
-            "Units are mm, N, s, rad and HU; world coordinates are LPS mm.",
-            "",
-            *lines,
-            "",
-            "`endopilot COMMAND --help` lists what is set most often, with units and defaults; `--help-all` lists all.",
-        ]
-    )
+    headings = {name: f"\n{group}\n" for name, group in GROUPS.items()}
+    commands = "\n".join(f"{headings.get(name, '')}  {name:<12} {summary}" for name, summary in COMMANDS.items())
+    return f"""usage: endopilot COMMAND ...
+
+From a CT angiogram to an agent that drives an endovascular guidewire. For research; no medical device.
+Units are mm, N, s, rad and HU; world coordinates are LPS mm.
+{commands}
+
+`endopilot COMMAND --help` lists what is set most often, with units and defaults; `--help-all` lists all."""
 
 
 def _work(name: str, arguments: Sequence[str]) -> None:

@@ -113,10 +113,12 @@ def show_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool) -> None:
     if as_json:
         print(_json(list(rows)))
         return
-    table = Table(*(Column(escape(name), overflow="fold") for name in (rows[0] if rows else ())))
+    named = [escape(name.replace("_", "\n")) for name in (rows[0] if rows else ())]  # a line a word: narrow columns
+    columns = (Column(name, overflow="fold", no_wrap=name == named[0]) for name in named)
+    table = Table(*columns, box=None, padding=(0, 1, 0, 0))
     for row in rows:
         table.add_row(*(escape(_text(value)) for value in row.values()))
-    Console(width=None if Console().is_terminal else 160).print(table)
+    Console(width=None if Console().is_terminal else 80).print(table)
 
 
 def _json(content: Any) -> str:

@@ -34,7 +34,8 @@ def command(
         return None
     names = devices or (*list_wires(), *user_devices())
     rows = [tip_load_row(read_wire(name)) if tip_load else _row(name) for name in names]
-    return Answer(rows, passed=all(row.get("passed") is not False for row in rows))
+    shown = [{name: value for name, value in row.items() if tip_load or name != "tip_load_gf"} for row in rows]
+    return Answer(rows, [shown], passed=all(row.get("passed") is not False for row in rows))
 
 
 def _yaml(name: str) -> str:

@@ -23,10 +23,6 @@ class NavigateEnv(gymnasium.Env):
 
     Spaces, reward, start and ends are as `NavigateVectorEnv` says; info holds numbers in place of arrays. After the end
     of an episode it waits for `reset`.
-
-    ## Version history
-
-    - v0: first version.
     """
 
     metadata: dict[str, Any] = NavigateVectorEnv.metadata
