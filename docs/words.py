@@ -10,7 +10,6 @@ FOLDER = Path(__file__).parent
 BOUNDS = {"guide": 400, "concepts": 1000, "evidence": 200}
 """Most words of a page's prose, by its shelf."""
 LONGER = {
-    "concepts/advice.md": 1050,
     "evidence/anatomy.md": 450,
     "evidence/detection.md": 820,
     "evidence/environments.md": 720,
