@@ -18,10 +18,9 @@ from endopilot.errors import InputError
 ROOT = Path(__file__).parents[2]
 CARD = str(Path(endopilot.__file__).parent / "models/pretrained/MODEL_CARD.md")
 PAGES = ["README.md", "Makefile", CARD]
-PAGES += [str(page.relative_to(ROOT)) for page in sorted((ROOT / "docs").glob("*.md"))]
 PAGES += [
     str(page.relative_to(ROOT))
-    for shelf in ("concepts", "evidence")
+    for shelf in ("", "concepts", "evidence")
     for page in sorted((ROOT / "docs" / shelf).glob("*.md"))
 ]
 GUIDE = [str(page.relative_to(ROOT)) for page in sorted((ROOT / "docs/guide").glob("*.md"))]
