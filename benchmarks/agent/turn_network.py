@@ -20,7 +20,8 @@ from endopilot.anatomy.catheter_axis import with_world_zero
 from endopilot.atlas.atlas import make_patient
 from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.cloned import NETWORK
-from endopilot.control.push import Push, Pushed, sides, stand_off, turn
+from endopilot.control.drive import Driver, Goal, Limits, Outcome
+from endopilot.control.repertoire import Row, sides, stand_off
 from endopilot.control.search_config import SearchConfig
 from endopilot.control.set_up import SPARE_SHARE
 from endopilot.control.trials import WIRE, Move, Trials
@@ -39,8 +40,11 @@ ATLAS_SEED = 5000
 """Added to the seed of a task's training patients."""
 TASKS = range(1, 10)
 """Levels of the tasks whose vessels and tips are taken."""
-TURNS, PERIODS, TRIES = 16, 60, 2
-"""Sides that are tried, for as many decision periods, and how often before one fork where none passes."""
+TURNS, TURN_PERIODS, PERIODS, TRIES = 16, 2, 60, 2
+"""Sides that are tried, decision periods in which the wire is turned and pushed, and how often before one fork where
+none passes."""
+OFF_MM, SLACK_MM = 4.0, 15.0
+"""A wire that is this far in another branch, or was pushed this far and did not come forward, is given up, mm."""
 TASK_SHARE = 0.75
 """Share of the navigations to the task's target; others go to any branch."""
 KEPT_ASIDE = 5
@@ -156,10 +160,10 @@ class Forks:
             for _ in range(TRIES):
                 place = self._approach(at)
                 view = ForkView.of(self._route, place, self._one.simulator.position[0], self._navigation.device)
-                azimuth, pushed = self._try(place, waypoint)
-                passed = pushed.within(SPARE_SHARE * self._navigation.force_limit_n)
+                azimuth, outcome = self._try(place, waypoint)
+                passed = (outcome.share == 1) & (outcome.force <= SPARE_SHARE * self._navigation.force_limit_n)
                 rows.append((view.features, azimuth, passed))
-                if passed.any() and self._follow(pushed, int(self._random.choice(np.flatnonzero(passed))), waypoint):
+                if passed.any() and self._follow(outcome, int(self._random.choice(np.flatnonzero(passed))), waypoint):
                     break
                 self._one.move(self._one.control(Move(WIRE, -self._random.uniform(2.0, 8.0) / DECISION_PERIOD_S)))
             else:
@@ -187,17 +191,21 @@ class Forks:
                 break
         return fork
 
-    def _try(self, place: float, waypoint: float) -> tuple[np.ndarray, Pushed]:
+    def _try(self, place: float, waypoint: float) -> tuple[np.ndarray, Outcome]:
         """Turn the wire to all sides, and push it past a waypoint; return the azimuths, and what became of it."""
         many, limit_n = self._many.copy_of(self._one), self._navigation.force_limit_n
-        turn(many, sides(TURNS), force_n=limit_n)
+        for _ in range(TURN_PERIODS):
+            rotation = sides(TURNS) / (TURN_PERIODS * DECISION_PERIOD_S)
+            many.still |= many.move(many.control(Move(WIRE, rotation=rotation)), force_n=limit_n)
         views = (ForkView.of(self._route, place, nodes, self._navigation.device) for nodes in many.simulator.position)
         azimuth = np.array([view.azimuth for view in views])
-        return azimuth, Push(self._route, self._navigation, self._config, waypoint).run(many, PERIODS)
+        motions = Row(follow_mm=(0.0,) * TURNS).motions(place, 0.0, self._config, 1, self._random, 0)
+        goal, limits = Goal(self._navigation, self._route, waypoint), Limits(limit_n, OFF_MM, SLACK_MM)
+        return azimuth, Driver(many, motions, goal, limits, self._config).run(PERIODS)
 
-    def _follow(self, pushed: Pushed, trial: int, waypoint: float) -> bool:
+    def _follow(self, outcome: Outcome, trial: int, waypoint: float) -> bool:
         """Do what a trial did; return whether the wire has passed."""
-        for control in pushed.controls(trial):
+        for control in outcome.controls_of(trial):
             self._one.move(control[None], force_n=self._navigation.force_limit_n)
         return bool(self._route.passed(self._one.foremost, waypoint)[0])
 

@@ -268,7 +268,7 @@ def test_an_agent_tells_what_it_believes_and_goes_on_after_hands(side_branch) ->
 
 def test_an_agent_gives_up_early_and_names_the_fork(side_branch) -> None:
     straight = replace(side_branch.device, tip_bend_rad=0.0, tip_bend_length_mm=0.0)
-    config = replace(QUICK, search=replace(QUICK.search, attempts=1, rounds=2), tries=2)
+    config = replace(QUICK, tries=2)
     record = NavigationLoop(replace(side_branch, device=straight), AgentPolicy(config), seed=2).run()
     assert record.reason == "gave up" and not record.success
     assert record.seconds < 0.5 * side_branch.seconds

@@ -92,7 +92,11 @@ def test_the_commands_plan_and_simulate_take_a_catheter(vessel, tmp_path, capsys
         ({}, {"model": "pretrained"}, "--model pretrained: models are of a wire alone"),
         ({}, {"device": Stack.of("workhorse-014", CATHETER, "straight-5f")}, "catheter: 2; the search drives one"),
         ({}, {"device": None}, "arrives: catheter; there is none"),
-        ({"config": replace(CONFIG, seconds=4.0)}, {}, r"seconds: 4 s are too few .* in microcatheter-1\.7f; give \d"),
+        (
+            {"config": replace(CONFIG, seconds=4.7, speed_mm_s=5.0)},
+            {},
+            r"s are too few .* in microcatheter-1\.7f; give",
+        ),
         ({"config": replace(CONFIG, force_limit_n=1e-6)}, {}, "no path found to branch"),
     ],
 )

@@ -10,12 +10,9 @@ import pytest
 from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.agent import AgentPolicy, OpenLoopPolicy, OraclePolicy
 from endopilot.control.agent_config import AgentConfig
-from endopilot.control.course import Course
-from endopilot.control.push import Push, Pushed
+from endopilot.control.course import Course, places_of
 from endopilot.control.search import Search
-from endopilot.control.search_config import ManoeuvreConfig
-from endopilot.control.together import STRAIGHT, Grid, Together
-from endopilot.control.trials import CATHETER, WIRE, Move
+from endopilot.control.trials import CATHETER, WIRE
 from endopilot.devices.catheter import read_catheter
 from endopilot.errors import InputError
 from endopilot.ladder.attempt import Recording, attempt, repeat
@@ -49,16 +46,15 @@ def side_branch(fork, wire) -> Navigation:
     )
 
 
-def agent_config(navigation: Navigation, turns: int = 4) -> AgentConfig:
-    own = AgentConfig.of(navigation)
-    return replace(own, search=replace(own.search, manoeuvres=ManoeuvreConfig(turns=turns)), belief=BELIEF)
+def agent_config(navigation: Navigation) -> AgentConfig:
+    return replace(AgentConfig.of(navigation), belief=BELIEF)
 
 
-def search(navigation: Navigation, turns: int = 4) -> tuple[Search, Belief, Course]:
+def search(navigation: Navigation) -> tuple[Search, Belief, Course]:
     """Return a search, the belief that it began with, and what it found."""
     belief = Belief(navigation, [World()], BELIEF)
     route = Route.to(navigation.anatomy, navigation.target)
-    one = Search(navigation, route, belief, config=agent_config(navigation, turns).search, seed=0)
+    one = Search(navigation, route, belief, config=agent_config(navigation).search, seed=0)
     return one, belief, one.find(belief, seconds=navigation.seconds)
 
 
@@ -94,16 +90,9 @@ def test_the_controls_of_a_course_lead_where_it_says(side_branch, found) -> None
     assert side_branch.reached(again.project())[0]
 
 
-def test_a_wire_that_leads_by_little_ends_little_beyond_the_target(side_branch, monkeypatch) -> None:
-    monkeypatch.setattr("endopilot.control.together._LEADS_MM", (3.0,))
-    _, _, course = search(side_branch)
-    assert course.reached == 1.0
-    assert course.tip.abscissa[-1, 0] - side_branch.target.abscissa == pytest.approx(3.0, abs=2.0)
-
-
 def test_where_no_manoeuvre_passes_the_search_says_where(side_branch, found) -> None:
     weak = replace(side_branch, force_limit_n=1e-6)
-    one, _, course = search(weak, turns=1)
+    one, _, course = search(weak)
     assert course.reached == 0.0 and len(course.control) == 0
     assert f"past {one.route.waypoints[0]:.0f} mm" in one.halt
 
@@ -184,85 +173,48 @@ def test_the_agent_drives_one_catheter(side_branch) -> None:
         NavigationLoop(replace(side_branch, catheters=(*side_branch.catheters, wide)), "agent").run()
 
 
-def test_of_manoeuvres_that_pass_alike_the_cheapest_is_taken(side_branch, found, monkeypatch) -> None:
-    """Where the hardest is called the cheapest, the course presses harder."""
-    _, course = found
-    monkeypatch.setattr(Search, "manoeuvre_cost", lambda _, pushed: -pushed.force)
-    _, _, harder = search(side_branch)
-    assert harder.reached == 1.0 and harder.force.max() > course.force.max()
-
-
 @pytest.fixture(scope="module")
-def hurried(side_branch) -> tuple[Navigation, AgentConfig]:
-    """Return a target straight ahead, and the settings of an agent that has little time for it."""
-    straight = replace(side_branch, target=Target(branch=0, abscissa=18.0))
-    assert AgentConfig.of(straight) is AgentConfig.of(side_branch)  # there is time for 4 x 18 mm at 5 mm/s
-    return straight, AgentConfig.of(replace(straight, seconds=6.0))
+def hurried(side_branch) -> Navigation:
+    """Return a target straight ahead for which there is little time."""
+    return replace(side_branch, target=Target(branch=0, abscissa=18.0), seconds=6.0)
 
 
-def search_straight(navigation: Navigation, config: AgentConfig) -> Course:
-    belief = Belief(navigation, [World()], BELIEF)
-    route = Route.to(navigation.anatomy, navigation.target)
-    return Search(navigation, route, belief, config=config.search, seed=0).find(belief, seconds=60.0)
-
-
-def test_where_there_is_little_time_wire_and_catheter_move_together_and_faster(hurried, monkeypatch) -> None:
-    monkeypatch.setattr("endopilot.control.together._LEADS_MM", (2.0,))
-    straight, config = hurried
-    assert config.search.manoeuvres.together and config.search.speed_mm_s == pytest.approx(4 * 18.0 / 6.0)
-    slow, fast = (search_straight(straight, each) for each in (agent_config(straight), config))
+def test_where_there_is_little_time_wire_and_catheter_move_together_and_faster(hurried) -> None:
+    config = AgentConfig.of(hurried).search
+    assert config.together and config.speed_mm_s == pytest.approx(4 * 18.0 / 6.0)
+    assert AgentConfig.of(replace(hurried, seconds=60.0)) is AgentConfig.of(replace(hurried, seconds=70.0))
+    slow, fast = (search(replace(hurried, seconds=seconds))[2] for seconds in (60.0, 6.0))
     assert slow.reached == fast.reached == 1.0 and len(fast.control) < 0.75 * len(slow.control)
-    both = [(np.abs(course.control[:, :, 0]) > 0.5).all(axis=1).any() for course in (slow, fast)]
-    assert both == [False, True]
 
 
-def test_where_there_is_little_time_slow_trials_are_given_up(hurried, monkeypatch) -> None:
-    monkeypatch.setattr("endopilot.control.together._LEADS_MM", (2.0, 1000.0))
-    monkeypatch.setattr("endopilot.control.push._LATE", 1)
-    straight, config = hurried
-    pushes, run = [], Push.run
-    monkeypatch.setattr(Push, "run", lambda *given: pushes.append(run(*given)) or pushes[-1])
-    assert search_straight(straight, config).reached == 1.0
-    assert [push.passed.tolist() for push in pushes] == [[True, False]] and pushes[0].halt[1] == "late"
+def test_a_wire_whose_tip_is_to_arrive_is_turned_on_in_a_narrow_lumen(pair) -> None:
+    """From a start that looks away from it, the wire does not enter the side branch as it is pushed."""
+    _, _, straight = search(pair)
+    assert straight.reached == 1.0
+    one, _, course = search(replace(pair, target=Target(branch=2, abscissa=30.0), start_rotation_rad=np.pi))
+    assert course.reached == 1.0 and one.halt == ""
+    assert np.abs(course.control[:, WIRE, 1]).max() > 0
 
 
-def test_where_there_is_little_time_loops_are_the_last_resort(hurried, monkeypatch) -> None:
-    straight, config = hurried
-    tried, push_on = [], Search._try
-
-    def nothing_passes(search: Search, grid: Grid, waypoint: float) -> Pushed:
-        if grid == STRAIGHT:
-            return push_on(search, grid, waypoint)
-        tried.append(grid)
-        many = search._many.count
-        none = np.zeros(many)
-        return Pushed([], none.astype(int), none > 0, none, none, none, ["off"] * many)
-
-    monkeypatch.setattr(Search, "_try", nothing_passes)
-    monkeypatch.setattr(Together, "bring_on", lambda *_: False)
-    assert search_straight(straight, config).reached == 1.0 and not tried
-    monkeypatch.setattr("endopilot.control.search.LOOPS_MM", -1000.0)
-    assert search_straight(straight, config).reached == 1.0 and tried
+def test_a_catheter_whose_tip_is_to_arrive_comes_along(pair) -> None:
+    _, _, course = search(replace(pair, arrives="catheter"))
+    assert course.reached == 1.0 and course.control[:, CATHETER, 0].max() > 0
 
 
-@pytest.mark.parametrize(("stays_mm", "slack_mm"), [(10.0, 8.0), (30.0, 30.0)])
-def test_where_there_is_little_time_slack_is_pulled_out_unless_the_tip_leaves(
-    hurried, monkeypatch, stays_mm, slack_mm
-) -> None:
-    """The tip lies 30 mm behind what is inserted; it stays until so much is left, and then comes along twice as far."""
-    straight, config = hurried
-    belief = Belief(straight, [World()], BELIEF)
-    one = Search(straight, Route.to(straight.anatomy, straight.target), belief, config=config.search, seed=0)
-    course = one._course
-    course.put(np.array([0]), belief.simulator, np.ones(1))
-    course.move(course.control(Move(WIRE, 30.0), Move(CATHETER, 50.0)))
-    inserted = float(course.lengths.max())
+def test_a_course_ends_beyond_its_horizon_and_is_no_failure(pair) -> None:
+    late = replace(pair, arrives="catheter", seconds=12.0)
+    belief = Belief(late, [World()], BELIEF)
+    one = Search(late, Route.to(late.anatomy, late.target), belief, config=AgentConfig.of(late).search, seed=0)
+    course = one.find(belief, seconds=30.0, horizon_mm=5.0)
+    assert course.reached == 0.0 and one.halt == "" and 11.0 <= course.tip.abscissa[-1, 0] < 34.0
+    policy = AgentPolicy(replace(AgentConfig.of(late), belief=BELIEF, horizon_mm=5.0, tries=1))
+    record = NavigationLoop(late, policy, config=LoopConfig(simulator=CORE), seed=2).run()
+    assert record.reason == "reached" and policy.plans > 1
 
-    def here(_: Together) -> float:
-        pulled = inserted - float(course.lengths.max())
-        return inserted - 30.0 - 20.0 * max(pulled - (30.0 - stays_mm), 0.0)
 
-    monkeypatch.setattr(Together, "here", property(here))
-    one._together.pull_taut(waypoint=5.0)
-    assert one._together.slack_mm == pytest.approx(slack_mm, abs=config.search.speed_mm_s * DECISION_PERIOD_S)
-    assert (len(course.rows) == 1) == (stays_mm == 30.0)
+def test_places_lie_at_forks_and_between_them(fork) -> None:
+    route = Route.to(fork, Target(branch=2, abscissa=35.0))
+    assert places_of(route, 0.0, alone=True, together=False) == route.waypoints.tolist() == pytest.approx([22.5, 35.0])
+    assert places_of(route, 0.0, alone=False, together=False) == pytest.approx([11.25, 22.5, 35.0])
+    assert places_of(route, 0.0, alone=False, together=True) == pytest.approx([22.5, 35.0])
+    assert places_of(route, 30.0, alone=False, together=False) == pytest.approx([35.0])

@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 
 from endopilot.belief.belief import Belief
-from endopilot.control import push
 from endopilot.control.agent import OraclePolicy
-from endopilot.control.search import Search
 from endopilot.control.set_up import describe_halt
-from endopilot.control.trials import Period, drive_period
+from endopilot.control.trials import drive_period
 from endopilot.simulation.motion import motion_named
 from endopilot.simulation.world import World
 from endopilot.tasks.route import Route
@@ -37,48 +35,12 @@ def test_a_course_is_what_the_simulator_does_under_its_controls(side_branch, kno
     assert side_branch.reached(simulator.project())[0]
 
 
-def test_a_course_may_begin_with_a_turn(side_branch) -> None:
-    policy = OraclePolicy(config=QUICK)
-    policy.start(side_branch, 0)
-    course = policy._search.find_turned(policy.belief, np.pi, seconds=20.0)
-    assert course.proximal[1, 0, 1] - side_branch.start_rotation_rad == pytest.approx(np.pi)
-    assert (course.control[:2, 0, 0] == 0.0).all() and course.reached == 1.0
-
-
-def test_a_search_begins_farther_before_a_wide_junction(side_branch, monkeypatch) -> None:
-    """The junction is at 20 mm in a vessel of 1 mm: 4 mm before it, or as many radii as a mouth needs."""
-    begun = []
-    for radii in (1.4, 8.0):
-        monkeypatch.setattr(push, "_MOUTH_RADII", radii)
-        policy = OraclePolicy(config=QUICK)
-        policy.start(side_branch, 0)
-        one = policy._search
-        one._course.put(np.zeros(1, dtype=int), policy.belief.simulator, np.ones(1))
-        one._together.most_periods, one._hard = 20, np.inf
-        one._approach(22.5)
-        begun.append(float(one._course.foremost.abscissa[0]))
-    assert begun == pytest.approx([16.0, 12.0], abs=1.1)
-
-
-@pytest.mark.timeout(60)
-def test_a_search_ends_though_pushing_seems_to_arrive_and_the_target_is_not_reached(side_branch, monkeypatch) -> None:
-    monkeypatch.setattr(Search, "_straight", lambda *_: None)
-    policy = OraclePolicy(config=QUICK)
-    policy.start(side_branch, 0)
-    course = policy.find_course(5.0)
-    assert course.reached == 0.0 and len(course.control) == 10
-
-
-def test_no_attempt_wins_without_a_wire_that_arrives(side_branch) -> None:
-    """However many attempts were made, a path that no wire follows into the branch is none."""
-    policy = OraclePolicy(config=QUICK)
+def test_a_wire_without_a_bend_finds_no_way_into_the_branch(side_branch) -> None:
+    """However many motions are drawn, a path that no wire follows is none."""
     straight = replace(side_branch.device, tip_bend_rad=0.0, tip_bend_length_mm=0.0)
+    policy = OraclePolicy(config=QUICK)
     policy.start(replace(side_branch, device=straight), 0)
-    one = policy._search
-    one._course.put(np.zeros(1, dtype=int), policy.belief.simulator, np.ones(1))
-    for attempt in (0, 5, 9):
-        _, _, won = one._population.attempt(one._course, 22.5, 2, attempt, 0.9)
-        assert not won
+    assert policy.find_course(20.0).reached == 0.0 and "does not enter" in policy.halt
 
 
 def test_advice_names_a_tip_at_forks_alone(side_branch) -> None:
@@ -102,17 +64,6 @@ def test_a_search_takes_no_path_that_presses_harder_than_the_limit(side_branch) 
     course = policy.find_course(20.0)
     assert course.reached == 0.0 and course.force.max(initial=0.0) <= tight.force_limit_n
     assert "on the wall; give a larger force_limit_n" in policy.halt
-
-
-def test_a_path_that_does_not_arrive_ends_before_it_presses_too_hard(side_branch) -> None:
-    policy = OraclePolicy(config=QUICK)
-    policy.start(side_branch, 0)
-    one, tip = policy._search, policy.belief.tip
-    for share in (0.5, 1.0, 1.5, 0.5):
-        force = np.array([share * side_branch.force_limit_n])
-        one._course.rows.append(Period(np.zeros((1, 1, 2)), np.zeros((1, 1, 2)), tip, force))
-    one._cut_hard()
-    assert len(one._course.rows) == 2
 
 
 def test_a_force_that_a_snap_ends_within_a_period_counts(side_branch) -> None:

@@ -75,7 +75,7 @@ class _PlanningPolicy:
         """
         self.navigation, self.config = navigation, self._given_config or AgentConfig.of(navigation)
         self.route = Route.to(navigation.anatomy, navigation.target)
-        if self.config.search.manoeuvres.together:
+        if self.config.search.together:
             self.route = self.route.beyond_carinas()
         for device in navigation.devices:
             check_passable(self.route, device)
@@ -120,8 +120,7 @@ class _PlanningPolicy:
             advance: called with every millimetre along the route.
             horizon_mm: the course may end when it leads so far on, mm.
         """
-        first = self.plans <= 1
-        return self._search.find(self.belief, seconds=seconds, horizon_mm=horizon_mm, first=first, advance=advance)
+        return self._search.find(self.belief, seconds=seconds, horizon_mm=horizon_mm, advance=advance)
 
     @property
     def halt(self) -> str:
@@ -196,7 +195,7 @@ class _PlanningPolicy:
         config, inserted = self.config.search, self.belief.drives.proximal[:, 0].tolist()
         if self.monitor.states.now is State.SEEKING:
             return self._follower.move([0.0 for _ in inserted])
-        pulled = [config.manoeuvres.together or inserted[0] <= each for each in inserted]
+        pulled = [config.together or inserted[0] <= each for each in inserted]
         return self._follower.move([-config.speed_mm_s if each else 0.0 for each in pulled])
 
     def _go_on(self, observation: Observation) -> Proximals:

@@ -59,10 +59,9 @@ class AgentConfig:
             return IN_CATHETER
         fastest = min(device.max_velocity_mm_s for device in navigation.devices)
         speed = max(search.speed_mm_s, _WAYS * target / navigation.seconds)
-        manoeuvres = replace(search.manoeuvres, together=True, longest_s=_HURRIED_S)
         return replace(
             IN_CATHETER,
-            search=replace(search, speed_mm_s=min(speed, fastest), attempts=_HURRIED_ATTEMPTS, manoeuvres=manoeuvres),
+            search=replace(search, speed_mm_s=min(speed, fastest), together=True, longest_s=_HURRIED_S),
             tries=_HURRIED_TRIES,
             losses=_HURRIED_TRIES,
             horizon_mm=_HURRIED_HORIZON_MM,
@@ -123,14 +122,12 @@ _WAYS = 4.0
 """Wire and catheter move in turn if there is time for a way so many times as long as the route; else together, and so
 fast that there is time for it."""
 _HURRIED_S = 10.0
-"""A catheter is then brought to its place in this time at most, s."""
+"""Motions then take this much longer than twice the way at most, s."""
 _HURRIED_EXPOSURES = 100
 """Exposures that may then be taken: soft devices fold and snap on half a metre of route."""
 _OFF_WIDE_MM = 10.0
 """Another course for such a pair is searched in a wide lumen where it is off by so much, mm: soft devices do not lie
 there as simulated, and what counts is how they come to the next fork."""
-_HURRIED_ATTEMPTS = 2
-"""Attempts at a place in which motions are drawn at random: turned manoeuvres are left."""
 _HURRIED_TRIES = 20
 """Times that such a pair may be lost, or a search for it may fail: its motions are drawn anew each time."""
 _HURRIED_HORIZON_MM = 60.0

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from endopilot.belief.monitor import BelievedTip, Monitor
 from endopilot.control.agent_config import AgentConfig, read_agent_calibration
-from endopilot.control.push import stand_off
+from endopilot.control.repertoire import stand_off
 from endopilot.control.turn_network import AZIMUTH, ForkView, TurnNetwork
 from endopilot.errors import InputError
 from endopilot.navigation.policy import Decision, Observation

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +10,7 @@ from jaxtyping import Bool, Float
 from endopilot.belief.drives import Drives
 from endopilot.devices.stack import Proximals
 from endopilot.tasks.navigation import DECISION_PERIOD_S
-from endopilot.tasks.route import ENTERED_MM, Route
+from endopilot.tasks.route import Route
 from endopilot.types import TipProjection
 
 Controls = Float[np.ndarray, "periods devices 2"]
@@ -64,12 +63,6 @@ def places_of(route: Route, begun: float, *, alone: bool, together: bool) -> lis
         count = max(1, int(np.ceil((goal - begin) / longest)))
         places += [begin + (goal - begin) * (k + 1) / count for k in range(count - 1)] + [goal]
     return places
-
-
-def next_place(places: Sequence[float], here: float, *, alone: bool) -> float:
-    """Return the first place that devices which have come to an abscissa, mm, have not passed; else the last."""
-    beyond = ENTERED_MM if alone else 0.0
-    return next((place for place in places if place + beyond > here), places[-1])
 
 
 _UNSURE_RAD = 0.3

@@ -200,7 +200,7 @@ def _search(navigation: Navigation, config: PlanConfig, trial: int) -> tuple[Con
     """Search a course in the rod core: with the settings of the agent, then with those that a plan is checked with."""
     fine, agent = SimulatorConfig(), AgentConfig.of(navigation)
     speed_mm_s = min(agent.search.speed_mm_s, config.speed_mm_s) if navigation.catheters else config.speed_mm_s
-    search = replace(agent.search, speed_mm_s=speed_mm_s, cost=config.cost)
+    search = replace(agent.search, speed_mm_s=speed_mm_s)
     fine_belief = replace(agent.belief, element_mm=fine.element_mm, time_step_s=fine.time_step_s)
     policy = OraclePolicy(config=replace(agent, search=search, belief=fine_belief if trial else agent.belief))
     policy.start(navigation, config.seed + trial)

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int
 
-from endopilot.control.push import TURN_PERIODS, Push, middle, sides, stand_off, turn
+from endopilot.control.drive import Driver, Goal
+from endopilot.control.repertoire import Repertoire, Row, stand_off
 from endopilot.control.search_config import SearchConfig
 from endopilot.control.trials import Trials
 from endopilot.devices.device import Wire
@@ -80,17 +81,18 @@ def rotations_that_enter(navigation: Navigation, device: Wire) -> Int[np.ndarray
         inserted_length=np.full(ROTATIONS, navigation.start_inserted_length_mm),
         rotation=np.full(ROTATIONS, navigation.start_rotation_rad),
     )
-    limits, config = [DriveLimits.of(device, navigation.anatomy)], SearchConfig()
+    limits, config, row = [DriveLimits.of(device, navigation.anatomy)], SearchConfig(), Row(turns=ROTATIONS)
 
     def go_on(waypoint: float) -> int:
         """Turn and push up to a waypoint, put all where the middle of those is that pass it; return how many do."""
         here, trials = float(route.progress(simulator.project()[:, 0])[0]), Trials(simulator, limits)
         straight = int(1.5 * max(waypoint - here, 0.0) / (config.speed_mm_s * DECISION_PERIOD_S))
-        turn(trials, sides(ROTATIONS))
-        push = Push(route, navigation, config, waypoint)
-        passed = push.run(trials, straight + _MORE_PERIODS - TURN_PERIODS).passed
-        trials.copy_trials(np.full(ROTATIONS, middle(passed)))
-        return int(passed.sum())
+        motions = row.motions(waypoint, 0.0, config, 1, np.random.default_rng(0), 0)
+        goal, limit_n = Goal(navigation, route, waypoint), navigation.force_limit_n
+        given_up = Repertoire.of(navigation, route, config, here).limits(row, route, here, waypoint, limit_n)
+        outcome = Driver(trials, motions, goal, given_up, config).run(straight + _MORE_PERIODS)
+        trials.copy_trials(np.full(ROTATIONS, np.argmin(outcome.expected_cost(limit_n))))
+        return int((outcome.share == 1.0).sum())
 
     places = forks(Route.to(navigation.anatomy, navigation.target), device)
     count = np.zeros(len(places), dtype=int)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from endopilot.anatomy.catheter_axis import turned_axis, with_axis
-from endopilot.control.push import Halt
+from endopilot.control.drive import Halt
 from endopilot.control.reach import ROTATIONS, Fork, forks, rotations_that_enter
 from endopilot.devices.device import Wire
 from endopilot.errors import InputError

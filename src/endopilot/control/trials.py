@@ -193,9 +193,13 @@ class Trials:
         return self
 
     def copy_trials(self, chosen: Int[np.ndarray, "trials"]) -> None:
-        """Put each trial where another one is."""
-        self.simulator.copy_worlds((np.arange(self.wires)[:, None] * self.count + chosen).ravel())
+        """Put each trial where another one is, as if it had done what that one has done."""
+        worlds = (np.arange(self.wires)[:, None] * self.count + chosen).ravel()
+        self.simulator.copy_worlds(worlds)
         self._seen = None
+        self.rows = [
+            Period(row.control[chosen], row.proximal[worlds], row.tip[worlds], row.force[worlds]) for row in self.rows
+        ]
 
     def _forget(self, weight: Float[np.ndarray, "wires"]) -> None:
         self.weight, self._seen = weight, None

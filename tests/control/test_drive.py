@@ -1,0 +1,139 @@
+"""Motions that are driven side by side: their steps, when a trial passes or is given up, what it costs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from endopilot.belief.belief import Belief, BeliefConfig
+from endopilot.control.drive import Driver, Goal, Limits, Motions, Outcome
+from endopilot.control.repertoire import Draws, Repertoire, Row, sides
+from endopilot.control.search_config import SearchConfig
+from endopilot.control.trials import CATHETER, WIRE, Trials
+from endopilot.devices.catheter import read_catheter
+from endopilot.simulation.world import World
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.route import Route
+
+CONFIG = SearchConfig()
+RANDOM = np.random.default_rng(0)
+
+
+def drive(navigation: Navigation, row: Row, place: float, *, force_n: float = np.inf, periods: int = 60) -> Outcome:
+    """Drive the motions of a row towards a place, from where the navigation begins; the obstacle lies at 20 mm."""
+    belief, route = (
+        Belief(navigation, [World()], BeliefConfig(members=1)),
+        Route.to(navigation.anatomy, navigation.target),
+    )
+    trials = Trials.of(navigation, belief.kinds, row.count, like=belief.simulator)
+    trials.put(np.zeros(1, dtype=int), belief.simulator, np.ones(1))
+    motions = row.motions(20.0, 4.0, CONFIG, trials.devices, RANDOM, 0)
+    limits = Limits(force_n=force_n, off_mm=3.0, slack_mm=15.0)
+    return Driver(trials, motions, Goal(navigation, route, place), limits, CONFIG).run(periods)
+
+
+def test_a_motion_places_then_turns_then_retracts_then_pushes(side_branch) -> None:
+    outcome = drive(side_branch, Row(at=(-1.0,), back=(0.5,), turns=2), 22.5)
+    control = outcome.controls_of(1)  # not turned: it lies half a turn before the first
+    placed = int(np.argmax(control[:, WIRE, 0] < 0))
+    assert (control[:placed, WIRE, 0] > 0).all() and not control[:, WIRE, 1].any()
+    begun = side_branch.start_inserted_length_mm
+    assert begun + control[:placed, WIRE, 0].sum() * DECISION_PERIOD_S == pytest.approx(16.0, abs=1.1)
+    assert control[placed, WIRE, 0] * DECISION_PERIOD_S == pytest.approx(-2.0)
+    assert (control[placed + 1 :, WIRE, 0] > 0).all()
+    turned = outcome.controls_of(0)
+    assert turned[:, WIRE, 1].sum() * DECISION_PERIOD_S == pytest.approx(-np.pi)
+    assert not turned[turned[:, WIRE, 1] != 0, WIRE, 0].any()
+
+
+def test_rotations_that_look_into_the_branch_pass_and_the_others_are_off(side_branch) -> None:
+    outcome = drive(side_branch, Row(at=(-1.0,), turns=8), 22.5)
+    passes = outcome.share == 1.0
+    assert 0 < passes.sum() < 8 and {halt for halt, each in zip(outcome.halt, passes, strict=True) if not each} == {
+        "off"
+    }
+    assert (outcome.farthest[~passes] < 22.5).all() and (outcome.to_go[~passes] > 0).all()
+    best = int(np.argmin(outcome.expected_cost(0.5)))
+    assert passes[best]
+    beside = np.cos(sides(8) - sides(8)[best])
+    assert passes @ beside == pytest.approx(max(passes @ np.cos(sides(8) - side) for side in sides(8)[passes]))
+
+
+def test_a_trial_that_presses_too_hard_passes_nothing(side_branch) -> None:
+    free = drive(side_branch, Row(), 12.0)
+    assert free.share[0] == 1.0 and free.force[0] > 0
+    pressed = drive(side_branch, Row(), 12.0, force_n=0.5 * float(free.force[0]))
+    assert pressed.share[0] == 0.0 and pressed.halt == ["pressed"] and pressed.periods[0] <= free.periods[0]
+
+
+def test_a_wire_slows_down_before_the_target_and_stops_there(side_branch) -> None:
+    straight = replace(side_branch, target=replace(side_branch.target, branch=0, abscissa=14.0))
+    outcome = drive(straight, Row(), 14.0)
+    speed = outcome.controls_of(0)[:, WIRE, 0]
+    assert outcome.share[0] == 1.0 and speed[0] == CONFIG.speed_mm_s > speed[-1] and outcome.to_go[0] <= 1.5
+
+
+def outcome_of(turn: np.ndarray, share: np.ndarray, **differs: np.ndarray) -> Outcome:
+    """Return what became of made-up trials."""
+    n, none = len(turn), np.zeros(len(turn))
+    motions = Motions(np.full(n, np.nan), none, turn, none, none, np.zeros((n, 1, 2)))
+    made = {"force": none, "to_go": none, "slack": none, "periods": none.astype(int)} | differs
+    return Outcome(motions, np.zeros((1, n, 1, 2)), share=share, farthest=none, halt=["late"] * n, **made)
+
+
+def test_of_rotations_that_pass_the_one_in_the_middle_is_expected_to_cost_least() -> None:
+    share = np.zeros(16)
+    share[3:8] = 1.0
+    assert np.argmin(outcome_of(sides(16), share).expected_cost(1.0)) == 5
+
+
+@pytest.mark.parametrize("worse", ["force", "to_go", "slack", "periods"])
+def test_pressing_lagging_slack_and_time_cost(worse) -> None:
+    share = np.full(2, 0.5)
+    made = outcome_of(np.array([0.0, np.pi]), share, **{worse: np.array([1, 3] if worse == "periods" else [1.0, 3.0])})
+    cost = made.cost(1.0)
+    assert cost[1] > cost[0]
+
+
+def test_a_row_combines_places_leads_and_rotations() -> None:
+    row = Row(at=(-1.0, 2.0), lead_mm=(-3.0, -15.0), turns=4)
+    made = row.motions(20.0, 5.0, CONFIG, 2, RANDOM, 0)
+    assert row.count == len(made.at_mm) == 16
+    assert sorted(set(made.at_mm)) == [15.0, 30.0] and np.array_equal(made.turn_rad[:4], sides(4))
+    # A wire that is placed deep in its catheter stays there; one at its mouth leads all along.
+    assert set(made.follow_mm[made.lead_mm == -15.0]) == {-15.0} and (made.follow_mm[made.lead_mm == -3.0] > 100).all()
+
+
+def test_motions_of_later_rounds_are_drawn_and_begin_where_devices_are() -> None:
+    row = Row(at=(-1.0,), back=(0.0, 2.0), turns=64, rounds=2)
+    first, later = (row.motions(20.0, 5.0, CONFIG, 1, np.random.default_rng(1), number) for number in (0, 1))
+    assert (first.at_mm == 15.0).all() and np.isnan(later.at_mm).all()
+    assert 0 <= later.back_mm.min() < 1.0 and 9.0 < later.back_mm.max() <= 10.0
+    assert later.turn_rad.min() < -2.0 and later.turn_rad.max() > 2.0
+
+
+def test_velocities_are_drawn_as_the_row_says() -> None:
+    row = Row(turns=1000, draws=Draws(speeds=(-0.5, 1.0), spins=(-1.0, 0.0, 1.0)))
+    made = row.motions(20.0, 5.0, CONFIG, 2, np.random.default_rng(1), 0)
+    assert np.isnan(made.follow_mm).all() and not made.turn_rad.any()
+    assert made.velocity[0].tolist() == [[CONFIG.speed_mm_s, 0.0], [0.0, 0.0]]
+    assert set(made.velocity[:, WIRE, 0]) == {-5.0, 10.0} and set(made.velocity[:, WIRE, 1]) == {-7.0, 0.0, 7.0}
+    catheter = made.velocity[:, CATHETER, 0]
+    assert (catheter == 0).mean() == pytest.approx(0.5, abs=0.05)
+    assert (catheter == made.velocity[:, WIRE, 0]).mean() == pytest.approx(0.25 + 0.25 / 2, abs=0.05)
+
+
+def test_each_kind_of_stack_and_lumen_has_a_table(side_branch) -> None:
+    route = Route.to(side_branch.anatomy, side_branch.target)
+
+    def rows(shape: str | None, *, together: bool = False) -> Repertoire:
+        catheters = () if shape is None else (read_catheter(shape),)
+        given = replace(side_branch, catheters=catheters)
+        return Repertoire.of(given, route, replace(CONFIG, together=together), 10.0)
+
+    alone, plain, shaped = rows(None), rows("microcatheter-1.7f"), rows("vertebral-5f")
+    soft = rows("microcatheter-1.7f", together=True)
+    assert len({alone, plain, shaped, soft}) == 4 and alone.drawn and soft.rows[0].draws and not plain.drawn
+    assert alone.rows[0].count == 1 and alone.rows[0].off_radii == 0  # straight on, never off the route
