@@ -16,8 +16,7 @@ from endopilot.cli import command_of, main
 from endopilot.errors import InputError
 
 ROOT = Path(__file__).parents[2]
-CARD = str(Path(endopilot.__file__).parent / "models/pretrained/MODEL_CARD.md")
-PAGES = ["README.md", "Makefile", CARD]
+PAGES = ["README.md", "Makefile"]
 PAGES += [str(page.relative_to(ROOT)) for page in sorted((ROOT / "docs").glob("*.md"))]
 PAGES += [
     str(page.relative_to(ROOT))

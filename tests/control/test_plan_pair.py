@@ -89,7 +89,7 @@ def test_the_commands_plan_and_simulate_take_a_catheter(vessel, tmp_path, capsys
     [
         ({"config": replace(CONFIG, method="spin")}, {}, "method: spin; a wire in a catheter is planned by search"),
         ({"target": "tips.csv"}, {}, "desired tips are followed by a wire alone"),
-        ({}, {"model": "pretrained"}, "--model pretrained: models are of a wire alone"),
+        ({}, {"model": "a-run"}, "--model a-run: models are of a wire alone"),
         ({}, {"device": Stack.of("workhorse-014", CATHETER, "straight-5f")}, "catheter: 2; the search drives one"),
         ({}, {"device": None}, "arrives: catheter; there is none"),
         ({"config": replace(CONFIG, seconds=4.0)}, {}, r"seconds: 4 s are too few .* in microcatheter-1\.7f; give \d"),

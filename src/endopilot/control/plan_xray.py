@@ -22,8 +22,8 @@ from endopilot.belief.monitor import predicted_tip
 from endopilot.belief.online_predictors import online_predictor
 from endopilot.belief.watch import Watch
 from endopilot.control.agent_config import AgentConfig, read_agent_calibration
-from endopilot.control.plan_config import NETWORK_METHODS, Plan
-from endopilot.models.config import WINDOW, run_path
+from endopilot.control.plan_config import Plan
+from endopilot.models.config import WINDOW, WIRES, read_run
 from endopilot.tasks.route import Route
 from endopilot.xray.fluoroscope import TipMeasurement
 
@@ -46,14 +46,15 @@ def read_calibration(method: str, model: str | Path | None, devices: int) -> Cal
 
     Args:
         method: of the plan; it says whether a network makes it.
-        model: the trained run, or "pretrained".
+        model: the trained run, if any.
         devices: 1 for a wire alone, 2 with a catheter.
 
     Raises:
-        InputError: the run has no calibration, or a damaged one.
+        InputError: there is no such run, or it has no calibration, or a damaged one.
     """
-    if method in NETWORK_METHODS and model is not None:
-        return Calibration.read(run_path(model))
+    if model is not None and _by_networks(method, model):
+        read_run(model)
+        return Calibration.read(Path(model))
     return read_agent_calibration("assumed", devices)
 
 
@@ -70,7 +71,7 @@ def plan_xray(plan: Plan, *, calibration: Calibration | None = None) -> PlannedX
     """
     if calibration is None:
         calibration = read_calibration(plan.config.method, plan.model, len(plan.navigation.devices))
-    networks = plan.config.method in NETWORK_METHODS
+    networks = _by_networks(plan.config.method, plan.model)
     model: _Model = _Networks(plan) if networks else _Wires(plan)
     alone = not networks and not plan.navigation.catheters
     watch = Watch(calibration, AdviserConfig(), plan.navigation.device.tip_radius_mm, model.start(), alone=alone)
@@ -83,6 +84,10 @@ def plan_xray(plan: Plan, *, calibration: Calibration | None = None) -> PlannedX
             watch.exposed(float(at.tip[1]), at)
             model.observe(period)
     return PlannedXray(exposure=exposure, half_width=half_width)
+
+
+def _by_networks(method: str, model: str | Path | None) -> bool:
+    return method == "inverse" and model is not None and str(model) != WIRES
 
 
 class _Model(Protocol):
@@ -134,7 +139,7 @@ class _Networks:
 
         assert plan.model is not None
         run, navigation = Path(plan.model), plan.navigation
-        episodes = RestingStart(navigation, run).episodes(plan.predicted[None], plan.control[None, :, 0])
+        episodes = RestingStart(navigation).episodes(plan.predicted[None], plan.control[None, :, 0])
         self._model = online_predictor(load_model(run), episodes)
         self._route = Route.to(navigation.anatomy, navigation.target)
         self._proximal = episodes.proximal[0]
