@@ -132,7 +132,7 @@ def test_a_posterior_finds_what_a_line_explains_and_no_more():
     tip[::10] += 3.0
     mean, sd = posterior(members, paths, tip, np.zeros_like(tip), np.ones(30, dtype=bool))
     assert mean[0] == pytest.approx(1.15, abs=0.01) and sd[0] < 0.1 * SPREADS[0]
-    np.testing.assert_allclose(mean[1:], NOMINAL[1:], atol=1e-6)
+    np.testing.assert_allclose(mean[1:], NOMINAL[1:], atol=1e-4)
     np.testing.assert_allclose(sd[1:], SPREADS[1:], rtol=1e-3)
 
 
