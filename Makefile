@@ -79,6 +79,8 @@ recipe-laptop: $(INSTALLED)
 	$(BIN)/endopilot atlas --vessel lca --count 20 --seed 951 -o $(LEARNING)/patients
 	$(BIN)/endopilot dataset $(LEARNING)/patients/* -o $(LEARNING)/dataset --sequences 2 --seed 95 --seen-test-share 0 \
 	  --friction 0.08 0.12 --tip-stiffness-factor 0.8 1.2 --anatomy-shares 0.15 0.25 0.6
+	$(BIN)/endopilot dataset $(LEARNING)/patients/* -o $(LEARNING)/both --motion both --sequences 1 --seed 97 --seen-test-share 0 \
+	  --friction 0.08 0.12 --tip-stiffness-factor 0.8 1.2 --anatomy-shares 0.15 0.25 0.6
 	for world in compliant-wall bent-tip deeper-ostium; do \
 	  $(BIN)/endopilot dataset $(LEARNING)/patients/* -o $(LEARNING)/$$world --world $$world --sequences 1 --seed 96 \
 	    --friction 0.08 0.12 --anatomy-shares 0.15 0.25 0.6 --seen-test-share 0 || exit; \

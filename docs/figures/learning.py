@@ -31,6 +31,7 @@ WORLDS = {
     "compliant-wall": "a compliant wall",
     "bent-tip": "another bend",
     "deeper-ostium": "a deeper ostium",
+    "both": "heart and breath",
 }
 MODELS = {"wires": "simulated wires", "paper": "the paper's pair", "networks": "causal networks, removed since"}
 SPANS = ((0, 20), (20, 60), (60, 90))
@@ -94,7 +95,7 @@ def p1_rows(folder: Path, models: dict[str, dict[str, Any]]) -> Iterator[str]:
 
 def advice_rows(models: dict[str, dict[str, Any]]) -> Iterator[str]:
     """Yield the rows of the advice in worlds."""
-    yield "| patients | model | bands hold throughout | at samples | error of Δtip, γtip, mm | missed | exposures a minute |"
+    yield "| patients | model | bands hold throughout | at samples | error of Δtip, γtip, mm | missed | a minute |"
     yield "|---|---|---|---|---|---|---|"
     for world, title in WORLDS.items():
         for name, found in models.items():
