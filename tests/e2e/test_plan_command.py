@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +12,7 @@ from command import refused, run
 
 from benchmarks.anatomy.analytic_lumens import forked_tree, tree_distance
 from endopilot.anatomy.io import write_anatomy
-from endopilot.belief.bands import Calibration
-from endopilot.control.agent_config import CALIBRATIONS
-from endopilot.devices.device import read_wire
-from endopilot.files import write_json
 from endopilot.types import Anatomy, Branch, DistanceMap, Insertion, VesselTree
-from toy_navigation import make_untrained_run
 
 
 @pytest.fixture(scope="module")
@@ -61,32 +56,12 @@ def test_a_plan_is_driven_where_it_was_made_and_nowhere_else(fork, patient, tmp_
     assert not (tmp_path / "again.csv").exists()
 
 
-@pytest.fixture
-def a_run(tmp_path) -> Path:
-    write_json(tmp_path / "dataset/meta/manifest.json", {"key": "k", "device": asdict(read_wire("workhorse-014"))})
-    (tmp_path / "run").mkdir()
-    make_untrained_run(tmp_path / "dataset", tmp_path / "run")
-    return tmp_path / "run"
-
-
-def test_xray_is_foreseen_along_a_plan(patient, a_run, tmp_path, capsys):
+def test_xray_is_foreseen_along_a_plan(patient, tmp_path, capsys):
     plan = ("plan", patient, "--target", "0,0,33", "--xray", "-o", tmp_path / "plan")
     table = tmp_path / "plan" / "plan.csv"
     by_wires = run(capsys, *plan)
     assert len(by_wires["xray_due_s"]) <= 1  # straight on, near the middle
     assert "band_tip_abscissa_mm" in table.read_text(encoding="utf-8").splitlines()[0]
-    bands = Calibration.read(CALIBRATIONS["assumed", 1])
-    replace(bands, abscissa_terms=(5.0, 0.0, 0.0, 0.0)).write(a_run)
-    plan = (*plan[:-1], tmp_path / "by-network")
-    by_network = run(capsys, *plan, "--method", "inverse", "--model", a_run, "--seconds", "10")
-    assert by_network["method"] == "inverse" and by_network["xray_due_s"][:2] == [1.5, 3.0]  # as often as it may
-
-
-def test_a_model_without_calibration_foresees_no_xray(patient, a_run, tmp_path, capsys):
-    plan = ("plan", patient, "--target", "0,0,33", "--model", a_run, "--method", "inverse", "--xray")
-    line = refused(capsys, *plan, "-o", tmp_path / "plan")
-    assert f"{a_run}: the model has no calibration" in line and "endopilot advise" in line
-    assert not (tmp_path / "plan").exists()
 
 
 def test_desired_tips_that_no_drive_can_keep_up_with(patient, tmp_path, capsys):

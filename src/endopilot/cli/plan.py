@@ -12,7 +12,7 @@ from endopilot.cli.arguments import Existing, Figures, OutputFolder
 from endopilot.control.plan import plan
 from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import write_plan
-from endopilot.control.plan_xray import plan_xray, read_calibration
+from endopilot.control.plan_xray import plan_xray
 from endopilot.devices.stack import Stack
 from endopilot.models.config import WIRES, run_inputs
 from endopilot.runs import claiming
@@ -43,12 +43,9 @@ def command(
             without a model.
         catheter: one around the wire, which is planned for too (method search): a name such as microcatheter-1.7f, or a
             YAML file.
-        xray: also predict when X-ray will be needed, with the calibration that `endopilot advise` wrote into the run
-            given as --model (inverse), or else with that of the agent's simulated wires.
+        xray: also predict when X-ray will be needed, by the bands of the agent's simulated wires.
         config: method, limits and cost.
     """
-    if xray:
-        read_calibration(config.method, model, 1 + len(catheter))  # refused before the search, which takes its time
     stack = Stack.of(device or "workhorse-014", *catheter) if device or catheter else None
     patient, asked = read_anatomy(anatomy), {"target": target, "device": stack, "config": config, "xray": xray}
     weights = run_inputs(model or WIRES)
