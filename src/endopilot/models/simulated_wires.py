@@ -8,6 +8,7 @@ may jump. There is nothing to train: a vessel and devices are all that the model
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from weakref import WeakKeyDictionary
@@ -23,6 +24,7 @@ from endopilot.models.ensemble import NARROWEST, NOMINAL, SPREADS, Members, Path
 from endopilot.models.episodes import (
     EachObserved,
     Episodes,
+    EpisodeSetUp,
     Observed,
     OpenLoop,
     Prediction,
@@ -44,6 +46,8 @@ TRANSLATIONS_MM_S = (-5.0, -1.5, 0.0, 1.5, 5.0)
 """Speeds that are tried, beyond the one that would move a tip without slack to where it is desired."""
 ROTATIONS_RAD_S = (-2.0, 0.0, 2.0)
 """Rotations that are tried with each."""
+Parameters = tuple[Float[np.ndarray, "episodes 5"], Float[np.ndarray, "episodes 5"]]
+"""Mean and standard deviation of each episode's `ensemble.NAMES`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +55,14 @@ class SimulatedWires:
     """The rod core as a predictor of whatever devices episodes have.
 
     Attributes:
+        identified: mean and standard deviation of the parameters after what was seen of given states, by setup and by
+            a digest of patient, commands and tips; all protocols and later plans share them.
         tracked: controls that lead the tip along the desired one from the given states on; P2 and P3 share them.
     """
 
+    identified: WeakKeyDictionary[EpisodeSetUp, dict[bytes, Parameters]] = field(
+        default_factory=WeakKeyDictionary, repr=False
+    )
     tracked: WeakKeyDictionary[Episodes, OpenLoop] = field(default_factory=WeakKeyDictionary, repr=False)
 
     def predict(self, episodes: Episodes, observed: Observed | EachObserved) -> Prediction:
@@ -78,7 +87,7 @@ class SimulatedWires:
         found = np.full((1 + FOLLOWED, *episodes.tip.shape), np.nan)
         for anatomy, chosen in _by_anatomy(episodes):
             data = episodes.select(chosen)
-            mean, sd = _identified(anatomy, data, seen[chosen])
+            mean, sd = self._identified(anatomy, data, seen[chosen])
             sd = np.clip(sd, NARROWEST * SPREADS, SPREADS)
             around = ensemble.drawn(mean, sd, FOLLOWED, moves=_moves(data, anatomy))
             members = np.concatenate([ensemble.rounded(mean)[None], around])
@@ -102,16 +111,60 @@ class SimulatedWires:
         The wire that retraces the observed tips best is led along the desired ones, one sample at a time: see `track`.
         """
         if observed is not None:
-            return _led(episodes, observed)
+            return self._led(episodes, observed)
         if episodes not in self.tracked:
-            self.tracked[episodes] = _led(episodes, given_states(episodes))
+            self.tracked[episodes] = self._led(episodes, given_states(episodes))
         return self.tracked[episodes]
 
+    def _led(self, episodes: Episodes, observed: Observed) -> OpenLoop:
+        """Return the controls that lead each episode's best wire along the desired tips after the last observed one."""
+        begin = begin_after(observed)
+        desired = episodes.tip[:, begin:].astype(float)
+        tip, control = np.empty(desired.shape), np.empty(desired.shape)
+        for anatomy, chosen in _by_anatomy(episodes):
+            data = episodes.select(chosen)
+            mean, _ = self._identified(anatomy, data, np.broadcast_to(observed, data.branch.shape))
+            best, stack = ensemble.rounded(mean), Stack.of(data.setup.device)
+            stacks = ensemble.with_stiffnesses(stack, best[:, 1])
+            tip[chosen], control[chosen] = track(
+                anatomy,
+                [stacks[factor] for factor in best[:, 1]],
+                friction=ensemble.frictions(stack, best[:, 0]),
+                start=ensemble.as_deep(data.start, best[:, 2]),
+                command=data.command,
+                desired=desired[chosen],
+                config=data.setup.simulator,
+                motion=data.setup.known_motions.get(anatomy.name),
+            )
+        start = episodes.proximal[:, begin - 1 : begin].astype(float)
+        return OpenLoop(tip=tip, proximal=start + SAMPLE_PERIOD_S * np.cumsum(control, axis=1), control=control)
 
-def _identified(
-    anatomy: Anatomy, data: Episodes, seen: EachObserved
-) -> tuple[Float[np.ndarray, "episodes 5"], Float[np.ndarray, "episodes 5"]]:
-    """Return mean and standard deviation of the parameters of each episode of one anatomy after what was seen."""
+    def _identified(self, anatomy: Anatomy, data: Episodes, seen: EachObserved) -> Parameters:
+        """Return mean and deviation of the parameters of episodes of one anatomy after what was seen of given states."""
+        known, seen = self.identified.setdefault(data.setup, {}), seen[:, :WINDOW]
+        digests = [_digest(data, i, seen[i]) for i in range(len(data))]
+        new = np.array([i for i, digest in enumerate(digests) if digest not in known], dtype=int)
+        if len(new):
+            for i, *found in zip(new, *_identify(anatomy, data.select(new), seen[new]), strict=True):
+                known[digests[i]] = found[0], found[1]
+        mean, sd = zip(*(known[digest] for digest in digests), strict=True)
+        return np.array(mean), np.array(sd)
+
+
+def _digest(data: Episodes, i: int, seen: Observed) -> bytes:
+    """Return what identifies an episode's patient, its commands and what was seen of its first samples."""
+    given = slice(len(seen))
+    signals = (
+        data.start[i],
+        data.command[i, given],
+        np.packbits(seen),
+        data.tip[i, given][seen],
+        data.tip_sd[i, given],
+    )
+    return hashlib.sha256(b"\0".join([str(data.anatomy[i]).encode(), *(part.tobytes() for part in signals)])).digest()
+
+
+def _identify(anatomy: Anatomy, data: Episodes, seen: EachObserved) -> Parameters:
     mean, sd = np.tile(NOMINAL, (len(data), 1)), np.tile(SPREADS, (len(data), 1))
     spread, samples = sd, int(np.nonzero(seen)[1].max(initial=-1)) + 1
     tips, sd_mm = (signal[:, :samples].astype(float) for signal in (data.tip, data.tip_sd))
@@ -135,31 +188,6 @@ def _replayed(anatomy: Anatomy, data: Episodes, members: Members, samples: int) 
         config=setup.simulator,
         motion=setup.known_motions.get(anatomy.name),
     )
-
-
-def _led(episodes: Episodes, observed: Observed) -> OpenLoop:
-    """Return the controls that lead each episode's best wire along the desired tips after the last observed one."""
-    begin = begin_after(observed)
-    desired = episodes.tip[:, begin:].astype(float)
-    tip, control = np.empty(desired.shape), np.empty(desired.shape)
-    for anatomy, chosen in _by_anatomy(episodes):
-        data = episodes.select(chosen)
-        wire = _identified(anatomy, data, np.broadcast_to(observed, data.branch.shape))[0]
-        best = ensemble.rounded(wire)
-        stack = Stack.of(data.setup.device)
-        stacks = ensemble.with_stiffnesses(stack, best[:, 1])
-        tip[chosen], control[chosen] = track(
-            anatomy,
-            [stacks[factor] for factor in best[:, 1]],
-            friction=ensemble.frictions(stack, best[:, 0]),
-            start=ensemble.as_deep(data.start, best[:, 2]),
-            command=data.command,
-            desired=desired[chosen],
-            config=data.setup.simulator,
-            motion=data.setup.known_motions.get(anatomy.name),
-        )
-    start = episodes.proximal[:, begin - 1 : begin].astype(float)
-    return OpenLoop(tip=tip, proximal=start + SAMPLE_PERIOD_S * np.cumsum(control, axis=1), control=control)
 
 
 def track(
@@ -190,22 +218,23 @@ def track(
     """
     tries = np.array([(v, w) for v in TRANSLATIONS_MM_S for w in ROTATIONS_RAD_S])
     episodes, each = len(stacks), len(tries)
+    limits, begin = DriveLimits.of(stacks[0].wire, anatomy), command.shape[1] - desired.shape[1]
+    given = Simulator(anatomy, list(stacks), config=config, motion=motion)
+    given.reset(inserted_length=start[..., 0], rotation=start[..., 1], friction=friction)
+    for sample in range(begin):
+        moved = command[:, sample].astype(float)
+        moved[:, 0] = limits.clip(moved[:, 0], given.inserted_length[:, 0], SAMPLE_PERIOD_S)
+        given.step(moved, SAMPLE_PERIOD_S)
     simulator = Simulator(anatomy, [stack for stack in stacks for _ in range(each)], config=config, motion=motion)
-    length, rotation = np.moveaxis(np.repeat(start, each, axis=0), -1, 0)
-    simulator.reset(inserted_length=length, rotation=rotation, friction=np.repeat(friction, each, axis=0))
-    limits = DriveLimits.of(stacks[0].wire, anatomy)
+    simulator.copy_worlds(np.repeat(np.arange(episodes), each), of=given)
     tip, control = np.empty(desired.shape), np.empty(desired.shape)
-    begin = command.shape[1] - desired.shape[1]
-    for sample in range(command.shape[1]):
-        moved, k = np.repeat(command[:, sample], each, axis=0).astype(float), sample - begin
-        if k >= 0:
-            lead = (np.repeat(desired[:, k, 0], each) - simulator.project().abscissa[:, 0]) / SAMPLE_PERIOD_S
-            moved[:, 0] = np.tile(tries, (episodes, 1))
-            moved[:, 0, 0] += lead
+    for k in range(desired.shape[1]):
+        moved = np.repeat(command[:, begin + k], each, axis=0).astype(float)
+        lead = (np.repeat(desired[:, k, 0], each) - simulator.project().abscissa[:, 0]) / SAMPLE_PERIOD_S
+        moved[:, 0] = np.tile(tries, (episodes, 1))
+        moved[:, 0, 0] += lead
         moved[:, 0] = limits.clip(moved[:, 0], simulator.inserted_length[:, 0], SAMPLE_PERIOD_S)
         step = simulator.step(moved, SAMPLE_PERIOD_S)
-        if k < 0:
-            continue
         reached = simulator.project()[:, 0]
         error = np.abs(reached.abscissa - np.repeat(desired[:, k, 0], each))
         error += np.abs(reached.offset - np.repeat(desired[:, k, 1], each))
