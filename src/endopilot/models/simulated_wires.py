@@ -140,7 +140,7 @@ class SimulatedWires:
         return OpenLoop(tip=tip, proximal=start + SAMPLE_PERIOD_S * np.cumsum(control, axis=1), control=control)
 
     def _identified(self, anatomy: Anatomy, data: Episodes, seen: EachObserved) -> Parameters:
-        """Return mean and deviation of the parameters of episodes of one anatomy after what was seen of given states."""
+        """Return the parameters of episodes of one anatomy after what was seen of the given states."""
         known, seen = self.identified.setdefault(data.setup, {}), seen[:, :WINDOW]
         digests = [_digest(data, i, seen[i]) for i in range(len(data))]
         new = np.array([i for i, digest in enumerate(digests) if digest not in known], dtype=int)
