@@ -46,10 +46,10 @@ def recipe_rows(folder: Path) -> list[dict[str, Any]]:
             "hours_of_the_full_recipe": round(share * work["wall_seconds"] / 3600, 2),
         }
     ]
-    for model in ("paper", "causal"):
+    for model in ("paper",):
         manifest = json.loads((folder / model / "manifest.json").read_text(encoding="utf-8"))
         curves = json.loads((folder / model / "training.json").read_text(encoding="utf-8"))
-        windows = work["samples"] // (PATIENTS * SEQUENCES) - WINDOW if model == "paper" else 1
+        windows = work["samples"] // (PATIENTS * SEQUENCES) - WINDOW
         for network, result in curves.items():
             speed = result["curve"][-1]["samples_per_second"]
             samples = share * manifest["episodes"]["train"] * windows * manifest["config"]["epochs"]

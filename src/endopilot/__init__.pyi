@@ -18,7 +18,6 @@ from .control.navigate import navigate as navigate
 from .control.plan import plan as plan
 from .control.plan_config import Plan as Plan
 from .control.plan_config import PlanConfig as PlanConfig
-from .control.plan_config import SampleConfig as SampleConfig
 from .control.plan_xray import PlannedXray as PlannedXray
 from .control.plan_xray import plan_xray as plan_xray
 from .control.reach import Fork as Fork
@@ -57,15 +56,12 @@ from .ladder.ladder import climb as climb
 from .ladder.submission import SubmissionCheck as SubmissionCheck
 from .ladder.submission import check_submission as check_submission
 from .models.checkpoint import load_model as load_model
-from .models.config import CausalConfig as CausalConfig
 from .models.config import TrainConfig as TrainConfig
 from .models.config import TransformerConfig as TransformerConfig
-from .models.config import TwinConfig as TwinConfig
 from .models.episodes import Episodes as Episodes
 from .models.episodes import EpisodeSetUp as EpisodeSetUp
 from .models.episodes import OpenLoop as OpenLoop
 from .models.episodes import Predictor as Predictor
-from .models.patient import Patient as Patient
 from .models.train import train as train
 from .navigation.loop import LoopConfig as LoopConfig
 from .navigation.loop import NavigationLoop as NavigationLoop

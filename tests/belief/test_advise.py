@@ -16,16 +16,15 @@ from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import Calibration
 from endopilot.belief.image_exposures import Exposures
 from endopilot.belief.monitoring import AdviseConfig
-from endopilot.belief.online_predictors import OnlinePredictor, OnlineTwin, OnlineWindowed, online_predictor
+from endopilot.belief.online_predictors import OnlinePredictor, OnlineWindowed, OnlineWires, online_predictor
 from endopilot.cli import main
 from endopilot.dataset.loader import read_dataset
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.files import write_json
-from endopilot.models.config import WINDOW, TwinConfig, run_path
-from endopilot.models.episodes import OpenLoop, Prediction
-from endopilot.models.twin import TwinPredictor
-from endopilot.simulation.config import SimulatorConfig
+from endopilot.models.config import WINDOW
+from endopilot.models.episodes import OpenLoop
+from endopilot.models.simulated_wires import SimulatedWires
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.world import World
 from toy_navigation import make_toy_dataset
@@ -262,49 +261,17 @@ def test_the_adviser_asks_for_more_where_exposures_show_that_the_model_errs(spli
     assert (asked[0] == 3).all() and (asked[1] > 3).all()  # in 10 s
 
 
-class Unsure(HoldSlack):
-    """Holds the slack of the last observed tip; its spread is 0.1 mm for each sample since."""
-
-    def predict(self, episodes, observed) -> Prediction:
-        each = np.broadcast_to(observed, episodes.branch.shape)
-        here = np.arange(each.shape[1])
-        last = np.maximum.accumulate(np.where(each, here, 0), axis=1)
-        row = np.arange(len(episodes))[:, None]
-        length = episodes.proximal[..., 0]
-        abscissa = length - (length - episodes.tip[..., 0])[row, last]
-        tip = np.stack([abscissa, episodes.tip[row, last, 1]], axis=-1).astype(float)
-        return Prediction(tip, np.repeat(0.1 * (here - last)[..., None], 2, axis=-1), np.zeros(tip.shape[:2]))
-
-
-def test_a_probabilistic_model_keeps_its_own_spread(split) -> None:
-    model = online_predictor(Unsure(), split.episodes)
-    before = model.tip.copy(), model.spread.copy()
-    np.testing.assert_allclose(model.spread[:, WINDOW:, 0], np.tile(0.1 * np.arange(1, 21), (len(before[0]), 1)))
-    model.observe(np.array([1]), 34, np.array([[20.0, 0.4]]), np.array([0]))
-    np.testing.assert_array_equal(model.tip[:, :35], before[0][:, :35])
-    np.testing.assert_array_equal(model.tip[[0, 2]], before[0][[0, 2]])
-    length = split.episodes.proximal[1, :, 0]
-    np.testing.assert_allclose(model.tip[1, 35:, 0], length[35:] - (length[34] - 20.0), rtol=1e-5)
-    np.testing.assert_allclose(model.spread[1, 35:, 1], 0.1 * np.arange(1, 16))
-    model.observe(np.array([0, 1]), 45, np.array([[30.0, 0.4], [31.0, 0.5]]), np.array([0, 0]))
-    assert (model.spread[:2, 46] == 0.1).all() and model.spread[2, 46, 0] > 1.5
-    model.reset()
-    np.testing.assert_array_equal(model.tip, before[0])
-    np.testing.assert_array_equal(model.spread, before[1])
-
-
-def test_a_twin_weights_its_wires_by_what_is_observed(split, monkeypatch) -> None:
+def test_simulated_wires_are_weighted_by_what_is_observed(split) -> None:
     samples, count = split.truth.shape[1], len(split.truth)
     slack = np.array([0.0, 1.0, 2.0])[:, None, None] * (np.arange(samples) >= WINDOW)
     paths = np.stack([np.broadcast_to(20.0 - slack, (3, count, samples)), np.full((3, count, samples), 0.5)], axis=-1)
     given = replace(split.episodes, tip=np.tile([20.0, 0.5], (count, samples, 1)))
-    monkeypatch.setattr(TwinPredictor, "ensemble", lambda self, episodes, observed: paths)
-    config = TwinConfig(members=3, abscissa_sd_mm=0.05)
-    model = OnlineTwin(
-        TwinPredictor(device=read_wire("workhorse-014"), simulator=SimulatorConfig(), config=config),
-        given,
-        split.found,
-    )
+
+    class Parting(SimulatedWires):
+        def paths(self, episodes, seen):
+            return paths
+
+    model = OnlineWires(Parting(), given, split.found)
     assert (model.tip[:, WINDOW:, 0] == 19.0).all()  # all alike so far: the middle one
     assert model.spread[0, -1, 0] == pytest.approx(np.sqrt(2 / 3))
     model.observe(np.array([0]), 33, np.array([[18.0, 0.5]]), np.array([0]))
@@ -335,18 +302,16 @@ def test_the_command_calibrates_measures_and_draws(folder, hold_slack, capsys) -
     assert figures["adviser"]["offset_share"] == offset_share == Calibration.read(run).offset_share
 
 
-def test_the_calibration_of_the_model_of_the_package_goes_to_the_output(
+def test_the_calibration_of_simulated_wires_goes_to_the_output(
     folder, split, hold_slack, tmp_path, monkeypatch
 ) -> None:
     monkeypatch.setattr(monitoring, "monitor", lambda *_, **__: split)
     monkeypatch.setattr(advise_module, "PERIODS", (1, 90))
     monkeypatch.setattr(advise_module, "SHARES", ())
     monkeypatch.setattr(advise_module, "THRESHOLDS", ())
-    packaged = Calibration.read(run_path(Path("pretrained")))
-    found = advise(Path("pretrained"), folder / "dataset", tmp_path / "out", AdviseConfig())
+    found = advise(Path("wires"), folder / "dataset", tmp_path / "out", AdviseConfig())
     assert Calibration.read(tmp_path / "out") == found["calibration"]
-    assert Calibration.read(run_path(Path("pretrained"))) == packaged != found["calibration"]
-    assert not Path("pretrained").exists()
+    assert not Path("wires").exists()
     with pytest.raises(InputError, match="no-run: no such run; give a folder made by"):
         advise(tmp_path / "no-run", folder / "dataset", tmp_path / "out", AdviseConfig())
 

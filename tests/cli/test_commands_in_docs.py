@@ -11,13 +11,11 @@ from pathlib import Path
 
 import pytest
 
-import endopilot
 from endopilot.cli import command_of, main
 from endopilot.errors import InputError
 
 ROOT = Path(__file__).parents[2]
-CARD = str(Path(endopilot.__file__).parent / "models/pretrained/MODEL_CARD.md")
-PAGES = ["README.md", "Makefile", CARD]
+PAGES = ["README.md", "Makefile"]
 PAGES += [
     str(page.relative_to(ROOT))
     for shelf in ("", "concepts", "evidence")

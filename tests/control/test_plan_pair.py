@@ -11,11 +11,11 @@ import pytest
 from endopilot.anatomy.io import read_anatomy
 from endopilot.belief.bands import Calibration
 from endopilot.cli import main
-from endopilot.control.agent_config import CALIBRATIONS
+from endopilot.control.agent_config import CALIBRATIONS, read_agent_calibration
 from endopilot.control.plan import plan
 from endopilot.control.plan_config import Plan, PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan
-from endopilot.control.plan_xray import plan_xray, read_calibration
+from endopilot.control.plan_xray import plan_xray
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
@@ -64,8 +64,8 @@ def test_a_written_plan_is_read_back_and_drives_both_devices(pair, vessel, tmp_p
 
 
 def test_the_agent_s_ensemble_forecasts_the_x_ray_of_both(pair):
-    own = read_calibration(pair.config.method, None, 2)
-    assert own == Calibration.read(CALIBRATIONS["assumed", 2]) != read_calibration(pair.config.method, None, 1)
+    own = read_agent_calibration("assumed", 2)
+    assert own == Calibration.read(CALIBRATIONS["assumed", 2]) != read_agent_calibration("assumed", 1)
     xray = plan_xray(pair)
     assert (xray.half_width > 0).all() and xray.exposure.sum() < len(pair.control) / 2
 
@@ -89,7 +89,7 @@ def test_the_commands_plan_and_simulate_take_a_catheter(vessel, tmp_path, capsys
     [
         ({"config": replace(CONFIG, method="spin")}, {}, "method: spin; a wire in a catheter is planned by search"),
         ({"target": "tips.csv"}, {}, "desired tips are followed by a wire alone"),
-        ({}, {"model": "pretrained"}, "--model pretrained: models are of a wire alone"),
+        ({}, {"model": "a-run"}, "--model a-run: models are of a wire alone"),
         ({}, {"device": Stack.of("workhorse-014", CATHETER, "straight-5f")}, "catheter: 2; the search drives one"),
         ({}, {"device": None}, "arrives: catheter; there is none"),
         (

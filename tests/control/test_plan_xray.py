@@ -1,24 +1,14 @@
-"""X-ray that a plan will need: as the agent's simulated wires predict it, and as a run does."""
+"""X-ray that a plan will need, as the agent's simulated wires predict it."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
-
 import numpy as np
-import pytest
 
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief
 from endopilot.control.agent_config import CALIBRATIONS
-from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan
-from endopilot.control.plan_xray import PlannedXray, plan_xray, read_calibration
-from endopilot.errors import InputError
-from endopilot.files import write_json
-from endopilot.models.config import WINDOW
-from endopilot.models.episodes import Episodes, OpenLoop, Prediction
-from endopilot.tasks.route import Route
+from endopilot.control.plan_xray import PlannedXray, plan_xray
 
 STILL = (0.0, 0.0, 0.0, 0.0)
 
@@ -37,99 +27,8 @@ def calibration(abscissa=STILL, offset=STILL) -> Calibration:
     )
 
 
-class Lagging:
-    """A network whose tip is at 0.8 Δ, in the middle of the lumen."""
-
-    def rollout_forward(self, episodes: Episodes) -> OpenLoop:
-        proximal = episodes.proximal[:, WINDOW:]
-        tip = np.stack([0.8 * proximal[..., 0], np.full(proximal.shape[:2], 0.1)], axis=-1)
-        return OpenLoop(tip=tip, proximal=proximal, control=episodes.control[:, WINDOW:])
-
-    rollout_inverse = rollout_dual = rollout_forward
-
-
-class Unsure(Lagging):
-    """The same, whose spread grows by 0.3 mm a period since the tip was last observed."""
-
-    def predict(self, episodes: Episodes, observed: np.ndarray) -> Prediction:
-        each = np.broadcast_to(observed, episodes.branch.shape)
-        last = np.maximum.accumulate(np.where(each, np.arange(each.shape[1]), 0), axis=1)
-        spread = 0.3 * (np.arange(each.shape[1]) - last)
-        tip = np.stack([0.8 * episodes.proximal[..., 0], np.full(each.shape, 0.1)], axis=-1)
-        return Prediction(tip=tip, spread=np.stack([spread, 0.0 * spread], axis=-1), jump=0.0 * spread)
-
-
-@pytest.fixture
-def by_network(found, tmp_path, monkeypatch):
-    """Return what makes a plan of 20 periods at 4 mm/s by a run that predicts as the given predictor does."""
-
-    def made(predictor):
-        monkeypatch.setattr("endopilot.models.checkpoint.load_model", lambda _: predictor)
-        write_json(tmp_path / "run" / "manifest.json", {"config": {}, "networks": {}, "device": {}})
-        inserted = 2.0 + 2.0 * np.arange(1, 21)
-        longer = found.trajectory._each(lambda values: np.resize(values, (1, 20, *values.shape[2:])))
-        return replace(
-            found,
-            config=PlanConfig(method="mppi"),
-            model=str(tmp_path / "run"),
-            trajectory=replace(
-                longer,
-                command=np.tile([4.0, 0.0], (1, 20, 1, 1)),
-                inserted_length=inserted[None, :, None],
-                rotation=np.zeros((1, 20, 1)),
-            ),
-            desired=np.resize(found.desired, (20, 2)),
-            predicted=np.column_stack([0.8 * inserted, np.full(20, 0.1)]),
-        )
-
-    return made
-
-
 def due(xray: PlannedXray) -> list[int]:
     return (1 + np.flatnonzero(xray.exposure)).tolist()
-
-
-def test_a_networks_band_grows_from_exposure_to_exposure(by_network):
-    # half-width 0.15 mm a mm of travel: 2 mm are reached after 14 mm, which are 7 periods of 2 mm
-    xray = plan_xray(by_network(Lagging()), calibration=calibration(abscissa=(0.0, 0.0, 0.15, 0.0)))
-    assert due(xray) == [7, 14]
-    travel = 2.0 * np.array([*range(1, 8), *range(1, 8), *range(1, 7)])
-    np.testing.assert_allclose(xray.half_width[:, 0], 0.15 * travel, atol=1e-5)
-
-
-def test_a_networks_own_spread_widens_its_band_until_the_tip_is_observed(by_network):
-    # 0.3 mm a period: 2 mm are reached after 7 of them
-    xray = plan_xray(by_network(Unsure()), calibration=calibration(abscissa=(0.0, 0.0, 0.0, 1.0)))
-    assert due(xray) == [7, 14]
-    np.testing.assert_allclose(xray.half_width[:, 0], 0.3 * np.array([*range(1, 8), *range(1, 8), *range(1, 7)]))
-
-
-def test_a_networks_band_of_the_offset_reaches_the_wall(by_network):
-    plan = by_network(Lagging())
-    # clearance 1 − r_w mm: γ + 0.05 mm a period reaches 0.7 of it
-    first = int(np.ceil((0.7 * (1.0 - plan.navigation.device.tip_radius_mm) - 0.1) / 0.05))
-    assert due(plan_xray(plan, calibration=calibration(offset=(0.0, 0.1, 0.0, 0.0))))[0] == first
-
-
-class Branched(Lagging):
-    """Keeps the branches that the tip was observed in."""
-
-    def __init__(self) -> None:
-        self.branches = []
-
-    def predict(self, episodes: Episodes, observed: np.ndarray) -> Prediction:
-        self.branches.append(episodes.branch[np.broadcast_to(observed, episodes.branch.shape)][WINDOW:].tolist())
-        tip = np.stack([0.8 * episodes.proximal[..., 0], np.full(episodes.branch.shape, 0.1)], axis=-1)
-        return Prediction(tip=tip, spread=np.zeros_like(tip), jump=0.0 * tip[..., 0])
-
-
-def test_a_network_observes_the_tip_in_the_branch_that_the_route_takes(by_network):
-    model = Branched()
-    plan = by_network(model)
-    xray = plan_xray(plan, calibration=calibration(abscissa=(0.0, 0.0, 0.15, 0.0)))
-    route = Route.to(plan.navigation.anatomy, plan.navigation.target)
-    beyond = plan.predicted[xray.exposure, 0] > route.junctions[0]
-    assert model.branches[-1] == np.where(beyond, *route.branches[::-1]).tolist() and len(set(model.branches[-1])) == 2
 
 
 def test_the_agents_wires_follow_the_plan_and_observe_its_tip(found, monkeypatch):
@@ -153,9 +52,9 @@ def test_the_agents_wires_follow_the_plan_and_observe_its_tip(found, monkeypatch
 
 
 def test_the_agents_own_calibration_asks_seldom_along_a_straight_vessel(found):
-    own = read_calibration("search", None, 1)
-    assert own == Calibration.read(CALIBRATIONS["assumed", 1])
     xray = plan_xray(found)
+    by_shipped = plan_xray(found, calibration=Calibration.read(CALIBRATIONS["assumed", 1]))
+    np.testing.assert_array_equal(xray.half_width, by_shipped.half_width)
     assert (xray.half_width > 0).all()
     assert xray.exposure.sum() < len(found.control) / 3
 
@@ -182,12 +81,3 @@ def test_it_is_written_beside_the_plan(found, vessel, tmp_path):
     np.testing.assert_allclose(table[["band_tip_abscissa_mm", "band_tip_offset_mm"]], xray.half_width)
     read_plan(tmp_path / "plan", read_anatomy(vessel))
     assert "xray_due_s" not in write_plan(found, output=tmp_path / "plan")
-
-
-def test_a_model_without_calibration_is_refused(tmp_path):
-    (tmp_path / "run").mkdir()
-    with pytest.raises(InputError, match=r"run: the model has no calibration.*endopilot advise"):
-        read_calibration("inverse", tmp_path / "run", 1)
-    assert read_calibration("search", tmp_path / "run", 1) == read_calibration("search", None, 1)
-    with pytest.raises(InputError, match="no such run"):
-        read_calibration("mppi", Path("nowhere"), 1)

@@ -10,7 +10,6 @@ import pytest
 
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.cli import main
 from endopilot.dataset import loader
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset, write_episode
@@ -152,17 +151,14 @@ def test_a_catheter_stops_short_of_the_end_of_the_vessel(patient):
     np.testing.assert_array_equal(driven.command[:, :, 0, 0], 0.0)
 
 
-def test_models_refuse_it_with_one_line(pairs, capsys, tmp_path):
+def test_models_take_it_with_the_commands_of_both_devices(pairs):
     data = read_dataset(pairs)
-    line = "its wires lie in microcatheter-1.7f, and a model takes a wire alone; make a dataset without --catheter"
-    for refused in (lambda: Episodes.of_dataset(data), lambda: check_wire(pairs, {"device": {}}, data)):
-        with pytest.raises(InputError, match=line):
-            refused()
-    with pytest.raises(SystemExit) as leaving:
-        main(["train", str(pairs), "-o", str(tmp_path / "run")])
-    assert leaving.value.code == 2
-    assert line in " ".join(capsys.readouterr().err.split())
-    assert not (tmp_path / "run").exists()
+    longer = {each.name: np.repeat(getattr(data, each.name), 2, axis=1) for each in fields(data)}
+    episodes = Episodes.of_dataset(replace(data, **longer))
+    np.testing.assert_array_equal(episodes.command, np.repeat(data.command, 2, axis=1))
+    np.testing.assert_array_equal(episodes.start, data.initial)
+    assert episodes.setup.device == Stack(WIRE, (WEAK,))
+    check_wire(pairs, {"device": data.manifest["device"]}, data)
 
 
 def test_what_does_not_go_together_is_refused(pairs, patient, tmp_path, monkeypatch):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,8 +12,6 @@ from command import refused, run
 
 from benchmarks.anatomy.analytic_lumens import forked_tree, tree_distance
 from endopilot.anatomy.io import write_anatomy
-from endopilot.files import read_json, write_json
-from endopilot.models.config import run_path
 from endopilot.types import Anatomy, Branch, DistanceMap, Insertion, VesselTree
 
 
@@ -65,21 +62,6 @@ def test_xray_is_foreseen_along_a_plan(patient, tmp_path, capsys):
     by_wires = run(capsys, *plan)
     assert len(by_wires["xray_due_s"]) <= 1  # straight on, near the middle
     assert "band_tip_abscissa_mm" in table.read_text(encoding="utf-8").splitlines()[0]
-    shutil.copytree(run_path(Path("pretrained")), tmp_path / "unsure")
-    bands = read_json(tmp_path / "unsure" / "xray.json")
-    write_json(tmp_path / "unsure" / "xray.json", bands | {"scale": 1000 * bands["scale"]})
-    plan = (*plan[:-1], tmp_path / "by-network")
-    by_network = run(capsys, *plan, "--method", "mppi", "--model", tmp_path / "unsure", "--seconds", "10")
-    assert by_network["method"] == "mppi" and by_network["xray_due_s"][:2] == [1.5, 3.0]  # as often as it may
-
-
-def test_a_model_without_calibration_foresees_no_xray(patient, tmp_path, capsys):
-    shutil.copytree(run_path(Path("pretrained")), tmp_path / "run")
-    (tmp_path / "run" / "xray.json").unlink()
-    plan = ("plan", patient, "--target", "0,0,33", "--model", tmp_path / "run", "--method", "mppi", "--xray")
-    line = refused(capsys, *plan, "-o", tmp_path / "plan")
-    assert f"{tmp_path / 'run'}: the model has no calibration" in line and "endopilot advise" in line
-    assert not (tmp_path / "plan").exists()
 
 
 def test_desired_tips_that_no_drive_can_keep_up_with(patient, tmp_path, capsys):
@@ -100,7 +82,6 @@ def test_desired_tips_that_no_drive_can_keep_up_with(patient, tmp_path, capsys):
         (("--target", ""), ("target: is empty", "X,Y,Z")),
         (("--target", "nothing.csv"), ("nothing.csv",)),
         (("--target", "0,0,33", "--seconds", "2"), ("seconds: 2", "31 mm", "speed_mm_s")),
-        (("--target", "0,0,33", "--method", "inverse"), ("--model",)),
         (("--target", "0,0,33", "--force-limit-n", "nan"), ("force_limit_n",)),
         (("--target", "0,0,33", "--force-limit-n", "1e-6"), ("under 1e-06 N", "workhorse-014", "larger force_limit_n")),
         (("--target", "0,0,33", "--force-weight", "-1"), ("force_weight",)),

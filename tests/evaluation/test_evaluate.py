@@ -283,9 +283,9 @@ def test_a_run_without_its_dataset_is_refused(evaluated, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_packaged_model_asks_for_a_dataset(tmp_path):
-    with pytest.raises(InputError, match="not in the package; name one with --dataset"):
-        evaluate(Path("pretrained"), output=tmp_path / "out", config=EvaluateConfig())
+def test_simulated_wires_ask_for_a_dataset(tmp_path):
+    with pytest.raises(InputError, match="trained on no dataset; name one with --dataset"):
+        evaluate(Path("wires"), output=tmp_path / "out", config=EvaluateConfig())
 
 
 @pytest.mark.parametrize("record", [None, {"config": {}, "stages": {}}])

@@ -4,22 +4,35 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-import endopilot
 from endopilot.dataset.loader import read_manifest
+from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
+from endopilot.files import write_json
 from endopilot.models.checkpoint import load_model
 from endopilot.models.config import read_run
 from endopilot.pipeline.study import Stages
 from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
+from toy_navigation import make_untrained_run
 
-PRETRAINED = Path(endopilot.__file__).parent / "models" / "pretrained"
 ODD = [None, [], "text", 3, True, {"a": []}]
+
+
+@pytest.fixture(scope="module")
+def a_run(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("damaged")
+    write_json(
+        folder / "dataset" / "meta" / "manifest.json", {"key": "k", "device": asdict(read_wire("workhorse-014"))}
+    )
+    (folder / "run").mkdir()
+    make_untrained_run(folder / "dataset", folder / "run")
+    return folder / "run"
 
 
 def refused(path: Path, read: Any) -> str:
@@ -31,12 +44,12 @@ def refused(path: Path, read: Any) -> str:
 
 @pytest.mark.parametrize("odd", ODD, ids=repr)
 @pytest.mark.parametrize("name", ["config", "device", "networks"])
-def test_a_run_whose_manifest_holds_something_else(tmp_path, name, odd) -> None:
+def test_a_run_whose_manifest_holds_something_else(tmp_path, a_run, name, odd) -> None:
     run = tmp_path / "run"
-    shutil.copytree(PRETRAINED, run)
+    shutil.copytree(a_run, run)
     record = json.loads((run / "manifest.json").read_text())
     (run / "manifest.json").write_text(json.dumps(record | {name: odd}))
-    if (name, odd) != ("networks", []):  # a run without networks is that of a model that has none
+    if name != "config" and (name, odd) != ("networks", []):  # weights say their own size; no networks are none
         refused(run, lambda: load_model(run))
 
 
@@ -56,9 +69,9 @@ def test_a_dataset_whose_manifest_or_info_holds_something_else(tmp_path, odd) ->
     refused(tmp_path, lambda: read_manifest(tmp_path))
 
 
-def test_weights_that_are_none(tmp_path) -> None:
+def test_weights_that_are_none(tmp_path, a_run) -> None:
     run = tmp_path / "run"
-    shutil.copytree(PRETRAINED, run)
+    shutil.copytree(a_run, run)
     for content in (b"", b"\x00" * 100, (run / "ff.safetensors").read_bytes()[:5000]):
         (run / "ff.safetensors").write_bytes(content)
         assert "train it again" in refused(run, lambda: load_model(run))

@@ -11,7 +11,7 @@ from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.files import read_json
-from endopilot.models.config import PRETRAINED, TrainConfig, TransformerConfig, run_path
+from endopilot.models.config import WIRES, TrainConfig, TransformerConfig, read_run
 from endopilot.models.episodes import trained_patients
 from endopilot.models.train import train
 from toy_navigation import make_toy_dataset
@@ -64,17 +64,9 @@ def test_an_older_run_knows_its_own_dataset_alone(own, elsewhere, record):
         trained_patients(RUN, old, elsewhere)
 
 
-def test_the_twin_knows_nobody(toy_dataset, own, tmp_path):
-    train(toy_dataset, output=tmp_path, config=TrainConfig(model="twin"))
-    record = read_json(tmp_path / "manifest.json")
-    assert record["patients"] == []
-    assert trained_patients(RUN, record, own) == frozenset()
-
-
-def test_the_packaged_model_names_its_patients():
-    record = read_json(run_path(Path(PRETRAINED)) / "manifest.json")
-    assert len(set(record["patients"])) == 44 + 21  # as its model card says: at rest, and moving
-    assert record["episodes"]["train"] == 44 * (4 + 4) + 21 * 3  # one of five is held out; one in each of four worlds
+def test_simulated_wires_know_nobody_and_take_any_wire(own):
+    other = replace(own, manifest=own.manifest | {"device": asdict(read_wire("j-035"))})
+    assert trained_patients(RUN, read_run(WIRES), other) == frozenset()
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ from endopilot.belief.bands import CALIBRATION_FILE, Calibration, check_enough
 from endopilot.belief.monitoring import AdviseConfig, Monitored
 from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.errors import InputError
-from endopilot.files import manifest, sha256, write_json, writing
-from endopilot.models.config import PRETRAINED, WINDOW, read_run, run_path
+from endopilot.files import manifest, write_json, writing
+from endopilot.models.config import WINDOW, WIRES, read_run, run_inputs
 from endopilot.models.episodes import check_wire
 from endopilot.progress import progress
 from endopilot.runs import claim
@@ -38,11 +38,11 @@ def advise(
 ) -> dict[str, Any]:
     """Calibrate the X-ray adviser of a run on a dataset's calibration patients, and measure it on its test patients.
 
-    Writes the calibration beside the run (`xray.json`; for "pretrained", to the output), and `advice.json` and
+    Writes the calibration beside the run (`xray.json`; of simulated wires, to the output), and `advice.json` and
     `advice.png` to the output, each whole or not at all.
 
     Args:
-        run: made by `endopilot train`, or "pretrained", the model of the package.
+        run: made by `endopilot train`, or "wires", the simulated wires.
         dataset: made by `endopilot dataset`; its patients must not be those that the run was trained on, unless they
             are of its split 'train'.
         also_test: datasets of the same wire that were made otherwise, with another wall or other elements: their test
@@ -60,13 +60,13 @@ def advise(
     from endopilot.plotting import png  # brings matplotlib, which takes a second to import
 
     start = time.perf_counter()
-    beside = output if str(run) == PRETRAINED else run
+    beside = output if str(run) == WIRES else run
     episodes, predictor = read_dataset(dataset), load_model(run)
     check_wire(run, read_run(run), episodes)
     splits = [episodes.of_split(name) for name in ("train", "calibrate", "test")]
     check_enough(len(set(splits[1].anatomy)), config.adviser.level)
     others = [_other(run, folder, splits[:2]) for folder in also_test]
-    inputs = {"run": sha256(run_path(run) / "manifest.json"), "dataset": episodes.manifest["key"]}
+    inputs = run_inputs(run) | {"dataset": episodes.manifest["key"]}
     inputs |= {"also_test": [other.manifest["key"] for other in others]}
     claim(output, "endopilot advise", inputs=inputs, config=config, version=__version__)
     fitted = monitoring.monitor(predictor, splits[0], config, samples=WINDOW)

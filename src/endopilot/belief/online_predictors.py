@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from endopilot.models.config import WINDOW
-from endopilot.models.episodes import EachObserved, Episodes, Predictor, ProbabilisticPredictor, given_states
-from endopilot.models.twin import TwinPredictor, weigh
+from endopilot.models.ensemble import weigh
+from endopilot.models.episodes import EachObserved, Episodes, Predictor, given_states
+from endopilot.models.simulated_wires import SimulatedWires
 
 Tips = Float[np.ndarray, "episodes samples 2"]
 
@@ -50,8 +51,8 @@ class OnlinePredictor:
 
         Args:
             tip: (Δtip, γtip) in the image, mm.
-            sd_mm: standard deviations of both as the detector states them, mm; none if not given. The twin weighs its
-                wires by them; networks have no such input.
+            sd_mm: standard deviations of both as the detector states them, mm; none if not given. Simulated wires are
+                weighed by them; networks have no such input.
         """
         self._observed[episodes, sample] = True
         self._tip[episodes, sample], self._branch[episodes, sample] = tip, branch
@@ -60,29 +61,15 @@ class OnlinePredictor:
         self.tip[episodes, later], self.spread[episodes, later] = (part[:, later] for part in found)
 
 
-class OnlineTwin(OnlinePredictor):
-    """A twin, whose ensemble is simulated once and weighted again at every exposure."""
+class OnlineWires(OnlinePredictor):
+    """Simulated wires, which are simulated once and weighted again at every exposure."""
 
-    def __init__(self, twin: TwinPredictor, episodes: Episodes, observed: EachObserved) -> None:
-        self._config, self._paths = twin.config, twin.ensemble(episodes, observed & given_states(episodes))
+    def __init__(self, wires: SimulatedWires, episodes: Episodes, observed: EachObserved) -> None:
+        self._paths = wires.paths(episodes, observed & given_states(episodes))
         super().__init__(episodes, observed)
 
     def _predict(self, chosen: Int[np.ndarray, "some"], sample: int) -> tuple[Tips, Tips]:
-        paths, seen = self._paths[:, chosen], self._observed[chosen]
-        return weigh(paths, self._tip[chosen], seen, self._sd[chosen], self._config)
-
-
-class OnlineCausal(OnlinePredictor):
-    """The causal networks, which run again over the whole navigation at every exposure."""
-
-    def __init__(self, predictor: ProbabilisticPredictor, episodes: Episodes, observed: EachObserved) -> None:
-        self._predictor, self._episodes = predictor, episodes
-        super().__init__(episodes, observed)
-
-    def _predict(self, chosen: Int[np.ndarray, "some"], sample: int) -> tuple[Tips, Tips]:
-        episodes = replace(self._episodes.select(chosen), tip=self._tip[chosen], branch=self._branch[chosen])
-        found = self._predictor.predict(episodes, self._observed[chosen])
-        return found.tip, found.spread
+        return weigh(self._paths[:, chosen], self._tip[chosen], self._observed[chosen], self._sd[chosen])
 
 
 class OnlineWindowed(OnlinePredictor):
@@ -117,8 +104,6 @@ def online_predictor(predictor: Predictor, episodes: Episodes, observed: EachObs
     """
     if observed is None:
         observed = np.ones(episodes.branch.shape, dtype=bool)
-    if isinstance(predictor, TwinPredictor):
-        return OnlineTwin(predictor, episodes, observed)
-    if isinstance(predictor, ProbabilisticPredictor):
-        return OnlineCausal(predictor, episodes, observed)
+    if isinstance(predictor, SimulatedWires):
+        return OnlineWires(predictor, episodes, observed)
     return OnlineWindowed(predictor, episodes)

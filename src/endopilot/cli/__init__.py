@@ -31,7 +31,7 @@ COMMANDS = {
     "simulate": "anatomy and proximal controls -> motion of the wire and its contact forces",
     "dataset": "anatomies -> many random navigations on disk",
     "dataset-info": "dataset -> its content in figures and pictures",
-    "train": "dataset -> forward and inverse networks: the paper's, ours, or the rod core as a twin",
+    "train": "dataset -> the paper's forward and inverse network",
     "evaluate": "trained run -> errors beside the paper's and the baselines'",
     "plan": "anatomy and target -> controls that bring the tip there",
     "navigate": "anatomy and target -> a wire driven there by a policy, in closed loop, and its page",

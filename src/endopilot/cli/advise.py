@@ -25,8 +25,8 @@ def command(
     The adviser asks for X-ray before the tip may be at the wall or far from where the model predicts it.
 
     Args:
-        run: folder made by `endopilot train`; the calibration, xray.json, is written into it. Or `pretrained`, the
-            model that comes with endopilot; the calibration is then written to the output.
+        run: folder made by `endopilot train`; the calibration, xray.json, is written into it. Or `wires`,
+            the simulated wires; the calibration is then written to the output.
         dataset: folder made by `endopilot dataset`, with at least 9 patients in its split 'calibrate'.
         output: folder of advice.json and advice.png.
         also_test: datasets that were made otherwise, with another wall or other elements: the same calibration is

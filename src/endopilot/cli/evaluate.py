@@ -24,7 +24,7 @@ def command(
     """Roll the networks of a run out in open loop (protocols P1 to P4) and measure their errors.
 
     Args:
-        run: folder made by `endopilot train`, or `pretrained`, the causal model that comes with endopilot.
+        run: folder made by `endopilot train`, or `wires`, the simulated wires.
         output: folder of report.html, metrics.json, figures and tables.
         dataset: dataset to evaluate on; the one that the run was trained on if not given.
         other_seeds: runs of the same training with other seeds; their errors in P1 are reported beside the run's, with

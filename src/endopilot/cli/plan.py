@@ -12,10 +12,9 @@ from endopilot.cli.arguments import Existing, Figures, OutputFolder
 from endopilot.control.plan import plan
 from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import write_plan
-from endopilot.control.plan_xray import plan_xray, read_calibration
+from endopilot.control.plan_xray import plan_xray
 from endopilot.devices.stack import Stack
-from endopilot.files import input_hash
-from endopilot.models.config import run_path
+from endopilot.models.config import WIRES, run_inputs
 from endopilot.runs import claiming
 
 
@@ -38,21 +37,18 @@ def command(
         target: section label such as 4 or PDA, point X,Y,Z in LPS mm, or CSV of desired tips (time_s, tip_abscissa_mm,
             tip_offset_mm).
         output: folder of plan.csv, plan.png and manifest.json.
-        model: folder made by `endopilot train`, or `pretrained`, the causal model that comes with endopilot; needed for
-            the methods inverse and mppi.
+        model: folder made by `endopilot train`, for the method inverse; the simulated wires, named `wires`, if not
+            given.
         device: name of a device (`endopilot devices`) or a YAML file; by default the model's device, or workhorse-014
             without a model.
         catheter: one around the wire, which is planned for too (method search): a name such as microcatheter-1.7f, or a
             YAML file.
-        xray: also predict when X-ray will be needed, with the calibration that `endopilot advise` wrote into the run
-            (inverse, mppi), or with that of the agent's simulated wires (other methods).
+        xray: also predict when X-ray will be needed, by the bands of the agent's simulated wires.
         config: method, limits and cost.
     """
-    if xray:
-        read_calibration(config.method, model, 1 + len(catheter))  # refused before the search, which takes its time
     stack = Stack.of(device or "workhorse-014", *catheter) if device or catheter else None
     patient, asked = read_anatomy(anatomy), {"target": target, "device": stack, "config": config, "xray": xray}
-    weights = {} if model is None else input_hash(run_path(model), [*run_path(model).glob("*.safetensors")])
+    weights = run_inputs(model or WIRES)
     with claiming(output, "endopilot plan", anatomy=patient.identity, model=weights, **asked, version=__version__):
         found = plan(patient, target, device=stack, model=model, config=config)
         return write_plan(found, output=output, xray=plan_xray(found) if xray else None)

@@ -21,7 +21,7 @@ def command(
     """Run every stage on one patient, from the CT angiogram to the report.
 
     With --target the agent drives the wire to a place of the vessel, as `endopilot navigate` does with its defaults;
-    the page of that navigation is in the folder `navigation`. The networks of the package are evaluated in this
+    the page of that navigation is in the folder `navigation`. Simulated wires are evaluated in this
     patient; --training-seconds trains networks on it instead.
 
     An interrupted run goes on where it stopped when the same command is given again.

@@ -18,7 +18,7 @@ def command(
     output: OutputFolder,
     config: TrainConfig = TrainConfig(),
 ) -> Answer | None:
-    """Train the forward and the inverse network on a dataset.
+    """Train the paper's forward and inverse network on a dataset.
 
     An interrupted run goes on where it stopped when the same command is given again.
 

@@ -15,7 +15,7 @@ from endopilot.anatomy.io import read_anatomy
 from endopilot.control.agent import OraclePolicy
 from endopilot.control.agent_config import AgentConfig
 from endopilot.control.course import Controls
-from endopilot.control.plan_config import NETWORK_METHODS, Plan, PlanConfig, Steps
+from endopilot.control.plan_config import Plan, PlanConfig, Steps
 from endopilot.control.set_up import TipChoice, choose_tip
 from endopilot.devices.device import Wire, read_wire
 from endopilot.devices.drive_limits import DriveLimits
@@ -23,7 +23,7 @@ from endopilot.devices.robot import IDEAL, read_robot
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
-from endopilot.models.config import read_run
+from endopilot.models.config import WIRES, read_run
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.progress import progress
 from endopilot.settings import from_record, public
@@ -55,8 +55,7 @@ def plan(
         target: a section such as "4" or "PDA", a point "X,Y,Z" in LPS mm, or the path of a CSV of desired tips.
         device: the wire, its name or its YAML file; or the wire and a catheter, which is then planned for too, by the
             method search. The model's wire if not given, the workhorse if there is no model.
-        model: run made by `endopilot train`, or "pretrained", the model of the package; needed for the methods inverse
-            and mppi.
+        model: run made by `endopilot train`, for the method inverse; the simulated wires, named "wires", if not given.
         config: method, time, limits and cost.
 
     Raises:
@@ -67,11 +66,11 @@ def plan(
     """
     config = config or PlanConfig()
     vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
-    model = None if model is None else Path(model)
+    model = None if model is None or str(model) == WIRES else Path(model)
     catheters = device.catheters if isinstance(device, Stack) else ()
     if catheters:
         _check_for_stack(config, target, model)
-    wire = _wire(model, device, config.method)
+    wire = _wire(model, device)
     tips = (
         read_tips(Path(target), wire.max_velocity_mm_s, config.start_inserted_length_mm)
         if target.endswith(".csv")
@@ -117,7 +116,7 @@ def plan(
     made, trials = None, _TRIALS if config.method == "search" and tips is None else 1
     trials = min(trials, 2) if catheters else trials  # nothing of theirs is drawn at random
     for trial in range(trials):
-        find = _method(navigation, config, model, desired, route, follow=tips is not None, trial=trial)
+        find = _method(navigation, config, model, desired, follow=tips is not None, trial=trial)
         began = _clock()
         control, predicted = find()
         control = control.reshape(len(control), -1, 2)
@@ -137,19 +136,17 @@ def _clock() -> Float[np.ndarray, "2"]:
 
 
 def _method(
-    navigation: Navigation, config: PlanConfig, model: Path | None, desired: Steps, route: Route, *,
-    follow: bool, trial: int,
-) -> Callable[[], tuple[Controls | Steps, Steps]]:  # fmt: skip
+    navigation: Navigation, config: PlanConfig, model: Path | None, desired: Steps, *, follow: bool, trial: int
+) -> Callable[[], tuple[Controls | Steps, Steps]]:
     """Return a function that finds controls and predicts their tips; loading a model is done before it is called."""
-    if config.method in NETWORK_METHODS:
+    if config.method == "inverse" and model is not None:
         with extra_named(f"plan by {config.method}"):
             from endopilot.control.network_plan import network_planner  # torch is slow to import
 
-        assert model is not None
-        return network_planner(navigation, model, desired, route, config)
-    if config.method != "search":
-        return lambda: _by_policy(navigation, config)
-    return lambda: _track(navigation, desired) if follow else _search(navigation, config, trial)
+        return network_planner(navigation, model, desired)
+    if config.method == "inverse" or (config.method == "search" and follow):
+        return lambda: _track(navigation, desired)
+    return lambda: _search(navigation, config, trial) if config.method == "search" else _by_policy(navigation, config)
 
 
 def _check_for_stack(config: PlanConfig, target: str, model: Path | None) -> None:
@@ -168,14 +165,10 @@ def _check_for_stack(config: PlanConfig, target: str, model: Path | None) -> Non
         )
 
 
-def _wire(model: Path | None, device: Wire | Stack | str | Path | None, method: str) -> Wire:
+def _wire(model: Path | None, device: Wire | Stack | str | Path | None) -> Wire:
     """Return the wire: the one that is asked for, else the model's; both must be the same."""
     asked = None if device is None else Stack.of(device).wire
     if model is None:
-        if method in NETWORK_METHODS:
-            raise InputError(
-                f"--model: none given, and method {method} needs one; give a run of `endopilot train`, or pretrained"
-            )
         return asked or read_wire("workhorse-014")
     trained = from_record(Wire, read_run(model)["device"])
     if asked is not None and asked.constants != trained.constants:
@@ -249,17 +242,17 @@ def _check_kept(made: Plan) -> None:
 
 def _track(navigation: Navigation, desired: Steps) -> tuple[Steps, Steps]:
     """Track desired tips in the rod core, one sample at a time."""
-    from endopilot.models.twin import track
+    from endopilot.models.simulated_wires import track
 
-    core = SimulatorConfig(threads=1)
+    stack = Stack.of(navigation.device)
     tip, control = track(
         navigation.anatomy,
-        [navigation.device],
-        friction=np.array([navigation.device.friction]),
-        start=np.array([[navigation.start_inserted_length_mm, navigation.start_rotation_rad]]),
-        given=np.zeros((1, 0, 2)),
+        [stack],
+        friction=stack.frictions(np.array([navigation.device.friction])),
+        start=np.array([[[navigation.start_inserted_length_mm, navigation.start_rotation_rad]]]),
+        command=np.zeros((1, len(desired), 1, 2)),
         desired=desired[None],
-        config=core,
+        config=SimulatorConfig(threads=1),
     )
     return control[0], tip[0]
 

@@ -18,26 +18,8 @@ from endopilot.simulation.trajectory import Trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Arrives, Navigation
 from endopilot.types import TipProjection
 
-Method = Literal["search", "inverse", "mppi", "forward", "spin", "retract-rotate"]
-NETWORK_METHODS = ("inverse", "mppi")
-"""Methods that ask a trained network."""
+Method = Literal["search", "inverse", "forward", "spin", "retract-rotate"]
 Steps = Float[np.ndarray, "samples 2"]
-
-
-@settings
-class SampleConfig:
-    """Sampling through the forward network (method mppi), after Williams et al., J. Guid. Control Dyn. 40, 2017."""
-
-    candidates: Annotated[int, Within(1, 4096)] = 12
-    """Control sequences that are rolled out together."""
-    iterations: Annotated[int, Within(1, 1000)] = 4
-    """Rounds; each draws around the weighted mean of the one before."""
-    translation_sd_mm_s: Positive = 1.0
-    """Standard deviation of the translation that is drawn, mm/s."""
-    rotation_sd_rad_s: Positive = 0.5
-    """Standard deviation of the rotation that is drawn, rad/s."""
-    temperature: Positive = 0.1
-    """Candidates are weighted by exp(−cost/(temperature · standard deviation of the costs))."""
 
 
 @settings
@@ -45,8 +27,8 @@ class PlanConfig:
     """Method, limits and cost of a plan."""
 
     method: Method = "search"
-    """How the controls are found: search (searched in the rod core), inverse (the inverse network of --model), mppi
-    (sampled through its forward network), or a baseline: forward, spin, retract-rotate."""
+    """How the controls are found: search (searched in the rod core), inverse (led along desired tips: by the inverse
+    network of --model, or else by a simulated wire), or a baseline: forward, spin, retract-rotate."""
     seconds: Seconds = 60.0
     """Time in which the target is to be reached, s."""
     speed_mm_s: Annotated[float, Within(0.1, 1000)] = 10.0
@@ -68,8 +50,6 @@ class PlanConfig:
     """Seed of what is drawn at random."""
     cost: Cost = field(default_factory=Cost)
     """Weights of the cost."""
-    sample: SampleConfig = field(default_factory=SampleConfig)
-    """Sampling through the forward network."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -100,22 +100,6 @@ class Dataset(Outputs):
         catheters = tuple(from_record(Catheter, record) for record in self.manifest["catheters"])
         return Stack(from_record(Wire, self.manifest["device"]), catheters)
 
-    def check_wire_alone(self, what: str) -> None:
-        """Check that the dataset's wire has no catheter around it, for what takes a wire alone.
-
-        Args:
-            what: what takes a wire alone, as the line ends.
-
-        Raises:
-            InputError: it has one.
-        """
-        if self.stack.catheters:
-            names = ", ".join(catheter.name for catheter in self.stack.catheters)
-            raise InputError(
-                f"{self.folder}: its wires lie in {names}, and {what} takes a wire alone; "
-                "make a dataset without --catheter"
-            )
-
     def __getitem__(self, episodes: int | slice | Shaped[np.ndarray, "chosen"]) -> Dataset:
         """Return one episode, by its number, or several, by a mask or their numbers; one may stand there several times.
 

@@ -30,8 +30,8 @@ from endopilot.evaluation.results import (
     write_results,
 )
 from endopilot.extras import extra_named
-from endopilot.files import manifest, sha256, write_json
-from endopilot.models.config import PRETRAINED, read_run, run_path
+from endopilot.files import manifest, write_json
+from endopilot.models.config import WIRES, read_run, run_inputs
 from endopilot.models.episodes import trained_patients
 from endopilot.progress import progress
 from endopilot.runs import claim
@@ -70,7 +70,7 @@ def evaluate(
     at all. `report.report_evaluation` makes figures and a page of them.
 
     Args:
-        run: made by `endopilot train`, or "pretrained", the model of the package.
+        run: made by `endopilot train`, or "wires", the simulated wires.
         output: where the result goes.
         config: how much is evaluated.
         dataset: folder of the dataset to evaluate on; the one that the run was trained on if not given.
@@ -98,11 +98,9 @@ def evaluate(
     for other in other_seeds:
         if trained_patients(other, read_run(other), whole) != known:
             raise InputError(f"{other}: was trained on other patients than {run_folder}; give runs of one training")
-    weights = {path.name: sha256(path) for path in sorted(run_path(run_folder).glob("*.safetensors"))}
-    inputs = weights | {"dataset": whole.manifest["key"]}
-    made_from = inputs | {"run": sha256(run_path(run_folder) / "manifest.json")}
+    inputs = run_inputs(run_folder) | {"dataset": whole.manifest["key"]}
     about = {"robot": robot, "other_seeds": other_seeds, "config": config, "version": __version__}
-    claim(output, "endopilot evaluate", inputs=made_from, **about)
+    claim(output, "endopilot evaluate", inputs=inputs, **about)
     predictor, others = load_model(run_folder), [load_model(other) for other in other_seeds]
     held_out, training = _parted(whole, known)
     if not held_out:
@@ -163,8 +161,8 @@ def _chosen(data: Dataset, sequences: int | None) -> Dataset:
 
 
 def _own_dataset(run: Path, record: Mapping[str, Any]) -> Path:
-    if str(run) == PRETRAINED:
-        raise InputError(f"{run}: the dataset that it was trained on is not in the package; name one with --dataset")
+    if str(run) == WIRES:
+        raise InputError(f"{run}: simulated wires are trained on no dataset; name one with --dataset")
     own = Path(run) / record["dataset"]
     if not own.is_dir():
         raise InputError(f"{own}: the dataset that the run was trained on is not here; name one with --dataset")

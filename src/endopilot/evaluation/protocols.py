@@ -87,8 +87,9 @@ class Recorded:
     def simulated(
         self, controls: Mapping[str, Control], advance: Advance | None = None
     ) -> Iterator[tuple[Int[np.ndarray, "chosen"], Trajectory]]:
-        """Drive episodes as they were driven while states are given, and by each series of controls after.
+        """Drive episodes as they were driven while states are given, and the wire by each series of controls after.
 
+        Catheters go on as they were commanded.
         Series of `REPLAYED` with another friction have it from the start.
 
         Args:
@@ -101,9 +102,10 @@ class Recorded:
             mine = np.flatnonzero(self.anatomy_of == index)
             worlds = self.data[np.tile(mine, len(controls))]
             after = np.concatenate([control[mine] for control in controls.values()])
-            driven = np.nan_to_num(np.concatenate([worlds.command[:, :WINDOW, 0], after], axis=1))
+            driven = worlds.command[:, : WINDOW + after.shape[1]].astype(float)
+            driven[:, WINDOW:, 0] = np.nan_to_num(after)
             friction = np.concatenate([REPLAYED.get(name, 1.0) * self.data.friction[mine] for name in controls])
-            yield mine, worlds.driven(driven[:, :, None], anatomy=anatomy, friction=friction)
+            yield mine, worlds.driven(driven, anatomy=anatomy, friction=friction)
             if advance:
                 advance(1, anatomy.name)
 
@@ -202,7 +204,7 @@ def _driven(
         lost[chosen] = ~ok
         kept, moved = chosen[ok], slice(WINDOW, now + 1)
         made["control"][kept, moved] = rollout.control[ok, moved, 0]
-        made["command"][kept, moved] = rollout.command[ok, moved, 0]
+        made["command"][kept, moved] = rollout.command[ok, moved]
         made["proximal"][kept, moved] = rollout.proximal[ok, moved, 0]
         made["tip"][kept, now] = np.stack([rollout.tip.abscissa, rollout.tip.offset], axis=-1)[ok, now, 0]
         made["branch"][kept, last + 1 : now] = made["branch"][kept, last, None]  # not observed since
@@ -229,26 +231,27 @@ def hold_slack(data: Dataset, given: int) -> Float[np.ndarray, "episodes samples
     """Return (Δtip, γtip), mm, if the slack Δ − Δtip and the offset stay as in the last given state."""
     slack = data.inserted_length[:, given - 1, 0] - data.tip_abscissa[:, given - 1, 0]
     abscissa = data.inserted_length[:, given:, 0] - slack[:, None]
-    offset = np.broadcast_to(data.tip_offset[:, given - 1], abscissa.shape)
+    offset = np.broadcast_to(data.tip_offset[:, given - 1, :1], abscissa.shape)
     return np.stack([abscissa, offset], axis=-1).astype(float)
 
 
 def mean_tip(train: Dataset, data: Dataset, given: int) -> Float[np.ndarray, "episodes samples 2"]:
     """Return (Δtip, γtip), mm, if slack and offset are always the means over the training episodes."""
-    slack = np.mean(train.inserted_length - train.tip_abscissa, dtype=float)
+    slack = np.mean((train.inserted_length - train.tip_abscissa)[:, :, 0], dtype=float)
     abscissa = data.inserted_length[:, given:, 0] - slack
-    return np.stack([abscissa, np.full(abscissa.shape, np.mean(train.tip_offset, dtype=float))], axis=-1)
+    return np.stack([abscissa, np.full(abscissa.shape, np.mean(train.tip_offset[:, :, 0], dtype=float))], axis=-1)
 
 
 def hold_control(data: Dataset, given: int) -> Float[np.ndarray, "episodes samples 2"]:
     """Return the last given control at every sample, (mm/s, rad/s)."""
     samples = data.control.shape[1] - given
-    return np.repeat(data.control[:, given - 1], samples, axis=1).astype(float)
+    return np.repeat(data.control[:, given - 1, :1], samples, axis=1).astype(float)
 
 
 def mean_control(train: Dataset, data: Dataset, given: int) -> Float[np.ndarray, "episodes samples 2"]:
     """Return the mean control of the training episodes at every sample, (mm/s, rad/s)."""
-    return np.broadcast_to(train.control.mean(axis=(0, 1), dtype=float), data.control[:, given:, 0].shape).copy()
+    mean = train.control[:, :, 0].mean(axis=(0, 1), dtype=float)
+    return np.broadcast_to(mean, data.control[:, given:, 0].shape).copy()
 
 
 def follow_slack(data: Dataset, given: int) -> Float[np.ndarray, "episodes samples 2"]:

@@ -17,34 +17,22 @@ from endopilot.devices.device import Wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.errors import InputError
 from endopilot.files import json_text, reading, regular, writing
-from endopilot.models.causal import CAUSAL_NETWORKS, CausalNetwork, CausalPredictor
-from endopilot.models.config import PRETRAINED, CausalConfig, TransformerConfig, TwinConfig, read_run, run_path
+from endopilot.models.config import WIRES, TransformerConfig, read_run
 from endopilot.models.episodes import Predictor
+from endopilot.models.simulated_wires import SimulatedWires
 from endopilot.models.transformer import NETWORKS, Network, TransformerPredictor
-from endopilot.models.twin import TwinPredictor
 from endopilot.settings import from_record
-from endopilot.simulation.config import SimulatorConfig
 
 FORMAT_VERSION = 1
 """Counts changes of the tensors or of their meaning."""
 
 
-Size = TransformerConfig | CausalConfig
-"""What a network of either kind is made from."""
-
-
-def make_network(name: str, size: Size) -> Network | CausalNetwork:
-    """Return a fresh network, "ff" or "if", of the kind that its size says."""
-    return CAUSAL_NETWORKS[name](size) if isinstance(size, CausalConfig) else NETWORKS[name](size)
-
-
-def write_network(path: Path, name: str, network: Network | CausalNetwork, config: Size) -> None:
+def write_network(path: Path, name: str, network: Network, config: TransformerConfig) -> None:
     """Write weights and scales of a network, whole or not at all."""
-    kind = "causal" if isinstance(config, CausalConfig) else "paper"
-    write_tensors(path, network.state_dict(), {"network": name, "kind": kind, "size": asdict(config)})
+    write_tensors(path, network.state_dict(), {"network": name, "size": asdict(config)})
 
 
-def read_network(path: Path) -> Network | CausalNetwork:
+def read_network(path: Path) -> Network:
     """Return a network that `write_network` wrote.
 
     Raises:
@@ -52,8 +40,7 @@ def read_network(path: Path) -> Network | CausalNetwork:
     """
     tensors, facts = read_tensors(path)
     try:
-        size = CausalConfig if facts.get("kind") == "causal" else TransformerConfig
-        network = make_network(facts["network"], size(**facts["size"]))
+        network = NETWORKS[facts["network"]](TransformerConfig(**facts["size"]))
         network.load_state_dict(tensors)
     except (KeyError, TypeError, RuntimeError, InputError) as error:
         raise InputError(f"{path}: holds no network of this version ({error}); train it again") from error
@@ -103,26 +90,17 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Te
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
 
 
-def load_model(run: str | Path = PRETRAINED) -> Predictor:
-    """Return the predictor of a run made by `endopilot train`, or the packaged one, named "pretrained".
+def load_model(run: str | Path = WIRES) -> Predictor:
+    """Return the predictor of a run made by `endopilot train`, or the simulated wires, named "wires".
 
     Raises:
         InputError: the run is unfinished, or a file of it is damaged or of another version.
     """
-    record, run_folder = read_run(run), run_path(run)
-    with reading(run_folder, "train anew"):
-        return _predictor(record, run_folder)
-
-
-def _predictor(record: dict[str, Any], run_folder: Path) -> Predictor:
-    device = from_record(Wire, record["device"])
-    if record["config"]["model"] == "twin":
-        return TwinPredictor(
-            device=device,
-            simulator=SimulatorConfig(**record["simulator"]),
-            config=TwinConfig(**record["config"]["twin"]),
-        )
-    files = {name: run_folder / f"{name}.safetensors" for name in record["networks"]}
-    networks: dict[str, Any] = {name: read_network(file) for name, file in files.items()}
-    kind = CausalPredictor if record["config"]["model"] == "causal" else TransformerPredictor
-    return kind(forward=networks.get("ff"), inverse=networks.get("if"), limits=DriveLimits.of(device))
+    if str(run) == WIRES:
+        return SimulatedWires()
+    record, folder = read_run(run), Path(run)
+    with reading(folder, "train anew"):
+        files = {name: folder / f"{name}.safetensors" for name in record["networks"]}
+        networks = {name: read_network(file) for name, file in files.items()}
+        limits = DriveLimits.of(from_record(Wire, record["device"]))
+        return TransformerPredictor(forward=networks.get("ff"), inverse=networks.get("if"), limits=limits)

@@ -1,8 +1,8 @@
 """What a predictor is given of navigations, `Episodes`, and what it returns, `OpenLoop` or `Prediction`.
 
 A dataset gives them by `Episodes.of_dataset`, a plan by `Episodes.of_controls`; `trained_patients` says which of them a
-run was trained on. A navigation under way fills the fields
-with what its encoder and its X-ray images have measured so far; `EpisodeSetUp.of_anatomy` holds its vessel in memory.
+run was trained on. A navigation under way fills the fields with what its encoder and its X-ray images have measured so
+far; `EpisodeSetUp.of_anatomy` holds its vessel in memory.
 """
 
 from __future__ import annotations
@@ -19,49 +19,42 @@ from jaxtyping import Bool, Float, Int, Shaped
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.loader import Dataset, check_same_wire
 from endopilot.devices.device import Wire
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import reading
 from endopilot.models.config import WINDOW
-from endopilot.models.patient import Patient, prepare, read_or_prepare
-from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion, published_mean
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 AnyNetwork = TypeVar("AnyNetwork")
-PATIENTS_FOLDER = "patients"
-"""Folder of a dataset in which its patients are kept as they were prepared for its device."""
 
 
 @dataclass(frozen=True, eq=False)
 class EpisodeSetUp:
-    """What episodes have in common: the vessels that they may lie in, and the wire.
+    """What episodes have in common: the vessels that they may lie in, and the devices.
 
     Attributes:
         anatomies: what reads each anatomy, by the anatomy's name; a distance map takes memory, so none is held here.
-        device: the wire.
-        simulator: settings of the rod core that patients are prepared with.
-        patients_folder: where prepared patients are kept for the next time; nowhere if None.
-        identities: SHA-256 of what a simulation depends on in each anatomy, by name; needed with `patients_folder`.
+        device: the wire, or the wire in its catheters, as they are given.
+        simulator: settings of the rod core.
         known_motions: what is known of how vessels move with heart and breath, by the anatomy's name; those that are
             not there, or None, lie still.
     """
 
     anatomies: Mapping[str, Callable[[], Anatomy]]
-    device: Wire
+    device: Wire | Stack
     simulator: SimulatorConfig
-    patients_folder: Path | None = None
-    identities: Mapping[str, str] | None = None
     known_motions: Mapping[str, Motion | None] = field(default_factory=dict)
 
     @staticmethod
-    def of_anatomy(anatomy: Anatomy, device: Wire, simulator: SimulatorConfig) -> EpisodeSetUp:
+    def of_anatomy(anatomy: Anatomy, device: Wire | Stack, simulator: SimulatorConfig) -> EpisodeSetUp:
         """Return the setup of navigations in one vessel that is in memory."""
         return EpisodeSetUp({anatomy.name: lambda: anatomy}, device, simulator)
 
     @staticmethod
     def of_dataset(dataset: Dataset) -> EpisodeSetUp:
-        """Return the setup of a dataset, which keeps its prepared patients in its folder.
+        """Return the setup of a dataset.
 
         Of patients who move the published mean is known, with the phase of heart and breath.
         """
@@ -70,31 +63,17 @@ class EpisodeSetUp:
             return read_anatomy(dataset.anatomy_folder(name))
 
         with reading(dataset.folder, "make the dataset again"):
-            device = from_record(Wire, dataset.manifest["device"])
+            device = dataset.stack
             simulator = SimulatorConfig(**dataset.manifest["config"]["simulator"])
         return EpisodeSetUp(
             anatomies={name: partial(read, name) for name in dataset.patients},
             device=device,
             simulator=simulator,
-            patients_folder=dataset.folder / PATIENTS_FOLDER,
-            identities=dataset.patients,
             known_motions={
                 name: published_mean(motion)
                 for name in dataset.patients
                 if (motion := dataset.motion(name)) is not None
             },
-        )
-
-    def patient(self, name: str) -> Patient:
-        """Return a patient prepared for the wire; what is kept on disk is read, all else is prepared now.
-
-        Raises:
-            InputError: the anatomy cannot be read or prepared, or the folder cannot be written.
-        """
-        if self.patients_folder is None or self.identities is None:
-            return prepare(self.anatomies[name](), self.device, self.simulator)
-        return read_or_prepare(
-            self.patients_folder, name, self.identities[name], self.device, self.simulator, self.anatomies[name]
         )
 
 
@@ -108,33 +87,34 @@ class Episodes:
     Attributes:
         setup: the vessels and the wire.
         anatomy: name of each episode's anatomy.
-        initial: (Δ mm, φ rad) before the first period.
-        control: π = (mm/s, rad/s) that the drive made, the mean over each period.
-        command: what the drive was commanded (mm/s, rad/s), see `Dataset.command`.
+        initial: (Δ mm, φ rad) of the wire before the first period.
+        control: π = (mm/s, rad/s) that the wire's drive made, the mean over each period.
+        command: what the drives of wire and catheters were commanded (mm/s, rad/s), see `Dataset.command`.
         proximal: x^prox = (Δ mm, φ rad).
         tip: (Δtip, γtip), mm.
         branch: index of the branch that the tip lies in.
         tip_sd: standard deviations of (Δtip, γtip) as whatever measured them states them, mm; 0 where it states none.
+        catheters: (Δ mm, φ rad) of the catheters before the first period.
     """
 
     setup: EpisodeSetUp
     anatomy: Shaped[np.ndarray, "episodes"]
     initial: Float[np.ndarray, "episodes 2"]
     control: Float[np.ndarray, "episodes samples 2"]
-    command: Float[np.ndarray, "episodes samples 2"]
+    command: Float[np.ndarray, "episodes samples devices 2"]
     proximal: Float[np.ndarray, "episodes samples 2"]
     tip: Float[np.ndarray, "episodes samples 2"]
     branch: Int[np.ndarray, "episodes samples"]
     tip_sd: Float[np.ndarray, "episodes samples 2"]
+    catheters: Float[np.ndarray, "episodes catheters 2"]
 
     @staticmethod
     def of_dataset(dataset: Dataset) -> Episodes:
         """Return the navigations of a dataset, with their true tips.
 
         Raises:
-            InputError: they are no longer than the states that a predictor is given, or have catheters.
+            InputError: they are no longer than the states that a predictor is given.
         """
-        dataset.check_wire_alone("a model")
         samples = dataset.valid.shape[1]
         if samples <= WINDOW:
             seconds = (WINDOW + 1) * dataset.sample_period_s
@@ -147,11 +127,12 @@ class Episodes:
             anatomy=dataset.anatomy,
             initial=dataset.initial[:, 0],
             control=dataset.control[:, :, 0],
-            command=dataset.command[:, :, 0],
+            command=dataset.command,
             proximal=np.stack([dataset.inserted_length, dataset.rotation], axis=-1)[:, :, 0],
             tip=np.stack([dataset.tip_abscissa, dataset.tip_offset], axis=-1)[:, :, 0],
             branch=dataset.branch[:, :, 0],
             tip_sd=np.zeros((*dataset.valid.shape, 2), dtype=np.float32),
+            catheters=dataset.initial[:, 1:],
         )
 
     @staticmethod
@@ -177,16 +158,22 @@ class Episodes:
             anatomy=np.full(count, name),
             initial=np.tile(initial, (count, 1)),
             control=control,
-            command=control.astype(float),
+            command=control[:, :, None].astype(float),
             proximal=initial + SAMPLE_PERIOD_S * np.cumsum(control, axis=1),
             tip=tip,
             branch=np.zeros((count, samples), dtype=np.int64),
             tip_sd=np.zeros((count, samples, 2)),
+            catheters=np.zeros((count, 0, 2)),
         )
 
     def __len__(self) -> int:
         """Return the number of episodes."""
         return len(self.anatomy)
+
+    @property
+    def start(self) -> Float[np.ndarray, "episodes devices 2"]:
+        """(Δ mm, φ rad) of the wire and its catheters before the first period."""
+        return np.concatenate([self.initial[:, None], self.catheters], axis=1).astype(float)
 
     @property
     def samples(self) -> int:
@@ -205,17 +192,6 @@ class Episodes:
         names = ("control", "command", "proximal", "tip", "branch", "tip_sd")
         later = {name: getattr(self, name)[:, first:] for name in names}
         return replace(self, initial=self.proximal[:, first - 1], **later)
-
-    def driven(
-        self, proximal: Float[np.ndarray, "episodes later 2"], control: Float[np.ndarray, "episodes later 2"]
-    ) -> Episodes:
-        """Return the episodes with another motion of the drive in their last samples, made as it is commanded."""
-
-        def then(before: np.ndarray, later: np.ndarray) -> np.ndarray:
-            return np.concatenate([before[:, : -later.shape[1]], later.astype(before.dtype)], axis=1)
-
-        moved = {"control": control, "command": control, "proximal": proximal}
-        return replace(self, **{name: then(getattr(self, name), later) for name, later in moved.items()})
 
 
 Observed = Bool[np.ndarray, "samples"]
@@ -244,7 +220,7 @@ class OpenLoop:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """The predicted tip of each episode at every sample; where the tip was observed, that is the prediction.
+    """The predicted tip of each episode at every sample.
 
     Attributes:
         tip: (Δtip, γtip), mm.
@@ -258,22 +234,8 @@ class Prediction:
 
 
 @runtime_checkable
-class ProbabilisticPredictor(Protocol):
-    """A predictor that takes tips observed at any time and estimates its own error: causal networks and the twin."""
-
-    def predict(self, episodes: Episodes, observed: Observed | EachObserved) -> Prediction:
-        """Predict the tips of episodes from their controls and from the observed tips.
-
-        Args:
-            episodes: their controls, and their tips where `observed`; no other tip is read.
-            observed: samples at which the tip was observed, of all episodes alike or of each.
-        """
-        ...
-
-
-@runtime_checkable
 class Predictor(Protocol):
-    """Whatever predicts episodes: the networks of a run, the twin, or a baseline.
+    """Whatever predicts episodes: the networks of a run, the simulated wires, or a baseline.
 
     The first 30 states of an episode are given, and it goes on without measurements. P3 may also begin later, in a
     navigation under way whose tip was observed now and then.
@@ -329,14 +291,14 @@ def jumps(
 
 
 def check_wire(run: Path, record: Mapping[str, Any], dataset: Dataset) -> None:
-    """Check that a dataset was made with the wire that a run was trained with.
+    """Check that a dataset was made with the wire that a run was trained with; simulated wires take any devices.
 
     Raises:
-        InputError: it was made with another wire, or with catheters.
+        InputError: it was made with another wire.
     """
-    dataset.check_wire_alone("a model")
-    with reading(run, "train anew"):
-        check_same_wire(dataset, record["device"], run, "make a dataset with the run's wire")
+    if record["device"] is not None:
+        with reading(run, "train anew"):
+            check_same_wire(dataset, record["device"], run, "make a dataset with the run's wire")
 
 
 def trained_patients(run: Path, record: Mapping[str, Any], dataset: Dataset) -> frozenset[str]:
@@ -350,8 +312,6 @@ def trained_patients(run: Path, record: Mapping[str, Any], dataset: Dataset) -> 
     check_wire(run, record, dataset)
     if "patients" in record:
         return frozenset(name for name, sha in dataset.patients.items() if sha in set(record["patients"]))
-    if record["config"]["model"] == "twin":
-        return frozenset()
     if record.get("inputs", {}).get("dataset") == dataset.manifest["key"]:
         return frozenset(dataset.of_split("train").anatomy.tolist())
     raise InputError(

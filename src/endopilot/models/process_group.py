@@ -21,7 +21,7 @@ from endopilot.models.config import Processor
 from endopilot.progress import silence
 
 _PATIENCE = timedelta(hours=12)
-"""How long the others wait while the first process prepares patients."""
+"""How long the others wait while the first process reads the dataset."""
 
 
 @dataclass(frozen=True)

@@ -1,305 +1,256 @@
-"""Simulated wires that follow a navigation's own controls: what the causal forward network starts from.
+"""The model of simulated wires: rod cores that are weighted by what X-ray showed, and led along desired tips.
 
-Nominal push–pull envelopes know nothing of a wire that turns while it moves. A few wires, each with another friction,
-simulated under the commanded controls do. The middle one is the wire that retraces the given tips best
-(`fitted_wires`): the network learns from the observed tips which to trust, and where the wires part, the true one may
-jump. In a patient who moves they are simulated in a vessel that moves, and the fitted one once more with the heart at
-rest: the difference is what the motion does to the tip, and networks see every patient without it.
+A few wires that differ in what is uncertain (`ensemble`) follow the known commands through the samples at which the tip
+was seen. A regression over them says which wire retraces those best, and how surely. Wires around it follow the
+commands to the end: their weighted median is the prediction, their weighted spread its band; where they part the tip
+may jump. There is nothing to train: a vessel and devices are all that the model needs.
 """
 
 from __future__ import annotations
 
 import hashlib
-import warnings
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
-from itertools import pairwise
-from pathlib import Path
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from weakref import WeakKeyDictionary
-from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from endopilot.files import json_text, writing
+from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.stack import Stack
+from endopilot.models import ensemble
 from endopilot.models.config import WINDOW
-from endopilot.models.ensemble import Ensemble
-from endopilot.models.episodes import EachObserved, Episodes, EpisodeSetUp
-from endopilot.models.fitted_wires import Wires, by_motion, ensemble_of, fitted
-from endopilot.parallel import CORES
-from endopilot.progress import progress
-from endopilot.simulation.state import SimulatorState
-from endopilot.types import SAMPLE_PERIOD_S
+from endopilot.models.ensemble import NARROWEST, NOMINAL, SPREADS, Members, Paths
+from endopilot.models.episodes import (
+    EachObserved,
+    Episodes,
+    EpisodeSetUp,
+    Observed,
+    OpenLoop,
+    Prediction,
+    Steps2,
+    begin_after,
+    given_states,
+    jumps,
+)
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.motion import Motion
+from endopilot.simulation.simulator import Simulator
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
-FRICTION_FACTORS = (0.8, 1.0, 1.25)
-"""Friction of the simulated wires, as factors of the fitted one's."""
-_KEPT = 4096
-"""Navigations of a setup whose wires' tips are kept in memory."""
-_KEPT_WORLDS = 1024
-"""Wires of a setup whose states are kept in memory."""
-_STATE_EVERY = 20
-"""Samples from one kept state to the next, from the given states on."""
-_FORMAT_VERSION = 4
-
-
-@dataclass(frozen=True, eq=False)
-class WireTips:
-    """What simulated wires did in some navigations.
-
-    Attributes:
-        tip: (Δtip, γtip) of each wire, mm; NaN from where a simulation fails.
-        moved: by how much the patient's motion displaces the tip in its vessel, mm; 0 in a vessel that lies still.
-    """
-
-    tip: Float[np.ndarray, "episodes samples wires 2"]
-    moved: Float[np.ndarray, "episodes samples 2"]
-
-    @staticmethod
-    def of(tips: Float[np.ndarray, "episodes samples simulated 2"]) -> WireTips:
-        """Return them from the tips of all simulated wires: the last is the fitted one with the heart at rest."""
-        wires = len(FRICTION_FACTORS)
-        moved = tips[:, :, FRICTION_FACTORS.index(1.0)] - tips[:, :, wires]
-        return WireTips(tips[:, :, :wires], np.nan_to_num(moved))
-
-    def halves(self) -> tuple[WireTips, WireTips]:
-        """Return those of the first half of the navigations, and those of the second."""
-        tip, moved = np.split(self.tip, 2), np.split(self.moved, 2)
-        return WireTips(tip[0], moved[0]), WireTips(tip[1], moved[1])
+GENERATIONS = 2
+"""Times that wires are tried through what was seen; those of the next are drawn around the best of the last."""
+TRIED, FOLLOWED = 16, 8
+"""Wires of a generation; wires that follow the commands to the end, around the best one."""
+TRANSLATIONS_MM_S = (-5.0, -1.5, 0.0, 1.5, 5.0)
+"""Speeds that are tried, beyond the one that would move a tip without slack to where it is desired."""
+ROTATIONS_RAD_S = (-2.0, 0.0, 2.0)
+"""Rotations that are tried with each."""
+Parameters = tuple[Float[np.ndarray, "episodes 5"], Float[np.ndarray, "episodes 5"]]
+"""Mean and standard deviation of each episode's `ensemble.NAMES`."""
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedWires:
-    """Simulates the wires of navigations, once for the same controls and given tips.
-
-    A plan is often another end of one that was simulated before: then wires go on from a state on its way.
+    """The rod core as a predictor of whatever devices episodes have.
 
     Attributes:
-        fits: parameters of fitted wires, by setup and by a digest of patient, controls and tips of the given samples.
-        known: tips of navigations that were simulated before, by setup and by a digest of patient, controls and fit.
-        courses: the wires themselves as they were driven last, by setup and by a digest of patient, starts and fits.
+        identified: mean and standard deviation of the parameters after what was seen of given states, by setup and by
+            a digest of patient, commands and tips; all protocols and later plans share them.
+        tracked: controls that lead the tip along the desired one from the given states on; P2 and P3 share them.
     """
 
-    fits: WeakKeyDictionary[EpisodeSetUp, dict[bytes, np.ndarray]] = field(
+    identified: WeakKeyDictionary[EpisodeSetUp, dict[bytes, Parameters]] = field(
         default_factory=WeakKeyDictionary, repr=False
     )
-    known: WeakKeyDictionary[EpisodeSetUp, dict[bytes, np.ndarray]] = field(
-        default_factory=WeakKeyDictionary, repr=False
-    )
-    courses: WeakKeyDictionary[EpisodeSetUp, dict[bytes, Course]] = field(default_factory=WeakKeyDictionary, repr=False)
+    tracked: WeakKeyDictionary[Episodes, OpenLoop] = field(default_factory=WeakKeyDictionary, repr=False)
 
-    def tips(self, episodes: Episodes, observed: EachObserved) -> WireTips:
-        """Return the tips of the wires that follow the controls of each episode.
+    def predict(self, episodes: Episodes, observed: Observed | EachObserved) -> Prediction:
+        """Predict the tips of episodes from their commands and from the observed tips.
 
         Args:
-            episodes: their controls, and their tips where `observed` among the first `WINDOW` samples.
-
-        Raises:
-            InputError: an anatomy is missing or damaged.
+            episodes: their commands, and their tips where `observed`; no other tip is read.
+            observed: samples at which the tip was observed, of all episodes alike or of each.
         """
-        given = [_digest(episodes, i, observed) for i in range(len(episodes))]
-        fits = self.fits.setdefault(episodes.setup, {})
-        new = _unknown(fits, given)
-        for i, wire in zip(new, fitted_wires(episodes.select(new), observed[new]), strict=True):
-            fits[given[i]] = wire
-        wires = np.array([fits[digest] for digest in given])
-        known = self.known.setdefault(episodes.setup, {})
-        digests = [_digest(episodes, i) + wires[i].tobytes() for i in range(len(episodes))]
-        new = _unknown(known, digests)
+        seen = np.broadcast_to(observed, episodes.branch.shape)
+        paths, tips, sd_mm = self.paths(episodes, seen), episodes.tip.astype(float), episodes.tip_sd.astype(float)
+        tip, spread = ensemble.weigh(paths, tips, seen, sd_mm)
+        weight = ensemble.weights(paths, tips, seen, sd_mm)
+        jumping = np.array([jumps(each[..., 0], episodes.proximal[..., 0].astype(float)) for each in paths])
+        return Prediction(tip, spread, np.einsum("me,mes->es", weight, jumping))
+
+    def paths(self, episodes: Episodes, seen: EachObserved) -> Paths:
+        """Return the tips, mm, of the wires that are likely after the seen ones; NaN from where a simulation fails.
+
+        `ensemble.weigh` makes a prediction of them, and again, without another simulation, when more tips are seen.
+        """
+        found = np.full((1 + FOLLOWED, *episodes.tip.shape), np.nan)
+        for anatomy, chosen in _by_anatomy(episodes):
+            data = episodes.select(chosen)
+            mean, sd = self._identified(anatomy, data, seen[chosen])
+            sd = np.clip(sd, NARROWEST * SPREADS, SPREADS)
+            around = ensemble.drawn(mean, sd, FOLLOWED, moves=_moves(data, anatomy))
+            members = np.concatenate([ensemble.rounded(mean)[None], around])
+            found[:, chosen] = _replayed(anatomy, data, members, data.samples)
+        return found
+
+    def rollout_forward(self, episodes: Episodes) -> OpenLoop:
+        """P1: predict the tip under the true controls."""
+        later = slice(WINDOW, None)
+        tip = self.predict(episodes, given_states(episodes)).tip[:, later]
+        return OpenLoop(tip, episodes.proximal[:, later].astype(float), episodes.control[:, later].astype(float))
+
+    def rollout_inverse(self, episodes: Episodes) -> OpenLoop:
+        """P2: predict the controls that bring about the true tip."""
+        found = self.rollout_dual(episodes)
+        return OpenLoop(tip=episodes.tip[:, WINDOW:].astype(float), proximal=found.proximal, control=found.control)
+
+    def rollout_dual(self, episodes: Episodes, observed: Observed | None = None) -> OpenLoop:
+        """P3: predict the controls that bring about the true tip, and the tip that they lead to.
+
+        The wire that retraces the observed tips best is led along the desired ones, one sample at a time: see `track`.
+        """
+        if observed is not None:
+            return self._led(episodes, observed)
+        if episodes not in self.tracked:
+            self.tracked[episodes] = self._led(episodes, given_states(episodes))
+        return self.tracked[episodes]
+
+    def _led(self, episodes: Episodes, observed: Observed) -> OpenLoop:
+        """Return the controls that lead each episode's best wire along the desired tips after the last observed one."""
+        begin = begin_after(observed)
+        desired = episodes.tip[:, begin:].astype(float)
+        tip, control = np.empty(desired.shape), np.empty(desired.shape)
+        for anatomy, chosen in _by_anatomy(episodes):
+            data = episodes.select(chosen)
+            mean, _ = self._identified(anatomy, data, np.broadcast_to(observed, data.branch.shape))
+            best, stack = ensemble.rounded(mean), Stack.of(data.setup.device)
+            stacks = ensemble.with_stiffnesses(stack, best[:, 1])
+            tip[chosen], control[chosen] = track(
+                anatomy,
+                [stacks[factor] for factor in best[:, 1]],
+                friction=ensemble.frictions(stack, best[:, 0]),
+                start=ensemble.as_deep(data.start, best[:, 2]),
+                command=data.command,
+                desired=desired[chosen],
+                config=data.setup.simulator,
+                motion=data.setup.known_motions.get(anatomy.name),
+            )
+        start = episodes.proximal[:, begin - 1 : begin].astype(float)
+        return OpenLoop(tip=tip, proximal=start + SAMPLE_PERIOD_S * np.cumsum(control, axis=1), control=control)
+
+    def _identified(self, anatomy: Anatomy, data: Episodes, seen: EachObserved) -> Parameters:
+        """Return the parameters of episodes of one anatomy after what was seen of the given states."""
+        known, seen = self.identified.setdefault(data.setup, {}), seen[:, :WINDOW]
+        digests = [_digest(data, i, seen[i]) for i in range(len(data))]
+        new = np.array([i for i, digest in enumerate(digests) if digest not in known], dtype=int)
         if len(new):
-            courses = self.courses.setdefault(episodes.setup, {})
-            for i, tip in zip(new, simulated_tips(episodes.select(new), wires[new], courses), strict=True):
-                known[digests[i]] = tip
-            while sum(course.command.shape[0] for course in courses.values()) > _KEPT_WORLDS:
-                del courses[next(iter(courses))]
-        return WireTips.of(np.stack([known[digest] for digest in digests]))
+            for i, *found in zip(new, *_identify(anatomy, data.select(new), seen[new]), strict=True):
+                known[digests[i]] = found[0], found[1]
+        mean, sd = zip(*(known[digest] for digest in digests), strict=True)
+        return np.array(mean), np.array(sd)
 
 
-def _unknown(kept: dict[bytes, np.ndarray], digests: list[bytes]) -> Int[np.ndarray, "new"]:
-    """Return which of some digests are not kept; all of them, and nothing is kept, where there is no room."""
-    new = np.array([i for i, digest in enumerate(digests) if digest not in kept], dtype=int)
-    if len(kept) + len(new) <= _KEPT:
-        return new
-    kept.clear()
-    return np.arange(len(digests))
+def _digest(data: Episodes, i: int, seen: Observed) -> bytes:
+    """Return what identifies an episode's patient, its commands and what was seen of its first samples."""
+    given = slice(len(seen))
+    signals = (
+        data.start[i],
+        data.command[i, given],
+        np.packbits(seen),
+        data.tip[i, given][seen],
+        data.tip_sd[i, given],
+    )
+    return hashlib.sha256(b"\0".join([str(data.anatomy[i]).encode(), *(part.tobytes() for part in signals)])).digest()
 
 
-def _digest(episodes: Episodes, i: int, observed: EachObserved | None = None) -> bytes:
-    """Return what identifies an episode within its setup: all its controls, or the observed part of the given states"""
-    samples = None if observed is None else WINDOW
-    parts = [str(episodes.anatomy[i]).encode(), episodes.initial[i].tobytes(), episodes.command[i, :samples].tobytes()]
-    if observed is not None:
-        seen = observed[i, :WINDOW]
-        signals = (np.packbits(seen), episodes.tip[i, :WINDOW][seen], episodes.tip_sd[i, :WINDOW][seen])
-        parts.extend(signal.tobytes() for signal in signals)
-    return hashlib.sha256(b"\0".join(parts)).digest()
+def _identify(anatomy: Anatomy, data: Episodes, seen: EachObserved) -> Parameters:
+    mean, sd = np.tile(NOMINAL, (len(data), 1)), np.tile(SPREADS, (len(data), 1))
+    spread, samples = sd, int(np.nonzero(seen)[1].max(initial=-1)) + 1
+    tips, sd_mm = (signal[:, :samples].astype(float) for signal in (data.tip, data.tip_sd))
+    for _ in range(GENERATIONS if samples else 0):
+        members = ensemble.drawn(mean, spread, TRIED, moves=_moves(data, anatomy))
+        paths = _replayed(anatomy, data, members, samples)
+        each = zip(np.moveaxis(members, 1, 0), np.moveaxis(paths, 1, 0), tips, sd_mm, seen[:, :samples], strict=True)
+        mean, sd = (np.array(part) for part in zip(*(ensemble.posterior(*one) for one in each), strict=True))
+        spread = np.clip(2 * sd, NARROWEST * SPREADS, SPREADS)
+    return mean, sd
 
 
-class Course:
-    """Wires of one patient as they were driven last, with states to go on from where the next course is the same.
-
-    Attributes:
-        command: mm/s and rad/s of each wire and sample.
-        tips: at the end of each sample, mm; NaN from where a simulation fails.
-        states: of the simulations, by the sample that follows.
-    """
-
-    def __init__(
-        self, ensembles: list[tuple[Int[np.ndarray, "some"], Ensemble]], reach_mm: float, samples: int
-    ) -> None:
-        """Bring the wires to their start, laid out for an inserted length, mm.
-
-        Args:
-            ensembles: rows of the wires that are simulated together, and the wires.
-        """
-        self.reach_mm = reach_mm
-        self._parts = [(rows, ensemble.started(reach_mm)) for rows, ensemble in ensembles]
-        self.command, self.tips = np.full((2, sum(len(rows) for rows, _ in ensembles), samples, 2), np.nan)
-        self.states: dict[int, list[SimulatorState]] = {0: [simulator.state for _, simulator in self._parts]}
-
-    def drive(self, command: Float[np.ndarray, "wires samples 2"]) -> None:
-        """Drive the wires by other commands, from the last state before which they are the same."""
-        samples = command.shape[1]
-        shared = int((command == self.command).all(axis=(0, 2)).cumprod().sum())
-        self.states = {at: state for at, state in self.states.items() if at <= shared}
-        begin, self.command = max(self.states), command
-        stops = [at for at in range(WINDOW, samples, _STATE_EVERY) if at > begin]
-        for (_, simulator), state in zip(self._parts, self.states[begin], strict=True):
-            simulator.set_state(state)
-        for start, end in pairwise([begin, *stops, samples]):
-            for rows, simulator in self._parts:
-                made = simulator.run(command[rows, start:end, None])
-                tip = np.stack([made.tip.abscissa, made.tip.offset], axis=-1)[:, :, 0]
-                self.tips[rows, start:end] = np.where(made.valid[..., None], tip, np.nan)
-            if end < samples:
-                self.states[end] = [simulator.state for _, simulator in self._parts]
+def _replayed(anatomy: Anatomy, data: Episodes, members: Members, samples: int) -> Paths:
+    setup = data.setup
+    return ensemble.replay(
+        anatomy,
+        Stack.of(setup.device),
+        members,
+        start=data.start,
+        command=data.command[:, :samples],
+        config=setup.simulator,
+        motion=setup.known_motions.get(anatomy.name),
+    )
 
 
-def _each_patient(episodes: Episodes, what: str, found: np.ndarray, of_one, *, parts: int = 1) -> np.ndarray:
-    """Fill the rows of an array, one an episode, by a function of rows of one patient, on all cores.
+def track(
+    anatomy: Anatomy,
+    stacks: Sequence[Stack],
+    *,
+    friction: Float[np.ndarray, "episodes devices"],
+    start: Float[np.ndarray, "episodes devices 2"],
+    command: Float[np.ndarray, "episodes samples devices 2"],
+    desired: Steps2,
+    config: SimulatorConfig,
+    motion: Motion | None = None,
+) -> tuple[Steps2, Steps2]:
+    """Drive each episode's wire by its first commands, then sample by sample along the desired tips.
+
+    At every sample each wire tries all combinations of `TRANSLATIONS_MM_S` and `ROTATIONS_RAD_S` from its present state
+    and keeps the one whose tip ends nearest to the desired (Δtip, γtip), in the sum of both distances.
 
     Args:
-        parts: into which each patient's episodes are split; fewer if there are fewer episodes.
-    """
-    patients = [np.flatnonzero(episodes.anatomy == name) for name in np.unique(episodes.anatomy)]
-    each = [part for rows in patients for part in np.array_split(rows, min(parts, len(rows)))]
-    with (
-        progress(what, total=len(each)) as advance,
-        warnings.catch_warnings(),  # around the threads, which change what all of them see
-        ThreadPoolExecutor(CORES) as pool,  # few wires leave threads of one simulation idle
-    ):
-        warnings.simplefilter("ignore")  # a wire that fails is left out
-        for chosen, made in zip(each, pool.map(of_one, each), strict=True):
-            found[chosen] = made
-            advance(1)
-    return found
-
-
-def _parts(episodes: Episodes) -> int:
-    """Return into how many parts each patient's episodes are split, so that a few patients keep all cores busy."""
-    return -(-CORES // max(1, len(np.unique(episodes.anatomy))))
-
-
-def fitted_wires(episodes: Episodes, observed: EachObserved) -> Wires:
-    """Return the wires that retrace best what was observed of each episode among the first `WINDOW` samples.
-
-    Raises:
-        InputError: an anatomy is missing or damaged.
-    """
-
-    def of_one(chosen: Int[np.ndarray, "chosen"]) -> Wires:
-        return fitted(episodes.select(chosen), observed[chosen, :WINDOW])
-
-    return _each_patient(episodes, "Fitted wires", np.ones((len(episodes), 4)), of_one, parts=_parts(episodes))
-
-
-def simulated_tips(
-    episodes: Episodes, wires: Wires, courses: dict[bytes, Course] | None = None
-) -> Float[np.ndarray, "episodes samples simulated 2"]:
-    """Simulate wires under the commanded controls of each episode.
-
-    Args:
-        wires: the fitted wire of each.
-        courses: of the same wires before, which are brought up to date.
+        stacks: the devices of each episode; the same object where they are the same.
+        friction: Coulomb friction coefficients.
+        start: (Δ mm, φ rad) before the first command.
+        command: mm/s and rad/s; in the last samples, those of `desired`, catheters alone follow it.
+        desired: (Δtip, γtip) mm at the end of each of the last sample periods.
 
     Returns:
-        Their tips, mm: of `FRICTION_FACTORS`, and of the fitted wire with the heart at rest.
-
-    Raises:
-        InputError: an anatomy is missing or damaged.
+        Tip (Δtip, γtip) mm, and control (mm/s, rad/s) as the wire's drive made it, in the last sample periods.
     """
-    tips = np.full((*episodes.branch.shape, len(FRICTION_FACTORS) + 1, 2), np.nan)
-    courses = {} if courses is None else courses
-
-    def of_one(chosen: Int[np.ndarray, "chosen"]) -> np.ndarray:
-        return _of_one_patient(episodes.select(chosen), wires[chosen], courses)
-
-    return _each_patient(episodes, "Simulated wires", tips, of_one, parts=_parts(episodes))
-
-
-def _of_one_patient(
-    episodes: Episodes, wires: Wires, courses: dict[bytes, Course]
-) -> Float[np.ndarray, "episodes samples simulated 2"]:
-    name = str(episodes.anatomy[0])
-    moves = episodes.setup.known_motions.get(name) is not None
-    own = FRICTION_FACTORS.index(1.0)
-    count = len(FRICTION_FACTORS) + moves
-    theta = np.repeat(wires[:, None], count, axis=1)
-    theta[:, : len(FRICTION_FACTORS), 0] *= FRICTION_FACTORS
-    theta[:, len(FRICTION_FACTORS) :, 2:] = 0.0
-    theta = theta.reshape(-1, 4)
-    command = np.repeat(episodes.command, count, axis=0)
-    start, samples = np.repeat(episodes.initial, count, axis=0), command.shape[1]
-    reach_mm = float((start[:, 0] + np.maximum(command[..., 0], 0.0).sum(axis=1) * SAMPLE_PERIOD_S).max())
-    key = f"{name} {samples} ".encode() + start.tobytes() + theta.tobytes()
-    course = courses.pop(key, None)
-    if course is None or course.reach_mm < reach_mm:
-        anatomy = episodes.setup.anatomies[name]()
-        parts = [(rows, ensemble_of(episodes.setup, anatomy, theta[rows], start[rows])) for rows in by_motion(theta)]
-        course = Course(parts, 1.2 * reach_mm + 1.0, samples)  # other ends may push farther
-    course.drive(command)
-    courses[key] = course
-    tips = np.moveaxis(course.tips.reshape(len(episodes), count, samples, 2), 1, 2)
-    return tips if moves else np.concatenate([tips, tips[:, :, own : own + 1]], axis=2)
+    tries = np.array([(v, w) for v in TRANSLATIONS_MM_S for w in ROTATIONS_RAD_S])
+    episodes, each = len(stacks), len(tries)
+    limits, begin = DriveLimits.of(stacks[0].wire, anatomy), command.shape[1] - desired.shape[1]
+    given = Simulator(anatomy, list(stacks), config=config, motion=motion)
+    given.reset(inserted_length=start[..., 0], rotation=start[..., 1], friction=friction)
+    for sample in range(begin):
+        moved = command[:, sample].astype(float)
+        moved[:, 0] = limits.clip(moved[:, 0], given.inserted_length[:, 0], SAMPLE_PERIOD_S)
+        given.step(moved, SAMPLE_PERIOD_S)
+    simulator = Simulator(anatomy, [stack for stack in stacks for _ in range(each)], config=config, motion=motion)
+    simulator.copy_worlds(np.repeat(np.arange(episodes), each), of=given)
+    tip, control = np.empty(desired.shape), np.empty(desired.shape)
+    for k in range(desired.shape[1]):
+        moved = np.repeat(command[:, begin + k], each, axis=0).astype(float)
+        lead = (np.repeat(desired[:, k, 0], each) - simulator.project().abscissa[:, 0]) / SAMPLE_PERIOD_S
+        moved[:, 0] = np.tile(tries, (episodes, 1))
+        moved[:, 0, 0] += lead
+        moved[:, 0] = limits.clip(moved[:, 0], simulator.inserted_length[:, 0], SAMPLE_PERIOD_S)
+        step = simulator.step(moved, SAMPLE_PERIOD_S)
+        reached = simulator.project()[:, 0]
+        error = np.abs(reached.abscissa - np.repeat(desired[:, k, 0], each))
+        error += np.abs(reached.offset - np.repeat(desired[:, k, 1], each))
+        error[~step.valid] = np.inf
+        best = error.reshape(episodes, each).argmin(axis=1) + each * np.arange(episodes)
+        tip[:, k] = np.stack([reached.abscissa[best], reached.offset[best]], axis=-1)
+        slip = np.stack([step.slip, step.rotation_slip], axis=-1)[best, 0]
+        control[:, k] = moved[best, 0] - slip / SAMPLE_PERIOD_S
+        simulator.copy_worlds(np.repeat(best, each))
+    return tip, control
 
 
-def read_or_simulate(folder: Path | None, episodes: Episodes, observed: EachObserved) -> WireTips:
-    """Return the tips of the wires of a dataset's episodes: read from a folder, or simulated now and kept there.
-
-    Args:
-        folder: where they are kept, one file for each patient with these episodes; nowhere if None.
-        episodes: the navigations; one may be there several times, with other samples observed.
-        observed: samples at which the tip was observed; wires are fitted to those among the first `WINDOW`.
-
-    Raises:
-        InputError: an anatomy is missing or damaged.
-    """
-
-    def of_one(chosen: Int[np.ndarray, "chosen"]) -> np.ndarray:
-        part, seen = episodes.select(chosen), observed[chosen]
-        each = [_digest(part, i) + _digest(part, i, seen) for i in range(len(part))]
-        path = None if folder is None else folder / f"{part.anatomy[0]}-wires-{_key(part, each)}.npz"
-        try:
-            with np.load(path or "", allow_pickle=False) as stored:
-                return stored["tips"]
-        except (OSError, ValueError, KeyError, BadZipFile):
-            first = {digest: i for i, digest in reversed(list(enumerate(each)))}
-            some = np.array(sorted(first.values()))
-            few = part.select(some)
-            made = _of_one_patient(few, fitted(few, seen[some, :WINDOW]), {})
-            tips = made[np.searchsorted(some, [first[digest] for digest in each])]
-        if path is not None:
-            with writing(path) as partial, partial.open("wb") as stream:
-                np.savez_compressed(stream, tips=tips)
-        return tips
-
-    tips = np.empty((*episodes.branch.shape, len(FRICTION_FACTORS) + 1, 2))
-    return WireTips.of(_each_patient(episodes, "Fitted and simulated wires", tips, of_one))
+def _moves(episodes: Episodes, anatomy: Anatomy) -> bool:
+    return episodes.setup.known_motions.get(anatomy.name) is not None
 
 
-def _key(episodes: Episodes, each: list[bytes]) -> str:
-    """Return what identifies wires of one patient: the patient, the device, and a digest of each navigation."""
-    setup, name = episodes.setup, str(episodes.anatomy[0])
-    settings = (_FORMAT_VERSION, FRICTION_FACTORS, asdict(replace(setup.simulator, threads=0)))
-    vessel = (setup.identities or {}).get(name), setup.known_motions.get(name)
-    text = json_text((settings, asdict(setup.device), vessel))
-    return hashlib.sha256(text.encode() + b"".join(each)).hexdigest()[:16]
+def _by_anatomy(episodes: Episodes) -> Iterator[tuple[Anatomy, Int[np.ndarray, "chosen"]]]:
+    for name in np.unique(episodes.anatomy):
+        yield episodes.setup.anatomies[str(name)](), np.flatnonzero(episodes.anatomy == name)

@@ -1,4 +1,4 @@
-"""Training of FF and IF, the paper's or ours, on a dataset: `train`.
+"""Training of the paper's FF and IF on a dataset: `train`.
 
 After every epoch one file, `checkpoints/<network>.safetensors`, is written whole or not at all; it holds weights,
 optimizer and learning curve, and a killed run goes on from it along the same curve. All randomness follows from the
@@ -25,9 +25,7 @@ from endopilot import __version__
 from endopilot.dataset.loader import Dataset, read_joined
 from endopilot.errors import InputError
 from endopilot.files import manifest, write_json
-from endopilot.models.causal import CausalNetwork
 from endopilot.models.checkpoint import (
-    make_network,
     optimizer_tensors,
     read_tensors,
     restore_optimizer,
@@ -37,8 +35,7 @@ from endopilot.models.checkpoint import (
 from endopilot.models.config import TrainConfig
 from endopilot.models.episodes import Episodes
 from endopilot.models.process_group import ProcessGroup, joined
-from endopilot.models.sequences import Sequences, play_tables
-from endopilot.models.transformer import Network, Windows
+from endopilot.models.transformer import NETWORKS, Network, Windows
 from endopilot.progress import Advance, progress
 from endopilot.runs import claim
 
@@ -82,9 +79,6 @@ VALIDATION_WINDOWS = 512
 """Windows of held-out navigations that the loss is checked on after every epoch."""
 WARM_UP_EPOCHS = 0.5
 """Epochs over which the learning rate rises to its peak; afterwards it falls to zero along a cosine."""
-Examples = Windows | Sequences
-"""What is trained on: windows for the paper's networks, whole sequences for ours."""
-AnyNetwork = Network | CausalNetwork
 _SCALE_WINDOWS = 16384
 _TIMED_STEPS = 12
 _GRADIENT_NORM = 1.0
@@ -93,8 +87,6 @@ _GRADIENT_NORM = 1.0
 def train(dataset: str | Path | Sequence[str | Path], *, output: str | Path, config: TrainConfig | None = None) -> None:
     """Train the forward and the inverse network on the split "train" and write them into a run folder.
 
-    The twin has no networks: its run is a folder with settings alone.
-
     Writes `ff.safetensors` and `if.safetensors` (weights and scales), `training.json` (learning curves) and
     `manifest.json`. A run that was interrupted goes on where it stopped when it is started again with the
     same arguments; a finished one returns at once.
@@ -102,7 +94,7 @@ def train(dataset: str | Path | Sequence[str | Path], *, output: str | Path, con
     Args:
         dataset: folder of a dataset made by `endopilot dataset`, or several that are trained on together.
         output: run folder.
-        config: what is trained, and how long; the paper's networks if not given.
+        config: what is trained, and how long; as the paper has it if not given.
 
     Raises:
         InputError: the dataset cannot be used, the run folder belongs to another run, or the loss left the
@@ -116,13 +108,12 @@ def train(dataset: str | Path | Sequence[str | Path], *, output: str | Path, con
 
 def _train(folders: list[Path], run_folder: Path, config: TrainConfig, group: ProcessGroup) -> None:
     dataset = read_joined(folders)
-    dataset.check_wire_alone("a model")
-    with group.first():  # which writes the settings and prepares the patients, where need be
+    with group.first():  # which writes the settings
         if group.writes:
             identity = {"config": config, "dataset": dataset.manifest["key"], "version": __version__}
             claim(run_folder, "endopilot train", **identity)
-        training = examples_of(dataset, "train", config)
-        validation = examples_of(dataset, "seen_test", config) if "seen_test" in dataset.split else None
+        training = windows_of(dataset, "train")
+        validation = windows_of(dataset, "seen_test") if "seen_test" in dataset.split else None
     start = time.perf_counter()
     results: dict[str, Any] = {}
     for name in config.networks:
@@ -132,14 +123,13 @@ def _train(folders: list[Path], run_folder: Path, config: TrainConfig, group: Pr
             write_json(run_folder / "training.json", results)
     if not group.writes:
         return
-    write_json(run_folder / "training.json", results)  # of a model that trains nothing too
     record = manifest(
         config=config,
         seed=config.seed,
         inputs={"dataset": dataset.manifest["key"]},
         dataset=os.path.relpath(folders[0].resolve(), run_folder.resolve()),
         joined=[os.path.relpath(folder.resolve(), run_folder.resolve()) for folder in folders[1:]],
-        patients=_patients(dataset, config),
+        patients=sorted(dataset.patients[name] for name in set(dataset.of_split("train").anatomy.tolist())),
         episodes={"train": len(training.tip), "seen_test": 0 if validation is None else len(validation.tip)},
         rejected={"invalid_episodes": int((~dataset.valid.all(axis=1)).sum())},
         device=dataset.manifest["device"],
@@ -153,13 +143,7 @@ def _train(folders: list[Path], run_folder: Path, config: TrainConfig, group: Pr
     write_json(run_folder / "manifest.json", record)
 
 
-def _patients(dataset: Dataset, config: TrainConfig) -> list[str]:
-    """Return the SHA-256 of each patient that was trained on, by which it is known in any dataset."""
-    trained = set(dataset.of_split("train").anatomy.tolist()) if config.networks else set()
-    return sorted(sha for name, sha in dataset.patients.items() if name in trained)
-
-
-def examples_of(dataset: Dataset, split: str, config: TrainConfig) -> Examples:
+def windows_of(dataset: Dataset, split: str) -> Windows:
     """Return the episodes of a split, which must be finite: one bad sample would spoil the scales of all."""
     chosen = dataset.of_split(split)
     for name in ("tip_abscissa", "tip_offset", "inserted_length", "rotation", "control"):
@@ -170,10 +154,7 @@ def examples_of(dataset: Dataset, split: str, config: TrainConfig) -> Examples:
                 f"{dataset.folder}: {name} of {chosen.anatomy[bad]}, sequence {chosen.sequence[bad]}, is not finite "
                 "though the episode is marked valid; make the dataset again"
             )
-    episodes = Episodes.of_dataset(chosen)
-    if config.model != "causal":
-        return Windows.of(episodes)
-    return Sequences.of(episodes, play_tables(episodes), config.networks, config.seed)
+    return Windows.of(Episodes.of_dataset(chosen))
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,8 +163,8 @@ class Job:
 
     name: str
     config: TrainConfig
-    training: Examples
-    validation: Examples | None
+    training: Windows
+    validation: Windows | None
     run_folder: Path
     group: ProcessGroup
 
@@ -192,7 +173,7 @@ class Job:
         config = self.config
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(_seed(config.seed, self.name, "weights"))
-            network = make_network(self.name, config.network_size)
+            network = NETWORKS[self.name](config.size)
             targets = self.training.targets()
             chosen = torch.linspace(0, len(targets) - 1, min(len(targets), _SCALE_WINDOWS)).long()
             network.fit_scales(*self.training.window(self.name, targets[chosen]))
@@ -215,7 +196,7 @@ class Job:
 
     def _epoch(
         self,
-        network: AnyNetwork,
+        network: Network,
         together: nn.Module,
         optimizer: torch.optim.Adam,
         state: dict[str, Any],
@@ -263,7 +244,7 @@ class Job:
 
     def step(
         self,
-        network: AnyNetwork,
+        network: Network,
         together: nn.Module,
         optimizer: torch.optim.Adam,
         targets: torch.Tensor,
@@ -286,7 +267,7 @@ class Job:
         return value
 
     @torch.no_grad()
-    def _validate(self, network: AnyNetwork) -> float | None:
+    def _validate(self, network: Network) -> float | None:
         if self.validation is None:
             return None
         network.eval()
@@ -309,10 +290,10 @@ class Job:
             raise InputError(f"batch_size: {len(batches[0])} samples for {self.group.size} processes; give more")
         return whole
 
-    def _window(self, examples: Examples, targets: torch.Tensor) -> list[torch.Tensor]:
+    def _window(self, examples: Windows, targets: torch.Tensor) -> list[torch.Tensor]:
         return [part.to(self.group.device) for part in examples.window(self.name, targets)]
 
-    def _steps(self, network: AnyNetwork, state: dict[str, Any]) -> int:
+    def _steps(self, network: Network, state: dict[str, Any]) -> int:
         """Return the steps of the next epoch: every window once, or what `windows_per_epoch` or the time allow."""
         config = self.config
         windows = min(len(self.training.targets()), config.windows_per_epoch or 2**62)
@@ -328,7 +309,7 @@ class Job:
         seconds_left = (config.max_seconds - state["seconds"]) / (config.epochs - len(curve)) - validation
         return self.group.agreed(max(min(steps, int(seconds_left / a_step)), 1))
 
-    def _time(self, network: AnyNetwork) -> tuple[float, float]:
+    def _time(self, network: Network) -> tuple[float, float]:
         """Return how long a training step and a validation take, s, tried out on a copy of the network."""
         trial = copy.deepcopy(network).train()
         optimizer = torch.optim.Adam(trial.parameters(), fused=True)
@@ -342,12 +323,12 @@ class Job:
         self._validate(trial)
         return float(np.median(times)), time.perf_counter() - start
 
-    def _save(self, network: AnyNetwork, optimizer: torch.optim.Adam, state: dict[str, Any]) -> None:
+    def _save(self, network: Network, optimizer: torch.optim.Adam, state: dict[str, Any]) -> None:
         tensors = {f"network.{key}": value for key, value in network.state_dict().items()}
         write_tensors(self._checkpoint, tensors | optimizer_tensors(optimizer), {"network": self.name, **state})
-        write_network(self._file, self.name, network, self.config.network_size)
+        write_network(self._file, self.name, network, self.config.size)
 
-    def _resume(self, network: AnyNetwork, optimizer: torch.optim.Adam) -> dict[str, Any] | None:
+    def _resume(self, network: Network, optimizer: torch.optim.Adam) -> dict[str, Any] | None:
         if not self._checkpoint.exists():
             return None
         tensors, facts = read_tensors(self._checkpoint)
@@ -356,7 +337,7 @@ class Job:
         restore_optimizer(optimizer, tensors)
         # A kill between the two files of an epoch leaves the second one behind by an epoch.
         if self.group.writes:
-            write_network(self._file, self.name, network, self.config.network_size)
+            write_network(self._file, self.name, network, self.config.size)
         return {key: facts[key] for key in ("seconds", "curve")}
 
     @property

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import model_validator
 
 from endopilot import __version__
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
@@ -35,7 +34,7 @@ from endopilot.extras import require_extras
 from endopilot.files import input_hash, manifest, read_json, write_json
 from endopilot.imaging.segment import METHODS, SegmentConfig, segment
 from endopilot.imaging.volume import read_mask, read_volume, write_mask, write_volume
-from endopilot.models.config import PRETRAINED, TrainConfig, run_path
+from endopilot.models.config import WIRES, TrainConfig
 from endopilot.parallel import each
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.pipeline.navigation import navigate_into
@@ -49,17 +48,16 @@ VOLUME_SUFFIX = ".nii.gz"
 EVALUATED = 32
 """Navigations that are evaluated in each split; each is simulated seven times."""
 MISMATCH = (0.8, 1.2)
-"""Friction and tip stiffness of the navigations that the packaged networks are evaluated on, over those they know."""
+"""Friction and tip stiffness of the navigations that simulated wires are evaluated on, over those they are given."""
 _EXTRAS = ("learn", "report")
 """Extras that the stages need, the last one after minutes of work."""
-_PRETRAINED_DEVICE = "workhorse-014"
 DEMO_ORIGIN = (
     "The patients are synthetic: right coronary arteries drawn from published statistics, and a CT angiogram of each, "
     "made with noise, blur, calcium, chambers and veins. Everything after the CT is made from it alone."
 )
 UNKNOWN_WIRE = (
-    "The networks are not given the wires as they are: friction and tip stiffness differ by up to 20 % from what they "
-    "know."
+    "The model is not given the wires as they are: friction and tip stiffness differ by up to 20 % from what it is "
+    "given."
 )
 RUN_ORIGIN = "One CT angiogram, given by the user; everything is made from it alone."
 
@@ -114,26 +112,17 @@ class StudyConfig:
     seconds: Seconds = 60.0
     """Length of a navigation, s."""
     training_seconds: Annotated[float, Within(0, 10 * 86400)] = 0.0
-    """Training time of each of the paper's two networks, s; 0 takes the trained networks that come with the package."""
+    """Training time of each of the paper's two networks, s; 0 evaluates the simulated wires."""
     seed: Seed = 1
     """Seed of everything random."""
 
 
 @settings
 class DemoConfig(StudyConfig):
-    """The demo: synthetic right-coronary patients that the evaluated networks were not trained on."""
+    """The demo: synthetic right-coronary patients."""
 
     patients: Annotated[int, Within(3, 1000)] = 6
     """Number of patients, at least 3."""
-
-    @model_validator(mode="after")
-    def _consistent(self) -> DemoConfig:
-        if self.training_seconds == 0 and self.device != _PRETRAINED_DEVICE:
-            raise ValueError(
-                f"device: {self.device!r}; the networks of the package know {_PRETRAINED_DEVICE} alone: "
-                "train others, for example with --training-seconds 100"
-            )
-        return self
 
 
 @settings
@@ -174,19 +163,13 @@ class _Run:
 
     @property
     def trains(self) -> bool:
-        """Whether networks are trained here, rather than taken from the package."""
+        """Whether networks are trained here, rather than simulated wires evaluated."""
         return self.config.training_seconds > 0
 
     @property
-    def trained(self) -> Path:
-        """The run whose networks are evaluated: this study's, or that of the package."""
-        return self.output / "training" if self.trains else Path(PRETRAINED)
-
-    @property
-    def evaluates(self) -> bool:
-        """Whether there are networks for the wire: those of the package know one wire alone."""
-        packaged = read_wire(_PRETRAINED_DEVICE)
-        return self.trains or self.device.constants == packaged.constants
+    def model(self) -> Path:
+        """What is evaluated: this study's networks, or simulated wires."""
+        return self.output / "training" if self.trains else Path(WIRES)
 
 
 def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
@@ -348,14 +331,13 @@ def _drive(run: _Run, anatomy: Path) -> None:
 
 
 def _study(run: _Run, anatomies: Sequence[Path]) -> dict[str, Any]:
-    if run.evaluates:
-        _learn(run, anatomies)
+    _learn(run, anatomies)
     run.stages.do("report", lambda: _report(run, [folder.name for folder in anatomies]))
     return _finish(run)
 
 
 def _learn(run: _Run, anatomies: Sequence[Path]) -> None:
-    """Simulate navigations, train networks on them or take those of the package, and evaluate the networks."""
+    """Simulate navigations, train networks on them or take simulated wires, and evaluate the model."""
     from endopilot.dataset.generate import generate_dataset  # an extra brings its libraries
     from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
     from endopilot.models.train import train  # torch takes seconds to import
@@ -372,18 +354,18 @@ def _learn(run: _Run, anatomies: Sequence[Path]) -> None:
         friction=None if trains else friction,
         tip_stiffness_factor=None if trains else MISMATCH,
         anatomy_shares=shares,
-        seen_test_share=DatasetConfig.seen_test_share if trains else 0.0,  # all are new to the packaged networks
+        seen_test_share=DatasetConfig.seen_test_share if trains else 0.0,  # all are new to simulated wires
     )
     run.stages.do(
         "dataset", lambda: generate_dataset(anatomies, output=output / "dataset", device=run.device, config=dataset)
     )
     if trains:
-        training = TrainConfig(model="paper", max_seconds=config.training_seconds, seed=config.seed)
+        training = TrainConfig(max_seconds=config.training_seconds, seed=config.seed)
         run.stages.do("training", lambda: train(output / "dataset", output=output / "training", config=training))
 
     def measure() -> None:
         settings = EvaluateConfig(sequences=EVALUATED, seed=config.seed)
-        evaluate(run.trained, output=output / "evaluation", config=settings, dataset=output / "dataset")
+        evaluate(run.model, output=output / "evaluation", config=settings, dataset=output / "dataset")
         report_evaluation(output / "evaluation")
 
     run.stages.do("evaluation", measure)
@@ -393,7 +375,7 @@ def _report(run: _Run, names: Sequence[str]) -> None:
     from endopilot.report.report import PatientContent, ReportContent, write_report  # matplotlib and plotly
 
     output = run.output
-    anatomy, replay = _replay(output) if run.evaluates else (None, None)
+    anatomy, replay = _replay(output)
     scores = _scores(output, names)
     patients = tuple(
         PatientContent(
@@ -407,11 +389,11 @@ def _report(run: _Run, names: Sequence[str]) -> None:
     )
     content = ReportContent(
         title="endopilot: from a CT angiogram to guidewire control",
-        origin=f"{run.origin} {UNKNOWN_WIRE}" if run.evaluates and not run.trains else run.origin,
+        origin=f"{run.origin} {UNKNOWN_WIRE}" if not run.trains else run.origin,
         command=run.command,
         patients=patients,
-        evaluation=output / "evaluation" if run.evaluates else None,
-        run=run_path(run.trained) if run.evaluates else None,
+        evaluation=output / "evaluation",
+        run=run.model,
         replay=replay,
         replay_anatomy=anatomy,
         navigation=run.navigation,
@@ -451,7 +433,7 @@ def _replay(output: Path) -> tuple[Path, Trajectory]:
 def _finish(run: _Run) -> dict[str, Any]:
     """Write metrics.json and manifest.json unless they are there, and return what the command prints."""
     output, stages = run.output, run.stages
-    metrics = read_json(output / "evaluation" / "metrics.json") if run.evaluates else {"findings": []}
+    metrics = read_json(output / "evaluation" / "metrics.json")
     wall_seconds = sum(stages.seconds.values())
     if not (output / "manifest.json").exists():
         write_json(output / "metrics.json", {**metrics, "anatomy_scores": read_json(output / "scores.json")})

@@ -30,7 +30,7 @@ from endopilot.evaluation.results import (
 )
 from endopilot.files import json_text, read_json, writing
 from endopilot.imaging.volume import read_mask, read_volume
-from endopilot.models.config import run_path
+from endopilot.models.config import WIRES
 from endopilot.plotting import png
 from endopilot.report import figures, report_text, tables
 from endopilot.report.scene import navigation_scene, scene_html, visible_devices
@@ -196,11 +196,9 @@ def _stored_figure(evaluation: Path | None, name: str) -> Markup | None:
 
 
 def _training(run: Path | None) -> dict[str, Any] | None:
-    if run is None:
-        return None
+    if run is None or str(run) == WIRES:
+        return None  # simulated wires are not trained
     record = read_json(run / "training.json")
-    if not record:
-        return None  # the twin trains nothing
     curves = [
         {"network": report_text.NETWORK_TITLES[network], "epoch": point["epoch"], "curve": title, "loss": point[key]}
         for network, result in record.items()
@@ -267,7 +265,7 @@ def _write_page(folder: Path, metrics: Mapping[str, Any]) -> Path:
         origin=f"The run {run}, on the dataset {dataset}.",
         command=" ".join(command),
         evaluation=folder,
-        run=run_path(Path(run)),
+        run=Path(run),
         manifest=record,
     )
     page = folder / REPORT_FILE
