@@ -17,11 +17,10 @@ from scipy.spatial.transform import Rotation
 from benchmarks.anatomy import analytic_lumens as analytic
 from benchmarks.anatomy.compare import compare_with_atlas
 from benchmarks.figures import Bar
-from endopilot.anatomy.distance import BAND_MM, distance_map_from_mask, distance_map_from_spheres, sample
+from endopilot.anatomy.distance import distance_map_from_spheres, sample
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import write_anatomy
 from endopilot.anatomy.projection import project_tip
-from endopilot.anatomy.read_source import read_source
 from endopilot.anatomy.tree import sampled
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.cli.arguments import existing
@@ -29,6 +28,9 @@ from endopilot.errors import InputError
 from endopilot.evaluation.anatomy_score import compare_trees
 from endopilot.progress import progress
 from endopilot.types import Anatomy, LumenMask, VesselTree, Volume
+from endopilot.vessels.read_source import read_source
+from endopilot.vessels.surface import BAND_MM
+from endopilot.vessels.surface_distance import distance_map_from_mask
 
 VOXELS_MM = ((0.35, 0.35, 0.35), (0.5, 0.5, 0.5), (0.35, 0.35, 0.5), (0.4, 0.4, 0.8))
 """Voxel edges of the masks, mm. Errors are given in units of the shortest edge."""

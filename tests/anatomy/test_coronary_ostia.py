@@ -11,16 +11,17 @@ import pytest
 from analytic_shapes import mask_of
 
 from benchmarks.anatomy.analytic_lumens import tree_of
-from endopilot.anatomy.coronary_ends import open_ends, skeleton_of
-from endopilot.anatomy.coronary_inlet import _coarse, coronary_inlet
-from endopilot.anatomy.coronary_ostia import end_score, rank_ostia
-from endopilot.anatomy.distance import distance_map_from_mask, distance_map_from_spheres, distance_map_from_surface
+from endopilot.anatomy.distance import distance_map_from_spheres
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
-from endopilot.anatomy.inlet import component, entrance, grid_points
-from endopilot.anatomy.surface import surface_from_mask
 from endopilot.errors import InputError
 from endopilot.imaging.volume import read_volume
 from endopilot.types import Insertion, LumenMask, Volume
+from endopilot.vessels.coronary_inlet import _coarse, coronary_inlet
+from endopilot.vessels.coronary_ostia import end_score, rank_ostia
+from endopilot.vessels.ends import open_ends, skeleton_of
+from endopilot.vessels.inlet import component, entrance, grid_points
+from endopilot.vessels.surface import surface_from_mask
+from endopilot.vessels.surface_distance import distance_map_from_mask, distance_map_from_surface
 from toy_coronaries import PLACE_MM, artery, mask_of_arteries, without
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "real_coronaries"

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from endopilot.anatomy.distance import (
     add_catheter,
-    distance_map_from_mask,
     distance_map_from_spheres,
     sample,
     smooth_union,
@@ -17,6 +16,7 @@ from endopilot.anatomy.distance import (
 from endopilot.anatomy.tree import make_centerline
 from endopilot.errors import InputError
 from endopilot.types import Branch, Insertion, VesselTree
+from endopilot.vessels.surface_distance import distance_map_from_mask
 
 
 def grid_points(distance_map):

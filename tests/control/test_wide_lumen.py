@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from endopilot.anatomy.extract import extract_anatomy
-from endopilot.anatomy.sources import Polylines
 from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.agent import AgentPolicy
 from endopilot.control.agent_config import IN_WIDE_LUMEN, AgentConfig
@@ -23,6 +22,7 @@ from endopilot.devices.drive_limits import DriveLimits, far_end_mm
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.tasks.route import Route
+from endopilot.vessels.sources import Polylines
 
 
 @pytest.fixture(scope="module")

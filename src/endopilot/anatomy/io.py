@@ -23,10 +23,10 @@ from typing import Any
 import numpy as np
 
 from endopilot import files
-from endopilot.anatomy import mesh_process
 from endopilot.errors import InputError
 from endopilot.settings import public
 from endopilot.types import Anatomy, Branch, Centerline, DistanceMap, Insertion, VesselTree
+from endopilot.vessels import mesh_process
 
 SCHEMA_VERSION = 2
 

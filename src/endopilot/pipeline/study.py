@@ -23,7 +23,6 @@ from pydantic import model_validator
 from endopilot import __version__
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import read_anatomy, write_anatomy
-from endopilot.anatomy.read_source import read_source
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.control.navigate import NavigateConfig
 from endopilot.dataset.config import DatasetConfig
@@ -44,6 +43,7 @@ from endopilot.runs import claim
 from endopilot.settings import Seconds, Seed, Within, settings
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import Volume
+from endopilot.vessels.read_source import read_source
 
 VOLUME_SUFFIX = ".nii.gz"
 EVALUATED = 32

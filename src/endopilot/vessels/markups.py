@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot import files
-from endopilot.anatomy.sources import RADIUS_NAMES, RAS_TO_LPS, AnatomySource, Polylines, checked_lines
-from endopilot.anatomy.units import mm_per_unit
 from endopilot.errors import InputError
+from endopilot.vessels.sources import RADIUS_NAMES, RAS_TO_LPS, AnatomySource, Polylines, checked_lines
+from endopilot.vessels.units import mm_per_unit
 
 _AXES = {"LPS": "lps", "RAS": "ras", "0": "ras", "1": "lps"}
 """Axes by their names and by the numbers of Slicer's older files."""

@@ -15,8 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from endopilot.anatomy import mesh_process
-from endopilot.anatomy.sources import (
+from endopilot.errors import InputError
+from endopilot.vessels import mesh_process
+from endopilot.vessels.sources import (
     RADIUS_NAMES,
     RAS_TO_LPS,
     AnatomySource,
@@ -24,9 +25,8 @@ from endopilot.anatomy.sources import (
     checked_lines,
     in_mm,
 )
-from endopilot.anatomy.surface import Surface
-from endopilot.anatomy.units import ASSUMED, BY_ARRAYS, STATED, mm_per_unit
-from endopilot.errors import InputError
+from endopilot.vessels.surface import Surface
+from endopilot.vessels.units import ASSUMED, BY_ARRAYS, STATED, mm_per_unit
 
 _HEADER_BYTES = 65536
 """Statements of axes and unit stand in the first bytes of a file."""

@@ -23,6 +23,12 @@ _FIT_ITERATIONS = 8
 _BLOCK = 24
 """Edge in voxels of the blocks that a mask is smoothed in."""
 
+BAND_MM = 2.5
+"""How far outside the wall the distance map reaches, mm; beyond, it holds the constant −`BAND_MM`."""
+
+MAXIMUM_GRID_POINTS = 20_000_000
+"""A distance map holds at most this many grid points (80 MB of float32); the spacing grows until it fits."""
+
 _NEAREST_TRIANGLES = 4
 _WORTH_THREADS = 20_000
 """With fewer points than this, starting threads takes longer than they save."""
@@ -204,6 +210,14 @@ def surface_from_mask(mask: Volume) -> Surface:
     index = vertices * scale + corner
     surface = Surface(mask.index_to_world(index[:, ::-1].astype(float)), faces.astype(np.int64))
     return surface if surface.volume > 0 else Surface(surface.vertices, surface.faces[:, ::-1])
+
+
+def grid_of(
+    lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"], spacing: float
+) -> tuple[tuple[int, int, int], Float[np.ndarray, "3"]]:
+    """Return the shape (nz, ny, nx) and the LPS origin of a grid that covers a box, mm."""
+    counts = np.ceil((upper - lower) / spacing).astype(int) + 1
+    return (int(counts[2]), int(counts[1]), int(counts[0])), np.asarray(lower, dtype=float)
 
 
 def filled_box(voxels: Bool[np.ndarray, "nz ny nx"]) -> tuple[slice, slice, slice]:

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.ndimage import binary_erosion, distance_transform_edt
 
-from endopilot.anatomy.surface import filled_box
 from endopilot.imaging.grid import connected_components
 from endopilot.types import Volume
+from endopilot.vessels.surface import filled_box
 
 _MOST_VOXELS = 2_000_000
 """A mask of more is looked at in blocks: 0.5 s."""

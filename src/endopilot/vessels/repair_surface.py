@@ -12,15 +12,15 @@ from jaxtyping import Float, Int
 from scipy.ndimage import binary_dilation, binary_opening, distance_transform_edt
 from scipy.spatial import KDTree
 
-from endopilot.anatomy.coverage import voxelised
-from endopilot.anatomy.lumen_graph import pieces
-from endopilot.anatomy.parent_vessel import Vessel, piece_on_side
-from endopilot.anatomy.repair import NEAR_OSTIUM_MM, NOTED_MM, OTHER_SIDE, other_pieces_text
-from endopilot.anatomy.surface import Surface, surface_from_mask
-from endopilot.anatomy.topology import MOST_LISTED
-from endopilot.anatomy.walls import enclosed, lumen_in_wall, wall_text
 from endopilot.errors import InputError, place_text
 from endopilot.types import Insertion, Volume
+from endopilot.vessels.coverage import voxelised
+from endopilot.vessels.graph import pieces
+from endopilot.vessels.inlet import Vessel, piece_on_side
+from endopilot.vessels.repair import NEAR_OSTIUM_MM, NOTED_MM, OTHER_SIDE, other_pieces_text
+from endopilot.vessels.surface import Surface, surface_from_mask
+from endopilot.vessels.topology import MOST_LISTED
+from endopilot.vessels.walls import enclosed, lumen_in_wall, wall_text
 
 MOST_PIECES = 12
 """At most this many pieces of a surface are looked at as coronary arteries or parts of them."""

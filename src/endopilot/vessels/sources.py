@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.anatomy.surface import Surface
-from endopilot.anatomy.units import ANSWERED, STATED
 from endopilot.errors import InputError, place_text
 from endopilot.types import LumenMask, VesselTree
+from endopilot.vessels.surface import Surface
+from endopilot.vessels.units import ANSWERED, STATED
 
 RADIUS_NAMES = ("maximuminscribedsphereradius", "misr", "radius", "radii")
 """Names of the point array or measurement that holds radii, in lower case: VMTK's, Slicer's, and plain ones."""

@@ -12,16 +12,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from endopilot.anatomy.distance import MAXIMUM_GRID_POINTS
-from endopilot.anatomy.lumen_graph import pieces
-from endopilot.anatomy.medial_lines import MedialLines
-from endopilot.anatomy.repair import NOTED_MM
-from endopilot.anatomy.surface import Surface, blur_voxels, smooth_level
-from endopilot.anatomy.topology import MOST_LISTED
-from endopilot.anatomy.tree import sampled
 from endopilot.errors import place_text
 from endopilot.imaging.grid import connected_components
-from endopilot.types import VesselTree, Volume
+from endopilot.types import Volume
+from endopilot.vessels.graph import pieces
+from endopilot.vessels.medial_lines import MedialLines
+from endopilot.vessels.repair import NOTED_MM
+from endopilot.vessels.surface import MAXIMUM_GRID_POINTS, Surface, blur_voxels, smooth_level
+from endopilot.vessels.topology import MOST_LISTED
 
 _REACH_VOXELS = 1.5
 """The tree reaches what lies within its radius and this many voxels of its axis: the mask's middle is not smooth."""
@@ -110,15 +108,17 @@ def widened(mask: Volume, lines: MedialLines, minimum_mm: float) -> tuple[Volume
     return result, lines.points[asked], _widened_text(wanted, radius)
 
 
-def unreached(lines: MedialLines, tree: VesselTree, voxel_mm: float) -> list[Stretch]:
+def unreached(
+    lines: MedialLines, points: Float[np.ndarray, "m 3"], radius: Float[np.ndarray, "m"], voxel_mm: float
+) -> list[Stretch]:
     """Return the parts of a mask's middle that a tree does not reach, longest first.
 
     Args:
         lines: the middle.
-        tree: what was made of the mask.
+        points: of the tree, close together, LPS mm.
+        radius: its radii there, mm.
         voxel_mm: the voxels' longest edge, mm.
     """
-    points, radius = sampled(tree)
     gap, nearest = map(np.asarray, KDTree(points).query(lines.points))
     return stretches(lines, gap > radius[nearest] + _REACH_VOXELS * voxel_mm, gap)
 
@@ -135,7 +135,7 @@ def stretches(
     """
     inner = chosen[lines.edges].all(axis=1)
     part = pieces(lines.edges[inner], len(lines.points))
-    length, behind = lines.from_widest
+    length, behind = lines.tree.length, lines.behind_mm
     order = length if order is None else order
     found = []
     members = np.flatnonzero(chosen)

@@ -13,13 +13,13 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, find_objects
 from scipy.spatial import KDTree
 
-from endopilot.anatomy.medial_lines import MedialLines, piece_labels
-from endopilot.anatomy.parent_vessel import COMPARABLE, Vessel, piece_on_side
-from endopilot.anatomy.surface import filled_box
-from endopilot.anatomy.topology import MOST_LISTED, SMALLEST_PIECE, Touch, parted, touch_remarks
 from endopilot.errors import InputError, place_text
 from endopilot.imaging.grid import connected_components
 from endopilot.types import Insertion, Volume
+from endopilot.vessels.inlet import COMPARABLE, Vessel, piece_on_side
+from endopilot.vessels.medial_lines import MedialLines, piece_labels
+from endopilot.vessels.surface import filled_box
+from endopilot.vessels.topology import MOST_LISTED, SMALLEST_PIECE, Touch, parted, touch_remarks
 
 NEAR_OSTIUM_MM = 5.0
 """A lumen farther than this from a given ostium does not belong to it."""
@@ -158,8 +158,8 @@ def connected_mask(
     if closed.sum() > sizes[main]:
         remarks.append(f"cavities of {int(closed.sum() - sizes[main])} voxels filled")
     lumen = replace(mask, voxels=closed, origin_mm=whole.joined.index_to_world(corner[::-1].astype(float)))
-    lines = whole.lines.part(result[tuple(whole.lines.index.T)], corner)
-    before = whole.before.part(own[tuple(whole.before.index.T)], corner)
+    lines = whole.lines.within(result[tuple(whole.lines.index.T)], corner)
+    before = whole.before.within(own[tuple(whole.before.index.T)], corner)
     told = np.isin(labels[tuple((before.index + corner).T)], severed)
     return Lumen(lumen, lines, before, told, remarks)
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from endopilot import files
-from endopilot.anatomy.markups import read_markups
-from endopilot.anatomy.sources import AnatomySource, Polylines
 from endopilot.errors import InputError
 from endopilot.types import LumenMask
+from endopilot.vessels.markups import read_markups
+from endopilot.vessels.sources import AnatomySource, Polylines
 
 MASK_SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd", ".dcm")
 SURFACE_SUFFIXES = (".stl", ".obj", ".ply", ".vtp", ".vtu", ".vtk")
@@ -55,7 +55,7 @@ def read_source(path: str | Path, *, label: int | str | None = None, threshold: 
     elif lower.endswith(".json"):
         source = read_markups(path)
     elif lower.endswith(SURFACE_SUFFIXES):
-        from endopilot.anatomy.polydata import read_polydata  # slow to import
+        from endopilot.vessels.polydata import read_polydata  # slow to import
 
         source = read_polydata(path)
     else:
