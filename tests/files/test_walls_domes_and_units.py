@@ -15,9 +15,8 @@ from endopilot.atlas.atlas import VESSELS, AtlasConfig, make_patient_tree
 from endopilot.errors import InputError
 from endopilot.types import LumenMask, Volume
 from endopilot.vessels.read_source import read_source
-from endopilot.vessels.sources import Polylines, transformed
+from endopilot.vessels.sources import ASSUMED, Polylines, check_unit, transformed
 from endopilot.vessels.surface import Surface, surface_from_mask
-from endopilot.vessels.units import ASSUMED, check_unit
 
 COARSE = AnatomyConfig(spacing_mm=0.8)
 

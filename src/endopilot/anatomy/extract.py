@@ -35,12 +35,20 @@ from endopilot.vessels.coronary_ostia import Side, course_off_deg
 from endopilot.vessels.graph import lumen_graph
 from endopilot.vessels.inlet import beyond_parent, component, entrance, grid_points, in_front, inlets
 from endopilot.vessels.read_source import read_source
-from endopilot.vessels.sources import AnatomySource, Polylines, transformed
+from endopilot.vessels.sources import (
+    ANSWERED,
+    ASSUMED,
+    BY_ARRAYS,
+    SMALLEST_RADIUS_MM,
+    AnatomySource,
+    Polylines,
+    check_unit,
+    transformed,
+    unit_name,
+)
 from endopilot.vessels.surface import MAXIMUM_GRID_POINTS, Surface, surface_from_mask
 from endopilot.vessels.surface_distance import distance_map_from_surface
 from endopilot.vessels.topology import parted, touch_remarks
-from endopilot.vessels.units import ANSWERED, ASSUMED, BY_ARRAYS, SMALLEST_RADIUS_MM, check_unit, unit_name
-from endopilot.vessels.walls import without_wall
 
 CORONARY_RADIUS_MM = 1.6
 """Mean radius of a coronary tree at most: what counts for the grid where a lumen holds a piece of the aorta too."""
@@ -190,7 +198,7 @@ def _wall(
     inlet, remarks = None, list[str]()
     repair.pieces_of.cache_clear()  # what a caller's mask held before may be another vessel
     if isinstance(content, LumenMask):
-        volume, remarks = without_wall(content.volume)
+        volume, remarks = repair_surface.without_wall(content.volume)
         content = replace(content, volume=volume)
     if given is None and config.vessel != "generic":
         inlet = coronary_inlet(content, config.vessel, label, axes)

@@ -76,10 +76,6 @@ class Labeller:
         """How far to the patient's left an end lies, mm."""
         return float(self.tree.branches[leaf].centerline.points[-1, 0])
 
-    def upward(self, leaf: int) -> float:
-        """How far up an end lies, mm."""
-        return float(self.tree.branches[leaf].centerline.points[-1, 2])
-
     def major(self, branch: int, length_mm: float) -> list[int]:
         """Children of a branch with at least this much length behind their start, mm."""
         return [child for child in self.tree.children(branch) if self.length_behind(child) >= length_mm]

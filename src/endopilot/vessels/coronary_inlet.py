@@ -24,9 +24,9 @@ from endopilot.vessels.coronary_ostia import (
 )
 from endopilot.vessels.ends import OpenEnd, Skeleton, open_ends, skeleton_of
 from endopilot.vessels.inlet import AORTA_RADIUS_MM
+from endopilot.vessels.sources import check_unit
 from endopilot.vessels.surface import Surface, filled_box, surface_from_mask
 from endopilot.vessels.surface_distance import distance_map_from_surface
-from endopilot.vessels.units import check_unit
 
 CERTAIN = 0.8
 """An ostium less probable than this is asked for."""

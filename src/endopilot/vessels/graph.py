@@ -14,7 +14,7 @@ from functools import cached_property
 from typing import ClassVar, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
@@ -99,6 +99,12 @@ class VesselGraph:
     def away(self, nodes: Int[np.ndarray, "k"] | list[int], limit: float = np.inf) -> Float[np.ndarray, "k n"]:
         """Return what the cheapest way from each of some points to every point costs; infinity beyond a limit."""
         return np.asarray(dijkstra(self.costs, directed=False, indices=nodes, limit=limit))
+
+    def parts(self, chosen: Bool[np.ndarray, "n"]) -> list[Int[np.ndarray, "_"]]:
+        """Return the connected parts of chosen points."""
+        members = np.flatnonzero(chosen)
+        part = pieces(self.edges[chosen[self.edges].all(axis=1)], len(chosen))[members]
+        return split(members, np.unique(part, return_inverse=True)[1]) if len(members) else []
 
     def part(self: Graph, kept: Bool[np.ndarray, "n"]) -> Graph:
         """Return some of the points with what joins them."""
@@ -215,6 +221,11 @@ def pieces(pairs: Int[np.ndarray, "m 2"], count: int) -> Int[np.ndarray, "count"
     """Return for each of `count` points, of which pairs are joined, the number of its connected piece, from 0 on."""
     joined = csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     return connected_components(joined, directed=False)[1]
+
+
+def split(values: Shaped[np.ndarray, "n ..."], numbers: Int[np.ndarray, "n"]) -> list[Shaped[np.ndarray, "_ ..."]]:
+    """Return the values of each number from 0 on, in their order."""
+    return np.split(values[np.argsort(numbers, kind="stable")], np.cumsum(np.bincount(numbers))[:-1])
 
 
 def lumen_graph(

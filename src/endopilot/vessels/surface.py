@@ -66,11 +66,6 @@ class Surface:
         products = [np.einsum("ij,ij->i", a, b)[:, None] for a, b in ((one, one), (one, two), (two, two))]
         return np.concatenate([corners[:, 0], one, two, *products], axis=1)
 
-    @property
-    def area(self) -> float:
-        """Area of the wall, mm²."""
-        return float(self.triangles()[2].sum())
-
     def triangles(self) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
         """Return the triangles' centres, mm, unit normals, and areas, mm²."""
         edges = np.diff(self._corners, axis=1)
@@ -88,7 +83,7 @@ class Surface:
     @property
     def mean_radius(self) -> float:
         """Radius of the tube that has a closed wall's volume and area, mm."""
-        return 2.0 * self.volume / self.area
+        return 2.0 * self.volume / float(self.triangles()[2].sum())
 
     def distance(self, points: Float[np.ndarray, "n 3"], *, limit_mm: float = np.inf) -> Float[np.ndarray, "n"]:
         """Return the unsigned distance in mm from points to the wall, `limit_mm` where it is at least that.
