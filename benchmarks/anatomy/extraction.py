@@ -29,8 +29,8 @@ from endopilot.evaluation.anatomy_score import compare_trees
 from endopilot.progress import progress
 from endopilot.types import Anatomy, LumenMask, VesselTree, Volume
 from endopilot.vessels.read_source import read_source
-from endopilot.vessels.surface import BAND_MM
-from endopilot.vessels.surface_distance import distance_map_from_mask
+from endopilot.vessels.surface import BAND_MM, surface_from_mask
+from endopilot.vessels.surface_distance import distance_map_from_surface
 
 VOXELS_MM = ((0.35, 0.35, 0.35), (0.5, 0.5, 0.5), (0.35, 0.35, 0.5), (0.4, 0.4, 0.8))
 """Voxel edges of the masks, mm. Errors are given in units of the shortest edge."""
@@ -159,7 +159,7 @@ def _axis_and_radius(tree: VesselTree, mask: LumenMask) -> Judged:
 def _wall(tree: VesselTree, mask: LumenMask) -> Judged:
     """Return the distance map's error near the wall, and that of a binary distance transform of the same mask."""
     voxel = float(mask.volume.spacing_mm.min())
-    ours = distance_map_from_mask(mask.volume)
+    ours = distance_map_from_surface(surface_from_mask(mask.volume), spacing_mm=voxel)
     k, j, i = np.nonzero(np.abs(ours.values) < BAND_MM - 0.1)
     points = ours.origin_mm + ours.spacing_mm * np.stack([i, j, k], axis=1)
     error = _error_near_wall(tree, points, ours.values[k, j, i])

@@ -354,14 +354,7 @@ def _insertion(tree: VesselTree, given: Insertion | None) -> Insertion:
 
 
 def _understood(tree: VesselTree, source: AnatomySource, coordinates: str | None, remarks: Sequence[str]) -> str:
-    """Return what was understood: inlet, extent and narrowest place, unit and axes as taken, and what was done.
-
-    Args:
-        tree: what was made.
-        source: in mm, as it was taken.
-        coordinates: axes that the user stated, if any.
-        remarks: what each step did, a sentence each.
-    """
+    """Return what was understood: inlet, extent and narrowest place, unit and axes as taken, and what was done."""
     lines = [branch.centerline for branch in tree.branches]
     farthest = max(float(line.abscissa[-1]) for line in lines)
     narrowest = min((line for line in lines), key=lambda line: float(line.radius.min()))

@@ -82,11 +82,7 @@ def coronary_inlet(
 ) -> CoronaryInlet | None:
     """Return where an artery begins, or None where the lumen holds a piece of the aorta, which shows it.
 
-    Args:
-        content: both coronary arteries, or one, with whatever specks.
-        side: which artery is asked for.
-        label: name of the source, for messages.
-        coordinates: the axes that the user gave for a file that does not state its own; None where the file does.
+    `coordinates` are the axes that the user gave for a file that does not state its own; None where the file does.
 
     Raises:
         InputError: the artery is not there, the file is in other axes, or it is not certain where the artery begins;

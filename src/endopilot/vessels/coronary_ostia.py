@@ -307,10 +307,7 @@ def find_crux(
 ) -> Crux | None:
     """Return the crux of a patient, or None where neither artery reaches it: then the ends are cut off.
 
-    Args:
-        right_ostium: ostium of the right coronary artery, LPS mm.
-        right: points along the right artery's tree, LPS mm.
-        left: points along the left artery's tree, LPS mm.
+    It follows from the right artery's ostium and points along both trees, LPS mm.
     """
     position = right_ostium + CRUX_FROM_OSTIUM_MM
     reached = [bool(np.linalg.norm(tree - position, axis=1).min() < REACHED_MM) for tree in (right, left)]

@@ -268,11 +268,8 @@ def _flatness(
 
     A vessel cut straight or aslant has 1 or more, a dome 0.12 (what lies within 20° of one direction on a sphere).
 
-    Args:
-        points: the way inwards from the tip.
-        place: where on it the vessel has its whole width.
-        width: its radius there, mm.
-        triangles: centres, normals and areas of the wall's triangles.
+    The points, mm, are the way inwards from the tip, at `place` of which the vessel has its whole width, a radius, mm;
+    the triangles are the wall's centres, normals and areas.
     """
     centres, normals, areas = triangles
     back = int(np.searchsorted(length_along(points[place:]), 1.5 * width))

@@ -14,7 +14,7 @@ from functools import cached_property
 from typing import ClassVar, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Integer, Shaped
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
@@ -223,7 +223,7 @@ def pieces(pairs: Int[np.ndarray, "m 2"], count: int) -> Int[np.ndarray, "count"
     return connected_components(joined, directed=False)[1]
 
 
-def split(values: Shaped[np.ndarray, "n ..."], numbers: Int[np.ndarray, "n"]) -> list[Shaped[np.ndarray, "_ ..."]]:
+def split(values: Shaped[np.ndarray, "n ..."], numbers: Integer[np.ndarray, "n"]) -> list[Shaped[np.ndarray, "_ ..."]]:
     """Return the values of each number from 0 on, in their order."""
     return np.split(values[np.argsort(numbers, kind="stable")], np.cumsum(np.bincount(numbers))[:-1])
 

@@ -58,10 +58,7 @@ def piece_on_side(
     The right coronary artery lies to the patient's right of the left one (smaller x in LPS), so among pieces of
     comparable size the side decides; for other vessels it is the largest.
 
-    Args:
-        sizes: volumes, or anything that grows with them.
-        centres: centres of the pieces, LPS mm.
-        vessel: which vessel is wanted.
+    Sizes are volumes, or anything that grows with them; centres are in LPS mm.
     """
     large = np.flatnonzero(sizes >= COMPARABLE * sizes.max())
     if vessel == "generic":

@@ -28,10 +28,6 @@ def left_out(found: FoundLines, tree: VesselTree) -> tuple[list[str], dict[str, 
 
     The balance: `length_mm` of the lines, of them `reached_mm` by the tree's spheres and `left_out_mm` (these two add
     up to the first), and `bridged_mm` of gaps between them.
-
-    Args:
-        found: the lines.
-        tree: what was made of them.
     """
     nodes, piece = found.whole, found.piece
     whole = tree.line

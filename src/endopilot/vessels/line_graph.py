@@ -328,10 +328,6 @@ def in_order(source: Polylines, label: str) -> tuple[Polylines, list[str]]:
     shortest. Where neighbouring spheres do not touch, a line is joined by a straight piece, or cut if it jumps to
     another vessel.
 
-    Args:
-        source: lines as read, mm.
-        label: name of the source, for messages.
-
     Raises:
         InputError: the points of a line are in no order.
     """

@@ -75,7 +75,7 @@ def closed_surface(
     mesh: Any = _without_duplicates(_polydata(surface.vertices, surface.faces).clean().triangulate())
     mesh, remarks = _lumen_of(mesh)
     regions = mesh.connectivity(extraction_mode="all")
-    ids = np.asarray(regions.point_data["RegionId"], dtype=np.int64)
+    ids = np.asarray(regions.point_data["RegionId"]).astype(np.int64)
     if ids.max() > 0:
         places = split(np.asarray(regions.points, dtype=float), ids)
         sizes = np.array([np.linalg.norm(np.ptp(place, axis=0)) * len(place) ** 0.5 for place in places])

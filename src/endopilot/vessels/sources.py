@@ -189,11 +189,7 @@ def checked_lines(lines: Polylines, path: Path, notes: list[str]) -> Polylines:
 
 
 def mm_per_unit(name: object) -> float | None:
-    """Return how many mm a unit of length has, or None where the name is of none.
-
-    Args:
-        name: such as "mm" or "inches", in upper or lower case.
-    """
+    """Return how many mm a unit of length such as "mm" or "Inches" has, or None where the name is of none."""
     return _NAMES.get(str(name).strip().lower())
 
 

@@ -181,9 +181,6 @@ class Surface:
 def surface_from_mask(mask: Volume) -> Surface:
     """Return the smooth wall whose blurred inside equals the blurred mask: the zero level of `level_function`.
 
-    Args:
-        mask: boolean voxels, at least one of them true.
-
     Raises:
         InputError: the mask is nowhere thick enough to hold a lumen.
     """

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.imaging.grid import dilated
-from endopilot.types import DistanceMap, Volume
-from endopilot.vessels.surface import BAND_MM, Surface, grid_of, surface_from_mask
+from endopilot.types import DistanceMap
+from endopilot.vessels.surface import BAND_MM, Surface, grid_of
 
 _NEAR_WALL = (2, 5)
 """This many grid steps outside and inside the wall are computed exactly, the rest on every second grid point."""
@@ -70,14 +70,3 @@ def _far_field(
         finer[(*first, slice(1, None, 2))] = 0.5 * (even[(*first, slice(size // 2))] + after)
         values = finer
     return values
-
-
-def distance_map_from_mask(mask: Volume, *, spacing_mm: float | None = None) -> DistanceMap:
-    """Return the signed distance to the smooth wall of a mask, with sub-voxel accuracy.
-
-    Args:
-        mask: boolean voxels on any grid, at least one of them true.
-        spacing_mm: grid spacing, mm; the mask's smallest voxel edge if None.
-    """
-    spacing = float(mask.spacing_mm.min()) if spacing_mm is None else spacing_mm
-    return distance_map_from_surface(surface_from_mask(mask), spacing_mm=spacing)

@@ -182,9 +182,7 @@ def _porous(mask: Volume, thin: MedialLines, rings: list[_Ring]) -> list[Touch]:
 def touch_remarks(found: list[Touch], *, parted: bool = True) -> list[str]:
     """Return what is said of places where a lumen touches itself: one remark for each kind, the largest place first.
 
-    Args:
-        found: the places.
-        parted: whether the lumen was parted there; a surface is not.
+    Where the lumen, a surface's, is not parted there, the words are others.
     """
     kinds = [touch.kind if parted else _LEFT.get(touch.kind, touch.kind) for touch in found]
     remarks = []
