@@ -7,12 +7,7 @@ import pytest
 from analytic_shapes import BEND_MM, forked_tree, mask_of, torus_distance, tree_distance
 from scipy.spatial.transform import Rotation
 
-from endopilot.anatomy.distance import (
-    add_catheter,
-    distance_map_from_spheres,
-    sample,
-    smooth_union,
-)
+from endopilot.anatomy.distance import add_catheter, distance_map_from_spheres, sample, smooth_union
 from endopilot.anatomy.tree import make_centerline
 from endopilot.errors import InputError
 from endopilot.types import Branch, Insertion, VesselTree

@@ -67,16 +67,20 @@ def distance_map_from_spheres(
     lower, upper = (whole.points - margin).min(axis=0), (whole.points + margin).max(axis=0)
     spacing = automatic_spacing(whole.radius, upper - lower) if spacing_mm is None else float(spacing_mm)
     shape, origin = grid_of(lower, upper, spacing)
-    values = np.full(shape, -BAND_MM, dtype=np.float32)
+    result = DistanceMap(np.full(shape, -BAND_MM, dtype=np.float32), spacing, origin)
     for own in lumens:
-        line = own[0]
-        window = _window(Centerline.joined(own), origin, spacing, shape, BAND_MM)
-        corner = origin + spacing * np.array([window[2].start, window[1].start, window[0].start])
-        fields = [_tube_field(part, values[window].shape, corner, spacing, BAND_MM) for part in own]
-        field = np.maximum.reduce(fields)
-        fillet = FILLET * float(line.radius[min(len(line.radius) - 1, 3)])
-        values[window] = smooth_union(values[window], field, spacing_mm=spacing, fillet_mm=fillet)
-    return DistanceMap(values=values, spacing_mm=spacing, origin_mm=origin)
+        radius = own[0].radius
+        _join(result, own, BAND_MM, FILLET * float(radius[min(len(radius) - 1, 3)]))
+    return result
+
+
+def _join(distance_map: DistanceMap, lines: Sequence[Centerline], band: float, fillet_mm: float) -> None:
+    """Join the lumen of some lines' tubes to a map that has room for it."""
+    values, spacing, origin = distance_map.values, distance_map.spacing_mm, distance_map.origin_mm
+    window = _window(Centerline.joined(lines), origin, spacing, values.shape, band)
+    corner = origin + spacing * np.array([part.start for part in window[::-1]])
+    field = np.maximum.reduce([_tube_field(line, values[window].shape, corner, spacing, band) for line in lines])
+    values[window] = smooth_union(values[window], field, spacing_mm=spacing, fillet_mm=fillet_mm)
 
 
 def add_catheter(
@@ -108,13 +112,7 @@ def add_catheter(
         normals=np.zeros((steps, 3)),
     )
     grown = _grow(distance_map, line.points.min(axis=0), line.points.max(axis=0), radius_mm + band, -band)
-    shape = (grown.values.shape[0], grown.values.shape[1], grown.values.shape[2])
-    window = _window(line, grown.origin_mm, spacing, shape, band)
-    corner = grown.origin_mm + spacing * np.array([window[2].start, window[1].start, window[0].start])
-    field = _tube_field(line, grown.values[window].shape, corner, spacing, band)
-    grown.values[window] = smooth_union(
-        grown.values[window], field, spacing_mm=spacing, fillet_mm=FILLET * float(radius_mm)
-    )
+    _join(grown, [line], band, FILLET * float(radius_mm))
     return grown
 
 
@@ -183,7 +181,7 @@ def _grow(
 
 
 def _window(
-    line: Centerline, origin: Float[np.ndarray, "3"], spacing: float, shape: tuple[int, int, int], band: float
+    line: Centerline, origin: Float[np.ndarray, "3"], spacing: float, shape: tuple[int, ...], band: float
 ) -> tuple[slice, slice, slice]:
     """Return the part of the grid that a line's tube and band can reach."""
     margin = line.radius[:, None] + band

@@ -72,14 +72,11 @@ def piece_on_side(
 def component(distance_map: DistanceMap, given: Insertion | None) -> Bool[np.ndarray, "nz ny nx"]:
     """Return the connected inside at the ostium, or the largest one."""
     labels = connected_components(distance_map.values > 0, corners=True)
-    count = labels.max()
-    if count == 1:
-        return labels == 1
-    if count == 0 or given is None:
-        sizes = np.bincount(labels.ravel())
-        sizes[0] = 0
-        return labels == sizes.argmax()
-    return part_at(distance_map, labels, given)
+    if given is not None and labels.max() > 1:
+        return part_at(distance_map, labels, given)
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    return labels == sizes.argmax()
 
 
 def grid_points(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -163,19 +164,26 @@ class Surface:
 
     def to_polydata(self):
         """Return the wall as a `vtkPolyData`."""
-        from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
-        from vtkmodules.vtkCommonCore import vtkPoints
-        from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+        return polydata_of(self.vertices, np.arange(0, 3 * len(self.faces) + 1, 3), self.faces.ravel(), "Polys")
 
-        points, cells, polydata = vtkPoints(), vtkCellArray(), vtkPolyData()
-        points.SetData(numpy_to_vtk(np.ascontiguousarray(self.vertices, dtype=float), deep=True))
-        cells.SetData(
-            numpy_to_vtkIdTypeArray(np.arange(0, 3 * len(self.faces) + 1, 3, dtype=np.int64), deep=True),
-            numpy_to_vtkIdTypeArray(np.ascontiguousarray(self.faces, dtype=np.int64).ravel(), deep=True),
-        )
-        polydata.SetPoints(points)
-        polydata.SetPolys(cells)
-        return polydata
+
+def polydata_of(
+    points: Float[np.ndarray, "n 3"],
+    offsets: Int[np.ndarray, "k"],
+    corners: Int[np.ndarray, "m"],
+    kind: Literal["Polys", "Lines"],
+):
+    """Return cells as a `vtkPolyData`: indices of points, and where among these each cell begins, and the last ends."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+
+    places, cells, polydata = vtkPoints(), vtkCellArray(), vtkPolyData()
+    places.SetData(numpy_to_vtk(np.ascontiguousarray(points, dtype=float), deep=True))
+    cells.SetData(*(numpy_to_vtkIdTypeArray(np.ascontiguousarray(i, np.int64), deep=True) for i in (offsets, corners)))
+    polydata.SetPoints(places)
+    (polydata.SetPolys if kind == "Polys" else polydata.SetLines)(cells)
+    return polydata
 
 
 def surface_from_mask(mask: Volume) -> Surface:
