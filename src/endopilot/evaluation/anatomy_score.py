@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from endopilot.anatomy.projection import project_tip
 from endopilot.anatomy.tree import SAMPLE_STEP_MM, sampled
 from endopilot.types import Anatomy, DistanceMap, LumenMask, VesselTree, Volume
-from endopilot.vessels.lumen_graph import groups
+from endopilot.vessels.graph import groups
 
 SMALLEST_RADIUS_MM = 0.75
 """Vessels thinner than this are not scored: two voxels of a coronary CTA across, CAT08 scores from 0.75 mm up too."""

@@ -223,6 +223,11 @@ def pieces(pairs: Int[np.ndarray, "m 2"], count: int) -> Int[np.ndarray, "count"
     return connected_components(joined, directed=False)[1]
 
 
+def groups(points: Float[np.ndarray, "n 3"], apart_mm: float) -> Int[np.ndarray, "n"]:
+    """Return for each point the number of its group: points as near each other as this, mm, are of one."""
+    return pieces(KDTree(points).query_pairs(apart_mm, output_type="ndarray"), len(points))
+
+
 def split(values: Shaped[np.ndarray, "n ..."], numbers: Integer[np.ndarray, "n"]) -> list[Shaped[np.ndarray, "_ ..."]]:
     """Return the values of each number from 0 on, in their order."""
     return np.split(values[np.argsort(numbers, kind="stable")], np.cumsum(np.bincount(numbers))[:-1])

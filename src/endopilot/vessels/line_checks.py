@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from endopilot.errors import place_text
 from endopilot.lines import length_along
 from endopilot.types import VesselTree
-from endopilot.vessels.graph import RootedGraph, pieces
+from endopilot.vessels.graph import RootedGraph, groups, pieces
 from endopilot.vessels.line_graph import STEP_MM, FoundLines, LineGraph
 
 _SHORTEST_MM = 2.0
@@ -97,8 +97,7 @@ def closures(tree: VesselTree) -> list[str]:
     one, two, overlap, route = one[found], two[found], overlap[found], route[found]
     places = 0.5 * (points[one] + points[two])
     cells, member = np.unique(np.floor(places / STEP_MM), axis=0, return_inverse=True)
-    near = KDTree(STEP_MM * cells).query_pairs(float(np.median(radius[one])) + 2 * STEP_MM, output_type="ndarray")
-    cluster = pieces(near, len(cells))[member.reshape(-1)]
+    cluster = groups(STEP_MM * cells, float(np.median(radius[one])) + 2 * STEP_MM)[member.reshape(-1)]
     last = [np.flatnonzero(branch == number)[-1] for number in tree.leaves()]
     graph, notes = _graph_of(tree, branch), []
     for number in range(cluster.max() + 1):
