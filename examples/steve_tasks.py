@@ -30,9 +30,9 @@ import yaml
 
 import endopilot
 from endopilot.anatomy.catheter_axis import with_axis
-from endopilot.anatomy.read_source import read_source
-from endopilot.anatomy.sources import Polylines
 from endopilot.tasks.task import list_tasks
+from endopilot.vessels.read_source import read_source
+from endopilot.vessels.sources import Polylines
 
 POISSON = 0.49
 TIP_RADIUS_MM, TIP_DEG = 12.1, 72.0

@@ -10,8 +10,8 @@ import yaml
 
 from endopilot.anatomy.extract import extract_anatomy
 from endopilot.anatomy.io import write_anatomy
-from endopilot.anatomy.sources import Polylines
 from endopilot.tasks.task import Task, list_tasks
+from endopilot.vessels.sources import Polylines
 
 
 def own_tasks(folder: Path, **change: Any) -> Task:

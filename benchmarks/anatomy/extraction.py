@@ -17,11 +17,10 @@ from scipy.spatial.transform import Rotation
 from benchmarks.anatomy import analytic_lumens as analytic
 from benchmarks.anatomy.compare import compare_with_atlas
 from benchmarks.figures import Bar
-from endopilot.anatomy.distance import BAND_MM, distance_map_from_mask, distance_map_from_spheres, sample
+from endopilot.anatomy.distance import distance_map_from_spheres, sample
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import write_anatomy
 from endopilot.anatomy.projection import project_tip
-from endopilot.anatomy.read_source import read_source
 from endopilot.anatomy.tree import sampled
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.cli.arguments import existing
@@ -29,6 +28,9 @@ from endopilot.errors import InputError
 from endopilot.evaluation.anatomy_score import compare_trees
 from endopilot.progress import progress
 from endopilot.types import Anatomy, LumenMask, VesselTree, Volume
+from endopilot.vessels.read_source import read_source
+from endopilot.vessels.surface import BAND_MM, surface_from_mask
+from endopilot.vessels.surface_distance import distance_map_from_surface
 
 VOXELS_MM = ((0.35, 0.35, 0.35), (0.5, 0.5, 0.5), (0.35, 0.35, 0.5), (0.4, 0.4, 0.8))
 """Voxel edges of the masks, mm. Errors are given in units of the shortest edge."""
@@ -157,7 +159,7 @@ def _axis_and_radius(tree: VesselTree, mask: LumenMask) -> Judged:
 def _wall(tree: VesselTree, mask: LumenMask) -> Judged:
     """Return the distance map's error near the wall, and that of a binary distance transform of the same mask."""
     voxel = float(mask.volume.spacing_mm.min())
-    ours = distance_map_from_mask(mask.volume)
+    ours = distance_map_from_surface(surface_from_mask(mask.volume), spacing_mm=voxel)
     k, j, i = np.nonzero(np.abs(ours.values) < BAND_MM - 0.1)
     points = ours.origin_mm + ours.spacing_mm * np.stack([i, j, k], axis=1)
     error = _error_near_wall(tree, points, ours.values[k, j, i])

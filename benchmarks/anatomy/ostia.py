@@ -12,7 +12,6 @@ from tyro.conf import Positional
 
 from benchmarks.figures import Bar
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
-from endopilot.anatomy.read_source import MASK_SUFFIXES
 from endopilot.anatomy.tree import sampled
 from endopilot.cli.arguments import existing
 from endopilot.errors import InputError
@@ -21,6 +20,7 @@ from endopilot.imaging.grid import connected_components
 from endopilot.imaging.volume import read_volume
 from endopilot.progress import progress
 from endopilot.types import Anatomy, LumenMask, Volume
+from endopilot.vessels.read_source import MASK_SUFFIXES
 
 TRUTH_FILE = "ostia.json"
 

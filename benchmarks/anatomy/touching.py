@@ -16,12 +16,12 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.figures import Bar
 from endopilot.anatomy.extract import extract_anatomy
-from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.cli.arguments import existing
 from endopilot.errors import InputError
 from endopilot.imaging.volume import read_volume, write_mask
 from endopilot.progress import progress
 from endopilot.types import LumenMask, Volume
+from endopilot.vessels.surface import Surface, surface_from_mask
 
 VOXEL_MM = 0.35
 """Edge that real masks are resampled to, mm: a coronary CTA's."""

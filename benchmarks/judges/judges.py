@@ -19,12 +19,12 @@ from benchmarks.anatomy import analytic_lumens as analytic
 from benchmarks.anatomy.extraction import moved_shapes
 from benchmarks.judges.environment import CannotInstall, environment
 from endopilot.anatomy.extract import extract_anatomy
-from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.anatomy.tree import sampled
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.progress import progress
 from endopilot.types import VesselTree, Volume
+from endopilot.vessels.surface import Surface, surface_from_mask
 from endopilot.xray.absorbers import WATER_MM
 from endopilot.xray.carm import CArmGeometry, view_at
 from endopilot.xray.projector import cast

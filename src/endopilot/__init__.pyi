@@ -2,9 +2,6 @@ from .anatomy.extract import AnatomyConfig as AnatomyConfig
 from .anatomy.extract import extract_anatomy as extract_anatomy
 from .anatomy.io import read_anatomy as read_anatomy
 from .anatomy.io import write_anatomy as write_anatomy
-from .anatomy.sources import AnatomySource as AnatomySource
-from .anatomy.sources import Polylines as Polylines
-from .anatomy.surface import Surface as Surface
 from .angiograms.config import AngiogramsConfig as AngiogramsConfig
 from .angiograms.make import make_angiograms as make_angiograms
 from .atlas.atlas import AtlasConfig as AtlasConfig
@@ -116,6 +113,9 @@ from .types import LumenMask as LumenMask
 from .types import TipProjection as TipProjection
 from .types import VesselTree as VesselTree
 from .types import Volume as Volume
+from .vessels.sources import AnatomySource as AnatomySource
+from .vessels.sources import Polylines as Polylines
+from .vessels.surface import Surface as Surface
 from .xray.camera import CArmCamera as CArmCamera
 from .xray.camera import PlanarCamera as PlanarCamera
 from .xray.camera import read_camera as read_camera

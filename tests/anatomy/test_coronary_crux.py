@@ -10,10 +10,11 @@ import pytest
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.labels import dominance as tree_dominance
 from endopilot.anatomy.labels import label_tree
-from endopilot.anatomy.labels_tree import CRUX_FROM_OSTIUM_MM, LCA_SECTIONS, Crux, find_crux
-from endopilot.anatomy.sources import Polylines
+from endopilot.anatomy.labels_tree import LCA_SECTIONS
 from endopilot.anatomy.tree import Line, tree_from_lines
 from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
+from endopilot.vessels.coronary_ostia import CRUX_FROM_OSTIUM_MM, Crux, find_crux
+from endopilot.vessels.sources import Polylines
 
 OSTIUM = np.array([5.0, -7.0, 3.0])
 CRUX = OSTIUM + CRUX_FROM_OSTIUM_MM

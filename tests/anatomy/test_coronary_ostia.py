@@ -11,16 +11,17 @@ import pytest
 from analytic_shapes import mask_of
 
 from benchmarks.anatomy.analytic_lumens import tree_of
-from endopilot.anatomy.coronary_ends import open_ends, skeleton_of
-from endopilot.anatomy.coronary_inlet import _coarse, coronary_inlet
-from endopilot.anatomy.coronary_ostia import end_score, rank_ostia
-from endopilot.anatomy.distance import distance_map_from_mask, distance_map_from_spheres, distance_map_from_surface
+from endopilot.anatomy.distance import distance_map_from_spheres
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
-from endopilot.anatomy.inlet import component, entrance, grid_points
-from endopilot.anatomy.surface import surface_from_mask
 from endopilot.errors import InputError
 from endopilot.imaging.volume import read_volume
 from endopilot.types import Insertion, LumenMask, Volume
+from endopilot.vessels.coronary_inlet import _coarse, coronary_inlet
+from endopilot.vessels.coronary_ostia import end_score, rank_ostia
+from endopilot.vessels.ends import open_ends, skeleton_of
+from endopilot.vessels.inlet import component, entrance, grid_points
+from endopilot.vessels.surface import surface_from_mask
+from endopilot.vessels.surface_distance import distance_map_from_surface
 from toy_coronaries import PLACE_MM, artery, mask_of_arteries, without
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "real_coronaries"
@@ -113,7 +114,7 @@ def test_a_cone_narrows_from_its_wide_end_and_widens_from_the_narrow_one():
         height = np.clip(points[..., 2], -30.0, 30.0)
         return 1.7 - height / 60.0 - np.sqrt(points[..., 0] ** 2 + points[..., 1] ** 2 + (points[..., 2] - height) ** 2)
 
-    lumen = distance_map_from_mask(mask_of(cone, (5, 5, 34), (0.5, 0.5, 0.5)).volume)
+    lumen = distance_map_from_surface(surface_from_mask(mask_of(cone, (5, 5, 34), (0.5,) * 3).volume), spacing_mm=0.5)
     ends = open_ends(skeleton_of(*grid_points(lumen, lumen.values > 0), lumen.spacing_mm))
     wide, narrow = (pick(ends, key=lambda end: end.position[2]) for pick in (min, max))
     # mean of ln(u) over u from 1 to 2.2/1.2, where u is the radius over that of the narrow end

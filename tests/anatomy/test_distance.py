@@ -7,16 +7,12 @@ import pytest
 from analytic_shapes import BEND_MM, forked_tree, mask_of, torus_distance, tree_distance
 from scipy.spatial.transform import Rotation
 
-from endopilot.anatomy.distance import (
-    add_catheter,
-    distance_map_from_mask,
-    distance_map_from_spheres,
-    sample,
-    smooth_union,
-)
+from endopilot.anatomy.distance import add_catheter, distance_map_from_spheres, sample, smooth_union
 from endopilot.anatomy.tree import make_centerline
 from endopilot.errors import InputError
 from endopilot.types import Branch, Insertion, VesselTree
+from endopilot.vessels.surface import surface_from_mask
+from endopilot.vessels.surface_distance import distance_map_from_surface
 
 
 def grid_points(distance_map):
@@ -68,7 +64,7 @@ def test_smooth_union_does_not_bulge_where_tubes_carry_on():
 def test_mask_gives_a_sub_voxel_distance(spacing):
     rotation = Rotation.from_rotvec([0.3, 0.2, 0.5]).as_matrix()
     mask = mask_of(lambda p: torus_distance(p, 2.0), (25, 25, 9), spacing, rotation)
-    found = distance_map_from_mask(mask.volume, spacing_mm=0.5)
+    found = distance_map_from_surface(surface_from_mask(mask.volume), spacing_mm=0.5)
     exact = torus_distance(grid_points(found), 2.0)
     error = (found.values - exact)[np.abs(exact) < 2.0]
     assert np.sqrt(np.mean(error**2)) < 0.1 * max(spacing)
@@ -77,7 +73,7 @@ def test_mask_gives_a_sub_voxel_distance(spacing):
 
 def test_thin_vessel_of_one_voxel_radius_survives():
     mask = mask_of(lambda p: torus_distance(p, 0.5), (23, 23, 2), (0.5, 0.5, 0.5))
-    found = distance_map_from_mask(mask.volume, spacing_mm=0.25)
+    found = distance_map_from_surface(surface_from_mask(mask.volume), spacing_mm=0.25)
     angle = np.linspace(0, 2 * np.pi, 100)
     axis = BEND_MM * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     assert sample(found, axis).min() > 0.1

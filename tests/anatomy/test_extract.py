@@ -11,15 +11,15 @@ from analytic_shapes import BEND_MM, forked_tree, mask_of, torus_distance, tree_
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from endopilot.anatomy.centerline import to_cut
 from endopilot.anatomy.distance import CATHETER_RADIUS_MM, distance_map_from_spheres, sample
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
-from endopilot.anatomy.line_ends import to_cut
-from endopilot.anatomy.read_source import read_source
-from endopilot.anatomy.sources import Polylines
-from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.errors import InputError
 from endopilot.imaging.volume import write_volume
 from endopilot.types import DistanceMap, Insertion, LumenMask, Volume
+from endopilot.vessels.read_source import read_source
+from endopilot.vessels.sources import Polylines
+from endopilot.vessels.surface import Surface, surface_from_mask
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "coronary_centerlines"
 

@@ -9,9 +9,9 @@ import pytest
 from analytic_shapes import mask_of
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
-from endopilot.anatomy.parent_vessel import piece_on_side
-from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.errors import InputError
+from endopilot.vessels.inlet import piece_on_side
+from endopilot.vessels.surface import Surface, surface_from_mask
 from toy_coronaries import artery, mask_of_arteries
 
 HALF_MM = (22.0, 12.0, 34.0)

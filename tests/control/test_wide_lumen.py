@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from endopilot.anatomy.extract import extract_anatomy
-from endopilot.anatomy.sources import Polylines
 from endopilot.control.agent import AgentPolicy
 from endopilot.control.agent_config import IN_WIDE_LUMEN, AgentConfig
 from endopilot.control.trials import WIRE, Move, Trials
@@ -16,6 +15,7 @@ from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
 from endopilot.devices.drive_limits import DriveLimits, far_end_mm
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
+from endopilot.vessels.sources import Polylines
 
 
 @pytest.fixture(scope="module")

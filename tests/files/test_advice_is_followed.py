@@ -10,10 +10,10 @@ import pytest
 from scipy.ndimage import label
 from scipy.spatial import KDTree
 
-from endopilot.anatomy.coronary_inlet import coronary_inlet
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.errors import InputError
 from endopilot.types import LumenMask
+from endopilot.vessels.coronary_inlet import coronary_inlet
 from toy_coronaries import PLACE_MM, artery, mask_of_arteries
 
 

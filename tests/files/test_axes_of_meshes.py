@@ -9,10 +9,10 @@ import pytest
 from make_meshes import SLICER, arc, markup, tube, write_lines, write_surface
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
-from endopilot.anatomy.read_source import read_source
-from endopilot.anatomy.sources import Polylines, transformed
-from endopilot.anatomy.surface import Surface
 from endopilot.errors import InputError
+from endopilot.vessels.read_source import read_source
+from endopilot.vessels.sources import Polylines, transformed
+from endopilot.vessels.surface import Surface
 
 RAS = np.array([-1.0, -1.0, 1.0])
 MESHES = ["mesh.bin.stl", "mesh.stl", "mesh.ply", "mesh.obj", "mesh.vtk", "mesh.vtp"]

@@ -11,8 +11,8 @@ from make_meshes import arc
 from endopilot import files
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import read_anatomy, write_anatomy
-from endopilot.anatomy.sources import Polylines
 from endopilot.errors import InputError
+from endopilot.vessels.sources import Polylines
 
 
 @pytest.fixture(scope="module")

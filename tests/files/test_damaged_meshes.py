@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from make_meshes import arc, tube, write_lines, write_surface
 
-from endopilot.anatomy.read_source import read_source
-from endopilot.anatomy.surface import Surface
 from endopilot.errors import InputError
+from endopilot.vessels.read_source import read_source
+from endopilot.vessels.surface import Surface
 
 
 @pytest.mark.parametrize("name", ["mesh.bin.stl", "mesh.ply", "mesh.obj", "mesh.vtk", "mesh.vtp"])

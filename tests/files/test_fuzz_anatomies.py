@@ -15,7 +15,7 @@ from make_meshes import arc
 
 from endopilot.anatomy.extract import extract_anatomy
 from endopilot.anatomy.io import read_anatomy, write_anatomy
-from endopilot.anatomy.sources import Polylines
+from endopilot.vessels.sources import Polylines
 
 FLIPS = st.lists(st.tuples(st.integers(0, 1 << 16), st.integers(0, 255)), max_size=4)
 CUT = st.one_of(st.none(), st.integers(0, 4000))

@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from make_meshes import arc, markup, tube, write_lines, write_surface
 
-from endopilot.anatomy.polylines import tree_from_polylines
-from endopilot.anatomy.read_source import read_source
-from endopilot.anatomy.sources import Polylines
+from endopilot.anatomy.tree import tree_from_polylines
 from endopilot.errors import InputError
+from endopilot.vessels.read_source import read_source
+from endopilot.vessels.sources import Polylines
 
 NAMES = ["mesh.bin.stl", "mesh.stl", "mesh.ply", "mesh.obj", "mesh.vtk", "mesh.vtp", "lines.vtp"]
 EDITS = st.lists(st.tuples(st.floats(0, 1), st.sampled_from(["put", "cut", "add"]), st.binary(min_size=1, max_size=6)))

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from make_images import RAMP, metaimage, nifti, nrrd
 
-from endopilot.anatomy.read_source import read_source
 from endopilot.errors import InputError
 from endopilot.files import sha256
 from endopilot.imaging.volume import read_mask, read_volume
+from endopilot.vessels.read_source import read_source
 
 
 def test_a_nifti_is_read_itself_beside_its_twin(tmp_path):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from endopilot.anatomy.polylines import tree_from_polylines
-from endopilot.anatomy.sources import Polylines
+from endopilot.anatomy.tree import tree_from_polylines
 from endopilot.errors import InputError
+from endopilot.vessels.sources import Polylines
 
 
 def made(lines, radius=1.5, **given):

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from endopilot.anatomy.polylines import tree_from_polylines
-from endopilot.anatomy.read_source import read_source
-from endopilot.anatomy.sources import Polylines
+from endopilot.anatomy.tree import tree_from_polylines
+from endopilot.vessels.read_source import read_source
+from endopilot.vessels.sources import Polylines
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 

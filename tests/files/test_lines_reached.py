@@ -39,8 +39,8 @@ def test_covered_left_out_and_bridged_are_all_of_the_lines(pieces):
         end = np.array(start) + length * unit / np.linalg.norm(unit)
         lines.append(straight(start, end, max(2, int(length / radius))))
         radii.append(radius)
-    from endopilot.anatomy.polylines import tree_from_polylines
-    from endopilot.anatomy.sources import Polylines
+    from endopilot.anatomy.tree import tree_from_polylines
+    from endopilot.vessels.sources import Polylines
 
     source = Polylines(
         tuple(lines), tuple(np.full(len(line), radius) for line, radius in zip(lines, radii, strict=True))
@@ -80,8 +80,8 @@ def test_a_small_gap_between_lines_is_bridged_and_noted():
 
 
 def test_the_longer_of_two_pieces_is_taken_though_the_other_is_wider():
-    from endopilot.anatomy.polylines import tree_from_polylines
-    from endopilot.anatomy.sources import Polylines
+    from endopilot.anatomy.tree import tree_from_polylines
+    from endopilot.vessels.sources import Polylines
 
     lines = (straight([0, 0, 0], [0, 0, 90]), straight([40, 0, 0], [40, 0, 30]))
     found = tree_from_polylines(Polylines(lines, (np.full(100, 1.0), np.full(100, 2.0))), None, "lines.vtp")

@@ -10,10 +10,10 @@ from make_vessels import hairpin, length_of, line, lumen, tubes, with_voxels
 from scipy.ndimage import label
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
-from endopilot.anatomy.surface import surface_from_mask
-from endopilot.anatomy.topology import parted, touch_remarks
 from endopilot.errors import InputError
 from endopilot.types import Volume
+from endopilot.vessels.surface import surface_from_mask
+from endopilot.vessels.topology import parted, touch_remarks
 
 VOXELS = [(0.35, 0.35, 0.5), (0.7, 0.7, 0.5)]
 

@@ -9,9 +9,9 @@ import pytest
 from make_meshes import arc, markup
 
 from endopilot.anatomy.extract import extract_anatomy
-from endopilot.anatomy.read_source import read_source
-from endopilot.anatomy.sources import Polylines
 from endopilot.errors import InputError
+from endopilot.vessels.read_source import read_source
+from endopilot.vessels.sources import Polylines
 
 RADIUS = np.full(60, 1.5)
 

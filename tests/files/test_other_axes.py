@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from endopilot.anatomy.coronary_inlet import coronary_inlet
-from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.errors import InputError
 from endopilot.imaging.volume import read_mask
 from endopilot.types import LumenMask
+from endopilot.vessels.coronary_inlet import coronary_inlet
+from endopilot.vessels.surface import Surface, surface_from_mask
 from toy_coronaries import PLACE_MM, artery, mask_of_arteries
 
 REAL = Path(__file__).parents[3] / "shared/data/real_coronaries"

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from make_vessels import length_of, line, lumen, thinned_at, tubes, with_voxels
 from scipy.spatial import KDTree
 
-from endopilot.anatomy.coverage import NOTED_MM
 from endopilot.anatomy.extract import extract_anatomy
-from endopilot.anatomy.medial_lines import traced_lines
-from endopilot.anatomy.surface import Surface
 from endopilot.anatomy.tree import sampled
+from endopilot.vessels.coverage import NOTED_MM
+from endopilot.vessels.medial_lines import traced_lines
+from endopilot.vessels.surface import Surface
 
 STRAIGHT = line((0, 0, 0), (0, 0, 60))
 

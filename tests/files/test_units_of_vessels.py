@@ -9,11 +9,10 @@ import pytest
 from make_meshes import arc, markup, tube, write_surface
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
-from endopilot.anatomy.read_source import read_source
-from endopilot.anatomy.sources import Polylines, transformed
-from endopilot.anatomy.surface import Surface
-from endopilot.anatomy.units import check_unit
 from endopilot.errors import InputError
+from endopilot.vessels.read_source import read_source
+from endopilot.vessels.sources import Polylines, check_unit, transformed
+from endopilot.vessels.surface import Surface
 
 FACTORS = {"dm": 100.0, "m": 1000.0, "cm": 10.0, "µm": 0.001}
 

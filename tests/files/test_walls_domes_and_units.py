@@ -11,13 +11,12 @@ from make_meshes import arc, tube, write_lines
 from make_vessels import line, tubes
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
-from endopilot.anatomy.read_source import read_source
-from endopilot.anatomy.sources import Polylines, transformed
-from endopilot.anatomy.surface import Surface, surface_from_mask
-from endopilot.anatomy.units import ASSUMED, check_unit
 from endopilot.atlas.atlas import VESSELS, AtlasConfig, make_patient_tree
 from endopilot.errors import InputError
 from endopilot.types import LumenMask, Volume
+from endopilot.vessels.read_source import read_source
+from endopilot.vessels.sources import ASSUMED, Polylines, check_unit, transformed
+from endopilot.vessels.surface import Surface, surface_from_mask
 
 COARSE = AnatomyConfig(spacing_mm=0.8)
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 
-from endopilot.anatomy.read_source import read_source
 from endopilot.errors import InputError
 from endopilot.imaging.volume import check_output, read_mask, read_volume, write_mask, write_volume
 from endopilot.types import Insertion, LumenMask, Volume
+from endopilot.vessels.read_source import read_source
 
 
 def _oblique_volume(dtype=np.int16) -> Volume:

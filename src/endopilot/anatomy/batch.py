@@ -11,11 +11,11 @@ from typing import Any
 from endopilot import __version__, files
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import write_anatomy
-from endopilot.anatomy.read_source import MASK_SUFFIXES, SURFACE_SUFFIXES, read_source
-from endopilot.anatomy.sources import AnatomySource
 from endopilot.errors import InputError
 from endopilot.parallel import each
 from endopilot.runs import claiming
+from endopilot.vessels.read_source import MASK_SUFFIXES, SURFACE_SUFFIXES, read_source
+from endopilot.vessels.sources import AnatomySource
 
 
 def extract_all(

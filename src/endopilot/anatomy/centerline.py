@@ -6,16 +6,18 @@ Side branches are joined to their parents where the two axes meet.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.distance import sample
-from endopilot.anatomy.line_ends import before_cap, from_ostium, from_tip, to_cut, without_inlets
-from endopilot.anatomy.lumen_graph import LumenGraph
-from endopilot.anatomy.surface import Surface
-from endopilot.anatomy.tree import Line, cross_axes, resampled, smoothed, tangents
+from endopilot.anatomy.tree import cross_axes, resampled, smoothed, tangents
+from endopilot.lines import length_along
 from endopilot.types import DistanceMap, Insertion
+from endopilot.vessels.graph import Line, RootedGraph
+from endopilot.vessels.surface import Surface
 
 ROUNDNESS = 0.05
 """A cross-section whose half-axes differ by less than twice this share of its radius counts as round."""
@@ -36,6 +38,24 @@ _CROSSED = 0.25
 _WAY = 12
 """Places at which such a way is looked at."""
 
+_FLAT = 0.75
+"""A vessel whose smaller half-axis falls below this share of its radius is not drawn out any farther."""
+
+_ROUND = 0.9
+"""A half-axis counts as different from the radius where it is smaller than this share of it."""
+
+_AHEAD = 0.87
+"""Cosine of the largest angle at which a line may leave a known ostium off the catheter's axis."""
+
+_SIGHT = np.linspace(0.0, 1.0, 50)
+"""Shares of a line of sight at which the lumen is looked at."""
+
+_LED_ELSEWHERE = 2.0
+"""A line drawn out to its cut ends within this many radii of the tip that it was traced from."""
+
+_LONGEST_BRIDGE = 4.0
+"""A known ostium is joined to a line that begins at most this many radii away."""
+
 _REFINEMENTS = 8
 _STEP_LIMIT = 0.3
 """A refinement moves a point by at most this share of its distance to the wall."""
@@ -44,7 +64,7 @@ _STEP_LIMIT = 0.3
 def refined_lines(
     surface: Surface,
     distance_map: DistanceMap,
-    graph: LumenGraph,
+    graph: RootedGraph,
     paths: list[Int[np.ndarray, "_"]],
     step_mm: float,
     ostium: Insertion | None = None,
@@ -58,9 +78,9 @@ def refined_lines(
     lines: list[Line] = []
     for index, nodes in enumerate(paths):
         parent = int(home[nodes[0]]) if index else -1
-        kept = nodes[: before_cap(graph, nodes)]
+        kept = nodes[: graph.before_cap(nodes)]
         if index == 0:
-            kept = kept[::-1][: before_cap(graph, kept[::-1])][::-1]
+            kept = kept[::-1][: graph.before_cap(kept[::-1])][::-1]
         elif parent >= 0:
             kept = kept[_outside(graph.points[kept], lines[parent]) :]
         home[nodes if index == 0 else nodes[1:]] = parent if index else 0
@@ -73,14 +93,14 @@ def refined_lines(
         place = 0
         if index == 0:
             drawn, width = (side[::-1] for side in to_cut(distance_map, points[::-1], radius[::-1], step_mm))
-            begun = None if ostium is None else from_ostium(distance_map, drawn, width, points, radius, ostium, step_mm)
-            points, radius = begun or from_tip(drawn, width, points, radius, graph.points[nodes], step_mm)
+            begun = ostium and _from_ostium(distance_map, drawn, width, points, radius, ostium, step_mm)
+            points, radius = begun or _from_tip(drawn, width, points, radius, graph.points[nodes], step_mm)
         else:
             home[nodes[1:]] = len(lines)
             place = _meeting_point(distance_map, points, float(radius[0]), lines[parent])
             points, radius = _joined(surface, lines[parent], place, points, radius, step_mm)
         lines.append(Line(points, radius, parent, place))
-    return lines if ostium is None else without_inlets(distance_map, lines, ostium)
+    return lines if ostium is None else _without_inlets(distance_map, lines, ostium)
 
 
 def _to_axis(
@@ -212,3 +232,130 @@ def _meeting_point(distance_map: DistanceMap, body: Float[np.ndarray, "n 3"], ra
     order = np.argsort(score, kind="stable")
     place = int(next((i for i in order if is_open(int(i))), order[0]))
     return int(np.clip(place, 1, len(parent.points) - 2))
+
+
+def to_cut(
+    distance_map: DistanceMap, points: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, "n"], step_mm: float
+) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
+    """Draw a line out as long as the lumen keeps its width, to the cut of a vessel that ends flat.
+
+    Each step goes on along the last ones, bent as they are, and is centred by the walls beside it alone: the cut ahead
+    does not draw it back. Where the lumen grows narrow or flat, it is no longer the same vessel that runs to a cut.
+    """
+    width = float(radius[-1])
+    back = max(3, round(1.5 * width / step_mm))
+    line = list(points[-2 * back - 1 :])
+    kept = len(line)
+    added: list[float] = []
+    for _ in range(int(3 * width / step_mm) + 1):
+        behind = min(back, len(line) - 1)
+        axis = line[-1] - line[-1 - behind]
+        if len(line) > 2 * behind:
+            axis = 1.5 * axis - 0.5 * (line[-1 - behind] - line[-1 - 2 * behind])
+        axis /= max(float(np.linalg.norm(axis)), 1e-12)
+        candidate = line[-1] + step_mm * axis
+        wall, rays = _section(distance_map, candidate, axis, 2 * width)
+        small = 0.5 * float((wall[: _RING // 2] + wall[_RING // 2 :]).min())
+        if np.median(wall) < 0.9 * width or small < _FLAT * width:
+            break
+        added.append(width if small > _ROUND * width else small)  # less than that is ripple
+        shift = 2.0 / _RING * wall @ rays
+        size = float(np.linalg.norm(shift))
+        line.append(candidate + shift * min(0.5, 0.2 * step_mm / max(size, 1e-12)))
+    return np.concatenate([points, np.reshape(line[kept:], (-1, 3))]), np.concatenate([radius, added])
+
+
+def _from_ostium(
+    distance_map: DistanceMap,
+    drawn: Float[np.ndarray, "n 3"],
+    width: Float[np.ndarray, "n"],
+    points: Float[np.ndarray, "m 3"],
+    radius: Float[np.ndarray, "m"],
+    ostium: Insertion,
+    step_mm: float,
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k"]] | None:
+    """Return the first line so that it begins at a known ostium, or None where no line of sight leads there."""
+    along = length_along(drawn)
+    shift = ostium.position - drawn[0]
+    beside = shift - (shift @ ostium.direction) * ostium.direction
+    if np.linalg.norm(shift) <= 2 * width[0] and np.linalg.norm(beside) <= 0.5 * width[0]:
+        share = np.clip(1 - along / (3 * width[0]), 0.0, 1.0)
+        return drawn + (share**2 * (3 - 2 * share))[:, None] * shift, width
+    offset = points - ostium.position
+    length = np.linalg.norm(offset, axis=1)
+    ahead = np.flatnonzero(offset @ ostium.direction > _AHEAD * length)
+    if len(ahead) == 0 or length[ahead[0]] > _LONGEST_BRIDGE * radius[ahead[0]]:
+        return None
+    first = int(ahead[0])
+    count = max(2, round(float(length[first]) / step_mm))
+    bridge = ostium.position + np.arange(count)[:, None] / count * offset[first]
+    clearance = sample(distance_map, bridge)
+    if clearance[1:].min() <= 0:
+        return None
+    # Near the ostium the nearest wall is the cut's own cap, and no width of the vessel.
+    gone = np.linalg.norm(bridge - ostium.position, axis=1)
+    free = int(np.argmax(np.append(gone > 1.25 * clearance + step_mm, True)))
+    clearance[:free] = np.append(clearance, radius[first])[free]
+    return smoothed(np.concatenate([bridge, points[first:]]), 3.0), np.concatenate([clearance, radius[first:]])
+
+
+def _from_tip(
+    drawn: Float[np.ndarray, "n 3"],
+    width: Float[np.ndarray, "n"],
+    points: Float[np.ndarray, "m 3"],
+    radius: Float[np.ndarray, "m"],
+    traced: Float[np.ndarray, "t 3"],
+    step_mm: float,
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k"]]:
+    """Return the first line so that it begins at the tip that it was traced from, if drawing it out led elsewhere.
+
+    Where a short left main meets its branches, a line that is cut back from the cap is cut back round the bend.
+    """
+    if np.linalg.norm(drawn[0] - traced[0]) < _LED_ELSEWHERE * width[0]:
+        return drawn, width
+    first = int(np.linalg.norm(traced - points[0], axis=1).argmin())
+    # The tip lies in the rim of the cap, not on the axis: begin where a sphere of half the width touches it.
+    gone = np.linalg.norm(traced[:first] - traced[0], axis=1)
+    stub = traced[:first][gone > 0.5 * radius[0]]
+    if len(stub) < 2:
+        return drawn, width
+    line = resampled(smoothed(np.concatenate([stub, points]), radius[0] / step_mm), step_mm)
+    added = len(line) - len(points)
+    return line, np.concatenate([np.full(max(added, 0), radius[0]), radius[max(-added, 0) :]])
+
+
+def _without_inlets(distance_map: DistanceMap, lines: list[Line], ostium: Insertion) -> list[Line]:
+    """Leave out lines that lead back to the ostium's own cut: the other side of a wide inlet, and no branch.
+
+    Such a line ends in the plane of the ostium, and there the lumen joins it to the first line in a straight line. In
+    the merged lumens of a dissection, a wire beside the first line would seem to lie far ahead, on the returning part.
+    """
+    first, kept = lines[0].points, [True] * len(lines)
+    for index in range(len(lines) - 1, 0, -1):
+        points, width = lines[index].points, float(lines[index].radius[-1])
+        leads_on = any(kept[i] and other.parent == index for i, other in enumerate(lines))
+        if leads_on or abs((points[-1] - ostium.position) @ ostium.direction) > width:
+            continue
+        inner = points[int(np.argmax(np.linalg.norm(points - points[-1], axis=1) <= width))]
+        beside = first[int(np.linalg.norm(first - inner, axis=1).argmin())]
+        kept[index] = bool(sample(distance_map, inner + _SIGHT[:, None] * (beside - inner)).min() <= 0)
+    number = np.cumsum(kept) - 1
+    whole = [line for line, stays in zip(lines, kept, strict=True) if stays]
+    return [replace(line, parent=int(number[line.parent]) if line.parent >= 0 else -1) for line in whole]
+
+
+def _section(
+    distance_map: DistanceMap, point: Float[np.ndarray, "3"], tangent: Float[np.ndarray, "3"], limit_mm: float
+) -> tuple[Float[np.ndarray, "r"], Float[np.ndarray, "r 3"]]:
+    """Return the distance to the wall along rays across a vessel, mm, and the rays: 0 outside, at most `limit_mm`."""
+    one, two = cross_axes(tangent[None])
+    angle = 2 * np.pi * np.arange(_RING) / _RING
+    rays = np.cos(angle)[:, None] * one + np.sin(angle)[:, None] * two
+    step = 0.5 * distance_map.spacing_mm
+    along = np.arange(0.0, limit_mm + step, step)
+    value = sample(distance_map, (point + along[:, None, None] * rays).reshape(-1, 3)).reshape(len(along), _RING)
+    outside = value <= 0
+    first = np.maximum(outside.argmax(axis=0), 1)
+    before, after = value[first - 1, np.arange(_RING)], value[first, np.arange(_RING)]
+    crossing = along[first - 1] + step * before / np.maximum(before - after, 1e-12)
+    return np.where(outside[0], 0.0, np.where(outside.any(axis=0), crossing, limit_mm)), rays

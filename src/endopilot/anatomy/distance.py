@@ -11,18 +11,12 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.errors import InputError
 from endopilot.lines import length_along
-from endopilot.types import Centerline, DistanceMap, Insertion, VesselTree, Volume
-
-BAND_MM = 2.5
-"""How far outside the wall the distance map reaches, mm; beyond, it holds the constant −`BAND_MM`."""
-
-MAXIMUM_GRID_POINTS = 20_000_000
-"""A distance map holds at most this many grid points (80 MB of float32); the spacing grows until it fits."""
+from endopilot.types import Centerline, DistanceMap, Insertion, VesselTree
+from endopilot.vessels.surface import BAND_MM, MAXIMUM_GRID_POINTS, grid_of
 
 FILLET = 0.5
 """Strength of the fillet where a branch leaves its parent, in radii of the branch."""
@@ -35,12 +29,6 @@ CATHETER_LENGTH_MM = 20.0
 
 ENGAGED_MM = 3.0
 """A guiding catheter's tip lies this deep in the ostium, mm."""
-
-_NEAR_WALL = (2, 5)
-"""This many grid steps outside and inside the wall are computed exactly, the rest on every second grid point."""
-
-Grid = tuple[tuple[int, int, int], Float[np.ndarray, "3"]]
-"""Shape (nz, ny, nx) and LPS origin of a distance map."""
 
 
 def automatic_spacing(radius: Float[np.ndarray, "n"], extent_mm: Float[np.ndarray, "3"]) -> float:
@@ -78,89 +66,21 @@ def distance_map_from_spheres(
     margin = whole.radius[:, None] + BAND_MM
     lower, upper = (whole.points - margin).min(axis=0), (whole.points + margin).max(axis=0)
     spacing = automatic_spacing(whole.radius, upper - lower) if spacing_mm is None else float(spacing_mm)
-    shape, origin = _grid(lower, upper, spacing)
-    values = np.full(shape, -BAND_MM, dtype=np.float32)
+    shape, origin = grid_of(lower, upper, spacing)
+    result = DistanceMap(np.full(shape, -BAND_MM, dtype=np.float32), spacing, origin)
     for own in lumens:
-        line = own[0]
-        window = _window(Centerline.joined(own), origin, spacing, shape, BAND_MM)
-        corner = origin + spacing * np.array([window[2].start, window[1].start, window[0].start])
-        fields = [_tube_field(part, values[window].shape, corner, spacing, BAND_MM) for part in own]
-        field = np.maximum.reduce(fields)
-        fillet = FILLET * float(line.radius[min(len(line.radius) - 1, 3)])
-        values[window] = smooth_union(values[window], field, spacing_mm=spacing, fillet_mm=fillet)
-    return DistanceMap(values=values, spacing_mm=spacing, origin_mm=origin)
+        radius = own[0].radius
+        _join(result, own, BAND_MM, FILLET * float(radius[min(len(radius) - 1, 3)]))
+    return result
 
 
-def distance_map_from_surface(surface: Surface, *, spacing_mm: float, band_mm: float = BAND_MM) -> DistanceMap:
-    """Return the signed distance to a closed triangulated wall.
-
-    Args:
-        surface: closed wall, LPS mm.
-        spacing_mm: grid spacing, mm.
-        band_mm: how far outside the wall distances are kept, mm.
-    """
-    lower = surface.vertices.min(axis=0) - band_mm
-    shape, origin = _grid(lower, surface.vertices.max(axis=0) + band_mm, spacing_mm)
-    inside = surface.inside(shape, origin, spacing_mm)
-    surface = surface.refined(3.0 * spacing_mm)
-    from endopilot.imaging.grid import dilated  # brings SimpleITK, which simulating does without
-
-    wanted = dilated(inside, math.ceil(band_mm / spacing_mm) + 2)
-    values = _far_field(surface, inside, wanted, origin, spacing_mm, band_mm)
-    outside = dilated(inside, _NEAR_WALL[0]) & ~inside
-    index = np.argwhere(outside)
-    values[outside] = -surface.distance(origin + spacing_mm * index[:, ::-1], limit_mm=band_mm)
-    shallow = inside & dilated(~inside, _NEAR_WALL[1])
-    index = np.argwhere(shallow)
-    values[shallow] = surface.distance(origin + spacing_mm * index[:, ::-1])
-    return DistanceMap(values=values, spacing_mm=float(spacing_mm), origin_mm=origin)
-
-
-def _far_field(
-    surface: Surface,
-    inside: Bool[np.ndarray, "nz ny nx"],
-    wanted: Bool[np.ndarray, "nz ny nx"],
-    origin: Float[np.ndarray, "3"],
-    spacing: float,
-    band: float,
-) -> Float[np.ndarray, "nz ny nx"]:
-    """Return signed distances from every second grid point, linear between them; far inside, from every fourth.
-
-    At a distance ρ from the medial axis this errs by at most h²/2ρ, so it serves away from the wall.
-    """
-    from endopilot.imaging.grid import dilated  # brings SimpleITK, which simulating does without
-
-    half = np.full(tuple((np.array(inside.shape) + 1) // 2 + 1), -band, dtype=np.float32)
-    second, asked = inside[::2, ::2, ::2], wanted[::2, ::2, ::2]
-    if (deep := second & ~dilated(~second, _NEAR_WALL[1])).any():
-        around = dilated(deep, 2) & second
-        own = tuple(slice(0, size) for size in second.shape)
-        half[own][deep] = _far_field(surface, second, around, origin, 2 * spacing, band)[deep]
-        asked = asked & ~deep
-    coarse = np.argwhere(asked)
-    within = second[tuple(coarse.T)]
-    for part, sign, limit in ((coarse[within], 1.0, np.inf), (coarse[~within], -1.0, band)):
-        half[tuple(part.T)] = sign * surface.distance(origin + 2 * spacing * part[:, ::-1], limit_mm=limit)
-    values = half
-    for axis in (2, 1, 0):
-        size, first = inside.shape[axis], (slice(None),) * axis
-        finer = np.empty((*values.shape[:axis], size, *values.shape[axis + 1 :]), dtype=np.float32)
-        even = finer[(*first, slice(None, None, 2))] = values[(*first, slice((size + 1) // 2))]
-        after = values[(*first, slice(1, size // 2 + 1))]
-        finer[(*first, slice(1, None, 2))] = 0.5 * (even[(*first, slice(size // 2))] + after)
-        values = finer
-    return values
-
-
-def distance_map_from_mask(mask: Volume, *, spacing_mm: float | None = None) -> DistanceMap:
-    """Return the signed distance to the smooth wall of a mask, with sub-voxel accuracy.
-
-    Args:
-        mask: boolean voxels on any grid, at least one of them true.
-        spacing_mm: grid spacing, mm; the mask's smallest voxel edge if None.
-    """
-    spacing = float(mask.spacing_mm.min()) if spacing_mm is None else spacing_mm
-    return distance_map_from_surface(surface_from_mask(mask), spacing_mm=spacing)
+def _join(distance_map: DistanceMap, lines: Sequence[Centerline], band: float, fillet_mm: float) -> None:
+    """Join the lumen of some lines' tubes to a map that has room for it."""
+    values, spacing, origin = distance_map.values, distance_map.spacing_mm, distance_map.origin_mm
+    window = _window(Centerline.joined(lines), origin, spacing, values.shape, band)
+    corner = origin + spacing * np.array([part.start for part in window[::-1]])
+    field = np.maximum.reduce([_tube_field(line, values[window].shape, corner, spacing, band) for line in lines])
+    values[window] = smooth_union(values[window], field, spacing_mm=spacing, fillet_mm=fillet_mm)
 
 
 def add_catheter(
@@ -192,13 +112,7 @@ def add_catheter(
         normals=np.zeros((steps, 3)),
     )
     grown = _grow(distance_map, line.points.min(axis=0), line.points.max(axis=0), radius_mm + band, -band)
-    shape = (grown.values.shape[0], grown.values.shape[1], grown.values.shape[2])
-    window = _window(line, grown.origin_mm, spacing, shape, band)
-    corner = grown.origin_mm + spacing * np.array([window[2].start, window[1].start, window[0].start])
-    field = _tube_field(line, grown.values[window].shape, corner, spacing, band)
-    grown.values[window] = smooth_union(
-        grown.values[window], field, spacing_mm=spacing, fillet_mm=FILLET * float(radius_mm)
-    )
+    _join(grown, [line], band, FILLET * float(radius_mm))
     return grown
 
 
@@ -253,11 +167,6 @@ def sample(distance_map: DistanceMap, points: Float[np.ndarray, "n 3"], *, order
     return map_coordinates(distance_map.values, index[:, ::-1].T, order=order, mode="nearest", output=np.float64)
 
 
-def _grid(lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"], spacing: float) -> Grid:
-    counts = np.ceil((upper - lower) / spacing).astype(int) + 1
-    return (int(counts[2]), int(counts[1]), int(counts[0])), np.asarray(lower, dtype=float)
-
-
 def _grow(
     distance_map: DistanceMap, lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"], margin: float, fill: float
 ) -> DistanceMap:
@@ -272,7 +181,7 @@ def _grow(
 
 
 def _window(
-    line: Centerline, origin: Float[np.ndarray, "3"], spacing: float, shape: tuple[int, int, int], band: float
+    line: Centerline, origin: Float[np.ndarray, "3"], spacing: float, shape: tuple[int, ...], band: float
 ) -> tuple[slice, slice, slice]:
     """Return the part of the grid that a line's tube and band can reach."""
     margin = line.radius[:, None] + band

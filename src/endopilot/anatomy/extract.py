@@ -13,35 +13,42 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot import __version__
-from endopilot.anatomy import coverage, polylines, repair, repair_surface
 from endopilot.anatomy.centerline import refined_lines
-from endopilot.anatomy.coronary_inlet import CoronaryInlet, coronary_inlet
-from endopilot.anatomy.coronary_ostia import Side, course_off_deg
 from endopilot.anatomy.distance import (
     CATHETER_RADIUS_MM,
-    MAXIMUM_GRID_POINTS,
     add_catheter,
     automatic_spacing,
     catheter_tilt_deg,
     distance_map_from_spheres,
-    distance_map_from_surface,
 )
-from endopilot.anatomy.inlet import beyond_parent, component, entrance, grid_points, in_front, inlets
 from endopilot.anatomy.labels import dominance, label_tree, missing_main_vessel
 from endopilot.anatomy.labels_coronary import SHORT_MM
-from endopilot.anatomy.lumen_graph import lumen_graph, trace_branches
-from endopilot.anatomy.read_source import read_source
-from endopilot.anatomy.sources import AnatomySource, Polylines, transformed
-from endopilot.anatomy.surface import Surface, surface_from_mask
-from endopilot.anatomy.topology import parted, touch_remarks
-from endopilot.anatomy.tree import tree_from_lines
-from endopilot.anatomy.units import ANSWERED, ASSUMED, BY_ARRAYS, SMALLEST_RADIUS_MM, check_unit, unit_name
-from endopilot.anatomy.walls import without_wall
+from endopilot.anatomy.tree import sampled, tree_from_lines, tree_from_polylines
 from endopilot.errors import InputError, place_text
 from endopilot.imaging.grid import connected_components
 from endopilot.progress import progress
 from endopilot.settings import Finite, Within, public, settings
 from endopilot.types import Anatomy, DistanceMap, Insertion, LumenMask, VesselTree
+from endopilot.vessels import coverage, repair, repair_surface
+from endopilot.vessels.coronary_inlet import CoronaryInlet, coronary_inlet
+from endopilot.vessels.coronary_ostia import Side, course_off_deg
+from endopilot.vessels.graph import lumen_graph
+from endopilot.vessels.inlet import beyond_parent, component, entrance, grid_points, in_front, inlets
+from endopilot.vessels.read_source import read_source
+from endopilot.vessels.sources import (
+    ANSWERED,
+    ASSUMED,
+    BY_ARRAYS,
+    SMALLEST_RADIUS_MM,
+    AnatomySource,
+    Polylines,
+    check_unit,
+    transformed,
+    unit_name,
+)
+from endopilot.vessels.surface import MAXIMUM_GRID_POINTS, Surface, surface_from_mask
+from endopilot.vessels.surface_distance import distance_map_from_surface
+from endopilot.vessels.topology import parted, touch_remarks
 
 CORONARY_RADIUS_MM = 1.6
 """Mean radius of a coronary tree at most: what counts for the grid where a lumen holds a piece of the aorta too."""
@@ -130,7 +137,7 @@ def extract_anatomy(
             if isinstance(content, Polylines):
                 points, radius = np.concatenate(content.points), np.concatenate(content.radius)
                 check_unit(points, float(np.median(radius)), config.vessel, source_name, **unit)
-            made = polylines.tree_from_polylines(content, given, source_name, config.vessel)
+            made = tree_from_polylines(content, given, source_name, config.vessel)
             tree, rule, balance = made.tree, made.rule, made.coverage
             notes += made.notes
             inlet: CoronaryInlet | None = None
@@ -151,7 +158,7 @@ def extract_anatomy(
             advance()
             distance_map = _final_map(surface, tree, config)
             notes += rivals
-            left = coverage.unreached(lumen.before, tree, float(voxels_mm.max()))
+            left = coverage.unreached(lumen.before, *sampled(tree), float(voxels_mm.max()))
             balance = coverage.record(lumen.before, widened, left)
             left = [stretch for stretch in left if not lumen.told[stretch.nodes].all()]
             line = tree.branches[0].centerline
@@ -191,7 +198,7 @@ def _wall(
     inlet, remarks = None, list[str]()
     repair.pieces_of.cache_clear()  # what a caller's mask held before may be another vessel
     if isinstance(content, LumenMask):
-        volume, remarks = without_wall(content.volume)
+        volume, remarks = repair_surface.without_wall(content.volume)
         content = replace(content, volume=volume)
     if given is None and config.vessel != "generic":
         inlet = coronary_inlet(content, config.vessel, label, axes)
@@ -306,8 +313,8 @@ def _tree(
         points, clearance = in_front(points, clearance, given)
         root = int(np.linalg.norm(points - given.position, axis=1).argmin())
     graph = lumen_graph(points, clearance, spacing, root)
-    paths = trace_branches(graph, minimum_length_mm=config.minimum_branch_length_mm)
-    middle = float(np.median(graph.clearance[np.concatenate(paths)]))
+    paths = graph.traced(config.minimum_branch_length_mm)
+    middle = float(np.median(graph.radius[np.concatenate(paths)]))
     step = float(np.clip(0.3 * middle, 0.25, 2.0))
     ostium = given if given is not None and given.direction.any() else None
     lines = refined_lines(surface, distance_map, graph, paths, step, ostium)
@@ -347,14 +354,7 @@ def _insertion(tree: VesselTree, given: Insertion | None) -> Insertion:
 
 
 def _understood(tree: VesselTree, source: AnatomySource, coordinates: str | None, remarks: Sequence[str]) -> str:
-    """Return what was understood: inlet, extent and narrowest place, unit and axes as taken, and what was done.
-
-    Args:
-        tree: what was made.
-        source: in mm, as it was taken.
-        coordinates: axes that the user stated, if any.
-        remarks: what each step did, a sentence each.
-    """
+    """Return what was understood: inlet, extent and narrowest place, unit and axes as taken, and what was done."""
     lines = [branch.centerline for branch in tree.branches]
     farthest = max(float(line.abscissa[-1]) for line in lines)
     narrowest = min((line for line in lines), key=lambda line: float(line.radius.min()))

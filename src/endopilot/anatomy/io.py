@@ -23,10 +23,11 @@ from typing import Any
 import numpy as np
 
 from endopilot import files
-from endopilot.anatomy import mesh_process
 from endopilot.errors import InputError
 from endopilot.settings import public
 from endopilot.types import Anatomy, Branch, Centerline, DistanceMap, Insertion, VesselTree
+from endopilot.vessels import mesh_process
+from endopilot.vessels.surface import polydata_of
 
 SCHEMA_VERSION = 2
 
@@ -129,21 +130,12 @@ def _insertion(record: Any, version: int) -> Insertion:
 
 
 def _write_tree(tree: VesselTree, path: Path) -> None:
-    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
-    from vtkmodules.vtkCommonCore import vtkPoints
-    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+    from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
     whole, counts = tree.line, [len(branch.section) for branch in tree.branches]
-    polydata, points, cells = vtkPolyData(), vtkPoints(), vtkCellArray()
-    points.SetData(numpy_to_vtk(whole.points.astype(float), deep=True))
-    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    cells.SetData(
-        numpy_to_vtkIdTypeArray(offsets, deep=True),
-        numpy_to_vtkIdTypeArray(np.arange(offsets[-1], dtype=np.int64), deep=True),
-    )
-    polydata.SetPoints(points)
-    polydata.SetLines(cells)
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    polydata = polydata_of(whole.points, offsets, np.arange(offsets[-1]), "Lines")
     columns: dict[str, tuple[Any, np.ndarray]] = {
         "MaximumInscribedSphereRadius": (polydata.GetPointData(), whole.radius),
         "Abscissa": (polydata.GetPointData(), whole.abscissa),

@@ -19,12 +19,12 @@ from endopilot.anatomy.labels_tree import (
     LCA_SECTIONS,
     PORTAL_SECTIONS,
     RCA_SECTIONS,
-    Crux,
     Labeller,
 )
 from endopilot.anatomy.labels_vessels import label_arch, label_cerebral, label_portal
 from endopilot.errors import InputError
 from endopilot.types import Branch, VesselTree
+from endopilot.vessels.coronary_ostia import Crux
 
 _LOW = 0.39
 """A posterolateral branch that leaves this far under the fork of the left main, against the distance from there to the

@@ -72,14 +72,13 @@ def _crux_near(labeller: Labeller, route: tuple[int, ...], passed: float | None)
     """Return the branch of a route that forks first near where the route passes the known crux, or None."""
     if passed is None:
         return None
-    ends = {index: float(labeller.tree.branches[index].centerline.abscissa[-1]) for index in route}
-    forks = [
-        index
-        for index in route
-        if abs(ends[index] - passed) < CRUX_FORK_MM
-        and sum(labeller.length_behind(child) >= MAJOR_MM for child in labeller.tree.children(index)) >= 2
-    ]
-    return min(forks, key=lambda index: ends[index], default=None)
+    ends = {index: float(labeller.tree.branches[index].centerline.abscissa[-1]) for index in _forks(labeller, route)}
+    return next((index for index, end in ends.items() if abs(end - passed) < CRUX_FORK_MM), None)
+
+
+def _forks(labeller: Labeller, route: tuple[int, ...]) -> list[int]:
+    """Return the branches of a route at whose ends two or more named vessels leave."""
+    return [branch for branch in route if len(labeller.major(branch, MAJOR_MM)) >= 2]
 
 
 def _end_of_distal(line: Centerline, passed: float | None) -> float:
@@ -93,9 +92,11 @@ def _end_of_distal(line: Centerline, passed: float | None) -> float:
     return passed if whole - passed > BEYOND_CRUX_MM else whole
 
 
-def _turns_forwards(line: Centerline, crux_mm: float) -> bool:
+def _turns_forwards(line: Centerline, crux_mm: float, beyond_mm: float = 0.0) -> bool:
+    """Return whether a vessel goes on beyond the crux for long enough and turns forwards, to the apex, there."""
     behind = line.points[line.abscissa >= crux_mm, 1]
-    return len(behind) > 0 and float(behind.max() - behind[-1]) > FORWARDS_MM
+    long = float(line.abscissa[-1]) - crux_mm >= beyond_mm
+    return long and len(behind) > 0 and float(behind.max() - behind[-1]) > FORWARDS_MM
 
 
 def _crux(labeller: Labeller, route: tuple[int, ...]) -> int | None:
@@ -103,16 +104,11 @@ def _crux(labeller: Labeller, route: tuple[int, ...]) -> int | None:
 
     Before the acute margin the vessel runs down and to the right; from there to the crux, to the left and the back.
     """
-    forks = [
-        branch
-        for branch in route
-        if sum(labeller.length_behind(child) >= MAJOR_MM for child in labeller.tree.children(branch)) >= 2
-    ]
     back = np.array([1.0, 1.0, 0.0]) / np.sqrt(2.0)
     height = labeller.tree.path(route[-1]).points[:, 2]
     low = height.min() + 0.4 * float(np.ptp(height))
     whole = float(labeller.tree.branches[route[-1]].centerline.abscissa[-1])
-    for branch in forks:
+    for branch in _forks(labeller, route):
         line = labeller.tree.branches[branch].centerline
         late = float(line.abscissa[-1]) > 0.52 * whole
         if late and line.points[-1, 2] < low and float(labeller.arriving(branch) @ back) > -0.1:
@@ -130,11 +126,8 @@ def _unforked_crux(labeller: Labeller, route: tuple[int, ...]) -> float:
     if line.abscissa[-1] < SHORT_MM:
         return USUAL_CRUX_MM
     later = np.flatnonzero(line.abscissa > 0.5 * line.abscissa[-1])
-    turn = int(later[line.points[later, 1].argmax()])
-    forwards = line.points[turn, 1] - line.points[-1, 1]
-    beyond = line.abscissa[-1] - line.abscissa[turn]
-    goes_on = beyond > BEYOND_CRUX_MM and forwards > FORWARDS_MM
-    return float(line.abscissa[turn]) if goes_on else float(line.abscissa[-1])
+    turn = float(line.abscissa[later[line.points[later, 1].argmax()]])
+    return turn if _turns_forwards(line, turn, BEYOND_CRUX_MM) else float(line.abscissa[-1])
 
 
 def _towards_apex(labeller: Labeller, branch: int) -> float:
@@ -254,10 +247,8 @@ def _left_crux(labeller: Labeller, route: tuple[int, ...]) -> float:
     if labeller.crux is not None:
         passed = labeller.crux.abscissa(line)
         return np.inf if passed is None or labeller.crux.dominance == "right" else passed
-    turn = int((line.points @ GROOVE).argmax())
-    beyond = line.abscissa[-1] - line.abscissa[turn]
-    forwards = line.points[turn, 1] - line.points[-1, 1]
-    return float(line.abscissa[turn]) if beyond > BEYOND_CRUX_MM and forwards > FORWARDS_MM else np.inf
+    turn = float(line.abscissa[(line.points @ GROOVE).argmax()])
+    return turn if _turns_forwards(line, turn, BEYOND_CRUX_MM) else np.inf
 
 
 def _from_crux(labeller: Labeller, leaf: int) -> float:

@@ -109,7 +109,10 @@ def label_portal(labeller: Labeller) -> None:
         for leaf in groups[name]:
             labeller.fill(labeller.own(leaf), upper)
         if len(groups[name]) > 1:
-            labeller.fill(labeller.own(min(groups[name], key=labeller.upward)), lower)
+            labeller.fill(
+                labeller.own(min(groups[name], key=lambda leaf: float(tree.branches[leaf].centerline.points[-1, 2]))),
+                lower,
+            )
     left = sorted(groups["LPV"], key=labeller.leftward)
     if len(left) > 1:
         labeller.fill(labeller.own(left[0]), "S4")

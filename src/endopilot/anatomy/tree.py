@@ -9,27 +9,44 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.lines import length_along, places_on
-from endopilot.types import Branch, Centerline, VesselTree
+from endopilot.types import Branch, Centerline, Insertion, VesselTree
+from endopilot.vessels.graph import Line
+from endopilot.vessels.line_checks import closures, left_out
+from endopilot.vessels.line_graph import found_lines
+from endopilot.vessels.sources import Polylines
 
 SAMPLE_STEP_MM = 0.1
 """Distance of the points by which two trees are compared."""
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
-    """A line of a tree before it is cut at its branching points.
+class LineTree:
+    """One tree from centerlines, and what became of the lines.
 
     Attributes:
-        points: positions, LPS mm; the first one is the parent's point `place`.
-        radius: inscribed-sphere radii, mm.
-        parent: index of the line that it leaves, -1 for the first.
-        place: index of the point of the parent that it leaves from.
+        tree: the tree.
+        rule: by which its root was chosen.
+        notes: what was done and left out, a sentence each.
+        coverage: see `line_checks.left_out`.
     """
 
-    points: Float[np.ndarray, "n 3"]
-    radius: Float[np.ndarray, "n"]
-    parent: int
-    place: int
+    tree: VesselTree
+    rule: str
+    notes: list[str]
+    coverage: dict[str, float]
+
+
+def tree_from_polylines(
+    source: Polylines | VesselTree, given: Insertion | None, label: str, vessel: str = "generic"
+) -> LineTree:
+    """Return one tree from centerlines; arguments and errors are those of `line_graph.found_lines`."""
+    if isinstance(source, VesselTree):
+        lines = [branch.centerline for branch in source.branches]
+        source = Polylines(tuple(line.points for line in lines), tuple(line.radius for line in lines))
+    found = found_lines(source, given, label, vessel)
+    tree = tree_from_lines(found.lines)
+    lost, balance = left_out(found, tree)
+    return LineTree(tree, found.rule, [*found.notes, *lost, *closures(tree), *found.rivals], balance)
 
 
 def tree_from_lines(lines: list[Line]) -> VesselTree:

@@ -10,13 +10,13 @@ from tyro.conf import Positional
 from endopilot.anatomy.batch import claim_anatomy, extract_all
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import write_anatomy
-from endopilot.anatomy.read_source import read_source
 from endopilot.cli.arguments import Existing, Figures, OutputFolder, Picture, existing
 from endopilot.errors import InputError
 from endopilot.imaging.grid import check_covers
 from endopilot.imaging.volume import read_volume
 from endopilot.runs import check_outside
 from endopilot.types import Anatomy
+from endopilot.vessels.read_source import read_source
 
 
 def command(

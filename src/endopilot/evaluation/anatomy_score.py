@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from endopilot.anatomy.lumen_graph import groups
 from endopilot.anatomy.projection import project_tip
 from endopilot.anatomy.tree import SAMPLE_STEP_MM, sampled
 from endopilot.types import Anatomy, DistanceMap, LumenMask, VesselTree, Volume
+from endopilot.vessels.graph import groups
 
 SMALLEST_RADIUS_MM = 0.75
 """Vessels thinner than this are not scored: two voxels of a coronary CTA across, CAT08 scores from 0.75 mm up too."""

@@ -22,7 +22,6 @@ import numpy as np
 from endopilot import __version__
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import read_anatomy, write_anatomy
-from endopilot.anatomy.read_source import read_source
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.control.navigate import NavigateConfig
 from endopilot.dataset.config import DatasetConfig
@@ -43,6 +42,7 @@ from endopilot.runs import claim
 from endopilot.settings import Seconds, Seed, Within, settings
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import Volume
+from endopilot.vessels.read_source import read_source
 
 VOLUME_SUFFIX = ".nii.gz"
 EVALUATED = 32

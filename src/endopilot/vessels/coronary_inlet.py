@@ -9,16 +9,24 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt, find_objects, minimum_filter
 
-from endopilot.anatomy import parent_vessel, repair, repair_surface
-from endopilot.anatomy.coronary_ends import OpenEnd, Skeleton, open_ends, skeleton_of
-from endopilot.anatomy.coronary_ostia import OTHER_AXES, OstiumCandidate, OstiumRanking, Side, rank_ostia
-from endopilot.anatomy.distance import distance_map_from_surface
-from endopilot.anatomy.labels_tree import Crux, find_crux
-from endopilot.anatomy.surface import Surface, filled_box, surface_from_mask
-from endopilot.anatomy.units import check_unit
 from endopilot.errors import InputError, place_text
 from endopilot.imaging.grid import connected_components
 from endopilot.types import DistanceMap, Insertion, LumenMask, Volume
+from endopilot.vessels import repair, repair_surface
+from endopilot.vessels.coronary_ostia import (
+    OTHER_AXES,
+    Crux,
+    OstiumCandidate,
+    OstiumRanking,
+    Side,
+    find_crux,
+    rank_ostia,
+)
+from endopilot.vessels.ends import OpenEnd, Skeleton, open_ends, skeleton_of
+from endopilot.vessels.inlet import AORTA_RADIUS_MM
+from endopilot.vessels.sources import check_unit
+from endopilot.vessels.surface import Surface, filled_box, surface_from_mask
+from endopilot.vessels.surface_distance import distance_map_from_surface
 
 CERTAIN = 0.8
 """An ostium less probable than this is asked for."""
@@ -74,11 +82,7 @@ def coronary_inlet(
 ) -> CoronaryInlet | None:
     """Return where an artery begins, or None where the lumen holds a piece of the aorta, which shows it.
 
-    Args:
-        content: both coronary arteries, or one, with whatever specks.
-        side: which artery is asked for.
-        label: name of the source, for messages.
-        coordinates: the axes that the user gave for a file that does not state its own; None where the file does.
+    `coordinates` are the axes that the user gave for a file that does not state its own; None where the file does.
 
     Raises:
         InputError: the artery is not there, the file is in other axes, or it is not certain where the artery begins;
@@ -96,10 +100,10 @@ def coronary_inlet(
     for lumen in _lumens(coarse, label):
         inside = lumen.values > 0
         for points, clearance in _parts(lumen, inside):
-            if clearance.max() > parent_vessel.AORTA_RADIUS_MM:
+            if clearance.max() > AORTA_RADIUS_MM:
                 return None
             skeleton = skeleton_of(points, clearance, lumen.spacing_mm)
-            if skeleton.length_mm >= SHORTEST_MM:
+            if skeleton.costs.sum() >= SHORTEST_MM:
                 pieces.append(open_ends(skeleton))
                 skeletons.append(skeleton)
     if not pieces:
@@ -201,11 +205,11 @@ def _parts(lumen: DistanceMap, inside: np.ndarray) -> Iterator[tuple[Float[np.nd
 def _holds_aorta(coarse: Volume) -> bool:
     """Return whether a mask is somewhere too thick for a coronary artery, at a fraction of its wall's cost."""
     # A ball holds a cube of its radius over √3; without such a cube the costly distance need not be asked.
-    cube = 2 * np.floor(parent_vessel.AORTA_RADIUS_MM / np.sqrt(3.0) / coarse.spacing_mm[::-1]).astype(int) - 1
+    cube = 2 * np.floor(AORTA_RADIUS_MM / np.sqrt(3.0) / coarse.spacing_mm[::-1]).astype(int) - 1
     if not minimum_filter(coarse.voxels, size=np.maximum(cube, 1), mode="constant").any():
         return False
     depth = np.asarray(distance_transform_edt(coarse.voxels, sampling=coarse.spacing_mm[::-1]))
-    return bool(depth.max(initial=0.0) > parent_vessel.AORTA_RADIUS_MM)
+    return bool(depth.max(initial=0.0) > AORTA_RADIUS_MM)
 
 
 def _coarse(mask: Volume) -> Volume:

@@ -9,17 +9,18 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy.ndimage import distance_transform_edt, find_objects
+from jaxtyping import Bool, Float, Int, Shaped
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 
-from endopilot.anatomy.medial_lines import MedialLines, piece_labels
-from endopilot.anatomy.parent_vessel import COMPARABLE, Vessel, piece_on_side
-from endopilot.anatomy.surface import filled_box
-from endopilot.anatomy.topology import MOST_LISTED, SMALLEST_PIECE, Touch, parted, touch_remarks
 from endopilot.errors import InputError, place_text
 from endopilot.imaging.grid import connected_components
 from endopilot.types import Insertion, Volume
+from endopilot.vessels.graph import split
+from endopilot.vessels.inlet import COMPARABLE, Vessel, piece_on_side
+from endopilot.vessels.medial_lines import MedialLines, piece_labels
+from endopilot.vessels.surface import filled_box
+from endopilot.vessels.topology import MOST_LISTED, SMALLEST_PIECE, Touch, parted, touch_remarks
 
 NEAR_OSTIUM_MM = 5.0
 """A lumen farther than this from a given ostium does not belong to it."""
@@ -121,46 +122,36 @@ def connected_mask(
     _refuse_blocks_and_noise(np.asarray(mask.voxels[filled_box(mask.voxels)], dtype=bool), label)
     whole = pieces_of(mask)
     labels, read = piece_labels(whole.parted), piece_labels(whole.joined)
-    sizes = np.bincount(labels[whole.parted.voxels])
-    if given is None:
-        main, others = _piece_on_side(whole.parted, labels, sizes, vessel)
-    else:
-        main, gap, nearest = _nearest_piece(whole.parted, labels, sizes, given.position)
-        others = []
-        if gap > max(NEAR_OSTIUM_MM, 2.0 * float(mask.spacing_mm.max())):
-            raise InputError(
-                f"{label}: the mask touches nothing near the ostium at {place_text(given.position)}; "
-                f"its nearest voxel is {gap:.1f} mm away at {place_text(nearest)}"
-            )
+    index = np.argwhere(whole.parted.voxels)
+    pieces = split(whole.parted.index_to_world(index[:, ::-1].astype(float)), labels[tuple(index.T)] - 1)
+    sizes = np.array([len(piece) for piece in pieces])
+    main, gap, nearest, others = chosen_piece(pieces, sizes, given, vessel)
+    if gap > max(NEAR_OSTIUM_MM, 2.0 * float(mask.spacing_mm.max())):
+        raise InputError(
+            f"{label}: the mask touches nothing near the ostium at {place_text(given.position)}; "  # pyright: ignore[reportOptionalMemberAccess]
+            f"its nearest voxel is {gap:.1f} mm away at {place_text(nearest)}"
+        )
     if sizes[main] < SMALLEST_PIECE:
         raise InputError(f"{label}: the lumen has only {sizes[main]} voxels; check the label or segment again")
-    result = labels == main
+    result = labels == main + 1
     own = read == read[result][0]  # all that the file connects with it
-    foreign = 0
-    if other_ostium is not None:
-        piece, gap, _ = _nearest_piece(whole.parted, labels, sizes, other_ostium)
-        foreign = piece if gap < NEAR_OSTIUM_MM and piece != main else 0
-    severed = np.setdiff1d(labels[own], [0, main])
+    severed = np.setdiff1d(labels[own] - 1, [-1, main])
     remarks = touch_remarks([touch for touch in whole.touches if _holds(whole.joined, own, touch.place)])
     joints = [joined for place, joined in whole.gaps if own[tuple(place)]]
     if beside := joints.count(False):
         remarks.append(f"{beside} pieces that run alongside the lumen, not on from it, were not joined to it")
-    if apart := np.setdiff1d(others, [foreign, *severed]).tolist():
-        remarks.append(other_pieces_text(vessel, len(apart)))
     if joints.count(True):
         remarks.append(f"{joints.count(True)} gaps of up to {LARGEST_GAP_VOXELS:g} voxels bridged")
-    if foreign:
-        remarks.append(f"the {OTHER_SIDE[vessel]} ({sizes[foreign]} voxels) is not part of this one")
-    remarks += _left_out(whole, result, labels, foreign, severed, vessel)
+    remarks += pieces_left_out(pieces, [main], severed, others, vessel, other_ostium, "voxels")
     box = filled_box(result)
     corner = np.array([part.start for part in box])
     closed = _filled(result[box])
     if closed.sum() > sizes[main]:
         remarks.append(f"cavities of {int(closed.sum() - sizes[main])} voxels filled")
     lumen = replace(mask, voxels=closed, origin_mm=whole.joined.index_to_world(corner[::-1].astype(float)))
-    lines = whole.lines.part(result[tuple(whole.lines.index.T)], corner)
-    before = whole.before.part(own[tuple(whole.before.index.T)], corner)
-    told = np.isin(labels[tuple((before.index + corner).T)], severed)
+    lines = whole.lines.within(result[tuple(whole.lines.index.T)], corner)
+    before = whole.before.within(own[tuple(whole.before.index.T)], corner)
+    told = np.isin(labels[tuple((before.index + corner).T)] - 1, severed)
     return Lumen(lumen, lines, before, told, remarks)
 
 
@@ -187,72 +178,85 @@ def _refuse_blocks_and_noise(voxels: Bool[np.ndarray, "nz ny nx"], label: str) -
         raise InputError(f"{label}: the mask is a solid block ({share:.0%} of its box); segment the vessel alone")
 
 
-def _nearest_piece(
-    mask: Volume, labels: np.ndarray, sizes: np.ndarray, place: Float[np.ndarray, "3"]
-) -> tuple[int, float, Float[np.ndarray, "3"]]:
-    """Return the label of the piece at a place, how far away it is, mm, and where; a speck of noise does not count."""
-    index = np.argwhere(mask.voxels)
-    index = index[sizes[labels[tuple(index.T)]] >= min(SMALLEST_PIECE, sizes.max())]
-    points = mask.index_to_world(index[:, ::-1].astype(float))
-    gap = np.linalg.norm(points - place, axis=1)
-    return int(labels[tuple(index[gap.argmin()])]), float(gap.min()), points[gap.argmin()]
+def chosen_piece(
+    pieces: list[Float[np.ndarray, "_ 3"]], sizes: Shaped[np.ndarray, "p"], given: Insertion | None, vessel: Vessel
+) -> tuple[int, float, Float[np.ndarray, "3"], list[int]]:
+    """Return the piece at the ostium, how far away it is, mm, and where; and which other pieces are nearly as large.
+
+    Without an ostium it is that on the vessel's side (`piece_on_side`). A speck of noise is no piece.
+    """
+    if given is None:
+        main, others = piece_on_side(sizes.astype(float), np.array([piece.mean(axis=0) for piece in pieces]), vessel)
+        return main, 0.0, pieces[main][0], others
+    found = []
+    for number, piece in enumerate(pieces):
+        if len(piece) >= min(SMALLEST_PIECE, max(map(len, pieces))):
+            gap = np.linalg.norm(piece - given.position, axis=1)
+            found.append((float(gap.min()), number, int(gap.argmin())))
+    gap, main, at = min(found)
+    return main, gap, pieces[main][at], []
 
 
-def _left_out(
-    whole: Pieces,
-    result: Bool[np.ndarray, "nz ny nx"],
-    labels: Int[np.ndarray, "nz ny nx"],
-    foreign: int,
+def pieces_left_out(
+    pieces: list[Float[np.ndarray, "_ 3"]],
+    taken: list[int],
     severed: Int[np.ndarray, "_"],
+    others: list[int],
     vessel: Vessel,
+    other_ostium: Float[np.ndarray, "3"] | None,
+    counted: str,
 ) -> list[str]:
     """Say which pieces were left out and where they lie, since a real vessel may be lost with them.
 
     Args:
-        whole: all pieces.
-        result: the lumen.
-        labels: number of each piece.
-        foreign: number of the other coronary artery, 0 if it is not there or not known.
-        severed: numbers of those that touched the lumen and were parted from it.
+        pieces: points of each piece, LPS mm.
+        taken: numbers of those that the lumen is made of.
+        severed: of those that touched it and were parted from it.
+        others: of those nearly as large.
         vessel: which vessel is wanted.
+        other_ostium: of the other coronary artery, LPS mm, if it is known.
+        counted: what the points are.
     """
-    mask = whole.parted
-    sizes = np.bincount(labels[mask.voxels])
-    lost = np.setdiff1d(np.flatnonzero(sizes), [0, labels[result][0], foreign])
-    if len(lost) == 0:
-        return []
-    boxes = find_objects(labels)
-    corners = np.array([[[part.start, part.stop - 1] for part in boxes[piece - 1]] for piece in lost])
-    extent = np.linalg.norm(np.diff(corners, axis=2)[..., 0] * mask.spacing_mm[::-1], axis=1)
-    order = np.argsort(-extent, kind="stable")
-    reach = KDTree(mask.index_to_world(np.argwhere(result)[:, ::-1].astype(float)))
-    remarks = []
-    for number in order[:MOST_LISTED]:
-        if extent[number] < NOTED_MM:
-            break
-        piece = lost[number]
-        own = np.argwhere(labels[boxes[piece - 1]] == piece) + corners[number, :, 0]
-        place = mask.index_to_world(own[:, ::-1].astype(float))
-        some = np.asarray(reach.query(place[:: len(place) // 64 + 1])[0]).min()  # so that far voxels end a search early
-        gap = np.asarray(reach.query(place, distance_upper_bound=some + 1e-6)[0])
-        at, apart = place_text(place[gap.argmin()]), "apart from the lumen"
-        begins = f"begins {gap.min():.1f} mm away at {at}"
-        kind = "a piece"
-        if piece in severed:
-            kind, apart, begins = "another vessel", "that touches this one", f"touches it at {at}"
-        elif sizes[piece] >= COMPARABLE * result.sum():
-            kind = "another vessel, " + (
-                f"perhaps the {OTHER_SIDE[vessel]}," if vessel in OTHER_SIDE else "or a part not connected in the file,"
-            )
-        remarks.append(
-            f"{kind} {apart} left out ({sizes[piece]} voxels): it is {extent[number]:.0f} mm long and {begins}"
+    remarks, foreign = list[str](), -1
+    lost = [number for number in range(len(pieces)) if number not in taken]
+    if lost and other_ostium is not None:
+        number, gap, *_ = chosen_piece(pieces, np.array([]), Insertion(other_ostium, np.zeros(3)), vessel)
+        if gap < NEAR_OSTIUM_MM and number in lost:
+            foreign = number
+            lost.remove(foreign)
+            remarks.append(f"the {OTHER_SIDE[vessel]} ({len(pieces[foreign])} {counted}) is not part of this one")
+    if apart := set(others) - {foreign, *taken, *severed.tolist()}:
+        choice = (
+            "the largest was taken: for coronary arteries give --vessel rca or lca"
+            if vessel == "generic"
+            else f"the one on the {vessel.upper()}'s side was taken"
         )
-    rest = order[len(remarks) :]
-    if len(rest):
+        lie = "1 other large piece lies" if len(apart) == 1 else f"{len(apart)} other large pieces lie"
+        remarks.append(f"{lie} apart and {choice}; --ostium-mm chooses another")
+    lumen = np.concatenate([pieces[number] for number in taken])
+    extent = {number: float(np.linalg.norm(np.ptp(pieces[number], axis=0))) for number in lost}
+    order = sorted(lost, key=lambda number: -extent[number])
+    listed = [number for number in order[:MOST_LISTED] if extent[number] >= NOTED_MM]
+    reach = KDTree(lumen if listed else lumen[:1])
+    for number in listed:
+        place = pieces[number]
+        some = np.asarray(reach.query(place[:: len(place) // 64 + 1])[0]).min()  # so that far points end a search early
+        gap = np.asarray(reach.query(place, distance_upper_bound=some + 1e-6)[0])
+        at, kind = place_text(place[gap.argmin()]), "a piece apart from the lumen"
+        begins = f"begins {gap.min():.1f} mm away at {at}"
+        if number in severed:
+            kind, begins = "another vessel that touches this one", f"touches it at {at}"
+        elif len(place) >= COMPARABLE * len(lumen):
+            other = (
+                f"perhaps the {OTHER_SIDE[vessel]}" if vessel in OTHER_SIDE else "or a part not connected in the file"
+            )
+            kind = f"another vessel, {other}, apart from the lumen"
+        remarks.append(f"{kind} left out ({len(place)} {counted}): it is {extent[number]:.0f} mm long and {begins}")
+    if rest := order[len(listed) :]:
         kind = "piece" if len(rest) == 1 else "pieces"
-        kind = f"more {kind}" if remarks else f"{kind} apart from the lumen"
-        longest, size = float(extent[rest].max()), int(sizes[lost[rest]].sum())
-        remarks.append(f"{len(rest)} {kind} of up to {longest:.0f} mm left out ({size} voxels)")
+        kind = f"more {kind}" if listed else f"{kind} apart from the lumen"
+        size = sum(len(pieces[number]) for number in rest)
+        remarks.append(f"{len(rest)} {kind} of up to {extent[rest[0]]:.0f} mm left out ({size} {counted})")
     return remarks
 
 
@@ -265,12 +269,9 @@ def _joined(
     voxels, and for each gap a voxel at it and whether it was bridged.
     """
     labels, index = connected_components(voxels, corners=True), np.argwhere(voxels)
-    numbers = labels[tuple(index.T)]
-    sizes = np.bincount(numbers)
-    order = np.argsort(numbers, kind="stable")
-    members = dict(enumerate(np.split(index[order], np.cumsum(sizes)[:-1])))
-    large = np.argsort(-sizes, kind="stable")[:_MOST_JOINED].tolist()
-    left = [piece for piece in large if sizes[piece] >= SMALLEST_PIECE]
+    members = split(index, labels[tuple(index.T)] - 1)
+    large = sorted(range(len(members)), key=lambda piece: -len(members[piece]))[:_MOST_JOINED]
+    left = [piece for piece in large if len(members[piece]) >= SMALLEST_PIECE]
     gaps, result = list[tuple[np.ndarray, bool]](), voxels.copy()
     clearance: np.ndarray | None = None  # where nothing is joined it is not needed
     while len(left) > 1:
@@ -321,23 +322,3 @@ def _draw_tube(voxels: np.ndarray, start: np.ndarray, end: np.ndarray, width: fl
     gap = np.linalg.norm(grid - start - share[..., None] * along, axis=-1)
     window = tuple(slice(a, b) for a, b in zip(lower, upper, strict=True))
     voxels[window] |= gap <= max(width, 1.0)
-
-
-def _piece_on_side(mask: Volume, labels: np.ndarray, sizes: np.ndarray, vessel: Vessel) -> tuple[int, list[int]]:
-    large = np.flatnonzero(sizes >= COMPARABLE * sizes.max())
-    index = np.argwhere(mask.voxels)
-    own = labels[tuple(index.T)]
-    centres = np.array([index[own == piece].mean(axis=0) for piece in large])[:, ::-1]
-    chosen, others = piece_on_side(sizes[large].astype(float), mask.index_to_world(centres), vessel)
-    return int(large[chosen]), [int(large[other]) for other in others]
-
-
-def other_pieces_text(vessel: Vessel, count: int) -> str:
-    """Return the remark on other pieces that are nearly as large as the one taken."""
-    choice = (
-        "the largest was taken: for coronary arteries give --vessel rca or lca"
-        if vessel == "generic"
-        else f"the one on the {vessel.upper()}'s side was taken"
-    )
-    pieces = "1 other large piece lies" if count == 1 else f"{count} other large pieces lie"
-    return f"{pieces} apart and {choice}; --ostium-mm chooses another"

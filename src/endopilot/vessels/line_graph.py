@@ -1,43 +1,42 @@
-"""One tree from centerlines that overlap, as VMTK writes them, or that meet end to end, as Slicer writes them.
+"""Centerlines as a vessel graph, and the lines of one tree in it: joined along lines, where they meet, over small gaps.
 
-Lines are resampled and their points made the nodes of a graph (`line_graph`). The tree is then traced as in a lumen:
-farthest end first, each further line from where it leaves what is there. What the tree does not reach is noted with
-its length and place, and so are gaps that were bridged, loops that were cut and further inlets.
+Lines may overlap, as VMTK writes them, or meet end to end, as Slicer writes them. The tree is traced as in a lumen:
+farthest end first, each further line from where it leaves what is there.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.cluster.hierarchy import DisjointSet
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, dijkstra, minimum_spanning_tree
 from scipy.spatial import KDTree
 
-from endopilot.anatomy.line_checks import closures, left_out
-from endopilot.anatomy.line_ends import InletEnd, likely_inlets
-from endopilot.anatomy.line_graph import (
-    STEP_MM,
-    Edges,
-    LineNodes,
-    bridges,
-    dense_nodes,
-    meeting_edges,
-    with_bridges,
-)
-from endopilot.anatomy.lumen_graph import LumenGraph
-from endopilot.anatomy.sources import Polylines
-from endopilot.anatomy.tree import Line, tree_from_lines
 from endopilot.errors import InputError, place_text
 from endopilot.lines import length_along, places_on
-from endopilot.types import Insertion, VesselTree
+from endopilot.types import Insertion
+from endopilot.vessels.ends import likely_inlets
+from endopilot.vessels.graph import Line, RootedGraph, VesselGraph
+from endopilot.vessels.sources import Polylines
+
+STEP_MM = 0.5
+"""Distance between the points of the tree, mm."""
+
+LONGEST_BRIDGE = 4.0
+"""Lines that end within this many radii of another are joined to it; the gap is noted."""
 
 PARENT_VESSEL_RATIO = 2.5
 """Where lines start in spheres this many times wider than their own median, they start in a parent vessel."""
 
-TOGETHER = 0.5
-"""Lines nearer each other than this share of the local radius run together and become one."""
+_OPPOSITE = -0.5
+"""Cosine of the angle between two directions from which on a vessel passes a place rather than forks there."""
+
+_OWN_MM = 2.0
+"""A line's points that coincide and lie farther than this apart along it are a place that it comes back to, mm."""
 
 _SHORTEST_MM = 2.0
 
@@ -55,27 +54,91 @@ _JUMP_STEPS, _JUMP_RADII = 8.0, 5.0
 
 
 @dataclass(frozen=True, eq=False)
-class LineTree:
-    """One tree from centerlines, and what became of the lines.
+class LineGraph(VesselGraph):
+    """Points of all lines, twice as dense as the tree's; what a way costs is its length, more where it changes lines.
 
     Attributes:
-        tree: the tree.
-        rule: by which its root was chosen.
-        notes: what was done and left out, a sentence each.
-        coverage: `length_mm` of the lines, of them `reached_mm` by the tree's spheres and `left_out_mm` (these two add
-            up to the first), and `bridged_mm` of gaps between them.
+        owner: index of the line of each point.
+        along: distance from the start of its line, mm.
+        ends: which are the first or last of their line.
+        share: length of line that each stands for, mm.
     """
 
-    tree: VesselTree
+    columns = ("points", "radius", "owner", "along", "ends", "share")
+    owner: Int[np.ndarray, "n"]
+    along: Float[np.ndarray, "n"]
+    ends: Bool[np.ndarray, "n"]
+    share: Float[np.ndarray, "n"]
+
+    def outside(self, keep: Bool[np.ndarray, "n"]) -> LineGraph:
+        """Return some of the points; where a line is cut it has an end."""
+        part = self.part(keep)
+        cut = (np.diff(part.owner) != 0) | (np.diff(part.along) > STEP_MM)
+        return replace(part, ends=np.concatenate([[True], cut]) | np.concatenate([cut, [True]]))
+
+    def free_ends(self) -> Int[np.ndarray, "e"]:
+        """Return the ends that no vessel passes, or all ends if there is no such.
+
+        Seen from a free end, what lies about one and a half radii away lies in one direction, or forks there.
+        """
+        tree, free = KDTree(self.points), []
+        for end in np.flatnonzero(self.ends):
+            reach = max(1.5 * float(self.radius[end]), 4 * STEP_MM)
+            near = np.array(tree.query_ball_point(self.points[end], reach), dtype=np.int64)
+            offset = self.points[near] - self.points[end]
+            gap = np.linalg.norm(offset, axis=1)
+            sight = np.unique((offset[gap > 0.6 * reach] / gap[gap > 0.6 * reach, None]).round(1), axis=0)
+            if len(sight) == 0 or (sight @ sight.T).min() > _OPPOSITE:
+                free.append(end)
+        return np.array(free or np.flatnonzero(self.ends), dtype=np.int64)
+
+    def around_ends(self, radii: float) -> Iterator[tuple[int, Int[np.ndarray, "m"], Float[np.ndarray, "m"]]]:
+        """Yield each end with the points at most so many of the wider radius away, and how far they are, mm."""
+        tree = KDTree(self.points)
+        for end in np.flatnonzero(self.ends):
+            near = np.array(tree.query_ball_point(self.points[end], radii * float(self.radius.max())), dtype=np.int64)
+            gap = np.linalg.norm(self.points[near] - self.points[end], axis=1)
+            fits = gap <= radii * np.maximum(self.radius[near], self.radius[end])
+            yield int(end), near[fits], gap[fits]
+
+    def elsewhere(
+        self, one: Int[np.ndarray, "m"], two: Int[np.ndarray, "m"], apart: Float[np.ndarray, "m"] | float
+    ) -> Bool[np.ndarray, "m"]:
+        """Return which pairs are on different lines, or farther apart along their own than `apart`."""
+        return (self.owner[one] != self.owner[two]) | (np.abs(self.along[one] - self.along[two]) > apart)
+
+    def met(self, pairs: Int[np.ndarray, "m 2"]) -> LineGraph:
+        """Return the graph with points of different lines joined."""
+        return self.joined(pairs, 2 * self.lengths(pairs) + 0.1)
+
+
+@dataclass(frozen=True, eq=False)
+class FoundLines:
+    """The lines of one tree in centerlines, and what became of the others.
+
+    Attributes:
+        lines: of the tree.
+        rule: by which its root was chosen.
+        notes: what was done, a sentence each.
+        rivals: a note on other ends that may be the inlet.
+        whole: all lines as given.
+        piece: connected piece of each point of `whole`, -1 in the parent vessel that the lines start in.
+        own: the piece that the tree was made from.
+        bridged_mm: length of gaps that were bridged, mm.
+    """
+
+    lines: list[Line]
     rule: str
     notes: list[str]
-    coverage: dict[str, float]
+    rivals: list[str]
+    whole: LineGraph
+    piece: Int[np.ndarray, "n"]
+    own: int
+    bridged_mm: float
 
 
-def tree_from_polylines(
-    source: Polylines | VesselTree, given: Insertion | None, label: str, vessel: str = "generic"
-) -> LineTree:
-    """Return one tree from centerlines.
+def found_lines(source: Polylines, given: Insertion | None, label: str, vessel: str = "generic") -> FoundLines:
+    """Return the lines of one tree in centerlines.
 
     Where the lines start in a parent vessel (VMTK's coronary centerlines start in the aorta), they are cut at the
     ostium: where they leave the parent's spheres.
@@ -90,51 +153,96 @@ def tree_from_polylines(
         InputError: the points of a line are in no order, no line is near the given ostium, or a coronary artery is
             asked for and the lines are those of two.
     """
-    if isinstance(source, VesselTree):
-        lines = [branch.centerline for branch in source.branches]
-        source = Polylines(tuple(line.points for line in lines), tuple(line.radius for line in lines))
     source, notes = in_order(source, label)
-    whole = dense_nodes(source)
+    whole = line_graph(source)
     keep, cut_at = _outside_parent_vessel(whole)
-    nodes = whole.part(keep)
-    edges = meeting_edges(nodes)
-    gaps = bridges(nodes, edges)
-    bridged = np.linalg.norm(nodes.points[gaps[:, 0]] - nodes.points[gaps[:, 1]], axis=1)
+    graph = _meeting(whole.outside(keep))
+    gaps = _bridges(graph)
+    bridged = graph.lengths(gaps)
     notes += [
-        f"a gap of {gap:.1f} mm between lines at {place_text(nodes.points[end])} is bridged"
+        f"a gap of {gap:.1f} mm between lines at {place_text(graph.points[end])} is bridged"
         for gap, end in zip(bridged, gaps[:, 0], strict=True)
     ]
-    edges = with_bridges(nodes, edges, gaps)
-    piece, rivals = edges.pieces, list[str]()
-    if given is not None:
-        gap = np.linalg.norm(nodes.points - given.position, axis=1)
-        root, rule = int(gap.argmin()), "given"
-        if gap[root] > max(5.0, 2 * nodes.radius[root]):
+    graph, rivals = graph.met(gaps), list[str]()
+    goal = cut_at if given is None else given.position
+    if goal is not None:
+        gap = np.linalg.norm(graph.points - goal, axis=1)
+        root, rule = int(gap.argmin()), "given" if given else "where the lines leave the parent vessel"
+        if given is not None and gap[root] > max(5.0, 2 * graph.radius[root]):
             raise InputError(
-                f"{label}: the ostium at {np.round(given.position, 1).tolist()} mm is {gap[root]:.1f} mm from the "
-                "nearest centerline; check the coordinates (LPS mm)"
+                f"{label}: the ostium at {np.round(goal, 1).tolist()} mm is {gap[root]:.1f} mm from the nearest "
+                "centerline; check the coordinates (LPS mm)"
             )
-    elif cut_at is not None:
-        gap = np.linalg.norm(nodes.points - cut_at, axis=1)
-        root, rule = int(gap.argmin()), "where the lines leave the parent vessel"
     else:
-        first, *others = _inlets(source, nodes, edges, _widest_end(nodes, piece, vessel, label))
+        tree = _rooted(graph, _widest_end(graph, vessel, label))
+        ends = [line[[0, -1]] for line in source.points]
+        first, *others = likely_inlets(tree, tree.traced(_SHORTEST_MM, together=True), lines=ends)
         root, rule, rivals = first.node, "widest end", first.rivals(others)
-    paths = _trace(nodes, edges, root)
-    tree = tree_from_lines(_lines(nodes.points, nodes.radius, paths))
-    lost, covered = left_out(whole, keep, tree, piece, int(piece[root]))
-    total = float(whole.share.sum())
-    balance = {"length": total, "reached": covered, "left_out": total - covered, "bridged": float(bridged.sum())}
-    notes += [*lost, *closures(tree), *rivals]
-    return LineTree(tree, rule, notes, {f"{name}_mm": round(value, 1) for name, value in balance.items()})
+    paths = _rooted(graph, root).traced(_SHORTEST_MM, together=True)
+    piece = np.full(len(keep), -1)
+    piece[keep] = graph.pieces
+    lines = _lines(graph.points, graph.radius, paths)
+    return FoundLines(lines, rule, notes, rivals, whole, piece, int(graph.pieces[root]), float(bridged.sum()))
 
 
-def _outside_parent_vessel(nodes: LineNodes) -> tuple[Bool[np.ndarray, "n"], Float[np.ndarray, "3"] | None]:
+def _rooted(graph: LineGraph, root: int) -> RootedGraph:
+    """Return the graph with the cheapest ways to a root, a way's length being what it costs."""
+    length, before = dijkstra(graph.costs, directed=False, indices=root, return_predecessors=True)
+    return RootedGraph(graph.points, graph.radius, graph.costs, graph.step_mm, before, length)
+
+
+def line_graph(source: Polylines) -> LineGraph:
+    """Return the points of lines, about `STEP_MM` / 2 apart, joined along them; lines repeat no point in succession."""
+    parts = []
+    for number, (line, size) in enumerate(zip(source.points, source.radius, strict=True)):
+        length = length_along(line)
+        wanted = np.linspace(0.0, length[-1], max(2, round(length[-1] / (0.5 * STEP_MM)) + 1))
+        ends = np.zeros(len(wanted), dtype=bool)
+        ends[[0, -1]] = True
+        share = np.where(ends, 0.5, 1.0) * (wanted[1] - wanted[0])
+        owner = np.full(len(wanted), number)
+        parts.append((places_on(line, length, wanted), np.interp(wanted, length, size), owner, wanted, ends, share))
+    points, radius, *rest = (np.concatenate(values) for values in zip(*parts, strict=True))
+    along = np.flatnonzero(np.diff(rest[0]) == 0)
+    graph = LineGraph(points, radius, csr_matrix((len(points),) * 2), 0.5 * STEP_MM, *rest)
+    pairs = np.column_stack([along, along + 1])
+    return graph.joined(pairs, graph.lengths(pairs))
+
+
+def _meeting(graph: LineGraph) -> LineGraph:
+    """Join points that coincide, and line ends that lie inside another line's sphere."""
+    near = KDTree(graph.points).query_pairs(0.8 * STEP_MM, output_type="ndarray")
+    meets = [near[graph.elsewhere(near[:, 0], near[:, 1], _OWN_MM)]]
+    for end, found, gap in graph.around_ends(1.0):
+        reach = np.maximum(graph.radius[found], graph.radius[end])
+        fits = graph.elsewhere(np.full(len(found), end), found, np.maximum(2 * np.pi * reach, _OWN_MM))
+        if fits.any():
+            meets.append(np.array([[end, found[fits][gap[fits].argmin()]]]))
+    return graph.met(np.concatenate(meets))
+
+
+def _bridges(graph: LineGraph) -> Int[np.ndarray, "m 2"]:
+    """Return the shortest gaps, from line ends, that join pieces which lie within `LONGEST_BRIDGE` radii of each other.
+
+    Each joins two pieces that nothing shorter joins.
+    """
+    piece, found = graph.pieces, list[tuple[float, int, int]]()
+    for end, near, gap in graph.around_ends(LONGEST_BRIDGE) if piece.max() > 0 else ():
+        for other in np.setdiff1d(piece[near], piece[end]):
+            mine = np.flatnonzero(piece[near] == other)
+            nearest = mine[gap[mine].argmin()]
+            found.append((float(gap[nearest]), end, int(near[nearest])))
+    joined = DisjointSet(range(int(piece.max()) + 1))
+    chosen = [(end, other) for _, end, other in sorted(found) if joined.merge(int(piece[end]), int(piece[other]))]
+    return np.array(chosen, dtype=np.int64).reshape(-1, 2)
+
+
+def _outside_parent_vessel(graph: LineGraph) -> tuple[Bool[np.ndarray, "n"], Float[np.ndarray, "3"] | None]:
     """Return which points lie outside the parent vessel that the lines start in, and where they leave it.
 
     The parent's spheres are those at the lines' common start that are several times wider than the lines' median.
     """
-    points, radius, owner = nodes.points, nodes.radius, nodes.owner
+    points, radius, owner = graph.points, graph.radius, graph.owner
     everywhere = np.ones(len(points), dtype=bool)
     starts = np.flatnonzero(np.diff(owner, prepend=-1))
     usual = float(np.median(radius))
@@ -158,58 +266,27 @@ def _outside_parent_vessel(nodes: LineNodes) -> tuple[Bool[np.ndarray, "n"], Flo
             first_kept.append(start + leave)
     if not first_kept:
         return everywhere, None
-    return keep, points[first_kept].mean(axis=0) if _close(points[first_kept]) else points[first_kept[0]]
+    close = np.ptp(points[first_kept], axis=0).max() < 2.0
+    return keep, points[first_kept].mean(axis=0) if close else points[first_kept[0]]
 
 
-def _close(points: Float[np.ndarray, "n 3"]) -> bool:
-    return bool(np.ptp(points, axis=0).max() < 2.0)
-
-
-def _widest_end(nodes: LineNodes, piece: Int[np.ndarray, "n"], vessel: str, label: str) -> int:
+def _widest_end(graph: LineGraph, vessel: str, label: str) -> int:
     """Return the widest line end of the longest connected piece."""
+    piece = graph.pieces
     # Lines that overlap count once: lengths are those of the cells of 1 mm that they pass through.
-    cells = np.unique(np.column_stack([np.floor(nodes.points), piece]), axis=0)
+    cells = np.unique(np.column_stack([np.floor(graph.points), piece]), axis=0)
     length = np.bincount(cells[:, 3].astype(np.int64), minlength=int(piece.max()) + 1)
-    index = nodes.free_ends()
+    index = graph.free_ends()
     widest = {number: index[piece[index] == number] for number in np.argsort(-length, kind="stable")[:2]}
-    roots = [int(ends[nodes.radius[ends].argmax()]) for ends in widest.values()]
+    roots = [int(ends[graph.radius[ends].argmax()]) for ends in widest.values()]
     rival = len(roots) > 1 and length[piece[roots[1]]] > _RIVAL * length[piece[roots[0]]]
     if rival and vessel != "generic":
-        one, two = (place_text(nodes.points[root]) for root in roots)
+        one, two = (place_text(graph.points[root]) for root in roots)
         raise InputError(
             f"{label}: holds two trees that are not connected, with their widest ends at {one} and {two} (LPS); "
             "name the ostium of one with --ostium-mm"
         )
     return roots[0]
-
-
-def _inlets(source: Polylines, nodes: LineNodes, edges: Edges, end: int) -> list[InletEnd]:
-    """Return the ends of the piece that a node is an end of, the one that looks most like the inlet first."""
-    length, before = dijkstra(edges.matrix, directed=False, indices=end, return_predecessors=True)
-    tree = LumenGraph(nodes.points, nodes.radius, before, length, 0.5 * STEP_MM, edges.matrix)
-    return likely_inlets(tree, _trace(nodes, edges, end), lines=[line[[0, -1]] for line in source.points])
-
-
-def _trace(nodes: LineNodes, edges: Edges, root: int) -> list[Int[np.ndarray, "_"]]:
-    """Return the tree as paths of nodes, the first from the root, each other from a node of an earlier one."""
-    points, radius = nodes.points, nodes.radius
-    places = KDTree(points)
-    distance, before = dijkstra(edges.matrix, directed=False, indices=root, return_predecessors=True)
-    covered = ~np.isfinite(distance)
-    paths: list[np.ndarray] = []
-    for tip in np.argsort(-np.where(covered, -1.0, distance), kind="stable"):
-        if covered[tip]:
-            continue
-        path = [int(tip)]
-        while before[path[-1]] >= 0 and not covered[path[-1]]:
-            path.append(int(before[path[-1]]))
-        found = np.array(path[::-1])
-        new = float(distance[found[-1]] - distance[found[0]])
-        if not paths or new > max(_SHORTEST_MM, float(radius[found[0]])):
-            paths.append(found)
-        for reached in places.query_ball_point(points[found], np.maximum(TOGETHER * radius[found], STEP_MM)):
-            covered[reached] = True
-    return paths
 
 
 def _lines(
@@ -251,10 +328,6 @@ def in_order(source: Polylines, label: str) -> tuple[Polylines, list[str]]:
     shortest. Where neighbouring spheres do not touch, a line is joined by a straight piece, or cut if it jumps to
     another vessel.
 
-    Args:
-        source: lines as read, mm.
-        label: name of the source, for messages.
-
     Raises:
         InputError: the points of a line are in no order.
     """
@@ -268,7 +341,7 @@ def in_order(source: Polylines, label: str) -> tuple[Polylines, list[str]]:
             continue
         order = _order(line, f"{label}: {name}")
         if order is not None:
-            before, after = _length(line), _length(line[order])
+            before, after = length_along(line)[-1], length_along(line[order])[-1]
             line, size = line[order], size[order]
             notes.append(
                 f"{name}: its points were in another order than along the vessel, and are sorted "
@@ -312,7 +385,7 @@ def _order(line: Float[np.ndarray, "n 3"], label: str) -> Int[np.ndarray, "n"] |
     pairs = np.unique(np.sort(np.stack([rows, columns], axis=1)[rows != columns], axis=1), axis=0)
     gap = np.linalg.norm(line[pairs[:, 0]] - line[pairs[:, 1]], axis=1) + 1e-9
     shortest = minimum_spanning_tree(csr_matrix((gap, (pairs[:, 0], pairs[:, 1])), shape=(count, count))).tocoo()
-    given, least = _length(line), float(shortest.data.sum())
+    given, least = length_along(line)[-1], float(shortest.data.sum())
     if given < least + 1.5 * float(np.median(shortest.data)):
         return None
     degree = np.bincount(np.concatenate([shortest.row, shortest.col]), minlength=count)
@@ -334,7 +407,3 @@ def _turns(line: Float[np.ndarray, "n 3"]) -> int:
     """Return at how many points a line turns by more than 90°."""
     step = np.diff(line, axis=0)
     return int((np.einsum("ij,ij->i", step[1:], step[:-1]) < 0).sum())
-
-
-def _length(line: Float[np.ndarray, "n 3"]) -> float:
-    return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())

@@ -15,18 +15,22 @@ from pathlib import Path
 
 import numpy as np
 
-from endopilot.anatomy import mesh_process
-from endopilot.anatomy.sources import (
+from endopilot.errors import InputError
+from endopilot.vessels import mesh_process
+from endopilot.vessels.sources import (
+    ASSUMED,
+    AXES,
+    BY_ARRAYS,
     RADIUS_NAMES,
     RAS_TO_LPS,
+    STATED,
     AnatomySource,
     Polylines,
     checked_lines,
     in_mm,
+    mm_per_unit,
 )
-from endopilot.anatomy.surface import Surface
-from endopilot.anatomy.units import ASSUMED, BY_ARRAYS, STATED, mm_per_unit
-from endopilot.errors import InputError
+from endopilot.vessels.surface import Surface
 
 _HEADER_BYTES = 65536
 """Statements of axes and unit stand in the first bytes of a file."""
@@ -39,7 +43,6 @@ _SIMVASCULAR = {"ModelFaceID", "BranchId", "CenterlineSectionArea", "GlobalNodeI
 
 _SPACE = re.compile(r"\bSPACE\s*[=:]\s*[\"']?([A-Za-z][A-Za-z-]*)", re.IGNORECASE)
 _UNIT = re.compile(r"\bUNITS?\s*[=:]\s*[\"']?([A-Za-zµμ]+)", re.IGNORECASE)
-_AXES = {"LPS": "lps", "LEFT-POSTERIOR-SUPERIOR": "lps", "RAS": "ras", "RIGHT-ANTERIOR-SUPERIOR": "ras"}
 
 _FEWEST_BYTES = 16
 """No format holds a vessel in fewer bytes."""
@@ -133,7 +136,7 @@ def _header(path: Path) -> str:
 
 def _coordinates(statement: str, path: Path) -> str | None:
     found = sorted({name.upper() for name in _SPACE.findall(statement)})
-    axes = {_AXES.get(name) for name in found}
+    axes = {AXES.get(name) for name in found}
     if len(axes) > 1 or None in axes:
         raise InputError(
             f"{path}: the header states SPACE={' and '.join(found)}; give a file in LPS or RAS that states one of them"

@@ -17,8 +17,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from endopilot.anatomy.coronary_ends import OpenEnd
-from endopilot.types import VesselTree
+from endopilot.types import Centerline, VesselTree
+from endopilot.vessels.ends import OpenEnd
 
 Side = Literal["rca", "lca"]
 
@@ -93,6 +93,14 @@ UNSTATED = 1.5
 """What is added for RAS axes where the file does not state its own."""
 
 _FREEDOM = 3.0
+
+Dominance = Literal["right", "balanced", "left"]
+
+CRUX_FROM_OSTIUM_MM = np.array([12.0, 43.0, -44.0])
+"""The crux as seen from the right ostium, LPS mm: behind and below it. In six real patients within 13 mm of this."""
+
+REACHED_MM = 20.0
+"""An artery that comes this near to the crux reaches it; in seven real patients the other one stays 34 mm away."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,3 +282,35 @@ def _log_t(square: Float[np.ndarray, "..."] | float) -> Float[np.ndarray, "..."]
 def _angle_deg(one: Float[np.ndarray, "... 3"], two: Float[np.ndarray, "3"]) -> Float[np.ndarray, "..."] | np.float64:
     cosine = one @ two / np.maximum(np.linalg.norm(one, axis=-1) * np.linalg.norm(two), 1e-9)
     return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class Crux:
+    """Where the posterior interventricular groove meets the atrioventricular one.
+
+    Attributes:
+        position: LPS mm, within some 15 mm.
+        dominance: which artery reaches it.
+    """
+
+    position: Float[np.ndarray, "3"]
+    dominance: Dominance
+
+    def abscissa(self, line: Centerline) -> float | None:
+        """Return where a line passes the crux, mm; None if it does not come near."""
+        gap = np.linalg.norm(line.points - self.position, axis=1)
+        return float(line.abscissa[gap.argmin()]) if gap.min() < REACHED_MM else None
+
+
+def find_crux(
+    right_ostium: Float[np.ndarray, "3"], right: Float[np.ndarray, "n 3"], left: Float[np.ndarray, "m 3"]
+) -> Crux | None:
+    """Return the crux of a patient, or None where neither artery reaches it: then the ends are cut off.
+
+    It follows from the right artery's ostium and points along both trees, LPS mm.
+    """
+    position = right_ostium + CRUX_FROM_OSTIUM_MM
+    reached = [bool(np.linalg.norm(tree - position, axis=1).min() < REACHED_MM) for tree in (right, left)]
+    if not any(reached):
+        return None
+    return Crux(position, "balanced" if all(reached) else "right" if reached[0] else "left")

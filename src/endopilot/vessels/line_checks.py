@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
+from scipy.sparse import csr_matrix
 from scipy.spatial import KDTree
 
-from endopilot.anatomy.line_graph import STEP_MM, LineNodes
-from endopilot.anatomy.lumen_graph import groups, pieces
 from endopilot.errors import place_text
 from endopilot.lines import length_along
 from endopilot.types import VesselTree
+from endopilot.vessels.graph import RootedGraph, groups, pieces
+from endopilot.vessels.line_graph import STEP_MM, FoundLines, LineGraph
 
 _SHORTEST_MM = 2.0
 """Shorter stretches are left out together in one note, mm."""
@@ -22,40 +23,31 @@ _OPEN_MM = 0.2
 """A loop has a hole where the spheres on its two sides are this far apart, mm."""
 
 
-def left_out(
-    nodes: LineNodes,
-    kept: Bool[np.ndarray, "n"],
-    tree: VesselTree,
-    piece: Int[np.ndarray, "m"],
-    root_piece: int,
-) -> tuple[list[str], float]:
-    """Return a note on each stretch of line outside the tree's spheres, and the length that lies inside them, mm.
+def left_out(found: FoundLines, tree: VesselTree) -> tuple[list[str], dict[str, float]]:
+    """Return a note on each stretch of line outside the tree's spheres, and the balance of all.
 
-    Args:
-        nodes: of all lines as given.
-        kept: which nodes lie outside the parent vessel.
-        tree: what was made of them.
-        piece: connected piece of each kept node.
-        root_piece: the piece that the tree was made from.
+    The balance: `length_mm` of the lines, of them `reached_mm` by the tree's spheres and `left_out_mm` (these two add
+    up to the first), and `bridged_mm` of gaps between them.
     """
+    nodes, piece = found.whole, found.piece
     whole = tree.line
     gap, nearest = KDTree(whole.points).query(nodes.points)
     inside = gap <= np.maximum(whole.radius[nearest], STEP_MM)
-    covered = float(nodes.share[inside].sum())
-    lost = np.flatnonzero(~inside)
+    total, covered, lost = float(nodes.share.sum()), float(nodes.share[inside].sum()), np.flatnonzero(~inside)
+    sizes = {"length": total, "reached": covered, "left_out": total - covered, "bridged": found.bridged_mm}
+    balance = {f"{name}_mm": round(size, 1) for name, size in sizes.items()}
     if len(lost) == 0:
-        return [], covered
-    own = np.full(len(kept), -1)
-    own[kept] = piece
-    stretch = _stretches(nodes, lost, kept)
+        return [], balance
+    near = KDTree(nodes.points[lost]).query_pairs(2 * STEP_MM, output_type="ndarray")
+    stretch = pieces(near[np.diff(piece[lost[near]] < 0, axis=1)[:, 0] == 0], len(lost))
     notes, short = [], []
     for number in range(stretch.max() + 1):
         part = lost[stretch == number]
         length = _length_once(nodes, part)
         place = place_text(nodes.points[part[gap[part].argmax()]])
-        if not kept[part].any():
+        if piece[part[0]] < 0:
             why = "it lies in the parent vessel that the lines start in"
-        elif own[part].max() != root_piece:
+        elif piece[part].max() != found.own:
             why = f"no line leads there; the nearest is {gap[part].min():.1f} mm away"
         else:
             why = "it is no longer than the vessel it leaves is wide"
@@ -69,20 +61,10 @@ def left_out(
             f"{total:.1f} mm of line in {len(short)} short stretches left out; the longest, {longest[0]:.1f} mm, "
             f"{longest[1].split(' is')[0]}"
         )
-    return texts, covered
+    return texts, balance
 
 
-def _stretches(nodes: LineNodes, lost: Int[np.ndarray, "l"], kept: Bool[np.ndarray, "n"]) -> Int[np.ndarray, "l"]:
-    """Return which stretch each lost node belongs to: those joined along lines, or lying on one another."""
-    follows = (np.diff(lost) == 1) & (nodes.owner[lost[1:]] == nodes.owner[lost[:-1]])
-    follows &= kept[lost[1:]] == kept[lost[:-1]]
-    along = np.flatnonzero(follows)
-    near = KDTree(nodes.points[lost]).query_pairs(2 * STEP_MM, output_type="ndarray")
-    near = near[kept[lost[near[:, 0]]] == kept[lost[near[:, 1]]]]
-    return pieces(np.concatenate([np.stack([along, along + 1], axis=1), near]), len(lost))
-
-
-def _length_once(nodes: LineNodes, part: Int[np.ndarray, "p"]) -> float:
+def _length_once(nodes: LineGraph, part: Int[np.ndarray, "p"]) -> float:
     """Return the length of a stretch, lines that run together counted once, mm."""
     total, seen = 0.0, np.empty((0, 3))
     for owner in np.unique(nodes.owner[part]):
@@ -117,12 +99,12 @@ def closures(tree: VesselTree) -> list[str]:
     cells, member = np.unique(np.floor(places / STEP_MM), axis=0, return_inverse=True)
     cluster = groups(STEP_MM * cells, float(np.median(radius[one])) + 2 * STEP_MM)[member.reshape(-1)]
     last = [np.flatnonzero(branch == number)[-1] for number in tree.leaves()]
-    notes = []
+    graph, notes = _graph_of(tree, branch), []
     for number in range(cluster.max() + 1):
         mine = np.flatnonzero(cluster == number)
         best = mine[overlap[mine].argmax()]
         ends = [int(one[best]), int(two[best])]
-        nodes = _way(tree, points, branch, ends)
+        nodes = np.array(graph.way(*ends))
         if not _has_hole(points[nodes], radius[nodes]):
             continue
         tip = any(
@@ -143,25 +125,14 @@ def closures(tree: VesselTree) -> list[str]:
     return texts + ([f"{len(notes) - _MOST_NOTES} shorter loops are cut too"] if len(notes) > _MOST_NOTES else [])
 
 
-def _way(
-    tree: VesselTree, points: Float[np.ndarray, "n 3"], branch: Int[np.ndarray, "n"], ends: list[int]
-) -> Int[np.ndarray, "w"]:
-    """Return the points on the way along the tree from one point to another, in order."""
-    first = np.flatnonzero(np.diff(branch, prepend=-1))
-    before = np.arange(len(points)) - 1
-    for start, own in zip(first, tree.branches, strict=True):
+def _graph_of(tree: VesselTree, branch: Int[np.ndarray, "n"]) -> RootedGraph:
+    """Return a tree's points as a graph, the first of each branch joined to the nearest one of its parent."""
+    line, before = tree.line, np.arange(len(branch)) - 1
+    for start, own in zip(np.flatnonzero(np.diff(branch, prepend=-1)), tree.branches, strict=True):
         if own.parent >= 0:
             host = np.flatnonzero(branch == own.parent)
-            before[start] = host[np.linalg.norm(points[host] - points[start], axis=1).argmin()]
-    sides = []
-    for end in ends:
-        side = [end]
-        while before[side[-1]] >= 0:
-            side.append(int(before[side[-1]]))
-        sides.append(side)
-    common = set(sides[0]) & set(sides[1])
-    ways = [[node for node in side if node not in common] for side in sides]
-    return np.array(ways[0] + ways[1][::-1], dtype=np.int64)
+            before[start] = host[np.linalg.norm(line.points[host] - line.points[start], axis=1).argmin()]
+    return RootedGraph(line.points, line.radius, csr_matrix((len(branch),) * 2), STEP_MM, before, line.abscissa)
 
 
 def _has_hole(points: Float[np.ndarray, "w 3"], radius: Float[np.ndarray, "w"]) -> bool:

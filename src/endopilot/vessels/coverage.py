@@ -12,16 +12,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from endopilot.anatomy.distance import MAXIMUM_GRID_POINTS
-from endopilot.anatomy.lumen_graph import pieces
-from endopilot.anatomy.medial_lines import MedialLines
-from endopilot.anatomy.repair import NOTED_MM
-from endopilot.anatomy.surface import Surface, blur_voxels, smooth_level
-from endopilot.anatomy.topology import MOST_LISTED
-from endopilot.anatomy.tree import sampled
 from endopilot.errors import place_text
 from endopilot.imaging.grid import connected_components
-from endopilot.types import VesselTree, Volume
+from endopilot.types import Volume
+from endopilot.vessels.medial_lines import MedialLines
+from endopilot.vessels.repair import NOTED_MM
+from endopilot.vessels.surface import MAXIMUM_GRID_POINTS, Surface, blur_voxels, smooth_level
+from endopilot.vessels.topology import MOST_LISTED
 
 _REACH_VOXELS = 1.5
 """The tree reaches what lies within its radius and this many voxels of its axis: the mask's middle is not smooth."""
@@ -110,15 +107,10 @@ def widened(mask: Volume, lines: MedialLines, minimum_mm: float) -> tuple[Volume
     return result, lines.points[asked], _widened_text(wanted, radius)
 
 
-def unreached(lines: MedialLines, tree: VesselTree, voxel_mm: float) -> list[Stretch]:
-    """Return the parts of a mask's middle that a tree does not reach, longest first.
-
-    Args:
-        lines: the middle.
-        tree: what was made of the mask.
-        voxel_mm: the voxels' longest edge, mm.
-    """
-    points, radius = sampled(tree)
+def unreached(
+    lines: MedialLines, points: Float[np.ndarray, "m 3"], radius: Float[np.ndarray, "m"], voxel_mm: float
+) -> list[Stretch]:
+    """Return the parts of a mask's middle that a tree, given by points close together, does not reach."""
     gap, nearest = map(np.asarray, KDTree(points).query(lines.points))
     return stretches(lines, gap > radius[nearest] + _REACH_VOXELS * voxel_mm, gap)
 
@@ -128,19 +120,12 @@ def stretches(
 ) -> list[Stretch]:
     """Return the connected parts of chosen points of a mask's middle, longest first.
 
-    Args:
-        lines: the middle.
-        chosen: which points.
-        order: a part begins at its point of the lowest value; by default at that nearest to the widest place.
+    A part begins at its point of the lowest `order`; by default at that nearest to the widest place.
     """
-    inner = chosen[lines.edges].all(axis=1)
-    part = pieces(lines.edges[inner], len(lines.points))
-    length, behind = lines.from_widest
+    length, behind = lines.tree.length, lines.behind_mm
     order = length if order is None else order
     found = []
-    members = np.flatnonzero(chosen)
-    members = members[np.argsort(part[members], kind="stable")]
-    for nodes in np.split(members, np.flatnonzero(np.diff(part[members])) + 1) if len(members) else []:
+    for nodes in lines.parts(chosen):
         own = float(lines.share_mm[nodes].sum())
         beyond = max(0.0, float(behind[nodes[length[nodes].argmin()]]) - own)
         found.append(Stretch(nodes, own, beyond, lines.points[nodes[order[nodes].argmin()]]))
@@ -150,10 +135,7 @@ def stretches(
 def left_out_text(left: list[Stretch], ostium: Float[np.ndarray, "3"], reach_mm: float) -> list[str]:
     """Return what is said of the parts that a tree does not reach: one remark a part, and one for all crumbs.
 
-    Args:
-        left: the parts.
-        ostium: where the tree begins, LPS mm.
-        reach_mm: a part that begins this near it lies behind it.
+    A part that begins within `reach_mm` of the ostium lies behind it.
     """
     left = sorted(left, key=lambda stretch: -stretch.length_mm)
     long = [s for s in left if s.length_mm >= NOTED_MM]
@@ -176,13 +158,7 @@ def left_out_text(left: list[Stretch], ostium: Float[np.ndarray, "3"], reach_mm:
 
 
 def record(lines: MedialLines, wide: Float[np.ndarray, "m 3"], left: list[Stretch]) -> dict[str, float]:
-    """Return the balance that `anatomy.json` keeps, mm: length = reached + widened + left out.
-
-    Args:
-        lines: the middle of all that the file connects.
-        wide: places that were widened, LPS mm.
-        left: parts that the tree does not reach.
-    """
+    """Return the balance that `anatomy.json` keeps, mm: length = reached + widened (at places `wide`) + left out."""
     out = np.zeros(len(lines.points), dtype=bool)
     thin = np.asarray(KDTree(wide).query(lines.points)[0]) < lines.edges_mm.min() if len(wide) else out
     for stretch in left:

@@ -1,21 +1,39 @@
-"""Where a device enters a lumen: at a given place, where the vessel leaves the aorta, or at the widest open end."""
+"""Where a device enters a lumen: at a given place, where the vessel leaves the aorta, or at the likeliest open end."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer
+from scipy.ndimage import center_of_mass, distance_transform_edt
 
-from endopilot.anatomy import parent_vessel
-from endopilot.anatomy.coronary_ends import OpenEnd, open_ends, skeleton_of
-from endopilot.anatomy.coronary_ostia import Side, end_score
-from endopilot.anatomy.distance import distance_map_from_surface
-from endopilot.anatomy.line_ends import InletEnd, likely_inlets
-from endopilot.anatomy.lumen_graph import lumen_graph, trace_branches
-from endopilot.anatomy.surface import Surface
 from endopilot.imaging.grid import connected_components
 from endopilot.types import DistanceMap, Insertion
+from endopilot.vessels.coronary_ostia import Side, end_score
+from endopilot.vessels.ends import InletEnd, OpenEnd, likely_inlets, open_ends, skeleton_of
+from endopilot.vessels.graph import RootedGraph, lumen_graph
+from endopilot.vessels.surface import Surface
+from endopilot.vessels.surface_distance import distance_map_from_surface
+
+Vessel = Literal["rca", "lca", "generic"]
+
+PARENT_RATIO = 2.5
+"""A lumen this many times wider than the tree's median, at its inlet, is the parent vessel."""
+
+PARENT_RADIUS_MM = (3.5, 6.0)
+"""The aorta's root is never narrower than the first, a coronary artery never wider than the second (an aneurysm is)."""
+
+AORTA_RADIUS_MM = 7.0
+"""A lumen with a coronary artery that is as wide as this somewhere holds the aorta itself."""
+
+GRID_MM = 0.6
+"""Grid spacing at which the parent vessel is looked for, mm."""
+
+COMPARABLE = 0.25
+"""A piece with at least this share of the largest one's size may be the other coronary artery."""
+
 
 ENTRANCE_RADII = 3.0
 """An ostium given nearer than this many radii to an end of the vessel enters at that end."""
@@ -32,17 +50,33 @@ LIKENESS_SD = 0.25
 _BRANCH_MM = 4.0
 
 
+def piece_on_side(
+    sizes: Float[np.ndarray, "n"], centres: Float[np.ndarray, "n 3"], vessel: Vessel
+) -> tuple[int, list[int]]:
+    """Return which of several separate lumens is the vessel, and which others are nearly as large.
+
+    The right coronary artery lies to the patient's right of the left one (smaller x in LPS), so among pieces of
+    comparable size the side decides; for other vessels it is the largest.
+
+    Sizes are volumes, or anything that grows with them; centres are in LPS mm.
+    """
+    large = np.flatnonzero(sizes >= COMPARABLE * sizes.max())
+    if vessel == "generic":
+        chosen = int(sizes.argmax())
+    else:
+        across = centres[large, 0] if vessel == "rca" else -centres[large, 0]
+        chosen = int(large[across.argmin()])
+    return chosen, [int(piece) for piece in large if piece != chosen]
+
+
 def component(distance_map: DistanceMap, given: Insertion | None) -> Bool[np.ndarray, "nz ny nx"]:
     """Return the connected inside at the ostium, or the largest one."""
     labels = connected_components(distance_map.values > 0, corners=True)
-    count = labels.max()
-    if count == 1:
-        return labels == 1
-    if count == 0 or given is None:
-        sizes = np.bincount(labels.ravel())
-        sizes[0] = 0
-        return labels == sizes.argmax()
-    return part_at(distance_map, labels, given)
+    if given is not None and labels.max() > 1:
+        return part_at(distance_map, labels, given)
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    return labels == sizes.argmax()
 
 
 def grid_points(
@@ -71,23 +105,18 @@ def beyond_parent(
         side: which coronary artery is wanted.
         inlet: where the artery begins, LPS mm, if the lumen holds no aorta; a stub of the aorta may bulge there.
     """
-    if distance_map.values[inside].max(initial=0.0) < parent_vessel.PARENT_RADIUS_MM[0]:
+    if distance_map.values[inside].max(initial=0.0) < PARENT_RADIUS_MM[0]:
         return None, inside
     coarse = distance_map
-    if distance_map.spacing_mm < parent_vessel.GRID_MM:
-        coarse = distance_map_from_surface(surface, spacing_mm=parent_vessel.GRID_MM, band_mm=2 * parent_vessel.GRID_MM)
+    if distance_map.spacing_mm < GRID_MM:
+        coarse = distance_map_from_surface(surface, spacing_mm=GRID_MM, band_mm=2 * GRID_MM)
     within = component(coarse, None)
     points, clearance = grid_points(coarse, within)
-    usual, root = 0.0, int(clearance.argmax())
-    aorta = inlet is None
-    if inlet is not None:
-        root = int(np.linalg.norm(points - inlet, axis=1).argmin())
+    root = int(clearance.argmax() if inlet is None else np.linalg.norm(points - inlet, axis=1).argmin())
     graph = lumen_graph(points, clearance, coarse.spacing_mm, root)
-    if not aorta:
-        paths = trace_branches(graph, minimum_length_mm=_BRANCH_MM)
-        usual = float(np.median(graph.clearance[np.concatenate(paths)]))
-    parent = parent_vessel.parent_region(coarse, within, graph, usual)
-    ostium = None if parent is None else parent_vessel.ostium_beyond(coarse, within, parent, graph, side)
+    usual = 0.0 if inlet is None else float(np.median(graph.radius[np.concatenate(graph.traced(_BRANCH_MM))]))
+    parent = _parent_region(coarse, within, graph, usual)
+    ostium = None if parent is None else _ostium_beyond(coarse, within, parent, graph, side)
     if parent is None or ostium is None:
         return None, inside
     index = np.argwhere(inside)
@@ -158,10 +187,8 @@ def _directed(
     graph = lumen_graph(points, clearance, distance_map.spacing_mm, inlet)
     node = int(np.linalg.norm(graph.points - given.position, axis=1).argmin())
     reach = ENTRANCE_RADII * float(clearance[np.linalg.norm(points - given.position, axis=1) < 3.0].max(initial=1.0))
-    path = [node]
-    while graph.predecessor[path[-1]] >= 0 and graph.length[node] - graph.length[path[-1]] < reach:
-        path.append(int(graph.predecessor[path[-1]]))
-    direction = graph.points[node] - graph.points[path[-1]]
+    way = graph.back(node, graph.length[node] - graph.length >= reach)
+    direction = graph.points[node] - graph.points[way[-1]]
     length = float(np.linalg.norm(direction))
     ahead = (graph.points - graph.points[node]) @ direction > length * reach
     beyond = ahead & (graph.length > graph.length[node] + reach)
@@ -185,6 +212,58 @@ def inlets(
     surface: Surface | None, points: Float[np.ndarray, "n 3"], clearance: Float[np.ndarray, "n"], spacing_mm: float
 ) -> list[InletEnd]:
     """Return the ends of a lumen, given as grid points; the one that looks most like its inlet comes first."""
-    graph = lumen_graph(points, clearance, spacing_mm, int(clearance.argmax()))
-    graph = lumen_graph(graph.points, graph.clearance, spacing_mm, int(graph.length.argmax()))
-    return likely_inlets(graph, trace_branches(graph, minimum_length_mm=_BRANCH_MM), wall=surface)
+    graph = lumen_graph(points, clearance, spacing_mm)
+    return likely_inlets(graph, graph.traced(_BRANCH_MM), wall=surface)
+
+
+def _parent_region(
+    distance_map: DistanceMap, inside: Bool[np.ndarray, "nz ny nx"], graph: RootedGraph, usual_mm: float
+) -> Bool[np.ndarray, "nz ny nx"] | None:
+    """Return the grid points of the parent vessel that the graph's root lies in, or None where it lies in none.
+
+    The parent is what spheres of `PARENT_RATIO` times the usual radius reach, connected and around the root; a bulge
+    farther along is an aneurysm and stays.
+    """
+    spacing = distance_map.spacing_mm
+    wide = float(np.clip(PARENT_RATIO * usual_mm, *PARENT_RADIUS_MM))
+    core = inside & (distance_map.values > wide)
+    if not core.any():
+        return None
+    root = graph.points[int(np.flatnonzero(graph.before < 0)[0])]
+    index = np.argwhere(core)
+    points = distance_map.origin_mm + spacing * index[:, ::-1]
+    gap = np.linalg.norm(points - root, axis=1)
+    # The inlet lies on the parent's own wall, which is not round: at most about its width away from a centre.
+    reach = 2.0 * distance_map.values[tuple(index.T)] + 2.0 * spacing
+    touching = np.flatnonzero(gap < reach)
+    if len(touching) == 0:
+        return None
+    labels = connected_components(core, corners=True)
+    own = labels == labels[tuple(index[touching[gap[touching].argmin()]])]
+    return inside & (np.asarray(distance_transform_edt(~own)) * spacing < wide + spacing)
+
+
+def _ostium_beyond(
+    distance_map: DistanceMap,
+    inside: Bool[np.ndarray, "nz ny nx"],
+    parent: Bool[np.ndarray, "nz ny nx"],
+    graph: RootedGraph,
+    vessel: Vessel,
+) -> Insertion | None:
+    """Return where the vessel leaves its parent: the largest one, or of both coronary arteries the one wanted."""
+    origin, spacing = distance_map.origin_mm, distance_map.spacing_mm
+    labels = connected_components(inside & ~parent, corners=True)
+    if (count := int(labels.max())) == 0:
+        return None
+    places = np.rint((graph.points - origin) / spacing).astype(int)[:, ::-1]
+    piece = labels[tuple(places.T)]
+    # How far a piece reaches beyond the parent distinguishes a vessel from a crust of the parent's wall.
+    reach = np.array(
+        [np.ptp(graph.length[piece == i]) if (piece == i).any() else 0.0 for i in range(1, count + 1)], dtype=float
+    )
+    centres = np.array(center_of_mass(labels > 0, labels, range(1, count + 1)))[:, ::-1]
+    chosen, _ = piece_on_side(reach, origin + spacing * centres, vessel)
+    tip = int(np.where(piece == chosen + 1, graph.length, -1.0).argmax())
+    way = graph.back(tip, piece != chosen + 1)
+    # The direction is left open: the refined centerline gives it better than this grid.
+    return Insertion(graph.points[way[-1]].copy(), np.zeros(3)) if len(way) >= 3 else None

@@ -1,26 +1,28 @@
-"""Repairs of the flaws that surfaces from elsewhere have: separate pieces, holes, inverted normals.
+"""Repairs of the flaws that surfaces from elsewhere have: separate pieces, holes, inverted normals, walls for lumens.
+
+A printed phantom's shell or a vessel wall's mask is given for a lumen: the lumen is what the wall encloses.
 
 Every repair returns remarks, which `extract_anatomy` writes into the provenance.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.ndimage import binary_dilation, binary_opening, distance_transform_edt
+from jaxtyping import Bool, Float
+from scipy.ndimage import binary_dilation, binary_erosion, binary_opening, distance_transform_edt
 from scipy.spatial import KDTree
 
-from endopilot.anatomy.coverage import voxelised
-from endopilot.anatomy.lumen_graph import pieces
-from endopilot.anatomy.parent_vessel import Vessel, piece_on_side
-from endopilot.anatomy.repair import NEAR_OSTIUM_MM, NOTED_MM, OTHER_SIDE, other_pieces_text
-from endopilot.anatomy.surface import Surface, surface_from_mask
-from endopilot.anatomy.topology import MOST_LISTED
-from endopilot.anatomy.walls import enclosed, lumen_in_wall, wall_text
 from endopilot.errors import InputError, place_text
+from endopilot.imaging.grid import connected_components
 from endopilot.types import Insertion, Volume
+from endopilot.vessels.coverage import voxelised
+from endopilot.vessels.graph import pieces, split
+from endopilot.vessels.inlet import Vessel
+from endopilot.vessels.repair import NEAR_OSTIUM_MM, chosen_piece, pieces_left_out
+from endopilot.vessels.surface import Surface, filled_box, surface_from_mask
 
 MOST_PIECES = 12
 """At most this many pieces of a surface are looked at as coronary arteries or parts of them."""
@@ -38,6 +40,24 @@ _OVERLAP = 20
 """Surfaces that have no more voxels than this in common touch."""
 
 
+_MOST_VOXELS = 2_000_000
+"""A mask of more is looked at in blocks: 0.5 s."""
+
+_ENCLOSED = 16
+"""A void is enclosed where the wall is met in this many of the 26 directions: 16 in the plane of a tube's open end,
+13 or fewer between two branches."""
+
+_REACH = 5
+"""The wall is looked for within 2 to the power of this many voxels."""
+
+_UNIFORM, _LINING = 0.4, 0.9
+"""A wall's thickness varies by at most this share of it (SD), and this share of it lines the lumen: not so a vessel
+with a catheter or an island in it."""
+
+_THICKEST = 4.0
+"""A wall is at most this many times as thick as its lumen's radius."""
+
+
 def closed_surface(
     surface: Surface,
     given: Insertion | None,
@@ -47,14 +67,7 @@ def closed_surface(
 ) -> tuple[Surface, list[str]]:
     """Return one closed wall with outward normals: largest piece (or the one at the ostium), holes capped.
 
-    Where a file holds both coronary arteries and no ostium is given, `vessel` decides by the patient's side.
-
-    Args:
-        surface: one or several walls.
-        given: the ostium, if it is known.
-        label: name of the source, for messages.
-        vessel: which vessel is wanted.
-        other_ostium: ostium of the other coronary artery, LPS mm, if it is known.
+    Arguments are those of `repair.connected_mask`, with a surface for the mask.
 
     Raises:
         InputError: the holes cannot be closed, or the surface is nowhere near the given ostium.
@@ -62,22 +75,15 @@ def closed_surface(
     mesh: Any = _without_duplicates(_polydata(surface.vertices, surface.faces).clean().triangulate())
     mesh, remarks = _lumen_of(mesh)
     regions = mesh.connectivity(extraction_mode="all")
-    ids = np.asarray(regions.point_data["RegionId"])
+    ids = np.asarray(regions.point_data["RegionId"]).astype(np.int64)
     if ids.max() > 0:
-        if given is None:
-            chosen, others = _region_on_side(regions, ids, vessel)
-        else:
-            chosen, others = int(ids[np.linalg.norm(regions.points - given.position, axis=1).argmin()]), []
+        places = split(np.asarray(regions.points, dtype=float), ids)
+        sizes = np.array([np.linalg.norm(np.ptp(place, axis=0)) * len(place) ** 0.5 for place in places])
+        chosen, *_, others = chosen_piece(places, sizes, given, vessel)
         joined, mesh = _united(regions, ids, chosen)
-        others = [other for other in others if other not in joined]
-        if others:
-            remarks.append(other_pieces_text(vessel, len(others)))
         if len(joined) > 1:
             remarks.append(f"{len(joined)} closed surfaces overlap: united to one vessel")
-        ids = np.where(np.isin(ids, joined), chosen, ids)
-        remarks += _regions_left_out(
-            np.asarray(regions.points, float), ids.astype(np.int64), chosen, vessel, other_ostium
-        )
+        remarks += pieces_left_out(places, joined, np.empty(0, int), others, vessel, other_ostium, "vertices")
     if given is not None:
         gap = float(KDTree(mesh.points).query(given.position)[0])
         if gap > max(NEAR_OSTIUM_MM, 0.15 * float(np.ptp(mesh.points, axis=0).max())):
@@ -113,7 +119,7 @@ def _lumen_of(mesh: Any) -> tuple[Any, list[str]]:
     closed = _surface(_capped(mesh))
     step = float(np.prod(np.ptp(closed.vertices, axis=0))) ** (1 / 3) / _ACROSS
     solid = voxelised(closed, step)
-    found = lumen_in_wall(solid)
+    found = _lumen_in_wall(solid)
     if found is None:
         return mesh, []
     lumen, thickness = found
@@ -122,7 +128,7 @@ def _lumen_of(mesh: Any) -> tuple[Any, list[str]]:
     index = tuple(np.rint((centres - solid.origin_mm) / solid.spacing_mm[0]).astype(int).T[::-1])
     near, far = (distance_transform_edt(~part) for part in (lumen, ~lumen & ~solid.voxels))
     inner = _polydata(mesh.points, faces[np.asarray(near)[index] < np.asarray(far)[index]]).clean()
-    return inner.connectivity(extraction_mode="largest"), [wall_text(thickness)]
+    return inner.connectivity(extraction_mode="largest"), [_wall_text(thickness)]
 
 
 def _met_again(mesh: Any, sign: float) -> float:
@@ -188,41 +194,6 @@ def region_places(surface: Surface) -> list[Float[np.ndarray, "3"]]:
     return [np.asarray(regions.points[ids == i][0], float) for i in np.argsort(-sizes)[:MOST_PIECES] if sizes[i] >= 100]
 
 
-def _regions_left_out(
-    points: Float[np.ndarray, "n 3"],
-    ids: Int[np.ndarray, "n"],
-    chosen: int,
-    vessel: Vessel,
-    other_ostium: Float[np.ndarray, "3"] | None,
-) -> list[str]:
-    """Say which separate walls of a surface were left out and where they lie."""
-    own = KDTree(points[ids == chosen])
-    found: list[tuple[float, str]] = []
-    for region in np.unique(ids[ids != chosen]):
-        place = points[ids == region]
-        extent = float(np.linalg.norm(np.ptp(place, axis=0)))
-        if other_ostium is not None and np.linalg.norm(place - other_ostium, axis=1).min() < NEAR_OSTIUM_MM:
-            found.append((np.inf, f"the {OTHER_SIDE[vessel]} ({len(place)} vertices) is not part of this one"))
-        elif extent >= NOTED_MM:
-            gap = np.asarray(own.query(place)[0])
-            at = place_text(place[gap.argmin()])
-            text = f"a separate piece of the surface left out: {extent:.0f} mm long, {gap.min():.1f} mm away at {at}"
-            found.append((extent, text))
-    remarks = [text for _, text in sorted(found, key=lambda item: -item[0])[:MOST_LISTED]]
-    rest = len(np.unique(ids)) - 1 - len(remarks)
-    if rest:
-        longest = sorted((extent for extent, _ in found if np.isfinite(extent)), reverse=True)[MOST_LISTED:]
-        size = f"{longest[0]:.0f}" if longest else f"{NOTED_MM:g}"
-        remarks.append(f"{rest} more separate pieces of the surface of up to {size} mm left out")
-    return remarks
-
-
-def _region_on_side(regions, ids: np.ndarray, vessel: Vessel) -> tuple[int, list[int]]:
-    pieces = [regions.points[ids == i] for i in range(min(int(ids.max()) + 1, 100))]
-    sizes = np.array([np.linalg.norm(np.ptp(points, axis=0)) * len(points) ** 0.5 for points in pieces])
-    return piece_on_side(sizes, np.array([points.mean(axis=0) for points in pieces]), vessel)
-
-
 def _without_duplicates(mesh):
     """Drop triangles that occur twice, as where a surface was exported together with its own copy."""
     faces = np.asarray(mesh.faces.reshape(-1, 4)[:, 1:])
@@ -260,8 +231,82 @@ def _from_shell(surface: Surface, label: str) -> Surface:
     samples = np.concatenate([fine.vertices, fine.vertices[fine.faces].mean(axis=1)])
     index = np.rint((samples - origin) / spacing).astype(int)
     shell[index[:, 2], index[:, 1], index[:, 0]] = True
-    inside = np.asarray(binary_opening(enclosed(shell)), dtype=bool)
+    inside = np.asarray(binary_opening(_enclosed(shell)), dtype=bool)
     if inside.sum() > _HOLDS * shell.sum():
         inside = np.asarray(binary_dilation(inside), dtype=bool) & (inside | shell)
         return surface_from_mask(Volume(inside, np.full(3, spacing), origin, np.eye(3)))
     raise InputError(f"{label}: the surface has holes that cannot be closed; cap it or make it watertight")
+
+
+def _lumen_in_wall(mask: Volume) -> tuple[Bool[np.ndarray, "nz ny nx"], float] | None:
+    """Return the void that a wall encloses, closed or open at the ends, and the wall's thickness, mm; None if none."""
+    box = filled_box(mask.voxels)
+    solid = np.asarray(mask.voxels[box], dtype=bool)
+    if solid.size == 0:
+        return None
+    factor = int(np.ceil((solid.size / _MOST_VOXELS) ** (1 / 3)))
+    coarse = _blocks(solid, factor)
+    edges = mask.spacing_mm[::-1] * factor
+    void = _enclosed(coarse)
+    labels = connected_components(void, corners=False)
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    lumen = labels == sizes.argmax()
+    if sizes.max(initial=0) == 0:
+        return None
+    to_lumen = np.asarray(distance_transform_edt(~lumen, sampling=edges))
+    outside = ~coarse & ~void
+    rim = coarse & ~np.asarray(binary_erosion(~outside, border_value=False), dtype=bool)
+    thickness = to_lumen[rim]
+    middle = float(np.median(thickness)) if rim.any() else 0.0
+    width = float(np.asarray(distance_transform_edt(lumen, sampling=edges)).max())
+    lining = float((to_lumen[coarse] <= 1.5 * middle + edges.max()).mean())
+    if lining < _LINING or np.std(thickness) > _UNIFORM * middle or middle > _THICKEST * width:
+        return None
+    whole = np.zeros(mask.voxels.shape, dtype=bool)
+    fine = lumen
+    for axis in range(3):
+        fine = np.repeat(fine, factor, axis=axis)
+    whole[box] = fine[tuple(slice(0, size) for size in solid.shape)] & ~solid
+    return whole, middle
+
+
+def without_wall(mask: Volume) -> tuple[Volume, list[str]]:
+    """Return the lumen that a mask of a wall encloses, with a remark; any other mask as it is."""
+    found = _lumen_in_wall(mask)
+    if found is None:
+        return mask, []
+    return replace(mask, voxels=found[0]), [_wall_text(found[1])]
+
+
+def _wall_text(thickness_mm: float) -> str:
+    """Return the remark on a wall that was given for a lumen."""
+    return f"what is given is a wall of {thickness_mm:.1f} mm: the lumen inside it is taken"
+
+
+def _blocks(solid: Bool[np.ndarray, "nz ny nx"], factor: int) -> Bool[np.ndarray, "a b c"]:
+    padded = np.pad(solid, [(0, -size % factor) for size in solid.shape])
+    shape = [part for size in padded.shape for part in (size // factor, factor)]
+    return np.asarray(padded.reshape(shape).any(axis=(1, 3, 5)))
+
+
+def _enclosed(solid: Bool[np.ndarray, "nz ny nx"]) -> Bool[np.ndarray, "nz ny nx"]:
+    """Return the void from which a solid is met in most directions."""
+    count = np.zeros(solid.shape, dtype=np.int8)
+    for step in np.ndindex(3, 3, 3):
+        direction = np.array(step) - 1
+        if not direction.any():
+            continue
+        met = solid.copy()
+        for power in range(_REACH):
+            _or_shifted(met, direction * 2**power)
+        count += met
+    return (count >= _ENCLOSED) & ~solid
+
+
+def _or_shifted(met: Bool[np.ndarray, "nz ny nx"], by: np.ndarray) -> None:
+    if (np.abs(by) >= met.shape).any():
+        return
+    here = tuple(slice(max(0, -step), met.shape[axis] - max(0, step)) for axis, step in enumerate(by))
+    there = tuple(slice(max(0, step), met.shape[axis] + min(0, step)) for axis, step in enumerate(by))
+    met[here] |= met[there].copy()

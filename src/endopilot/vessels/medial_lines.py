@@ -7,20 +7,19 @@ where it is thinner than they can show, the mask is widened; what the final tree
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, find_objects
-from scipy.sparse import coo_matrix
+from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 from scipy.spatial import KDTree
 
-from endopilot.anatomy.lumen_graph import lumen_graph, pieces, trace_branches
 from endopilot.imaging.grid import connected_components
 from endopilot.types import Volume
+from endopilot.vessels.graph import RootedGraph, VesselGraph, lumen_graph
 
 SMALLEST_PIECE = 12
 """A piece of fewer voxels is noise."""
@@ -37,22 +36,20 @@ _STUB_VOXELS, _SLENDER = 4.0, 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class MedialLines:
-    """The middle of a mask.
+class MedialLines(VesselGraph):
+    """The middle of a mask: a forest whose ways are as wide as they can be.
+
+    Its radius is the distance to the mask's border, half a voxel where the mask is one or two voxels thick; its costs
+    are lengths, mm.
 
     Attributes:
         index: voxel indices (z, y, x).
-        points: their positions, LPS mm.
-        clearance: distance to the mask's border, mm; half a voxel where it is one or two voxels thick.
-        edges: pairs of neighbours that make a forest: of every loop the edge at its narrowest place is left out.
-        closing: these left-out edges.
+        closing: edges that are left out, of every loop one at its narrowest place.
         edges_mm: edges of the voxels along their own axes (z, y, x), mm.
     """
 
+    columns = ("points", "radius", "index")
     index: Int[np.ndarray, "n 3"]
-    points: Float[np.ndarray, "n 3"]
-    clearance: Float[np.ndarray, "n"]
-    edges: Int[np.ndarray, "m 2"]
     closing: Int[np.ndarray, "k 2"]
     edges_mm: Float[np.ndarray, "3"]
 
@@ -62,61 +59,41 @@ class MedialLines:
         return self.index * self.edges_mm
 
     @cached_property
-    def share_mm(self) -> Float[np.ndarray, "n"]:
-        """Length that each point stands for, mm: half the length of the forest's edges at it."""
-        half = 0.5 * self.lengths(self.edges)
-        return np.bincount(self.edges.ravel(), weights=np.repeat(half, 2), minlength=len(self.points))
+    def tree(self) -> RootedGraph:
+        """The ways from each piece's widest place."""
+        order = np.lexsort((-self.radius, self.pieces))
+        roots = order[np.unique(self.pieces[order], return_index=True)[1]]
+        length, before, _ = dijkstra(self.costs, directed=False, indices=roots, return_predecessors=True, min_only=True)  # pyright: ignore[reportAssignmentType]
+        return RootedGraph(self.points, self.radius, self.costs, self.step_mm, before, length)
 
     @cached_property
-    def forest(self) -> Any:
-        """The forest as a sparse matrix of lengths, mm, both ways."""
-        return self.matrix(self.edges)
-
-    @cached_property
-    def _rooted(self) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-        """Length of the path from each piece's widest place to each point, mm, and the point before it."""
-        piece = pieces(self.edges, len(self.points))
-        order = np.lexsort((-self.clearance, piece))
-        roots = order[np.unique(piece[order], return_index=True)[1]]
-        length, before, _ = dijkstra(
-            self.forest, directed=False, indices=roots, return_predecessors=True, min_only=True
-        )  # pyright: ignore[reportAssignmentType]
-        return length, before
-
-    @cached_property
-    def from_widest(self) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-        """Length of the path from each piece's widest place to each point, and of all at and beyond that point, mm."""
-        (length, before), behind = self._rooted, self.share_mm.copy()
-        for node in np.argsort(-length):
+    def behind_mm(self) -> Float[np.ndarray, "n"]:
+        """Length of all at and beyond each point, as seen from the widest place, mm."""
+        behind, before = self.share_mm.copy(), self.tree.before
+        for node in np.argsort(-self.tree.length):
             if before[node] >= 0:
                 behind[before[node]] += behind[node]
-        return length, behind
+        return behind
 
-    def part(self, kept: Bool[np.ndarray, "n"], corner: Int[np.ndarray, "3"]) -> MedialLines:
+    def within(self, kept: Bool[np.ndarray, "n"], corner: Int[np.ndarray, "3"]) -> MedialLines:
         """Return some of the points with what joins them, in a mask that begins at the voxel `corner` of this one."""
-        number = np.cumsum(kept) - 1
-        edges, closing = (number[pairs[kept[pairs].all(axis=1)]] for pairs in (self.edges, self.closing))
-        index = self.index[kept] - corner
-        return MedialLines(index, self.points[kept], self.clearance[kept], edges, closing, self.edges_mm)
+        closing = (np.cumsum(kept) - 1)[self.closing[kept[self.closing].all(axis=1)]]
+        part = self.part(kept)
+        return replace(part, closing=closing, index=part.index - corner)
 
-    def way(self, one: int, two: int) -> list[int]:
-        """Return the points of the only path between two points of a piece."""
-        length, before = self._rooted
-        there, back = [one], [two]
-        while there[-1] != back[-1]:  # the deeper one goes up, until both are where the two ways from the root part
-            deeper = there if length[there[-1]] > length[back[-1]] else back
-            deeper.append(int(before[deeper[-1]]))
-        return there + back[-2::-1]
 
-    def lengths(self, edges: Int[np.ndarray, "m 2"]) -> Float[np.ndarray, "m"]:
-        """Return the lengths of edges, mm."""
-        return np.linalg.norm(self.points[edges[:, 0]] - self.points[edges[:, 1]], axis=1)
-
-    def matrix(self, edges: Int[np.ndarray, "m 2"]) -> Any:
-        """Return edges as a sparse matrix of lengths, mm, both ways."""
-        both = np.concatenate([edges, edges[:, ::-1]])
-        size = (len(self.points),) * 2
-        return coo_matrix((np.tile(self.lengths(edges), 2), (both[:, 0], both[:, 1])), shape=size).tocsr()
+def _lines(
+    mask: Volume,
+    index: Int[np.ndarray, "n 3"],
+    radius: Float[np.ndarray, "n"],
+    edges: Int[np.ndarray, "m 2"],
+    closing: Int[np.ndarray, "k 2"],
+) -> MedialLines:
+    points = mask.index_to_world(index[:, ::-1].astype(float))
+    lengths = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+    costs = csr_matrix((lengths, edges.T), shape=(len(points),) * 2)
+    steps = mask.spacing_mm[::-1]
+    return MedialLines(points, radius, costs, float(steps.max()), index, closing, steps)
 
 
 @lru_cache(maxsize=2)
@@ -135,9 +112,8 @@ def thinned_lines(mask: Volume) -> MedialLines:
     index = np.concatenate(found)
     clearance = _clearance(voxels, index, mask.spacing_mm)
     pairs = KDTree(index).query_pairs(_NEIGHBOURS_APART, output_type="ndarray").astype(np.int64).reshape(-1, 2)
-    edges, closing = _widest_forest(pairs, clearance, np.linalg.norm(index[pairs[:, 0]] - index[pairs[:, 1]], axis=1))
-    points = mask.index_to_world(index[:, ::-1].astype(float))
-    return MedialLines(index, points, clearance, edges, closing, mask.spacing_mm[::-1])
+    apart = np.linalg.norm(index[pairs[:, 0]] - index[pairs[:, 1]], axis=1)
+    return _lines(mask, index, clearance, *_widest_forest(pairs, clearance, apart))
 
 
 def traced_lines(mask: Volume) -> MedialLines:
@@ -151,10 +127,8 @@ def traced_lines(mask: Volume) -> MedialLines:
         edges.append(pairs + sum(len(part) for part in index))
         index.append(nodes + corner)
         clearance.append(width)
-    places = np.concatenate(index)
-    points = mask.index_to_world(places[:, ::-1].astype(float))
     joined = np.concatenate(edges)
-    return MedialLines(places, points, np.concatenate(clearance), joined, joined[:0], mask.spacing_mm[::-1])
+    return _lines(mask, np.concatenate(index), np.concatenate(clearance), joined, joined[:0])
 
 
 def _packed(voxels: Bool[np.ndarray, "nz ny nx"]) -> tuple[bytes, tuple[int, ...]]:
@@ -183,9 +157,8 @@ def _traced_piece(
     clearance = _clearance(voxels, index, edges_mm)
     if len(index) < SMALLEST_PIECE:
         return index[:1], clearance[:1], np.empty((0, 2), int)
-    graph = lumen_graph(index[:, ::-1] * edges_mm, clearance, edges_mm, int(clearance.argmax()))
-    graph = graph.rooted_at(int(graph.length.argmax()))
-    paths = trace_branches(graph, minimum_length_mm=_STUB_VOXELS * float(edges_mm.max()), slenderness=_SLENDER)
+    graph = lumen_graph(index[:, ::-1] * edges_mm, clearance, edges_mm)
+    paths = graph.traced(_STUB_VOXELS * float(edges_mm.max()), slenderness=_SLENDER)
     places = np.rint(graph.points / edges_mm).astype(int)[:, ::-1]
     nodes: list[int] = []
     pairs: list[tuple[int, int]] = []
@@ -202,7 +175,7 @@ def _traced_piece(
             if joint >= 0:
                 pairs.append((joint, len(nodes) - 1))
             joint = len(nodes) - 1
-    return places[nodes], graph.clearance[nodes], np.array(pairs, dtype=int).reshape(-1, 2)
+    return places[nodes], graph.radius[nodes], np.array(pairs, dtype=int).reshape(-1, 2)
 
 
 def _clearance(
@@ -239,7 +212,7 @@ def _widest_forest(
     """Return the forest whose paths are as wide as they can be, and the edges that would close a loop."""
     # Of equally wide edges the shorter is kept, so that the corners of the voxels' steps are not cut.
     cost = 1.0 + clearance.max(initial=0.0) - clearance[pairs].min(axis=1) + 1e-3 * apart
-    size = (len(clearance),) * 2
-    tree = minimum_spanning_tree(coo_matrix((cost, (pairs[:, 0], pairs[:, 1])), shape=size).tocsr()).tocoo()
+    costs = csr_matrix((cost, pairs.T), shape=(len(clearance),) * 2)
+    tree = minimum_spanning_tree(costs).tocoo()
     kept = np.isin(pairs[:, 0] * len(clearance) + pairs[:, 1], tree.row.astype(np.int64) * len(clearance) + tree.col)
     return pairs[kept], pairs[~kept]

@@ -19,17 +19,16 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import binary_closing, binary_dilation, distance_transform_edt
-from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
-from endopilot.anatomy.lumen_graph import pieces
-from endopilot.anatomy.medial_lines import SMALLEST_PIECE, MedialLines, piece_labels, thinned_lines, traced_lines
-from endopilot.anatomy.parent_vessel import AORTA_RADIUS_MM
 from endopilot.errors import place_text
 from endopilot.imaging.grid import connected_components
 from endopilot.lines import length_along
 from endopilot.types import Volume
+from endopilot.vessels.graph import pieces
+from endopilot.vessels.inlet import AORTA_RADIUS_MM
+from endopilot.vessels.medial_lines import SMALLEST_PIECE, MedialLines, piece_labels, thinned_lines, traced_lines
 
 CONTACT = 0.6
 """A place whose clearance is less than this share of the vessels' on both sides is a contact, not a stenosis."""
@@ -183,9 +182,7 @@ def _porous(mask: Volume, thin: MedialLines, rings: list[_Ring]) -> list[Touch]:
 def touch_remarks(found: list[Touch], *, parted: bool = True) -> list[str]:
     """Return what is said of places where a lumen touches itself: one remark for each kind, the largest place first.
 
-    Args:
-        found: the places.
-        parted: whether the lumen was parted there; a surface is not.
+    Where the lumen, a surface's, is not parted there, the words are others.
     """
     kinds = [touch.kind if parted else _LEFT.get(touch.kind, touch.kind) for touch in found]
     remarks = []
@@ -248,7 +245,7 @@ class _Parting:
 
     def ring(self, ring: _Ring, lines: MedialLines) -> bool:
         """Cut a loop at its narrowest place, if nothing is lost by it, and return whether that was done."""
-        clearance, ends = lines.clearance[ring.nodes], ring.nodes[[0, -1]]
+        clearance, ends = lines.radius[ring.nodes], ring.nodes[[0, -1]]
         place = lines.local[ends].mean(axis=0)
         if self._neck(place, 2.0 * float(np.median(clearance)), place[None])[1]:
             self.say("flap", place, ring.around_mm)
@@ -258,7 +255,7 @@ class _Parting:
         if _count(trial) > _count(self.result):
             self.say("hole", place, ring.around_mm)
             return False
-        narrow = float(lines.clearance[ends].min()) < CONTACT * float(np.median(clearance))
+        narrow = float(lines.radius[ends].min()) < CONTACT * float(np.median(clearance))
         self.say("itself" if narrow else "loop", place, ring.around_mm)
         self.result = trial
         return True
@@ -293,10 +290,10 @@ def _rings(lines: MedialLines, mask: Volume) -> list[_Ring]:
     """Return the loops of a mask's middle that are not rough voxels, one for each edge that closes one."""
     rings = []
     for start, end in lines.closing:
-        nodes = np.array(lines.way(int(end), int(start)))
+        nodes = np.array(lines.tree.way(int(end), int(start)))
         around = float(lines.lengths(np.column_stack([nodes, np.roll(nodes, 1)])).sum())
         across = np.linalg.norm(lines.points[nodes] - np.roll(lines.points[nodes], len(nodes) // 2, axis=0), axis=1)
-        wide = 2 * np.pi * float(np.quantile(lines.clearance[nodes], 0.9))
+        wide = 2 * np.pi * float(np.quantile(lines.radius[nodes], 0.9))
         if across.min() >= _SLIT_VOXELS * mask.spacing_mm.max() and around >= max(SHORTEST_TUNNEL_MM, wide):
             rings.append(_Ring(nodes, around))
     return rings
@@ -308,7 +305,7 @@ def _crossings(lines: MedialLines, rings: list[_Ring]) -> Iterator[_Crossing]:
     ends = Counter(node for segment in segments for node in (segment[0], segment[-1]))
     length = [float(length_along(lines.local[segment])[-1]) for segment in segments]
     forks = [ends[segment[0]] > 2 and ends[segment[-1]] > 2 for segment in segments]
-    radius = [float(lines.clearance[[segment[0], segment[-1]]].max()) for segment in segments]
+    radius = [float(lines.radius[[segment[0], segment[-1]]].max()) for segment in segments]
     inner = [fork and size <= wide for fork, size, wide in zip(forks, length, radius, strict=True)]
     short = np.array([(s[0], s[-1]) for s, within in zip(segments, inner, strict=True) if within], int).reshape(-1, 2)
     group = pieces(short, len(lines.points))
@@ -359,12 +356,12 @@ def _is_stub(lines: MedialLines, path: list[int]) -> bool:
     """Return whether a segment that ends is no longer than the middle is wide where it begins."""
     length = float(length_along(lines.local[path])[-1])
     around = np.linalg.norm(lines.local - lines.local[path[0]], axis=1) <= length
-    return length < max(2.0 * float(lines.clearance[around].max()), _SLIT_VOXELS * float(lines.edges_mm.max()))
+    return length < max(2.0 * float(lines.radius[around].max()), _SLIT_VOXELS * float(lines.edges_mm.max()))
 
 
 def _arm(lines: MedialLines, path: list[int]) -> _Arm | None:
     """Return what leaves a junction outside its inscribed sphere; None if that is too short to have a direction."""
-    points, wide = lines.local[path], float(lines.clearance[path[0]])
+    points, wide = lines.local[path], float(lines.radius[path[0]])
     along = length_along(points)
     first = int(np.searchsorted(along, wide))
     last = int(np.searchsorted(along, along[min(first, len(path) - 1)] + _ARM_RADII * wide))
@@ -372,7 +369,7 @@ def _arm(lines: MedialLines, path: list[int]) -> _Arm | None:
     if len(points) < 3 or np.linalg.norm(points[-1] - points[0]) < 1.5 * wide:
         return None
     direction = (points[-1] - points[0]) / np.linalg.norm(points[-1] - points[0])
-    return _Arm(points, direction, float(np.quantile(lines.clearance[path[first : last + 1]], 0.75)))
+    return _Arm(points, direction, float(np.quantile(lines.radius[path[first : last + 1]], 0.75)))
 
 
 def _crossing(arms: list[_Arm]) -> _Crossing | None:
@@ -459,10 +456,9 @@ def _are_apart(mask: Volume, edges: Float[np.ndarray, "3"], crossing: _Crossing)
 
 def _sever(voxels: Bool[np.ndarray, "nz ny nx"], lines: MedialLines, ends: tuple[int, int]) -> None:
     """Empty the voxels between the two sides of a cut, a layer of either, so that their walls do not run together."""
-    others = ~np.isin(lines.edges, ends).all(axis=1)
-    near, far = dijkstra(lines.matrix(lines.edges[others]), indices=list(ends))
+    near, far = lines.away(list(ends))
     centre = lines.index[list(ends)].mean(axis=0)
-    reach = 3.0 * lines.clearance[list(ends)].max() / float(lines.edges_mm.mean()) + 4.0
+    reach = 3.0 * lines.radius[list(ends)].max() / float(lines.edges_mm.mean()) + 4.0
     local = np.flatnonzero(np.linalg.norm(lines.index - centre, axis=1) < 3.0 * reach)
     window = tuple(slice(max(0, int(c - reach)), int(c + reach) + 2) for c in centre)
     index = np.argwhere(voxels[window])
@@ -477,16 +473,16 @@ def _without_sides(mask: Volume, lines: MedialLines) -> tuple[Volume, Touch] | N
     Each voxel belongs to the nearest point of the middle; neighbours that belong to distant points are emptied, unless
     the lumen falls apart that way. None if there are none.
     """
-    if lines.clearance.max(initial=0.0) > AORTA_RADIUS_MM:  # a branch's first part lies inside the aorta's own middle
+    if lines.radius.max(initial=0.0) > AORTA_RADIUS_MM:  # a branch's first part lies inside the aorta's own middle
         return None
     voxel = float(mask.spacing_mm.max())
-    pairs = KDTree(lines.points).query_pairs(2.0 * float(lines.clearance.max()) + voxel, output_type="ndarray")
+    pairs = KDTree(lines.points).query_pairs(2.0 * float(lines.radius.max()) + voxel, output_type="ndarray")
     gap = np.linalg.norm(lines.points[pairs[:, 0]] - lines.points[pairs[:, 1]], axis=1)
-    pairs = pairs[gap < lines.clearance[pairs].sum(axis=1) + voxel]
+    pairs = pairs[gap < lines.radius[pairs].sum(axis=1) + voxel]
     sources, own = np.unique(pairs[:, 0], return_inverse=True)
     if len(sources) == 0:
         return None
-    along = np.asarray(dijkstra(lines.forest, indices=sources, limit=SHORTEST_LOOP_MM))
+    along = lines.away(sources, SHORTEST_LOOP_MM)
     touching = np.unique(pairs[np.isinf(along[own.reshape(-1), pairs[:, 1]])])
     if len(touching) == 0:
         return None
@@ -495,7 +491,7 @@ def _without_sides(mask: Volume, lines: MedialLines) -> tuple[Volume, Touch] | N
     home[tuple((index + 1).T)] = KDTree(lines.local).query(index * lines.edges_mm)[1]
     number = np.full(len(lines.points), -1)
     number[touching] = np.arange(len(touching))
-    distant = np.isinf(np.asarray(dijkstra(lines.forest, indices=touching, limit=SHORTEST_LOOP_MM)))
+    distant = np.isinf(lines.away(touching, SHORTEST_LOOP_MM))
     own = home[tuple((index + 1).T)]
     rim = np.zeros(len(index), dtype=bool)
     asked = np.flatnonzero(number[own] >= 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -22,6 +23,12 @@ thick slices keeps their steps, which are long in the plane; at 1, the crotch of
 _FIT_ITERATIONS = 8
 _BLOCK = 24
 """Edge in voxels of the blocks that a mask is smoothed in."""
+
+BAND_MM = 2.5
+"""How far outside the wall the distance map reaches, mm; beyond, it holds the constant −`BAND_MM`."""
+
+MAXIMUM_GRID_POINTS = 20_000_000
+"""A distance map holds at most this many grid points (80 MB of float32); the spacing grows until it fits."""
 
 _NEAREST_TRIANGLES = 4
 _WORTH_THREADS = 20_000
@@ -60,11 +67,6 @@ class Surface:
         products = [np.einsum("ij,ij->i", a, b)[:, None] for a, b in ((one, one), (one, two), (two, two))]
         return np.concatenate([corners[:, 0], one, two, *products], axis=1)
 
-    @property
-    def area(self) -> float:
-        """Area of the wall, mm²."""
-        return float(self.triangles()[2].sum())
-
     def triangles(self) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
         """Return the triangles' centres, mm, unit normals, and areas, mm²."""
         edges = np.diff(self._corners, axis=1)
@@ -82,7 +84,7 @@ class Surface:
     @property
     def mean_radius(self) -> float:
         """Radius of the tube that has a closed wall's volume and area, mm."""
-        return 2.0 * self.volume / self.area
+        return 2.0 * self.volume / float(self.triangles()[2].sum())
 
     def distance(self, points: Float[np.ndarray, "n 3"], *, limit_mm: float = np.inf) -> Float[np.ndarray, "n"]:
         """Return the unsigned distance in mm from points to the wall, `limit_mm` where it is at least that.
@@ -162,26 +164,30 @@ class Surface:
 
     def to_polydata(self):
         """Return the wall as a `vtkPolyData`."""
-        from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
-        from vtkmodules.vtkCommonCore import vtkPoints
-        from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+        return polydata_of(self.vertices, np.arange(0, 3 * len(self.faces) + 1, 3), self.faces.ravel(), "Polys")
 
-        points, cells, polydata = vtkPoints(), vtkCellArray(), vtkPolyData()
-        points.SetData(numpy_to_vtk(np.ascontiguousarray(self.vertices, dtype=float), deep=True))
-        cells.SetData(
-            numpy_to_vtkIdTypeArray(np.arange(0, 3 * len(self.faces) + 1, 3, dtype=np.int64), deep=True),
-            numpy_to_vtkIdTypeArray(np.ascontiguousarray(self.faces, dtype=np.int64).ravel(), deep=True),
-        )
-        polydata.SetPoints(points)
-        polydata.SetPolys(cells)
-        return polydata
+
+def polydata_of(
+    points: Float[np.ndarray, "n 3"],
+    offsets: Int[np.ndarray, "k"],
+    corners: Int[np.ndarray, "m"],
+    kind: Literal["Polys", "Lines"],
+):
+    """Return cells as a `vtkPolyData`: indices of points, and where among these each cell begins, and the last ends."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+
+    places, cells, polydata = vtkPoints(), vtkCellArray(), vtkPolyData()
+    places.SetData(numpy_to_vtk(np.ascontiguousarray(points, dtype=float), deep=True))
+    cells.SetData(*(numpy_to_vtkIdTypeArray(np.ascontiguousarray(i, np.int64), deep=True) for i in (offsets, corners)))
+    polydata.SetPoints(places)
+    (polydata.SetPolys if kind == "Polys" else polydata.SetLines)(cells)
+    return polydata
 
 
 def surface_from_mask(mask: Volume) -> Surface:
     """Return the smooth wall whose blurred inside equals the blurred mask: the zero level of `level_function`.
-
-    Args:
-        mask: boolean voxels, at least one of them true.
 
     Raises:
         InputError: the mask is nowhere thick enough to hold a lumen.
@@ -204,6 +210,14 @@ def surface_from_mask(mask: Volume) -> Surface:
     index = vertices * scale + corner
     surface = Surface(mask.index_to_world(index[:, ::-1].astype(float)), faces.astype(np.int64))
     return surface if surface.volume > 0 else Surface(surface.vertices, surface.faces[:, ::-1])
+
+
+def grid_of(
+    lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"], spacing: float
+) -> tuple[tuple[int, int, int], Float[np.ndarray, "3"]]:
+    """Return the shape (nz, ny, nx) and the LPS origin of a grid that covers a box, mm."""
+    counts = np.ceil((upper - lower) / spacing).astype(int) + 1
+    return (int(counts[2]), int(counts[1]), int(counts[0])), np.asarray(lower, dtype=float)
 
 
 def filled_box(voxels: Bool[np.ndarray, "nz ny nx"]) -> tuple[slice, slice, slice]:
