@@ -26,7 +26,7 @@ from endopilot.xray.carm import View
 from endopilot.xray.corridor import CATHETER_MM, make_corridor
 from endopilot.xray.corridor_view import CorridorView, box_around
 from endopilot.xray.projector import splat
-from endopilot.xray.tip_posterior import TipEstimate, estimate_tip, longest_mm
+from endopilot.xray.tip_posterior import Expected, TipEstimate, estimate_tip, longest_mm
 from endopilot.xray.wire_end import fit_end
 
 SCALES_PX = (1.0, 1.7, 2.8)
@@ -227,7 +227,7 @@ class TipDetector:
         views: Sequence[View],
         signals: Sequence[Signal],
         photons: Sequence[float],
-        inserted_length: float,
+        inserted_length: float | None,
         slack_mm: float | None = None,
         before: Sequence[Signal] | None = None,
     ) -> TipEstimate | None:
@@ -237,7 +237,7 @@ class TipDetector:
             views: of the images, in the CT's frame (`Registration.views`).
             signals: from `XrayImager.signal`.
             photons: that a pixel of usual brightness counts, in each image.
-            inserted_length: Δ by the robot's encoder, mm.
+            inserted_length: Δ by the robot's encoder, mm; None where there is none.
             slack_mm: how far outside the lumen the wire is looked for, mm; the configuration's if not given.
             before: images of the same views without a wire: lines in them that this exposure's noise, that of
                 `photons`, would show are none of its; none if not given.
@@ -253,11 +253,15 @@ class TipDetector:
         views: Sequence[View],
         signals: Sequence[Signal],
         photons: Sequence[float],
-        inserted_length: float,
+        inserted_length: float | None,
         slack_mm: float | None = None,
         before: Sequence[Signal] | None = None,
+        expected: Expected | None = None,
     ) -> TipEstimate:
-        """Return where the tip is if there is a wire, and how likely that is; the arguments are those of `find`."""
+        """Return where the tip is if there is a wire, and how likely that is.
+
+        The arguments are those of `find`, and what `estimate_tip` expects.
+        """
         slack_mm = self.config.slack_mm if slack_mm is None else slack_mm
         corridor = make_corridor(self._anatomy, self._radius_mm, slack_mm, longest_mm(inserted_length))
         shown = [CorridorView(corridor, *one) for one in zip(views, map(len, signals), strict=True)]
@@ -266,7 +270,8 @@ class TipDetector:
         lines = [] if before is None else [self._lines(*one) for one in zip(views, before, photons, strict=True)]
         for image, line in zip(evidence, lines, strict=before is not None):
             image[line] = 0.0
-        found = _refined(estimate_tip(corridor, shown, evidence, inserted_length), views, plain, self._radius_mm)
+        found = estimate_tip(corridor, shown, evidence, inserted_length, expected)
+        found = _refined(found, views, plain, self._radius_mm)
         hidden = any(_lies_on(line, view, found.position) for line, view in zip(lines, views, strict=False))
         return self._judged(found, hidden=hidden)
 

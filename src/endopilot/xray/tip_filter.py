@@ -117,6 +117,12 @@ class TipLocation:
     moved_mm: Float[np.ndarray, "3"]
     residual_mm: float
 
+    @classmethod
+    def nowhere(cls, frame: int) -> TipLocation:
+        """Return that a frame shows no tip."""
+        nothing = np.full(3, np.nan)
+        return cls(frame, "not found", nothing, np.full((3, 3), np.nan), 0.0, np.nan, -1, "", nothing, np.nan)
+
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
@@ -176,7 +182,7 @@ class TipFilter:
         else:
             self._begun = self._begin(lines)
         if all(line is None for line in lines):
-            return self._nowhere(frame)
+            return TipLocation.nowhere(frame)
         share = np.exp(self._log)
         base = share @ self._mean
         pairs, way = zip(self._cameras, lines, strict=True), self._moved(base)
@@ -191,7 +197,7 @@ class TipFilter:
         odds = fit.log_density - _STRAY * rows.used.sum(axis=1)
         whole = rows.value.shape[1] > 2 * len(seen)
         if np.logaddexp.reduce(self._log[places] + odds) < (_LEAST_ODDS if whole else 0.0):
-            return self._nowhere(frame)
+            return TipLocation.nowhere(frame)
         log = self._log[places] + odds + (_BEYOND - _STRAY) * beyond
         evidence = np.logaddexp.reduce(log)
         self._log = np.full_like(self._log, -np.inf)
@@ -300,10 +306,6 @@ class TipFilter:
             aside=np.einsum("mri,mr->mi", own, weight),
             aside_covariance=aside[:, :1, :1] * np.eye(3) - own.swapaxes(1, 2) @ solved[..., 7:],
         )
-
-    def _nowhere(self, frame: int) -> TipLocation:
-        nothing = np.full(3, np.nan)
-        return TipLocation(frame, "not found", nothing, np.full((3, 3), np.nan), 0.0, np.nan, -1, "", nothing, np.nan)
 
     def _answer(
         self, frame: int, places: Int[np.ndarray, "m"], fit: _Fit, rows: Observations, base: Float[np.ndarray, "6"]

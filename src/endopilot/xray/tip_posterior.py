@@ -36,6 +36,7 @@ _FOLDS, _FOLDS_APART_MM, _FOLD_ODDS = 4, 4.0, 60.0
 likely than the likeliest."""
 
 Status = Literal["found", "ambiguous", "not found"]
+Expected = Callable[[int, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +53,8 @@ class TipEstimate:
         wire: places of the wire from the catheter to the tip, LPS mm.
         middle: the vessel's centerline at these, LPS mm.
         room: how far from it the wire's axis may lie there, mm.
+        ends: branch (-1 in the catheter), abscissa, mm, and how likely a wire that does not fold ends there whatever
+            its length, a logarithm, of every section.
     """
 
     log_odds: float
@@ -62,16 +65,19 @@ class TipEstimate:
     wire: Float[np.ndarray, "n 3"]
     middle: Float[np.ndarray, "n 3"]
     room: Float[np.ndarray, "n"]
+    ends: Float[np.ndarray, "sections 3"]
     status: Status = "found"
 
 
-def longest_mm(inserted_length: float) -> float:
-    """Return how long the way to the tip is at most, by the robot's encoder, mm."""
-    return inserted_length + _LONGEST * _spread(inserted_length)[1]
+def longest_mm(inserted_length: float | None) -> float:
+    """Return how long the way to the tip is at most, by the robot's encoder, mm; any length without one."""
+    return np.inf if inserted_length is None else inserted_length + _LONGEST * _spread(inserted_length)[1]
 
 
-def _spread(inserted_length: float) -> tuple[float, float]:
+def _spread(inserted_length: float | None) -> tuple[float, float]:
     """Return by how much the way to the tip is shorter and longer than the inserted length: standard deviations, mm."""
+    if inserted_length is None:
+        return np.inf, np.inf
     wire_mm = max(inserted_length, 0.0)
     return _NEAR_MM + _SHORTER_SHARE * wire_mm, _NEAR_MM + _LONGER_SHARE * wire_mm
 
@@ -80,7 +86,8 @@ def estimate_tip(
     corridor: Corridor,
     shown: Sequence[CorridorView],
     evidence: Sequence[Float32[np.ndarray, "rows columns"]],
-    inserted_length: float,
+    inserted_length: float | None,
+    expected: Expected | None = None,
 ) -> TipEstimate:
     """Find the tip of a wire.
 
@@ -88,31 +95,40 @@ def estimate_tip(
         corridor: of the vessel.
         shown: it in each view, as registration has them.
         evidence: for each view the logarithm of how much likelier each pixel is on a wire than off it.
-        inserted_length: Δ by the robot's encoder, mm.
+        inserted_length: Δ by the robot's encoder, mm; None where there is none.
+        expected: how likely the tip is at places of a branch before the images are seen, a logarithm, by other times.
     """
     follower, (shorter, longer) = Follower(corridor, shown, evidence), _spread(inserted_length)
+    encoder = 0.0 if inserted_length is None else inserted_length
     legs = follower.forwards()
 
     def prior(lengths: Sequence[np.ndarray], share: float) -> Callable[[np.ndarray], np.ndarray]:
         def log(length: np.ndarray) -> np.ndarray:
-            excess = length - inserted_length
+            excess = length - encoder
             return -0.5 * (excess / np.where(excess > 0, longer, shorter)) ** 2
 
         everywhere = np.logaddexp.reduce(log(np.concatenate(lengths)))
         return lambda length: log(length) - everywhere + np.log(share)
 
     straight = prior([one.abscissa for one in corridor.passages], 1 - _FOLDED_SHARE)
+    ends = np.concatenate(
+        [np.column_stack([np.full(len(leg.section), leg.passage.branch), leg.length, leg.log_scale]) for leg in legs]
+    )
     scores = [leg.log_scale + straight(leg.length) for leg in legs]
-    folds = _folds(legs, inserted_length + 2 * longer)
+    folds = _folds(legs, encoder + 2 * longer)
     back = [one for leg, at in folds for one in follower.backwards(leg, at, longest_mm(inserted_length))]
     if back:
         folded = prior([leg.length for leg in back], _FOLDED_SHARE)
         scores += [leg.log_scale + folded(leg.length) for leg in back]
         legs += back
+    if expected is not None:
+        places = [(leg.passage.branch, leg.passage.abscissa[leg.section]) for leg in legs]
+        scores = [score + expected(*place) for score, place in zip(scores, places, strict=True)]
     total = float(np.logaddexp.reduce(np.concatenate(scores)))
     # What lies in the catheter alone is a poor sign of a wire: the catheter is a dark line too.
     catheter = max(float(legs[0].log_scale[-1]) - _MOST_OF_CATHETER, 0.0)
-    return _summary(follower, legs, [np.exp(values - total) for values in scores], total - catheter)
+    weights = [np.exp(values - total) for values in scores]
+    return _summary(follower, legs, weights, total - catheter, ends)
 
 
 def _folds(legs: Sequence[Leg], deepest_mm: float) -> list[tuple[Leg, int]]:
@@ -132,7 +148,11 @@ def _folds(legs: Sequence[Leg], deepest_mm: float) -> list[tuple[Leg, int]]:
 
 
 def _summary(
-    follower: Follower, legs: Sequence[Leg], weights: Sequence[Float[np.ndarray, "n"]], log_odds: float
+    follower: Follower,
+    legs: Sequence[Leg],
+    weights: Sequence[Float[np.ndarray, "n"]],
+    log_odds: float,
+    ends: Float[np.ndarray, "sections 3"],
 ) -> TipEstimate:
     """Return mean and covariance around the mode of the posterior, whose weight in each leg's sections is given."""
     best = int(np.argmax([weight.max() for weight in weights]))
@@ -159,6 +179,7 @@ def _summary(
         wire=places_of(way),
         middle=np.array([passage.middle[at] for passage, at in passed]),
         room=np.array([passage.room[at] for passage, at in passed]),
+        ends=ends,
     )
 
 
