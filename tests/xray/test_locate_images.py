@@ -95,7 +95,7 @@ def test_angles_of_another_sign_and_a_mirrored_image_are_found_out(made, wire) -
     anatomy = make_patient(AtlasConfig(seed=5), 0)
     imager = XrayImager(anatomy, wire, config=CONFIG.image)
     plane = imager.plane((-30.0, 20.0))
-    signals = np.stack([imager.signal(plane, np.zeros((0, 3)), contrast=k, seed=k) for k in (0, 1)])
+    signals = np.stack([imager.signal(plane, np.zeros((0, 3)), contrast=float(k), seed=k) for k in (0, 1)])
     known = read_cine(made / "cine.dcm").camera
     cine = XrayCine(made, signals[..., ::-1], np.arange(2.0), replace(known, angles_deg=(-30.0, -20.0)), ())
     found = locate_in_images(anatomy, cines=[cine], device=wire)

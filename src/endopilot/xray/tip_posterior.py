@@ -105,7 +105,8 @@ def estimate_tip(
     def prior(lengths: Sequence[np.ndarray], share: float) -> Callable[[np.ndarray], np.ndarray]:
         def log(length: np.ndarray) -> np.ndarray:
             excess = length - encoder
-            return -0.5 * (excess / np.where(excess > 0, longer, shorter)) ** 2
+            log = -0.5 * (excess / np.where(excess > 0, longer, shorter)) ** 2
+            return log if inserted_length is not None else np.where(length > 0, log, -np.inf)
 
         everywhere = np.logaddexp.reduce(log(np.concatenate(lengths)))
         return lambda length: log(length) - everywhere + np.log(share)
@@ -126,7 +127,8 @@ def estimate_tip(
         scores = [score + expected(*place) for score, place in zip(scores, places, strict=True)]
     total = float(np.logaddexp.reduce(np.concatenate(scores)))
     # What lies in the catheter alone is a poor sign of a wire: the catheter is a dark line too.
-    catheter = max(float(legs[0].log_scale[-1]) - _MOST_OF_CATHETER, 0.0)
+    most = _MOST_OF_CATHETER if inserted_length is not None else 0.0
+    catheter = max(float(legs[0].log_scale[-1]) - most, 0.0)
     weights = [np.exp(values - total) for values in scores]
     return _summary(follower, legs, weights, total - catheter, ends)
 
