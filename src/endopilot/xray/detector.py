@@ -19,14 +19,15 @@ from scipy.ndimage import label as connected_parts
 
 from endopilot.devices.device import Wire
 from endopilot.files import read_json
-from endopilot.settings import Finite, NonNegative, OpenShare, Share, settings
+from endopilot.settings import Finite, OpenShare, Positive, Share, settings
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import catheter_lumen_points, lumen_points
 from endopilot.xray.carm import View
-from endopilot.xray.corridor import CATHETER_MM, make_corridor
+from endopilot.xray.corridor import CATHETER_MM, Corridor, make_corridor
 from endopilot.xray.corridor_view import CorridorView, box_around
+from endopilot.xray.displacement import displacements
 from endopilot.xray.projector import splat
-from endopilot.xray.tip_posterior import Expected, TipEstimate, estimate_tip, longest_mm
+from endopilot.xray.tip_posterior import MODE_MM, Expected, TipEstimate, end_log, estimate_tip, longest_mm
 from endopilot.xray.wire_end import fit_end
 
 SCALES_PX = (1.0, 1.7, 2.8)
@@ -173,6 +174,10 @@ _KEPT_LINES = 8
 """Lines of so many images from before, or doses, are kept for the next exposures."""
 _HIDDEN_MM = 1.5
 """Standard deviation that a tip on such a line has more, mm."""
+_SLACK_MM = 0.3
+"""How far outside the lumen the wire's axis may seem to lie, mm: the grid that it is followed on is 0.2 mm."""
+_WORTH, _STAYS_MM = 0.0, 0.5
+"""A wire is also followed in a displaced vessel where that is likelier by this logarithm, and by more than this, mm."""
 _BELIEVABLE = 3.0
 """An end farther than this many standard deviations from the followed wire's is another line's."""
 
@@ -181,8 +186,10 @@ _BELIEVABLE = 3.0
 class DetectorConfig:
     """How far an image is trusted."""
 
-    slack_mm: NonNegative = 0.3
-    """How far outside the lumen the wire's axis may seem to lie, because registration is not perfect, mm."""
+    displaced: OpenShare = 0.2
+    """Share of the exposures in which the vessel lies elsewhere than registration has it."""
+    displaced_mm: Positive = 1.5
+    """How far it lies from there then, along each axis: standard deviation, mm."""
     hidden: OpenShare = 0.02
     """Share of the wire that is not seen, whatever the evidence against it."""
     alike: OpenShare = 0.05
@@ -222,30 +229,9 @@ class TipDetector:
         self._vessel = anatomy.tree.line.points
         self._filled = np.concatenate([points, behind[near]]), np.concatenate([volume, size[near]])
 
-    def find(
-        self,
-        views: Sequence[View],
-        signals: Sequence[Signal],
-        photons: Sequence[float],
-        inserted_length: float | None,
-        slack_mm: float | None = None,
-        before: Sequence[Signal] | None = None,
-    ) -> TipEstimate | None:
-        """Find the tip in the images of one exposure.
-
-        Args:
-            views: of the images, in the CT's frame (`Registration.views`).
-            signals: from `XrayImager.signal`.
-            photons: that a pixel of usual brightness counts, in each image.
-            inserted_length: Δ by the robot's encoder, mm; None where there is none.
-            slack_mm: how far outside the lumen the wire is looked for, mm; the configuration's if not given.
-            before: images of the same views without a wire: lines in them that this exposure's noise, that of
-                `photons`, would show are none of its; none if not given.
-
-        Returns:
-            The tip, found or ambiguous; None where there is no wire.
-        """
-        found = self.estimate(views, signals, photons, inserted_length, slack_mm, before)
+    def find(self, *image: Any, **how: Any) -> TipEstimate | None:
+        """Return the tip, found or ambiguous; None where there is no wire. The arguments are those of `estimate`."""
+        found = self.estimate(*image, **how)
         return None if found.status == "not found" else found
 
     def estimate(
@@ -254,33 +240,65 @@ class TipDetector:
         signals: Sequence[Signal],
         photons: Sequence[float],
         inserted_length: float | None,
-        slack_mm: float | None = None,
         before: Sequence[Signal] | None = None,
         expected: Expected | None = None,
+        displaced: Float[np.ndarray, "3 3"] | None = None,
     ) -> TipEstimate:
-        """Return where the tip is if there is a wire, and how likely that is.
+        """Return where the tip is in the images of one exposure if there is a wire, and how likely that is.
 
-        The arguments are those of `find`, and what `estimate_tip` expects.
+        Args:
+            views: of the images, in the CT's frame (`Registration.views`).
+            signals: from `XrayImager.signal`.
+            photons: that a pixel of usual brightness counts, in each image.
+            inserted_length: Δ by the robot's encoder, mm; None where there is none.
+            before: images of the same views without a wire: lines in them that this exposure's noise, that of
+                `photons`, would show are none of its; none if not given.
+            expected: as `estimate_tip` takes it.
+            displaced: covariance of how far the vessel lies from where the views have it, if it does not lie there,
+                mm²; the configuration's if not given.
         """
-        slack_mm = self.config.slack_mm if slack_mm is None else slack_mm
-        corridor = make_corridor(self._anatomy, self._radius_mm, slack_mm, longest_mm(inserted_length))
-        shown = [CorridorView(corridor, *one) for one in zip(views, map(len, signals), strict=True)]
-        seen = [self._look(*one) for one in zip(shown, signals, photons, strict=True)]
+        config, before = self.config, before or []
+        corridor = make_corridor(self._anatomy, self._radius_mm, _SLACK_MM, longest_mm(inserted_length))
+        seen = [self._look(corridor, *one) for one in zip(views, signals, photons, strict=True)]
         plain, evidence = [one for one, _ in seen], [one for _, one in seen]
-        lines = [] if before is None else [self._lines(*one) for one in zip(views, before, photons, strict=True)]
-        for image, line in zip(evidence, lines, strict=before is not None):
+        lines = [self._lines(*one) for one in zip(views, before, photons, strict=False)]
+        for image, line in zip(evidence, lines, strict=False):
             image[line] = 0.0
-        found = estimate_tip(corridor, shown, evidence, inserted_length, expected)
+
+        def follow(seen: Sequence[View]) -> TipEstimate:
+            shown = [CorridorView(corridor, view, len(image)) for view, image in zip(seen, evidence, strict=True)]
+            return estimate_tip(corridor, shown, evidence, inserted_length, expected)
+
+        here = follow(views)
+        covariance = config.displaced_mm**2 * np.eye(3) if displaced is None else displaced
+        ends = [end_log(one, inserted_length, expected) for one in corridor.passages]
+        moved = displacements(corridor, views, evidence, covariance, ends)
+        log_share = float(np.log(config.displaced / (1 - config.displaced)))
+        found = here
+        if moved.log_odds + log_share > _WORTH and np.linalg.norm(moved.shift) > _STAYS_MM:
+            views = [replace(view, source=view.source - moved.shift) for view in views]
+            there = follow(views)
+            # Laplace's evidence: of all shifts that were possible, one as narrow as what the images leave.
+            fits = -0.5 * float(moved.shift @ np.linalg.solve(covariance, moved.shift))
+            fits += 0.5 * float(np.linalg.slogdet(moved.covariance)[1] - np.linalg.slogdet(covariance)[1])
+            # A vessel that lies farther back shows more of the same wire in its catheter.
+            behind = here if moved.shift @ self._anatomy.insertion.direction > 0 else there
+            in_catheter = behind.ends[behind.ends[:, 0] < 0, 2][-1] / CATHETER_MM
+            fits += float(in_catheter * (moved.shift @ self._anatomy.insertion.direction))
+            odds = there.log_odds - here.log_odds + log_share + fits
+            found = _either(here, replace(there, shift=moved.shift, shift_covariance=moved.covariance), odds)
+            if found.shift is here.shift:
+                views = [replace(view, source=view.source + moved.shift) for view in views]
         found = _refined(found, views, plain, self._radius_mm)
         hidden = any(_lies_on(line, view, found.position) for line, view in zip(lines, views, strict=False))
         return self._judged(found, hidden=hidden)
 
-    def _look(self, shown: CorridorView, signal: Signal, photons: float) -> tuple[Signal, Signal]:
-        """Return an image without contrast, and how likely its pixels are on a wire, none where no vessel is near."""
-        rows, columns = (slice(max(side.start - _AROUND_PX, 0), side.stop + _AROUND_PX) for side in shown.box)
-        box, evidence = (rows, columns), np.zeros_like(signal)
-        plain = self.without_contrast(shown.view, signal, box)
-        evidence[box] = self._saturated(self._evidence(plain[box], photons, shown.pixels[box]))
+    def _look(self, corridor: Corridor, view: View, signal: Signal, photons: float) -> tuple[Signal, Signal]:
+        """Return an image without contrast, and how likely its pixels are on a wire, none far from the vessel."""
+        middle, evidence = np.concatenate([one.middle for one in corridor.passages]), np.zeros_like(signal)
+        box = box_around(view, middle, len(signal), around_px=_AROUND_PX)
+        plain = self.without_contrast(view, signal, box)
+        evidence[box] = self._saturated(self._evidence(plain[box], photons))
         return plain, evidence
 
     def _lines(self, view: View, before: Signal, photons: float) -> Bool[np.ndarray, "rows columns"]:
@@ -339,6 +357,17 @@ class TipDetector:
         return signal + np.float32(strength) * path_mm if strength > _LEAST_CONTRAST else signal
 
 
+def _either(here: TipEstimate, there: TipEstimate, odds: float) -> TipEstimate:
+    """Return the likelier of two estimates, given the logarithm of the second's odds; the other one is elsewhere."""
+    chosen, other, share = (there, here, odds) if odds > 0 else (here, there, -odds)
+    share = 1 / (1 + float(np.exp(-min(share, 30.0))))
+    off = other.position - chosen.position
+    if float(np.linalg.norm(off)) < MODE_MM:
+        return replace(chosen, covariance=chosen.covariance + (1 - share) * np.outer(off, off))
+    elsewhere = share * chosen.elsewhere + (1 - share) * np.outer(off, off)
+    return replace(chosen, share=share * chosen.share, elsewhere=elsewhere)
+
+
 def _halved(image: Signal) -> Float32[np.ndarray, "half_rows half_columns"]:
     """Return means of two by two pixels."""
     rows, columns = len(image) // 2, image.shape[1] // 2
@@ -376,5 +405,5 @@ def _refined(found: TipEstimate, views: Sequence[View], signals: Sequence[Signal
     if not fitted:
         position, covariance = found.position, found.covariance
     moved_mm, count = float(np.linalg.norm(position - found.position)), len(views)
-    covariance = _WIDER[count] * covariance + (_FIT_SHARE[count] * moved_mm) ** 2 * np.eye(3)
+    covariance = _WIDER[count] * covariance + (_FIT_SHARE[count] * moved_mm) ** 2 * np.eye(3) + found.shift_covariance
     return replace(found, position=position, covariance=covariance)

@@ -36,6 +36,9 @@ _DARKEST_SHARE = 0.05
 """This share of an image, the darkest, tells how much contrast a frame shows: vessels cover no less."""
 _LESS = 0.04
 """A frame lays the vessel by itself where image and vessel agree within this of the best frame's correlation."""
+_MOVES_MM = 2.5
+"""How far heart and breath move a vessel from where a landmark or another frame registers it, along each axis: standard
+deviation, mm, of the size of the published amplitudes (docs/concepts/motion.md)."""
 _ELSEWHERE_MM = 4.0
 """A tip this far from where all frames together have it is sought anew."""
 
@@ -86,14 +89,16 @@ def locate_in_images(
     for one in cines[1:]:
         if len(one.times_s) != count:
             raise InputError(f"{one.path}: {len(one.times_s)} frames, and {count} in {cines[0].path}; give one pair")
-    cines, poses, registered, best, notes = _registered(anatomy, tuple(cines), config)
+    cines, poses, near, registered, best, notes = _registered(anatomy, tuple(cines), config)
     isocenter = isocenter_of(anatomy)
     views = [[view_of(one.view(isocenter), pose, isocenter) for one in cines] for pose in poses]
     detector, photons = TipDetector(anatomy, device), [one.photons() for one in cines]
     found: list[TipEstimate] = []
+    moves = _MOVES_MM**2 * np.eye(3)
 
     def look(frame: int, expected: Callable[[int, np.ndarray], np.ndarray] | None) -> TipEstimate:
-        return detector.estimate(views[frame], [one.signals[frame] for one in cines], photons, None, expected=expected)
+        shown, off = [one.signals[frame] for one in cines], None if near[frame] == frame else moves
+        return detector.estimate(views[frame], shown, photons, None, expected=expected, displaced=off)
 
     with progress(f"locate {anatomy.name}", count) as advance:
         for frame in range(count):
@@ -120,8 +125,8 @@ def locate_in_images(
 
 def _registered(
     anatomy: Anatomy, cines: tuple[XrayCine, ...], config: LocateConfig
-) -> tuple[tuple[XrayCine, ...], list[Pose], Registration | None, int, tuple[str, ...]]:
-    """Return the cines as they fit the vessel, the pose at each frame, the best registration and its frame, and notes.
+) -> tuple[tuple[XrayCine, ...], list[Pose], list[int], Registration | None, int, tuple[str, ...]]:
+    """Return the cines as they fit the vessel, the pose at each frame and whose it is, the best one, and notes.
 
     Raises:
         InputError: nothing registers the patient.
@@ -136,7 +141,7 @@ def _registered(
         pixel = (np.array(config.landmark_px) - middle) * [1, -1]
         for _ in range(4):
             shift = shift + np.linalg.pinv(view.slope(point + shift)) @ (pixel - view.project(point + shift))
-        return cines, [Pose(translation_mm=shift)] * count, None, 0, notes
+        return cines, [Pose(translation_mm=shift)] * count, [-1] * count, None, 0, notes
     before = [np.quantile(one.signals, _EMPTY_SHARE, axis=0).astype(np.float32) for one in cines]
     contrast = np.sum([_contrast(one, empty) for one, empty in zip(cines, before, strict=True)], axis=0)
     best = int(contrast.argmax())
@@ -161,9 +166,10 @@ def _registered(
             known[frame] = register(anatomy, views, lit, before, cines[0].image, known[near].pose)
     most = max(one.correlation for one in known.values())
     known = {frame: one for frame, one in known.items() if not one.failure and one.correlation > most - _LESS}
-    poses = [known[min(known, key=lambda one: abs(one - frame))].pose for frame in range(count)]
+    near = [min(known, key=lambda one: abs(one - frame)) for frame in range(count)]
+    poses = [known[of].pose for of in near]
     best = max(known, key=lambda one: known[one].correlation)
-    return cines, poses, known[best], best, (*notes, *([said] if said else []))
+    return cines, poses, near, known[best], best, (*notes, *([said] if said else []))
 
 
 def _contrast(cine: XrayCine, before: Float32[np.ndarray, "rows rows"]) -> Float[np.ndarray, "frames"]:

@@ -8,13 +8,13 @@ with one the vessel gives it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from endopilot.xray.corridor import STEP_MM, Corridor
+from endopilot.xray.corridor import STEP_MM, Corridor, Passage
 from endopilot.xray.corridor_view import CorridorView
 from endopilot.xray.wire_following import Follower, Leg, places_of
 
@@ -25,7 +25,7 @@ _LONGEST = 4.0
 """No way is longer than the inserted length by more than so many standard deviations."""
 _MOST_OF_CATHETER = 20.0
 """The evidence of a wire in the catheter counts no more than this."""
-_MODE_MM = 4.0
+MODE_MM = 4.0
 """Mean and covariance are those of the posterior within this distance of its mode, mm."""
 _NOTHING = 1e-8
 """A place with less of the posterior is left out of the sums."""
@@ -67,6 +67,8 @@ class TipEstimate:
     room: Float[np.ndarray, "n"]
     ends: Float[np.ndarray, "sections 3"]
     status: Status = "found"
+    shift: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    shift_covariance: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
 
 
 def longest_mm(inserted_length: float | None) -> float:
@@ -80,6 +82,16 @@ def _spread(inserted_length: float | None) -> tuple[float, float]:
         return np.inf, np.inf
     wire_mm = max(inserted_length, 0.0)
     return _NEAR_MM + _SHORTER_SHARE * wire_mm, _NEAR_MM + _LONGER_SHARE * wire_mm
+
+
+def end_log(passage: Passage, inserted_length: float | None, expected: Expected | None) -> Float[np.ndarray, "n"]:
+    """Return how likely a wire ends in each section of a passage before images are seen, a logarithm; unnormalised."""
+    shorter, longer = _spread(inserted_length)
+    excess = passage.abscissa - (inserted_length or 0.0)
+    log = -0.5 * (excess / np.where(excess > 0, longer, shorter)) ** 2
+    if inserted_length is None and passage.branch < 0:
+        log = np.full(len(excess), -np.inf)
+    return log if expected is None else log + expected(passage.branch, passage.abscissa)
 
 
 def estimate_tip(
@@ -165,7 +177,7 @@ def _summary(
     ) / here.sum()
     parts = [_counted(leg, weight) for leg, weight in zip(legs, weights, strict=True)]
     places, weight = (np.concatenate(part) for part in zip(*parts, strict=True))
-    near = ((places - mode) ** 2).sum(axis=1) <= _MODE_MM**2
+    near = ((places - mode) ** 2).sum(axis=1) <= MODE_MM**2
     # A cell has a size: that of a section's step and of its grid.
     share, mean, covariance = around_mode(places, weight, near, STEP_MM)
     far = places[~near] - mean
