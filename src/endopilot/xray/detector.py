@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32
 from scipy.ndimage import binary_dilation, gaussian_filter
 from scipy.ndimage import label as connected_parts
 
@@ -30,6 +30,7 @@ from endopilot.xray.projector import splat
 from endopilot.xray.tip_posterior import MODE_MM, Expected, TipEstimate, end_log, estimate_tip, longest_mm
 from endopilot.xray.wire_end import fit_end
 
+Signal = Float32[np.ndarray, "rows columns"]
 SCALES_PX = (1.0, 1.7, 2.8)
 """Standard deviations of the Gaussians whose second derivatives are taken; a coronary wire is some 1.7 pixels wide."""
 _BESIDE_PX = 8.0
@@ -56,65 +57,44 @@ class RidgeEvidence:
         found = read_json(path)
         return cls(np.array(found["weight"]), float(found["offset"]))
 
-    def __call__(
-        self,
-        signal: Float32[np.ndarray, "rows columns"],
-        photons: float,
-        where: Bool[np.ndarray, "rows columns"] | None = None,
-    ) -> Float32[np.ndarray, "rows columns"]:
+    def __call__(self, signal: Signal, photons: float) -> Signal:
         """Return the logarithm of how much likelier each pixel is on a wire than off it.
 
         Args:
             signal: from `XrayImager.signal`.
             photons: that a pixel of usual brightness counts.
-            where: pixels that it is wanted of; 0 elsewhere; all if not given.
         """
-        pixels = None if where is None else np.flatnonzero(where)
-        found = features(signal, photons, pixels)
+        found = features(signal, photons)
         count = len(found)
         square = np.zeros((count, count), dtype=np.float32)
         square[np.triu_indices(count)] = self.weight[count:] / _MOST
         # The same as `products` times the weights, without an image for each product.
         terms = square @ found + self.weight[:count, None].astype(np.float32)
-        likelier = np.einsum("fn,fn->n", terms, found) + np.float32(self.offset)
-        if pixels is None:
-            return likelier.reshape(signal.shape)
-        evidence = np.zeros(signal.shape, dtype=np.float32)
-        evidence.ravel()[pixels] = likelier
-        return evidence
+        return (np.einsum("fn,fn->n", terms, found) + np.float32(self.offset)).reshape(signal.shape)
 
 
-def features(
-    signal: Float32[np.ndarray, "rows columns"], photons: float, pixels: Int[np.ndarray, "n"] | None = None
-) -> Float32[np.ndarray, "f n"]:
-    """Return the features of some pixels of the flat image, or of all: ridges and darkness over the noise, and that."""
-    chosen = slice(None) if pixels is None else pixels
+def features(signal: Signal, photons: float) -> Float32[np.ndarray, "f n"]:
+    """Return the features of the flat image's pixels: ridges and darkness over the noise, and that."""
     smooth = [gaussian_filter(signal, scale, mode="nearest") for scale in SCALES_PX]
-    around = _smoother(smooth[-1], SCALES_PX[-1], _BESIDE_PX).ravel()[chosen]
+    around = _smoother(smooth[-1], SCALES_PX[-1], _BESIDE_PX).ravel()
     noise = np.exp(-0.5 * around) / np.float32(np.sqrt(photons))
     found = np.empty((2 * len(SCALES_PX) + 2, len(around)), dtype=np.float32)
     for number, (scale, image) in enumerate(zip(SCALES_PX, smooth, strict=True)):
-        mean, half = _curvatures(image, pixels)
+        mean, half = _curvatures(image)
         # The Hessian of white noise, smoothed, falls with the third power of the scale.
         weight = np.float32(scale**3) / noise
         found[2 * number], found[2 * number + 1] = weight * (mean + half), weight * (mean - half)
-    found[-2] = (around - smooth[0].ravel()[chosen]) / noise * np.float32(SCALES_PX[0])
+    found[-2] = (around - smooth[0].ravel()) / noise * np.float32(SCALES_PX[0])
     found[-1] = np.log(noise)
     return np.clip(found, -_MOST, _MOST, out=found)
 
 
-def _curvatures(
-    image: Float32[np.ndarray, "rows columns"], pixels: Int[np.ndarray, "n"] | None
-) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"]]:
-    """Return the mean of the two principal curvatures of some pixels, and half their difference."""
+def _curvatures(image: Signal) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"]]:
+    """Return the mean of the two principal curvatures of the flat image's pixels, and half their difference."""
     (rows, columns), padded = image.shape, np.pad(image, 2, mode="edge")
-    width, flat = columns + 4, padded.ravel()
-    at = None if pixels is None else (pixels // columns + 2) * width + pixels % columns + 2
 
     def beside(down: int, right: int) -> Float32[np.ndarray, "n"]:
-        if at is None:
-            return padded[2 + down : 2 + down + rows, 2 + right : 2 + right + columns].ravel()
-        return flat[at + (down * width + right)]
+        return padded[2 + down : 2 + down + rows, 2 + right : 2 + right + columns].ravel()
 
     here = 2 * beside(0, 0)
     down, right = beside(2, 0) - here + beside(-2, 0), beside(0, 2) - here + beside(0, -2)
@@ -122,9 +102,7 @@ def _curvatures(
     return 0.125 * (down + right), 0.125 * np.sqrt((down - right) ** 2 + 4 * mixed**2)
 
 
-def _smoother(
-    image: Float32[np.ndarray, "rows columns"], done_px: float, scale_px: float
-) -> Float32[np.ndarray, "rows columns"]:
+def _smoother(image: Signal, done_px: float, scale_px: float) -> Signal:
     """Return an image, smoothed already, smoothed to a larger standard deviation: every other pixel will do."""
     rows, columns = image.shape
     part = gaussian_filter(image[::2, ::2], 0.5 * float(np.sqrt(scale_px**2 - done_px**2)))
@@ -142,7 +120,6 @@ def products(values: Float32[np.ndarray, "*n f"]) -> Float32[np.ndarray, "*n ter
     return np.concatenate([values, values[..., rows] * values[..., columns] / np.float32(_MOST)], axis=-1)
 
 
-Signal = Float32[np.ndarray, "rows columns"]
 _HIGH_PASS_PX, _AROUND_PX = 12.0, 24
 """Contrast is what is darker than its surroundings, blurred by this; and how much of an image around the vessel is
 looked at, pixels."""
@@ -271,7 +248,8 @@ class TipDetector:
 
         here = follow(views)
         covariance = config.displaced_mm**2 * np.eye(3) if displaced is None else displaced
-        ends = [end_log(one, inserted_length, expected) for one in corridor.passages]
+        places = [(one.branch, one.abscissa, one.abscissa) for one in corridor.passages]
+        ends = [end_log(*place, inserted_length, expected) for place in places]
         moved = displacements(corridor, views, evidence, covariance, ends)
         log_share = float(np.log(config.displaced / (1 - config.displaced)))
         found = here

@@ -27,7 +27,7 @@ from endopilot.xray.detector import TipDetector
 from endopilot.xray.image import isocenter_of
 from endopilot.xray.line_observations import VesselGrid, make_grid
 from endopilot.xray.registration import Registration, lay, observed_contrast, register
-from endopilot.xray.tip_filter import LocateConfig, TipLocation
+from endopilot.xray.tip_filter import LocateConfig, TipLocation, goes
 from endopilot.xray.tip_posterior import TipEstimate
 
 _EMPTY_SHARE = 0.9
@@ -229,10 +229,8 @@ class _Track:
         self._prior, self._log = ahead + back, ahead + back + seen
 
     def _gone(self, log: Float[np.ndarray, "n"], seconds: float) -> Float[np.ndarray, "n"]:
-        stay = np.exp(-self._grid.distance / (self._config.travel_mm * max(seconds, 1e-3) / _FRAME_S))
-        rare = self._config.anywhere_share
-        goes = (1 - rare) * stay / stay.sum(axis=1, keepdims=True) + rare / len(stay)
-        return np.log(goes.T @ np.exp(log - log.max()) + 1e-300)
+        flow = goes(self._grid, self._config, max(seconds, 1e-3) / _FRAME_S)
+        return np.log(flow.T @ np.exp(log - log.max()) + 1e-300)
 
     def elsewhere(self, frame: int, one: TipEstimate) -> bool:
         """Return whether all frames together have the tip elsewhere than a frame by itself."""

@@ -144,6 +144,13 @@ class _Fit:
     aside_covariance: Float[np.ndarray, "m 3 3"]
 
 
+def goes(grid: VesselGrid, config: LocateConfig, frames: float) -> Float[np.ndarray, "n n"]:
+    """Return how likely the tip goes from each place to each in so many frames' time."""
+    stay = np.exp(-grid.distance / (config.travel_mm * frames))
+    rare = min(config.anywhere_share * frames, 0.5)
+    return (1 - rare) * stay / stay.sum(axis=1, keepdims=True) + rare / len(stay)
+
+
 class TipFilter:
     """Follows the tip of one device through the frames of a sequence.
 
@@ -157,9 +164,6 @@ class TipFilter:
         self._tree, self._cameras = tree, tuple(cameras)
         self.grid: VesselGrid = make_grid(tree, step_mm=_STEP_MM, stiff_mm=self.config.stiff_mm)
         count = len(self.grid.middle)
-        stay = np.exp(-self.grid.distance / self.config.travel_mm)
-        rare = self.config.anywhere_share
-        self._goes = (1 - rare) * stay / stay.sum(axis=1, keepdims=True) + rare / count
         self._centre = self.grid.way.mean(axis=0)
         self._aside = _ASIDE_SD_MM + _ASIDE_RADII * self.grid.radius
         turn = np.deg2rad(self.config.turn_sd_deg)
@@ -178,9 +182,10 @@ class TipFilter:
                 the tip alone; None where the camera does not see it.
         """
         if self._begun:
-            self._predict()
+            self._predict(max(frame - self._frame, 1))
         else:
             self._begun = self._begin(lines)
+        self._frame = frame
         if all(line is None for line in lines):
             return TipLocation.nowhere(frame)
         share = np.exp(self._log)
@@ -226,9 +231,9 @@ class TipFilter:
         self._covariance[:, :3, :3] = _LANDMARK_SD_MM**2 * np.eye(3)
         return True
 
-    def _predict(self) -> None:
-        """Let the tip travel and the pose drift; what comes together at a place is one normal distribution there."""
-        flow = self._goes * np.exp(self._log)[:, None]
+    def _predict(self, frames: int) -> None:
+        """Let the tip travel and the pose drift for some frames; what comes together at a place is one normal there."""
+        flow = goes(self.grid, self.config, float(frames)) * np.exp(self._log)[:, None]
         total = flow.sum(axis=0)
         flow /= total
         square = self._covariance + self._mean[:, :, None] * self._mean[:, None]
@@ -236,7 +241,7 @@ class TipFilter:
         square = (flow.T @ square.reshape(len(total), -1)).reshape(square.shape)
         drift = np.array([*[_DRIFT_MM] * 3, *[_DRIFT_RAD] * 3])
         self._log, self._mean = np.log(total), mean
-        self._covariance = square - mean[:, :, None] * mean[:, None] + np.diag(drift**2)
+        self._covariance = square - mean[:, :, None] * mean[:, None] + frames * np.diag(drift**2)
 
     def _moved(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "n 3"]:
         matrix = Rotation.from_rotvec(pose[3:6]).as_matrix()

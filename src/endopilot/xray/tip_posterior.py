@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from endopilot.xray.corridor import STEP_MM, Corridor, Passage
+from endopilot.xray.corridor import STEP_MM, Corridor
 from endopilot.xray.corridor_view import CorridorView
 from endopilot.xray.wire_following import Follower, Leg, places_of
 
@@ -51,8 +51,6 @@ class TipEstimate:
         elsewhere: what the rest adds to the covariance, mm².
         status: "found"; "ambiguous" where the tip may well lie elsewhere; "not found" where there is no wire.
         wire: places of the wire from the catheter to the tip, LPS mm.
-        middle: the vessel's centerline at these, LPS mm.
-        room: how far from it the wire's axis may lie there, mm.
         ends: branch (-1 in the catheter), abscissa, mm, and how likely a wire that does not fold ends there whatever
             its length, a logarithm, of every section.
     """
@@ -63,8 +61,6 @@ class TipEstimate:
     share: float
     elsewhere: Float[np.ndarray, "3 3"]
     wire: Float[np.ndarray, "n 3"]
-    middle: Float[np.ndarray, "n 3"]
-    room: Float[np.ndarray, "n"]
     ends: Float[np.ndarray, "sections 3"]
     status: Status = "found"
     shift: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
@@ -84,14 +80,27 @@ def _spread(inserted_length: float | None) -> tuple[float, float]:
     return _NEAR_MM + _SHORTER_SHARE * wire_mm, _NEAR_MM + _LONGER_SHARE * wire_mm
 
 
-def end_log(passage: Passage, inserted_length: float | None, expected: Expected | None) -> Float[np.ndarray, "n"]:
-    """Return how likely a wire ends in each section of a passage before images are seen, a logarithm; unnormalised."""
+def end_log(
+    branch: int,
+    abscissa: Float[np.ndarray, "n"],
+    length: Float[np.ndarray, "n"],
+    inserted_length: float | None,
+    expected: Expected | None,
+) -> Float[np.ndarray, "n"]:
+    """Return how likely a wire ends at some places before images are seen, a logarithm; unnormalised.
+
+    Args:
+        branch: that they lie in; -1 for the catheter.
+        abscissa: of the places, mm.
+        length: of the wire up to them, mm.
+        inserted_length, expected: as `estimate_tip` takes them.
+    """
     shorter, longer = _spread(inserted_length)
-    excess = passage.abscissa - (inserted_length or 0.0)
+    excess = length - (inserted_length or 0.0)
     log = -0.5 * (excess / np.where(excess > 0, longer, shorter)) ** 2
-    if inserted_length is None and passage.branch < 0:
+    if inserted_length is None and branch < 0:
         log = np.full(len(excess), -np.inf)
-    return log if expected is None else log + expected(passage.branch, passage.abscissa)
+    return log if expected is None else log + expected(branch, abscissa)
 
 
 def estimate_tip(
@@ -110,33 +119,27 @@ def estimate_tip(
         inserted_length: Δ by the robot's encoder, mm; None where there is none.
         expected: how likely the tip is at places of a branch before the images are seen, a logarithm, by other times.
     """
-    follower, (shorter, longer) = Follower(corridor, shown, evidence), _spread(inserted_length)
-    encoder = 0.0 if inserted_length is None else inserted_length
+    follower = Follower(corridor, shown, evidence)
     legs = follower.forwards()
 
-    def prior(lengths: Sequence[np.ndarray], share: float) -> Callable[[np.ndarray], np.ndarray]:
-        def log(length: np.ndarray) -> np.ndarray:
-            excess = length - encoder
-            log = -0.5 * (excess / np.where(excess > 0, longer, shorter)) ** 2
-            return log if inserted_length is not None else np.where(length > 0, log, -np.inf)
+    def weighed(some: Sequence[Leg], everywhere: Sequence[np.ndarray], share: float) -> list[np.ndarray]:
+        whole = np.logaddexp.reduce(np.concatenate(everywhere)) - np.log(share)
+        return [leg.log_scale + before(leg) - whole for leg in some]
 
-        everywhere = np.logaddexp.reduce(log(np.concatenate(lengths)))
-        return lambda length: log(length) - everywhere + np.log(share)
+    def before(leg: Leg) -> np.ndarray:
+        abscissa = leg.passage.abscissa[leg.section]
+        return end_log(leg.passage.branch, abscissa, leg.length, inserted_length, expected)
 
-    straight = prior([one.abscissa for one in corridor.passages], 1 - _FOLDED_SHARE)
     ends = np.concatenate(
         [np.column_stack([np.full(len(leg.section), leg.passage.branch), leg.length, leg.log_scale]) for leg in legs]
     )
-    scores = [leg.log_scale + straight(leg.length) for leg in legs]
-    folds = _folds(legs, encoder + 2 * longer)
+    places = [(one.branch, one.abscissa, one.abscissa) for one in corridor.passages]
+    scores = weighed(legs, [end_log(*place, inserted_length, expected) for place in places], 1 - _FOLDED_SHARE)
+    folds = _folds(legs, np.inf if inserted_length is None else inserted_length + 2 * _spread(inserted_length)[1])
     back = [one for leg, at in folds for one in follower.backwards(leg, at, longest_mm(inserted_length))]
     if back:
-        folded = prior([leg.length for leg in back], _FOLDED_SHARE)
-        scores += [leg.log_scale + folded(leg.length) for leg in back]
+        scores += weighed(back, [before(leg) for leg in back], _FOLDED_SHARE)
         legs += back
-    if expected is not None:
-        places = [(leg.passage.branch, leg.passage.abscissa[leg.section]) for leg in legs]
-        scores = [score + expected(*place) for score, place in zip(scores, places, strict=True)]
     total = float(np.logaddexp.reduce(np.concatenate(scores)))
     # What lies in the catheter alone is a poor sign of a wire: the catheter is a dark line too.
     most = _MOST_OF_CATHETER if inserted_length is not None else 0.0
@@ -182,17 +185,13 @@ def _summary(
     share, mean, covariance = around_mode(places, weight, near, STEP_MM)
     far = places[~near] - mean
     elsewhere = (weight[~near, None] * far).T @ far
-    way = follower.way(legs[best], section)
-    passed = [(stop.leg.passage, stop.leg.section[stop.at]) for stop in way]
     return TipEstimate(
         log_odds=log_odds,
         position=mean,
         covariance=covariance,
         share=share,
         elsewhere=elsewhere,
-        wire=places_of(way),
-        middle=np.array([passage.middle[at] for passage, at in passed]),
-        room=np.array([passage.room[at] for passage, at in passed]),
+        wire=places_of(follower.way(legs[best], section)),
         ends=ends,
     )
 
