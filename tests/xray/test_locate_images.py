@@ -101,7 +101,8 @@ def test_angles_of_another_sign_and_a_mirrored_image_are_found_out(made, wire) -
     found = locate_in_images(anatomy, cines=[cine], device=wire)
     (said,) = found.notes
     assert "PositionerSecondaryAngle has the other sign" in said and "mirrored left to right" in said
-    assert found.cines[0].camera.angles_deg == (-30.0, 20.0) and found.registration.correlation > 0.95
+    assert found.cines[0].camera.angles_deg == (-30.0, 20.0)
+    assert found.registration is not None and found.registration.correlation > 0.95
     assert [one.status for one in found.tips] == ["not found"] * 2
 
 

@@ -92,10 +92,11 @@ _Found = tuple[Sequence[TipLocation], dict[str, Any], dict[str, Any], Sequence[s
 def _in_lines(
     vessel: Anatomy, seen: tuple[Path, ...], camera: tuple[Path, ...], device: str, config: LocateConfig
 ) -> _Found:
-    if len(seen) > 1 or not 1 <= len(camera) <= 2:
+    if not (len(seen) == 1 and 1 <= len(camera) <= 2):
         raise InputError(f"--camera: {len(camera)} files for {len(seen)} of lines; give one for each view, one or two")
     cameras = [read_camera(path) for path in camera]
-    frames = read_frames(seen[0], views=len(cameras))
+    lines = next(iter(seen))
+    frames = read_frames(lines, views=len(cameras))
     found = locate(vessel, frames=frames, cameras=cameras, config=config)
     residuals = [one.residual_mm for one in found if one.residual_mm == one.residual_mm]
     drawn = {
@@ -114,9 +115,9 @@ def _in_images(
     planes = [seen] if seen[0].suffix.lower() == ".png" else [(one,) for one in seen]
     if len(planes) > 2:
         raise InputError(f"{seen[2]}: is a third cine; give one, or two of planes that were exposed together")
-    if camera and len(camera) != len(planes):
+    if len(camera) not in (0, len(planes)):
         raise InputError(f"--camera: {len(camera)} files for {len(planes)} planes; give one for each")
-    cines = [read_cine(paths, c_arm=camera[k] if camera else None) for k, paths in enumerate(planes)]
+    cines = [read_cine(paths, c_arm=camera[k] if len(camera) else None) for k, paths in enumerate(planes)]
     found = locate_in_images(vessel, cines=cines, device=Stack.of(device).wire, config=config)
     drawn = {
         "lines": [None if wire is None else found.pixels(frame, wire[::-1]) for frame, wire in enumerate(found.wires)],

@@ -6,8 +6,7 @@ the frames, is anywhere: so a tip in the wrong branch is found again. Heart and 
 in each frame.
 
 In a frame the device's line is compared with the projected way to each place (`line_observations`), with what is known
-of pose, of breathing, and of how far the device lies off its way. Lines are those of any detector; those of
-`TipDetector`, which knows nothing of other times, are turned into frames by `frames.frame_of`.
+of pose, of breathing, and of how far the device lies off its way.
 """
 
 from __future__ import annotations
