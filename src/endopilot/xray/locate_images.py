@@ -34,11 +34,15 @@ _EMPTY_SHARE = 0.9
 """A pixel's light where no contrast passes is this quantile of the frames': contrast and wire darken fewer."""
 _DARKEST_SHARE = 0.05
 """This share of an image, the darkest, tells how much contrast a frame shows: vessels cover no less."""
-_LESS = 0.04
-"""A frame lays the vessel by itself where image and vessel agree within this of the best frame's correlation."""
+_LESS = 0.06
+"""They do where image and vessel agree within this of the best frame's correlation."""
+_SOME = 0.4
+"""Frames with this share of the most contrast lay the vessel by themselves."""
 _MOVES_MM = 2.5
 """How far heart and breath move a vessel from where a landmark or another frame registers it, along each axis: standard
 deviation, mm, of the size of the published amplitudes (docs/concepts/motion.md)."""
+_FEWEST, _STIRS_MM = 4, 1.0
+"""From so many frames on, how far their vessels lie apart says how far it moves; and by how much more at least, mm."""
 _ELSEWHERE_MM = 4.0
 """A tip this far from where all frames together have it is sought anew."""
 
@@ -89,16 +93,15 @@ def locate_in_images(
     for one in cines[1:]:
         if len(one.times_s) != count:
             raise InputError(f"{one.path}: {len(one.times_s)} frames, and {count} in {cines[0].path}; give one pair")
-    cines, poses, near, registered, best, notes = _registered(anatomy, tuple(cines), config)
+    cines, poses, moves, registered, best, notes = _registered(anatomy, tuple(cines), config)
     isocenter = isocenter_of(anatomy)
     views = [[view_of(one.view(isocenter), pose, isocenter) for one in cines] for pose in poses]
     detector, photons = TipDetector(anatomy, device), [one.photons() for one in cines]
     found: list[TipEstimate] = []
-    moves = _MOVES_MM**2 * np.eye(3)
 
     def look(frame: int, expected: Callable[[int, np.ndarray], np.ndarray] | None) -> TipEstimate:
-        shown, off = [one.signals[frame] for one in cines], None if near[frame] == frame else moves
-        return detector.estimate(views[frame], shown, photons, None, expected=expected, displaced=off)
+        shown = [one.signals[frame] for one in cines]
+        return detector.estimate(views[frame], shown, photons, None, expected=expected, displaced=moves[frame])
 
     with progress(f"locate {anatomy.name}", count) as advance:
         for frame in range(count):
@@ -125,8 +128,8 @@ def locate_in_images(
 
 def _registered(
     anatomy: Anatomy, cines: tuple[XrayCine, ...], config: LocateConfig
-) -> tuple[tuple[XrayCine, ...], list[Pose], list[int], Registration | None, int, tuple[str, ...]]:
-    """Return the cines as they fit the vessel, the pose at each frame and whose it is, the best one, and notes.
+) -> tuple[tuple[XrayCine, ...], list[Pose], list[np.ndarray | None], Registration | None, int, tuple[str, ...]]:
+    """Return the cines as they fit the vessel, the pose at each frame and how far off, the best one, and notes.
 
     Raises:
         InputError: nothing registers the patient.
@@ -141,7 +144,7 @@ def _registered(
         pixel = (np.array(config.landmark_px) - middle) * [1, -1]
         for _ in range(4):
             shift = shift + np.linalg.pinv(view.slope(point + shift)) @ (pixel - view.project(point + shift))
-        return cines, [Pose(translation_mm=shift)] * count, [-1] * count, None, 0, notes
+        return cines, [Pose(translation_mm=shift)] * count, [_MOVES_MM**2 * np.eye(3)] * count, None, 0, notes
     before = [np.quantile(one.signals, _EMPTY_SHARE, axis=0).astype(np.float32) for one in cines]
     contrast = np.sum([_contrast(one, empty) for one, empty in zip(cines, before, strict=True)], axis=0)
     best = int(contrast.argmax())
@@ -160,16 +163,25 @@ def _registered(
         )
     views, known = [one.view(isocenter) for one in cines], {best: first}
     for frame in sorted(range(count), key=lambda one: (one < best, abs(one - best))):
-        if frame != best and contrast[frame] > 0.5 * contrast[best]:
+        if frame != best and contrast[frame] > _SOME * contrast[best]:
             near = min(known, key=lambda one: abs(one - frame))
             lit = [one.signals[frame] for one in cines]
-            known[frame] = register(anatomy, views, lit, before, cines[0].image, known[near].pose)
+            laid = register(anatomy, views, lit, before, cines[0].image, known[near].pose)
+            known |= {} if laid.failure else {frame: laid}
     most = max(one.correlation for one in known.values())
-    known = {frame: one for frame, one in known.items() if not one.failure and one.correlation > most - _LESS}
-    near = [min(known, key=lambda one: abs(one - frame)) for frame in range(count)]
-    poses = [known[of].pose for of in near]
+    known = {frame: one for frame, one in known.items() if one.correlation > most - _LESS}
+    poses = {frame: one.pose for frame, one in known.items()}
+    # Where a frame shows no contrast, the vessel lies as far from its mean place as in those that do.
+    points = anatomy.tree.line.points[::8]
+    lies = np.array([one.move(points, isocenter) for one in poses.values()])
+    off = lies - lies.mean(axis=0)
+    spread = np.einsum("kni,knj->ij", off, off) / off[..., 0].size + _STIRS_MM**2 * np.eye(3)
+    spread += max(_FEWEST - len(known), 0) / _FEWEST * _MOVES_MM**2 * np.eye(3)
+    mean = Pose.of_vector(np.mean([one.vector for one in poses.values()], axis=0))
+    moves = [None if frame in known else spread for frame in range(count)]
     best = max(known, key=lambda one: known[one].correlation)
-    return cines, poses, near, known[best], best, (*notes, *([said] if said else []))
+    poses = [poses.get(frame, mean) for frame in range(count)]
+    return cines, poses, moves, known[best], best, (*notes, *([said] if said else []))
 
 
 def _contrast(cine: XrayCine, before: Float32[np.ndarray, "rows rows"]) -> Float[np.ndarray, "frames"]:
