@@ -17,7 +17,7 @@ from endopilot.angiograms.config import AngiogramsConfig
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.cli import command_of
 from endopilot.errors import InputError
-from endopilot.xray.carm import CArmGeometry
+from endopilot.xray.carm import CArmGeometry, Pose
 from endopilot.xray.cine import XrayCine, read_cine
 from endopilot.xray.image import ImageConfig, XrayImager
 from endopilot.xray.locate_images import locate_in_images
@@ -104,6 +104,21 @@ def test_angles_of_another_sign_and_a_mirrored_image_are_found_out(made, wire) -
     assert found.cines[0].camera.angles_deg == (-30.0, 20.0)
     assert found.registration is not None and found.registration.correlation > 0.95
     assert [one.status for one in found.tips] == ["not found"] * 2
+
+
+def test_two_planes_are_read_together(made, fork, wire) -> None:
+    imager, known = XrayImager(fork, wire, config=CONFIG.image), read_cine(made / "cine.dcm").camera
+    at, cines = np.arange(30.0, -30.0, -0.5), []
+    nodes = np.stack([0.0 * at, 0.4 + 0.0 * at, at], axis=-1)
+    for angles in ((-30.0, 0.0), (60.0, 0.0)):
+        plane = imager.plane(angles, pose=Pose(translation_mm=np.array([8.0, -3.0, 6.0])))
+        frames = [imager.signal(plane, nodes, contrast=k, dose=4.0, seed=int(k)) for k in (0.0, 1.0)]
+        cines.append(XrayCine(made, np.stack(frames), np.arange(2.0), replace(known, angles_deg=angles), ()))
+    found = locate_in_images(fork, cines=cines, device=wire)
+    assert [float(np.linalg.norm(one.position - nodes[0])) for one in found.tips] == pytest.approx([0, 0], abs=1.0)
+    short = replace(cines[1], signals=cines[1].signals[:1], times_s=cines[1].times_s[:1])
+    with pytest.raises(InputError, match="1 frames, and 2 in"):
+        locate_in_images(fork, cines=[cines[0], short], device=wire)
 
 
 def test_a_landmark_registers_a_png(made, fork, tmp_path) -> None:

@@ -93,6 +93,8 @@ def locate_in_images(
     for one in cines[1:]:
         if len(one.times_s) != count:
             raise InputError(f"{one.path}: {len(one.times_s)} frames, and {count} in {cines[0].path}; give one pair")
+        if one.image != cines[0].image:
+            raise InputError(f"{one.path}: has another geometry or size than {cines[0].path}; give two planes alike")
     cines, poses, moves, registered, best, notes = _registered(anatomy, tuple(cines), config)
     isocenter = isocenter_of(anatomy)
     views = [[view_of(one.view(isocenter), pose, isocenter) for one in cines] for pose in poses]
@@ -114,7 +116,9 @@ def locate_in_images(
             found[frame] = look(frame, track.expected(frame))
     project, tips = TipProjector(anatomy.tree, anatomy.insertion), []
     for frame, one in enumerate(found):
-        tips.append(_location(anatomy, project, frame, one, poses[frame].move(one.position, isocenter) - one.position))
+        views[frame] = [replace(view, source=view.source - one.shift) for view in views[frame]]
+        moved = poses[frame].move(one.position + one.shift, isocenter) - one.position
+        tips.append(_location(anatomy, project, frame, one, moved))
     return ImagesLocated(
         tips=tuple(tips),
         wires=tuple(None if one.status == "not found" else one.wire for one in found),
