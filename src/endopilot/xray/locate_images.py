@@ -114,6 +114,9 @@ def locate_in_images(
     for frame, one in enumerate(found):
         if one.status != "not found" and track.elsewhere(frame, one):
             found[frame] = look(frame, track.expected(frame))
+        # Where heart and breath have taken the vessel is a guess in frames without contrast: no tip is sure there.
+        if found[frame].status == "found" and (moves[frame] is not None or track.elsewhere(frame, found[frame])):
+            found[frame] = replace(found[frame], status="ambiguous")
     project, tips = TipProjector(anatomy.tree, anatomy.insertion), []
     for frame, one in enumerate(found):
         views[frame] = [replace(view, source=view.source - one.shift) for view in views[frame]]
