@@ -19,9 +19,9 @@ from endopilot.settings import Seed, Within, settings
 from endopilot.simulation.motion import draw_motion, published_mean
 from endopilot.xray.carm import Pose
 from endopilot.xray.detector import TipDetector
+from endopilot.xray.displacement import Displaced
 from endopilot.xray.image import ImageConfig
 from endopilot.xray.motion_registration import motion_error_mm, register_motion, take_run
-from endopilot.xray.pose_refinement import PoseRefiner
 from endopilot.xray.registration import Registration, register, vessel_error_mm
 from endopilot.xray.tip_posterior import TipEstimate
 
@@ -198,21 +198,22 @@ def _motion_errors(
 
 def _refined(scene: Scene, registered: Registration, used: Sequence[int]) -> list[float]:
     """Return the error of a registered pose, mm, after each of some exposures of wires in these views."""
-    detector, refiner = TipDetector(scene.anatomy, scene.device), PoseRefiner(scene.anatomy, registered)
-    views, errors = [scene.view(i) for i in used], []
-    slack_mm = refiner.slack_mm(views, detector.config.slack_mm)
+    detector = TipDetector(scene.anatomy, scene.device)
+    displaced = Displaced(scene.anatomy, registered, detector.config.displaced_mm)
+    views, errors = registered.views([scene.view(i) for i in used], scene.imager.isocenter), []
     for wire in range(_REFINING):
         signals = scene.signals(wire, seed=910_000 + wire)
         found = detector.find(
-            refiner.views(views),
+            displaced.views(views),
             [signals[i] for i in used],
             [scene.imager.photons(scene.planes[i]) for i in used],
             float(scene.inserted_length[wire]),
-            slack_mm,
+            displaced=displaced.covariance,
         )
-        if found is not None and found.status == "found":
-            refiner.refine(views, found, slack_mm)
-        errors.append(vessel_error_mm(scene.anatomy, scene.pose, refiner.pose))
+        if found is not None:
+            displaced.update(found)
+        pose = Pose(registered.pose.rotation_rad, registered.pose.translation_mm + displaced.shift)
+        errors.append(vessel_error_mm(scene.anatomy, scene.pose, pose))
     return errors
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +11,7 @@ from endopilot.anatomy.tree import Line, tree_from_lines
 from endopilot.errors import InputError
 from endopilot.types import Anatomy, DistanceMap, Insertion
 from endopilot.xray.camera import CArmCamera, PlanarCamera, read_camera
-from endopilot.xray.detector import TipDetector
-from endopilot.xray.frames import DeviceFrame, frame_of, read_frames, write_locations
-from endopilot.xray.image import XrayImager
+from endopilot.xray.frames import DeviceFrame, read_frames, write_locations
 from endopilot.xray.locate import locate
 from endopilot.xray.tip_filter import LocateConfig, TipFilter
 
@@ -169,25 +166,6 @@ def test_files(anatomy, tmp_path) -> None:
     assert table["status"].tolist() == [one.status for one in found]
     with pytest.raises(InputError, match="frame 0: 2 lines for 1 cameras; give one for each, or None"):
         locate(anatomy, frames=frames_of(devices[:1], moved[:1], CAMERAS), cameras=CAMERAS[:1])
-
-
-def test_the_wires_of_the_detector_are_followed(fork, wire) -> None:
-    """Images of one view, of a patient who lies 6 mm off and of whose pose nothing is known."""
-    imager = XrayImager(fork, wire)
-    plane, line = imager.plane((-30.0, 0.0)), fork.tree.path(2)
-    detector, frames, tips = TipDetector(fork, wire), [], []
-    for number, tip in enumerate((26.0, 30.0, 34.0)):
-        at = np.arange(tip, -30.0, -0.5)
-        nodes = np.stack([np.interp(np.maximum(at, 0.0), line.abscissa, axis) for axis in line.points.T], axis=-1)
-        nodes = nodes + np.minimum(at, 0.0)[:, None] * fork.insertion.direction
-        seen = imager.signal(plane, nodes, seed=number)
-        frames.append(frame_of(number, detector.find([plane.view], [seen], [imager.photons(plane)], tip), [plane.view]))
-        tips.append(nodes[0])
-    away = replace(plane.view, source=plane.view.source + np.array([4.0, 0.0, -4.0]))
-    known = LocateConfig(registration_sd_mm=5.0, breathing_sd_mm=1.0, stiff_mm=1.0)
-    found = locate(fork, frames=frames, cameras=[away], config=known)
-    assert found[-1].branch == 2 and np.linalg.norm(found[-1].position - tips[-1]) < 4.0
-    assert frame_of(3, None, [away, away]).lines == (None, None)
 
 
 def test_the_command(anatomy, tmp_path) -> None:

@@ -1,62 +1,134 @@
-"""`endopilot locate`: vessel and lines in X-ray images -> the tip in three dimensions, frame by frame."""
+"""`endopilot locate`: vessel and X-ray images, or lines in them -> the tip in three dimensions, frame by frame."""
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
 from statistics import median
+from typing import Annotated, Any
 
+from pydantic import AfterValidator
 from tyro.conf import Positional
 
 from endopilot.anatomy.extract import extract_anatomy
 from endopilot.anatomy.io import read_anatomy
-from endopilot.cli.arguments import Existing, Figures, OutputFile, Picture
+from endopilot.cli.arguments import IS_FILE, Existing, Figures, OutputFile, Picture
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
+from endopilot.types import Anatomy
 from endopilot.xray.camera import read_camera
 from endopilot.xray.frames import read_frames, write_locations
 from endopilot.xray.locate import locate
-from endopilot.xray.tip_filter import LocateConfig
+from endopilot.xray.tip_filter import LocateConfig, TipLocation
+
+
+def _named_html(path: Path) -> Path:
+    if path.suffix.lower() != ".html":
+        raise InputError(f"{path}: a page is written as HTML; name it with .html")
+    return path
 
 
 def command(
     anatomy: Positional[Existing],
-    lines: Positional[Existing],
+    seen: Positional[tuple[Existing, ...]],
     /,
     *,
-    camera: tuple[Existing, ...],
+    camera: tuple[Existing, ...] = (),
     output: OutputFile,
     picture: Picture | None = None,
+    page: Annotated[Path, AfterValidator(_named_html), IS_FILE] | None = None,
+    device: str = "workhorse-014",
     config: LocateConfig = LocateConfig(),
 ) -> Figures:
-    """Find the tip of a device in a vessel tree, from its lines, or tip, in the images of one view or two.
+    """Find the tip of a device in a vessel tree, in X-ray images of one view or two, or from its lines in them.
 
-    The patient need not be registered, and breathes: the tip is followed through the frames.
+    Images register the patient by their contrast, or by a landmark; to lines the patient need not be registered. The
+    tip is followed through the frames, and the vessel as heart and breath move it.
 
     Args:
         anatomy: folder made by `endopilot anatomy` or `endopilot atlas`; or a mask, a surface or centerlines, as
             `endopilot anatomy` takes them.
-        lines: CSV file with a row for each point of a line, from the tip backwards: frame, view (1 or 2), column_px,
+        seen: an X-ray cine (DICOM XA), or two of planes exposed together; PNG images of one plane in the order of time;
+            or a CSV file of lines with a row for each point, from the tip backwards: frame, view (1 or 2), column_px,
             row_px.
-        camera: YAML file of the C-arm or camera of each view.
+        camera: YAML file of the C-arm or camera of each view; for a cine, in place of what its tags say.
         output: CSV file of the tips.
         picture: PNG of some frames.
+        page: HTML page of what was found.
+        device: name of the wire (`endopilot devices`) or a YAML file, for images.
         config: what is known of patient and device before the first frame.
     """
-    if not 1 <= len(camera) <= 2:
-        raise InputError(f"--camera: {len(camera)} files; give one for each view, one or two")
-    cameras = [read_camera(path) for path in camera]
-    frames = read_frames(lines, views=len(cameras))
+    if not seen:
+        raise InputError("seen: no file; give a cine (DICOM), PNG images or a CSV file of lines")
     vessel = read_anatomy(anatomy) if (anatomy / "anatomy.json").exists() else extract_anatomy(anatomy)
-    found = locate(vessel, frames=frames, cameras=cameras, config=config)
+    find = _in_lines if seen[0].suffix.lower() == ".csv" else _in_images
+    found, drawn, figures, said = find(vessel, seen, camera, device, config)
     write_locations(found, output=output)
-    if picture is not None:
-        from endopilot.xray.locate_picture import draw_locations  # matplotlib is slow to import
+    if picture is not None or page is not None:
+        from endopilot.xray.locate_picture import draw_locations, write_page  # matplotlib is slow to import
 
-        draw_locations(vessel, found, picture, frames=frames, cameras=cameras)
+        with tempfile.TemporaryDirectory() as scratch:
+            path = Path(scratch) / "frames.png" if picture is None else picture
+            draw_locations(vessel, found, path, **drawn)
+            if page is not None:
+                title = f"{vessel.name}: tips in {', '.join(one.name for one in seen)}"
+                write_page(found, page, title=title, said=said, picture=path)
     count = {status: sum(one.status == status for one in found) for status in ("found", "ambiguous", "not found")}
-    residuals = [one.residual_mm for one in found if one.residual_mm == one.residual_mm]
     return {
         "tips": output,
         "frames": len(found),
         **{status.replace(" ", "_"): number for status, number in count.items()},
-        "residual_median_mm": round(median(residuals), 2) if residuals else None,
+        **figures,
         **({} if picture is None else {"picture": picture}),
+        **({} if page is None else {"page": page}),
     }
+
+
+_Found = tuple[Sequence[TipLocation], dict[str, Any], dict[str, Any], Sequence[str]]
+"""Tips, what is drawn, figures, and what is said of them."""
+
+
+def _in_lines(
+    vessel: Anatomy, seen: tuple[Path, ...], camera: tuple[Path, ...], device: str, config: LocateConfig
+) -> _Found:
+    if not (len(seen) == 1 and 1 <= len(camera) <= 2):
+        raise InputError(f"--camera: {len(camera)} files for {len(seen)} of lines; give one for each view, one or two")
+    cameras = [read_camera(path) for path in camera]
+    lines = next(iter(seen))
+    frames = read_frames(lines, views=len(cameras))
+    found = locate(vessel, frames=frames, cameras=cameras, config=config)
+    residuals = [one.residual_mm for one in found if one.residual_mm == one.residual_mm]
+    drawn = {
+        "lines": [frame.lines[0] for frame in frames],
+        "project": lambda index, points: cameras[0].project(points + found[index].moved_mm),
+    }
+    return found, drawn, {"residual_median_mm": round(median(residuals), 2) if residuals else None}, ()
+
+
+def _in_images(
+    vessel: Anatomy, seen: tuple[Path, ...], camera: tuple[Path, ...], device: str, config: LocateConfig
+) -> _Found:
+    from endopilot.xray.cine import read_cine  # pydicom is slow to import
+    from endopilot.xray.locate_images import locate_in_images
+
+    planes = [seen] if seen[0].suffix.lower() == ".png" else [(one,) for one in seen]
+    if len(planes) > 2:
+        raise InputError(f"{seen[2]}: is a third cine; give one, or two of planes that were exposed together")
+    if len(camera) not in (0, len(planes)):
+        raise InputError(f"--camera: {len(camera)} files for {len(planes)} planes; give one for each")
+    cines = [read_cine(paths, c_arm=camera[k] if len(camera) else None) for k, paths in enumerate(planes)]
+    found = locate_in_images(vessel, cines=cines, device=Stack.of(device).wire, config=config)
+    drawn = {
+        "lines": [None if wire is None else found.pixels(frame, wire[::-1]) for frame, wire in enumerate(found.wires)],
+        "project": found.pixels,
+        "images": found.cines[0].signals,
+    }
+    registered = found.registration
+    figures = {
+        "registered": "by landmark" if registered is None else f"by contrast, frame {found.best}",
+        "agreement": None if registered is None else round(registered.correlation, 3),
+        "notes": list(found.notes),
+    }
+    said = [f"registered {figures['registered']}; image and vessel agree by {figures['agreement']}", *found.notes]
+    return found.tips, drawn, figures, said

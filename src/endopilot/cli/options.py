@@ -46,7 +46,7 @@ LISTED: Mapping[str, str] = MappingProxyType(
         "navigate": "target output policy device catheter world robot xray seed json",
         "ladder": "output policy tasks patients version robot world mismatch check json",
         "xray": "output show view_deg zoom device inserted_length_mm catheter catheter_inserted_length_mm ct json",
-        "locate": "camera output picture landmark_mm landmark_px registration_sd_mm travel_mm stiff_mm json",
+        "locate": "camera output picture page device landmark_mm landmark_px registration_sd_mm travel_mm json",
         "angiograms": "output device catheter cines seconds seed drive motion dose json",
         "calibrate": "anatomy output device robot given episodes wires seed json",
         "advise": "output also_test xray level wall_ratio abscissa_mm missed ostium_mm seed json",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float, Float32
 
 from endopilot.xray.carm import View
 from endopilot.xray.corridor import STEP_MM, Corridor, Passage
@@ -23,7 +23,6 @@ class CorridorView:
     Attributes:
         view: source and detector, in the CT's frame.
         box: rows and columns that show the corridor.
-        pixels: which pixels say something of a place; none but these are read.
         new: for each passage how long each section's step is in the image, as a share of one across the beam.
     """
 
@@ -34,21 +33,14 @@ class CorridorView:
         self.box = box_around(view, np.concatenate([one.middle for one in corridor.passages]), rows, widest_mm)
         self._shape = tuple(side.stop - side.start + 2 * _EDGE_PX for side in self.box)
         self._first = np.array([side.start - _EDGE_PX for side in self.box])
-        seen = np.zeros(self._shape, dtype=bool)
         self._corner, self._rest = [], []
         for passage in corridor.passages:
             at = _shown(passage, view, self._middle - self._first)
             np.clip(at, 0, np.array(self._shape)[:, None] - 2, out=at)
             corner = at.astype(np.int32)
             at -= corner
-            place = corner[0] * np.int32(self._shape[1]) + corner[1]
-            seen.ravel()[place] = True
-            self._corner.append(place)
+            self._corner.append(corner[0] * np.int32(self._shape[1]) + corner[1])
             self._rest.append(at)
-        seen[1:] |= seen[:-1]
-        seen[:, 1:] |= seen[:, :-1]
-        self.pixels: Bool[np.ndarray, "rows columns"] = np.zeros((rows, rows), dtype=bool)
-        self.pixels[self.box] = seen[_EDGE_PX:-_EDGE_PX, _EDGE_PX:-_EDGE_PX]
         self.new = [_new_pixels(one, view) for one in corridor.passages]
         disc = np.argwhere(
             np.hypot(*np.mgrid[-_COVER_PX : _COVER_PX + 1, -_COVER_PX : _COVER_PX + 1]) < _COVER_PX + 0.5

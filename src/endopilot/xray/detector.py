@@ -13,22 +13,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32
 from scipy.ndimage import binary_dilation, gaussian_filter
 from scipy.ndimage import label as connected_parts
 
 from endopilot.devices.device import Wire
 from endopilot.files import read_json
-from endopilot.settings import Finite, NonNegative, OpenShare, Share, settings
+from endopilot.settings import Finite, OpenShare, Positive, Share, settings
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import catheter_lumen_points, lumen_points
 from endopilot.xray.carm import View
-from endopilot.xray.corridor import CATHETER_MM, make_corridor
+from endopilot.xray.corridor import CATHETER_MM, Corridor, make_corridor
 from endopilot.xray.corridor_view import CorridorView, box_around
+from endopilot.xray.displacement import displacements
 from endopilot.xray.projector import splat
-from endopilot.xray.tip_posterior import TipEstimate, estimate_tip, longest_mm
+from endopilot.xray.tip_posterior import MODE_MM, Expected, TipEstimate, end_log, estimate_tip, longest_mm
 from endopilot.xray.wire_end import fit_end
 
+Signal = Float32[np.ndarray, "rows columns"]
 SCALES_PX = (1.0, 1.7, 2.8)
 """Standard deviations of the Gaussians whose second derivatives are taken; a coronary wire is some 1.7 pixels wide."""
 _BESIDE_PX = 8.0
@@ -55,65 +57,44 @@ class RidgeEvidence:
         found = read_json(path)
         return cls(np.array(found["weight"]), float(found["offset"]))
 
-    def __call__(
-        self,
-        signal: Float32[np.ndarray, "rows columns"],
-        photons: float,
-        where: Bool[np.ndarray, "rows columns"] | None = None,
-    ) -> Float32[np.ndarray, "rows columns"]:
+    def __call__(self, signal: Signal, photons: float) -> Signal:
         """Return the logarithm of how much likelier each pixel is on a wire than off it.
 
         Args:
             signal: from `XrayImager.signal`.
             photons: that a pixel of usual brightness counts.
-            where: pixels that it is wanted of; 0 elsewhere; all if not given.
         """
-        pixels = None if where is None else np.flatnonzero(where)
-        found = features(signal, photons, pixels)
+        found = features(signal, photons)
         count = len(found)
         square = np.zeros((count, count), dtype=np.float32)
         square[np.triu_indices(count)] = self.weight[count:] / _MOST
         # The same as `products` times the weights, without an image for each product.
         terms = square @ found + self.weight[:count, None].astype(np.float32)
-        likelier = np.einsum("fn,fn->n", terms, found) + np.float32(self.offset)
-        if pixels is None:
-            return likelier.reshape(signal.shape)
-        evidence = np.zeros(signal.shape, dtype=np.float32)
-        evidence.ravel()[pixels] = likelier
-        return evidence
+        return (np.einsum("fn,fn->n", terms, found) + np.float32(self.offset)).reshape(signal.shape)
 
 
-def features(
-    signal: Float32[np.ndarray, "rows columns"], photons: float, pixels: Int[np.ndarray, "n"] | None = None
-) -> Float32[np.ndarray, "f n"]:
-    """Return the features of some pixels of the flat image, or of all: ridges and darkness over the noise, and that."""
-    chosen = slice(None) if pixels is None else pixels
+def features(signal: Signal, photons: float) -> Float32[np.ndarray, "f n"]:
+    """Return the features of the flat image's pixels: ridges and darkness over the noise, and that."""
     smooth = [gaussian_filter(signal, scale, mode="nearest") for scale in SCALES_PX]
-    around = _smoother(smooth[-1], SCALES_PX[-1], _BESIDE_PX).ravel()[chosen]
+    around = _smoother(smooth[-1], SCALES_PX[-1], _BESIDE_PX).ravel()
     noise = np.exp(-0.5 * around) / np.float32(np.sqrt(photons))
     found = np.empty((2 * len(SCALES_PX) + 2, len(around)), dtype=np.float32)
     for number, (scale, image) in enumerate(zip(SCALES_PX, smooth, strict=True)):
-        mean, half = _curvatures(image, pixels)
+        mean, half = _curvatures(image)
         # The Hessian of white noise, smoothed, falls with the third power of the scale.
         weight = np.float32(scale**3) / noise
         found[2 * number], found[2 * number + 1] = weight * (mean + half), weight * (mean - half)
-    found[-2] = (around - smooth[0].ravel()[chosen]) / noise * np.float32(SCALES_PX[0])
+    found[-2] = (around - smooth[0].ravel()) / noise * np.float32(SCALES_PX[0])
     found[-1] = np.log(noise)
     return np.clip(found, -_MOST, _MOST, out=found)
 
 
-def _curvatures(
-    image: Float32[np.ndarray, "rows columns"], pixels: Int[np.ndarray, "n"] | None
-) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"]]:
-    """Return the mean of the two principal curvatures of some pixels, and half their difference."""
+def _curvatures(image: Signal) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"]]:
+    """Return the mean of the two principal curvatures of the flat image's pixels, and half their difference."""
     (rows, columns), padded = image.shape, np.pad(image, 2, mode="edge")
-    width, flat = columns + 4, padded.ravel()
-    at = None if pixels is None else (pixels // columns + 2) * width + pixels % columns + 2
 
     def beside(down: int, right: int) -> Float32[np.ndarray, "n"]:
-        if at is None:
-            return padded[2 + down : 2 + down + rows, 2 + right : 2 + right + columns].ravel()
-        return flat[at + (down * width + right)]
+        return padded[2 + down : 2 + down + rows, 2 + right : 2 + right + columns].ravel()
 
     here = 2 * beside(0, 0)
     down, right = beside(2, 0) - here + beside(-2, 0), beside(0, 2) - here + beside(0, -2)
@@ -121,9 +102,7 @@ def _curvatures(
     return 0.125 * (down + right), 0.125 * np.sqrt((down - right) ** 2 + 4 * mixed**2)
 
 
-def _smoother(
-    image: Float32[np.ndarray, "rows columns"], done_px: float, scale_px: float
-) -> Float32[np.ndarray, "rows columns"]:
+def _smoother(image: Signal, done_px: float, scale_px: float) -> Signal:
     """Return an image, smoothed already, smoothed to a larger standard deviation: every other pixel will do."""
     rows, columns = image.shape
     part = gaussian_filter(image[::2, ::2], 0.5 * float(np.sqrt(scale_px**2 - done_px**2)))
@@ -141,7 +120,6 @@ def products(values: Float32[np.ndarray, "*n f"]) -> Float32[np.ndarray, "*n ter
     return np.concatenate([values, values[..., rows] * values[..., columns] / np.float32(_MOST)], axis=-1)
 
 
-Signal = Float32[np.ndarray, "rows columns"]
 _HIGH_PASS_PX, _AROUND_PX = 12.0, 24
 """Contrast is what is darker than its surroundings, blurred by this; and how much of an image around the vessel is
 looked at, pixels."""
@@ -173,6 +151,10 @@ _KEPT_LINES = 8
 """Lines of so many images from before, or doses, are kept for the next exposures."""
 _HIDDEN_MM = 1.5
 """Standard deviation that a tip on such a line has more, mm."""
+_SLACK_MM = 0.3
+"""How far outside the lumen the wire's axis may seem to lie, mm: the grid that it is followed on is 0.2 mm."""
+_WORTH, _STAYS_MM = 0.0, 0.5
+"""A wire is also followed in a displaced vessel where that is likelier by this logarithm, and by more than this, mm."""
 _BELIEVABLE = 3.0
 """An end farther than this many standard deviations from the followed wire's is another line's."""
 
@@ -181,8 +163,10 @@ _BELIEVABLE = 3.0
 class DetectorConfig:
     """How far an image is trusted."""
 
-    slack_mm: NonNegative = 0.3
-    """How far outside the lumen the wire's axis may seem to lie, because registration is not perfect, mm."""
+    displaced: OpenShare = 0.2
+    """Share of the exposures in which the vessel lies elsewhere than registration has it."""
+    displaced_mm: Positive = 1.5
+    """How far it lies from there then, along each axis: standard deviation, mm."""
     hidden: OpenShare = 0.02
     """Share of the wire that is not seen, whatever the evidence against it."""
     alike: OpenShare = 0.05
@@ -222,30 +206,9 @@ class TipDetector:
         self._vessel = anatomy.tree.line.points
         self._filled = np.concatenate([points, behind[near]]), np.concatenate([volume, size[near]])
 
-    def find(
-        self,
-        views: Sequence[View],
-        signals: Sequence[Signal],
-        photons: Sequence[float],
-        inserted_length: float,
-        slack_mm: float | None = None,
-        before: Sequence[Signal] | None = None,
-    ) -> TipEstimate | None:
-        """Find the tip in the images of one exposure.
-
-        Args:
-            views: of the images, in the CT's frame (`Registration.views`).
-            signals: from `XrayImager.signal`.
-            photons: that a pixel of usual brightness counts, in each image.
-            inserted_length: Δ by the robot's encoder, mm.
-            slack_mm: how far outside the lumen the wire is looked for, mm; the configuration's if not given.
-            before: images of the same views without a wire: lines in them that this exposure's noise, that of
-                `photons`, would show are none of its; none if not given.
-
-        Returns:
-            The tip, found or ambiguous; None where there is no wire.
-        """
-        found = self.estimate(views, signals, photons, inserted_length, slack_mm, before)
+    def find(self, *image: Any, **how: Any) -> TipEstimate | None:
+        """Return the tip, found or ambiguous; None where there is no wire. The arguments are those of `estimate`."""
+        found = self.estimate(*image, **how)
         return None if found.status == "not found" else found
 
     def estimate(
@@ -253,29 +216,67 @@ class TipDetector:
         views: Sequence[View],
         signals: Sequence[Signal],
         photons: Sequence[float],
-        inserted_length: float,
-        slack_mm: float | None = None,
+        inserted_length: float | None,
         before: Sequence[Signal] | None = None,
+        expected: Expected | None = None,
+        displaced: Float[np.ndarray, "3 3"] | None = None,
     ) -> TipEstimate:
-        """Return where the tip is if there is a wire, and how likely that is; the arguments are those of `find`."""
-        slack_mm = self.config.slack_mm if slack_mm is None else slack_mm
-        corridor = make_corridor(self._anatomy, self._radius_mm, slack_mm, longest_mm(inserted_length))
-        shown = [CorridorView(corridor, *one) for one in zip(views, map(len, signals), strict=True)]
-        seen = [self._look(*one) for one in zip(shown, signals, photons, strict=True)]
+        """Return where the tip is in the images of one exposure if there is a wire, and how likely that is.
+
+        Args:
+            views: of the images, in the CT's frame (`Registration.views`).
+            signals: from `XrayImager.signal`.
+            photons: that a pixel of usual brightness counts, in each image.
+            inserted_length: Δ by the robot's encoder, mm; None where there is none.
+            before: images of the same views without a wire: lines in them that this exposure's noise, that of
+                `photons`, would show are none of its; none if not given.
+            expected: as `estimate_tip` takes it.
+            displaced: covariance of how far the vessel lies from where the views have it, if it does not lie there,
+                mm²; the configuration's if not given.
+        """
+        config, before = self.config, before or []
+        corridor = make_corridor(self._anatomy, self._radius_mm, _SLACK_MM, longest_mm(inserted_length))
+        seen = [self._look(corridor, *one) for one in zip(views, signals, photons, strict=True)]
         plain, evidence = [one for one, _ in seen], [one for _, one in seen]
-        lines = [] if before is None else [self._lines(*one) for one in zip(views, before, photons, strict=True)]
-        for image, line in zip(evidence, lines, strict=before is not None):
+        lines = [self._lines(*one) for one in zip(views, before, photons, strict=False)]
+        for image, line in zip(evidence, lines, strict=False):
             image[line] = 0.0
-        found = _refined(estimate_tip(corridor, shown, evidence, inserted_length), views, plain, self._radius_mm)
+
+        def follow(seen: Sequence[View]) -> TipEstimate:
+            shown = [CorridorView(corridor, view, len(image)) for view, image in zip(seen, evidence, strict=True)]
+            return estimate_tip(corridor, shown, evidence, inserted_length, expected)
+
+        here = follow(views)
+        covariance = config.displaced_mm**2 * np.eye(3) if displaced is None else displaced
+        places = [(one.branch, one.abscissa, one.abscissa) for one in corridor.passages]
+        ends = [end_log(*place, inserted_length, expected) for place in places]
+        moved = displacements(corridor, views, evidence, covariance, ends)
+        log_share = float(np.log(config.displaced / (1 - config.displaced)))
+        found = here
+        if moved.log_odds + log_share > _WORTH and np.linalg.norm(moved.shift) > _STAYS_MM:
+            views = [replace(view, source=view.source - moved.shift) for view in views]
+            there = follow(views)
+            # Laplace's evidence: of all shifts that were possible, one as narrow as what the images leave.
+            fits = -0.5 * float(moved.shift @ np.linalg.solve(covariance, moved.shift))
+            fits += 0.5 * float(np.linalg.slogdet(moved.covariance)[1] - np.linalg.slogdet(covariance)[1])
+            # A vessel that lies farther back shows more of the same wire in its catheter.
+            behind = here if moved.shift @ self._anatomy.insertion.direction > 0 else there
+            in_catheter = behind.ends[behind.ends[:, 0] < 0, 2][-1] / CATHETER_MM
+            fits += float(in_catheter * (moved.shift @ self._anatomy.insertion.direction))
+            odds = there.log_odds - here.log_odds + log_share + fits
+            found = _either(here, replace(there, shift=moved.shift, shift_covariance=moved.covariance), odds)
+            if found.shift is here.shift:
+                views = [replace(view, source=view.source + moved.shift) for view in views]
+        found = _refined(found, views, plain, self._radius_mm)
         hidden = any(_lies_on(line, view, found.position) for line, view in zip(lines, views, strict=False))
         return self._judged(found, hidden=hidden)
 
-    def _look(self, shown: CorridorView, signal: Signal, photons: float) -> tuple[Signal, Signal]:
-        """Return an image without contrast, and how likely its pixels are on a wire, none where no vessel is near."""
-        rows, columns = (slice(max(side.start - _AROUND_PX, 0), side.stop + _AROUND_PX) for side in shown.box)
-        box, evidence = (rows, columns), np.zeros_like(signal)
-        plain = self.without_contrast(shown.view, signal, box)
-        evidence[box] = self._saturated(self._evidence(plain[box], photons, shown.pixels[box]))
+    def _look(self, corridor: Corridor, view: View, signal: Signal, photons: float) -> tuple[Signal, Signal]:
+        """Return an image without contrast, and how likely its pixels are on a wire, none far from the vessel."""
+        middle, evidence = np.concatenate([one.middle for one in corridor.passages]), np.zeros_like(signal)
+        box = box_around(view, middle, len(signal), around_px=_AROUND_PX)
+        plain = self.without_contrast(view, signal, box)
+        evidence[box] = self._saturated(self._evidence(plain[box], photons))
         return plain, evidence
 
     def _lines(self, view: View, before: Signal, photons: float) -> Bool[np.ndarray, "rows columns"]:
@@ -334,6 +335,17 @@ class TipDetector:
         return signal + np.float32(strength) * path_mm if strength > _LEAST_CONTRAST else signal
 
 
+def _either(here: TipEstimate, there: TipEstimate, odds: float) -> TipEstimate:
+    """Return the likelier of two estimates, given the logarithm of the second's odds; the other one is elsewhere."""
+    chosen, other, share = (there, here, odds) if odds > 0 else (here, there, -odds)
+    share = 1 / (1 + float(np.exp(-min(share, 30.0))))
+    off = other.position - chosen.position
+    if float(np.linalg.norm(off)) < MODE_MM:
+        return replace(chosen, covariance=chosen.covariance + (1 - share) * np.outer(off, off))
+    elsewhere = share * chosen.elsewhere + (1 - share) * np.outer(off, off)
+    return replace(chosen, share=share * chosen.share, elsewhere=elsewhere)
+
+
 def _halved(image: Signal) -> Float32[np.ndarray, "half_rows half_columns"]:
     """Return means of two by two pixels."""
     rows, columns = len(image) // 2, image.shape[1] // 2
@@ -371,5 +383,5 @@ def _refined(found: TipEstimate, views: Sequence[View], signals: Sequence[Signal
     if not fitted:
         position, covariance = found.position, found.covariance
     moved_mm, count = float(np.linalg.norm(position - found.position)), len(views)
-    covariance = _WIDER[count] * covariance + (_FIT_SHARE[count] * moved_mm) ** 2 * np.eye(3)
+    covariance = _WIDER[count] * covariance + (_FIT_SHARE[count] * moved_mm) ** 2 * np.eye(3) + found.shift_covariance
     return replace(found, position=position, covariance=covariance)

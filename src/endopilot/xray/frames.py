@@ -25,9 +25,7 @@ from jaxtyping import Float
 from endopilot.errors import InputError
 from endopilot.files import writing
 from endopilot.simulation.csv_file import read_columns
-from endopilot.xray.carm import View
 from endopilot.xray.tip_filter import TipLocation
-from endopilot.xray.tip_posterior import TipEstimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,20 +40,6 @@ class DeviceFrame:
 
     number: int
     lines: tuple[Float[np.ndarray, "_ 2"] | None, ...]
-
-
-def frame_of(number: int, found: TipEstimate | None, views: Sequence[View]) -> DeviceFrame:
-    """Return the frame of one exposure's images in which `TipDetector` found a wire, or none.
-
-    Args:
-        number: of the frame.
-        found: in the images.
-        views: that the detector was given; the frame's pixels are those of `View.project`.
-    """
-    if found is None:
-        return DeviceFrame(number, (None,) * len(views))
-    wire = np.concatenate([found.position[None], found.wire[::-1]])
-    return DeviceFrame(number, tuple(view.project(wire) for view in views))
 
 
 def read_frames(path: str | Path, *, views: int = 1) -> tuple[DeviceFrame, ...]:

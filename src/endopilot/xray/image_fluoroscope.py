@@ -18,21 +18,18 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import surroundings
 from endopilot.xray.carm import Pose, view_at
-from endopilot.xray.detector import Signal, TipDetector
+from endopilot.xray.detector import TipDetector
+from endopilot.xray.displacement import Displaced
 from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement, measurement_at
 from endopilot.xray.image import ImageConfig, Plane, XrayImager
 from endopilot.xray.motion_registration import register_motion, take_run
 from endopilot.xray.moving_patient import seen_wire
-from endopilot.xray.pose_refinement import PoseRefiner
-from endopilot.xray.registration import Registration, register, vessel_error_mm
-from endopilot.xray.tip_posterior import TipEstimate
+from endopilot.xray.registration import Registration, register
 
 _NO_WIRE = np.zeros((0, 3))
-_MOVED_MM = 0.1
-"""A tip is looked for again where its image has moved the vessel by more than this, mm."""
-_MOVING_SLACK_MM, _LIKELIER = 2.0, 10.0
-"""In a patient who moves, a wire is also looked for this far outside the lumen, mm: their motion is not quite the known
-one. It is there if the images are likelier so by this logarithm."""
+_MOVES_MM = 2.0
+"""Standard deviation of the vessel's place along each axis in a patient who moves, mm: their motion is not quite the
+known one."""
 
 
 class NotRegistered(InputError):
@@ -45,7 +42,7 @@ class ImageFluoroscope:
     Attributes:
         pose: in which the patient truly lies; nothing that is measured knows it.
         registration: the pose as one injection of contrast shows it.
-        refiner: the pose as that and all wires so far show it.
+        displaced: how far the vessel lies from there, by all wires so far.
     """
 
     def __init__(
@@ -89,12 +86,13 @@ class ImageFluoroscope:
             raise NotRegistered(f"X-ray images: {anatomy.name} cannot be registered: {self.registration.failure}")
         self._detector = TipDetector(anatomy, device)
         self._project = TipProjector(anatomy.tree, anatomy.insertion)
+        self._registered = self.registration.views(self._views, self._imager.isocenter)
         self.forget_wires()
-        self._slack_mm = self.refiner.slack_mm(self._views, self._detector.config.slack_mm)
 
     def forget_wires(self) -> None:
-        """Take the patient's pose to be what contrast showed, whatever the wires since: another navigation begins."""
-        self.refiner = PoseRefiner(self._anatomy, self.registration)
+        """Take the vessel to lie where contrast showed it, whatever the wires since: another navigation begins."""
+        sd_mm = self._detector.config.displaced_mm if self.known_motion is None else _MOVES_MM
+        self.displaced = Displaced(self._anatomy, self.registration, sd_mm)
 
     def measure_motion(self, motion: Motion | None, random: np.random.Generator) -> Motion | None:
         """Inject contrast once more, take a run of images over a breath, and return how the patient moves by them.
@@ -109,8 +107,7 @@ class ImageFluoroscope:
         if motion is None or (mean := published_mean(motion)) is None:
             return None
         run = take_run(self._imager, self._angles_deg, self.pose, motion, random)
-        views = self.registration.views(self._views, self._imager.isocenter)
-        found = register_motion(self._anatomy, views, run, self._before, mean, self._imager.config)
+        found = register_motion(self._anatomy, self._registered, run, self._before, mean, self._imager.config)
         if found.failure:
             name = self._anatomy.name
             raise NotRegistered(f"X-ray images: the motion of {name} cannot be measured: {found.failure}")
@@ -143,30 +140,13 @@ class ImageFluoroscope:
         """
         signals = [self._signal(plane, nodes, random) for plane in self._planes]
         photons = [self._imager.photons(plane) for plane in self._planes]
-        image = signals, photons, inserted_length
-        empty = self._before
-        found = self._detector.find(self.refiner.views(self._views), *image, self._slack_mm, empty)
-        if self.known_motion is not None and (beside := self._beside(found, image)) is not None:
-            return self._measured(beside)
+        views, covariance = self.displaced.views(self._registered), self.displaced.covariance
+        found = self._detector.find(views, signals, photons, inserted_length, before=self._before, displaced=covariance)
         if found is None:
             return None
-        before, moved_mm = self.refiner.pose, 0.0
-        if refine and found.status == "found":
-            moved_mm = vessel_error_mm(self._anatomy, before, self.refiner.refine(self._views, found, self._slack_mm))
-        if moved_mm > _MOVED_MM or self._slack_mm > self._detector.config.slack_mm:
-            found = self._detector.find(self.refiner.views(self._views), *image, before=empty) or found
-        return self._measured(found)
-
-    def _measured(self, found: TipEstimate) -> TipMeasurement:
+        if refine and self.known_motion is None:
+            self.displaced.update(found)
         return measurement_at(self._project, self._anatomy, found.position[None], found.covariance[None])
-
-    def _beside(self, found: TipEstimate | None, image: tuple[list[Signal], list[float], float]) -> TipEstimate | None:
-        """Return the tip of a wire that lies where the known motion does not take the vessel; None if it does not."""
-        slack_mm = max(_MOVING_SLACK_MM, self._slack_mm)
-        beside = self._detector.find(self.refiner.views(self._views), *image, slack_mm=slack_mm, before=self._before)
-        if beside is None or (found is not None and beside.log_odds < found.log_odds + _LIKELIER):
-            return None
-        return beside
 
     def _signal(
         self, plane: Plane, nodes: Float[np.ndarray, "n 3"], random: np.random.Generator, contrast: float = 0.0

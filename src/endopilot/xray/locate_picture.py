@@ -1,18 +1,19 @@
-"""Some frames of a sequence with the vessel, the line and the tip that was located: `draw_locations`."""
+"""Some frames of a sequence with the vessel, the device and the tip that was located, and a page of them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import base64
+from collections.abc import Callable, Sequence
+from html import escape
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from jaxtyping import Float, Float32
 
 from endopilot.files import writing
 from endopilot.plotting import BLUE, GREY, ORANGE, STYLE, VERMILLION
 from endopilot.types import Anatomy
-from endopilot.xray.camera import Camera
-from endopilot.xray.frames import DeviceFrame
 from endopilot.xray.tip_filter import TipLocation
 
 _SHOWN = 4
@@ -24,30 +25,40 @@ def draw_locations(
     locations: Sequence[TipLocation],
     output: str | Path,
     *,
-    frames: Sequence[DeviceFrame],
-    cameras: Sequence[Camera],
+    lines: Sequence[Float[np.ndarray, "_ 2"] | None],
+    project: Callable[[int, Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 2"]],
+    images: Float32[np.ndarray, "frames rows columns"] | None = None,
 ) -> None:
-    """Draw some frames of the first camera as PNG: its line, and the vessel where it was moved to.
+    """Draw some frames of the first camera as PNG: the device, and the vessel where it lies.
 
-    The vessel is drawn as it lies at the tip: elsewhere heart and breath may move it otherwise.
+    Args:
+        anatomy: the vessel.
+        locations: of each frame.
+        output: the picture, .png.
+        lines: the device in each frame, pixels; None where it is not seen.
+        project: turns places of the vessel, LPS mm, into the pixels of a frame, given its index.
+        images: of the frames, drawn beneath; none if not given.
     """
-    seen = [i for i, frame in enumerate(frames) if frame.lines[0] is not None and locations[i].status != "not found"]
+    seen = [i for i, line in enumerate(lines) if line is not None and locations[i].status != "not found"]
     chosen = [seen[i] for i in np.unique(np.linspace(0, len(seen) - 1, min(_SHOWN, len(seen))).astype(int))]
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(
             1, max(1, len(chosen)), figsize=(3.4 * max(1, len(chosen)), 3.8), squeeze=False, layout="constrained"
         )
         for axis, index in zip(axes[0], chosen, strict=False):
-            line, one = frames[index].lines[0], locations[index]
+            line, one = lines[index], locations[index]
             assert line is not None
             path = anatomy.tree.path(one.branch)
             upto = path.points[path.abscissa <= one.abscissa]
-            place, moved = cameras[0].project, one.moved_mm
+            if images is not None:
+                low, high = np.quantile(images[index], (0.01, 0.99)).tolist()
+                axis.imshow(images[index], cmap="gray", vmin=low, vmax=high)
+                axis.grid(visible=False)
             for branch in anatomy.tree.branches:
-                axis.plot(*place(branch.centerline.points + moved).T, color=GREY, lw=0.7)
-            axis.plot(*place(upto + moved).T, color=BLUE, lw=1.6, label="way to the tip")
-            axis.plot(*line.T, color=ORANGE, lw=1.6, label="line in the image")
-            axis.plot(*place(one.position[None] + moved).T, "o", color=VERMILLION, ms=5, label="tip")
+                axis.plot(*project(index, branch.centerline.points).T, color=GREY, lw=0.7)
+            axis.plot(*project(index, upto).T, color=BLUE, lw=1.2, label="way to the tip")
+            axis.plot(*line.T, color=ORANGE, lw=1.2, label="device in the image")
+            axis.plot(*project(index, one.position[None]).T, "o", color=VERMILLION, ms=4, mfc="none", label="tip")
             low, high = line.min(axis=0), line.max(axis=0)
             middle, half = (low + high) / 2, 0.6 * max(float((high - low).max()), 60.0)
             axis.set(
@@ -62,3 +73,31 @@ def draw_locations(
         with writing(Path(output)) as partial:
             figure.savefig(partial, format="png", dpi=STYLE["figure.dpi"])
         plt.close(figure)
+
+
+def write_page(
+    locations: Sequence[TipLocation], output: Path, *, title: str, said: Sequence[str], picture: Path
+) -> None:
+    """Write one HTML file that needs nothing beside it: what was found, the picture, and the tip of each frame."""
+    head = ("frame", "status", "section", "abscissa, mm", "tip, LPS mm", "standard deviation, mm")
+    rows = [
+        (
+            one.frame,
+            one.status,
+            one.section,
+            f"{one.abscissa:.1f}",
+            ", ".join(f"{value:.1f}" for value in one.position),
+            f"{np.sqrt(np.trace(one.covariance)):.1f}",
+        )
+        for one in locations
+    ]
+    table = "".join(f"<tr>{''.join(f'<td>{escape(str(cell))}</td>' for cell in row)}</tr>" for row in (head, *rows))
+    png = base64.b64encode(picture.read_bytes()).decode()
+    page = f"""<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>{escape(title)}</title>
+<style>body{{font-family:sans-serif;margin:2em}}img{{max-width:100%}}td{{padding:0 1em 0 0}}</style>
+<h1>{escape(title)}</h1><ul>{"".join(f"<li>{escape(line)}</li>" for line in said)}</ul>
+<img alt="frames with vessel, device and tip" src="data:image/png;base64,{png}">
+<table>{table}</table></html>
+"""
+    with writing(output) as partial:
+        partial.write_text(page, encoding="utf-8")

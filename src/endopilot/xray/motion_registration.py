@@ -65,12 +65,12 @@ def register_motion(
         config: detector and beam.
     """
     config, isocenter = config or ImageConfig(), isocenter_of(anatomy)
-    points, size = sampled_lumen(anatomy)
+    lumen = sampled_lumen(anatomy)
     amplitudes = _Amplitudes(mean, np.asarray(anatomy.insertion.position))
     found, correlation = np.zeros(len(amplitudes.names)), 0.0
     for averaged, blur in _LEVELS:
         observed = [observed_contrast(images, before, averaged, blur, config) for images in contrasted]
-        at_rest = [Comparison(points, size, views, images, averaged, blur, config, isocenter) for images in observed]
+        at_rest = [Comparison(*lumen, views, images, averaged, blur, config, isocenter) for images in observed]
         found = least_squares(
             amplitudes.residuals,
             found,

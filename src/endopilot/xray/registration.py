@@ -8,20 +8,21 @@ until both agree, first blurred, then finely. Where they do not agree in the end
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
+from scipy.spatial import KDTree
 from skimage.transform import downscale_local_mean
 
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import catheter_lumen_points, lumen_points
 from endopilot.xray.carm import Pose, View, view_of
 from endopilot.xray.image import ImageConfig, isocenter_of
-from endopilot.xray.projector import splat
+from endopilot.xray.projector import Shadow
 
 _PRIOR = np.concatenate([np.full(3, np.deg2rad(2.0)), np.full(3, 3.5)])
 """Standard deviations of a pose before any image: rad, mm. Poses of up to 3° and 5 mm lie within."""
@@ -38,6 +39,10 @@ AGREES = 0.8
 """Least correlation of image and projected vessel. Without contrast it is near 0."""
 _FELT = 0.02
 """Pixels that a pose changes by more than this share of what it changes the most show how well it fits."""
+_WEAKEST = 0.05
+"""Contrast is not taken to show weaker than by this share of what `ImageConfig.iodine_mm` says."""
+_LITTLE = 0.01
+"""Share of itself by which a change along the vessel costs: where a view shows little vessel, it is none."""
 _MISFIT = 0.1
 """Residuals are scaled by this share of the full contrast; beyond it they count less."""
 
@@ -69,6 +74,7 @@ def register(
     contrasted: Sequence[Float32[np.ndarray, "rows columns"]],
     before: Sequence[Float32[np.ndarray, "rows columns"]],
     config: ImageConfig | None = None,
+    start: Pose | None = None,
 ) -> Registration:
     """Find the pose in which the patient lies.
 
@@ -78,19 +84,24 @@ def register(
         contrasted: an image of the filled vessel for each view, from `XrayImager.signal`.
         before: the image before the injection, likewise.
         config: detector and beam.
+        start: the pose that is looked around, such as that of the frame before, in a cine, whose contrast need not fill
+            the vessel alike; the pose that the CT has, and a vessel that is filled, if not given.
     """
     config, isocenter = config or ImageConfig(), isocenter_of(anatomy)
-    points, size = sampled_lumen(anatomy)
-    found, correlation, covariance = np.zeros(6), 0.0, np.diag(_PRIOR**2)
-    for averaged, blur in _LEVELS:
+    lumen = sampled_lumen(anatomy, alike=start is None)
+    laid = np.zeros(6) if start is None else start.vector
+    found, correlation, covariance, misfit = laid, 0.0, np.diag(_PRIOR**2), _MISFIT
+    for averaged, blur in _LEVELS if start is None else _LEVELS[1:]:
         observed = observed_contrast(contrasted, before, averaged, blur, config)
-        level = Comparison(points, size, views, observed, averaged, blur, config, isocenter)
+        points, size, along = (part[:: averaged // 2] for part in lumen)  # coarse images need fewer points
+        size = size * (lumen[1].sum() / size.sum())
+        level = Comparison(points, size, along, views, observed, averaged, blur, config, isocenter, laid, misfit)
         slope: Any = level.slope  # the annotation of scipy knows names of schemes alone
         found = least_squares(
             level.residuals,
             found,
             slope,
-            bounds=(-_FAR * _PRIOR, _FAR * _PRIOR),
+            bounds=(laid - _FAR * _PRIOR, laid + _FAR * _PRIOR),
             x_scale=_PRIOR,
             loss="soft_l1",
             max_nfev=10,
@@ -98,13 +109,44 @@ def register(
             ftol=1e-4,
         ).x
         correlation, covariance = level.correlation(found), level.covariance(found)
-    far = float(np.abs(found / _PRIOR).max()) + 1e-2
+        misfit = max(_MISFIT, misfit * level.misfit_of(found))
+    # How far off a vessel lies that was laid by its images says nothing against it.
+    far = float(np.abs((found - laid) / _PRIOR)[: 6 if start is None else 3].max()) + 1e-2
     failure = ""
     if correlation < AGREES:
         failure = f"the image and the vessel agree by {correlation:.2f} only; inject contrast, or choose another view"
     elif far > _FAR:
         failure = "the vessel fits the image only far from where the patient was laid; check the views' angles"
     return Registration(Pose.of_vector(found), covariance, correlation, failure)
+
+
+def lay(
+    anatomy: Anatomy,
+    views: Sequence[View],
+    contrasted: Sequence[Float32[np.ndarray, "rows columns"]],
+    before: Sequence[Float32[np.ndarray, "rows columns"]],
+    config: ImageConfig,
+) -> tuple[Pose, float]:
+    """Return the shift, up to half an image, in which the vessel fits the images best, and their correlation then.
+
+    It begins a registration where nobody says how far the vessel lies from the isocenter; arguments as `register` has.
+    """
+    averaged, blur = _LEVELS[0]
+    observed = observed_contrast(contrasted, before, averaged, blur, config)
+    laid = Comparison(*sampled_lumen(anatomy), views, observed, averaged, blur, config, isocenter_of(anatomy))
+    rows, shifts, fits = [], [], []
+    for view, ours, theirs in zip(views, laid.expected(np.zeros(6)), observed, strict=True):
+        ours, theirs = ours[0] - ours[0].mean(), theirs - np.median(theirs)
+        side = 2 * len(ours)
+        alike = np.fft.irfft2(
+            np.fft.rfft2(theirs, (side, side)) * np.fft.rfft2(ours, (side, side)).conj(), (side, side)
+        )
+        fits.append(alike.max() / max(float(np.linalg.norm(ours) * np.linalg.norm(theirs)), 1e-12))
+        down, right = (int(at) - side * (at >= side // 2) for at in np.unravel_index(alike.argmax(), alike.shape))
+        rows.append(view.slope(laid.isocenter))
+        shifts.append([averaged * right, -averaged * down])
+    shift = np.linalg.pinv(np.concatenate(rows)) @ np.concatenate(shifts)
+    return Pose(translation_mm=shift), float(np.mean(fits))
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,41 +156,69 @@ class Comparison:
     Attributes:
         points: of the lumen, LPS mm.
         size: volume that each stands for, mm³.
+        along: how far along the vessel each lies, as a share of the deepest.
         views: of the images.
         observed: what contrast added to each image, pixels averaged and blurred.
         averaged: pixels along a side that are averaged.
         blur: of what is left, in averaged pixels.
         config: detector and beam.
         isocenter: about which poses turn, LPS mm.
+        laid: pose that is likeliest before any image.
+        misfit: usual difference of image and projected vessel, as a share of the full contrast.
     """
 
     points: Float[np.ndarray, "n 3"]
     size: Float[np.ndarray, "n"]
+    along: Float[np.ndarray, "n"]
     views: Sequence[View]
     observed: Sequence[np.ndarray]
     averaged: int
     blur: float
     config: ImageConfig
     isocenter: Float[np.ndarray, "3"]
+    laid: Float[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6))
+    misfit: float = _MISFIT
 
     def expected(self, pose: Float[np.ndarray, "6"]) -> list[np.ndarray]:
-        """Return what contrast would add to each image in a pose."""
+        """Return what contrast would add to each image in a pose: everywhere alike, and growing along the vessel."""
         images = []
         for view in self.views:
             coarse = view_of(view, Pose.of_vector(pose), self.isocenter).magnified(1 / self.averaged)
-            pixels = self.config.pixels // self.averaged
-            images.append(self.config.iodine_mm * splat(coarse, pixels, self.points, self.size, blur_px=self.blur))
+            shadow = Shadow(coarse, self.config.pixels // self.averaged, self.points)
+            parts = [shadow.of(size, blur_px=self.blur) for size in (self.size, self.size * self.along)]
+            images.append(self.config.iodine_mm * np.stack(parts))
         return images
+
+    def fitted(self, pose: Float[np.ndarray, "6"]) -> list[tuple[np.ndarray, np.ndarray, float]]:
+        """Return for each image what is expected in a pose, what is observed, and how strong the contrast shows.
+
+        Unless the vessel is filled alike, by an injection of one's own, nobody knows how strong it shows, how that
+        changes along the vessel as the blood carries it, and on which ground: each is what fits best.
+        """
+        found = []
+        for parts, theirs in zip(self.expected(pose), self.observed, strict=True):
+            if not self.along.any():
+                found.append((parts[0], theirs, 1.0))
+                continue
+            flat = np.stack([part - part.mean() for part in parts]).reshape(2, -1)
+            theirs = theirs - theirs.mean()
+            square = flat @ flat.T
+            square[np.diag_indices(2)] *= 1 + _LITTLE
+            shares = np.linalg.lstsq(square, flat @ theirs.ravel(), rcond=None)[0]
+            strength = max(float(shares @ [1.0, self.along.mean()]), _WEAKEST)
+            found.append(((shares @ flat).reshape(theirs.shape), theirs, strength))
+        return found
 
     def residuals(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "n"]:
         """Return all differences, and that of the pose from the prior."""
-        return np.concatenate([self.differences(pose), pose / _PRIOR])
+        return np.concatenate([self.differences(pose), (pose - self.laid) / _PRIOR])
 
     def differences(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "n"]:
         """Return how the images differ from what is expected in a pose, in units of the usual misfit."""
-        full = _MISFIT * self.config.iodine_mm * 3.0  # a vessel of 3 mm
-        pairs = zip(self.expected(pose), self.observed, strict=True)
-        return np.concatenate([((ours - theirs) / full).ravel() for ours, theirs in pairs])
+        full = self.misfit * self.config.iodine_mm * 3.0  # a vessel of 3 mm
+        return np.concatenate(
+            [((ours - theirs) / (strength * full)).ravel() for ours, theirs, strength in self.fitted(pose)]
+        )
 
     def slope(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "n 6"]:
         """Return the derivative of the residuals by the pose."""
@@ -161,19 +231,24 @@ class Comparison:
 
         Neighbouring pixels that were blurred together err together.
         """
+        slope, misfit = self.slope(pose)[:-6], self.misfit_of(pose)
+        return np.linalg.inv(slope.T @ slope / misfit**2 + np.diag(_PRIOR**-2.0))
+
+    def misfit_of(self, pose: Float[np.ndarray, "6"]) -> float:
+        """Return how large the differences near the vessel are, in units of the usual misfit, as if none were alike."""
         slope, residual = self.slope(pose)[:-6], self.residuals(pose)[:-6]
-        near = np.abs(slope).max(axis=1) > _FELT * np.abs(slope).max()
-        variance = float(np.mean(residual[near] ** 2)) * 4 * np.pi * self.blur**2
-        return np.linalg.inv(slope.T @ slope / variance + np.diag(_PRIOR**-2.0))
+        near = np.abs(slope).max(axis=1) >= _FELT * np.abs(slope).max()
+        return float(np.sqrt(np.mean(residual[near] ** 2) * 4 * np.pi)) * self.blur
 
     def correlation(self, pose: Float[np.ndarray, "6"]) -> float:
         """Return the correlation of what was expected and observed around the vessel."""
-        ours, theirs = (
-            np.concatenate([image.ravel() for image in images]) for images in (self.expected(pose), self.observed)
-        )
+        pairs = [(ours - ours.min(), theirs) for ours, theirs, _ in self.fitted(pose)]
+        ours, theirs = (np.concatenate([image.ravel() for image in images]) for images in zip(*pairs, strict=True))
         near = ours > 0.02 * ours.max()
         wide = near | (gaussian_filter(near.astype(np.float32), 2.0) > 0)
-        return float(np.corrcoef(ours[wide], theirs[wide])[0, 1]) if wide.sum() > 2 else 0.0
+        if wide.sum() < 3 or np.ptp(theirs[wide]) == 0:
+            return 0.0
+        return float(np.corrcoef(ours[wide], theirs[wide])[0, 1])
 
 
 def observed_contrast(
@@ -210,8 +285,19 @@ def _added(
     return np.log(np.maximum(before - scatter, least) / np.maximum(light - scatter, least)).astype(np.float32)
 
 
-def sampled_lumen(anatomy: Anatomy) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
-    """Return a sample of the lumen, and of the catheter's straight end, which contrast fills too."""
+def sampled_lumen(
+    anatomy: Anatomy, *, alike: bool = True
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Return a sample of the lumen, and of the catheter's straight end, which contrast fills too.
+
+    Args:
+        anatomy: the vessel.
+        alike: whether contrast fills all of it alike, as when an injection waits for that.
+
+    Returns:
+        Places, LPS mm, the volume that each stands for, mm³, and how far along the vessel it lies, from 0 to 1; 0 if
+        it is filled alike.
+    """
     points, size = lumen_points(anatomy)
     behind, size_behind = catheter_lumen_points(anatomy)
     near = np.linalg.norm(behind - anatomy.insertion.position, axis=1) < 10.0
@@ -219,6 +305,9 @@ def sampled_lumen(anatomy: Anatomy) -> tuple[Float[np.ndarray, "n 3"], Float[np.
     chosen = random.permutation(len(points))[:_POINTS]
     inside = np.flatnonzero(near)
     inside = inside[random.permutation(len(inside))[: _POINTS // 20]]
+    line = anatomy.tree.line
+    share = 0.0 if alike else 1 / line.abscissa.max()
+    along = share * line.abscissa[KDTree(line.points).query(points[chosen])[1]]
     return (
         np.concatenate([points[chosen], behind[inside]]),
         np.concatenate(
@@ -227,6 +316,7 @@ def sampled_lumen(anatomy: Anatomy) -> tuple[Float[np.ndarray, "n 3"], Float[np.
                 size_behind[inside] * size_behind[near].sum() / size_behind[inside].sum(),
             ]
         ),
+        np.concatenate([along, np.zeros(len(inside))]),
     )
 
 

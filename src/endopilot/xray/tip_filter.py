@@ -6,8 +6,7 @@ the frames, is anywhere: so a tip in the wrong branch is found again. Heart and 
 in each frame.
 
 In a frame the device's line is compared with the projected way to each place (`line_observations`), with what is known
-of pose, of breathing, and of how far the device lies off its way. Lines are those of any detector; those of
-`TipDetector`, which knows nothing of other times, are turned into frames by `frames.frame_of`.
+of pose, of breathing, and of how far the device lies off its way.
 """
 
 from __future__ import annotations
@@ -117,6 +116,12 @@ class TipLocation:
     moved_mm: Float[np.ndarray, "3"]
     residual_mm: float
 
+    @classmethod
+    def nowhere(cls, frame: int) -> TipLocation:
+        """Return that a frame shows no tip."""
+        nothing = np.full(3, np.nan)
+        return cls(frame, "not found", nothing, np.full((3, 3), np.nan), 0.0, np.nan, -1, "", nothing, np.nan)
+
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
@@ -138,6 +143,13 @@ class _Fit:
     aside_covariance: Float[np.ndarray, "m 3 3"]
 
 
+def goes(grid: VesselGrid, config: LocateConfig, frames: float) -> Float[np.ndarray, "n n"]:
+    """Return how likely the tip goes from each place to each in so many frames' time."""
+    stay = np.exp(-grid.distance / (config.travel_mm * frames))
+    rare = min(config.anywhere_share * frames, 0.5)
+    return (1 - rare) * stay / stay.sum(axis=1, keepdims=True) + rare / len(stay)
+
+
 class TipFilter:
     """Follows the tip of one device through the frames of a sequence.
 
@@ -151,9 +163,6 @@ class TipFilter:
         self._tree, self._cameras = tree, tuple(cameras)
         self.grid: VesselGrid = make_grid(tree, step_mm=_STEP_MM, stiff_mm=self.config.stiff_mm)
         count = len(self.grid.middle)
-        stay = np.exp(-self.grid.distance / self.config.travel_mm)
-        rare = self.config.anywhere_share
-        self._goes = (1 - rare) * stay / stay.sum(axis=1, keepdims=True) + rare / count
         self._centre = self.grid.way.mean(axis=0)
         self._aside = _ASIDE_SD_MM + _ASIDE_RADII * self.grid.radius
         turn = np.deg2rad(self.config.turn_sd_deg)
@@ -172,11 +181,12 @@ class TipFilter:
                 the tip alone; None where the camera does not see it.
         """
         if self._begun:
-            self._predict()
+            self._predict(max(frame - self._frame, 1))
         else:
             self._begun = self._begin(lines)
+        self._frame = frame
         if all(line is None for line in lines):
-            return self._nowhere(frame)
+            return TipLocation.nowhere(frame)
         share = np.exp(self._log)
         base = share @ self._mean
         pairs, way = zip(self._cameras, lines, strict=True), self._moved(base)
@@ -191,7 +201,7 @@ class TipFilter:
         odds = fit.log_density - _STRAY * rows.used.sum(axis=1)
         whole = rows.value.shape[1] > 2 * len(seen)
         if np.logaddexp.reduce(self._log[places] + odds) < (_LEAST_ODDS if whole else 0.0):
-            return self._nowhere(frame)
+            return TipLocation.nowhere(frame)
         log = self._log[places] + odds + (_BEYOND - _STRAY) * beyond
         evidence = np.logaddexp.reduce(log)
         self._log = np.full_like(self._log, -np.inf)
@@ -220,9 +230,9 @@ class TipFilter:
         self._covariance[:, :3, :3] = _LANDMARK_SD_MM**2 * np.eye(3)
         return True
 
-    def _predict(self) -> None:
-        """Let the tip travel and the pose drift; what comes together at a place is one normal distribution there."""
-        flow = self._goes * np.exp(self._log)[:, None]
+    def _predict(self, frames: int) -> None:
+        """Let the tip travel and the pose drift for some frames; what comes together at a place is one normal there."""
+        flow = goes(self.grid, self.config, float(frames)) * np.exp(self._log)[:, None]
         total = flow.sum(axis=0)
         flow /= total
         square = self._covariance + self._mean[:, :, None] * self._mean[:, None]
@@ -230,7 +240,7 @@ class TipFilter:
         square = (flow.T @ square.reshape(len(total), -1)).reshape(square.shape)
         drift = np.array([*[_DRIFT_MM] * 3, *[_DRIFT_RAD] * 3])
         self._log, self._mean = np.log(total), mean
-        self._covariance = square - mean[:, :, None] * mean[:, None] + np.diag(drift**2)
+        self._covariance = square - mean[:, :, None] * mean[:, None] + frames * np.diag(drift**2)
 
     def _moved(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "n 3"]:
         matrix = Rotation.from_rotvec(pose[3:6]).as_matrix()
@@ -300,10 +310,6 @@ class TipFilter:
             aside=np.einsum("mri,mr->mi", own, weight),
             aside_covariance=aside[:, :1, :1] * np.eye(3) - own.swapaxes(1, 2) @ solved[..., 7:],
         )
-
-    def _nowhere(self, frame: int) -> TipLocation:
-        nothing = np.full(3, np.nan)
-        return TipLocation(frame, "not found", nothing, np.full((3, 3), np.nan), 0.0, np.nan, -1, "", nothing, np.nan)
 
     def _answer(
         self, frame: int, places: Int[np.ndarray, "m"], fit: _Fit, rows: Observations, base: Float[np.ndarray, "6"]

@@ -8,7 +8,7 @@ with one the vessel gives it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -25,7 +25,7 @@ _LONGEST = 4.0
 """No way is longer than the inserted length by more than so many standard deviations."""
 _MOST_OF_CATHETER = 20.0
 """The evidence of a wire in the catheter counts no more than this."""
-_MODE_MM = 4.0
+MODE_MM = 4.0
 """Mean and covariance are those of the posterior within this distance of its mode, mm."""
 _NOTHING = 1e-8
 """A place with less of the posterior is left out of the sums."""
@@ -36,6 +36,7 @@ _FOLDS, _FOLDS_APART_MM, _FOLD_ODDS = 4, 4.0, 60.0
 likely than the likeliest."""
 
 Status = Literal["found", "ambiguous", "not found"]
+Expected = Callable[[int, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +51,8 @@ class TipEstimate:
         elsewhere: what the rest adds to the covariance, mm².
         status: "found"; "ambiguous" where the tip may well lie elsewhere; "not found" where there is no wire.
         wire: places of the wire from the catheter to the tip, LPS mm.
-        middle: the vessel's centerline at these, LPS mm.
-        room: how far from it the wire's axis may lie there, mm.
+        ends: branch (-1 in the catheter), abscissa, mm, and how likely a wire that does not fold ends there whatever
+            its length, a logarithm, of every section.
     """
 
     log_odds: float
@@ -60,27 +61,54 @@ class TipEstimate:
     share: float
     elsewhere: Float[np.ndarray, "3 3"]
     wire: Float[np.ndarray, "n 3"]
-    middle: Float[np.ndarray, "n 3"]
-    room: Float[np.ndarray, "n"]
+    ends: Float[np.ndarray, "sections 3"]
     status: Status = "found"
+    shift: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    shift_covariance: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
 
 
-def longest_mm(inserted_length: float) -> float:
-    """Return how long the way to the tip is at most, by the robot's encoder, mm."""
-    return inserted_length + _LONGEST * _spread(inserted_length)[1]
+def longest_mm(inserted_length: float | None) -> float:
+    """Return how long the way to the tip is at most, by the robot's encoder, mm; any length without one."""
+    return np.inf if inserted_length is None else inserted_length + _LONGEST * _spread(inserted_length)[1]
 
 
-def _spread(inserted_length: float) -> tuple[float, float]:
+def _spread(inserted_length: float | None) -> tuple[float, float]:
     """Return by how much the way to the tip is shorter and longer than the inserted length: standard deviations, mm."""
+    if inserted_length is None:
+        return np.inf, np.inf
     wire_mm = max(inserted_length, 0.0)
     return _NEAR_MM + _SHORTER_SHARE * wire_mm, _NEAR_MM + _LONGER_SHARE * wire_mm
+
+
+def end_log(
+    branch: int,
+    abscissa: Float[np.ndarray, "n"],
+    length: Float[np.ndarray, "n"],
+    inserted_length: float | None,
+    expected: Expected | None,
+) -> Float[np.ndarray, "n"]:
+    """Return how likely a wire ends at some places before images are seen, a logarithm; unnormalised.
+
+    Args:
+        branch: that they lie in; -1 for the catheter.
+        abscissa: of the places, mm.
+        length: of the wire up to them, mm.
+        inserted_length, expected: as `estimate_tip` takes them.
+    """
+    shorter, longer = _spread(inserted_length)
+    excess = length - (inserted_length or 0.0)
+    log = -0.5 * (excess / np.where(excess > 0, longer, shorter)) ** 2
+    if inserted_length is None and branch < 0:
+        log = np.full(len(excess), -np.inf)
+    return log if expected is None else log + expected(branch, abscissa)
 
 
 def estimate_tip(
     corridor: Corridor,
     shown: Sequence[CorridorView],
     evidence: Sequence[Float32[np.ndarray, "rows columns"]],
-    inserted_length: float,
+    inserted_length: float | None,
+    expected: Expected | None = None,
 ) -> TipEstimate:
     """Find the tip of a wire.
 
@@ -88,31 +116,36 @@ def estimate_tip(
         corridor: of the vessel.
         shown: it in each view, as registration has them.
         evidence: for each view the logarithm of how much likelier each pixel is on a wire than off it.
-        inserted_length: Δ by the robot's encoder, mm.
+        inserted_length: Δ by the robot's encoder, mm; None where there is none.
+        expected: how likely the tip is at places of a branch before the images are seen, a logarithm, by other times.
     """
-    follower, (shorter, longer) = Follower(corridor, shown, evidence), _spread(inserted_length)
+    follower = Follower(corridor, shown, evidence)
     legs = follower.forwards()
 
-    def prior(lengths: Sequence[np.ndarray], share: float) -> Callable[[np.ndarray], np.ndarray]:
-        def log(length: np.ndarray) -> np.ndarray:
-            excess = length - inserted_length
-            return -0.5 * (excess / np.where(excess > 0, longer, shorter)) ** 2
+    def weighed(some: Sequence[Leg], everywhere: Sequence[np.ndarray], share: float) -> list[np.ndarray]:
+        whole = np.logaddexp.reduce(np.concatenate(everywhere)) - np.log(share)
+        return [leg.log_scale + before(leg) - whole for leg in some]
 
-        everywhere = np.logaddexp.reduce(log(np.concatenate(lengths)))
-        return lambda length: log(length) - everywhere + np.log(share)
+    def before(leg: Leg) -> np.ndarray:
+        abscissa = leg.passage.abscissa[leg.section]
+        return end_log(leg.passage.branch, abscissa, leg.length, inserted_length, expected)
 
-    straight = prior([one.abscissa for one in corridor.passages], 1 - _FOLDED_SHARE)
-    scores = [leg.log_scale + straight(leg.length) for leg in legs]
-    folds = _folds(legs, inserted_length + 2 * longer)
+    ends = np.concatenate(
+        [np.column_stack([np.full(len(leg.section), leg.passage.branch), leg.length, leg.log_scale]) for leg in legs]
+    )
+    places = [(one.branch, one.abscissa, one.abscissa) for one in corridor.passages]
+    scores = weighed(legs, [end_log(*place, inserted_length, expected) for place in places], 1 - _FOLDED_SHARE)
+    folds = _folds(legs, np.inf if inserted_length is None else inserted_length + 2 * _spread(inserted_length)[1])
     back = [one for leg, at in folds for one in follower.backwards(leg, at, longest_mm(inserted_length))]
     if back:
-        folded = prior([leg.length for leg in back], _FOLDED_SHARE)
-        scores += [leg.log_scale + folded(leg.length) for leg in back]
+        scores += weighed(back, [before(leg) for leg in back], _FOLDED_SHARE)
         legs += back
     total = float(np.logaddexp.reduce(np.concatenate(scores)))
     # What lies in the catheter alone is a poor sign of a wire: the catheter is a dark line too.
-    catheter = max(float(legs[0].log_scale[-1]) - _MOST_OF_CATHETER, 0.0)
-    return _summary(follower, legs, [np.exp(values - total) for values in scores], total - catheter)
+    most = _MOST_OF_CATHETER if inserted_length is not None else 0.0
+    catheter = max(float(legs[0].log_scale[-1]) - most, 0.0)
+    weights = [np.exp(values - total) for values in scores]
+    return _summary(follower, legs, weights, total - catheter, ends)
 
 
 def _folds(legs: Sequence[Leg], deepest_mm: float) -> list[tuple[Leg, int]]:
@@ -132,7 +165,11 @@ def _folds(legs: Sequence[Leg], deepest_mm: float) -> list[tuple[Leg, int]]:
 
 
 def _summary(
-    follower: Follower, legs: Sequence[Leg], weights: Sequence[Float[np.ndarray, "n"]], log_odds: float
+    follower: Follower,
+    legs: Sequence[Leg],
+    weights: Sequence[Float[np.ndarray, "n"]],
+    log_odds: float,
+    ends: Float[np.ndarray, "sections 3"],
 ) -> TipEstimate:
     """Return mean and covariance around the mode of the posterior, whose weight in each leg's sections is given."""
     best = int(np.argmax([weight.max() for weight in weights]))
@@ -143,22 +180,19 @@ def _summary(
     ) / here.sum()
     parts = [_counted(leg, weight) for leg, weight in zip(legs, weights, strict=True)]
     places, weight = (np.concatenate(part) for part in zip(*parts, strict=True))
-    near = ((places - mode) ** 2).sum(axis=1) <= _MODE_MM**2
+    near = ((places - mode) ** 2).sum(axis=1) <= MODE_MM**2
     # A cell has a size: that of a section's step and of its grid.
     share, mean, covariance = around_mode(places, weight, near, STEP_MM)
     far = places[~near] - mean
     elsewhere = (weight[~near, None] * far).T @ far
-    way = follower.way(legs[best], section)
-    passed = [(stop.leg.passage, stop.leg.section[stop.at]) for stop in way]
     return TipEstimate(
         log_odds=log_odds,
         position=mean,
         covariance=covariance,
         share=share,
         elsewhere=elsewhere,
-        wire=places_of(way),
-        middle=np.array([passage.middle[at] for passage, at in passed]),
-        room=np.array([passage.room[at] for passage, at in passed]),
+        wire=places_of(follower.way(legs[best], section)),
+        ends=ends,
     )
 
 

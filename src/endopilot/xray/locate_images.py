@@ -1,0 +1,295 @@
+"""The tip of a wire in X-ray images of one's own: registered from contrast, detected, and followed over the frames.
+
+The frame that shows the vessel best registers the patient, and every other frame with contrast lays the vessel anew,
+since heart and breath move it; a frame without takes the nearest one's. In each frame the detector says how likely the
+wire ends at each place of the tree; what the other frames say of these places, and how far a tip travels in the time
+between, is the prior of the frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from jaxtyping import Float, Float32
+from scipy.spatial import KDTree
+
+from endopilot.anatomy.projection import TipProjector
+from endopilot.devices.device import Wire
+from endopilot.errors import InputError
+from endopilot.progress import progress
+from endopilot.types import Anatomy
+from endopilot.xray.carm import Pose, View, view_of
+from endopilot.xray.cine import XrayCine
+from endopilot.xray.detector import TipDetector
+from endopilot.xray.image import isocenter_of
+from endopilot.xray.line_observations import VesselGrid, make_grid
+from endopilot.xray.registration import Registration, lay, observed_contrast, register
+from endopilot.xray.tip_filter import LocateConfig, TipLocation, goes
+from endopilot.xray.tip_posterior import TipEstimate
+
+_EMPTY_SHARE = 0.9
+"""A pixel's light where no contrast passes is this quantile of the frames': contrast and wire darken fewer."""
+_DARKEST_SHARE = 0.05
+"""This share of an image, the darkest, tells how much contrast a frame shows: vessels cover no less."""
+_LESS = 0.06
+"""They do where image and vessel agree within this of the best frame's correlation."""
+_SOME = 0.4
+"""Frames with this share of the most contrast lay the vessel by themselves."""
+_MOVES_MM = 2.5
+"""How far heart and breath move a vessel from where a landmark or another frame registers it, along each axis: standard
+deviation, mm, of the size of the published amplitudes (docs/concepts/motion.md)."""
+_FEWEST, _STIRS_MM = 4, 1.0
+"""From so many frames on, how far their vessels lie apart says how far it moves; and by how much more at least, mm."""
+_ELSEWHERE_MM = 4.0
+"""A tip this far from where all frames together have it is sought anew."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImagesLocated:
+    """What was found in cines of one patient.
+
+    Attributes:
+        tips: of each frame.
+        wires: the wire in each, from the catheter to its tip, LPS mm of the CT; None where none is found.
+        views: of each frame and plane, in the CT's frame, as the vessel lies then.
+        cines: as they fit the vessel.
+        registration: of the frame that shows the vessel best; None where a landmark registered the patient.
+        best: index of that frame.
+        notes: what was assumed, or changed.
+    """
+
+    tips: tuple[TipLocation, ...]
+    wires: tuple[Float[np.ndarray, "_ 3"] | None, ...]
+    views: tuple[tuple[View, ...], ...]
+    cines: tuple[XrayCine, ...]
+    registration: Registration | None
+    best: int
+    notes: tuple[str, ...]
+
+    def pixels(self, frame: int, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+        """Return column and row, pixels of the first plane, of points of the vessel or in it, LPS mm of the CT."""
+        middle = (self.cines[0].signals.shape[1] - 1) / 2
+        return middle + self.views[frame][0].project(points) * [1.0, -1.0]
+
+
+def locate_in_images(
+    anatomy: Anatomy, *, cines: Sequence[XrayCine], device: Wire, config: LocateConfig | None = None
+) -> ImagesLocated:
+    """Find the tip of a wire in each frame of a cine, or of two planes that were exposed together.
+
+    Args:
+        anatomy: the vessel.
+        cines: one plane or two.
+        device: the wire.
+        config: a landmark, where no contrast registers the patient, and how far the tip travels.
+
+    Raises:
+        InputError: planes of different numbers of frames, or nothing that registers the patient.
+    """
+    config, count = config or LocateConfig(), len(cines[0].times_s)
+    for one in cines[1:]:
+        if len(one.times_s) != count:
+            raise InputError(f"{one.path}: {len(one.times_s)} frames, and {count} in {cines[0].path}; give one pair")
+        if one.image != cines[0].image:
+            raise InputError(f"{one.path}: has another geometry or size than {cines[0].path}; give two planes alike")
+    cines, poses, moves, registered, best, notes = _registered(anatomy, tuple(cines), config)
+    isocenter = isocenter_of(anatomy)
+    views = [[view_of(one.view(isocenter), pose, isocenter) for one in cines] for pose in poses]
+    detector, photons = TipDetector(anatomy, device), [one.photons() for one in cines]
+    found: list[TipEstimate] = []
+
+    def look(frame: int, expected: Callable[[int, np.ndarray], np.ndarray] | None) -> TipEstimate:
+        shown = [one.signals[frame] for one in cines]
+        return detector.estimate(views[frame], shown, photons, None, expected=expected, displaced=moves[frame])
+
+    with progress(f"locate {anatomy.name}", count) as advance:
+        for frame in range(count):
+            found.append(look(frame, None))
+            advance()
+    track = _Track(anatomy, config)
+    track.run([one.ends if one.status != "not found" else None for one in found], cines[0].times_s)
+    for frame, one in enumerate(found):
+        if one.status != "not found" and track.elsewhere(frame, one):
+            found[frame] = look(frame, track.expected(frame))
+        # Where heart and breath have taken the vessel is a guess in frames without contrast: no tip is sure there.
+        if found[frame].status == "found" and (moves[frame] is not None or track.elsewhere(frame, found[frame])):
+            found[frame] = replace(found[frame], status="ambiguous")
+    project, tips = TipProjector(anatomy.tree, anatomy.insertion), []
+    for frame, one in enumerate(found):
+        views[frame] = [replace(view, source=view.source - one.shift) for view in views[frame]]
+        moved = poses[frame].move(one.position + one.shift, isocenter) - one.position
+        tips.append(_location(anatomy, project, frame, one, moved))
+    return ImagesLocated(
+        tips=tuple(tips),
+        wires=tuple(None if one.status == "not found" else one.wire for one in found),
+        views=tuple(map(tuple, views)),
+        cines=cines,
+        registration=registered,
+        best=best,
+        notes=notes,
+    )
+
+
+def _registered(
+    anatomy: Anatomy, cines: tuple[XrayCine, ...], config: LocateConfig
+) -> tuple[tuple[XrayCine, ...], list[Pose], list[np.ndarray | None], Registration | None, int, tuple[str, ...]]:
+    """Return the cines as they fit the vessel, the pose at each frame and how far off, the best one, and notes.
+
+    Raises:
+        InputError: nothing registers the patient.
+    """
+    notes = tuple(f"{one.path.name}: {note}" for one in cines for note in one.notes)
+    count, isocenter = len(cines[0].times_s), isocenter_of(anatomy)
+    if config.landmark_mm is not None:
+        if config.landmark_px is None:
+            raise InputError("landmark_px: missing; give the pixel of the first frame that shows landmark_mm")
+        view, point, shift = cines[0].view(isocenter), np.array(config.landmark_mm), np.zeros(3)
+        middle = (cines[0].signals.shape[1] - 1) / 2
+        pixel = (np.array(config.landmark_px) - middle) * [1, -1]
+        for _ in range(4):
+            shift = shift + np.linalg.pinv(view.slope(point + shift)) @ (pixel - view.project(point + shift))
+        return cines, [Pose(translation_mm=shift)] * count, [_MOVES_MM**2 * np.eye(3)] * count, None, 0, notes
+    before = [np.quantile(one.signals, _EMPTY_SHARE, axis=0).astype(np.float32) for one in cines]
+    contrast = np.sum([_contrast(one, empty) for one, empty in zip(cines, before, strict=True)], axis=0)
+    best = int(contrast.argmax())
+    tried: list[tuple[Registration, tuple[XrayCine, ...], list[np.ndarray], str]] = []
+    for seen, empty, said in _read_otherwise(cines, before):
+        views, lit = [one.view(isocenter) for one in seen], [one.signals[best] for one in seen]
+        start = lay(anatomy, views, lit, empty, seen[0].image)[0]
+        tried.append((register(anatomy, views, lit, empty, seen[0].image, start), seen, empty, said))
+        if not tried[-1][0].failure:
+            break
+    first, cines, before, said = max(tried, key=lambda one: one[0].correlation)
+    if first.failure:
+        raise InputError(
+            f"{cines[0].path}: {anatomy.name} cannot be registered in frame {best}, whatever the angles' signs: "
+            f"{tried[0][0].failure}; or give --landmark-mm and --landmark-px"
+        )
+    views, known = [one.view(isocenter) for one in cines], {best: first}
+    for frame in sorted(range(count), key=lambda one: (one < best, abs(one - best))):
+        if frame != best and contrast[frame] > _SOME * contrast[best]:
+            near = min(known, key=lambda one: abs(one - frame))
+            lit = [one.signals[frame] for one in cines]
+            laid = register(anatomy, views, lit, before, cines[0].image, known[near].pose)
+            known |= {} if laid.failure else {frame: laid}
+    most = max(one.correlation for one in known.values())
+    known = {frame: one for frame, one in known.items() if one.correlation > most - _LESS}
+    poses = {frame: one.pose for frame, one in known.items()}
+    # Where a frame shows no contrast, the vessel lies as far from its mean place as in those that do.
+    points = anatomy.tree.line.points[::8]
+    lies = np.array([one.move(points, isocenter) for one in poses.values()])
+    off = lies - lies.mean(axis=0)
+    spread = np.einsum("kni,knj->ij", off, off) / off[..., 0].size + _STIRS_MM**2 * np.eye(3)
+    spread += max(_FEWEST - len(known), 0) / _FEWEST * _MOVES_MM**2 * np.eye(3)
+    mean = Pose.of_vector(np.mean([one.vector for one in poses.values()], axis=0))
+    moves = [None if frame in known else spread for frame in range(count)]
+    best = max(known, key=lambda one: known[one].correlation)
+    poses = [poses.get(frame, mean) for frame in range(count)]
+    return cines, poses, moves, known[best], best, (*notes, *([said] if said else []))
+
+
+def _contrast(cine: XrayCine, before: Float32[np.ndarray, "rows rows"]) -> Float[np.ndarray, "frames"]:
+    """Return how much contrast each frame shows, in powers of e."""
+    seen = [observed_contrast([one], [before], 8, 3.0, cine.image)[0].ravel() for one in cine.signals]
+    return np.array([np.sort(one)[-round(_DARKEST_SHARE * len(one)) :].mean() - np.median(one) for one in seen])
+
+
+def _read_otherwise(
+    cines: tuple[XrayCine, ...], before: list[np.ndarray]
+) -> Iterator[tuple[tuple[XrayCine, ...], list[np.ndarray], str]]:
+    """Yield the cines as their files have them, then with angles of other signs and mirrored, and say so."""
+    for mirrored, first, second in product((False, True), (1, -1), (1, -1)):
+        if any(one.camera.angles_deg is None for one in cines) and (first, second) != (1, 1):
+            continue
+        changes = [
+            *(["PositionerPrimaryAngle has the other sign (RAO, LAO)"] if first < 0 else []),
+            *(["PositionerSecondaryAngle has the other sign (cranial, caudal)"] if second < 0 else []),
+            *(["the image is mirrored left to right"] if mirrored else []),
+        ]
+        said = f"the vessel fits the images only if {' and '.join(changes)}; taken so" if changes else ""
+        seen = []
+        for one in cines:
+            angles = one.camera.angles_deg
+            turned = None if angles is None else (first * angles[0], second * angles[1])
+            signals = one.signals[..., ::-1] if mirrored else one.signals
+            seen.append(replace(one, signals=signals, camera=replace(one.camera, angles_deg=turned)))
+        yield tuple(seen), [empty[:, ::-1] if mirrored else empty for empty in before], said
+
+
+class _Track:
+    """Where the tip is at each time, by all frames together: forward and backward messages over places of the tree."""
+
+    def __init__(self, anatomy: Anatomy, config: LocateConfig) -> None:
+        self._grid: VesselGrid = make_grid(anatomy.tree, step_mm=1.0, stiff_mm=1.0)
+        self._near, self._config = KDTree(self._grid.middle), config
+        self._of = [np.flatnonzero(self._grid.branch == k) for k in range(len(anatomy.tree.branches))]
+        self._log: Float[np.ndarray, "frames n"] = np.zeros((0, len(self._grid.middle)))
+
+    def run(self, ends: Sequence[Float[np.ndarray, "_ 3"] | None], times_s: Float[np.ndarray, "frames"]) -> None:
+        """Take what each frame says of the tip's place; None where it shows no wire."""
+        count = len(self._grid.middle)
+        seen = np.zeros((len(ends), count))
+        for frame, rows in enumerate(ends):
+            if rows is not None:
+                seen[frame] = -np.inf
+                for branch, places in [(-1, np.zeros(1, dtype=int)), *enumerate(self._of)]:
+                    of = rows[rows[:, 0] == branch]
+                    if len(of) and len(places):
+                        at = places[np.abs(of[:, 1:2] - self._grid.abscissa[places]).argmin(axis=1)]
+                        np.logaddexp.at(seen[frame], at, of[:, 2])
+        ahead, back = np.zeros((len(ends), count)), np.zeros((len(ends), count))
+        ahead[0] = -np.log(count)
+        for k in range(1, len(ends)):
+            ahead[k] = self._gone(ahead[k - 1] + seen[k - 1], times_s[k] - times_s[k - 1])
+            back[-k - 1] = self._gone(back[-k] + seen[-k], times_s[-k] - times_s[-k - 1])
+        self._prior, self._log = ahead + back, ahead + back + seen
+
+    def _gone(self, log: Float[np.ndarray, "n"], seconds: float) -> Float[np.ndarray, "n"]:
+        flow = goes(self._grid, self._config, max(seconds, 1e-3) / _FRAME_S)
+        return np.log(flow.T @ np.exp(log - log.max()) + 1e-300)
+
+    def elsewhere(self, frame: int, one: TipEstimate) -> bool:
+        """Return whether all frames together have the tip elsewhere than a frame by itself."""
+        mode = self._grid.middle[int(self._log[frame].argmax())]
+        return float(np.linalg.norm(one.position - mode)) > _ELSEWHERE_MM
+
+    def expected(self, frame: int) -> Callable[[int, np.ndarray], np.ndarray]:
+        """Return what the other frames say of the tip's place in a frame."""
+        prior = self._prior[frame] - np.logaddexp.reduce(self._prior[frame])
+
+        def log(branch: int, abscissa: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+            places = self._of[branch] if branch >= 0 else np.zeros(1, dtype=int)
+            return np.interp(abscissa, self._grid.abscissa[places], prior[places])
+
+        return log
+
+
+_FRAME_S = 0.133
+"""Time of a frame at which `LocateConfig.travel_mm` is meant, s: 7.5 frames a second, usual in fluoroscopy."""
+
+
+def _location(
+    anatomy: Anatomy, project: TipProjector, frame: int, one: TipEstimate, moved_mm: Float[np.ndarray, "3"]
+) -> TipLocation:
+    """Return where a tip of the detector lies in the tree."""
+    if one.status == "not found":
+        return TipLocation.nowhere(frame)
+    at = project(one.position[None])
+    branch, abscissa = int(at.branch[0]), float(at.abscissa[0])
+    here = anatomy.tree.branches[branch]
+    section = here.section[np.abs(here.centerline.abscissa - abscissa).argmin()]
+    return TipLocation(
+        frame=frame,
+        status=one.status,
+        position=one.position,
+        covariance=one.covariance,
+        share=one.share,
+        abscissa=abscissa,
+        branch=branch,
+        section=anatomy.tree.section_names[section],
+        moved_mm=moved_mm,
+        residual_mm=np.nan,
+    )
