@@ -153,7 +153,8 @@ def test_a_catheter_stops_short_of_the_end_of_the_vessel(patient):
 
 def test_models_take_it_with_the_commands_of_both_devices(pairs):
     data = read_dataset(pairs)
-    longer = {each.name: np.repeat(getattr(data, each.name), 2, axis=1) for each in fields(data)}
+    arrays = {each.name: getattr(data, each.name) for each in fields(data)}
+    longer = {name: np.repeat(a, 2, axis=1) for name, a in arrays.items() if np.shape(a)[1:2] == (20,)}
     episodes = Episodes.of_dataset(replace(data, **longer))
     np.testing.assert_array_equal(episodes.command, np.repeat(data.command, 2, axis=1))
     np.testing.assert_array_equal(episodes.start, data.initial)
