@@ -1,4 +1,4 @@
-"""What becomes of motions that are driven side by side towards a place of the route: `drive`, `Outcome`.
+"""What becomes of motions that are driven side by side towards a place of the route: `Driver`, `Outcome`.
 
 A motion has four steps, each of which a trial takes when it is done with the one before: the devices are *placed*, all
 are *turned*, all are *retracted*, and they are *pushed on* until they pass the place. A catheter follows its wire by
@@ -168,6 +168,11 @@ class Outcome:
     def controls_of(self, trial: int) -> Controls:
         """Return the controls of one trial."""
         return self.controls[: self.periods[trial], trial]
+
+    @property
+    def left_mm(self) -> Each:
+        """How far each trial has to go, and what its slack adds, mm."""
+        return self.to_go + _SLACK * np.maximum(self.slack, 0.0)
 
     def cost(self, force_limit_n: float) -> Each:
         """Return what each trial costs, mm.

@@ -31,6 +31,8 @@ _KEEP = 8
 """Trials that go on to the next round."""
 _REPEATED = 3
 """Trials that the course tries, one after another."""
+_LONGER = 10
+"""Times the given time after which a course to the target with a catheter is given up: a plan tells how long."""
 
 
 class Search:
@@ -107,7 +109,7 @@ class Search:
         course.put(source, belief.simulator, weight)
         self._most = max(1, int(seconds / DECISION_PERIOD_S))
         if self._navigation.catheters and not np.isfinite(horizon_mm):
-            self._most *= 10
+            self._most *= _LONGER
         self.halt, self._kept = "", course.kept()
         self.budget.begin()
         try:
@@ -144,7 +146,7 @@ class Search:
                     return
 
     def _pass(self, goal: Goal) -> Halt | None:
-        """Lead the course past a place; else as far as the cheapest trial comes, and return why no motion passes."""
+        """Lead the course past a place, or on towards it; return why no motion does, else None."""
         course, repertoire, limit_n = self._course, self._repertoire, self._navigation.force_limit_n
         if self._left <= 0:
             return "late"
@@ -176,7 +178,9 @@ class Search:
         periods = self._left if row.draws is None else min(row.draws.periods, self._left)
         for number in range(row.rounds):
             motions = row.motions(obstacle, step, self.config, trials.devices, self._random, number)
-            outcome = Driver(trials, motions, goal, limits, self.config).run(periods)
+            outcome = Driver(trials, motions, goal, limits, self.config).run(
+                min(periods, self._left - len(trials.rows))
+            )
             yield outcome
             best = np.argsort(outcome.cost(limit_n))[:_KEEP]
             trials.copy_trials(np.resize(best, trials.count))
@@ -198,10 +202,10 @@ class Search:
         if row.draws is None or not gentle.any():
             return False
         start = float(goal.to_go(course, self.config.behind_mm)[0])
-        to_go = np.where(gentle, outcome.to_go + 0.1 * outcome.slack, np.inf)
-        if to_go.min() > start - row.draws.step_mm:
+        left = np.where(gentle, outcome.left_mm, np.inf)
+        if left.min() > start - row.draws.step_mm:
             return False
-        self._repeat(outcome, int(np.argmin(to_go)), pauses=True, most=row.draws.kept)
+        self._repeat(outcome, int(np.argmin(left)), pauses=True, most=row.draws.kept)
         return True
 
     def _repeat(self, outcome: Outcome, trial: int, *, pauses: bool, most: int = sys.maxsize) -> None:
