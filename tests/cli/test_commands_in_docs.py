@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+import endopilot
 from endopilot.cli import command_of, main
 from endopilot.errors import InputError
 

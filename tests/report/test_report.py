@@ -184,14 +184,6 @@ def test_sections_with_nothing_to_show_are_left_out(material, tmp_path, no_still
     assert "Nothing was evaluated" in page.words
 
 
-def test_a_model_that_trains_nothing_has_no_training_section(material, tmp_path, no_still):
-    write_json(tmp_path / "run" / "training.json", {})
-    content = ReportContent(
-        title="T", origin="O", command="C", evaluation=material / "evaluation", run=tmp_path / "run"
-    )
-    assert "training" not in write_page(tmp_path, content).sections
-
-
 def test_one_known_patient_alone_is_reported(material, results, tmp_path, no_still):
     write_json(tmp_path / "e" / "metrics.json", evaluate._metrics({"seen_test": results["test"]}, {"c"}, 0))
     content = ReportContent(title="T", origin="O", command="C", evaluation=tmp_path / "e")

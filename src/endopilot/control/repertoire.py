@@ -43,7 +43,7 @@ class Draws:
     """Decision periods that the motions last."""
     kept: Annotated[int, Within(1, 1000)] = 4
     """Those that the course keeps."""
-    step_mm: float = 3.0
+    step_mm: Annotated[float, Within(-1000, 1000)] = 3.0
     """A motion that brings the devices on by so much is taken though it does not pass the place, mm."""
 
     def velocity(self, count: int, devices: int, config: SearchConfig, random: np.random.Generator) -> Control:

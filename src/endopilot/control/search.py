@@ -167,6 +167,10 @@ class Search:
                 if self._follow(outcome, goal, row, row.force * limit_n):
                     return None
         course.restore(self._kept)
+        straight = tried[repertoire.rows[0]]
+        farthest = int(np.argmax(straight.farthest))
+        if straight.periods[farthest] >= self._left:  # it leads on as far as there is time
+            self._repeat(straight, farthest, pauses=True)
         return halt
 
     def _drive(self, row: Row, goal: Goal) -> Iterator[Outcome]:
