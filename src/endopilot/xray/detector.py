@@ -163,7 +163,7 @@ _BELIEVABLE = 3.0
 class DetectorConfig:
     """How far an image is trusted."""
 
-    displaced: OpenShare = 0.2
+    displaced: OpenShare = 0.05
     """Share of the exposures in which the vessel lies elsewhere than registration has it."""
     displaced_mm: Positive = 1.5
     """How far it lies from there then, along each axis: standard deviation, mm."""
