@@ -51,7 +51,7 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path, capsys, monkey
     unseen = metrics["splits"]["test"]
     assert list(metrics["splits"]) == ["test"]
     assert len(unseen["anatomies"]) == 3 and unseen["episodes"] == 3
-    assert unseen["tip"]["P1"]["abscissa"]["all"]["skill"]["hold_slack"] > 0.4  # the packaged networks
+    assert unseen["tip"]["P1"]["abscissa"]["all"]["skill"]["hold_slack"] > 0.4  # simulated wires
     for series in ("P1", "P3", "P4", "hold_slack"):
         assert unseen["tip"][series]["abscissa"]["all"]["count"] > 0
     assert min(score["dice"] for score in metrics["anatomy_scores"].values()) > 0.85
@@ -65,12 +65,8 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path, capsys, monkey
     assert (folder / "report.html").stat().st_mtime_ns == finished
 
 
-def test_settings_that_the_packaged_networks_do_not_fit_are_refused(tmp_path, capsys):
+def test_a_negative_training_time_is_refused(tmp_path, capsys):
     for arguments, message in (
-        (
-            ("demo", "--device", "j-035"),
-            "device: 'j-035'; the networks of the package know workhorse-014 alone",
-        ),
         (("demo", "--training-seconds", "-1"), "training_seconds: -1.0; give a number from 0 to 864000"),
         (("run", "ct.nii.gz", "--training-seconds", "-1"), "training_seconds: -1.0; give a number from 0 to 864000"),
     ):

@@ -88,33 +88,19 @@ def test_a_killed_run_goes_on_to_its_report_and_is_then_left_alone(case, capsys,
     assert {path: path.stat().st_mtime_ns for path in case.rglob("*")} == written
 
 
-def test_a_target_is_driven_to_with_the_packaged_networks_beside(case, made_before, tmp_path, capsys):
+def test_a_target_is_driven_to_with_simulated_wires_beside(case, made_before, tmp_path, capsys):
     line = ("run", case / "ct.nii.gz", "-o", tmp_path / "run", "--sequences", "1", "--seconds", "20")
     found = command.run(capsys, *line, "--target", "2")
     assert list(found)[:2] == ["outcome", "page"] and found["outcome"].startswith("reached section 2 at ")
     assert found["page"] == str(tmp_path / "run" / "navigation" / "2" / "navigation.html")
     manifest, metrics = (read_json(tmp_path / "run" / f"{name}.json") for name in ("manifest", "metrics"))
     assert list(manifest["stages"]) == [stage for stage in STAGES if stage != "training"]
-    assert list(metrics["splits"]) == ["test"]  # to the packaged networks the patient is new
+    assert list(metrics["splits"]) == ["test"]  # to simulated wires every patient is new
 
     again = command.run(capsys, *line, "--target", "1")  # another target, in the same folder
     assert again["report"] == found["report"] and again["page"] != found["page"]
     assert "has no such section" in command.refused(capsys, *line, "--target", "LADX")
     assert sorted(path.name for path in (tmp_path / "run" / "navigation").iterdir()) == ["1", "2"]
-
-
-def test_a_wire_that_the_packaged_networks_do_not_know_is_driven_without_them(case, made_before, tmp_path, capsys):
-    (tmp_path / "wire.yaml").write_text((case / "wire.yaml").read_text().replace("value: 0.36", "value: 0.35", 1))
-    line = ("run", case / "ct.nii.gz", "-o", tmp_path / "run", "--device", tmp_path / "wire.yaml")
-    found = command.run(capsys, *line, "--target", "1")
-    assert found["outcome"].startswith("reached section 1 at ") and found["findings"] == []
-    assert list(read_json(tmp_path / "run" / "manifest.json")["stages"]) == [
-        "read",
-        "segmentation",
-        "anatomy",
-        "report",
-    ]
-    assert "Nothing was evaluated" in (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.fixture
