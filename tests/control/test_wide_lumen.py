@@ -69,11 +69,10 @@ def test_wires_beyond_a_target_are_pulled_back_to_it(started, aorta):
     assert (course.control[:, WIRE, 1] == 0).all()
 
 
-def test_what_holds_for_two_periods_leaves_no_travel_after_them(aorta, started):
+def test_a_control_leaves_no_travel_after_its_period(aorta, started):
     limits = DriveLimits(max_velocity_mm_s=30.0, max_rotation_rad_s=3.0, travel_mm=(0.0, 6.0))
     trials = Trials(
         Trials.of(aorta, [(aorta.anatomy, aorta.stack)], 1, like=started.belief.simulator).simulator, [limits]
     )
-    for periods in (1, 2):
-        control = trials.possible(trials.control(Move(WIRE, 30.0)), periods=periods)
-        assert control[0, WIRE, 0] == pytest.approx(6.0 / (periods * DECISION_PERIOD_S))
+    control = trials.possible(trials.control(Move(WIRE, 30.0)))
+    assert control[0, WIRE, 0] == pytest.approx(6.0 / DECISION_PERIOD_S)

@@ -41,7 +41,6 @@ def test_a_waypoint_is_passed_in_the_right_branch_alone(route):
     tip = tips(route, inside, beside, np.array([0, 0, 20.0]) + 15.0 * out)
     assert route.passed(tip, 22.5).tolist() == [True, False, True]
     assert route.passed(tip, 35.0).tolist() == [False, False, True]
-    assert route.next_waypoint(10.0) == 22.5 and route.next_waypoint(24.0) == 35.0
 
 
 def test_a_second_rule_asks_for_a_straight_distance_too(route):
@@ -65,7 +64,6 @@ def test_the_waypoint_of_a_short_branch_lies_before_its_end(fork):
     route = Route.to(replace(fork, tree=tree), Target(branch=4, abscissa=32.0))
     assert np.allclose(route.junctions, [20.0, 22.0])
     assert np.allclose(route.waypoints, [21.0, 24.5, 32.0])
-    assert route.next_waypoint(21.9) == 21.0  # its branch is passed with its end
 
 
 @pytest.mark.parametrize(("angle_deg", "beyond_mm"), [(60, 2.0 + 1.5), (150, 2.0 / np.sin(np.deg2rad(30)) + 1.5)])
@@ -155,21 +153,6 @@ def test_a_lumen_narrower_than_the_wire_hides_what_lies_behind_it(fork, wire):
         check_passable(Route.to(anatomy, Target(branch=2, abscissa=35.0)), wire)
     check_passable(Route.to(anatomy, Target(branch=2, abscissa=at - 1.0)), wire)
     check_passable(Route.to(anatomy, Target(branch=1, abscissa=35.0)), wire)
-
-
-def test_a_bend_begins_where_the_line_turns(fork) -> None:
-    """A quarter of a circle of 10 mm behind 20 mm that are straight; smoothing over 1 mm spreads where it begins."""
-    angle = np.linspace(0.0, np.pi / 2, 200)[1:]
-    straight = np.column_stack([np.zeros(200), np.zeros(200), np.linspace(0.0, 20.0, 200)])
-    bend = np.column_stack([10 * (1 - np.cos(angle)), np.zeros(199), 20 + 10 * np.sin(angle)])
-    tree = tree_of((np.concatenate([straight, bend]), 1.0, -1))
-    route = Route.to(replace(fork, tree=tree), Target(branch=0, abscissa=35.0))
-    assert route.bends_from(0.0, 12.0) == pytest.approx(20.0, abs=2.0)
-    assert route.bends_from(0.0, 8.0) == route.bends_from(34.0, 5.0) == 35.0  # the target: no bend is as tight
-    assert route.bends_from(25.0, 12.0) == 25.0
-    assert route.outer_mm(50.0) == pytest.approx(np.pi / 2, rel=0.05)  # r times the angle
-    assert route.outer_mm(15.0) == pytest.approx(0.0, abs=1e-3)
-    assert route.narrow_from(1.9) == pytest.approx(35.0, abs=0.3) and route.narrow_from(2.1) == 0.0
 
 
 @pytest.mark.parametrize(

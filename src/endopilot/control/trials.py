@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -22,10 +22,6 @@ from endopilot.types import Anatomy, TipProjection
 
 Control = Float[np.ndarray, "trials devices 2"]
 """Translation (mm/s) and rotation (rad/s) of each device of each trial in a decision period."""
-STALL_PERIODS, STALL_SHARE = 4, 0.25
-"""A tip that comes forward by less than this share of its wire's advance in so many periods has stopped."""
-_LEAST_ADVANCE_MM = 2.0
-"""A wire that advances by less in these periods says nothing."""
 _SHORT_MM = 1.0
 """A course leaves this much of the travel unused, mm: encoders err."""
 _LOOKS = 5
@@ -260,19 +256,13 @@ class Trials:
             control[:, device, 0], control[:, device, 1] = translation, rotation
         return control
 
-    def possible(self, control: Control, *, alike: bool = False, periods: int = 1) -> Control:
-        """Return what the drives can do of a control: no wire of a trial leaves the travel.
-
-        Args:
-            control: of each trial.
-            alike: of no trial.
-            periods: decision periods that it holds for.
-        """
+    def possible(self, control: Control) -> Control:
+        """Return what the drives can do of a control in a decision period: no wire of a trial leaves the travel."""
         made = np.array(control)
         for device, limits in enumerate(self._limits):
             inserted = self.lengths[:, device].reshape(self.wires, -1)
-            for length in (inserted.min(axis=None if alike else 0), inserted.max(axis=None if alike else 0)):
-                made[:, device] = limits.clip(made[:, device], length, periods * DECISION_PERIOD_S)
+            for length in (inserted.min(axis=0), inserted.max(axis=0)):
+                made[:, device] = limits.clip(made[:, device], length, DECISION_PERIOD_S)
         return made
 
     def move(self, control: Control, *, force_n: float = np.inf) -> Bool[np.ndarray, "trials"]:
@@ -297,18 +287,6 @@ class Trials:
         proximal, tips = self._see()
         self.rows.append(Period(control, proximal, tips[:, WIRE], step.contact_force_max))
         return step
-
-    def stalled(self, along: Callable[[TipProjection], np.ndarray], gains: int) -> Bool[np.ndarray, "trials"]:
-        """Return which trials have a tip that stayed behind in the last periods while its wire went forward.
-
-        Args:
-            along: how far along the route tips are, mm.
-            gains: number of periods over which tips are compared.
-        """
-        rows = self.rows
-        advance = np.sum([row.control[:, WIRE, 0] for row in rows[-STALL_PERIODS:]], axis=0) * DECISION_PERIOD_S
-        gain = (along(rows[-1].tip) - along(rows[-1 - gains].tip)).reshape(self.wires, -1)[self.counted].min(axis=0)
-        return (advance > _LEAST_ADVANCE_MM) & (gain < STALL_SHARE * advance)
 
     def kept(self) -> Kept:
         """Return where they are."""

@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float, Int
 from endopilot.devices.device import Device
 from endopilot.devices.drive_limits import WIDE_MM
 from endopilot.errors import InputError
-from endopilot.lines import places_on
 from endopilot.tasks.navigation import Target
 from endopilot.types import Anatomy, Centerline, TipProjection, VesselTree
 
@@ -19,8 +18,6 @@ BEYOND_MM = 1.5
 """A waypoint lies this far beyond the wall of the parent, on the centerline of the branch that leaves it, mm."""
 ENTERED_MM = 1.0
 """A tip this far beyond a waypoint has entered the branch, mm."""
-_EVERY_MM = 0.5
-"""Distance of the points at which bends are measured, mm."""
 NEAR_MM = 1.5
 """A tip this near to the target, in its branch, has arrived, mm: half a millimetre before it counts as reached."""
 
@@ -97,11 +94,6 @@ class Route:
             return on_route & there & self.target.reached(tip[..., None])
         return on_route & (tip.abscissa >= min(waypoint + ENTERED_MM, self.target.abscissa))
 
-    def next_waypoint(self, progress: float) -> float:
-        """Return the first waypoint that a tip with this progress has not passed, mm."""
-        ahead = self.waypoints[self.waypoints + ENTERED_MM > progress]
-        return float(ahead[0]) if len(ahead) else self.target.abscissa
-
     def position(self, abscissa: float) -> Float[np.ndarray, "3"]:
         """Return a place on the route, LPS mm."""
         return np.array([np.interp(abscissa, self.line.abscissa, axis) for axis in self.line.points.T])
@@ -118,40 +110,11 @@ class Route:
         """Return whether a wire may fold in the lumen up to an abscissa, mm, and yet come forward (`WIDE_MM`)."""
         return self.width_mm(end) > WIDE_MM
 
-    def narrow_from(self, width_mm: float = WIDE_MM) -> float:
-        """Return the abscissa from which on the lumen is nowhere wider than that up to the target, mm."""
+    def narrow_from(self) -> float:
+        """Return the abscissa from which on the lumen is nowhere wider than `WIDE_MM` up to the target, mm."""
         before = self.line.abscissa <= self.target.abscissa
-        wide = self.line.abscissa[before & (2 * self.line.radius > width_mm)]
+        wide = self.line.abscissa[before & (2 * self.line.radius > WIDE_MM)]
         return float(wide.max(initial=0.0))
-
-    def bends_from(self, begin_mm: float, radius_mm: float) -> float:
-        """Return the first place beyond another at which the route bends with less than a radius, mm; else the target.
-
-        Bends are those of the line smoothed over the lumen's radius: a device need not follow narrower turns.
-        """
-        at = np.arange(begin_mm, self.target.abscissa, _EVERY_MM)
-        tight = at[np.interp(at, *self._curvature) > 1 / radius_mm]
-        return float(tight[0]) if len(tight) else self.target.abscissa
-
-    def outer_mm(self, end: float) -> float:
-        """Return how much longer the way along the outer walls of bends is than the line up to an abscissa, mm.
-
-        That is the integral of r κ, with the lumen's radius r and the curvature κ; a wall turns about no less than r.
-        """
-        at, curvature = self._curvature
-        return float(np.minimum(self.radius(at) * curvature, 1.0)[at < end].sum() * _EVERY_MM)
-
-    @cached_property
-    def _curvature(self) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-        """Abscissae along the route, mm, and the curvature of its smoothed line there, 1/mm."""
-        at = np.arange(self.line.abscissa[0], self.line.abscissa[-1], _EVERY_MM)
-        points = places_on(self.line.points, self.line.abscissa, at)
-        weight = np.exp(-(((at[:, None] - at) / self.radius(at)[:, None]) ** 2) / 2)
-        smooth = weight @ points / weight.sum(axis=1, keepdims=True)
-        along = np.gradient(smooth, axis=0)
-        step = np.linalg.norm(along, axis=1)
-        turn = np.gradient(along / step[:, None], axis=0)
-        return at, np.linalg.norm(turn, axis=1) / step
 
     def radius(self, abscissa: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Return the lumen radius along the route, mm."""
