@@ -6,7 +6,8 @@ from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.agent_config import AgentConfig
 from endopilot.xray.fluoroscope import TipMeasurement
 
-QUICK = AgentConfig(belief=BeliefConfig(members=6, time_step_s=0.05))
+QUICK = AgentConfig(belief=BeliefConfig(members=6, time_step_s=0.05), decision_evaluations=10**12)
+"""An agent of few wires, whose decisions wait for the whole search."""
 
 
 def measured(belief: Belief, member: int) -> TipMeasurement:

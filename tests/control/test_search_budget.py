@@ -1,8 +1,10 @@
-"""What a search may spend: it ends with what it has, and by evaluations the bits repeat."""
+"""What a search and a decision may spend: it ends with what it has, goes on while devices move, and bits repeat."""
 
 from __future__ import annotations
 
+import gc
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ import pytest
 from endopilot.control.agent import OraclePolicy
 from endopilot.control.trials import Budget, OutOfBudgetError
 from endopilot.navigation.loop import NavigationLoop
+from endopilot.tasks.navigation import Navigation
 from toy_belief import QUICK
 
 
@@ -25,7 +28,7 @@ def test_seconds_or_evaluations_end_a_budget() -> None:
 
 def test_a_search_ends_with_what_it_has(side_branch) -> None:
     """With little it comes to before the fork, and with less nowhere; the words say why."""
-    free, few, none = (OraclePolicy(config=replace(QUICK, evaluations=each)) for each in (10**6, 40, 1))
+    free, few, none = (OraclePolicy(config=replace(QUICK, evaluations=each)) for each in (10**9, 10**5, 1))
     lengths = []
     for policy in (free, few, none):
         policy.start(side_branch, 0)
@@ -34,6 +37,45 @@ def test_a_search_ends_with_what_it_has(side_branch) -> None:
     assert "in its budget; give more (AgentConfig.evaluations)" in few.halt
 
 
+def navigated(navigation: Navigation, **settings: Any) -> tuple[NavigationLoop, list[bool]]:
+    """Return a navigation that is over, and whether its search went on after each decision."""
+    loop = NavigationLoop(navigation, OraclePolicy(config=replace(QUICK, **settings)))
+    busy = []
+    while loop.reason is None and not loop.gives_up:
+        loop.step()
+        busy.append(loop.policy._planner.busy)
+    return loop, busy
+
+
+def test_a_search_goes_on_while_devices_follow_what_it_has_found(side_branch) -> None:
+    """They move before it has ended, rest where no more is known, and in the end have done what one search finds."""
+    (at_once, _), (slowly, busy) = navigated(side_branch), navigated(side_branch, decision_evaluations=100_000)
+    control = slowly.record().control
+    moves = control.any(axis=(1, 2))[:-1]  # the last row is the end
+    assert slowly.reason == at_once.reason == "reached" and sum(busy) > 5
+    assert (moves & busy).any() and (~moves & busy).any() and moves[~np.array(busy)].all()
+    assert np.allclose(control.sum(axis=0), at_once.record().control.sum(axis=0), rtol=0.05, atol=0.5)
+
+
 def test_by_evaluations_a_navigation_repeats(side_branch) -> None:
-    records = [NavigationLoop(side_branch, OraclePolicy(config=replace(QUICK, evaluations=3000))).run() for _ in "ab"]
+    """Which thread is the faster plays no part."""
+    records = [navigated(side_branch, decision_evaluations=200_000)[0].record() for _ in "ab"]
     assert records[0].reason == "reached" and np.array_equal(records[0].control, records[1].control)
+
+
+def test_by_seconds_a_decision_does_not_wait(side_branch) -> None:
+    """A decision that waits for next to nothing leaves the search behind; it arrives all the same."""
+    loop, busy = navigated(replace(side_branch, seconds=1000.0), decision_s=1e-6)
+    assert busy[0] and loop.reason == "reached"
+
+
+def test_a_search_that_nobody_waits_for_ends(side_branch) -> None:
+    """With the policy goes its thread."""
+    loop = NavigationLoop(side_branch, OraclePolicy(config=replace(QUICK, decision_evaluations=1)))
+    loop.step()
+    thread = loop.policy._planner._work
+    assert thread.is_alive()
+    del loop
+    gc.collect()
+    thread.join(timeout=60.0)
+    assert not thread.is_alive()

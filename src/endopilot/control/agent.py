@@ -8,7 +8,6 @@ from there.
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +19,7 @@ from endopilot.belief.monitor import BelievedTip, Monitor
 from endopilot.belief.states import State
 from endopilot.control.agent_config import AgentConfig, read_agent_calibration
 from endopilot.control.course import Course, Follower
+from endopilot.control.planner import Planner
 from endopilot.control.search import Search, check_devices
 from endopilot.control.trials import Budget
 from endopilot.devices.stack import Proximals
@@ -48,7 +48,6 @@ class _PlanningPolicy:
 
     Attributes:
         plans: how often a course was searched.
-        planning_s: processor time that the searches took, s.
     """
 
     def __init__(self, config: AgentConfig | None = None) -> None:
@@ -84,8 +83,8 @@ class _PlanningPolicy:
         self.belief, self._believed = self.monitor.belief, BelievedTip(np.nan, np.nan)
         self._back_mm, self._arrived, self._shows = np.inf, False, False
         self._crept = self.plans = 0
-        self.planning_s = 0.0
-        self._begin_anew()
+        self._planned_s = 0.0
+        self._set_out()
 
     def decide(self, observation: Observation) -> Decision:
         """Follow the course, search another one, or pull back, as the module describes."""
@@ -96,11 +95,11 @@ class _PlanningPolicy:
         ends = self._failed >= self.config.tries and self._follower.course is None and not lost
         ends = ends and not self.monitor.may_return
         expose = self._back_far_enough() if lost else self.wants_xray()
-        return Decision(wanted, expose=expose, gives_up=self._search.halt if ends else "")
+        return Decision(wanted, expose=expose, gives_up=self.halt if ends else "")
 
     def watch(self, observation: Observation) -> None:
         """Follow what somebody else does; a new course is searched at the next decision."""
-        self._follower.begin(None)
+        self._forget()
         self._failed = 0
         self._observe(observation)
 
@@ -120,26 +119,35 @@ class _PlanningPolicy:
             advance: called with every millimetre along the route.
             horizon_mm: the course may end when it leads so far on, mm.
         """
-        return self._search.find(self.belief, seconds=seconds, horizon_mm=horizon_mm, advance=advance)
+        return self._planner.search.find(self.belief, seconds=seconds, horizon_mm=horizon_mm, advance=advance)
 
     @property
     def halt(self) -> str:
         """Where and why the last search ended before the target, in words; empty if it arrived."""
-        return self._search.halt
+        return self._planner.search.halt
 
-    def _begin_anew(self) -> None:
-        """Forget course and failed searches: what they were made with is no longer believed.
+    @property
+    def planning_s(self) -> float:
+        """Processor time that the searches took, s."""
+        return self._planned_s + self._planner.worked_s
 
-        Walls press as much harder in the search as the drive is felt to push.
-        """
+    def _set_out(self) -> None:
+        """Follow and search with what is believed. Walls press as much harder as the drive is felt to push."""
         self._harder, given = self.monitor.load_ratio, self.belief.navigation
         navigation = replace(given, force_limit_n=given.force_limit_n / self._harder)
-        budget = Budget(self.config.planning_s or np.inf, self.config.evaluations)
-        search, seed = self.config.search, self._seed
-        self._search = Search(navigation, self.route, self.belief, config=search, seed=seed, budget=budget)
-        devices, turn_rad_s = len(self.navigation.devices), self.config.search.turn_rad_s
+        config = self.config
+        budget = Budget(config.planning_s or np.inf, config.evaluations)
+        search = Search(navigation, self.route, self.belief, config=config.search, seed=self._seed, budget=budget)
+        self._planner = Planner(search, evaluations=config.decision_evaluations, seconds=config.decision_s)
+        devices, turn_rad_s = len(self.navigation.devices), config.search.turn_rad_s
         self._follower = Follower(self.belief.drives, devices=devices, turn_rad_s=turn_rad_s)
         self._failed = 0
+
+    def _begin_anew(self) -> None:
+        """Forget course and failed searches: what they were made with is no longer believed."""
+        self._planner.cancel()
+        self._planned_s = self.planning_s
+        self._set_out()
 
     def _observe(self, observation: Observation) -> None:
         monitor, before = self.monitor, self.monitor.lost
@@ -151,7 +159,7 @@ class _PlanningPolicy:
             self._begin_anew()
         self._limit_load()
         if monitor.sought or (monitor.seen is not None and (before or monitor.lost)):
-            self._follower.begin(None)  # they lie otherwise than the course was searched for
+            self._forget()  # they lie otherwise than the course was searched for
         if monitor.seen is not None:
             self._back_mm = self.belief.drives.proximal[0, 0] - self._way_back(monitor.seen)
 
@@ -200,20 +208,23 @@ class _PlanningPolicy:
 
     def _go_on(self, observation: Observation) -> Proximals:
         """Return the velocities that lead to the next place of the course."""
-        arriving = self.navigation.arriving
-        if self._off_course() or (self._follower.ended and not (self._follower.reached and arriving)):
+        arriving, waits = self.navigation.arriving, self._planner.busy
+        if self._off_course() or (self._follower.ended and not waits and not (self._follower.reached and arriving)):
             self._plan(observation)
+        if self._planner.busy:
+            self._think()
         self._arrived = self._follower.reached and self._follower.ended
         if self._arrived and arriving:
             return self._creep()
         if self._arrived and self.monitor.seen is not None:  # no wire says what is wrong; the image does
             along_mm = self.navigation.target.abscissa - self.monitor.seen.abscissa
             if self.navigation.target.near_mm and abs(along_mm) <= NEAR_MM:  # beside the target: another course
-                self._follower.begin(None)
+                self._forget()
             left = along_mm / DECISION_PERIOD_S
             return self._follower.move([float(np.clip(left, -_WIRE_CREEP_MM_S, _WIRE_CREEP_MM_S))])
         if self._follower.ended:
-            self._shows = not self._search.draws  # another look, before another search
+            another = not self._planner.busy and not self._planner.search.draws
+            self._shows = another  # a look, before another search
             return ((0.0, 0.0),)
         wanted = self._follower.step()
         self._shows = self._follower.shows
@@ -223,7 +234,7 @@ class _PlanningPolicy:
         """Return the velocity of a catheter that should have arrived: a little ahead and back; then search again."""
         step, self._crept = self._crept, self._crept + 1
         if step >= 3 * _CREEP_PERIODS:
-            self._follower.begin(None)
+            self._forget()
         speed = _CREEP_MM_S if step < _CREEP_PERIODS else -_CREEP_MM_S
         return self._follower.move([*[0.0] * self.navigation.arriving, speed])
 
@@ -240,20 +251,30 @@ class _PlanningPolicy:
         return bool(self.route.off_route(tip)[0] > allowed_mm or error > self.config.off_course_mm)
 
     def _plan(self, observation: Observation) -> None:
-        """Search a course, unless too many searches failed or no time is left."""
+        """Begin to search a course, unless too many searches failed or no time is left."""
+        self._forget()
         seconds = self.navigation.seconds - observation.time_s
-        if self._failed >= self.config.tries:
-            self._follower.begin(None)
+        if self._failed >= self.config.tries or seconds < DECISION_PERIOD_S:
             return
-        self._crept, self.plans, worked = 0, self.plans + 1, time.process_time()
-        horizon_mm = self.config.horizon_mm or np.inf
-        course = self.find_course(seconds, horizon_mm=horizon_mm) if seconds >= DECISION_PERIOD_S else None
-        self._follower.begin(course)
-        self.planning_s += time.process_time() - worked
-        if course is None or not self.halt:
+        self._crept, self.plans = 0, self.plans + 1
+        self._planner.begin(self.belief, seconds=seconds, horizon_mm=self.config.horizon_mm or np.inf)
+
+    def _think(self) -> None:
+        """Let the search go on for a decision, and follow what it has found."""
+        course, search = self._planner.wait(), self._planner.search
+        if course is not None:
+            self._follower.extend(course)
+        if self._planner.busy:
+            return
+        if not self.halt:
             self._failed = 0
-        elif not (self._search.budget.over and len(course.control)):  # what came on in its time has not failed
+        elif not (search.budget.over and course is not None and len(course.control)):  # that came on in its time
             self._failed += 1
+
+    def _forget(self) -> None:
+        """Follow no course, and search none."""
+        self._planner.cancel()
+        self._follower.begin(None)
 
 
 class OraclePolicy(_PlanningPolicy):
@@ -351,8 +372,12 @@ class AgentPolicy(_PlanningPolicy):
         )
 
     def wants_xray(self) -> bool:
-        """Ask the monitor; a device that should have arrived, and the end of a manoeuvre, are looked at."""
-        return bool(self._believed.asks) or self._arrived or self._shows
+        """Ask the monitor; a device that should have arrived, and the end of a manoeuvre, are looked at.
+
+        Devices that rest while a search goes on are not: they are where they were.
+        """
+        rests = self._planner.busy and self._follower.ended
+        return not rests and (bool(self._believed.asks) or self._arrived or self._shows)
 
     def believed(self) -> BelievedTip:
         """Return where the likeliest wire has its tip, the adviser's bands around it, and why it asks for X-ray."""

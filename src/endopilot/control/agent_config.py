@@ -39,9 +39,15 @@ class AgentConfig:
     """Times that the devices may be lost, after which the agent gives up: each time another belief was sought."""
     horizon_mm: Positive | None = None
     """A course may end when it leads this far on, mm, and is searched on from there; all the way if not given."""
-    evaluations: Annotated[int, Within(1, 10**12)] = 100_000
-    """Decision periods of a world that a search may simulate; it then ends with the course that it has. Some 30 s of a
-    core in coronary arteries, where the longest of 21 navigations' decisions took 21 s; minutes with long devices."""
+    evaluations: Annotated[int, Within(1, 10**15)] = 300_000_000
+    """Evaluations of nodes (Newton's iterations times active nodes) that a search may take, some 30 s of a core; it
+    then ends with the course that it has."""
+    decision_evaluations: Annotated[int, Within(1, 10**15)] = 2_500_000
+    """Those that a decision waits for, some 0.3 s of a core. A longer search goes on at the next decisions; the devices
+    follow the course as far as it is known, and rest then."""
+    decision_s: Positive | None = None
+    """Wall time that a decision waits for a search instead, s: the search goes on while the devices move. That is for
+    real robots, since the bits of a navigation then hang on the machine's speed."""
     planning_s: Annotated[float, Within(0, 86_400, above_low=True)] | None = None
     """Processor time after which a search ends likewise, s: then its bits hang on the machine's speed."""
     most_exposures: Annotated[int, Within(1, 10**6)] = 40

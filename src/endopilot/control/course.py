@@ -107,6 +107,10 @@ class Follower:
         self.course, self.at, self._settled = course, 0, 0
         self._whole_turns = np.zeros((self._devices, 2))
 
+    def extend(self, course: Course) -> None:
+        """Follow a course that begins as the one which is followed does, and goes on from its end."""
+        self.course = course
+
     @property
     def ended(self) -> bool:
         """Whether there is no course, or no more of it."""

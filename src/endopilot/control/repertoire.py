@@ -81,6 +81,9 @@ class Row:
     off_radii: NonNegative = 3.0
     """A tip that is so many radii of the route's lumen deep in another branch does not come back: in a wide fork it may
     seem to leave the route."""
+    slack_widths: NonNegative = 0.0
+    """Devices that were pushed so far and did not come forward fold, widths of the lumen; `Repertoire.slack_mm` if that
+    is more."""
     draws: Draws | None = None
     """Devices keep velocities that are drawn, as many as there are rotations; they are not turned before."""
     rounds: Annotated[int, Within(1, 1000)] = 1
@@ -146,8 +149,6 @@ class Repertoire:
     """Shares of the force limit: where no row passes within one, the next will do."""
     slack_mm: Positive = 40.0
     """Devices that were pushed so far and did not come forward fold, mm."""
-    slack_widths: NonNegative = 0.0
-    """The same in widths of the lumen; the larger of both holds."""
     agree: Share = 1.0
     """Share of the wires, by weight, that has to come to the target."""
 
@@ -167,7 +168,7 @@ class Repertoire:
         return Limits(
             force_n=force_n,
             off_mm=row.off_radii * float(route.radius(np.array([begun_mm, end_mm])).max()),
-            slack_mm=max(self.slack_mm, self.slack_widths * route.width_mm(end_mm)),
+            slack_mm=max(self.slack_mm, row.slack_widths * route.width_mm(end_mm)),
         )
 
 

@@ -10,8 +10,9 @@ random: of each round the best go on, every one with several others.
 
 from __future__ import annotations
 
+import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
@@ -69,8 +70,8 @@ class Search:
         check_devices(navigation)
         self._navigation, self.route, self.config = navigation, route, config
         self.budget = budget or Budget()
-        self._belief, self._trials = belief, dict[int, Trials]()
-        self._course = self._new_trials(1)
+        self._belief, self._trials = belief, dict[tuple[int, ...], Trials]()
+        self._course = self._new_trials(1, range(len(belief.kinds)))
         self._random = np.random.default_rng([seed, 0x5EA])
         self.halt = ""
 
@@ -83,15 +84,19 @@ class Search:
     def _repertoire(self) -> Repertoire:
         return Repertoire.of(self._navigation, self.route, self.config, self._here)
 
-    def _new_trials(self, count: int) -> Trials:
-        like = self._belief.simulator
-        return Trials.of(self._navigation, self._belief.kinds, count, like=like, budget=self.budget)
+    def _new_trials(self, count: int, wires: Iterable[int]) -> Trials:
+        like, kinds = self._belief.simulator, self._belief.kinds
+        return Trials.of(self._navigation, [kinds[wire] for wire in wires], count, like=like, budget=self.budget)
 
     def _trials_of(self, count: int) -> Trials:
-        """Return the trials by which so many motions are driven."""
-        if count not in self._trials:
-            self._trials[count] = self._new_trials(count)
-        return self._trials[count].copy_of(self._course)
+        """Return the trials by which so many motions are driven: one with all wires, several with the likeliest few."""
+        course = self._course
+        few = course.wires if count == 1 else math.isqrt(course.wires)
+        wires = np.sort(np.argsort(-course.weight, kind="stable")[:few])
+        key = (count, *wires.tolist())
+        if key not in self._trials:
+            self._trials[key] = self._new_trials(count, key[1:])
+        return self._trials[key].copy_of(course, wires)
 
     def find(
         self, belief: Belief, *, seconds: float, horizon_mm: float = np.inf, advance: Advance | None = None
@@ -104,28 +109,45 @@ class Search:
             horizon_mm: a course may end when it has come so far forward, mm.
             advance: called with every millimetre along the route.
         """
-        course, settled = self._course, list[int]()
+        self.budget.begin()
+        self.set_out(belief, seconds=seconds, horizon_mm=horizon_mm)
+        return self.go_on(advance=advance)
+
+    def set_out(self, belief: Belief, *, seconds: float, horizon_mm: float = np.inf) -> None:
+        """Begin a course where the likeliest devices are; the arguments are those of `find`."""
         source, weight = belief.likeliest()
-        course.put(source, belief.simulator, weight)
+        self._course.put(source, belief.simulator, weight)
+        self._ostium_mm, self._horizon_mm = float(belief.ostium_mm[source[0]]), horizon_mm
         self._most = max(1, int(seconds / DECISION_PERIOD_S))
         if self._navigation.catheters and not np.isfinite(horizon_mm):
             self._most *= _LONGER
-        self.halt, self._kept = "", course.kept()
-        self.budget.begin()
+        self.halt, self._kept, self._settled = "", self._course.kept(), list[int]()
+
+    def go_on(self, *, advance: Advance | None = None, found: Callable[[Course], None] | None = None) -> Course:
+        """Return a course from where it has set out to the target.
+
+        Args:
+            advance: as in `find`.
+            found: called with the course as far as it is known, whenever it has passed another place.
+        """
         try:
-            self._lead(settled, horizon_mm, advance)
+            self._lead(advance, found)
         except OutOfBudgetError:
-            course.restore(self._kept)
+            self._course.restore(self._kept)
             self.halt = f"the search came to {self._here:.0f} mm in its budget; give more (AgentConfig.evaluations)"
-        return course.as_course(
-            reached=float(course.mean(self._navigation.reached(course.tips))[0]),
-            ostium_mm=float(belief.ostium_mm[source[0]]),
-            settled=settled if self._navigation.catheters else None,
+        return self._as_course()
+
+    def _as_course(self) -> Course:
+        return self._course.as_course(
+            reached=float(self._course.mean(self._navigation.reached(self._course.tips))[0]),
+            ostium_mm=self._ostium_mm,
+            settled=self._settled if self._navigation.catheters else None,
         )
 
-    def _lead(self, settled: list[int], horizon_mm: float, advance: Advance | None) -> None:
+    def _lead(self, advance: Advance | None, found: Callable[[Course], None] | None) -> None:
         """Lead the course from place to place, and note the periods at whose ends a motion is over."""
         course, begun, alone = self._course, self._here, not self._navigation.catheters
+        horizon_mm = self._horizon_mm
         together, reported = self.config.together, begun
         for place in places_of(self.route, begun, alone=alone, together=together):
             goal = Goal(self._navigation, self.route, place, self._repertoire.agree)
@@ -140,7 +162,9 @@ class Search:
                     at_mm = self._hard if alone and halt != "late" else place
                     self.halt = describe_halt(halt, at_mm, self.route, self._navigation)
                     return
-                settled.append(len(course.rows) - 1)
+                self._settled.append(len(course.rows) - 1)
+                if found is not None:
+                    found(self._as_course())
                 came = self._here >= begun + horizon_mm
                 if came or (np.isfinite(horizon_mm) and not goal.arrived(course)[0]):
                     return
@@ -198,8 +222,10 @@ class Search:
         for trial in np.flatnonzero(passes)[np.argsort(cost[passes])][:_REPEATED].tolist():
             for pauses in (False, True):
                 self._repeat(outcome, trial, pauses=pauses)
-                there = goal.passed(course) * course.weight
-                if there.sum() > 0 and (goal.agree < 1 or there.sum() >= row.agree - ROUNDING):
+                there, done = goal.passed(course) * course.weight, course.rows[self._kept.periods :]
+                pressed = max((float(period.force[course.counted].max()) for period in done), default=0.0)
+                enough = there.sum() > 0 and (goal.agree < 1 or there.sum() >= row.agree - ROUNDING)
+                if enough and pressed <= force_n:
                     course.weight = there / there.sum()
                     return True
         course.restore(self._kept)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 import time
-import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from endopilot.control.course import Course
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Stack
+from endopilot.simulation.config import LANES
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState, Step
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
@@ -27,6 +28,8 @@ _SHORT_MM = 1.0
 _LOOKS = 5
 """Times in a period at which forces are read: a tip that is caught presses harder until it snaps, within some tenths
 of a second."""
+_CALL = 4000
+"""Evaluations of nodes that take as long as what a call of the core takes besides, about 0.5 ms."""
 _TIP = tuple(TipProjection.__dataclass_fields__)
 
 
@@ -80,8 +83,14 @@ class OutOfBudgetError(Exception):
     """A search has spent its budget."""
 
 
+class CancelledError(Exception):
+    """Nobody waits for a search any more."""
+
+
 class Budget:
     """What a search may spend, by which it ends whatever it is at: all that it does is to drive trials.
+
+    A search in a thread of its own waits, too, until a decision grants what it spends next (`Planner`).
 
     Attributes:
         over: whether it is spent.
@@ -92,25 +101,54 @@ class Budget:
 
         Args:
             seconds: processor time of this thread, s: wall time where nothing else takes the processor.
-            evaluations: simulated decision periods of a world: by them alone the bits of a search repeat.
+            evaluations: of nodes (Newton's iterations times active nodes): by them alone the bits of a search repeat.
         """
         self._seconds, self._evaluations = seconds, evaluations
+        self._turn, self._granted, self._cancelled = threading.Condition(), np.inf, False
         self.begin()
 
-    def begin(self) -> None:
-        """Begin another search."""
-        self.over, self._until, self._left = False, time.thread_time() + self._seconds, self._evaluations
+    def begin(self, granted: float = np.inf) -> None:
+        """Begin another search; what is not granted has to be waited for."""
+        self.over, self._until, self._spent = False, np.inf, 0.0
+        self._granted, self._cancelled, self._ended = granted, False, False
 
-    def spend(self, worlds: int) -> None:
-        """Take a decision period of some worlds off.
+    def spend(self, evaluations: float | int) -> None:
+        """Take some evaluations off, and wait where they are more than is granted.
 
         Raises:
             OutOfBudgetError: nothing is left.
+            CancelledError: nobody waits any more.
         """
-        if self._left < worlds or time.thread_time() > self._until:
+        if np.isinf(self._until):
+            self._until = time.thread_time() + self._seconds
+        self._spent += evaluations
+        if self._spent > self._evaluations or time.thread_time() > self._until:
             self.over = True
             raise OutOfBudgetError
-        self._left -= worlds
+        with self._turn:
+            self._turn.notify_all()
+            self._turn.wait_for(lambda: self._spent < self._granted or self._cancelled)
+            if self._cancelled:
+                raise CancelledError
+
+    def grant(self, evaluations: float | int, seconds: float | None) -> None:
+        """Let a search in another thread spend more, and wait until it has, or has ended, or some time is over, s."""
+        with self._turn:
+            self._granted += evaluations
+            self._turn.notify_all()
+            self._turn.wait_for(lambda: self._ended or self._spent >= self._granted, timeout=seconds)
+
+    def end(self) -> None:
+        """Tell who waits that the search has ended."""
+        with self._turn:
+            self._ended = True
+            self._turn.notify_all()
+
+    def cancel(self) -> None:
+        """End a search in another thread: nobody waits any more."""
+        with self._turn:
+            self._cancelled = True
+            self._turn.notify_all()
 
 
 class Trials:
@@ -183,9 +221,9 @@ class Trials:
         self.simulator.copy_worlds(np.repeat(source, self.count), of=of)
         self._forget(weight)
 
-    def copy_of(self, one: Trials) -> Trials:
-        """Put all trials where those of one trial are; return these."""
-        self.put(np.arange(one.wires), one.simulator, one.weight)
+    def copy_of(self, one: Trials, wires: Int[np.ndarray, "wires"]) -> Trials:
+        """Put all trials where some wires of one trial are; return these."""
+        self.put(wires, one.simulator, one.weight[wires] / one.weight[wires].sum())
         return self
 
     def copy_trials(self, chosen: Int[np.ndarray, "trials"]) -> None:
@@ -281,12 +319,16 @@ class Trials:
         Raises:
             OutOfBudgetError: the search has spent its budget.
         """
-        self._budget.spend(self.simulator.worlds)
-        step = drive_period(self.simulator, np.tile(control, (self.wires, 1, 1)))
+        step = drive_period(self.simulator, np.tile(control, (self.wires, 1, 1)), self._spend)
         self._seen = None
         proximal, tips = self._see()
         self.rows.append(Period(control, proximal, tips[:, WIRE], step.contact_force_max))
         return step
+
+    def _spend(self, step: Step) -> None:
+        """Take a step off the budget: the worlds of each wire are driven in packs of `LANES`, which may not be full."""
+        packed = -(-self.count // LANES) * LANES
+        self._budget.spend(packed / self.count * float(step.node_iterations.sum()) + _CALL)
 
     def kept(self) -> Kept:
         """Return where they are."""
@@ -323,17 +365,23 @@ class Trials:
         )
 
 
-def drive_period(simulator: Simulator, control: Float[np.ndarray, "worlds *devices 2"]) -> Step:
+def drive_period(
+    simulator: Simulator,
+    control: Float[np.ndarray, "worlds *devices 2"],
+    took: Callable[[Step], None] = lambda step: None,
+) -> Step:
     """Drive all worlds for a decision period; a world that fails stays where it was.
 
     Args:
         simulator: of the wires.
         control: mm/s and rad/s of each wire, then of its catheters.
+        took: called with each part of the period.
 
     Returns:
         The worlds at the end of the period, but with the largest `contact_force_max` within it.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # whoever searches sees in `valid` that a wire has failed
-        steps = [simulator.step(control, DECISION_PERIOD_S / _LOOKS) for _ in range(_LOOKS)]
+    steps = list[Step]()
+    for _ in range(_LOOKS):
+        steps.append(simulator.step(control, DECISION_PERIOD_S / _LOOKS))
+        took(steps[-1])
     return replace(steps[-1], contact_force_max=np.max([step.contact_force_max for step in steps], axis=0))
