@@ -225,7 +225,7 @@ def test_whatever_the_model_returns_a_drive_takes_what_is_finite_and_within_limi
     """The search is made to return any numbers at all."""
     wild = np.array(control)
 
-    def go_on(**_: Any) -> Course:
+    def go_on(_: Any) -> Course:
         tip = np.repeat(wild[:, 2:3], 3, axis=1)
         tips = TipProjection(abscissa=tip, offset=tip, branch=np.zeros(tip.shape, dtype=int), radius=tip)
         yes = np.ones(len(wild), dtype=bool)
@@ -234,7 +234,7 @@ def test_whatever_the_model_returns_a_drive_takes_what_is_finite_and_within_limi
             reached=0.0,
         )  # fmt: skip
 
-    started._planner.search.go_on, started._failed = go_on, 0
+    started._search.go_on, started._failed = go_on, 0
     started._forget()
     for k in range(len(control)):
         (velocity,) = started.decide(Observation(0.5 * k, ((2.0, 0.0),), None)).devices
@@ -292,7 +292,7 @@ def test_a_wire_that_should_have_arrived_goes_by_the_image(side_branch) -> None:
     for off_mm, translation in ((0.4, 0.8), (-0.4, -0.8), (1.9, 2.0)):  # at most 2 mm/s
         navigation = replace(side_branch, target=Target(branch=0, abscissa=here + off_mm))
         policy.start(navigation, 0)
-        policy._planner.search.go_on = lambda **_: nowhere_to_go()
+        policy._search.go_on = lambda _: nowhere_to_go()
         blind = policy.decide(Observation(0.0, ((2.0, 0.0),), None))
         assert blind.expose and blind.devices[0][0] == 0.0
         assert policy.believed().asks == "the tip should be at the target"
@@ -307,7 +307,7 @@ def test_a_wire_beside_its_target_gets_another_course(side_branch) -> None:
     shown, here = measured(policy.belief, 0), float(policy.belief.tip.abscissa[0])
     for near_mm, goes_on in ((None, False), (0.01, True)):
         policy.start(replace(side_branch, target=Target(branch=0, abscissa=here, near_mm=near_mm)), 0)
-        policy._planner.search.go_on = lambda **_: nowhere_to_go()
+        policy._search.go_on = lambda _: nowhere_to_go()
         policy.decide(Observation(0.0, ((2.0, 0.0),), None))
         policy.decide(Observation(0.5, ((2.0, 0.0),), shown))
         assert (policy._follower.course is None) == goes_on

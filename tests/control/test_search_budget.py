@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from endopilot.belief.thought import Budget, OutOfBudgetError
 from endopilot.control.agent import OraclePolicy
-from endopilot.control.trials import Budget, OutOfBudgetError
 from endopilot.navigation.loop import NavigationLoop
 from endopilot.tasks.navigation import Navigation
 from toy_belief import QUICK
@@ -43,7 +43,7 @@ def navigated(navigation: Navigation, **settings: Any) -> tuple[NavigationLoop, 
     busy = []
     while loop.reason is None and not loop.gives_up:
         loop.step()
-        busy.append(loop.policy._planner.busy)
+        busy.append(loop.policy._thought is not None)
     return loop, busy
 
 
@@ -73,7 +73,7 @@ def test_a_search_that_nobody_waits_for_ends(side_branch) -> None:
     """With the policy goes its thread."""
     loop = NavigationLoop(side_branch, OraclePolicy(config=replace(QUICK, decision_evaluations=1)))
     loop.step()
-    thread = loop.policy._planner._work
+    thread = loop.policy._thought._thread
     assert thread.is_alive()
     del loop
     gc.collect()

@@ -17,11 +17,10 @@ from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import Calibration
 from endopilot.belief.monitor import BelievedTip, Monitor
 from endopilot.belief.states import State
+from endopilot.belief.thought import Budget, Thought
 from endopilot.control.agent_config import AgentConfig, read_agent_calibration
 from endopilot.control.course import Course, Follower
-from endopilot.control.planner import Planner
 from endopilot.control.search import Search, check_devices
-from endopilot.control.trials import Budget
 from endopilot.devices.stack import Proximals
 from endopilot.navigation.policy import Decision, Observation
 from endopilot.progress import Advance
@@ -48,6 +47,7 @@ class _PlanningPolicy:
 
     Attributes:
         plans: how often a course was searched.
+        planning_s: processor time that the searches took which have ended, s.
     """
 
     def __init__(self, config: AgentConfig | None = None) -> None:
@@ -83,7 +83,7 @@ class _PlanningPolicy:
         self.belief, self._believed = self.monitor.belief, BelievedTip(np.nan, np.nan)
         self._back_mm, self._arrived, self._shows = np.inf, False, False
         self._crept = self.plans = 0
-        self._planned_s = 0.0
+        self.planning_s, self._thought = 0.0, None
         self._set_out()
 
     def decide(self, observation: Observation) -> Decision:
@@ -119,17 +119,12 @@ class _PlanningPolicy:
             advance: called with every millimetre along the route.
             horizon_mm: the course may end when it leads so far on, mm.
         """
-        return self._planner.search.find(self.belief, seconds=seconds, horizon_mm=horizon_mm, advance=advance)
+        return self._search.find(self.belief, seconds=seconds, horizon_mm=horizon_mm, advance=advance)
 
     @property
     def halt(self) -> str:
         """Where and why the last search ended before the target, in words; empty if it arrived."""
-        return self._planner.search.halt
-
-    @property
-    def planning_s(self) -> float:
-        """Processor time that the searches took, s."""
-        return self._planned_s + self._planner.worked_s
+        return self._search.halt
 
     def _set_out(self) -> None:
         """Follow and search with what is believed. Walls press as much harder as the drive is felt to push."""
@@ -137,16 +132,15 @@ class _PlanningPolicy:
         navigation = replace(given, force_limit_n=given.force_limit_n / self._harder)
         config = self.config
         budget = Budget(config.planning_s or np.inf, config.evaluations)
-        search = Search(navigation, self.route, self.belief, config=config.search, seed=self._seed, budget=budget)
-        self._planner = Planner(search, evaluations=config.decision_evaluations, seconds=config.decision_s)
-        devices, turn_rad_s = len(self.navigation.devices), config.search.turn_rad_s
+        search, seed = config.search, self._seed
+        self._search = Search(navigation, self.route, self.belief, config=search, seed=seed, budget=budget)
+        devices, turn_rad_s = len(self.navigation.devices), search.turn_rad_s
         self._follower = Follower(self.belief.drives, devices=devices, turn_rad_s=turn_rad_s)
         self._failed = 0
 
     def _begin_anew(self) -> None:
         """Forget course and failed searches: what they were made with is no longer believed."""
-        self._planner.cancel()
-        self._planned_s = self.planning_s
+        self._forget()
         self._set_out()
 
     def _observe(self, observation: Observation) -> None:
@@ -208,11 +202,11 @@ class _PlanningPolicy:
 
     def _go_on(self, observation: Observation) -> Proximals:
         """Return the velocities that lead to the next place of the course."""
-        arriving, waits = self.navigation.arriving, self._planner.busy
+        arriving, waits = self.navigation.arriving, self._thought is not None
         if self._off_course() or (self._follower.ended and not waits and not (self._follower.reached and arriving)):
             self._plan(observation)
-        if self._planner.busy:
-            self._think()
+        if self._thought is not None:
+            self._think(self._thought)
         self._arrived = self._follower.reached and self._follower.ended
         if self._arrived and arriving:
             return self._creep()
@@ -223,7 +217,7 @@ class _PlanningPolicy:
             left = along_mm / DECISION_PERIOD_S
             return self._follower.move([float(np.clip(left, -_WIRE_CREEP_MM_S, _WIRE_CREEP_MM_S))])
         if self._follower.ended:
-            another = not self._planner.busy and not self._planner.search.draws
+            another = self._thought is None and not self._search.draws
             self._shows = another  # a look, before another search
             return ((0.0, 0.0),)
         wanted = self._follower.step()
@@ -257,23 +251,29 @@ class _PlanningPolicy:
         if self._failed >= self.config.tries or seconds < DECISION_PERIOD_S:
             return
         self._crept, self.plans = 0, self.plans + 1
-        self._planner.begin(self.belief, seconds=seconds, horizon_mm=self.config.horizon_mm or np.inf)
+        self._search.set_out(self.belief, seconds=seconds, horizon_mm=self.config.horizon_mm or np.inf)
+        evaluations, seconds = self.config.decision_evaluations, self.config.decision_s
+        self._thought = Thought(self._search.go_on, self._search.budget, evaluations=evaluations, seconds=seconds)
 
-    def _think(self) -> None:
+    def _think(self, thought: Thought[Course]) -> None:
         """Let the search go on for a decision, and follow what it has found."""
-        course, search = self._planner.wait(), self._planner.search
+        thought.wait()
+        course = thought.found
         if course is not None:
             self._follower.extend(course)
-        if self._planner.busy:
+        if thought.busy:
             return
+        self._thought, self.planning_s = None, self.planning_s + thought.took_s
         if not self.halt:
             self._failed = 0
-        elif not (search.budget.over and course is not None and len(course.control)):  # that came on in its time
+        elif not (self._search.budget.over and course is not None and len(course.control)):  # that came on in its time
             self._failed += 1
 
     def _forget(self) -> None:
         """Follow no course, and search none."""
-        self._planner.cancel()
+        if self._thought is not None:
+            self._thought.stop()
+            self._thought, self.planning_s = None, self.planning_s + self._thought.took_s
         self._follower.begin(None)
 
 
@@ -376,7 +376,7 @@ class AgentPolicy(_PlanningPolicy):
 
         Devices that rest while a search goes on are not: they are where they were.
         """
-        rests = self._planner.busy and self._follower.ended
+        rests = self._thought is not None and self._follower.ended
         return not rests and (bool(self._believed.asks) or self._arrived or self._shows)
 
     def believed(self) -> BelievedTip:

@@ -17,12 +17,13 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 
 from endopilot.belief.belief import Belief
+from endopilot.belief.thought import Budget, OutOfBudgetError
 from endopilot.control.course import Course, places_of
 from endopilot.control.drive import ROUNDING, Driver, Goal, Halt, Outcome
 from endopilot.control.repertoire import Repertoire, Row, stand_off
 from endopilot.control.search_config import SearchConfig
 from endopilot.control.set_up import describe_halt
-from endopilot.control.trials import Budget, OutOfBudgetError, Trials
+from endopilot.control.trials import Trials
 from endopilot.errors import InputError
 from endopilot.progress import Advance
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
@@ -123,12 +124,12 @@ class Search:
             self._most *= _LONGER
         self.halt, self._kept, self._settled = "", self._course.kept(), list[int]()
 
-    def go_on(self, *, advance: Advance | None = None, found: Callable[[Course], None] | None = None) -> Course:
+    def go_on(self, found: Callable[[Course], None] | None = None, *, advance: Advance | None = None) -> Course:
         """Return a course from where it has set out to the target.
 
         Args:
-            advance: as in `find`.
             found: called with the course as far as it is known, whenever it has passed another place.
+            advance: as in `find`.
         """
         try:
             self._lead(advance, found)

@@ -1,9 +1,7 @@
-"""Trials of a stack of devices that are driven side by side: `Trials`, within the `Budget` of a search."""
+"""Trials of a stack of devices that are driven side by side: `Trials`."""
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -11,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from endopilot.belief.thought import Budget
 from endopilot.control.course import Course
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Stack
@@ -77,78 +76,6 @@ class Kept(NamedTuple):
     def periods(self) -> int:
         """How many periods they had done."""
         return len(self.rows)
-
-
-class OutOfBudgetError(Exception):
-    """A search has spent its budget."""
-
-
-class CancelledError(Exception):
-    """Nobody waits for a search any more."""
-
-
-class Budget:
-    """What a search may spend, by which it ends whatever it is at: all that it does is to drive trials.
-
-    A search in a thread of its own waits, too, until a decision grants what it spends next (`Planner`).
-
-    Attributes:
-        over: whether it is spent.
-    """
-
-    def __init__(self, seconds: float = np.inf, evaluations: float | int = np.inf) -> None:
-        """Give a budget.
-
-        Args:
-            seconds: processor time of this thread, s: wall time where nothing else takes the processor.
-            evaluations: of nodes (Newton's iterations times active nodes): by them alone the bits of a search repeat.
-        """
-        self._seconds, self._evaluations = seconds, evaluations
-        self._turn, self._granted, self._cancelled = threading.Condition(), np.inf, False
-        self.begin()
-
-    def begin(self, granted: float = np.inf) -> None:
-        """Begin another search; what is not granted has to be waited for."""
-        self.over, self._until, self._spent = False, np.inf, 0.0
-        self._granted, self._cancelled, self._ended = granted, False, False
-
-    def spend(self, evaluations: float | int) -> None:
-        """Take some evaluations off, and wait where they are more than is granted.
-
-        Raises:
-            OutOfBudgetError: nothing is left.
-            CancelledError: nobody waits any more.
-        """
-        if np.isinf(self._until):
-            self._until = time.thread_time() + self._seconds
-        self._spent += evaluations
-        if self._spent > self._evaluations or time.thread_time() > self._until:
-            self.over = True
-            raise OutOfBudgetError
-        with self._turn:
-            self._turn.notify_all()
-            self._turn.wait_for(lambda: self._spent < self._granted or self._cancelled)
-            if self._cancelled:
-                raise CancelledError
-
-    def grant(self, evaluations: float | int, seconds: float | None) -> None:
-        """Let a search in another thread spend more, and wait until it has, or has ended, or some time is over, s."""
-        with self._turn:
-            self._granted += evaluations
-            self._turn.notify_all()
-            self._turn.wait_for(lambda: self._ended or self._spent >= self._granted, timeout=seconds)
-
-    def end(self) -> None:
-        """Tell who waits that the search has ended."""
-        with self._turn:
-            self._ended = True
-            self._turn.notify_all()
-
-    def cancel(self) -> None:
-        """End a search in another thread: nobody waits any more."""
-        with self._turn:
-            self._cancelled = True
-            self._turn.notify_all()
 
 
 class Trials:

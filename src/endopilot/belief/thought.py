@@ -1,0 +1,176 @@
+"""Long work in a thread of its own, for which decisions wait no longer than they may: `Thought`, and its `Budget`."""
+
+from __future__ import annotations
+
+import threading
+import time
+import weakref
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+import numpy as np
+
+Found = TypeVar("Found")
+
+
+class OutOfBudgetError(Exception):
+    """A search has spent its budget."""
+
+
+class CancelledError(Exception):
+    """Nobody waits any more."""
+
+
+class Budget:
+    """What a search may spend, by which it ends whatever it is at: all that it does is to simulate.
+
+    What works in a thread of its own waits, too, until a decision grants what it spends next (`Thought`).
+
+    Attributes:
+        over: whether it is spent.
+    """
+
+    def __init__(self, seconds: float = np.inf, evaluations: float | int = np.inf) -> None:
+        """Give a budget.
+
+        Args:
+            seconds: processor time of this thread, s: wall time where nothing else takes the processor.
+            evaluations: of nodes (Newton's iterations times active nodes): by them alone the bits of a search repeat.
+        """
+        self._seconds, self._evaluations = seconds, evaluations
+        self._turn, self._granted, self._cancelled = threading.Condition(), np.inf, False
+        self.begin()
+
+    def begin(self, granted: float = np.inf) -> None:
+        """Begin anew; what is not granted has to be waited for."""
+        self.over, self._until, self._spent = False, np.inf, 0.0
+        self._granted, self._cancelled, self._ended = granted, False, False
+
+    def spend(self, evaluations: float | int) -> None:
+        """Take some evaluations off, and wait where they are more than is granted.
+
+        Raises:
+            OutOfBudgetError: nothing is left.
+            CancelledError: nobody waits any more.
+        """
+        if np.isinf(self._until):
+            self._until = time.thread_time() + self._seconds
+        self._spent += evaluations
+        if self._spent > self._evaluations or time.thread_time() > self._until:
+            self.over = True
+            raise OutOfBudgetError
+        with self._turn:
+            self._turn.notify_all()
+            self._turn.wait_for(lambda: self._spent < self._granted or self._cancelled)
+            if self._cancelled:
+                raise CancelledError
+
+    def grant(self, evaluations: float | int, seconds: float | None) -> None:
+        """Let the work in another thread spend more, and wait until it has, or has ended, or some time is over, s."""
+        with self._turn:
+            self._granted += evaluations
+            self._turn.notify_all()
+            self._turn.wait_for(lambda: self._ended or self._spent >= self._granted, timeout=seconds)
+
+    def end(self) -> None:
+        """Tell who waits that the work has ended."""
+        with self._turn:
+            self._ended = True
+            self._turn.notify_all()
+
+    def cancel(self) -> None:
+        """End the work in another thread: nobody waits any more."""
+        with self._turn:
+            self._cancelled = True
+            self._turn.notify_all()
+
+
+class Thought(Generic[Found]):
+    """Works something out in a thread of its own, for which each decision waits no longer than it may.
+
+    Where each decision grants a number of evaluations, the thread waits for them, and the bits repeat; where a decision
+    waits for some seconds, they do not. The thread ends where nobody holds the thought any more.
+
+    Attributes:
+        busy: whether it goes on.
+    """
+
+    def __init__(
+        self,
+        work: Callable[[Callable[[Found], None]], Found],
+        budget: Budget,
+        *,
+        evaluations: float | int,
+        seconds: float | None,
+    ) -> None:
+        """Begin.
+
+        Args:
+            work: what is worked out; it is given what to call with the answer as far as it is known.
+            budget: that the work takes off, of which each decision grants some.
+            evaluations: of nodes that each decision grants.
+            seconds: that each decision waits at most, s: the work goes on without it then, and needs no grants.
+        """
+        self.busy, self._granted, self._seconds = True, evaluations if seconds is None else np.inf, seconds
+        budget.begin(granted=0.0)
+        self._budget, self._thread = budget, _Thread(work, budget)
+        self._thread.start()
+        weakref.finalize(self, self._thread.stop)
+
+    @property
+    def found(self) -> Found | None:
+        """The answer as far as it is known; None if nothing of it is."""
+        return self._thread.found
+
+    @property
+    def took_s(self) -> float:
+        """Processor time that it has taken once it has ended, s."""
+        return self._thread.took_s
+
+    def wait(self) -> None:
+        """Let it go on for a decision; what fails in it is raised here."""
+        self._budget.grant(self._granted, self._seconds)
+        self.busy = not self._thread.ended
+        if self._thread.error is not None:
+            raise self._thread.error
+
+    def stop(self) -> None:
+        """End it: what it was begun from is no longer believed."""
+        self._thread.stop()
+        self.busy = False
+
+
+class _Thread(threading.Thread):
+    """The thread of a thought, which does not hold it.
+
+    Attributes:
+        found, took_s: as those of the thought.
+        error: what the work raised.
+        ended: whether it is over.
+    """
+
+    def __init__(self, work: Callable[..., object], budget: Budget) -> None:
+        super().__init__(daemon=True)
+        self._work, self._budget, self.ended, self.took_s = work, budget, False, 0.0
+        self.found: object | None = None
+        self.error: Exception | None = None
+
+    def run(self) -> None:
+        began_s = time.thread_time()
+        try:
+            self.found = self._work(self._note)
+        except CancelledError:
+            pass
+        except Exception as error:  # raised where it is waited for
+            self.error = error
+        self.took_s, self.ended = time.thread_time() - began_s, True
+        self._budget.end()
+
+    def stop(self) -> None:
+        """End the work, and wait until it has."""
+        self._budget.cancel()
+        if threading.current_thread() is not self:
+            self.join()
+
+    def _note(self, found: object) -> None:
+        self.found = found
