@@ -42,8 +42,8 @@ class AgentConfig:
     evaluations: Annotated[int, Within(1, 10**15)] = 300_000_000
     """Evaluations of nodes (Newton's iterations times active nodes) that a search may take, some 30 s of a core; it
     then ends with the course that it has."""
-    decision_evaluations: Annotated[int, Within(1, 10**15)] = 2_500_000
-    """Those that a decision waits for, some 0.3 s of a core. A longer search goes on at the next decisions; the devices
+    decision_evaluations: Annotated[int, Within(1, 10**15)] = 3_500_000
+    """Those that a decision waits for, some 0.4 s of a core. A longer search goes on at the next decisions; the devices
     follow the course as far as it is known, and rest then."""
     decision_s: Positive | None = None
     """Wall time that a decision waits for a search instead, s: the search goes on while the devices move. That is for

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from endopilot.belief.drives import Drives
 from endopilot.devices.stack import Proximals
 from endopilot.tasks.navigation import DECISION_PERIOD_S
-from endopilot.tasks.route import Route
+from endopilot.tasks.route import ENTERED_MM, Route
 from endopilot.types import TipProjection
 
 Controls = Float[np.ndarray, "periods devices 2"]
@@ -41,12 +41,12 @@ class Course:
 
 
 _STRETCH_MM, _LONG_STRETCH_MM = 20.0, 40.0
-"""A wire in a catheter passes the route in stretches of this length at most, mm; of the latter where the two move
-together, since each stretch ends with the wire at rest until its catheter has come."""
+"""Devices pass the route in stretches of this length at most, mm: of the former where wire and catheter move in turn, of
+the latter else. What is hard is then tried from near by, and what is before it is driven while the search goes on."""
 
 
 def places_of(route: Route, begun: float, *, alone: bool, together: bool) -> list[float]:
-    """Return the places that are passed, mm: the route's waypoints, and with a catheter others between.
+    """Return the places that are passed, mm: the route's waypoints, and others between.
 
     Args:
         route: to the target.
@@ -54,11 +54,10 @@ def places_of(route: Route, begun: float, *, alone: bool, together: bool) -> lis
         alone: whether there is no catheter.
         together: whether wire and catheter move together.
     """
-    if alone:
-        return route.waypoints.tolist()
-    longest = _LONG_STRETCH_MM if together else _STRETCH_MM
+    longest = _LONG_STRETCH_MM if together or alone else _STRETCH_MM
     places: list[float] = []
-    for goal in [*route.waypoints[:-1][route.waypoints[:-1] > begun].tolist(), route.target.abscissa]:
+    ahead = route.waypoints[:-1] > begun - alone * ENTERED_MM
+    for goal in [*route.waypoints[:-1][ahead].tolist(), route.target.abscissa]:
         begin = places[-1] if places else begun
         count = max(1, int(np.ceil((goal - begin) / longest)))
         places += [begin + (goal - begin) * (k + 1) / count for k in range(count - 1)] + [goal]

@@ -27,7 +27,7 @@ from endopilot.control.trials import Trials
 from endopilot.errors import InputError
 from endopilot.progress import Advance
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
-from endopilot.tasks.route import ENTERED_MM, Route
+from endopilot.tasks.route import Route
 
 _KEEP = 8
 """Trials that go on to the next round."""
@@ -89,14 +89,18 @@ class Search:
         like, kinds = self._belief.simulator, self._belief.kinds
         return Trials.of(self._navigation, [kinds[wire] for wire in wires], count, like=like, budget=self.budget)
 
-    def _trials_of(self, count: int) -> Trials:
-        """Return the trials by which so many motions are driven: one with all wires, several with the likeliest few."""
+    def _trials_of(self, row: Row) -> Trials:
+        """Return the trials by which the motions of a row are driven.
+
+        A single motion is driven with all wires, and so are those that go on round by round, since few of them pass;
+        others with the likeliest few, and what passes is tried with all when it is followed.
+        """
         course = self._course
-        few = course.wires if count == 1 else math.isqrt(course.wires)
+        few = course.wires if row.count == 1 or row.rounds > 1 else math.isqrt(course.wires)
         wires = np.sort(np.argsort(-course.weight, kind="stable")[:few])
-        key = (count, *wires.tolist())
+        key = (row.count, *wires.tolist())
         if key not in self._trials:
-            self._trials[key] = self._new_trials(count, key[1:])
+            self._trials[key] = self._new_trials(row.count, key[1:])
         return self._trials[key].copy_of(course, wires)
 
     def find(
@@ -152,8 +156,7 @@ class Search:
         together, reported = self.config.together, begun
         for place in places_of(self.route, begun, alone=alone, together=together):
             goal = Goal(self._navigation, self.route, place, self._repertoire.agree)
-            passed = not goal.last and place + alone * ENTERED_MM <= begun
-            while not passed and not goal.arrived(course)[0]:
+            while not goal.arrived(course)[0]:
                 self._kept = course.kept()
                 halt = self._pass(goal)
                 if advance is not None:
@@ -200,7 +203,7 @@ class Search:
 
     def _drive(self, row: Row, goal: Goal) -> Iterator[Outcome]:
         """Drive the motions of a row from where the course is, and yield what becomes of them, round by round."""
-        trials = self._trials_of(row.count)
+        trials = self._trials_of(row)
         obstacle, step = self._obstacle(goal.at_mm)
         limit_n = self._navigation.force_limit_n
         limits = self._repertoire.limits(row, self.route, self._here, goal.at_mm, limit_n)

@@ -253,9 +253,10 @@ class Trials:
         return step
 
     def _spend(self, step: Step) -> None:
-        """Take a step off the budget: the worlds of each wire are driven in packs of `LANES`, which may not be full."""
-        packed = -(-self.count // LANES) * LANES
-        self._budget.spend(packed / self.count * float(step.node_iterations.sum()) + _CALL)
+        """Take a step off the budget. Worlds are driven in packs of `LANES`, which may not be full; a node of a pair, which
+        touches another device too, costs twice that of a wire."""
+        packed = -(-self.count // LANES) * LANES / self.count
+        self._budget.spend(self.devices * packed * float(step.node_iterations.sum()) + _CALL)
 
     def kept(self) -> Kept:
         """Return where they are."""
