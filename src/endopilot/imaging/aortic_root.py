@@ -56,13 +56,8 @@ _OPENING_MM = 5.0
 
 @dataclass(frozen=True, eq=False)
 class AorticRoot:
-    """The ascending aorta as discs, one an axial slice, from the lowest to the highest.
-
-    Attributes:
-        centres: LPS mm.
-        radius: mm.
-        blood_hu: median HU inside.
-    """
+    """The ascending aorta as discs (`centres` LPS mm, `radius` mm), one an axial slice from the lowest up; `blood_hu`
+    is their median."""
 
     centres: Float[np.ndarray, "n 3"]
     radius: Float[np.ndarray, "n"]
@@ -82,17 +77,9 @@ class _Disc:
 
 
 def find_aortic_roots(grid: Volume) -> list[AorticRoot]:
-    """Find what may be the ascending aorta, the likeliest first: a right heart as bright as the left is as likely.
-
-    Args:
-        grid: CT in HU along the LPS axes, isotropic, of about 1.5 mm: finer detail is of no use here.
-
-    Returns:
-        One to three, apart from each other.
-
-    Raises:
-        InputError: no contrast, or no such vessel in the volume.
-    """
+    """Return one to three places that may be the ascending aorta, the likeliest first: a right heart as bright as the
+    left is as likely. `grid` is a CT in HU along the LPS axes, isotropic, of about 1.5 mm. Raises InputError without
+    contrast or such a vessel."""
     hu = np.asarray(ndimage.gaussian_filter(grid.voxels, 0.7))
     spacing = float(grid.spacing_mm[0])
     if (ndimage.minimum_filter(hu, round(9.0 / spacing)) > LEAST_BLOOD_HU).sum() == 0:
@@ -188,12 +175,8 @@ def _best_chain(slices: list[list[_Disc]]) -> list[_Disc]:
 
 @dataclass(frozen=True, eq=False)
 class Opening:
-    """Where a vessel comes to the aortic wall.
-
-    Attributes:
-        voxel: the vessel's voxel nearest the wall (k, j, i).
-        vessel: number of the connected vessel among all.
-    """
+    """Where a vessel comes to the aortic wall: its `voxel` (k, j, i) nearest the wall, and its number among the
+    connected ones."""
 
     voxel: Int[np.ndarray, "3"]
     vessel: int
@@ -251,17 +234,12 @@ def find_ostium(
     aorta: Bool[np.ndarray, "nz ny nx"],
     grid: Volume,
 ) -> tuple[Insertion, Float[np.ndarray, "m 3"]]:
-    """Return the ostium, and the path begun anew from there.
+    """Return the ostium, and the path (LPS mm) begun anew from there.
 
     The artery's middle is the centroid of its blood at several heights above the aortic wall; a parabola through the
     lowest of them is carried on to the wall. Where the artery leaves at a slant, the tracked path begins at its edge,
-    and the blood near the path is more of one side than of the other: a second round looks around the parabola.
-
-    Args:
-        path: LPS mm, the first point within a few mm of the aortic wall, or anywhere if no aorta is near.
-        blood: voxels above half the lumen's HU.
-        aorta: voxels of the aorta, roughly.
-        grid: the isotropic grid of both masks.
+    and the blood near the path is more of one side than of the other: a second round looks around the parabola. `blood`
+    is above half the lumen's HU; `aorta` is rough; both lie on the isotropic `grid`.
     """
     spacing = float(grid.spacing_mm[0])
     half = round(_BOX_MM / spacing)

@@ -37,17 +37,10 @@ def lumen_at_half_height(
     lumen_hu: float,
     excluded: Bool[np.ndarray, "nz ny nx"],
 ) -> Bool[np.ndarray, "nz ny nx"]:
-    """Return the voxels of the lumen around a vessel's paths.
+    """Return the voxels of the lumen around dense points of a vessel's paths (LPS mm) with rough radii, mm.
 
     The surroundings differ from side to side (fat, muscle, lung), and the wall's level with them: a fixed threshold
-    would make a vessel too wide in muscle or too narrow in fat.
-
-    Args:
-        volume: CT in HU, cropped to the vessel.
-        points: dense points along the paths, LPS mm.
-        radius: rough lumen radius at each, mm.
-        lumen_hu: HU of the contrast-filled lumen.
-        excluded: voxels that belong to other blood pools.
+    would make a vessel too wide in muscle or too narrow in fat. `excluded` voxels belong to other blood pools.
     """
     spacing = volume.spacing_mm[::-1]
     hu = ndimage.gaussian_filter(volume.voxels.astype(np.float32), _SMOOTHING_MM / spacing, truncate=3.0)

@@ -67,16 +67,8 @@ _WALL_HU = 50.0
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """What is known of the scan on the grid of the vessels.
-
-    Attributes:
-        grid: CT in HU.
-        hu: the same, lightly smoothed.
-        lumen_hu: HU of contrast-filled lumen.
-        pools: aorta, chambers, great vessels.
-        vessels: voxels of thin vessels.
-        response: vesselness.
-    """
+    """A CT on the grid of the vessels: HU (`grid`, and `hu` lightly smoothed), HU of contrast-filled lumen, and voxels
+    of blood pools and thin vessels with their vesselness."""
 
     grid: Volume
     hu: Float[np.ndarray, "nz ny nx"]
@@ -93,17 +85,9 @@ class Scan:
 
 @dataclass(frozen=True, eq=False)
 class FoundTree(Scan):
-    """A coronary tree as it was found in a scan.
-
-    Attributes:
-        volume: CT in HU, as it was given.
-        aorta: voxels of the aorta on that grid; none if it is not in the volume.
-        tree: those of the scan's vessels that are the tree.
-        ostium: LPS mm.
-        paths: from the ostium to every distal end, each from where it leaves those before it, LPS mm.
-        radius: radius at the points of each path, mm.
-        lumen: the mask, on the voxels of `volume`.
-    """
+    """A coronary tree as found in a scan: paths (LPS mm, with radii, mm) from the ostium to every distal end, each from
+    where it leaves those before it. `aorta` and `lumen` lie on the voxels of `volume`, the tree on the grid of the
+    vessels."""
 
     volume: Volume
     aorta: Bool[np.ndarray, "nz ny nx"]

@@ -66,14 +66,8 @@ _AIR_HU = -1024.0
 
 @dataclass(frozen=True, eq=False)
 class _Slice:
-    """What the header of one file says of its image, without identifiers.
-
-    Attributes:
-        path: the file.
-        transfer_syntax: UID of the encoding.
-        numbers: values of each of `_NUMBERS`; none where the header has none.
-        words: text of each of `_WORDS`, in capitals; empty where the header has none.
-    """
+    """What a file's header says of its image, without identifiers: `numbers` by `_NUMBERS`, `words` by `_WORDS` in
+    capitals."""
 
     path: Path
     transfer_syntax: str
@@ -110,15 +104,10 @@ class _Slice:
 
 
 def read_series(path: Path, series: str | None, phase: str | None = None) -> Volume:
-    """Read a CT series in HU.
+    """Read a CT series in HU from a folder, its subfolders too, or by one of its files.
 
-    Args:
-        path: a folder, its subfolders searched too, or one file of the series wanted.
-        series: number or SeriesInstanceUID of the series to take where the folder holds several.
-        phase: number of the cardiac phase to take where the series holds several.
-
-    Raises:
-        InputError: there is no image or more than one series, or the series is no plain CT volume.
+    `series` is a number or a SeriesInstanceUID, `phase` the number of a cardiac phase. Raises InputError where there is
+    no image, more than one series, or no plain CT volume.
     """
     folder = path if path.is_dir() else path.parent
     slices, left_out = _read_headers(_files(folder, deep=path == folder))
@@ -164,11 +153,8 @@ def _files(folder: Path, *, deep: bool) -> list[Path]:
 
 
 def _read_headers(files: Sequence[Path]) -> tuple[list[_Slice], list[str]]:
-    """Return the headers of DICOM images, scout views left out, and what is to be noted of other files.
-
-    Among the other files may be slices whose content is lost: what is named as the slices are and is no text is
-    refused, and so is what says of itself that it is an image.
-    """
+    """Return the headers of DICOM images without scout views, and notes on other files. Raises InputError for a file
+    that may be a slice whose content is lost: named as the slices are and no text, or an image by its own word."""
     found, others = [], []
     # pydicom's warnings quote header values; none may reach a log.
     with progress("Reading DICOM headers", len(files)) as advance, warnings.catch_warnings():
@@ -335,10 +321,8 @@ def _geometry(
 
 
 def _read_pixels(slices: Sequence[_Slice]) -> tuple[np.ndarray, list[str]]:
-    """Decode slices in the order given and return HU: int16 where all are whole numbers that fit, else float32.
-
-    Pixels that show nothing are given the HU of air, and that is noted.
-    """
+    """Decode slices in the order given and return HU, int16 if whole, else float32; pixels that show nothing become
+    air, with a note."""
     padded = 0
     whole = all(number.is_integer() for slice_ in slices for number in slice_.rescale)
     voxels = np.empty((len(slices), *slices[0].size), dtype=np.float32)

@@ -35,16 +35,9 @@ def choose_phase(
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return the indices of the slices of the one phase there is, or of the one asked for, and what is to be noted.
 
-    Args:
-        values: of each field of `PHASE_TAGS`, for every slice; None where a header lacks it.
-        positions_mm: of the slices along their normal.
-        phase: number of the phase wanted, as the field gives it.
-        folder: for messages.
-        named: index of the slice whose file was given in place of the folder; its phase is taken if none is asked for.
-
-    Raises:
-        InputError: there are several phases and none was chosen, there is no such phase, or several images at one
-            position cannot be distinguished.
+    `values` has each field of `PHASE_TAGS` for every slice, None where a header lacks it. `named` is the slice whose
+    file was given in place of the folder; its phase is taken if none is asked for. Raises InputError where no or no
+    single phase fits.
     """
     everything = np.arange(len(positions_mm))
     if np.diff(np.sort(positions_mm)).min(initial=np.inf) >= _POSITION_MM:
@@ -94,10 +87,8 @@ def _single(values: Mapping[str, Sequence[float | None]], phase: str | None, fol
 
 
 def _split(values: Sequence[float | None], positions_mm: np.ndarray) -> dict[float, np.ndarray]:
-    """Return the slices of each phase by its value; none where the values do not tell phases apart.
-
-    The time after the R wave may vary from beat to beat: then phases are distinguished by their order at each position.
-    """
+    """Return the slices of each phase by its value; none where the values do not tell phases apart. The time after the
+    R wave may vary from beat to beat: then phases are distinguished by their order at each position."""
     if any(value is None or not np.isfinite(value) for value in values):
         return {}
     known = np.array(values, dtype=float)

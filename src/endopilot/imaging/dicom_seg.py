@@ -30,11 +30,7 @@ _SAME_MM = 1e-3
 
 
 def need_highdicom(path: Path) -> Any:
-    """Return the package `highdicom`.
-
-    Raises:
-        InputError: it is not installed.
-    """
+    """Return the package `highdicom`, or raise InputError where it is not installed."""
     try:
         return importlib.import_module("highdicom")
     except ImportError as error:
@@ -44,11 +40,7 @@ def need_highdicom(path: Path) -> Any:
 
 
 def write_seg(mask: LumenMask, path: Path) -> None:
-    """Write a mask as a binary DICOM-SEG object with one segment, empty slices included.
-
-    Raises:
-        InputError: highdicom is absent, or the file cannot be written.
-    """
+    """Write a mask as a binary DICOM-SEG object with one segment, empty slices included."""
     hd = need_highdicom(path)
     from pydicom.sr.codedict import codes
 
@@ -93,16 +85,11 @@ def write_seg(mask: LumenMask, path: Path) -> None:
 
 
 def read_seg(path: Path, label: int | str | None = None) -> Volume:
-    """Read one segment of a DICOM-SEG object, whatever other segments overlap it, as a volume of booleans.
+    """Read one segment of a DICOM-SEG object, by number or SegmentLabel, as a volume of booleans; other segments may
+    overlap it.
 
-    Of a fractional segment, voxels that it fills by half or more are taken, and a note says so.
-
-    Args:
-        path: the file.
-        label: number or SegmentLabel of the segment; None where there is but one.
-
-    Raises:
-        InputError: the file is damaged, no segmentation, or not on a regular grid, or the segment is not there.
+    Of a fractional segment, voxels that it fills by half or more are taken, and a note says so. Raises InputError for a
+    damaged file, another object, an irregular grid, or a segment that is not there.
     """
     import pydicom  # comes with an extra
 
@@ -142,12 +129,9 @@ def read_seg(path: Path, label: int | str | None = None) -> Volume:
 
 
 def _frames(content: Dataset) -> tuple[list[int], np.ndarray, tuple[float, ...], tuple[float, ...], float]:
-    """Return the geometry of all frames; any error means that the object is none that can be read.
-
-    Returns:
-        Of each frame ReferencedSegmentNumber (0 in a label map) and ImagePositionPatient, LPS mm; of all
-        ImageOrientationPatient, PixelSpacing, and SpacingBetweenSlices (0 where it is absent), mm.
-    """
+    """Return of each frame ReferencedSegmentNumber (0 in a label map) and ImagePositionPatient; of all
+    ImageOrientationPatient, PixelSpacing, and SpacingBetweenSlices (0 if absent), mm. Any error means that the object
+    cannot be read."""
     shared = content.SharedFunctionalGroupsSequence[0]
 
     def item(frame: Dataset, name: str) -> Dataset:

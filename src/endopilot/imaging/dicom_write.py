@@ -28,16 +28,10 @@ _UNNAMED = (
 
 
 def write_series(volume: Volume, folder: Path) -> None:
-    """Write a CT volume as a DICOM series, one file a slice, without any patient's data.
+    """Write a CT volume in HU, rounded to whole numbers, as a DICOM series without any patient's data, one file a
+    slice.
 
-    HU are rounded to whole numbers. The same volume gives the same bytes.
-
-    Args:
-        volume: CT in HU.
-        folder: a new folder, or an empty one.
-
-    Raises:
-        InputError: the folder holds files already, or cannot be written.
+    The same volume gives the same bytes. Raises InputError where the folder holds files already, or cannot be written.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: is there already; give a new folder for the DICOM series")
@@ -51,11 +45,7 @@ def write_series(volume: Volume, folder: Path) -> None:
 
 
 def save(content: Dataset, path: Path) -> None:
-    """Write a DICOM file, and compare what has arrived byte by byte.
-
-    Raises:
-        InputError: other bytes have arrived.
-    """
+    """Write a DICOM file, and compare what has arrived byte by byte; raises InputError if it differs."""
     stream = io.BytesIO()
     content.save_as(stream, enforce_file_format=True)
     path.write_bytes(stream.getvalue())
@@ -64,10 +54,8 @@ def save(content: Dataset, path: Path) -> None:
 
 
 def slice_headers(volume: Volume) -> list[Dataset]:
-    """Return the header of every slice of a volume, pixels left out.
-
-    The UIDs are made from the volume's own content (PS3.5 B.2), so that nothing of another header is in them.
-    """
+    """Return the header of every slice of a volume, pixels left out. The UIDs follow from the volume's own content
+    (PS3.5 B.2), so that nothing of another header is in them."""
     content = hashlib.sha256(np.ascontiguousarray(volume.voxels).tobytes())
     for part in (volume.spacing_mm, volume.origin_mm, volume.direction):
         content.update(np.ascontiguousarray(part).tobytes())

@@ -49,14 +49,7 @@ class Fields:
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Where voxels lie, as `Volume` holds it, and what was done to the header's numbers.
-
-    Attributes:
-        spacing_mm: distance between neighbouring voxel centres along i, j and k, mm.
-        origin_mm: LPS position of the centre of voxel (0, 0, 0), mm.
-        direction: columns are the LPS unit vectors along which i, j and k grow.
-        notes: a sentence for each change.
-    """
+    """Where voxels lie, as in `Volume` (mm, LPS), and a sentence for each change made to the header's numbers."""
 
     spacing_mm: Float[np.ndarray, "3"]
     origin_mm: Float[np.ndarray, "3"]
@@ -77,18 +70,11 @@ def geometry(
     path: Path,
     fields: Fields,
 ) -> Geometry:
-    """Return the geometry of an image, its axes straightened to the nearest rotation about the volume's centre.
+    """Return the geometry of an image of `size` (i, j, k), its axes straightened to the nearest rotation about its
+    centre.
 
-    Args:
-        direction: columns are the LPS directions of i, j and k, of length 1.
-        spacing_mm: distance between voxel centres along i, j and k, mm.
-        origin_mm: centre of the first voxel, LPS mm.
-        size: number of voxels along i, j and k.
-        path: the file, for messages.
-        fields: what its format calls these, for messages.
-
-    Raises:
-        InputError: a number is not finite, a spacing is not positive, an axis is no unit vector, or axes are sheared.
+    Columns of `direction` are the LPS unit directions of i, j and k. Raises InputError where a number is not finite, a
+    spacing not positive, an axis no unit vector, or the axes are sheared, and names the header's `fields`.
     """
     for name, values in ((fields.spacing, spacing_mm), (fields.origin, origin_mm), (fields.direction, direction.T)):
         if not np.isfinite(values).all():
@@ -126,10 +112,8 @@ def geometry(
 
 
 def parted(steps_mm: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """Return the directions and the lengths of steps from voxel to voxel, the columns of a header's matrix.
-
-    A step without length, or one that is not finite, is left as it is, for `geometry` to refuse.
-    """
+    """Return directions and lengths of the steps along i, j and k, columns of a header's matrix; a step without length
+    stays, for `geometry` to refuse."""
     lengths = np.linalg.norm(steps_mm, axis=0)
     with np.errstate(invalid="ignore"):
         return steps_mm / np.where(lengths > 0, lengths, 1.0), lengths
@@ -145,16 +129,9 @@ def farthest_apart_mm(one: Geometry | Volume, other: Geometry | Volume, size: Se
 def plane(
     orientation: Sequence[float], spacing_mm: Sequence[float], *, path: Path
 ) -> tuple[Float[np.ndarray, "3 2"], Float[np.ndarray, "3"]]:
-    """Return the directions in which i and j grow in a DICOM slice, as its header gives them, and their unit normal.
-
-    Args:
-        orientation: ImageOrientationPatient, six numbers.
-        spacing_mm: PixelSpacing: between rows, between columns, mm.
-        path: the file, for messages.
-
-    Raises:
-        InputError: they are no unit vectors at right angles, or pixels have no size.
-    """
+    """Return the directions in which i and j grow in a DICOM slice, from ImageOrientationPatient and PixelSpacing
+    (between rows, between columns), and their unit normal. Raises InputError for axes that are not at right angles, or
+    pixels without size."""
     axes = np.array(orientation, dtype=float).reshape(2, 3).T
     normal = np.cross(axes[:, 0], axes[:, 1])
     length = float(np.linalg.norm(normal))
@@ -173,21 +150,11 @@ def slice_grid(
     *,
     path: Path,
 ) -> Geometry:
-    """Return where the voxels of parallel slices lie (DICOM PS3.3 C.7.6.2.1.1).
+    """Return where the voxels of parallel slices of `size` (Rows, Columns) lie (DICOM PS3.3 C.7.6.2.1.1).
 
     Not the step from slice to slice is bounded, whose errors add up, but how far each slice lies from its place in the
-    even grid from the first to the last, along the slice too.
-
-    Args:
-        positions: ImagePositionPatient of each slice, LPS mm.
-        slots: number of each slice, from 0; several images may be of one slice, and slices may be left out.
-        axes: directions of i and j.
-        spacing_mm: PixelSpacing: between rows, between columns, mm.
-        size: Rows, Columns.
-        path: the file or folder, for messages.
-
-    Raises:
-        InputError: a slice lies elsewhere than even steps put it, or slices are stacked along a slant.
+    even grid from the first to the last, along the slice too. `slots` number the slices from 0: several images may be
+    of one slice, and slices may be left out. Raises InputError for uneven steps or a slant.
     """
     first, last = positions[slots.argmin()], positions[slots.argmax()]
     travel = (last - first) / slots.max()
@@ -210,17 +177,8 @@ def slice_grid(
 
 
 def converted(unit: str, sizes: Float[np.ndarray, "3"], *, path: Path, field: str) -> tuple[float, tuple[str, ...]]:
-    """Return the factor from a header's unit of length to mm, and the note that says so.
-
-    Args:
-        unit: as the header names it, in any case.
-        sizes: of the voxels in that unit.
-        path: the file, for messages.
-        field: of the header, for messages.
-
-    Raises:
-        InputError: the unit is unknown, or cannot be meant: voxels would be smaller than 1 µm or larger than 20 mm.
-    """
+    """Return the factor from a header's unit of length to mm, and the note that says so. Raises InputError for an
+    unknown unit, or one that makes voxels smaller than 1 µm or larger than 20 mm."""
     factor = MM_PER_UNIT.get(unit.strip().lower())
     if factor is None:
         raise InputError(f"{path}: {field} {unit!r} is no unit of length that is known; export it in mm")

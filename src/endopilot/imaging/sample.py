@@ -44,15 +44,8 @@ _FILES = {
 
 
 def fetch_sample(name: str = "cta-thorax") -> Path:
-    """Return the path of a sample CT, fetched into the user's cache if it is not there.
-
-    Its masks lie beside it. Licence and source are printed on standard error.
-
-    Args:
-        name: `cta-thorax`.
-
-    Raises:
-        InputError: the sample is unknown, cannot be fetched, or is not what it should be.
+    """Return the path of a sample CT, its masks beside it, fetched into the user's cache if it is not there; licence
+    and source go to standard error. Raises InputError if it is unknown, cannot be fetched, or is not what it should be.
     """
     import pooch
 

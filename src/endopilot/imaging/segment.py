@@ -190,17 +190,10 @@ def _refuse_cut_root(volume: Volume, ostium: Insertion) -> None:
 
 
 def refuse_other_units(volume: Volume, seeds: Sequence[Sequence[float]] = ()) -> None:
-    """Refuse a volume that cannot be in HU.
+    """Raise InputError for a volume that cannot be in HU: nothing is below 0, where fat, lung and air are.
 
-    A CT that was cut off at 0, or stripped of all but the brain, holds nothing below 0 either. Seeds tell it from one
-    whose rescale is lost: at them it has the HU of blood with contrast.
-
-    Args:
-        volume: CT in HU.
-        seeds: places in the vessel, LPS mm.
-
-    Raises:
-        InputError: nothing is below 0, where fat, lung and air are, and no blood at seeds shows that it is CT.
+    A CT that was cut off at 0, or stripped of all but the brain, holds nothing below 0 either. Seeds (LPS mm) tell it
+    from one whose rescale is lost: at them it has the HU of blood with contrast.
     """
     low, high = float(volume.voxels.min()), float(volume.voxels.max())
     if low < 0:
@@ -222,14 +215,10 @@ def refuse_other_units(volume: Volume, seeds: Sequence[Sequence[float]] = ()) ->
 
 
 def refuse_without_contrast(volume: Volume) -> None:
-    """Refuse a CT of the chest or abdomen whose blood holds no contrast.
+    """Raise InputError for a CT of the chest or abdomen without 4 connected ml of homogeneous tissue above 130 HU.
 
-    The histogram is that of homogeneous tissue. Blood with contrast is the one tissue that fills millilitres there
-    above 130 HU; blood without measures 30 to 60 HU, like muscle. Of a field of view shorter than a pool, a
-    proportionally smaller pool is asked for.
-
-    Raises:
-        InputError: no connected 4 ml of homogeneous tissue are that bright.
+    Blood with contrast is the one tissue that fills millilitres there above 130 HU; blood without measures 30 to 60 HU,
+    like muscle. Of a field of view shorter than a pool, a proportionally smaller pool is asked for.
     """
     extent_mm = float((volume.spacing_mm * volume.voxels.shape[::-1]).min())
     blocks, size_mm = _blocks(volume)

@@ -20,13 +20,8 @@ _LIKE_NEIGHBOURS = 0.25
 
 @dataclass(frozen=True)
 class Segment:
-    """A segment as a file describes it.
-
-    Attributes:
-        name: empty where it has none.
-        layer: which of the file's label images it is in, from 0.
-        value: of its voxels there.
-    """
+    """A segment as a file describes it: its name (or empty), the file's label image that it is in, from 0, and its
+    value there."""
 
     name: str
     layer: int
@@ -35,13 +30,8 @@ class Segment:
 
 @dataclass(frozen=True, eq=False)
 class ImageFile:
-    """What an image file holds.
-
-    Attributes:
-        volume: the voxels, of the first layer where there are several.
-        layers: all voxels, layer first: one for a plain volume.
-        segments: those that its header names.
-    """
+    """What an image file holds: the volume of its first layer, all layers (layer first), and the segments that its
+    header names."""
 
     volume: Volume
     layers: Shaped[np.ndarray, "layers nz ny nx"]
@@ -54,16 +44,8 @@ def inside_segment(
     """Return the voxels of the one segment that holds some, or of the one asked for, and what is to be noted.
 
     A segment's number is its value; where segments of several layers share values, it is its place in the file, from 1.
-
-    Args:
-        image: label images, 0 outside, or grey levels.
-        label: number or name of a segment; None where there is but one.
-        threshold: of grey levels, between those inside and outside.
-        path: the file, for messages.
-
-    Raises:
-        InputError: a layer is neither a label image nor grey levels with a threshold, nothing is inside, or the label
-            is not there or not given.
+    `threshold` divides grey levels. Raises InputError where a layer is neither labels nor thresholded grey levels,
+    nothing is inside, or the label is not there or not given.
     """
     layers = image.layers
     if threshold is not None:
@@ -99,17 +81,8 @@ def _inside_threshold(
 def choose(
     numbered: Sequence[tuple[int, Segment]], label: int | str | None, path: Path, *, show_names: bool = True
 ) -> Segment:
-    """Return the one segment there is, or the one with a number or name.
-
-    Args:
-        numbered: segments that hold voxels, each with its number.
-        label: number or name of a segment; None where there is but one.
-        path: the file, for messages.
-        show_names: whether messages may hold the names.
-
-    Raises:
-        InputError: there are several, or none or several of that name.
-    """
+    """Return the one segment there is, or the one with a number or name. Raises InputError, which names them if
+    `show_names`, where there are several, or none or several of that name."""
     listed = ", ".join(_shown(number, s.name if show_names else "") for number, s in numbered[:_MOST_LISTED])
     listed += ", …" if len(numbered) > _MOST_LISTED else ""
     if label is None:

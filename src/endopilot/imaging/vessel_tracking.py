@@ -34,14 +34,8 @@ def vesselness(
 
     Of the Hessian's eigenvalues λ₁ ≤ λ₂ ≤ λ₃ at scale σ, a bright tube has λ₁ ≈ λ₂ ≪ 0; the surface of a chamber has
     only λ₁ ≪ 0. The response is therefore −σ²λ₂ (Sato et al. 1998), divided by e⁻¹ times the contrast, which is what a
-    straight tube of radius √2·σ gives: its profile 1 − exp(−r²/2σ²) has −σ²·d²/dx² = u·exp(−u) with u = r²/2σ².
-
-    Args:
-        hu: image on an isotropic grid.
-        where: where the response is wanted; it is 0 elsewhere. The voxels at the volume's border are left out.
-        spacing_mm: distance between voxel centres, mm.
-        sigmas_mm: widths of the Gaussians, mm; a tube of radius r answers most at r/√2.
-        contrast_hu: HU of the lumen above its surroundings.
+    straight tube of radius √2·σ gives: its profile 1 − exp(−r²/2σ²) has −σ²·d²/dx² = u·exp(−u) with u = r²/2σ². It is 0
+    but `where` it is wanted, and at the border; a tube of radius r answers most at σ = r/√2.
     """
     where = where.copy()
     for axis in range(3):
@@ -99,20 +93,12 @@ def track_tree(
     ends: list[Int[np.ndarray, "3"]],
     spacing_mm: float,
 ) -> list[Float[np.ndarray, "_ 3"]]:
-    """Return the paths from `start` to every distal end of the tree, each from where it leaves those before it.
+    """Return the paths (voxel indices k, j, i) from `start` to every distal end, each from where it leaves those before
+    it.
 
     The farthest end is reached first; what its path covers is taken away, and so on until what is left is shorter than
-    a branch (after TEASAR, Sato et al. 2000). A path has the least cost; a strong response makes a step cheap.
-
-    Args:
-        response: vesselness.
-        passable: the tree's voxels; paths stay inside.
-        start: passable voxel (k, j, i) nearest the ostium.
-        ends: passable voxels that a path must reach, whatever its length.
-        spacing_mm: distance between voxel centres, mm.
-
-    Returns:
-        Continuous voxel indices (k, j, i), the longest path first.
+    a branch (after TEASAR, Sato et al. 2000). A path has the least cost in `passable` voxels; a strong vesselness makes
+    a step cheap. `ends` must be reached, whatever the length.
     """
     voxels = np.argwhere(passable)
     number = np.full(passable.shape, -1, dtype=np.int32)

@@ -49,15 +49,11 @@ _EVERY = 4  # of the skeleton's points, some 0.6 mm apart, are enough to find ve
 
 @dataclass(frozen=True, eq=False)
 class CoronaryInlet:
-    """Where a coronary artery begins.
+    """Where a coronary artery begins (LPS mm), with which probability, and the next best place.
 
     Attributes:
-        position: tip of the open end, LPS mm.
-        confidence: probability that the artery begins there, 0 to 1.
-        runner_up: the next best place, if any.
         crux: where the arteries meet the crux of the heart, if both are in the lumen and one reaches it.
         other: where the other coronary artery begins, LPS mm, if it is in the lumen too, as another piece.
-        notes: remarks on what speaks against it.
     """
 
     position: Float[np.ndarray, "3"]
@@ -82,11 +78,8 @@ def coronary_inlet(
 ) -> CoronaryInlet | None:
     """Return where an artery begins, or None where the lumen holds a piece of the aorta, which shows it.
 
-    `coordinates` are the axes that the user gave for a file that does not state its own; None where the file does.
-
-    Raises:
-        InputError: the artery is not there, the file is in other axes, or it is not certain where the artery begins;
-            the message names what to give.
+    `coordinates` are the axes that the user gave for a file that does not state its own. Raises InputError where the
+    artery is absent or uncertain, or the axes are others; the message names what to give.
     """
     pieces: list[list[OpenEnd]] = []
     skeletons: list[Skeleton] = []

@@ -105,13 +105,7 @@ REACHED_MM = 20.0
 
 @dataclass(frozen=True, eq=False)
 class OstiumCandidate:
-    """A place where an artery may begin.
-
-    Attributes:
-        position: mean of the ends of one stub, by their probability, LPS mm.
-        piece: which of the separate lumens it belongs to.
-        probability: share of the hypotheses that put the ostium here.
-    """
+    """A place (LPS mm, mean of one stub's ends) where an artery may begin, its piece of lumen, and its probability."""
 
     position: Float[np.ndarray, "3"]
     piece: int
@@ -123,8 +117,6 @@ class OstiumRanking:
     """How the hypotheses about a lumen's arteries share the probability of 1.
 
     Attributes:
-        candidates: places where the artery asked for may begin, most probable first.
-        absent: probability that the artery is absent.
         touching: where the artery would begin if one lumen held both, with that probability.
         axes: the axes, of `OTHER_AXES`, that explain the lumen best, and with which probability.
     """
@@ -140,12 +132,9 @@ def rank_ostia(
 ) -> dict[Side, OstiumRanking]:
     """Return where each artery may begin if it is asked for, and what else the lumen may hold.
 
-    What is missing to 1 is the probability that nothing in the lumen is as coronary arteries are.
-
-    Args:
-        pieces: the open ends of every lumen that may be a coronary artery.
-        vessels: points along all vessels, LPS mm: none of them may lie in the aorta.
-        stated: whether the file states its axes.
+    `pieces` are the open ends of every lumen that may be a coronary artery; no point of `vessels` (LPS mm) may lie in
+    the aorta; `stated` is whether the file states its axes. What is missing to 1 is the probability that nothing in the
+    lumen is as coronary arteries are.
     """
     ends = [end for own in pieces for end in own]
     owner = np.array([piece for piece, own in enumerate(pieces) for _ in own])
@@ -217,13 +206,8 @@ def _merged(
 
 
 def end_score(end: OpenEnd, side: Side, flip: Float[np.ndarray, "3"] | float = 1.0) -> float:
-    """Return the logarithmic likelihood, up to a constant, that the right or left artery begins at an end.
-
-    Args:
-        end: the end.
-        side: which artery.
-        flip: signs that turn the end's axes into LPS.
-    """
+    """Return the logarithmic likelihood, up to a constant, that an artery begins at an end; `flip` turns its axes into
+    LPS."""
     heading = WEIGHT["heading"] * _log_t((_angle_deg(flip * end.heading, HEADING[side]) / HEADING_SD_DEG) ** 2)
     course = WEIGHT["course"] * _log_t((_angle_deg(flip * end.course, COURSE[side]) / COURSE_SD_DEG) ** 2)
     return shape_score(end) + float(heading + course)
@@ -286,12 +270,8 @@ def _angle_deg(one: Float[np.ndarray, "... 3"], two: Float[np.ndarray, "3"]) -> 
 
 @dataclass(frozen=True, eq=False)
 class Crux:
-    """Where the posterior interventricular groove meets the atrioventricular one.
-
-    Attributes:
-        position: LPS mm, within some 15 mm.
-        dominance: which artery reaches it.
-    """
+    """Where the posterior interventricular groove meets the atrioventricular one, LPS mm within some 15 mm, and which
+    artery reaches it."""
 
     position: Float[np.ndarray, "3"]
     dominance: Dominance
@@ -305,10 +285,8 @@ class Crux:
 def find_crux(
     right_ostium: Float[np.ndarray, "3"], right: Float[np.ndarray, "n 3"], left: Float[np.ndarray, "m 3"]
 ) -> Crux | None:
-    """Return the crux of a patient, or None where neither artery reaches it: then the ends are cut off.
-
-    It follows from the right artery's ostium and points along both trees, LPS mm.
-    """
+    """Return the crux from the right ostium and points along both trees (LPS mm); None where the ends are cut off
+    before it."""
     position = right_ostium + CRUX_FROM_OSTIUM_MM
     reached = [bool(np.linalg.norm(tree - position, axis=1).min() < REACHED_MM) for tree in (right, left)]
     if not any(reached):

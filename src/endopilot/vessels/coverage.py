@@ -39,14 +39,8 @@ _DIAGONAL = 0.87
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """A connected part of a mask's middle.
-
-    Attributes:
-        nodes: which points of the middle these are.
-        length_mm: their length.
-        beyond_mm: length of what lies beyond them as seen from the widest place.
-        place: where they begin, LPS mm.
-    """
+    """A connected part of a mask's middle: its nodes and length, and the length of what lies beyond as seen from the
+    widest place, mm. It begins at `place`, LPS mm."""
 
     nodes: Int[np.ndarray, "_"]
     length_mm: float
@@ -55,12 +49,8 @@ class Stretch:
 
 
 def voxelised(surface: Surface, step_mm: float) -> Volume:
-    """Return the mask of all voxels that a closed wall holds or touches, so that its thinnest neck stays connected.
-
-    Args:
-        surface: the wall.
-        step_mm: edge of the voxels, mm; larger where there would be too many.
-    """
+    """Return the mask of all voxels (edge `step_mm`, larger where there would be too many) that a closed wall holds or
+    touches, so that its thinnest neck stays connected."""
     extent = np.ptp(surface.vertices, axis=0)
     most = max(float(np.prod(extent + 4 * step_mm)) / _MOST_VOXELS, abs(surface.volume) / _MOST_INSIDE)
     step = max(step_mm, most ** (1 / 3))
@@ -75,13 +65,8 @@ def voxelised(surface: Surface, step_mm: float) -> Volume:
 
 
 def widened(mask: Volume, lines: MedialLines, minimum_mm: float) -> tuple[Volume, Float[np.ndarray, "n 3"], list[str]]:
-    """Return the mask with a tube wherever it is too thin for the wall and the grid to carry it on, where, and remarks.
-
-    Args:
-        mask: one connected lumen.
-        lines: its middle.
-        minimum_mm: a thin stretch with less than this on it and beyond it stays as it is.
-    """
+    """Return a connected mask with a tube wherever it is too thin for the wall and the grid to carry it on, where, and
+    remarks. A thin stretch with less than `minimum_mm` on it and beyond it stays as it is."""
     edges = mask.spacing_mm
     extent = np.array(mask.voxels.shape[::-1]) * edges
     step = max(0.5 * float(edges.min()), float(np.prod(extent + 2) / MAXIMUM_GRID_POINTS) ** (1 / 3))
@@ -118,10 +103,8 @@ def unreached(
 def stretches(
     lines: MedialLines, chosen: Bool[np.ndarray, "n"], order: Float[np.ndarray, "n"] | None = None
 ) -> list[Stretch]:
-    """Return the connected parts of chosen points of a mask's middle, longest first.
-
-    A part begins at its point of the lowest `order`; by default at that nearest to the widest place.
-    """
+    """Return the connected parts of chosen points of a mask's middle, longest first. A part begins at its point of the
+    lowest `order`; by default at that nearest to the widest place."""
     length, behind = lines.tree.length, lines.behind_mm
     order = length if order is None else order
     found = []
@@ -133,10 +116,8 @@ def stretches(
 
 
 def left_out_text(left: list[Stretch], ostium: Float[np.ndarray, "3"], reach_mm: float) -> list[str]:
-    """Return what is said of the parts that a tree does not reach: one remark a part, and one for all crumbs.
-
-    A part that begins within `reach_mm` of the ostium lies behind it.
-    """
+    """Return what is said of the parts that a tree does not reach: one remark a part, and one for all crumbs. A part
+    that begins within `reach_mm` of the ostium lies behind it."""
     left = sorted(left, key=lambda stretch: -stretch.length_mm)
     long = [s for s in left if s.length_mm >= NOTED_MM]
     remarks = []
@@ -185,10 +166,8 @@ def _draw_balls(
 
 
 def _thin(mask: Volume, lines: MedialLines, enough: float) -> Bool[np.ndarray, "n"]:
-    """Return which points of a mask's middle the smooth wall does not carry on: it is too near, or closed in between.
-
-    Voxel centres lie up to half a diagonal off the axis, so that the deepest one around a point stands for it.
-    """
+    """Return which points of a mask's middle the smooth wall does not carry on. Voxel centres lie up to half a diagonal
+    off the axis, so that the deepest one around a point stands for it."""
     level, corner = smooth_level(mask)
     core = connected_components(level > enough, corners=True)
     around = (lines.index[:, None, :] - corner - 1 + np.array(list(np.ndindex(3, 3, 3)))).reshape(-1, 3)

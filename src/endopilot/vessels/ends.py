@@ -52,11 +52,8 @@ _RIVAL = 0.55
 
 @dataclass(frozen=True, eq=False)
 class Skeleton(VesselGraph):
-    """The middle of one connected lumen; its radius is the mean over the neighbourhood, its costs are lengths, mm.
-
-    Attributes:
-        tips: indices of the ends, stubs included.
-    """
+    """The middle of one connected lumen with its `tips`, stubs included; radii are means of the neighbourhood, costs
+    lengths, mm."""
 
     tips: Int[np.ndarray, "t"]
 
@@ -73,7 +70,7 @@ class OpenEnd:
         widening: mean over the tree of ln(r / narrowest radius on the path from the end); 0 where no path widens.
         heading: unit vector from the end to where the vessel is 8 to 16 mm on.
         course: unit vector from the end to the tree's centre.
-        opening_deg: angle between the two main branches at the first fork, degrees; 0 where nothing forks near.
+        opening_deg: angle between the main branches at the first fork, degrees; 0 where nothing forks near.
         longest_mm: longest path from the end, mm.
     """
 
@@ -172,14 +169,8 @@ def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
 
 @dataclass(frozen=True, eq=False)
 class InletEnd:
-    """An end of a tree that a device may enter at.
-
-    Attributes:
-        node: index of its tip.
-        position: middle of the end, mm.
-        radius: of the vessel there, mm.
-        score: how much it looks like the inlet, mm: its radius, less where something speaks against it.
-    """
+    """An end of a tree that a device may enter at: its tip, its middle and radius, mm, and how much it looks like the
+    inlet: the radius, less where something speaks against it."""
 
     node: int
     position: Float[np.ndarray, "3"]
@@ -209,13 +200,8 @@ def likely_inlets(
 
     The inlet is wide, the tree narrows from it, it is cut flat, and lines begin there. An end that bulges behind a neck
     is an aneurysm's dome: it counts as its neck does, less by how much it bulges. A cut that bulges is none: the root
-    of the aorta does.
-
-    Args:
-        tree: the vessel, rooted at one end.
-        paths: of its nodes, the first from one end to another, each other one from an earlier one to an end.
-        wall: the wall, which shows where a vessel is cut; None for lines.
-        lines: first and last point of each line of a file of lines.
+    of the aorta does. `paths` are those of `RootedGraph.traced`; the wall shows where a vessel is cut; `lines` are the
+    first and last points of a file's lines.
     """
     middle = np.concatenate(paths)
     widths = tree.radius[middle]

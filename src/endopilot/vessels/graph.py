@@ -43,14 +43,8 @@ Graph = TypeVar("Graph", bound="VesselGraph")
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """A line of a tree before it is cut at its branching points.
-
-    Attributes:
-        points: positions, LPS mm; the first one is the parent's point `place`.
-        radius: inscribed-sphere radii, mm.
-        parent: index of the line that it leaves, -1 for the first.
-        place: index of the point of the parent that it leaves from.
-    """
+    """A line of a tree before it is cut at its branching points: points (LPS mm; the first is the parent's point
+    `place`) and inscribed-sphere radii, mm. `parent` is the line that it leaves, -1 for the first."""
 
     points: Float[np.ndarray, "n 3"]
     radius: Float[np.ndarray, "n"]
@@ -64,7 +58,6 @@ class VesselGraph:
 
     Attributes:
         columns: names of the attributes that hold one row a point.
-        points: positions, mm.
         radius: distance to the wall at each, mm.
         costs: sparse matrix of what the way between neighbours costs; each pair stands in it once.
         step_mm: distance of neighbours along an axis of the grid, or along a line, mm.
@@ -132,12 +125,8 @@ class VesselGraph:
 
 @dataclass(frozen=True, eq=False)
 class RootedGraph(VesselGraph):
-    """A graph with a way from every point to a root.
-
-    Attributes:
-        before: the next point on the way to the root, -1 at the root itself.
-        length: of the way to the root, mm.
-    """
+    """A graph with a way of known `length`, mm, from every point to a root; `before` is the next point on it, -1 at the
+    root."""
 
     before: Int[np.ndarray, "n"]
     length: Float[np.ndarray, "n"]
@@ -173,15 +162,10 @@ class RootedGraph(VesselGraph):
     ) -> list[Int[np.ndarray, "_"]]:
         """Return the tree as paths of points: the first from the root, each other one from a point of an earlier path.
 
-        The farthest uncovered point is traced back to the tree, and its path covers its surroundings. What is not
-        longer than it is wide, or than the local radius, is a bump and is dropped.
-
-        Args:
-            minimum_mm: a branch reaches at least this far out of its parent, mm.
-            coverage: a path covers what lies within this many inscribed radii (and two steps) of it.
-            slenderness: a branch reaches at least this many times its own radius out of its parent.
-            together: whether points are those of lines that may repeat each other: a path ends where it comes within
-                `TOGETHER` radii of an earlier one, or two steps.
+        The farthest uncovered point is traced back to the tree, and its path covers its surroundings, within `coverage`
+        inscribed radii and two steps. What reaches less than `minimum_mm`, `slenderness` times its radius or the local
+        radius out of its parent is a bump, and is dropped. Points `together` are of lines that may repeat each other: a
+        path ends within `TOGETHER` radii, or two steps, of an earlier one.
         """
         reach = coverage * self.radius + 2 * self.step_mm
         if together:
@@ -239,13 +223,9 @@ def lumen_graph(
     spacing_mm: float | Float[np.ndarray, "3"],
     root: int | None = None,
 ) -> RootedGraph:
-    """Return the graph of grid points inside one lumen, with the ways to a root.
+    """Return the graph of grid points inside one lumen, with their clearance from the wall, mm, and the ways to a root.
 
-    Args:
-        points: grid points along the axes of the coordinates, mm.
-        clearance: their distance to the wall, mm.
-        spacing_mm: spacing of the grid, one or along each axis, mm; the graph keeps the largest.
-        root: index of the point that all ways lead to; the one farthest from the widest place if None.
+    Without `root` that is the point farthest from the widest place. Of several spacings the graph keeps the largest.
     """
     if root is None:
         graph = lumen_graph(points, clearance, spacing_mm, int(clearance.argmax()))
@@ -289,11 +269,8 @@ def lumen_graph(
 def _levels(
     index: Int[np.ndarray, "n 3"], clearance: Float[np.ndarray, "n"], edges: Float[np.ndarray, "3"], root: int
 ) -> Int[np.ndarray, "n"]:
-    """Return how coarse the grid may be at each point: every 2 to this power-th point is enough.
-
-    A part of the lumen that spheres of `_FINE_STEPS` times so many steps fill is as well resolved by it, away from
-    narrower parts and from the root.
-    """
+    """Return how coarse the grid may be at each point: every 2 to this power-th is enough where spheres of
+    `_FINE_STEPS` such steps fill the lumen, away from narrower parts and from the root."""
     from endopilot.imaging.grid import dilated  # brings SimpleITK, which simulating does without
 
     level = np.zeros(len(index), dtype=int)

@@ -56,9 +56,8 @@ def piece_on_side(
     """Return which of several separate lumens is the vessel, and which others are nearly as large.
 
     The right coronary artery lies to the patient's right of the left one (smaller x in LPS), so among pieces of
-    comparable size the side decides; for other vessels it is the largest.
-
-    Sizes are volumes, or anything that grows with them; centres are in LPS mm.
+    comparable size the side decides; for other vessels it is the largest. Sizes are volumes, or anything that grows
+    with them.
     """
     large = np.flatnonzero(sizes >= COMPARABLE * sizes.max())
     if vessel == "generic":
@@ -96,14 +95,8 @@ def beyond_parent(
 ) -> tuple[Insertion | None, Bool[np.ndarray, "nz ny nx"]]:
     """Return the ostium and the lumen beyond it where the lumen holds a piece of the aorta; else None and the lumen.
 
-    The aorta is looked for on a coarser grid: on that of the coronary artery it has millions of points.
-
-    Args:
-        surface: the wall.
-        distance_map: distance to it.
-        inside: which of its grid points belong to the lumen.
-        side: which coronary artery is wanted.
-        inlet: where the artery begins, LPS mm, if the lumen holds no aorta; a stub of the aorta may bulge there.
+    The aorta is looked for on a coarser grid: on that of the coronary artery it has millions of points. `inlet` is
+    where the artery begins (LPS mm) if the lumen holds no aorta; a stub of the aorta may bulge there.
     """
     if distance_map.values[inside].max(initial=0.0) < PARENT_RADIUS_MM[0]:
         return None, inside
@@ -150,15 +143,8 @@ def entrance(
     """Return where the device enters if a place some millimetres off is given: at an end near it, or in mid-vessel.
 
     An end that an artery may begin at, no farther than `SNAP_MM`, is the ostium; it gets no direction, since the
-    centerline gives it better. In mid-vessel the direction is away from the vessel's inlet.
-
-    Args:
-        distance_map: the wall.
-        points: grid points in the lumen, LPS mm.
-        clearance: their distance to the wall, mm.
-        given: the place, without a direction.
-        side: which coronary artery this is, None for any other vessel.
-        surface: the wall as triangles, which shows where a vessel is cut.
+    centerline gives it better. In mid-vessel the direction is away from the vessel's inlet. `clearance` is the distance
+    of the lumen's grid points to the wall, mm.
     """
     spacing = distance_map.spacing_mm
     ends: Sequence[InletEnd | OpenEnd]
@@ -219,10 +205,8 @@ def inlets(
 def _parent_region(
     distance_map: DistanceMap, inside: Bool[np.ndarray, "nz ny nx"], graph: RootedGraph, usual_mm: float
 ) -> Bool[np.ndarray, "nz ny nx"] | None:
-    """Return the grid points of the parent vessel that the graph's root lies in, or None where it lies in none.
-
-    The parent is what spheres of `PARENT_RATIO` times the usual radius reach, connected and around the root; a bulge
-    farther along is an aneurysm and stays.
+    """Return the grid points of the parent vessel that the graph's root lies in: what spheres of `PARENT_RATIO` times
+    the usual radius reach, connected and around the root; None if none. A bulge farther along is an aneurysm and stays.
     """
     spacing = distance_map.spacing_mm
     wide = float(np.clip(PARENT_RATIO * usual_mm, *PARENT_RADIUS_MM))

@@ -24,11 +24,8 @@ _OPEN_MM = 0.2
 
 
 def left_out(found: FoundLines, tree: VesselTree) -> tuple[list[str], dict[str, float]]:
-    """Return a note on each stretch of line outside the tree's spheres, and the balance of all.
-
-    The balance: `length_mm` of the lines, of them `reached_mm` by the tree's spheres and `left_out_mm` (these two add
-    up to the first), and `bridged_mm` of gaps between them.
-    """
+    """Return a note on each stretch of line outside the tree's spheres, and the balance, mm: `length_mm` of the lines
+    is `reached_mm` by the spheres and `left_out_mm`; `bridged_mm` of gaps lie between them."""
     nodes, piece = found.whole, found.piece
     whole = tree.line
     gap, nearest = KDTree(whole.points).query(nodes.points)
@@ -79,10 +76,8 @@ def _length_once(nodes: LineGraph, part: Int[np.ndarray, "p"]) -> float:
 
 
 def closures(tree: VesselTree) -> list[str]:
-    """Return a note on each place where vessels meet again, so that their lumens close a loop that a tree cannot hold.
-
-    Spheres of two places meet there, while on the way from one to the other along the tree some do not.
-    """
+    """Return a note on each place where lumens close a loop that a tree cannot hold: spheres of two places meet, while
+    on the way between them along the tree some do not."""
     whole = tree.line
     points, radius, abscissa = whole.points, whole.radius, whole.abscissa
     branch = np.repeat(np.arange(len(tree.branches)), [len(own.section) for own in tree.branches])

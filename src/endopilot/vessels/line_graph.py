@@ -60,7 +60,6 @@ class LineGraph(VesselGraph):
     Attributes:
         owner: index of the line of each point.
         along: distance from the start of its line, mm.
-        ends: which are the first or last of their line.
         share: length of line that each stands for, mm.
     """
 
@@ -77,10 +76,8 @@ class LineGraph(VesselGraph):
         return replace(part, ends=np.concatenate([[True], cut]) | np.concatenate([cut, [True]]))
 
     def free_ends(self) -> Int[np.ndarray, "e"]:
-        """Return the ends that no vessel passes, or all ends if there is no such.
-
-        Seen from a free end, what lies about one and a half radii away lies in one direction, or forks there.
-        """
+        """Return the ends that no vessel passes, or all if there is no such: seen from a free end, what lies about one
+        and a half radii away lies in one direction, or forks there."""
         tree, free = KDTree(self.points), []
         for end in np.flatnonzero(self.ends):
             reach = max(1.5 * float(self.radius[end]), 4 * STEP_MM)
@@ -117,9 +114,7 @@ class FoundLines:
     """The lines of one tree in centerlines, and what became of the others.
 
     Attributes:
-        lines: of the tree.
-        rule: by which its root was chosen.
-        notes: what was done, a sentence each.
+        rule: by which the root was chosen.
         rivals: a note on other ends that may be the inlet.
         whole: all lines as given.
         piece: connected piece of each point of `whole`, -1 in the parent vessel that the lines start in.
@@ -138,20 +133,11 @@ class FoundLines:
 
 
 def found_lines(source: Polylines, given: Insertion | None, label: str, vessel: str = "generic") -> FoundLines:
-    """Return the lines of one tree in centerlines.
+    """Return the lines of one tree in centerlines with radii, LPS mm.
 
     Where the lines start in a parent vessel (VMTK's coronary centerlines start in the aorta), they are cut at the
-    ostium: where they leave the parent's spheres.
-
-    Args:
-        source: centerlines with radii, LPS mm.
-        given: the ostium, if it is known.
-        label: name of the source, for messages.
-        vessel: "rca", "lca" or "generic".
-
-    Raises:
-        InputError: the points of a line are in no order, no line is near the given ostium, or a coronary artery is
-            asked for and the lines are those of two.
+    ostium: where they leave the parent's spheres. Raises InputError where the points of a line are in no order, no line
+    is near the given ostium, or a coronary artery is asked for and the lines are those of two.
     """
     source, notes = in_order(source, label)
     whole = line_graph(source)
@@ -222,10 +208,8 @@ def _meeting(graph: LineGraph) -> LineGraph:
 
 
 def _bridges(graph: LineGraph) -> Int[np.ndarray, "m 2"]:
-    """Return the shortest gaps, from line ends, that join pieces which lie within `LONGEST_BRIDGE` radii of each other.
-
-    Each joins two pieces that nothing shorter joins.
-    """
+    """Return the shortest gaps, from line ends, that join pieces within `LONGEST_BRIDGE` radii which nothing shorter
+    joins."""
     piece, found = graph.pieces, list[tuple[float, int, int]]()
     for end, near, gap in graph.around_ends(LONGEST_BRIDGE) if piece.max() > 0 else ():
         for other in np.setdiff1d(piece[near], piece[end]):
@@ -238,10 +222,8 @@ def _bridges(graph: LineGraph) -> Int[np.ndarray, "m 2"]:
 
 
 def _outside_parent_vessel(graph: LineGraph) -> tuple[Bool[np.ndarray, "n"], Float[np.ndarray, "3"] | None]:
-    """Return which points lie outside the parent vessel that the lines start in, and where they leave it.
-
-    The parent's spheres are those at the lines' common start that are several times wider than the lines' median.
-    """
+    """Return which points lie outside the parent vessel that the lines start in, and where they leave it. The parent's
+    spheres are those at the lines' common start that are several times wider than the lines' median."""
     points, radius, owner = graph.points, graph.radius, graph.owner
     everywhere = np.ones(len(points), dtype=bool)
     starts = np.flatnonzero(np.diff(owner, prepend=-1))
@@ -324,12 +306,9 @@ def _resampled(
 def in_order(source: Polylines, label: str) -> tuple[Polylines, list[str]]:
     """Return lines that follow their vessels, and what was done, a sentence each.
 
-    Points that repeat are dropped. Points in another order than along the vessel are sorted where only one order is the
-    shortest. Where neighbouring spheres do not touch, a line is joined by a straight piece, or cut if it jumps to
-    another vessel.
-
-    Raises:
-        InputError: the points of a line are in no order.
+    Points that repeat are dropped. Points in another order are sorted where only one order is the shortest. Where
+    neighbouring spheres do not touch, a line is joined by a straight piece, or cut if it jumps to another vessel.
+    Raises InputError where the points of a line are in no order.
     """
     points, radii, notes = [], [], []
     for number, (line, size) in enumerate(zip(source.points, source.radius, strict=True)):
@@ -372,10 +351,8 @@ def in_order(source: Polylines, label: str) -> tuple[Polylines, list[str]]:
 
 
 def _order(line: Float[np.ndarray, "n 3"], label: str) -> Int[np.ndarray, "n"] | None:
-    """Return the order of points along the vessel where it is another than they are in, or None where it is not.
-
-    The shortest tree through the points, where it has no fork, is the order along a vessel.
-    """
+    """Return the order of points along the vessel if it is another than theirs: the shortest tree through them, where
+    it has no fork."""
     count = len(line)
     if count < 4:
         return None

@@ -37,10 +37,8 @@ _STUB_VOXELS, _SLENDER = 4.0, 1.5
 
 @dataclass(frozen=True, eq=False)
 class MedialLines(VesselGraph):
-    """The middle of a mask: a forest whose ways are as wide as they can be.
-
-    Its radius is the distance to the mask's border, half a voxel where the mask is one or two voxels thick; its costs
-    are lengths, mm.
+    """The middle of a mask: a forest whose ways are as wide as they can be. Its radius is the distance to the mask's
+    border, half a voxel where the mask is one or two voxels thick; its costs are lengths, mm.
 
     Attributes:
         index: voxel indices (z, y, x).

@@ -17,10 +17,8 @@ import numpy as np
 
 
 def read(path: str) -> dict[str, np.ndarray]:
-    """Return the arrays of a mesh file by name, with VTK's complaints instead of on the screen.
-
-    Called outside a process of its own, it serves files that are known to be whole.
-    """
+    """Return the arrays of a mesh file by name, with VTK's complaints instead of on the screen. Called outside a
+    process of its own, it serves files that are known to be whole."""
     from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkStringOutputWindow
 
     window, before, level = (

@@ -55,12 +55,8 @@ _PLY_COUNTS = {name: kind for name, kind in _PLY_KINDS.items() if not kind.start
 
 
 def read_polydata(path: Path) -> AnatomySource:
-    """Read a surface, or centerlines with radii, in LPS mm where the header states axes and unit.
-
-    Raises:
-        InputError: the file is empty, damaged or truncated, is neither a surface nor a centerline, is a centerline
-            without radii, or states axes other than LPS and RAS.
-    """
+    """Read a surface, or centerlines with radii, in LPS mm where the header states axes and unit. Raises InputError for
+    a damaged file, one that is neither, centerlines without radii, or axes other than LPS and RAS."""
     _check_size(path)
     data = arrays(path)
     notes: list[str] = []
@@ -87,11 +83,8 @@ def read_polydata(path: Path) -> AnatomySource:
 
 
 def arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return what `mesh_process` reads from a file, in a process of its own, which may crash or hang.
-
-    Raises:
-        InputError: the file cannot be read, or holds neither triangles nor lines.
-    """
+    """Return what `mesh_process` reads from a file, in a process of its own, which may crash or hang. Raises InputError
+    for a file that cannot be read, or holds neither triangles nor lines."""
     limit_s = _LONGEST_S + path.stat().st_size / _BYTES_A_SECOND
     command = [sys.executable, "-P", mesh_process.__file__, str(path.resolve())]
     try:
@@ -200,11 +193,8 @@ def _radius_array(data: dict[str, np.ndarray], path: Path) -> np.ndarray:
 
 
 def _check_size(path: Path) -> None:
-    """Refuse a mesh file that is empty, or shorter than its header promises.
-
-    Raises:
-        InputError: it is; or the header of a PLY file cannot be understood.
-    """
+    """Raise InputError for a mesh file that is empty, shorter than its header promises, or a PLY file that cannot be
+    understood."""
     size = path.stat().st_size
     if size < _FEWEST_BYTES:
         raise InputError(f"{path}: is empty or truncated; export it again")
@@ -224,10 +214,8 @@ def _check_size(path: Path) -> None:
 
 
 def _is_ascii_stl(text: str) -> bool:
-    """Return whether the first bytes of an STL file are those of the text format.
-
-    A binary header may begin with "solid" too, but no facet follows it.
-    """
+    """Return whether an STL file is of the text format. A binary header may begin with "solid" too, but no facet
+    follows it."""
     return text.lstrip().lower().startswith("solid") and ("facet" in text.lower() or "endsolid" in text.lower())
 
 

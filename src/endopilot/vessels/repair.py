@@ -45,14 +45,11 @@ OTHER_SIDE = {"rca": "left coronary artery", "lca": "right coronary artery"}
 
 @dataclass(frozen=True, eq=False)
 class Lumen:
-    """One lumen of a mask, ready for its wall.
+    """One lumen of a mask, ready for its wall, with its middle and remarks on what was joined, parted and left out.
 
     Attributes:
-        mask: its voxels.
-        lines: their middle.
         before: middle of all that the file connects with it: what the tree should reach.
         told: which points of `before` lie in another vessel that was parted from this one, and that a remark names.
-        notes: remarks on what was joined, parted and left out.
     """
 
     mask: Volume
@@ -69,8 +66,7 @@ class Pieces:
     Attributes:
         joined: voxels as they were read, and over gaps of a few voxels to what carries on.
         gaps: a voxel at each gap, and whether what lies beyond was joined or runs alongside.
-        parted: the joined voxels, parted where they touch.
-        touches: what touches.
+        parted: the joined voxels, parted where they touch, as `touches` says.
         before: middle of the joined voxels.
         lines: middle of the parted ones.
     """
@@ -103,17 +99,8 @@ def connected_mask(
     """Return the one lumen at the ostium, or the largest: gaps of a few voxels bridged, cavities filled, blobs removed.
 
     Places where it touches itself are parted (`topology.parted`). Where a mask holds both coronary arteries and no
-    ostium is given, `vessel` decides by the patient's side.
-
-    Args:
-        mask: one or several lumens, and specks.
-        given: the ostium, if it is known.
-        label: name of the source, for messages.
-        vessel: which vessel is wanted.
-        other_ostium: ostium of the other coronary artery, LPS mm, if it is known.
-
-    Raises:
-        InputError: the mask is empty, full, a solid block, noise, or touches nothing near the given ostium.
+    ostium is given, `vessel` decides by the patient's side. Ostia are in LPS mm. Raises InputError for a mask that is
+    empty, full, a solid block or noise, or that touches nothing near the given ostium.
     """
     if not mask.voxels.any():
         raise InputError(f"{label}: the mask is empty; check the label or segment again")
@@ -182,9 +169,7 @@ def chosen_piece(
     pieces: list[Float[np.ndarray, "_ 3"]], sizes: Shaped[np.ndarray, "p"], given: Insertion | None, vessel: Vessel
 ) -> tuple[int, float, Float[np.ndarray, "3"], list[int]]:
     """Return the piece at the ostium, how far away it is, mm, and where; and which other pieces are nearly as large.
-
-    Without an ostium it is that on the vessel's side (`piece_on_side`). A speck of noise is no piece.
-    """
+    Without an ostium it is that on the vessel's side (`piece_on_side`). A speck of noise is no piece."""
     if given is None:
         main, others = piece_on_side(sizes.astype(float), np.array([piece.mean(axis=0) for piece in pieces]), vessel)
         return main, 0.0, pieces[main][0], others
@@ -208,14 +193,8 @@ def pieces_left_out(
 ) -> list[str]:
     """Say which pieces were left out and where they lie, since a real vessel may be lost with them.
 
-    Args:
-        pieces: points of each piece, LPS mm.
-        taken: numbers of those that the lumen is made of.
-        severed: of those that touched it and were parted from it.
-        others: of those nearly as large.
-        vessel: which vessel is wanted.
-        other_ostium: of the other coronary artery, LPS mm, if it is known.
-        counted: what the points are.
+    The points of `pieces` (LPS mm) are of `counted`. The lumen is made of `taken`; `severed` touched it and were parted
+    from it; `others` are nearly as large.
     """
     remarks, foreign = list[str](), -1
     lost = [number for number in range(len(pieces)) if number not in taken]
@@ -263,11 +242,9 @@ def pieces_left_out(
 def _joined(
     voxels: Bool[np.ndarray, "nz ny nx"],
 ) -> tuple[Bool[np.ndarray, "nz ny nx"], list[tuple[Int[np.ndarray, "3"], bool]]]:
-    """Join pieces that lie within the largest gap by tubes as wide as the vessels at both ends.
-
-    Two vessels that pass each other are not one: a piece that runs alongside another is not joined to it. Returns the
-    voxels, and for each gap a voxel at it and whether it was bridged.
-    """
+    """Join pieces within the largest gap by tubes as wide as the vessels at both ends, unless one runs alongside the
+    other: two vessels that pass each other are not one. Return the voxels, and for each gap a voxel at it and whether
+    it was bridged."""
     labels, index = connected_components(voxels, corners=True), np.argwhere(voxels)
     members = split(index, labels[tuple(index.T)] - 1)
     large = sorted(range(len(members)), key=lambda piece: -len(members[piece]))[:_MOST_JOINED]

@@ -65,13 +65,9 @@ def closed_surface(
     vessel: Vessel = "generic",
     other_ostium: Float[np.ndarray, "3"] | None = None,
 ) -> tuple[Surface, list[str]]:
-    """Return one closed wall with outward normals: largest piece (or the one at the ostium), holes capped.
-
-    Arguments are those of `repair.connected_mask`, with a surface for the mask.
-
-    Raises:
-        InputError: the holes cannot be closed, or the surface is nowhere near the given ostium.
-    """
+    """Return one closed wall with outward normals: largest piece (or the one at the ostium), holes capped. Arguments
+    are those of `repair.connected_mask`. Raises InputError for holes that cannot be closed, or a surface nowhere near
+    the ostium."""
     mesh: Any = _without_duplicates(_polydata(surface.vertices, surface.faces).clean().triangulate())
     mesh, remarks = _lumen_of(mesh)
     regions = mesh.connectivity(extraction_mode="all")
@@ -110,10 +106,8 @@ def closed_surface(
 
 
 def _lumen_of(mesh: Any) -> tuple[Any, list[str]]:
-    """Return the inner faces of a wall that has a thickness, with a remark; any other mesh as it is.
-
-    From a wall, unlike from a vessel, many lines along the normals meet the surface again on both sides.
-    """
+    """Return the inner faces of a wall that has a thickness, with a remark; any other mesh as it is. From a wall,
+    unlike from a vessel, many lines along the normals meet the surface again on both sides."""
     if min(_met_again(mesh, sign) for sign in (1.0, -1.0)) < _FACING:
         return mesh, []
     closed = _surface(_capped(mesh))

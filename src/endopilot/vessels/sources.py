@@ -105,16 +105,8 @@ class AnatomySource:
 
 
 def transformed(source: AnatomySource, *, scale: float | None, coordinates: str | None) -> AnatomySource:
-    """Return a source in LPS mm, with a note where nothing states the axes.
-
-    Args:
-        source: as read.
-        scale: factor that turns its unit into mm, if the user states it.
-        coordinates: "lps" or "ras" where the user states the axes, otherwise None.
-
-    Raises:
-        InputError: the user states other axes or another unit than the file.
-    """
+    """Return a source in LPS mm, with a note where nothing states the axes. `scale` (mm in its unit) and `coordinates`
+    ("lps", "ras") are the user's; InputError where the file states others."""
     label, notes = source.file or "the source", source.notes
     if coordinates is not None and source.coordinates is not None and coordinates != source.coordinates:
         stated = (
@@ -155,13 +147,8 @@ def in_mm(content: Any, factor: float, turn: Float[np.ndarray, "3"]) -> Any:
 
 
 def checked_lines(lines: Polylines, path: Path, notes: list[str]) -> Polylines:
-    """Return centerlines whose positions are finite and whose radii are positive.
-
-    Where the radius is no number or zero only at the end of a line, it becomes that of the point before, with a note.
-
-    Raises:
-        InputError: there is no line, or a position or radius is none.
-    """
+    """Return centerlines whose positions are finite and whose radii are positive; InputError where they are not. Where
+    the radius is no number or zero only at the end of a line, it becomes that of the point before, with a note."""
     if not lines.points:
         raise InputError(f"{path}: holds no line of at least two points; export the centerline again")
     if all((radius == 0).all() for radius in lines.radius):
@@ -210,18 +197,9 @@ def check_unit(
     """Refuse a vessel that has another size than vessels have, and ask where its size fits in several units.
 
     Radius and extent together tell the unit: no tree of the body is as long as a coronary artery's in mm and as wide as
-    an aorta's in cm. Each unit is weighed by how usual it makes the two, against the nearest kind of vessel.
-
-    Args:
-        points: places on the vessel or its wall, or the corners of its box, in mm as taken.
-        radius_mm: mean radius, if it is known.
-        vessel: which vessel it is to be.
-        label: name of the source, for the message.
-        factor: mm in the unit that the file was taken to be in.
-        odds: how much likelier that unit is than another: `ASSUMED`, `BY_ARRAYS`, `STATED` or `ANSWERED`.
-
-    Raises:
-        InputError: the size is no vessel's, or one in several units; the message names each size and its `--scale`.
+    an aorta's in cm. Each unit is weighed by how usual it makes the two, against the nearest kind of vessel. `points`
+    are on the vessel or corners of its box, in mm as taken with `factor`; `odds` (`ASSUMED`, `BY_ARRAYS`, `STATED`,
+    `ANSWERED`) favour that unit. The InputError names each size and its `--scale`.
     """
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     units = {factor: unit_name(factor)} | {one: name for name, one in _UNITS.items()}

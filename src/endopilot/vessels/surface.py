@@ -187,11 +187,8 @@ def polydata_of(
 
 
 def surface_from_mask(mask: Volume) -> Surface:
-    """Return the smooth wall whose blurred inside equals the blurred mask: the zero level of `level_function`.
-
-    Raises:
-        InputError: the mask is nowhere thick enough to hold a lumen.
-    """
+    """Return the smooth wall whose blurred inside equals the blurred mask: the zero level of `level_function`. Raises
+    InputError where the mask is nowhere thick enough to hold a lumen."""
     from skimage.measure import marching_cubes
 
     level, corner = smooth_level(mask)
@@ -237,10 +234,8 @@ def blur_voxels(edges_mm: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
 
 @lru_cache(maxsize=1)
 def smooth_level(mask: Volume) -> tuple[Float[np.ndarray, "nz ny nx"], Int[np.ndarray, "3"]]:
-    """Return the `level_function` of a mask on its filled box and a margin, and the voxel (z, y, x) it begins at.
-
-    The last mask's is kept: what it is too thin to show is looked for before the wall is made of it.
-    """
+    """Return the `level_function` of a mask on its filled box and a margin, and the voxel (z, y, x) it begins at. The
+    last mask's is kept: what it is too thin to show is looked for before the wall is made of it."""
     margin, box = 4, filled_box(mask.voxels)
     inside = np.pad(np.asarray(mask.voxels[box], dtype=bool), margin)
     return level_function(inside, mask.spacing_mm[::-1]), np.array([part.start for part in box]) - margin
@@ -254,13 +249,8 @@ def level_function(
     A Gaussian of one voxel takes the staircase out of the mask, but also shrinks round vessels (by about σ²/2R).
     Therefore the level function d is not the blurred mask itself: it starts from σ·Φ⁻¹(G∗mask), which is exact for a
     plane, and is corrected by σ√2π·(G∗mask − G∗H(d)) until its own blurred inside agrees. H(d) is the share of a voxel
-    that lies inside. The zero level keeps the mask's local volume, so radii are unbiased down to about one voxel.
-
-    A vessel fills little of its box, so the box is worked through in blocks, and only in those that hold some wall.
-
-    Args:
-        inside: the mask.
-        edges_mm: edges of its voxels along its axes, mm.
+    that lies inside. The zero level keeps the mask's local volume, so radii are unbiased down to about one voxel. A
+    vessel fills little of its box, so the box is worked through in blocks, and only in those that hold some wall.
     """
     from scipy.special import ndtri
 

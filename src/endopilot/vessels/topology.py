@@ -96,8 +96,8 @@ class Touch:
     """A place where a mask touches itself or closes a loop, and what was made of it.
 
     Attributes:
-        kind: parted: the vessel touches itself, a loop is narrowest, distant parts lie side by side, two vessels
-            touch; left: two vessels perhaps touch, a flap has an opening, a tunnel is small, or there are many rings.
+        kind: parted: the vessel touches itself, a loop is narrowest, distant parts lie side by side, two vessels touch;
+            left: two vessels perhaps touch, a flap has an opening, a tunnel is small, or there are many rings.
         place: where, LPS mm.
         size_mm: length of the vessel between the two sides, or of the contact.
     """
@@ -142,11 +142,9 @@ class _Ring:
 
 
 def parted(mask: Volume) -> tuple[Volume, list[Touch], MedialLines, MedialLines]:
-    """Return the mask parted where it touches itself, all places where it touches or closes a loop, and its middle.
-
-    No part of a lumen loses its way to the rest, except one of two vessels that certainly only touch. The middle is
-    that of the mask as it was, and as it is.
-    """
+    """Return the mask parted where it touches itself, all places where it touches or closes a loop, and its middle as
+    it was and as it is. No part of a lumen loses its way to the rest, except one of two vessels that certainly only
+    touch."""
     parting, before = _Parting(mask), traced_lines(mask)
     for _ in range(_ROUNDS):
         thin = thinned_lines(parting.result)  # has all loops, but not all ends
@@ -180,10 +178,8 @@ def _porous(mask: Volume, thin: MedialLines, rings: list[_Ring]) -> list[Touch]:
 
 
 def touch_remarks(found: list[Touch], *, parted: bool = True) -> list[str]:
-    """Return what is said of places where a lumen touches itself: one remark for each kind, the largest place first.
-
-    Where the lumen, a surface's, is not parted there, the words are others.
-    """
+    """Return what is said of places where a lumen touches itself: one remark a kind, the largest place first. Where the
+    lumen, a surface's, is not parted there, the words are others."""
     kinds = [touch.kind if parted else _LEFT.get(touch.kind, touch.kind) for touch in found]
     remarks = []
     for kind, (text, size) in _SAID.items():
@@ -263,10 +259,8 @@ class _Parting:
     def _neck(
         self, place: Float[np.ndarray, "3"], reach_mm: float, across: Float[np.ndarray, "n 3"]
     ) -> tuple[float, bool]:
-        """Return the least clearance at places across a neck, mm, and whether a flap is at its middle.
-
-        With its wall filled in, the vessel then is wider there than any lumen within reach.
-        """
+        """Return the least clearance at places across a neck, mm, and whether a flap is at its middle: with its wall
+        filled in, the vessel is wider there than any lumen within reach."""
         reach, at = np.ceil(reach_mm / self.edges).astype(int), np.rint(place / self.edges).astype(int)
         window = tuple(slice(max(0, c - 2 * r), c + 2 * r + 1) for c, r in zip(at, reach, strict=True))
         own = np.pad(self.result.voxels[window], 1)
@@ -468,11 +462,9 @@ def _sever(voxels: Bool[np.ndarray, "nz ny nx"], lines: MedialLines, ends: tuple
 
 
 def _without_sides(mask: Volume, lines: MedialLines) -> tuple[Volume, Touch] | None:
-    """Return the mask with parts that lie far from each other along the vessel parted where they touch over a length.
-
-    Each voxel belongs to the nearest point of the middle; neighbours that belong to distant points are emptied, unless
-    the lumen falls apart that way. None if there are none.
-    """
+    """Return the mask with parts far from each other along the vessel parted where they touch over a length; None if
+    there are none. Each voxel belongs to the nearest point of the middle; neighbours of distant points are emptied,
+    unless the lumen falls apart that way."""
     if lines.radius.max(initial=0.0) > AORTA_RADIUS_MM:  # a branch's first part lies inside the aorta's own middle
         return None
     voxel = float(mask.spacing_mm.max())

@@ -52,13 +52,9 @@ _SEED_MM = 6.0
 
 
 def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
-    """Segment the aortic lumen from the first seed, where the device enters, to the last.
-
-    Further seeds in between guide the path. With one seed, the lumen is followed to its far end.
-
-    Raises:
-        InputError: there is no seed, no contrast at a seed, or no contrast-filled path between seeds.
-    """
+    """Segment the aortic lumen from the first seed, where the device enters, to the last, or to its far end with one
+    seed. Seeds in between guide the path. Raises InputError without a seed, contrast at a seed, or a contrast-filled
+    path."""
     if not config.seeds:
         raise InputError("seeds: the aorta method needs one or two points in the lumen, LPS mm; give --seeds x y z")
     with progress("Segmenting the aorta", 4) as advance:

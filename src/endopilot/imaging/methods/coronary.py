@@ -89,15 +89,9 @@ left and back."""
 
 
 def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
-    """Segment the right or left coronary tree.
-
-    Without seeds everything is found automatically. The first seed overrides where the tree begins, the others add
-    distal ends that must be reached.
-
-    Raises:
-        InputError: the voxels are too coarse, there is no contrast, no aorta, no such vessel at its wall, or no vessel
-            at a seed.
-    """
+    """Segment the right or left coronary tree, without seeds automatically. The first seed overrides where the tree
+    begins, the others add distal ends that must be reached. Raises InputError where voxels are too coarse, or contrast,
+    an aorta, a vessel at its wall or at a seed is missing."""
     coarsest = float(volume.spacing_mm.max())
     if coarsest > COARSEST_MM:
         raise InputError(

@@ -39,11 +39,8 @@ _NNUNET = {"model": "", "device": "", "label": ""}
 
 
 def by_totalsegmentator(volume: Volume, config: SegmentConfig) -> LumenMask:
-    """Return the mask of one structure as TotalSegmentator finds it; the first seed, if any, is the ostium.
-
-    Raises:
-        InputError: TotalSegmentator is missing, fails, or writes no or an empty mask.
-    """
+    """Return the mask of one structure as TotalSegmentator finds it; the first seed, if any, is the ostium. Raises
+    InputError if it is missing, fails, or writes no or an empty mask."""
     settings = config.settings(_TOTALSEGMENTATOR)
     task = settings["task"]
     structure = settings["structure"] or task
@@ -66,11 +63,8 @@ def by_totalsegmentator(volume: Volume, config: SegmentConfig) -> LumenMask:
 
 
 def by_nnunet(volume: Volume, config: SegmentConfig) -> LumenMask:
-    """Return the lumen as a trained nnU-Net finds it, all folds of it together; the first seed, if any, is the ostium.
-
-    Raises:
-        InputError: no or an unfit model is given, nnU-Net is missing, fails, or writes no or an empty mask.
-    """
+    """Return the lumen as all folds of a trained nnU-Net find it together; the first seed, if any, is the ostium.
+    Raises InputError for an unfit model, a missing or failing nnU-Net, or an empty mask."""
     settings = config.settings(_NNUNET)
     model, label = Path(settings["model"]), settings["label"]
     folds = sorted(folder.name.removeprefix("fold_") for folder in model.glob("fold_*")) if settings["model"] else []
@@ -112,20 +106,11 @@ def segment_by_program(
     label: int | None = None,
     mend: str,
 ) -> LumenMask:
-    """Return the lumen that a program finds in a volume; the ostium is at the first seed.
+    """Return the lumen that a program finds in a volume; the ostium is at the first of `seeds` (LPS mm).
 
-    Args:
-        volume: CT in HU.
-        seeds: points in the lumen, LPS mm; none where the ostium is not known.
-        arguments: program and arguments, from the folder that holds the CT and the folder for its answer.
-        given: name of the CT's file.
-        answer: name of the file that the program is to write.
-        label: value of the lumen where the answer holds several.
-        mend: what to do where the program is missing or fails.
-
-    Raises:
-        InputError: the program is not there, fails, writes no such file, or marks nothing in the CT; or a seed lies
-            farther than 5 mm from the lumen.
+    `arguments` makes the command from the folder of the CT, which is named `given` there, and that of the `answer`.
+    `label` is the lumen's value there, `mend` what to do if the program fails. Raises InputError then, and if nothing
+    is marked in the CT or a seed lies farther than 5 mm from the lumen.
     """
     with tempfile.TemporaryDirectory(prefix="endopilot-") as temporary:
         source, target = Path(temporary) / "ct", Path(temporary) / "answer"
