@@ -120,11 +120,8 @@ def _origins(
     wide: dict[str, float],
     bovine: bool,
 ) -> dict[str, int]:
-    """Return where the branches leave the aorta, as indices of its points.
-
-    The brachiocephalic trunk leaves `drop_mm` below the top of the arch, the others between there and the descending
-    aorta.
-    """
+    """Return the points of the aorta where branches leave: the brachiocephalic trunk `drop_mm` below the top of the
+    arch, the others between there and the descending aorta."""
     top = int(points[:, 2].argmax())
     last = top + int(np.searchsorted(points[top, 2] - points[top:, 2], drop_mm))
     origins, before = {"brachiocephalic trunk": last}, "brachiocephalic trunk"

@@ -201,10 +201,8 @@ def _plans(
 def _opened_trunks(
     generator: np.random.Generator, plans: list[branching.SidePlan], population: Population
 ) -> tuple[list[branching.SidePlan], list[Fork]]:
-    """Return the plans and where the main line gives way; the trunks of M2 part at the population's angle.
-
-    The inferior trunk, which goes on from M1, and the superior one each take their half of it.
-    """
+    """Return the plans and where the main line gives way; the inferior trunk of M2, which goes on from M1, and the
+    superior one each take half of the population's angle."""
     forks = forks_of(plans, 0)
     if population.trunks_angle_deg is None:
         return plans, forks

@@ -48,11 +48,7 @@ def tortuosity(points: Float[np.ndarray, "n 3"]) -> float:
 def parallel_normals(
     tangent: Float[np.ndarray, "n 3"], first: Float[np.ndarray, "3"] | None = None
 ) -> Float[np.ndarray, "n 3"]:
-    """Return unit vectors perpendicular to the tangents, carried along without twist.
-
-    Args:
-        first: direction that the first normal takes as nearly as it can.
-    """
+    """Return unit vectors perpendicular to the tangents, carried along without twist from about the direction `first`."""
     start = np.eye(3)[np.argmin(np.abs(tangent[0]))] if first is None else first
     normals = np.empty_like(tangent)
     for i in range(len(tangent)):
@@ -75,14 +71,10 @@ def turned(points: Float[np.ndarray, "n 3"], rotations: Float[np.ndarray, "m 3"]
 
 @dataclass(frozen=True, eq=False)
 class Wiggle:
-    """A smooth random displacement along a curve: a sum of sines of random wavelength and phase.
+    """A smooth random displacement along a curve: a sum of sines of random wave number (1/mm) and phase, with weights
+    in mm.
 
     Amplitudes grow as the wavelength to the power 1.5, so that no single wavelength dominates the curvature.
-
-    Attributes:
-        wave_number: 1/mm, one a mode.
-        phase: rad, one a mode and normal direction.
-        weight: mm, one a mode and normal direction.
     """
 
     wave_number: Float[np.ndarray, "modes"]
@@ -99,10 +91,8 @@ class Wiggle:
     def apply(
         self, points: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"], amplitude: float, quiet_mm: float
     ) -> Float[np.ndarray, "n 3"]:
-        """Displace a curve across its direction; the first `quiet_mm` mm fade in, so that the start keeps its place.
-
-        `normal` holds unit vectors across the curve that turn smoothly along it.
-        """
+        """Displace a curve along unit normals that turn smoothly; the first `quiet_mm` mm fade in, so that the start
+        keeps its place."""
         tangent = tangents(points)
         along = length_along(points)
         sines = np.sin(along[:, None, None] * self.wave_number[:, None] + self.phase)
@@ -122,13 +112,9 @@ def steer(
 ) -> Float[np.ndarray, "n 3"]:
     """Return a smooth curve that leaves `start` along `direction` and follows one course after another on a surface.
 
-    Args:
-        start: first point, LPS mm.
-        direction: unit tangent there.
-        courses: (abscissa from which it holds, mm; unit direction), in order.
-        relaxation_mm: length over which the direction approaches the course by a factor e.
-        depth: how deep points lie below the surface, mm; the curve seeks a height of `_HEIGHT_MM` above it. None for
-            no surface.
+    A course is the abscissa from which it holds, mm, and a unit direction, approached by a factor e over
+    `relaxation_mm`. `depth` is how deep points lie below the surface, mm; the curve seeks a height of `_HEIGHT_MM`
+    above it.
     """
     count = max(round(length_mm / STEP_MM), 8)
     heading, aim, rise, outward = direction, direction, 0.0, np.zeros(3)

@@ -65,15 +65,8 @@ _GRID_LOW, _GRID_HIGH = np.array([-70.0, -110.0, -110.0]), np.array([110.0, 90.0
 class HeartFit:
     """The map from a patient to the reference heart: a similarity about the ostium, then a smooth warp.
 
-    The warp carries the patient's artery onto the reference course, so that chambers keep beside the artery.
-
-    Attributes:
-        origin: the patient's ostium, mm.
-        rotation: from the reference frame to the patient.
-        scale: size of the patient's heart against the reference.
-        knots: points of the patient's artery after the similarity, mm.
-        shifts: what is missing from each knot to the reference course, mm.
-        anchor: where the patient's ostium lies after the similarity, mm: the warp leaves it in its place.
+    The warp carries the patient's artery onto the reference course, so that chambers keep beside the artery: after the
+    similarity, `shifts` are missing from `knots` of the artery, mm, and the ostium keeps its place at `anchor`.
     """
 
     origin: Float[np.ndarray, "3"]
@@ -110,13 +103,8 @@ class HeartFit:
 
 
 def fit_heart(main: Float[np.ndarray, "n 3"], crux_mm: float, last_section: str) -> HeartFit:
-    """Fit the reference heart to a right coronary artery.
-
-    Args:
-        main: the artery from the ostium to the farthest tip, LPS mm.
-        crux_mm: abscissa of the crux.
-        last_section: "4" or "16", where the tip lies; anything else ignores what lies beyond the crux.
-    """
+    """Fit the reference heart to a right coronary artery from the ostium to its farthest tip, LPS mm. What lies beyond
+    the crux (abscissa `crux_mm`) counts where the tip lies in section "4" or "16"."""
     along = length_along(main)
     course = places_on(main, along, np.linspace(0.0, crux_mm, 20))
     to_crux = shape.curve_through(TO_CRUX)
@@ -134,13 +122,9 @@ def fit_heart(main: Float[np.ndarray, "n 3"], crux_mm: float, last_section: str)
 
 
 def fit_heart_along(lines: Sequence[Float[np.ndarray, "_ 3"]], courses: Sequence[Float[np.ndarray, "_ 3"]]) -> HeartFit:
-    """Fit the reference heart to the main vessels of a tree, as far as they go.
+    """Fit the reference heart to the main vessels of a tree, as far as they go; lines and courses begin at the ostium.
 
     A patient's point belongs to the reference point at the same length from the ostium, relative to the heart's size.
-
-    Args:
-        lines: the patient's main vessels, each from the ostium, LPS mm.
-        courses: their courses on the reference heart, each from the ostium, mm.
     """
     ostium, anchor, scale, rotation = lines[0][0], courses[0][0], 1.0, np.eye(3)
     found = wanted = np.zeros((0, 3))
@@ -264,10 +248,8 @@ _HEIGHT_MM = 3.0
 
 
 def place_from_ostium(distance_cm: float, azimuth_deg: float, elevation_deg: float) -> Float[np.ndarray, "3"]:
-    """Return the LPS position of one of Dodge's points with respect to its ostium, mm.
-
-    Azimuth counts from the front to the patient's left, elevation towards the head.
-    """
+    """Return the LPS position of one of Dodge's points with respect to its ostium, mm. Azimuth counts from the front to
+    the patient's left, elevation towards the head."""
     azimuth, elevation = np.deg2rad([azimuth_deg, elevation_deg])
     flat = np.cos(elevation) * np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
     return 10.0 * distance_cm * (flat + np.array([0.0, 0.0, np.sin(elevation)]))
@@ -324,13 +306,8 @@ _REFERENCE_LCX = np.array(
 def fit_left_heart(
     lad: Float[np.ndarray, "n 3"], lcx: Float[np.ndarray, "m 3"], inferior: Float[np.ndarray, "k 3"]
 ) -> HeartFit:
-    """Fit the reference heart to a left coronary artery.
-
-    Args:
-        lad: the patient's left main and anterior descending artery over the whole course of `LAD`, LPS mm.
-        lcx: circumflex artery and what would carry it on over the whole course of `LCX`.
-        inferior: the course of `INFERIOR` in this patient, whatever runs there.
-    """
+    """Fit the reference heart to a left coronary artery: left main and anterior descending artery, circumflex and what
+    would carry it on, and whatever runs along `INFERIOR`, over the whole courses of the reference, LPS mm."""
     course = np.concatenate([_evenly(line) for line in (lad, lcx, inferior)])
     reference = reference_courses()
     ostium = lad[0]

@@ -82,13 +82,8 @@ class Population:
 
 @dataclass(frozen=True, kw_only=True)
 class SideKind:
-    """How a kind of side branch leaves.
-
-    Attributes:
-        origin_mm: mean and SD of its origin's distance from where the vessel begins, mm.
-        length_mm: mean and SD, mm.
-        share: of the patients that have it.
-    """
+    """How a kind of side branch leaves: mean and SD of its origin's distance from where the vessel begins and of its
+    length, mm, and the share of patients that have it."""
 
     origin_mm: tuple[float, float]
     length_mm: tuple[float, float]

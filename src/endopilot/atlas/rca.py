@@ -53,10 +53,8 @@ class _Targets:
 def make_rca(
     generator: np.random.Generator, stenosis_share: float, population: Population
 ) -> tuple[VesselTree, dict[str, Any]]:
-    """Return one right coronary tree and what was drawn for it.
-
-    Targets are kept when a shape fails, so that failures do not bias the statistics.
-    """
+    """Return one right coronary tree and what was drawn for it. Targets are kept when a shape fails, so that failures
+    do not bias the statistics."""
     for _ in range(10):
         targets = _targets(generator)
         draw = partial(_draw, generator, targets, stenosis_share, population)
@@ -116,11 +114,8 @@ def _draw(
 
 
 def _main_vessel(generator: np.random.Generator, targets: _Targets) -> tuple[Float[np.ndarray, "n 3"], int]:
-    """Return the path from the ostium to the farthest tip, and the index of the crux on it.
-
-    Size, closure of the C and amplitude of the wiggles are solved for so that length, tortuosity and mean curvature
-    take the drawn values.
-    """
+    """Return the path from the ostium to the farthest tip, and the index of the crux on it. Size, closure of the C and
+    amplitude of the wiggles are solved for so that length, tortuosity and mean curvature take the drawn values."""
     length, ends_in = targets.length_mm, targets.ends_in
     waypoints = TO_CRUX if ends_in == "3" else np.concatenate([TO_CRUX, BEYOND_CRUX[ends_in]])
     template = shape.curve_through(waypoints, 1.0)

@@ -38,13 +38,8 @@ _SCATTER_DEG = 30.0
 
 @dataclass(frozen=True)
 class Fork:
-    """A place at which a main vessel gives way.
-
-    Attributes:
-        index: of the vessel's point where the branch leaves.
-        side: LPS direction in which it leaves.
-        deflection_deg: by how much the vessel gives way; drawn if none.
-    """
+    """A place at which a main vessel gives way, by an angle that is drawn if none, to a branch that leaves in an LPS
+    direction."""
 
     index: int
     side: tuple[float, float, float]
@@ -89,17 +84,9 @@ def bent(
     forks: Sequence[Fork] = (),
     first: int = 0,
 ) -> Float[np.ndarray, "n 3"]:
-    """Return a vessel with waves, sharp bends and deflections behind its point `first`; of the same length.
-
-    Args:
-        points: evenly spaced, LPS mm.
-        radius: lumen radius, mm.
-        population: how patients vary; the textbook's leaves the vessel as it is and draws nothing.
-        first: what lies before this point is left.
-
-    Raises:
-        NoShape: no draw kept the lumen's wall from folding.
-    """
+    """Return a vessel with waves, sharp bends and deflections behind its point `first`; of the same length. The
+    textbook's population leaves the vessel as it is and draws nothing. Raises NoShape where no draw kept the lumen's
+    wall from folding."""
     if not population.bends_vessels:
         return points
     mean = population.bends_per_100_mm
@@ -183,14 +170,8 @@ def opened_fork(
     wide: float,
     turns_deg: tuple[Spread, Spread],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:
-    """Return a vessel that goes on behind a fork, and the one that leaves there, at drawn angles to what arrives.
-
-    Args:
-        trunk: the vessel that goes on, LPS mm.
-        other: the one that leaves, from the fork on.
-        wide: lumen radius at the fork, mm: directions are chords over two radii.
-        turns_deg: angles by which the two turn away from what arrives, to opposite sides, degrees.
-    """
+    """Return a vessel that goes on behind a fork, and the one that leaves there, turned by `turns_deg` to opposite
+    sides of what arrives. Directions are chords over two lumen radii (`wide`)."""
     reach = max(round(2 * wide / shape.STEP_MM), 2)
     arriving = _unit(trunk[fork] - trunk[max(fork - reach, 0)])
     across = _unit(trunk[fork + reach] - trunk[fork]) - _unit(other[reach] - other[0])
@@ -280,10 +261,7 @@ def catheter_direction(
 
     It makes the drawn angle with the vessel 10 mm beyond the ostium, and turns away from the vessel's first direction
     by as little as that allows, within a scatter. Its tube keeps clear of every lumen but the first one; where no draw
-    does, the catheter has the vessel's first direction.
-
-    Args:
-        population: how patients vary; the textbook's catheter has the vessel's first direction, and draws nothing.
+    does, and in the textbook's population, the catheter has the vessel's first direction.
     """
     first = shape.tangents(tree.branches[0].centerline.points)[0]
     if population.catheter_deg is None:

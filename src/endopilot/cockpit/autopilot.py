@@ -33,7 +33,6 @@ class Autopilot:
 
     Attributes:
         status: "off", "thinking", "drives", "paused", "watches", "reached", "gave up" or "failed".
-        policy_name: of the policy, once there is one.
         asks: why it asks for X-ray at its next decision; empty if it does not.
         failure: what went wrong or why the policy gave up, in a line.
     """
@@ -216,13 +215,7 @@ class Autopilot:
 
 
 def check_policy(name: str | None, offered: tuple[str, ...]) -> str:
-    """Return the name of a policy that the page may choose.
-
-    A page names no module of its own: only what is offered is imported.
-
-    Raises:
-        InputError: it is not offered.
-    """
+    """Return the name of a policy that the page may choose: one that is offered, for a page names no module of its own."""
     if name not in offered:
         raise InputError(f"policy: {name!r}; choose from {', '.join(offered)}")
     return name

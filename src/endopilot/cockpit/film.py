@@ -38,11 +38,7 @@ FRAME_S = 0.05
 
 @dataclass(frozen=True, eq=False)
 class FilmFrame:
-    """The world at one moment of a film.
-
-    Attributes:
-        peak_n: largest wall force on one node so far, N.
-    """
+    """The world at one moment of a film, and the largest wall force on one node so far, N."""
 
     snapshot: Snapshot
     exposed: bool = False
@@ -51,13 +47,7 @@ class FilmFrame:
 
 @dataclass(eq=False)
 class Film:
-    """A navigation that is driven again, frame by frame, in a thread of its own.
-
-    Attributes:
-        navigation: vessel, wire and target.
-        frames: those that are there so far.
-        failure: why it ended early, in a line; empty if it did not.
-    """
+    """A navigation that is driven again in a thread of its own: its frames so far, and why it ended early, in a line."""
 
     navigation: Navigation
     seconds: float
@@ -83,16 +73,11 @@ class Film:
 
 
 def open_film(path: Path, patient: Path | None = None, *, world: int = 0, task: str | None = None) -> Film:
-    """Open what is to be replayed.
+    """Open what is to be replayed: a session (.cockpit.jsonl), a trajectory (.npz), a folder of a plan, of `endopilot
+    navigate` or of a data set, a submission.json, or a navigation's result of the ladder.
 
-    Args:
-        path: a session (.cockpit.jsonl); a trajectory (.npz); a folder of a plan, of `endopilot navigate` or of a data
-            set; a submission.json, or a navigation's result of the ladder.
-        world: which of a trajectory's worlds, a data set's episodes, or a task's patients.
-        task: of the ladder's files.
-
-    Raises:
-        InputError: it cannot be read, or lacks its patient or task.
+    `world` is a trajectory's world, a data set's episode, or a task's patient; `task` is of the ladder's files. Raises
+    InputError where it cannot be read, or lacks its patient or task.
     """
     if path.name.endswith(SUFFIX):
         return _session(path)
@@ -174,11 +159,8 @@ def _film(
     about: Mapping[str, Any],
     title: str,
 ) -> Film:
-    """Return a film of one world that is driven again by its commands.
-
-    Args:
-        about: its `target` and `exposures_s`, if they are known.
-    """
+    """Return a film of one world that is driven again by its commands; `about` has its `target` and `exposures_s`, if
+    known."""
     (anatomy,), (stack,), (start,) = set_up.anatomies, set_up.stacks, set_up.initial
     if np.isnan(start).any():
         raise InputError(f"{title}: was on its way when the recording began; record from its start")
@@ -219,11 +201,7 @@ def _film(
 
 
 class ReplayStage:
-    """A film in place of a session.
-
-    Attributes:
-        at: index of the frame that is shown.
-    """
+    """A film in place of a session, at the index of the frame that is shown."""
 
     def __init__(self, film: Film, xray: XrayUnit) -> None:
         """Begin at the start; the film is driven meanwhile."""

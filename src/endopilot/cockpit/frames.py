@@ -26,11 +26,7 @@ _POINT_MM = 1.0
 
 
 def encode(kind: str, header: dict[str, Any], **arrays: np.ndarray) -> bytes:
-    """Return a message.
-
-    Args:
-        arrays: float32, uint32 or uint8.
-    """
+    """Return a message of a header and arrays of float32, uint32 or uint8."""
     listed = [{"name": name, "type": _TYPES[array.dtype], "shape": array.shape} for name, array in arrays.items()]
     text = json.dumps(header | {"type": kind, "arrays": listed}, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
@@ -65,11 +61,8 @@ def device_arrays(snapshot: Snapshot) -> dict[str, np.ndarray]:
 
 def motion_values(snapshot: Snapshot, counted: Float[np.ndarray, "devices 2"] | None = None) -> dict[str, Any]:
     """Return how far wire and catheters are inserted and turned, and what their drives do, for the page's figures.
-
-    Args:
-        counted: inserted length, mm, and rotation, rad, as the drives' encoders have them, which a robot shows; as they
-            truly are if not given.
-    """
+    `counted` is inserted length (mm) and rotation (rad) as a robot's encoders have them; as they truly are if not
+    given."""
 
     true = [(device.inserted_length_mm, device.rotation) for device in (snapshot, *snapshot.catheters)]
     wire, *catheters = (

@@ -31,12 +31,7 @@ _SHOWN = ("success", "safe", "seconds", "exposures", "peak_force_n", "path_ratio
 
 @dataclass(frozen=True)
 class Attempt:
-    """Which task in which patient.
-
-    Attributes:
-        place: of the patient in the task's list.
-        robot: what drives, for a person and for the agent.
-    """
+    """Which task in which patient (`place` in the task's list), with which robot, for a person and for the agent."""
 
     task: Task
     place: int
@@ -58,12 +53,8 @@ class Attempt:
 
 
 class GameSession(Session):
-    """A session that is a game until its end, and an ordinary one afterwards.
-
-    Attributes:
-        phase: "waits", "on" or "over".
-        result: the figures that the person is scored by, at the end.
-    """
+    """A session that "waits", is "on" as a game until it is "over", and then is an ordinary one; `result` scores the
+    person."""
 
     def __init__(
         self,
@@ -73,12 +64,8 @@ class GameSession(Session):
         recorder: Recorder | None = None,
         policies: tuple[str, ...] = (),
     ) -> None:
-        """Take the parts; the clock stands still.
-
-        Args:
-            world: at the task's start.
-            policies: names of those that a page may choose at the end.
-        """
+        """Take the world at the task's start, its clock standing still, and the policies that a page may choose at the
+        end."""
         super().__init__(world, xray, recorder, policies)
         self.sight, self.phase = False, "waits"
         self.result: dict[str, Any] | None = None

@@ -38,13 +38,7 @@ CHECK_S = 0.25
 
 @dataclass(frozen=True)
 class Where:
-    """Where a session takes place.
-
-    Attributes:
-        patient: folder of the anatomy; None for a task.
-        task: name of a task of the ladder; None for a patient.
-        place: of the patient in the task's list.
-    """
+    """Where a session takes place: in the folder of an anatomy, or in patient `place` of a task of the ladder."""
 
     patient: Path | None = None
     task: str | None = None
@@ -55,11 +49,7 @@ class Recorder:
     """Writes a session while it goes on."""
 
     def __init__(self, path: Path, world: LiveWorld, where: Where, seed: int) -> None:
-        """Begin a new file, or go on with one that was resumed.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
+        """Begin a new file, or go on with one that was resumed; InputError if it cannot be written."""
         self.path, self._world = path, world
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -92,12 +82,7 @@ class Recorder:
 
 @dataclass(frozen=True, eq=False)
 class RecordedSession:
-    """A session that was recorded.
-
-    Attributes:
-        navigation: vessel, wire, target and start.
-        seed: of the encoders' noise.
-    """
+    """A session that was recorded: vessel, wire, target and start, and the seed of the encoders' noise."""
 
     path: Path
     navigation: Navigation
@@ -110,11 +95,8 @@ class RecordedSession:
 
 
 def read_session(path: Path) -> RecordedSession:
-    """Read a session. A last line that a killed server left half-written is ignored.
-
-    Raises:
-        InputError: no such file, no session, or one whose vessel is gone or has changed.
-    """
+    """Read a session without a last line that is half-written. Raises InputError for no such file, no session, or one
+    whose vessel is gone or has changed."""
     lines = _lines(path)
     header = lines[0] if lines else {}
     if str(header.get("format")).startswith("endopilot cockpit ") and header["format"] != FORMAT:
@@ -149,10 +131,7 @@ def _between_checks(config: LoopConfig) -> int:
 
 def replayed(recording: RecordedSession) -> Iterator[tuple[LiveWorld, list[dict[str, Any]]]]:
     """Drive a session again and yield the world before the first cycle and after each, with the events of that cycle.
-
-    Raises:
-        InputError: the wire is not where it was: another version of endopilot, or another processor.
-    """
+    Raises InputError where the wire is not where it was: another version of endopilot, or another processor."""
     world = LiveWorld(recording.navigation, recording.config, seed=recording.seed, reality=recording.reality)
     at: dict[int, list[dict[str, Any]]] = {}
     for event in recording.events:

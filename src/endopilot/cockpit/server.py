@@ -63,12 +63,8 @@ class Cockpit:
     def __init__(
         self, stage: Stage, scene: Callable[[], bytes], *, token: str, hosts: frozenset[str], cycle_s: float
     ) -> None:
-        """Lay the routes out.
-
-        Args:
-            token: that a page's address must hold.
-            hosts: names under which the page may be asked for, besides the address that a connection comes in at.
-        """
+        """Lay the routes out. A page's address must hold the token, and one of `hosts`, or the address that a
+        connection comes in at."""
         self._token, self._hosts, self._scene = token, hosts, scene
         self.loop = Loop(stage, cycle_s, self._publish)
         self._pages: list[_Page] = []
@@ -278,17 +274,8 @@ def serve(
     port: int = 0,
     listening: Callable[[str], None] = lambda url: print(url, flush=True),
 ) -> None:
-    """Serve a stage until Ctrl-C.
-
-    Args:
-        host: address to listen on; by default only this machine can connect. 0.0.0.0 or :: listens on all of this
-            machine's addresses.
-        port: TCP port; 0 for a free one.
-        listening: called with the page's address, token included.
-
-    Raises:
-        InputError: the address cannot be listened on.
-    """
+    """Serve a stage until Ctrl-C; `listening` is called with the page's address, token included. InputError if `host`
+    (0.0.0.0 or :: for all addresses of this machine) and `port` (0 for a free one) cannot be listened on."""
     token = secrets.token_urlsafe(_TOKEN_BYTES)
     with _listener(host, port) as listener:
         address, number = listener.getsockname()[:2]
@@ -321,11 +308,8 @@ def machine_names() -> set[str]:
 
 
 def _listener(host: str, port: int) -> socket.socket:
-    """Return a socket that is bound to an address.
-
-    Raises:
-        InputError: there is no such address here, or the port is taken or not for this user.
-    """
+    """Return a socket that is bound to an address; InputError if there is none here, or the port is taken or not for
+    this user."""
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         family, _, _, _, address = found[0]

@@ -35,8 +35,7 @@ class ShownDevice:
         nodes: of its axis from its tip to a little behind the ostium, LPS mm.
         node_force: of the wall at each of them, N; 0 where it lies in a catheter.
         tip: Δtip, γtip, branch and lumen radius, as arrays of one.
-        inserted_length_mm: Δ, mm, as it truly is.
-        rotation: φ of its drive, rad.
+        inserted_length_mm: Δ, mm, as it truly is; `rotation` is φ of its drive, rad.
     """
 
     nodes: Float[np.ndarray, "n 3"]
@@ -51,9 +50,6 @@ class Snapshot(ShownDevice):
     """The wire, and the world around it, at the end of a cycle.
 
     Attributes:
-        cycle: how many have passed.
-        time_s: since the start, s.
-        tip_direction: unit vector along the wire at its tip.
         velocity: of the drive's motor, mm/s and rad/s of the wire, then of each catheter.
         force_n: largest wall force on one node during the cycle, N.
         wall_force_n: largest resultant of the wall on 2 mm of the wire, N.
@@ -81,15 +77,11 @@ class Snapshot(ShownDevice):
 
 
 class LiveWorld:
-    """A navigation loop that a hand drives in short cycles, and what pages show of it.
+    """A navigation loop that a hand drives in short cycles, beyond its end too, until it is handed over, and what pages
+    show of it.
 
-    It goes on after the loop's end. The same commands in the same cycles give the same bits.
-
-    Attributes:
-        loop: wire, catheters, robot and C-arm; the hand drives it until it is handed over.
-        hand: what the hand holds.
-        force_n: largest wall force on one node in the last cycle, N.
-        peak_force_n: the same so far, N.
+    The same commands in the same cycles give the same bits. `force_n` is the largest wall force on one node in the last
+    cycle, `peak_force_n` so far, N.
     """
 
     def __init__(
@@ -100,11 +92,8 @@ class LiveWorld:
         seed: int = 0,
         reality: World | None = None,
     ) -> None:
-        """Bring wire and catheters to the navigation's start.
-
-        Raises:
-            InputError: a device does not fit the vessel, or starts deeper than it is long.
-        """
+        """Bring wire and catheters to the start; InputError if a device does not fit the vessel, or is shorter than its
+        start is deep."""
         self.hand, self.config = Hand(), config
         self.loop = NavigationLoop(navigation, self.hand, config=config, seed=seed, world=reality)
         self.reality = self.loop.world
@@ -128,11 +117,8 @@ class LiveWorld:
         return self.config.cycle_s / self._taken_s
 
     def command(self, devices: Proximals) -> Proximals:
-        """Let the hand hold velocities, and return what the robot has taken of them, as `Robot` says.
-
-        Raises:
-            InputError: more catheters are given than there are.
-        """
+        """Let the hand hold velocities, and return what the robot has taken of them, as `Robot` says; InputError for
+        too many devices."""
         around = len(self.navigation.catheters)
         if len(devices) > 1 + around:
             raise InputError(f"catheters: {len(devices) - 1}; this wire has {around} around it")
@@ -179,12 +165,7 @@ class LiveWorld:
 
 
 def loop_snapshot(loop: NavigationLoop, *, cycle: int, force_n: float) -> Snapshot:
-    """Return how the world of a navigation is now.
-
-    Args:
-        cycle: how many of the drives' cycles have passed.
-        force_n: largest wall force on one node in the last one, N.
-    """
+    """Return how the world of a navigation is after a number of the drives' cycles; `force_n` as in `Snapshot`."""
     return take_snapshot(
         loop.simulator,
         loop.robot.last_step,
@@ -204,12 +185,7 @@ def take_snapshot(
     force_n: float,
     velocity: tuple[float, ...],
 ) -> Snapshot:
-    """Return how the one world of a simulator is now.
-
-    Args:
-        force_n: largest wall force on one node in the cycle, N.
-        velocity: of the drives, mm/s and rad/s of the wire, then of each catheter.
-    """
+    """Return how the one world of a simulator is now; `force_n` and `velocity` as in `Snapshot`."""
     inserted, turned, tip = simulator.inserted_length[0], simulator.rotation[0].tolist(), simulator.project()
     wire, *catheters = (
         ShownDevice(*line, tip[:, k], float(inserted[k]), turned[k])
@@ -234,10 +210,8 @@ def take_snapshot(
 def _lines(
     simulator: Simulator, inserted_length_mm: Float[np.ndarray, "devices"]
 ) -> list[tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_"]]]:
-    """Return what is shown of each device: nodes from its tip on, LPS mm, and the wall's force at each, N.
-
-    The wall presses on the outermost device alone.
-    """
+    """Return of each device its nodes from the tip on, LPS mm, and the wall's force at each, N, which presses on the
+    outermost alone."""
     nodes, force = shown_part(simulator.position[0], float(inserted_length_mm.max())), simulator.contacts[0]
     found, covered = [], -np.inf
     for device, line in reversed(list(enumerate(lines_from_tips(nodes, inserted_length_mm)))):

@@ -211,16 +211,12 @@ def write_episode(
     seed: int,
     origin: Mapping[str, Any],
 ) -> None:
-    """Write a navigation that was recorded every 0.5 s as a dataset of one episode. That of a wire alone trains.
+    """Write a navigation of one world that was recorded every 0.5 s as a dataset of one episode. That of a wire alone
+    trains.
 
-    Args:
-        trajectory: the navigation, of one world.
-        stack: the devices as they were given; friction and stiffness of the wire's tip may have been others.
-        tip_stiffness_factor: the true factor on the stiffness of the distal 10 mm.
-        origin: what else it followed from, such as target and policy.
-
-    Raises:
-        InputError: the output folder holds something else.
+    `stack` has the devices as they were given: friction may have been another, and the stiffness of the distal 10 mm by
+    `tip_stiffness_factor`. `origin` is what else it followed from, such as target and policy. Raises InputError where
+    the output folder holds something else.
     """
     set_up = trajectory.set_up
     config = DatasetConfig(

@@ -40,20 +40,12 @@ def assign_splits(
     """Return the split of every sequence of every anatomy, one of `SPLITS`: fixed by hash, not by chance or order.
 
     Two splits are nested. By anatomy, whole patients go to train, calibrate or test, so that no data of a test patient
-    are used before. Within the train patients, some navigations are held out as `seen_test`: new controls on known
-    vessels, the paper's likely reading of its 80/20 split.
+    are used before. Within the train patients, `seen_test_share` of the navigations are held out as `seen_test`: new
+    controls on known vessels, the paper's likely reading of its 80/20 split.
 
-    Anatomies are ranked by the SHA-256 of their name and dealt out by counts, so that the shares are met as closely
-    as few patients allow; sequences likewise by the SHA-256 of "name/index". Neither a seed nor the order of `names`
-    matters.
-
-    Args:
-        anatomy_shares: shares of train, calibrate and test. None means 0.6, 0.2, 0.2, and for a single anatomy, which
-            cannot be divided, a split by sequence alone.
-        seen_test_share: share of the sequences of a train anatomy that are held out as `seen_test`.
-
-    Raises:
-        InputError: too few anatomies for the requested splits, or too few sequences.
+    Anatomies are ranked by the SHA-256 of their name and dealt out by counts, so that the shares (by default 0.6, 0.2,
+    0.2; a single anatomy is not divided) are met as closely as few patients allow; sequences likewise by the SHA-256 of
+    "name/index". Raises InputError for too few anatomies or sequences.
     """
     if anatomy_shares is None:
         anatomy_shares = (1.0, 0.0, 0.0) if len(names) == 1 else DEFAULT_ANATOMY_SHARES
@@ -147,12 +139,8 @@ class BlockContext:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Which navigations of which anatomies a dataset holds.
-
-    Attributes:
-        motions: how the vessel of each anatomy moves; None for one that lies still.
-        settings: what a resumed run must share with the run it continues, as plain JSON values.
-    """
+    """Which navigations of which anatomies, moving how, a dataset holds; a resumed run must share its settings (plain
+    JSON)."""
 
     context: BlockContext
     folders: tuple[Path, ...]
@@ -186,14 +174,9 @@ def make_layout(
 ) -> Layout:
     """Read the anatomies' records, and lay out the dataset in blocks.
 
-    Args:
-        robot: what makes the motions; they are made as drawn if not given.
-        world: what reality is; as given if not given.
-        origin: what else they follow from, where they were not drawn at random.
-
-    Raises:
-        InputError: no anatomy, or a folder that is none; two of one name; too few for the split; catheters that do not
-            fit around the wire, or are to be driven by force; a world that a dataset cannot hold.
+    `robot` makes the motions, `world` is what reality is, `origin` what else they follow from, where they were not
+    drawn. Raises InputError for a folder without anatomy, two of one name, too few for the split, catheters that do not
+    fit or are to be driven by force, or a world that a dataset cannot hold.
     """
     world = world or World()
     world.check_engine("datasets")
@@ -239,11 +222,8 @@ def version() -> str:
 
 
 def identify(folder: Path) -> tuple[str, str]:
-    """Return an anatomy's name and its identity, from its record; one that does not state it is read whole.
-
-    Raises:
-        InputError: the folder holds no anatomy, or a damaged one.
-    """
+    """Return an anatomy's name and its identity, from its record; one that does not state it is read whole. Raises
+    InputError."""
     path = folder / "anatomy.json"
     record = read_json(path) if path.exists() else {}
     if isinstance(record, dict) and {"name", "identity"} <= record.keys():

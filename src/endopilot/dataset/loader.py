@@ -230,11 +230,8 @@ class Dataset(Outputs):
 
 
 def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Read how a finished dataset was made, `meta/manifest.json`, and what it holds, `meta/info.json`.
-
-    Raises:
-        InputError: the folder holds no finished dataset, or one of another version.
-    """
+    """Read how a finished dataset was made, `meta/manifest.json`, and what it holds, `meta/info.json`; InputError if
+    there is none, or one of another version."""
     if not (folder / schema.MANIFEST_PATH).exists():
         if (folder / RECORD_FILE).exists():
             raise InputError(f"{folder}: the dataset is unfinished; run the same `endopilot dataset` command again")
@@ -361,16 +358,7 @@ _WIRE = (
 
 
 def check_same_wire(dataset: Dataset, other: Mapping[str, Any], of: Path, mend: str) -> None:
-    """Check that a dataset was made with the wire that another dataset, or a run, was made with.
-
-    Args:
-        other: that wire, as its record has it.
-        of: the other dataset, or the run.
-        mend: what to do else.
-
-    Raises:
-        InputError: it was made with another wire.
-    """
+    """Raise InputError, with how to mend it, unless a dataset was made with the wire of another dataset or run (`of`)."""
     ours = dataset.manifest["device"]
     for name in _WIRE:
         if not np.array_equal(ours[name], other[name]):
@@ -384,14 +372,8 @@ def read_joined(folders: Sequence[Path]) -> Dataset:
     """Read datasets as one: the first one, with the episodes of the others behind its own.
 
     A patient that the first dataset holds keeps the split that it has there, so nothing that is kept for a test is
-    trained on.
-
-    Args:
-        folders: of the datasets, made with the same devices and with episodes of one length.
-
-    Raises:
-        InputError: none is given; one cannot be read, was made with another wire or other catheters, has episodes of
-            another length, or has another patient of the same name, or the same one who moves otherwise.
+    trained on. Raises InputError where one cannot be read, or has other devices, episodes of another length, another
+    patient of the same name, or the same one who moves otherwise.
     """
     if not folders:
         raise InputError("dataset: none given; name at least one folder made by `endopilot dataset`")

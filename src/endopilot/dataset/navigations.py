@@ -43,14 +43,8 @@ than a free wire needs. It is drawn uniformly, and the result kept within the de
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """The drawn controls, friction and tips of navigations.
-
-    Attributes:
-        initial: Δ (mm) and φ (rad) of each device before the first period.
-        control: velocities (mm/s, rad/s) or loads (N, N·mm) of the drives.
-        tip_stiffness_factor: factor on the stiffness of the distal 10 mm.
-        seeds: of each navigation's robot.
-    """
+    """What was drawn of navigations: the devices' start (Δ mm, φ rad), velocities (mm/s, rad/s) or loads (N, N·mm) of
+    their drives, friction, tips (the factor is on the stiffness of the distal 10 mm) and seeds of the robots."""
 
     initial: Float[np.ndarray, "n devices 2"]
     control: Float[np.ndarray, "n samples devices 2"]
@@ -74,11 +68,8 @@ class Draw:
 def draw_navigations(
     config: DatasetConfig, device: Wire, anatomy: Anatomy, sequences: range, *, devices: int = 1
 ) -> Draw:
-    """Draw some navigations of an anatomy; each is the same whatever the number of the others.
-
-    Args:
-        devices: their number, each driven independently; the wire's draw is the same with and without catheters.
-    """
+    """Draw some navigations of an anatomy; each is the same whatever the number of the others. Each of `devices` is
+    driven independently; the wire's draw is the same with and without catheters."""
     controls, friction, tip, surplus, _, robots = _streams(config, anatomy.name)
     initial, control = random_controls(
         config.navigation,
@@ -168,20 +159,12 @@ def simulate_navigations(
     record_shape: bool = False,
     advance: Callable[[int], None] = lambda samples: None,
 ) -> tuple[Trajectory, Bool[np.ndarray, "worlds"]]:
-    """Simulate navigations, stopped short of the ends of the vessel.
+    """Simulate drawn navigations, stopped short of the ends of the vessel, and return them and which were stopped
+    short.
 
-    Args:
-        initial: (Δ mm, φ rad) of each device before the first period.
-        control: velocities (mm/s, rad/s) or loads (N, N·mm) that were drawn.
-        robot: what makes the motions and measures them, its drives' mean over a sample moves the devices; they are made
-            as drawn if not given.
-        seeds: of each world's robot.
-        ostium_mm: the true inserted lengths are this much more than its encoders', mm.
-
-    Returns:
-        What was driven, and which worlds were stopped short. Commands are float32 numbers. With a robot, its columns
-        are what the robot was commanded (`decided`), and what it measured (`encoders`, `load`); commands are then what
-        its drives made of that.
+    A robot makes the motions and measures them: its columns are what it was commanded (`decided`) and what it measured
+    (`encoders`, `load`); commands, float32 numbers, are then what its drives made of that, as the mean over a sample.
+    The true inserted lengths are `ostium_mm` more than its encoders', mm.
     """
     watch = _PushRoom(anatomy.tree, stacks)
     simulator = Simulator(anatomy, stacks, actuation=actuation, motion=motion, config=config)
@@ -249,11 +232,8 @@ def branch_ends(tree: VesselTree) -> Float[np.ndarray, "branches"]:
 
 
 class _PushRoom:
-    """How far each device may still be pushed. Arrays have a row a world and a column a device, the wire first.
-
-    Attributes:
-        caught_n: push at which each counts as caught, N.
-    """
+    """How far each device (columns, the wire first) may still be pushed in each world; beyond `caught_n` of push, N, it
+    is caught."""
 
     def __init__(self, tree: VesselTree, stacks: Sequence[Stack]) -> None:
         self._ends = branch_ends(tree)

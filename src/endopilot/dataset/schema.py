@@ -64,9 +64,9 @@ def features(actuation: Actuation, devices: int = 1, *, by_robot: bool = False) 
     """Return the `features` entry of `meta/info.json`: type, shape and component names of every column.
 
     `action` is what the drives were commanded, with all its digits: simulated again it gives the same navigation to the
-    bit. Under force control, `velocity` is the resulting velocity. The load of a drive is always in `drive_force_n` and
-    `drive_torque_nmm`. With catheters, a column has components of each device, those of catheter k named
-    `catheter_k_...`. A robot adds what it was commanded, `decided`, and what it measured, `encoders` and `load`.
+    bit. Under force control, `velocity` is the resulting velocity. A column has components of each device, those of
+    catheter k named `catheter_k_...`. A robot adds what it was commanded, `decided`, and what it measured, `encoders`
+    and `load`.
     """
     vectors: dict[str, tuple[str, list[str] | None]] = {
         "action": ("float64", LOAD if actuation == "force" else VELOCITY),
@@ -97,10 +97,8 @@ def _components(names: list[str] | None, devices: int) -> list[str] | None:
 
 
 def manoeuvres(velocity: np.ndarray) -> np.ndarray:
-    """Return the wire's manoeuvre in each row of velocities (mm/s, rad/s), as an index of `MANOEUVRES`.
-
-    A wire that advances is inserted, whether it turns or not; slower than 0.1 mm/s and 0.02 rad/s it rests.
-    """
+    """Return the wire's manoeuvre in each row of velocities (mm/s, rad/s), as an index of `MANOEUVRES`. A wire that
+    advances is inserted, whether it turns or not; slower than 0.1 mm/s and 0.02 rad/s it rests."""
     along, turn = velocity[..., 0], np.abs(velocity[..., 1])
     return np.select([along > _MOVES_MM_S, along < -_MOVES_MM_S, turn > _TURNS_RAD_S], [0, 1, 2], 3)
 
@@ -113,10 +111,8 @@ def paths_of_file(folder: Path, number: int) -> tuple[Path, Path]:
 
 
 def info(described: Mapping[str, Any], *, episodes: int, samples: int, tasks: int = 1) -> dict[str, Any]:
-    """Return the content of `meta/info.json`.
-
-    LeRobot's `splits` are ranges of episodes, which ours are not: they are in the episode table, column `split`.
-    """
+    """Return the content of `meta/info.json`. LeRobot's `splits` are ranges of episodes, which ours are not: they are
+    in the episode table, column `split`."""
     return {
         "codebase_version": LEROBOT_VERSION,
         "robot_type": "endovascular guidewire",

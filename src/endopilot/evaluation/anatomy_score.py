@@ -23,15 +23,7 @@ SMALLEST_RADIUS_MM = 0.75
 class AnatomyScore:
     """Agreement of an extracted vessel with the true one, over true vessels of radius 0.75 mm or more.
 
-    Attributes:
-        dice: Dice coefficient of the lumen's voxels beyond the ostium.
-        cldice: centerline Dice (Shit et al., CVPR 2021), see `cl_dice`.
-        overlap: OV (Schaap et al., Med. Image Anal. 2009, "CAT08"), see `Agreement`.
-        inside_accuracy_mm: AI of the same, mm.
-        radius_mae_mm: mean absolute error of the radius where the centerlines overlap, mm.
-        ostium_error_mm: distance between the ostia, mm.
-        false_length_mm: length of the longest connected piece of extracted centerline that follows no true vessel of
-            any radius, mm.
+    Dice is of the lumen's voxels beyond the ostium; clDice as in `cl_dice`; the other measures as in `Agreement`.
     """
 
     dice: float
@@ -83,11 +75,8 @@ def score_anatomy(mask: LumenMask, extracted: Anatomy, truth: Anatomy) -> Anatom
 def compare_trees(
     extracted: VesselTree, truth: VesselTree, *, smallest_radius_mm: float = SMALLEST_RADIUS_MM
 ) -> Agreement:
-    """Return how far an extracted centerline tree agrees with the true one.
-
-    Args:
-        smallest_radius_mm: true points of a smaller radius are not counted, mm.
-    """
+    """Return how far an extracted centerline tree agrees with the true one, of which points of a smaller radius do not
+    count."""
     true_points, true_radius = sampled(truth)
     points, radius = sampled(extracted)
     distance, nearest = KDTree(true_points).query(points)
@@ -113,21 +102,16 @@ def cl_dice(
     mask_skeleton: Bool[np.ndarray, "nz ny nx"],
     truth_skeleton: Bool[np.ndarray, "nz ny nx"],
 ) -> float:
-    """Return the centerline Dice of two masks (Shit et al., "clDice", CVPR 2021).
-
-    With V the masks and S their skeletons: topology precision T_prec = |S_mask ∩ V_truth| / |S_mask|, topology
-    sensitivity T_sens = |S_truth ∩ V_mask| / |S_truth|, clDice = 2·T_prec·T_sens / (T_prec + T_sens).
-    """
+    """Return the centerline Dice of two masks V with skeletons S (Shit et al., "clDice", CVPR 2021): 2·T_prec·T_sens /
+    (T_prec + T_sens) of T_prec = |S_mask ∩ V_truth| / |S_mask| and T_sens = |S_truth ∩ V_mask| / |S_truth|."""
     precision = (mask_skeleton & truth).sum() / max(mask_skeleton.sum(), 1)
     sensitivity = (truth_skeleton & mask).sum() / max(truth_skeleton.sum(), 1)
     return float(2 * precision * sensitivity / max(precision + sensitivity, 1e-12))
 
 
 def _mask_scores(mask: LumenMask, truth: Anatomy) -> tuple[float, float]:
-    """Return Dice and clDice over voxels beyond the ostium whose nearest true vessel is large enough.
-
-    The true skeleton is the true centerline; the mask's is thinned out of it (Lee et al. 1994).
-    """
+    """Return Dice and clDice over voxels beyond the ostium whose nearest true vessel is large enough. The true skeleton
+    is the true centerline; the mask's is thinned out of it (Lee et al. 1994)."""
     from skimage.morphology import skeletonize
 
     true = _resample(truth.distance_map, mask.volume) > 0

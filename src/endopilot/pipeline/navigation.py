@@ -42,22 +42,9 @@ def navigate_into(
 ) -> dict[str, Any]:
     """Drive a wire to a place in a patient's vessel, as `navigate` does, and write what happened into a folder.
 
-    A folder that was finished with the same arguments is left as it is.
-
-    Args:
-        anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
-        target: a section such as "4" or "LAD", or a point "X,Y,Z" in LPS mm, which is moved to the centerline.
-        output: folder of the results.
-        policy: name of what decides.
-        device: name of the wire, or its YAML file.
-        catheter: names of the catheters around it, from the inside out, or YAML files.
-        config: limits, X-ray, and how reality differs from what the policy is given.
-
-    Returns:
-        The outcome in one line, and figures.
-
-    Raises:
-        InputError: the navigation cannot be begun (see `navigate`), or the folder belongs to another run.
+    A folder that was finished with the same arguments is left as it is. `target` is a section such as "4" or "LAD", or
+    a point "X,Y,Z" in LPS mm, which is moved to the centerline. Returns the outcome in one line, and figures. Raises
+    InputError where the navigation cannot be begun, or the folder belongs to another run.
     """
     stack = Stack.of(device, *catheter)
     set_up = set_up_navigation(anatomy, target, policy=policy, device=stack, config=config)
@@ -105,13 +92,8 @@ def _claim(output: Path, set_up: SetUp) -> None:
 
 
 def _write(found: PatientNavigation, output: Path, asked: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Write all files that installed libraries make, the manifest last, and return the figures.
-
-    Args:
-        found: the navigation.
-        output: the folder.
-        asked: the names that `endopilot navigate` was given; None where it was not called.
-    """
+    """Write all files that installed libraries make, the manifest last, and return the figures; `asked` are the names
+    that `endopilot navigate` was given."""
     set_up, present = found.set_up, extras_present()
     driven_in, real = set_up.folder, set_up.true_anatomy
     if driven_in is None or real is not set_up.anatomy:  # the catheter lies otherwise: an anatomy of its own

@@ -63,11 +63,8 @@ RUN_ORIGIN = "One CT angiogram, given by the user; everything is made from it al
 
 
 class Stages:
-    """The finished stages of a run, their seconds and the rejected patients, kept in `stages.json`.
-
-    Args:
-        folder: the run's folder, which the run has claimed.
-    """
+    """The finished stages of a run, their seconds and the rejected patients, kept in `stages.json` of the folder that
+    it claimed."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / "stages.json"
@@ -135,20 +132,8 @@ class RunConfig(StudyConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class _Run:
-    """What the stages share.
-
-    Attributes:
-        output: folder of everything that is made.
-        config: device and size of the study.
-        segmentation: how to segment.
-        device: the wire.
-        stages: what is finished.
-        origin: where the patients come from, for the report.
-        command: what was typed, for the report.
-        inputs: SHA-256 of the input files, by name.
-        notes: what reading the volume changed.
-        navigation: folder of the agent's navigation; None where no target was given.
-    """
+    """What the stages share: settings and the wire, the record of finished stages, the input's SHA-256s and notes, and
+    for the report where the patients come from and what was typed."""
 
     output: Path
     config: StudyConfig
@@ -173,20 +158,11 @@ class _Run:
 
 
 def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
-    """Run all stages on synthetic patients and write `output`/report.html.
+    """Run all stages on synthetic patients, write `output`/report.html, and return its path and figures.
 
-    Everything after the CT volumes is made from them alone; the generator's truth only scores the result.
-
-    Args:
-        output: folder of everything the demo makes.
-        config: size of the demo.
-
-    Returns:
-        The report's path and the figures of its summary.
-
-    Raises:
-        InputError: a library of some stage is not installed, the folder belongs to another run, or too few patients
-            could be segmented.
+    Everything after the CT volumes is made from them alone; the generator's truth only scores the result. Raises
+    InputError where a library of some stage is missing, the folder belongs to another run, or too few patients could be
+    segmented.
     """
     require_extras(*_EXTRAS)
     device = read_wire(config.device)
@@ -221,25 +197,12 @@ def run_volume(
     phase: str | None = None,
     target: str | None = None,
 ) -> dict[str, Any]:
-    """Run all stages on one CT angiogram and write `output`/report.html.
+    """Run all stages on one CT angiogram in HU (DICOM, NIfTI, NRRD or MHA) and write `output`/report.html; return as
+    `run_demo`.
 
-    With a target, the agent drives the wire there, and its page is in `output`/navigation. Another target may be given
-    to the same folder later.
-
-    Args:
-        volume: DICOM folder or file, NIfTI, NRRD or MHA, in HU.
-        output: folder of everything the run makes.
-        config: segmentation, device and size of the study.
-        series: number or instance UID of the series, where a DICOM folder holds several.
-        phase: cardiac phase, where a DICOM series holds several.
-        target: a section such as "4" or "LAD", or a point "X,Y,Z" in LPS mm, that the agent drives the wire to.
-
-    Returns:
-        As `run_demo` does; with a target, the figures of the navigation first.
-
-    Raises:
-        InputError: a library of some stage is not installed, the volume cannot be read or segmented, the vessel has no
-            such target, or the folder belongs to another run, such as that of another volume.
+    With a target (a section such as "4" or "LAD", or a point "X,Y,Z" in LPS mm), the agent drives the wire there, and
+    its page is in `output`/navigation. Another target may be given to the same folder later. Raises InputError as
+    `read_volume`, `segment` and `navigate`, and where the folder belongs to another run.
     """
     require_extras(*_EXTRAS)
     content, device = read_volume(volume, series=series, phase=phase), read_wire(config.device)

@@ -79,10 +79,8 @@ def tip_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
 
 
 def safety_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
-    """Draw γ/(r − r_w), below it γ/r, against time: median, quartiles and 95 % quantile (`tables.safety_table`).
-
-    One column a split.
-    """
+    """Draw γ/(r − r_w), below it γ/r, against time, a column a split: median, quartiles, 95 % quantile
+    (`tables.safety_table`)."""
     splits = distinct(table, "split")
     plate = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
     ratios = (("clearance", "γ / (r − r_w)", "the wire touches"), ("radius", "γ / r", "the wire's axis on the wall"))
@@ -124,20 +122,16 @@ def control_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figu
 
 
 def drive_difference_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
-    """Draw histograms of the RMSE of the drive's force and torque of each sequence where controls are simulated.
-
-    One row a split (`tables.drive_difference_table`).
-    """
+    """Draw histograms of the RMSE of the drive's force and torque of each sequence where controls are simulated, a row
+    a split."""
     panels = (("force_rmse_n", "Difference in proximal force (RMSE), N"),)
     return _histograms(table, titles, (*panels, ("torque_rmse_nmm", "Difference in proximal torque (RMSE), N mm")))
 
 
 def _histograms(table: pd.DataFrame, titles: Mapping[str, str], panels: Sequence[tuple[str, str]]) -> Figure:
     """Draw histograms of columns with one value a sequence, one row a split; the series stand above one another.
-
     Sequences beyond the 98 % quantile of the second-widest series are counted in the last bar; the tick below a
-    histogram marks its median. The highest bar of each histogram says how many sequences it holds.
-    """
+    histogram marks its median. The highest bar of each histogram says how many sequences it holds."""
     splits, series = distinct(table, "split"), distinct(table, "series")
     with matplotlib.rc_context(STYLE):
         figure, axes = _grid(len(splits), len(panels), height=0.9 + 0.55 * len(series))
@@ -205,12 +199,9 @@ def stage_figure(table: pd.DataFrame) -> Figure:
 
 
 def volume_figure(volume: Volume, mask: LumenMask, anatomy: Anatomy | None = None) -> Figure:
-    """Draw the CTA with the segmented lumen's outline (axial and coronal) and, if given, the extracted tree.
-
-    The axial slice goes through the ostium; the coronal picture is the maximum over a slab as deep as the vessel,
-    so that the whole vessel shows. Both are cropped to the vessel and laid out as radiologists read them: the
-    patient's right on the left, the head on top. Volume and mask lie on the same grid.
-    """
+    """Draw the CTA with the outline of a mask on its grid (axial and coronal) and, if given, the extracted tree. The
+    axial slice goes through the ostium; the coronal picture is the maximum over a slab as deep as the vessel. Both are
+    cropped to the vessel and laid out as radiologists read them: the patient's right on the left, the head on top."""
     ostium = mask.ostium or (anatomy.insertion if anatomy is not None else None)
     voxels, lumen = _along_lps(volume, volume.voxels), _along_lps(volume, mask.volume.voxels).astype(bool)
     spacing = volume.spacing_mm[_lps_axes(volume)]  # along x, y and z

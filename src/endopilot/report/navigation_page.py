@@ -35,11 +35,7 @@ from endopilot.tasks.targets import section_at
 def write_navigation_page(
     path: Path, found: PatientNavigation, *, picture: bytes, commands: Mapping[str, str], manifest: Mapping[str, Any]
 ) -> None:
-    """Write the page as one HTML file that needs nothing beside it.
-
-    Raises:
-        InputError: the page cannot be written.
-    """
+    """Write the page as one HTML file that needs nothing beside it; InputError if it cannot be written."""
     name = found.set_up.navigation.anatomy.name
     outcome = tell_outcome(found)
     page = render(

@@ -43,15 +43,8 @@ STILL_FILE = "scene.png"
 
 @dataclass(frozen=True, kw_only=True)
 class PatientContent:
-    """One patient of a report.
-
-    Attributes:
-        name: the patient's name in the study.
-        anatomy: folder of the extracted anatomy.
-        volume: the CT angiogram, if there is one.
-        mask: the segmented lumen on the same grid, if there is one.
-        scores: agreement with the truth by name, where a truth is known; names end in their unit.
-    """
+    """One patient of a report: the folder of the anatomy, the CT and the mask on its grid, if there are, and the
+    agreement with a known truth by names that end in their unit."""
 
     name: str
     anatomy: Path
@@ -66,11 +59,9 @@ class ReportContent:
 
     Attributes:
         origin: one sentence that says what the patients are: real, or synthetic and how made.
-        evaluation: folder made by `endopilot evaluate`.
-        run: folder made by `endopilot train`.
-        replay: navigations with `shape`, the first of which is shown in space.
-        replay_anatomy: folder of the anatomy that they are in.
-        navigation: folder made by `endopilot navigate`, beside or below the report; its page is linked.
+        evaluation: folder made by `endopilot evaluate`; `run` of `endopilot train`; `navigation` of `endopilot
+            navigate`, beside or below the report.
+        replay: navigations with `shape`, in `replay_anatomy`, the first of which is shown in space.
         manifest: how everything was made (`files.manifest`).
     """
 
@@ -90,11 +81,8 @@ class ReportContent:
 def write_report(output_html: Path, content: ReportContent) -> list[str]:
     """Write the report as one self-contained HTML file, and the still picture `scene.png` beside it.
 
-    Returns:
-        Remarks for the user, such as which system library is missing for a picture that was left out.
-
-    Raises:
-        InputError: a file that the content names is missing or damaged, or the report cannot be written.
+    Returns remarks for the user, such as which system library a left-out picture needs. Raises InputError for a missing
+    or damaged file of the content, or a report that cannot be written.
     """
     output_html = Path(output_html)
     remarks: list[str] = []
@@ -226,14 +214,8 @@ def image(png: bytes, description: str) -> Markup:
 
 
 def report_evaluation(folder: Path) -> Path:
-    """Write the PNG and the CSV of each figure into `figures/`, and then `report.html`, one page that stands alone.
-
-    Returns:
-        The page's path.
-
-    Raises:
-        InputError: the folder holds no evaluation, or a damaged one.
-    """
+    """Write the PNG and the CSV of each figure into `figures/`, and then `report.html`, one page that stands alone;
+    return its path. Raises InputError where the folder holds no evaluation, or a damaged one."""
     metrics = read_json(folder / METRICS_FILE)
     titles = {split: of["title"] for split, of in metrics["splits"].items()}
     _write_figures(read_results(folder / RESULTS_FILE), titles, folder / FIGURES_FOLDER)

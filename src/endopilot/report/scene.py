@@ -41,13 +41,11 @@ def navigation_scene(
     devices: Sequence[Device] = (),
     believed: Sequence[Wires] | None = None,
 ) -> go.Figure:
-    """Return a plotly figure of the wall, the centerline by section, and the first world of a rollout replayed.
+    """Return a plotly figure of the wall, the centerline by section, and the first world of a rollout (with `shape`)
+    replayed.
 
-    Args:
-        rollout: navigations with `shape`; without one the vessel is shown alone.
-        devices: the wire and the catheters of the rollout, whose names and diameters are shown; a wire alone is drawn
-            without.
-        believed: wires that a policy holds possible at each sample, nodes from the tip on, LPS mm.
+    `devices` are its wire and catheters; `believed` are wires that a policy holds possible at each sample, nodes from
+    the tip on, LPS mm.
     """
     wall = _wall(anatomy)
     figure = go.Figure([wall, *_centerlines(anatomy)])
@@ -70,12 +68,7 @@ def mark_target(
     observed: Float[np.ndarray, "exposures 3"],
     seconds: Float[np.ndarray, "exposures"],
 ) -> None:
-    """Add the target to a scene, and where the tip was when X-ray was on.
-
-    Args:
-        target: LPS mm.
-        observed: places of the tip, LPS mm.
-    """
+    """Add the target to a scene, and where the tip was when X-ray was on, LPS mm."""
     for points, name, marker, labels in (
         (target[None], "Target", {"symbol": "diamond", "size": 6}, ["target"]),
         (observed, "Tip under X-ray", {"symbol": "circle-open", "size": 7}, [f"X-ray at {t:g} s" for t in seconds]),
@@ -87,11 +80,8 @@ def mark_target(
 
 
 def visible_devices(rollout: Trajectory, world: int, sample: int) -> list[Float[np.ndarray, "_ 3"]]:
-    """Return the nodes of the wire, then of each catheter, from its tip to a little behind the ostium, LPS mm.
-
-    Raises:
-        ValueError: the rollout was made without `record_shape`.
-    """
+    """Return the nodes of the wire, then of each catheter, from its tip to a little behind the ostium, LPS mm;
+    ValueError without shape."""
     if rollout.shape is None:
         raise ValueError("the rollout holds no wire shapes; simulate with record_shape=True")
     inserted = rollout.inserted_length[world, sample]

@@ -35,12 +35,8 @@ def render_still(
 ) -> str | None:
     """Render the vessel's translucent wall, its centerline, the wire and translucent catheters to a PNG.
 
-    Args:
-        lines: nodes of the wire, then of each catheter, from its tip backwards, LPS mm; none to show the vessel alone.
-        devices: wire and catheters, which are drawn as wide as each other's diameters; needed with catheters.
-
-    Returns:
-        None when the picture is there; otherwise one line that says what to install.
+    `lines` are nodes of the wire, then of each catheter, from its tip backwards, LPS mm. Returns None when the picture
+    is there; otherwise one line that says what to install.
     """
     surface = wall_mesh(anatomy.distance_map, max_triangles=400_000)
     centerlines = [branch.centerline.points for branch in anatomy.tree.branches]

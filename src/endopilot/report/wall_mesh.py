@@ -17,23 +17,16 @@ MAX_TRIANGLES = 45_000
 
 @dataclass(frozen=True, eq=False)
 class WallMesh:
-    """A triangle mesh.
-
-    Attributes:
-        vertices: positions, LPS mm.
-        triangles: indices of the corners of each triangle.
-    """
+    """Vertices, LPS mm, and the indices of the corners of each triangle."""
 
     vertices: Float[np.ndarray, "vertices 3"]
     triangles: Int[np.ndarray, "triangles 3"]
 
 
 def wall_mesh(distance_map: DistanceMap, *, max_triangles: int = MAX_TRIANGLES) -> WallMesh:
-    """Return the surface where the distance to the wall is zero (marching cubes).
-
-    Where it would have more than `max_triangles`, the distance map is resampled on a coarser grid first: it is
-    smooth, so this keeps the wall's shape better than removing triangles.
-    """
+    """Return the surface where the distance to the wall is zero (marching cubes). Above `max_triangles`, the distance
+    map is resampled on a coarser grid first: it is smooth, so this keeps the wall's shape better than removing
+    triangles."""
     values, origin = _cropped(distance_map)
     spacing = np.full(3, distance_map.spacing_mm)
     vertices, triangles = _march(values, spacing)

@@ -46,14 +46,8 @@ class Picture:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One comparison.
-
-    Attributes:
-        reference: value of the closed form, or of the other engine.
-        error: relative error, or absolute where the reference is 0.
-        picture: the case's figure.
-        skipped: why the comparison could not be made; empty if it was.
-    """
+    """One comparison with a closed form or another engine: the error is relative, or absolute where the reference is 0;
+    `skipped` says why it could not be made."""
 
     case: str
     reference: float
@@ -108,17 +102,9 @@ def straight_rod(
     """Return a uniform straight rod whose free length begins in the middle of its first free element.
 
     A clamped element fixes a direction over its whole length, and the joint behind it stands for half of it: so a rod
-    clamped at a wall has its wall in the middle of the clamped element. The free length is (elements - 1/2) element
-    lengths.
-
-    Args:
-        elements: number of elements, the half clamped one included.
-        bend: EI, N·mm².
-        twist: GJ, N·mm².
-        shear: κGA, N; very stiff if not given.
-        stretch: EA, N; very stiff if not given.
-        drag: drag of a node, N·s/mm.
-        clamp: nodes behind the wall that the drive holds.
+    clamped at a wall has its wall in the middle of the clamped element, and the free length is (elements - 1/2) element
+    lengths. EI and GJ are in N·mm², κGA and EA in N (very stiff if not given), a node's drag in N·s/mm; the drive holds
+    `clamp` nodes behind the wall.
     """
     stiff = 1e5 * bend / length_mm**2
     return uniform_rod(
@@ -203,14 +189,7 @@ def equilibrium(
     free_behind_mm: float = 0.0,
 ) -> dict[str, np.ndarray]:
     """Bring one clamped rod to rest and return the core's arrays, shape and attitude included, without the world axis.
-
-    Args:
-        rod: the rod; all nodes but the last three are free.
-        control: motion of the clamp, mm/s and rad/s.
-        insertion: where the wall of the clamp is, and the rod's direction.
-        inserted_length_mm: free length; the rod's own if not given.
-        free_behind_mm: the rod is held this far behind the wall of the clamp.
-    """
+    All nodes but the last three are free; `control` moves the clamp, mm/s and rad/s."""
     if inserted_length_mm is None:
         inserted_length_mm = (len(rod.abscissa_mm) - 3 - 0.5) * float(rod.abscissa_mm[1])
     return driven(
@@ -241,21 +220,13 @@ def driven(
     free_behind_mm: float = 0.0,
     push_limit_n: float = np.inf,
 ) -> dict[str, np.ndarray]:
-    """Drive one rod, or tubes in each other, and return the core's arrays, without the axis of worlds.
+    """Drive one rod, or tubes in each other, and return the core's arrays, without the axis of worlds; only tubes have
+    one of devices.
 
-    The axis of devices is there with tubes alone.
-
-    Args:
-        control: mm/s and rad/s, of each tube if there are some.
-        initial: inserted length (mm) and rotation (rad) at the start.
-        tubes: from the inside out, in place of the rod's stiffnesses.
-        insertion: where and in which direction the base slides.
-        approach: bring the rod to its first inserted length from the ostium; else it starts there, straight.
-        free_behind_mm: nodes farther behind the insertion follow the drive, mm.
-        push_limit_n: force at which the drive slips, N.
-
-    Raises:
-        RuntimeError: the core did not converge.
+    Controls (mm/s, rad/s) and the start (mm, rad) have a row for each of `tubes`, from the inside out, which replace
+    the rod's stiffnesses. With `approach` the rod comes to its first inserted length from the ostium; else it starts
+    there, straight. Nodes more than `free_behind_mm` behind the insertion follow the drive, which slips at
+    `push_limit_n`, N. Raises RuntimeError where the core did not converge.
     """
     result = run_core(
         rod,
