@@ -32,17 +32,9 @@ def each(
 ) -> dict[Path, InputError]:
     """Do the same work for every item, in as many processes as there are cores, under one progress bar.
 
-    Args:
-        title: name of the work, for the progress bar.
-        items: files or folders to work on.
-        work: a function of a module, or a `functools.partial` of one, since other processes import it.
-        pool: the processes, which go on afterwards; own ones if not given.
-
-    Returns:
-        The items whose work raised `InputError`, each with its error. Any other exception ends the work and is raised.
-
-    Raises:
-        InputError: a process died.
+    `work` is a function of a module, or a `functools.partial` of one; a given `pool` goes on afterwards. Returns the
+    items whose work raised `InputError`, each with its error; any other exception ends the work. Raises InputError
+    where a process died.
     """
     bad: dict[Path, InputError] = {}
 
@@ -74,11 +66,9 @@ def each(
 
 
 class Workers(ProcessPoolExecutor):
-    """Processes for work that other processes can import; they end with this one, however it ends.
-
-    Leaving the block by an exception stops them at once; they remove their half-written files. (joblib's loky kills its
-    workers, which leaves those files, and lets them live on where this process is killed.)
-    """
+    """Processes for work that other processes can import; they end with this one, however it ends. Leaving the block by
+    an exception stops them at once; they remove their half-written files. (joblib's loky kills its workers, which
+    leaves those files, and lets them live on where this process is killed.)"""
 
     def __init__(self, processes: int = min(CORES, MOST_PROCESSES)) -> None:
         """Make ready for so many processes; work starts them."""

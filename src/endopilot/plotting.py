@@ -71,16 +71,9 @@ def draw_vessel(
     names: Sequence[str],
     one_color: str | None = None,
 ) -> None:
-    """Draw straight pieces of a vessel's centerlines with the sections by colour, and a legend beside them.
-
-    Args:
-        axes: where.
-        pieces: both ends of each piece in the picture, mm.
-        radius: of its lumen; lines are as thick as the vessel is wide, the widest some points.
-        section: index of its section.
-        names: of the sections.
-        one_color: of all, without a legend.
-    """
+    """Draw straight pieces of a vessel's centerlines (both ends of each, and its lumen's radius, mm) with the sections
+    by colour, and a legend beside them; lines are as thick as the vessel is wide. `one_color` is of all, without a
+    legend."""
     present = np.unique(section)
     palette, width = section_colors(len(present)), _THICKEST * radius / radius.max()
     for number, index in enumerate(present):

@@ -31,8 +31,7 @@ class Registry:
 
     Attributes:
         setting: name of the setting that chooses one; error messages begin with it.
-        shipped: name of each implementation of the package, and its MODULE:OBJECT. Only the one that is asked for is
-            imported.
+        shipped: name and MODULE:OBJECT of each of the package's. Only the one that is asked for is imported.
         group: group of the entry points by which installed packages offer theirs.
     """
 
@@ -46,12 +45,8 @@ class Registry:
         return (*self.shipped, *offered)
 
     def load(self, name: str) -> Any:
-        """Return the object behind a name.
-
-        Raises:
-            InputError: no such name, a name that two packages offer, a module that cannot be imported, or an object
-                that it does not hold.
-        """
+        """Return the object behind a name; InputError for no such name, one that two packages offer, or a module that
+        cannot be imported or lacks it."""
         point = self._entry_point(name)
         if point is not None:
             return self._import(name, point.value)
@@ -61,20 +56,12 @@ class Registry:
         return self._import(name, name)
 
     def check(self, name: str) -> None:
-        """Refuse a name that `load` would refuse, without importing what the package ships.
-
-        Raises:
-            InputError: as for `load`.
-        """
+        """Refuse a name that `load` would refuse, without importing what the package ships."""
         if self._entry_point(name) is not None or name not in self.shipped:
             self.load(name)
 
     def origin(self, name: str) -> str:
-        """Return where an implementation comes from: package and version, or a module's file and its SHA-256.
-
-        Raises:
-            InputError: as for `load`.
-        """
+        """Return where an implementation comes from: package and version, or a module's file and its SHA-256."""
         point = self._entry_point(name)
         if point is not None:
             return f"{point.dist.name} {point.dist.version}" if point.dist else point.value
@@ -131,17 +118,9 @@ class Registry:
 
     @contextlib.contextmanager
     def running(self, name: str, failure: str) -> Iterator[None]:
-        """Run what is behind a name, as the block does: an exception out of a user's own code names that code.
-
-        What that code prints goes to standard error: standard output is for results.
-
-        Args:
-            name: of the implementation; exceptions of the package's own pass.
-            failure: what has failed after an exception, in words.
-
-        Raises:
-            InputError: the code raised something, if only `SystemExit` or `KeyboardInterrupt`.
-        """
+        """Run what is behind a name, as the block does: an exception out of a user's own code, if only `SystemExit`,
+        becomes an InputError that names that code and begins with `failure`. What that code prints goes to standard
+        error."""
         if name in self.shipped:
             yield
             return

@@ -32,14 +32,10 @@ _shown = False
 
 @contextmanager
 def progress(title: str, total: int | float) -> Iterator[Advance]:
-    """Show a bar on standard error while the block runs.
+    """Show a bar of `total` units of work on standard error while the block runs, but not within another.
 
     Standard output stays free for results. If standard error is no terminal, one line is printed at the end of work
-    that took more than two seconds. A bar within a bar is not shown.
-
-    Args:
-        title: name of the work.
-        total: number of units of work.
+    that took more than two seconds.
     """
     global _shown
     console = Console(stderr=True)

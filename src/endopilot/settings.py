@@ -71,10 +71,7 @@ class Within:
     """The range of a number, as an annotation of `int` (whole numbers alone) or `float` (finite numbers).
 
     Attributes:
-        low: least value.
-        high: largest value.
-        above_low: whether `low` itself is refused.
-        below_high: whether `high` itself is refused.
+        above_low: whether `low` itself is refused; `below_high` likewise.
         unit: of the number, such as "mm".
         mistaken: other units that it may have been given in by mistake: name, and size in `unit`.
     """
@@ -187,10 +184,7 @@ def settings(cls: type[T] | None = None, /, *, eq: bool = True) -> Any:
 
     Its construction raises `InputError`, in one line that names the field, its value and what to give instead. It takes
     mappings for fields that are settings classes themselves, and lists for tuples, as JSON and YAML files have them.
-
-    Args:
-        cls: the class.
-        eq: whether instances of equal fields are equal.
+    With `eq`, instances of equal fields are equal.
     """
     if cls is None:
         return lambda decorated: _made(decorated, eq)
@@ -205,14 +199,8 @@ def is_settings(cls: Any) -> bool:
 def from_record(cls: type[T], record: Any, *, onto: T | None = None) -> T:
     """Return settings from the names and values of their fields, as `dataclasses.asdict` or a file gives them.
 
-    Args:
-        cls: their class.
-        record: the names and values.
-        onto: settings that hold the fields which are not there; if not given, all must be there but those that are None
-            by default.
-
-    Raises:
-        InputError: it is no such record; the line names field, value and what to give instead.
+    `onto` holds the fields which are not there; without it all must be there but those that are None by default. Raises
+    InputError, in a line that names field, value and what to give instead.
     """
     if not isinstance(record, Mapping) or not all(isinstance(name, str) for name in record):
         raise InputError(f"holds no mapping of fields; the fields are {', '.join(_fields(cls))}")
@@ -224,17 +212,8 @@ def from_record(cls: type[T], record: Any, *, onto: T | None = None) -> T:
 
 
 def read_settings(path: Path, cls: type[T], *, onto: T | None = None, remedy: str = "") -> T:
-    """Read settings from a JSON file (by its suffix) or a YAML file.
-
-    Args:
-        path: the file.
-        cls: the class of the settings.
-        onto: settings that hold the fields which the file leaves out; all must be there if not given.
-        remedy: what else to do about a bad file, such as "run `endopilot advise` again".
-
-    Raises:
-        InputError: the file is missing or holds no such settings; the line names file, field, value and what to give.
-    """
+    """Read settings from a JSON file (by its suffix) or a YAML file, as `from_record` has it; `remedy` is what else to
+    do about a bad file, such as "run `endopilot advise` again"."""
     content = read_json(path) if Path(path).suffix == ".json" else read_yaml(path)
     try:
         return from_record(cls, content, onto=onto)
@@ -337,13 +316,9 @@ _MADE_BY = {
 
 
 def public(function: Callable[..., T]) -> Callable[..., T]:
-    """Make a function check the kinds of its arguments by their annotations, before it does anything.
-
-    Lists of numbers become arrays, and NumPy's numbers plain ones. What an annotation says of shapes is not checked.
-
-    Raises:
-        InputError: an argument is of no kind that is taken; the line says which are, and what makes them.
-    """
+    """Make a function check the kinds of its arguments by their annotations, before it does anything; InputError says
+    which are taken, and what makes them. Lists of numbers become arrays, and NumPy's numbers plain ones. What an
+    annotation says of shapes is not checked."""
     signature, hints_of = inspect.signature(function), cache(get_type_hints)
 
     @wraps(function)

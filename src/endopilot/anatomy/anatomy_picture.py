@@ -42,11 +42,7 @@ def draw_anatomy(anatomy: Anatomy, path: Path, *, volume: Volume | None = None) 
     """Write a PNG of the tree, its longest path as a straightened curved planar reformation, and cross-sections.
 
     The walls are the distance map's zero level (green) and, in the cross-sections, the inscribed circle (yellow).
-
-    Args:
-        anatomy: the vessel.
-        path: the PNG.
-        volume: the CT in HU that is shown behind the walls; without one it is the distance to the wall.
+    Behind them is a CT in HU, or without one the distance to the wall.
     """
     figure = plt.figure(figsize=(_WIDTH, 13), facecolor="white", layout="constrained")
     parts: Any = figure.subfigures(3, 1, height_ratios=(2.0, 1.15, 1.0))

@@ -69,11 +69,9 @@ def refined_lines(
     step_mm: float,
     ostium: Insertion | None = None,
 ) -> list[Line]:
-    """Return the traced paths on the medial axis, each joined to its parent where its axis meets the parent's.
-
-    Within one radius of an end the inscribed sphere feels the end's own cap. Lines are cut back from there and, where
-    the lumen keeps its width (a vessel cut flat), drawn out to the cut; the first one to the ostium, if that is known.
-    """
+    """Return the traced paths on the medial axis, each joined to its parent where its axis meets the parent's. Within
+    one radius of an end the inscribed sphere feels the end's own cap. Lines are cut back from there and, where the
+    lumen keeps its width (a vessel cut flat), drawn out to the cut; the first one to the ostium, if that is known."""
     home = np.full(len(graph.points), -1)
     lines: list[Line] = []
     for index, nodes in enumerate(paths):
@@ -106,10 +104,8 @@ def refined_lines(
 def _to_axis(
     surface: Surface, distance_map: DistanceMap, points: Float[np.ndarray, "n 3"], parent: Line | None
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
-    """Move a line onto its vessel's axis; return it with its radii.
-
-    Where a branch runs together with its parent, the directions in which it opens into the parent do not count.
-    """
+    """Move a line onto its vessel's axis; return it with its radii. Where a branch runs together with its parent, the
+    directions in which it opens into the parent do not count."""
     for iteration in range(_REFINEMENTS):
         clearance = surface.distance(points)
         around, ring = _ring_distance(surface, points, 0.5 * clearance)
@@ -211,10 +207,8 @@ def _outside(points: Float[np.ndarray, "n 3"], parent: Line) -> int:
 
 
 def _meeting_point(distance_map: DistanceMap, body: Float[np.ndarray, "n 3"], radius_mm: float, parent: Line) -> int:
-    """Return the index of the parent's point that the side branch's axis, drawn back, comes nearest to.
-
-    The straight way to it does not cross a wall, such as a flap beside the tear that the branch comes through.
-    """
+    """Return the parent's point that the side branch's axis, drawn back, comes nearest to, on a straight way that
+    crosses no wall, such as a flap beside the tear that the branch comes through."""
     start = body[: min(len(body), _STRAIGHT + 1)]
     back = np.linalg.svd(start - start.mean(axis=0))[2][0]
     back *= np.sign(back @ (start[0] - start[-1]))
@@ -237,11 +231,9 @@ def _meeting_point(distance_map: DistanceMap, body: Float[np.ndarray, "n 3"], ra
 def to_cut(
     distance_map: DistanceMap, points: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, "n"], step_mm: float
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
-    """Draw a line out as long as the lumen keeps its width, to the cut of a vessel that ends flat.
-
-    Each step goes on along the last ones, bent as they are, and is centred by the walls beside it alone: the cut ahead
-    does not draw it back. Where the lumen grows narrow or flat, it is no longer the same vessel that runs to a cut.
-    """
+    """Draw a line out as long as the lumen keeps its width, to the cut of a vessel that ends flat. Each step goes on
+    along the last ones, bent as they are, centred by the walls beside it alone: the cut ahead does not draw it back.
+    Where the lumen grows narrow or flat, it is no longer the same vessel."""
     width = float(radius[-1])
     back = max(3, round(1.5 * width / step_mm))
     line = list(points[-2 * back - 1 :])
@@ -307,10 +299,8 @@ def _from_tip(
     traced: Float[np.ndarray, "t 3"],
     step_mm: float,
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k"]]:
-    """Return the first line so that it begins at the tip that it was traced from, if drawing it out led elsewhere.
-
-    Where a short left main meets its branches, a line that is cut back from the cap is cut back round the bend.
-    """
+    """Return the first line so that it begins at the tip that it was traced from: where a short left main meets its
+    branches, a line that is cut back from the cap is cut back round the bend."""
     if np.linalg.norm(drawn[0] - traced[0]) < _LED_ELSEWHERE * width[0]:
         return drawn, width
     first = int(np.linalg.norm(traced - points[0], axis=1).argmin())
@@ -325,11 +315,9 @@ def _from_tip(
 
 
 def _without_inlets(distance_map: DistanceMap, lines: list[Line], ostium: Insertion) -> list[Line]:
-    """Leave out lines that lead back to the ostium's own cut: the other side of a wide inlet, and no branch.
-
-    Such a line ends in the plane of the ostium, and there the lumen joins it to the first line in a straight line. In
-    the merged lumens of a dissection, a wire beside the first line would seem to lie far ahead, on the returning part.
-    """
+    """Leave out lines that lead back to the ostium's own cut: the other side of a wide inlet, and no branch. Such a
+    line ends in the plane of the ostium, and there the lumen joins it to the first line in a straight line. In the
+    merged lumens of a dissection, a wire beside the first line would seem to lie far ahead, on the returning part."""
     first, kept = lines[0].points, [True] * len(lines)
     for index in range(len(lines) - 1, 0, -1):
         points, width = lines[index].points, float(lines[index].radius[-1])

@@ -32,15 +32,8 @@ ENGAGED_MM = 3.0
 
 
 def automatic_spacing(radius: Float[np.ndarray, "n"], extent_mm: Float[np.ndarray, "3"]) -> float:
-    """Return a grid spacing in mm that resolves the lumen and keeps the map small.
-
-    It is 0.45 times the radius that all but the narrowest twentieth of the centerline exceeds, from 0.3 to 1.5 mm,
-    and no smaller than `MAXIMUM_GRID_POINTS` allows over `extent_mm`.
-
-    Args:
-        radius: inscribed-sphere radii along the centerline, mm.
-        extent_mm: edges of the box that the map must cover, mm.
-    """
+    """Return a grid spacing in mm that resolves the lumen: 0.45 times the radius that all but the narrowest twentieth
+    of the centerline exceeds, from 0.3 to 1.5 mm, and no smaller than `MAXIMUM_GRID_POINTS` allows over `extent_mm`."""
     spacing = float(np.clip(0.45 * np.quantile(radius, 0.05), 0.3, 1.5))
     smallest = float(np.prod(np.maximum(extent_mm, 1.0)) / MAXIMUM_GRID_POINTS) ** (1 / 3)
     return round(max(spacing, smallest), 3)
@@ -52,13 +45,8 @@ def distance_map_from_spheres(
     beside: Sequence[Sequence[Centerline]] = (),
     spacing_mm: float | None = None,
 ) -> DistanceMap:
-    """Return the signed distance to the smooth union of a tree's inscribed spheres.
-
-    Args:
-        tree: centerlines with radii.
-        beside: for each branch, further lines of spheres that belong to its lumen; none for round sections.
-        spacing_mm: grid spacing, mm; chosen by `automatic_spacing` if None.
-    """
+    """Return the signed distance to the smooth union of a tree's inscribed spheres; `beside` are further lines of
+    spheres of each branch's lumen. The spacing, mm, is `automatic_spacing`'s if None."""
     lumens = [[branch.centerline] for branch in tree.branches]
     for own, others in zip(lumens, beside, strict=False):
         own.extend(others)
@@ -86,19 +74,10 @@ def _join(distance_map: DistanceMap, lines: Sequence[Centerline], band: float, f
 def add_catheter(
     distance_map: DistanceMap, insertion: Insertion, radius_mm: float, length_mm: float = CATHETER_LENGTH_MM
 ) -> DistanceMap:
-    """Return the map joined with a straight guiding catheter that ends at the ostium.
+    """Return the map, grown as needed, joined with a straight guiding catheter of `length_mm` that ends at the ostium.
 
-    The catheter is a tube of constant radius with a round end centred on the ostium, so the passage into the vessel is
-    open by at least `radius_mm`. The grid grows as needed.
-
-    Args:
-        distance_map: the vessel.
-        insertion: the ostium and the catheter's axis, pointing into the vessel.
-        radius_mm: inner radius of the catheter, mm.
-        length_mm: length of the tube behind the ostium, mm.
-
-    Raises:
-        InputError: the radius or the length is not positive.
+    The catheter is a tube of constant inner radius with a round end centred on the ostium, so the passage into the
+    vessel is open by at least `radius_mm`. Raises InputError for a radius or length that is not positive.
     """
     if not (radius_mm > 0 and length_mm > 0):
         raise InputError(f"catheter: radius {radius_mm} mm and length {length_mm} mm must both be positive")
@@ -117,12 +96,8 @@ def add_catheter(
 
 
 def catheter_tilt_deg(ostium_radius_mm: float, catheter_radius_mm: float) -> float:
-    """Return how far a catheter may lean off the vessel's axis before its engaged tip meets the wall, degrees.
-
-    Args:
-        ostium_radius_mm: the lumen's radius at the ostium, mm.
-        catheter_radius_mm: the catheter's inner radius, mm.
-    """
+    """Return how far a catheter (inner radius) may lean off the vessel's axis before its engaged tip meets the wall,
+    degrees."""
     return math.degrees(math.atan2(max(ostium_radius_mm - catheter_radius_mm, 0.0), ENGAGED_MM))
 
 
@@ -133,11 +108,9 @@ def smooth_union(
     spacing_mm: float,
     fillet_mm: float,
 ) -> Float[np.ndarray, "nz ny nx"]:
-    """Return the union of two signed distances (positive inside), with a fillet where their walls cross.
-
-    It is the polynomial smooth maximum ``max(a, b) + (k − |a − b|)₊² / 4k``. Its width k falls with the angle θ between
-    the two gradients as k = fillet · (1 − cos θ), so that two tubes that carry on into each other do not bulge.
-    """
+    """Return the union of two signed distances (positive inside), with a fillet where their walls cross. It is the
+    polynomial smooth maximum ``max(a, b) + (k − |a − b|)₊² / 4k``. Its width k falls with the angle θ between the two
+    gradients as k = fillet · (1 − cos θ), so that two tubes that carry on into each other do not bulge."""
     highest = np.maximum(first, second)
     near = np.abs(first - second) < 2 * fillet_mm
     near &= (first > first.min()) & (second > second.min())

@@ -45,15 +45,13 @@ _RULES: dict[str, tuple[tuple[str, ...], Callable[[Labeller], None]]] = {
 def label_tree(
     tree: VesselTree, scheme: Scheme, *, naming: Mapping[str, str] | None = None, crux: Crux | None = None
 ) -> VesselTree:
-    """Return the tree with every point's section.
+    """Return the tree (LPS mm) with every point's section.
 
     Args:
-        tree: centerlines in LPS mm.
         scheme: "rca" and "lca" name AHA/SCCT segments, "arch", "cerebral" and "portal" the vessels of these anatomies
             (`labels_tree` lists all names); "generic" names branches "G0", "G1.1", "G1.2", …: generation (bifurcations
             from the root), then order, widest first.
-        crux: where the crux of the heart lies and which artery reaches it, if both are known; otherwise the tree's own
-            shape decides.
+        crux: where the crux of the heart lies and which artery reaches it, if both are known.
         naming: other names for some sections, such as {"G0": "superficial femoral artery"}.
 
     Raises:

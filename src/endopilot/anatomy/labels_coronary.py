@@ -82,10 +82,8 @@ def _forks(labeller: Labeller, route: tuple[int, ...]) -> list[int]:
 
 
 def _end_of_distal(line: Centerline, passed: float | None) -> float:
-    """Return where segment 3 ends, mm, in an artery that does not fork where it passes the known crux.
-
-    One that ends before the crux is a part of the usual way there: a vestige of 35 mm is all segment 1.
-    """
+    """Return where segment 3 ends, mm, in an artery that does not fork where it passes the known crux. One that ends
+    before the crux is a part of the usual way there: a vestige of 35 mm is all segment 1."""
     whole = float(line.abscissa[-1])
     if passed is None:
         return max(whole, USUAL_CRUX_MM)
@@ -100,10 +98,8 @@ def _turns_forwards(line: Centerline, crux_mm: float, beyond_mm: float = 0.0) ->
 
 
 def _crux(labeller: Labeller, route: tuple[int, ...]) -> int | None:
-    """Return the branch that ends at the crux: the first low fork into two branches after the turn to the back.
-
-    Before the acute margin the vessel runs down and to the right; from there to the crux, to the left and the back.
-    """
+    """Return the branch that ends at the crux: the first low fork into two branches after the turn to the back. Before
+    the acute margin the vessel runs down and to the right; from there to the crux, to the left and the back."""
     back = np.array([1.0, 1.0, 0.0]) / np.sqrt(2.0)
     height = labeller.tree.path(route[-1]).points[:, 2]
     low = height.min() + 0.4 * float(np.ptp(height))
@@ -117,11 +113,9 @@ def _crux(labeller: Labeller, route: tuple[int, ...]) -> int | None:
 
 
 def _unforked_crux(labeller: Labeller, route: tuple[int, ...]) -> float:
-    """Return where segment 3 ends in a tree whose end does not fork, mm.
-
-    If the vessel turns forwards again behind its most posterior point for long enough, what follows is the posterior
-    descending artery; otherwise it ends as segment 3.
-    """
+    """Return where segment 3 ends in a tree whose end does not fork, mm. If the vessel turns forwards again behind its
+    most posterior point for long enough, what follows is the posterior descending artery; otherwise it ends as segment
+    3."""
     line = labeller.tree.path(route[-1])
     if line.abscissa[-1] < SHORT_MM:
         return USUAL_CRUX_MM
@@ -162,11 +156,9 @@ def _label_right_sides(labeller: Labeller, trunk: tuple[int, ...], crux: int | N
 
 
 def label_lca(labeller: Labeller) -> None:
-    """Name the sections of a left coronary tree.
-
-    Where the left main does not fork within `LONGEST_LEFT_MAIN_MM`, one of its main vessels is missing; the other one's
-    name follows from its course: the anterior descending artery runs forwards, the circumflex back.
-    """
+    """Name the sections of a left coronary tree. Where the left main does not fork within `LONGEST_LEFT_MAIN_MM`, one
+    of its main vessels is missing; the other one is the anterior descending artery if it runs forwards, else the
+    circumflex."""
     tree = labeller.tree
     fork = labeller.fork(0, NAMED_MM)
     major = labeller.major(fork, NAMED_MM)

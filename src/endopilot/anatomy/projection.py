@@ -26,16 +26,11 @@ _TAPER = 1.25
 
 
 def project_tip(tree: VesselTree, insertion: Insertion, points: Float[np.ndarray, "*n 3"]) -> TipProjection:
-    """Project tips onto the centerline tree.
+    """Project tips (LPS mm) onto the centerline tree.
 
-    Along a motion inside one branch, abscissa and offset are continuous; from one branch into another the abscissa
-    may step by no more than the shortcut that the tip takes across the bifurcation. Behind the ostium the line goes
-    on along the catheter's axis, with negative abscissa and the radius at the ostium.
-
-    Args:
-        tree: centerlines.
-        insertion: the ostium and the catheter's axis.
-        points: tip positions, LPS mm.
+    Along a motion inside one branch, abscissa and offset are continuous; from one branch into another the abscissa may
+    step by no more than the shortcut that the tip takes across the bifurcation. Behind the ostium the line goes on
+    along the catheter's axis, with negative abscissa and the radius at the ostium.
     """
     return TipProjector(tree, insertion)(points)
 
@@ -82,18 +77,9 @@ class TipProjector:
 def _rivals(
     tree: VesselTree, points: Float[np.ndarray, "m 3"], first: Int[np.ndarray, "b"], owner: Int[np.ndarray, "m"]
 ) -> tuple[Float[np.ndarray, "m b"], Int[np.ndarray, "m b"]]:
-    """Return what a point may lie deeper in than in the branch of its nearest vertex, a row for each such vertex.
-
-    Args:
-        tree: centerlines.
-        points: all their vertices.
-        first: the first vertex of every branch.
-        owner: the branch of every vertex.
-
-    Returns:
-        How far a point must lie from the vertex to lie deeper in each other branch, mm; and the branch's vertex that is
-        nearest to this one.
-    """
+    """Return what a point may lie deeper in than in the branch of its nearest vertex, a row for each such vertex: how
+    far a point must lie from it to lie deeper in each other branch, mm, and that branch's nearest vertex. `first` and
+    `owner` are each branch's first vertex and each vertex's branch."""
     lines = [branch.centerline for branch in tree.branches]
     spacing = np.concatenate([_spacing(line.points) for line in lines])
     rival = np.full((len(points), len(lines)), np.inf)
@@ -117,10 +103,8 @@ def _spacing(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
 
 
 def _shared_tangents(tree: VesselTree, insertion: Insertion) -> list[Float[np.ndarray, "n 3"]]:
-    """Return the tangents at all vertices; a branch and the child that carries it on share that at the joint.
-
-    So do the catheter and the first branch: the plane through the ostium stands across the catheter's axis.
-    """
+    """Return the tangents at all vertices; a branch and the child that carries it on share that at the joint. So do the
+    catheter and the first branch: the plane through the ostium stands across the catheter's axis."""
     result = [tangents(branch.centerline.points) for branch in tree.branches]
     for index in range(len(result)):
         children = [i for i in tree.children(index) if len(result[i]) > 1]
@@ -138,15 +122,10 @@ Samples = Float[np.ndarray, "*n"]
 
 
 def safety_ratio(offset: Samples, radius: Samples, wire_radius_mm: float) -> Samples:
-    """Return γ/(r − r_w): 0 on the centerline, 1 where the wire touches the wall of a round lumen.
+    """Return γ/(r − r_w): 0 on the centerline, 1 where the wire touches the wall of a round lumen; NaN stays NaN.
 
-    Where the lumen is no wider than the wire, the wire touches the wall wherever it lies: the ratio is 1. What is NaN
-    stays NaN. With a wire radius of 0 it is the paper's ratio γ/r, which is 1 − r_w/r where the wire touches.
-
-    Args:
-        offset: γ of the wire's axis, mm.
-        radius: of the lumen there, r, mm.
-        wire_radius_mm: r_w, mm.
+    Where the lumen is no wider than the wire, the wire touches the wall wherever it lies: the ratio is 1. With a wire
+    radius of 0 it is the paper's ratio γ/r, which is 1 − r_w/r where the wire touches. All are in mm.
     """
     room = radius - wire_radius_mm
     filled = room <= 0

@@ -21,14 +21,8 @@ SAMPLE_STEP_MM = 0.1
 
 @dataclass(frozen=True, eq=False)
 class LineTree:
-    """One tree from centerlines, and what became of the lines.
-
-    Attributes:
-        tree: the tree.
-        rule: by which its root was chosen.
-        notes: what was done and left out, a sentence each.
-        coverage: see `line_checks.left_out`.
-    """
+    """One tree from centerlines, the rule by which its root was chosen, what was done and left out, and
+    `line_checks.left_out`."""
 
     tree: VesselTree
     rule: str
@@ -50,10 +44,8 @@ def tree_from_polylines(
 
 
 def tree_from_lines(lines: list[Line]) -> VesselTree:
-    """Return the tree of lines that leave each other, cut into branches, with abscissa and normals.
-
-    Parents stand before their children in `lines`. Sections are not named yet: all points carry section 0, "vessel".
-    """
+    """Return the tree of lines that leave each other, parents first, cut into branches, with abscissa and normals.
+    Sections are not named yet: all points carry section 0, "vessel"."""
     branches: list[Branch] = []
     ends: dict[tuple[int, int], int] = {}
     for index, line in enumerate(lines):
@@ -79,14 +71,8 @@ def make_centerline(
     first_abscissa: float = 0.0,
     first_normal: Float[np.ndarray, "3"] | None = None,
 ) -> Centerline:
-    """Return a centerline with abscissa and parallel-transport normals.
-
-    Args:
-        points: positions, LPS mm.
-        radius: inscribed-sphere radii, mm.
-        first_abscissa: abscissa of the first point, mm.
-        first_normal: normal to carry along; any perpendicular one if None.
-    """
+    """Return a centerline (LPS mm, inscribed-sphere radii) with abscissa and parallel-transport normals, which carry
+    `first_normal`, or any perpendicular one, along."""
     abscissa = first_abscissa + length_along(points)
     return Centerline(points=points, radius=radius, abscissa=abscissa, normals=parallel_transport(points, first_normal))
 
@@ -172,11 +158,8 @@ def cross_axes(direction: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "
 
 
 def curvature_torsion(centerline: Centerline) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Return curvature and torsion along a line, 1/mm.
-
-    They come from the derivatives of a quartic fitted to the nine points around each point:
-    κ = |r′×r″|/|r′|³ and τ = (r′×r″)·r‴/|r′×r″|². Where the line is straight, the torsion is set to zero.
-    """
+    """Return curvature and torsion along a line, 1/mm, from the derivatives of a quartic fitted to the nine points
+    around each: κ = |r′×r″|/|r′|³ and τ = (r′×r″)·r‴/|r′×r″|², which is set to zero where the line is straight."""
     count = len(centerline.points)
     width = min(9, count)
     if width < 5:

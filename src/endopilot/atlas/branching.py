@@ -75,7 +75,7 @@ class SidePlan:
 def until_it_fits(
     draw: Callable[[], tuple[VesselTree, dict[str, Any]]], what: str
 ) -> tuple[VesselTree, dict[str, Any]]:
-    """Draw trees until one fits; its record states how many failed before (`redrawn`). Raises NoShape after 60 draws."""
+    """Draw trees until one fits, whose record states how many failed (`redrawn`); NoShape after 60 draws."""
     for attempt in range(60):
         try:
             tree, drawn = draw()

@@ -25,11 +25,7 @@ Figures = Mapping[str, Any] | Sequence[Mapping[str, Any]]
 
 
 def existing(path: Path) -> Path:
-    """Return `path` if a file or a folder is there.
-
-    Raises:
-        InputError: there is none, or it may not be looked at.
-    """
+    """Return `path` if a file or a folder is there; InputError if not, or if it may not be looked at."""
     try:
         path.stat()
     except OSError as error:
@@ -70,7 +66,7 @@ class Answer:
 
     Attributes:
         figures: all of them, which `--json` prints.
-        shown: what is printed else, one below another: figures, rows or text; `figures` if not given.
+        shown: what is printed else, one below another; `figures` if not given.
         passed: whether the command leaves with exit code 0, and not 1.
     """
 

@@ -62,16 +62,7 @@ _POSITIONAL = get_args(Positional[Any])[1]
 
 @dataclass(frozen=True)
 class Option:
-    """An option of a command, or a group of options.
-
-    Attributes:
-        name: of its field.
-        kind: what it takes, as annotated.
-        value: what it is set to; None where it must be given and is not.
-        meaning: in words, with the unit.
-        required: whether it must be given.
-        group: the options of a group.
-    """
+    """An option of a command, with what its field is called, takes, is set to and means; or a group of options."""
 
     name: str
     kind: Any
@@ -116,13 +107,8 @@ class Option:
 
 
 class Command:
-    """A command: a function whose parameters and settings are its options.
-
-    Attributes:
-        name: how it is called, such as `endopilot plan`.
-        settings: the settings class of all its options; a file for `--config` holds it.
-        defaults: what its options are set to if nothing is given, an instance of `settings`.
-    """
+    """A command, such as `endopilot plan`: a function whose parameters and settings are its options. `settings` is the
+    class of all of them, which a file for `--config` holds, `defaults` what they are set to if nothing is given."""
 
     def __init__(self, name: str, function: Callable[..., Any]) -> None:
         """Read the signature of `function`; if it returns something, that is shown and the command has `--json`."""
@@ -150,11 +136,8 @@ class Command:
         return "\n\n".join(part for part in (self._text.short_description, self._text.long_description) if part)
 
     def options(self, values: Any = None) -> list[Option]:
-        """Return its options: its function's in their order, then those of its settings.
-
-        Args:
-            values: what they are set to, an instance of `settings`; the defaults if not given.
-        """
+        """Return its options, set to `values` or the defaults: its function's in their order, then those of its
+        settings."""
         meanings = _meanings(self._config) | _EVERYWHERE
         meanings |= {one.arg_name: _line(one.description) for one in self._text.params}
         found = _options(self.defaults if values is None else values, meanings, self._required)
@@ -162,11 +145,8 @@ class Command:
         return [tree.pop(name) for name in self._own] + list(tree.values())
 
     def run(self, arguments: Sequence[str]) -> None:
-        """Do what the arguments ask for, and print what comes of it.
-
-        Raises:
-            InputError: the arguments or the file of `--config` are bad; the line says which, and how to mend it.
-        """
+        """Do what the arguments ask for, and print what comes of it; InputError for bad arguments, or a bad file of
+        `--config`."""
         values = self._asked(arguments)
         if values is not None:
             answer = self._called(values)
@@ -174,11 +154,7 @@ class Command:
                 show_answer(answer, as_json=values.json)
 
     def answer(self, arguments: Sequence[str]) -> Any:
-        """Do what the arguments ask for, and return what comes of it; None where they ask for help.
-
-        Raises:
-            InputError: as `run`.
-        """
+        """Do what the arguments ask for, and return what comes of it; None where they ask for help."""
         values = self._asked(arguments)
         return None if values is None else self._called(values)
 
@@ -214,11 +190,7 @@ class Command:
         return self._function(*places, **given)
 
     def read(self, arguments: Sequence[str]) -> Any:
-        """Return what the arguments set the options to, an instance of `settings`.
-
-        Raises:
-            InputError: as `run`.
-        """
+        """Return what the arguments set the options to, an instance of `settings`; InputError as `run`."""
         rest = [word for word in arguments if word != "--print-config"]
         file = _taken(rest, "--config")
         start = self.defaults if file is None else read_settings(Path(file), self.settings, onto=self.defaults)
@@ -272,11 +244,7 @@ class Command:
         return parser.format_help()
 
     def file(self, values: Any = None) -> str:
-        """Return the text of a file for `--config`.
-
-        Args:
-            values: what the options are set to, an instance of `settings`; the defaults if not given.
-        """
+        """Return the text of a file for `--config` that holds `values`, an instance of `settings`, or the defaults."""
         head = f"# Options of `{self.name}` for --config. Flags on the command line win over them."
         return "\n".join([head, *_yaml(self.options(values), ""), ""])
 

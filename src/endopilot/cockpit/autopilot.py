@@ -215,7 +215,7 @@ class Autopilot:
 
 
 def check_policy(name: str | None, offered: tuple[str, ...]) -> str:
-    """Return the name of a policy that the page may choose: one that is offered, for a page names no module of its own."""
+    """Return a policy's name that the page may choose: one that is offered, for a page names no module of its own."""
     if name not in offered:
         raise InputError(f"policy: {name!r}; choose from {', '.join(offered)}")
     return name

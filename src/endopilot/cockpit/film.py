@@ -47,7 +47,7 @@ class FilmFrame:
 
 @dataclass(eq=False)
 class Film:
-    """A navigation that is driven again in a thread of its own: its frames so far, and why it ended early, in a line."""
+    """A navigation driven again in a thread of its own: its frames so far, and why it ended early, in a line."""
 
     navigation: Navigation
     seconds: float

@@ -358,7 +358,7 @@ _WIRE = (
 
 
 def check_same_wire(dataset: Dataset, other: Mapping[str, Any], of: Path, mend: str) -> None:
-    """Raise InputError, with how to mend it, unless a dataset was made with the wire of another dataset or run (`of`)."""
+    """Raise InputError, with the mend, unless a dataset was made with the wire of another dataset or run (`of`)."""
     ours = dataset.manifest["device"]
     for name in _WIRE:
         if not np.array_equal(ours[name], other[name]):

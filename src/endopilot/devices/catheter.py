@@ -123,21 +123,14 @@ def read_catheter(name_or_path: str | Path) -> Catheter:
 
 
 def catheter_yaml(name_or_path: str | Path) -> str:
-    """Return the text of a catheter's YAML file, by its name or its path.
-
-    Raises:
-        InputError: no such catheter, or a file that is no text.
-    """
+    """Return the text of a catheter's YAML file, by its name or its path; InputError if there is none, or it is no
+    text."""
     path = named_file("catheter", name_or_path, (_SHIPPED,), list_catheters)
     return read_text(path, what="catheter's YAML file")
 
 
 def check_nested(wire: Wire, catheters: Sequence[Catheter]) -> None:
-    """Check that a wire and catheters, from the inside out, fit into each other.
-
-    Raises:
-        InputError: more catheters than two, or one that is too narrow for what lies in it.
-    """
+    """Raise InputError unless a wire and at most two catheters, from the inside out, fit into each other."""
     if len(catheters) > MOST_CATHETERS:
         raise InputError(f"catheters: {len(catheters)}; give at most {MOST_CATHETERS}")
     inner: Device = wire

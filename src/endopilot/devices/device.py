@@ -303,17 +303,8 @@ def read_wire(name_or_path: str | Path) -> Wire:
 def check_built(
     device: Device, *, bore_mm: float = 0.0, arcs: Sequence[tuple[float, float]] = (), catheter: bool = False
 ) -> None:
-    """Check that the constants of a device can be those of one and the same thing.
-
-    Args:
-        device: what its file says.
-        bore_mm: diameter of its bore, mm; 0 for a wire.
-        arcs: the arcs of a catheter's shape: mm, rad.
-        catheter: whether it is a catheter.
-
-    Raises:
-        InputError: two of them contradict each other; the line names field, value and what to give.
-    """
+    """Raise InputError where constants of a device's file cannot be those of one thing; `bore_mm` is 0 for a wire,
+    `arcs` (mm, rad) are of a catheter's shape."""
     _check_stiffness(device, bore_mm, catheter)
     shears = _STRENGTH_MPA / math.sqrt(3) * math.pi / 16 * device.diameter_mm**3  # yields in shear by von Mises
     if (torque := device.torque_limit_n_mm) > shears:
@@ -325,14 +316,7 @@ def check_built(
 
 
 def check_tip(device: Wire) -> None:
-    """Check that the tip of a wire can be one: its load, its bend, and the bends that a hand can give it.
-
-    Args:
-        device: what its file says.
-
-    Raises:
-        InputError: it cannot; the line names field, value and what to give.
-    """
+    """Raise InputError where a wire's tip cannot be one: its load, its bend, and the bends that a hand can give it."""
     if device.tip_load_n is not None:
         _check_tip_load(device.tip_load_n, device)
     if device.tip_bend_rad:
@@ -406,11 +390,7 @@ def _check_bends(name: str, bends: Sequence[tuple[float, float]], device: Device
 
 
 def check_fits(device: Device, anatomy: Anatomy) -> None:
-    """Check that the device passes through the guiding catheter and the ostium.
-
-    Raises:
-        InputError: the device is wider than one of them.
-    """
+    """Raise InputError where the device is wider than the guiding catheter or the ostium."""
     lumen = float(anatomy.tree.branches[0].centerline.radius[0])
     for what, radius in (("lumen at the ostium", lumen), ("guiding catheter", anatomy.catheter_radius_mm)):
         if device.tip_radius_mm >= radius:
@@ -421,13 +401,7 @@ def check_fits(device: Device, anatomy: Anatomy) -> None:
 
 
 def lateral_reach(bend_rad: float, length_mm: float) -> float:
-    """Return how far a tip stands beside the wire behind it, mm: L(1 − cos θ)/θ.
-
-    A tip that is bent by more than half a turn stands farthest beside the wire where it has turned by half of one.
-
-    Args:
-        bend_rad: angle by which it is bent, rad.
-        length_mm: length over which it is bent, with constant curvature, mm.
-    """
+    """Return how far a bent tip stands beside the wire behind it, mm: L(1 − cos θ)/θ. A tip that is bent by more than
+    half a turn stands farthest beside the wire where it has turned by half of one."""
     angle = abs(bend_rad)
     return float(length_mm * (1 - np.cos(min(angle, np.pi))) / angle) if angle > 0 else 0.0

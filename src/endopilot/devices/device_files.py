@@ -32,22 +32,15 @@ def list_wires() -> tuple[str, ...]:
 
 
 def user_devices() -> tuple[str, ...]:
-    """Return the names of the devices in the user's folders, those that the package ships left out.
-
-    Raises:
-        InputError: ENDOPILOT_DEVICES names no folder.
-    """
+    """Return the names of the devices in the user's folders, without the shipped ones; InputError if ENDOPILOT_DEVICES
+    is no folder."""
     names = {path.stem for folder in _user_folders() for path in folder.glob("*.yaml")}
     return tuple(sorted(names - set(list_wires())))
 
 
 def device_file(name_or_path: str | Path) -> Path:
-    """Return the YAML file of a device, by its name or its path.
-
-    Raises:
-        InputError: no such device or file, several folders hold a device of this name, or ENDOPILOT_DEVICES names no
-            folder.
-    """
+    """Return the YAML file of a device, by its name or its path; InputError for none, or several folders that hold the
+    name."""
     folders = (_SHIPPED, *_user_folders())
     return named_file("device", name_or_path, folders, lambda: (*list_wires(), *user_devices()))
 
@@ -55,11 +48,8 @@ def device_file(name_or_path: str | Path) -> Path:
 def named_file(
     kind: str, name_or_path: str | Path, folders: Sequence[Path], names: Callable[[], Sequence[str]]
 ) -> Path:
-    """Return a YAML file of some kind, by its name in one of some folders, or by its path.
-
-    Raises:
-        InputError: no such name or file, or several folders hold the name.
-    """
+    """Return a YAML file of some kind, by its name in one of some folders, or by its path; InputError as for
+    `device_file`."""
     files = [path for folder in folders if there(path := folder / f"{name_or_path}.yaml")]
     if len(files) > 1:
         raise InputError(f"{kind} '{name_or_path}': {' and '.join(map(str, files))} both hold it; rename yours")
@@ -84,11 +74,7 @@ def is_shipped(path: Path) -> bool:
 
 
 def device_yaml(name_or_path: str | Path) -> tuple[Path, str]:
-    """Return the YAML file of a device, by its name or its path, and the text in it.
-
-    Raises:
-        InputError: no such device, several of this name, or a file that is no text.
-    """
+    """Return the YAML file of a device, as `device_file`, and the text in it; InputError if it is no text."""
     path = device_file(name_or_path)
     return path, read_text(path, what="device's YAML file")
 

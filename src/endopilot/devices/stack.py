@@ -145,12 +145,8 @@ def column_prefixes(devices: int) -> tuple[str, ...]:
 def lines_from_tips(
     nodes: Float[np.ndarray, "n 3"], inserted_length_mm: Float[np.ndarray, "devices"]
 ) -> list[Float[np.ndarray, "_ 3"]]:
-    """Return the line that telescoping devices share, as each of them has it: from its own tip on.
-
-    Args:
-        nodes: of the line, from the foremost tip on, LPS mm.
-        inserted_length_mm: inserted length of each device; the foremost tip is that of the largest.
-    """
+    """Return the line that telescoping devices share (nodes from the foremost tip on, LPS mm), as each has it: from its
+    own tip on."""
     behind = inserted_length_mm.max() - inserted_length_mm
     along = length_along(nodes)
     return [
@@ -162,13 +158,8 @@ def lines_from_tips(
 def shown_part(
     nodes: Float[np.ndarray, "n 3"], deepest_mm: float, behind_mm: float = SHOWN_BEHIND_MM
 ) -> Float[np.ndarray, "shown 3"]:
-    """Return what pictures show of a line: from its tip to a little behind the ostium, LPS mm.
-
-    Args:
-        nodes: of the line, from the foremost tip on, LPS mm; NaN beyond its end.
-        deepest_mm: inserted length of the device with that tip.
-        behind_mm: how much of it is shown behind the ostium, mm.
-    """
+    """Return what pictures show of a line: from its tip, inserted by `deepest_mm`, to `behind_mm` behind the ostium,
+    LPS mm. Nodes are NaN beyond the line's end."""
     nodes = nodes[np.isfinite(nodes).all(axis=1)]
     return nodes[length_along(nodes) <= deepest_mm + behind_mm]
 

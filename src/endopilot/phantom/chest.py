@@ -24,10 +24,9 @@ _SLAB = 8
 
 @dataclass(frozen=True, eq=False)
 class Organ:
-    """One organ on the coarse grid.
+    """One organ of a tissue on the coarse grid.
 
     Attributes:
-        name: of which tissue.
         depth: signed distance to its surface, mm, positive inside, indexed [k, j, i].
         clearance_mm: the organ keeps this distance from coronary lumens; None where it may touch them.
     """
@@ -80,14 +79,10 @@ def organs(
     generator: np.random.Generator,
     appendage_mm: float = 0.0,
 ) -> tuple[Organ, ...]:
-    """Return the organs in painting order, from the chest wall to the blood pools.
+    """Return the organs in painting order, from the chest wall to the blood pools, their surfaces uneven at random.
 
-    Args:
-        heart: from `place`.
-        grid: the patient's positions of the coarse grid, mm.
-        around_vessels: signed distance to the surface of the fat that the coronaries need, mm.
-        generator: random stream of the surfaces' unevenness.
-        appendage_mm: the left atrial appendage is wider by this, mm, and touches the coronary walls; 0: it does not.
+    `around_vessels` is the signed distance to the surface of the fat that the coronaries need. The left atrial
+    appendage is wider by `appendage_mm`, and touches the coronary walls; at 0 it does not.
     """
     slabs = [
         heart.to_reference(slab.reshape(-1, 3)).reshape(slab.shape).astype(np.float32)
@@ -137,10 +132,8 @@ def organs(
 
 
 def other_coronary(heart: HeartFit, tree: VesselTree) -> tuple[Centerline, ...]:
-    """Return the first part of the other coronary artery, by the mean diameters of Dodge 1992.
-
-    Beside a right tree the left main (4.5 mm), LAD (3.7 mm) and LCx (3.4 mm); beside a left tree the right coronary
-    artery (4.0 mm) nearly to the acute margin.
+    """Return the first part of the other coronary artery, by the mean diameters of Dodge 1992: beside a right tree left
+    main (4.5 mm), LAD (3.7 mm) and LCx (3.4 mm); beside a left tree the right one (4.0 mm) nearly to the acute margin.
     """
     lines = []
     for waypoints, begin, end in _RIGHT_CORONARY if is_left(tree) else _LEFT_CORONARY:
@@ -152,10 +145,8 @@ def other_coronary(heart: HeartFit, tree: VesselTree) -> tuple[Centerline, ...]:
 
 
 def cardiac_veins(heart: HeartFit, tree: VesselTree, *, touching: bool = False) -> tuple[Centerline, ...]:
-    """Return the small cardiac vein beside segments 2 and 3, a vein beside the distal artery, the coronary sinus.
-
-    Where they touch the artery, only its wall lies between.
-    """
+    """Return the small cardiac vein beside segments 2 and 3, a vein beside the distal artery, the coronary sinus. Where
+    they touch the artery, only its wall lies between."""
     line, crux = tree.longest_path(), _crux_abscissa(tree)
     lines = []
     if is_left(tree):

@@ -40,12 +40,7 @@ _SWAY_MM = 1.5
 
 @dataclass(frozen=True, eq=False)
 class Metal:
-    """Metal as points of matter.
-
-    Attributes:
-        points: LPS mm.
-        mass: excess CT number times volume of each point, HU mm³.
-    """
+    """Metal as points of matter, LPS mm, and of each its excess CT number times volume, HU mm³."""
 
     points: Float[np.ndarray, "n 3"]
     mass: Float[np.ndarray, "n"]
@@ -99,16 +94,10 @@ def stents(lines: Sequence[Centerline], count: int, generator: np.random.Generat
 def add_metal(
     image: Float32[np.ndarray, "nz ny nx"], grid: Grid, metal: Sequence[Metal], generator: np.random.Generator
 ) -> None:
-    """Add metal and its streaks to the image, in place.
+    """Add leads and stents, and their streaks, to an image in HU, in place.
 
     Streaks are what filtered back-projection makes of the error of the line integrals: behind metal the beam hardens,
-    and metal that moves is elsewhere from view to view.
-
-    Args:
-        image: HU.
-        grid: its voxels.
-        metal: leads and stents.
-        generator: random stream of the motion's directions.
+    and metal that moves, in random directions, is elsewhere from view to view.
     """
     points = np.concatenate([part.points for part in metal])
     mass = np.concatenate([part.mass for part in metal])

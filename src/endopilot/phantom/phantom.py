@@ -237,16 +237,8 @@ def _plaque(
     place: tuple[float, float],
     semi_axes: tuple[float, float, float],
 ) -> _Plaque:
-    """Return an ellipsoid beside the line.
-
-    Args:
-        grid: the image's voxels.
-        tissue: what it consists of.
-        line: the vessel's centerline.
-        index: at which of its points.
-        place: how far from the line, mm, and at which angle from the line's normal, rad.
-        semi_axes: along the line, away from it and around it, mm.
-    """
+    """Return an ellipsoid beside a point of the line: how far from it (mm), at which angle from its normal (rad), and
+    the semi-axes along the line, away from it and around it, mm."""
     tangent = line.points[index + 1] - line.points[index - 1]
     tangent = tangent / np.linalg.norm(tangent)
     outward = np.cos(place[1]) * line.normals[index] + np.sin(place[1]) * np.cross(tangent, line.normals[index])

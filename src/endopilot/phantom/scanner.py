@@ -24,17 +24,10 @@ def smear(
     motion_mm: float,
     generator: np.random.Generator,
 ) -> None:
-    """Average the heart over the path of its motion during the scan, in place; the chest stays.
+    """Average the heart over the path of its motion during the scan, in a random direction, in place; the chest stays.
 
     The heart rests longest at the ends of the path, so that edges across it show a ghost. The anatomy is the middle.
-
-    Args:
-        image: HU.
-        painter: of this image.
-        heart: depth below the pericardium on the painter's coarse grid, mm.
-        spacing_mm: voxel size along k, j and i, mm.
-        motion_mm: length of the path, mm; its direction is random.
-        generator: random stream.
+    `heart` is the depth below the pericardium on the painter's coarse grid, mm; voxel sizes are along k, j and i.
     """
     path = generator.normal(size=3)
     path *= motion_mm / (np.linalg.norm(path) * np.array(spacing_mm))
@@ -58,16 +51,8 @@ def misregister(
 ) -> None:
     """Displace the heart from one slab of slices to the next, in place, as heart beats that differ do; the chest stays.
 
-    The heart lies in turn half a step to either side of its mean place, along one random direction.
-
-    Args:
-        image: HU.
-        painter: of this image.
-        heart: depth below the pericardium on the painter's coarse grid, mm.
-        spacing_mm: voxel size along k, j and i, mm.
-        step_mm: distance between the heart's places in neighbouring slabs, mm.
-        slab_mm: height of the slabs, mm; the first one's is random.
-        generator: random stream.
+    The heart lies in turn half of `step_mm` to either side of its mean place, along one random direction; the first
+    slab's height is random. `heart` is as for `smear`.
     """
     path = generator.normal(size=3)
     path *= 0.5 * step_mm / (np.linalg.norm(path) * np.array(spacing_mm))
@@ -101,15 +86,8 @@ def scan(
 ) -> None:
     """Add noise and blur, in place: the reconstruction kernel shapes the image and the noise's grain alike.
 
-    Iterative reconstruction leaves a coarser grain: it takes the noise's fine part away and the edges' not.
-
-    Args:
-        image: HU.
-        spacing_mm: voxel size along k, j and i, mm.
-        psf_mm: width of the point-spread function at half its height, mm.
-        noise_hu: standard deviation of the noise in the result, HU.
-        grain_mm: additional width of the noise's grain at half its height, mm.
-        generator: random stream.
+    Iterative reconstruction leaves a coarser grain: it takes the noise's fine part away and the edges' not. `psf_mm`
+    and the additional `grain_mm` are widths at half height; `noise_hu` is the standard deviation in the result.
     """
     sigmas = [psf_mm / np.sqrt(8 * np.log(2)) / step for step in spacing_mm]
     if grain_mm == 0:
