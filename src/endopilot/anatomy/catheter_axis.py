@@ -14,7 +14,7 @@ from endopilot.types import Anatomy, Insertion
 
 
 def turned_axis(axis: Float[np.ndarray, "3"], tilt_deg: float, side_deg: float) -> Float[np.ndarray, "3"]:
-    """Return an axis turned by `tilt_deg` to the side `side_deg`, degrees around it from the first of its `cross_axes`."""
+    """Return an axis turned by `tilt_deg` to the side `side_deg`, degrees about it from the first `cross_axes`."""
     one, two = (side[0] for side in cross_axes(axis[None]))
     tilt, side = np.radians(tilt_deg), np.radians(side_deg)
     return np.cos(tilt) * axis + np.sin(tilt) * (np.cos(side) * one + np.sin(side) * two)
@@ -30,8 +30,7 @@ def lean_between(axis: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) ->
 def carried(
     across: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
-    """Return where the shortest turn from an axis to another takes a unit vector across the first; it stays where they
-    are opposite."""
+    """Return where the shortest turn between axes takes a vector across the first; it stays if they are opposite."""
     cosine = float(axis @ other)
     turned = across - (across @ other) / (1.0 + cosine) * (axis + other) if cosine > -1 + 1e-12 else across
     turned = turned - (turned @ other) * other

@@ -48,7 +48,7 @@ def tortuosity(points: Float[np.ndarray, "n 3"]) -> float:
 def parallel_normals(
     tangent: Float[np.ndarray, "n 3"], first: Float[np.ndarray, "3"] | None = None
 ) -> Float[np.ndarray, "n 3"]:
-    """Return unit vectors perpendicular to the tangents, carried along without twist from about the direction `first`."""
+    """Return unit vectors perpendicular to the tangents, carried without twist from about the direction `first`."""
     start = np.eye(3)[np.argmin(np.abs(tangent[0]))] if first is None else first
     normals = np.empty_like(tangent)
     for i in range(len(tangent)):
@@ -91,8 +91,7 @@ class Wiggle:
     def apply(
         self, points: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"], amplitude: float, quiet_mm: float
     ) -> Float[np.ndarray, "n 3"]:
-        """Displace a curve along unit normals that turn smoothly; the first `quiet_mm` mm fade in, so that the start
-        keeps its place."""
+        """Displace a curve along smoothly turning unit normals; the start keeps its place: `quiet_mm` fade in."""
         tangent = tangents(points)
         along = length_along(points)
         sines = np.sin(along[:, None, None] * self.wave_number[:, None] + self.phase)

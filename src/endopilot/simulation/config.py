@@ -29,11 +29,8 @@ Processor = Literal["cpu", "cuda"]
 
 
 def core_for(processor: Processor) -> Any:
-    """Return the core's module that steps worlds there; it has the same names as `endopilot._core`.
-
-    Raises:
-        InputError: a GPU is asked for, and this installation or this machine has none.
-    """
+    """Return the core's module that steps worlds there, with the names of `endopilot._core`; InputError where there is
+    no GPU."""
     if processor == "cpu":
         return _core
     try:
@@ -51,11 +48,7 @@ def core_for(processor: Processor) -> Any:
 
 @contextmanager
 def gpu_errors(processor: Processor) -> Iterator[None]:
-    """Turn what a GPU reports, such as too little memory, into an error for people.
-
-    Raises:
-        InputError: the GPU failed.
-    """
+    """Turn what a GPU reports, such as too little memory, into an InputError."""
     try:
         yield
     except RuntimeError as error:

@@ -77,22 +77,11 @@ def random_controls(
     first: int = 0,
     devices: int = 1,
 ) -> tuple[Float[np.ndarray, "n devices 2"], Float[np.ndarray, "n samples devices 2"]]:
-    """Draw random navigations; sequence i is the same whatever `n_sequences`.
+    """Draw random navigations, and return their start (Δ mm, φ rad) and controls (mm/s, rad/s) for each device.
 
-    Args:
-        config: their distribution.
-        n_sequences: number of navigations.
-        n_samples: number of sample periods of each.
-        seed: key of the random streams.
-        max_inserted_length_mm: largest inserted length that a navigation reaches, mm; the smallest is 0.
-        first: index of the first of them.
-        devices: number of devices; each is driven independently of the others, with the same distribution.
-
-    Returns:
-        Initial (Δ mm, φ rad), and controls (mm/s, rad/s), of each device.
-
-    Raises:
-        InputError: a number that is not positive, or a negative seed.
+    Sequence i, counted from `first`, is the same whatever `n_sequences`; each of `devices` is driven independently of
+    the others. Inserted lengths lie between 0 and `max_inserted_length_mm`. Raises InputError for a number that is not
+    positive.
     """
     if n_sequences < 1 or n_samples < 1:
         raise InputError(f"random controls: {n_sequences} sequences of {n_samples} samples; give at least 1 of 1")
@@ -123,17 +112,11 @@ def random_controls(
 def free_wire_load(
     velocity: Float[np.ndarray, "*n 2"], *, radius_mm: float, friction_n: float, drag_n_s_mm: float, stick_mm_s: float
 ) -> Float[np.ndarray, "*n 2"]:
-    """Return the drive's force (N) and torque (N·mm) that move a wire through the introducer alone at some velocity.
+    """Return the drive's force (N) and torque (N·mm) that move a wire through the introducer alone at (Δ̇ mm/s, φ̇
+    rad/s).
 
-    The wire's surface moves by v = (Δ̇, r φ̇) past the valve, whose smoothed Coulomb friction F and drag c oppose it with
-    F v / √(v² + ε²) + c v, as the rod core has it.
-
-    Args:
-        velocity: Δ̇ (mm/s) and φ̇ (rad/s).
-        radius_mm: of the wire, r.
-        friction_n: F.
-        drag_n_s_mm: c.
-        stick_mm_s: ε, velocity below which friction falls off.
+    The wire's surface moves by v = (Δ̇, r φ̇) past the valve, whose smoothed Coulomb friction F and drag c oppose it
+    with F v / √(v² + ε²) + c v, as the rod core has it.
     """
     surface = velocity * np.array([1.0, radius_mm])
     size = np.sqrt((surface**2).sum(axis=-1, keepdims=True) + stick_mm_s**2)
@@ -168,13 +151,8 @@ def _manoeuvre(config: ControlConfig, generator: np.random.Generator) -> Float[n
 
 @dataclass(frozen=True, eq=False)
 class ScriptedControls:
-    """Controls from a file.
-
-    Attributes:
-        initial: (Δ mm, φ rad) of each world and device before the first period.
-        control: mm/s and rad/s, likewise.
-        period_s: time that each control holds, s.
-    """
+    """Controls from a file: the start (Δ mm, φ rad) and velocities (mm/s, rad/s) of each world and device, each held
+    for `period_s`."""
 
     initial: Float[np.ndarray, "worlds devices 2"]
     control: Float[np.ndarray, "worlds samples devices 2"]
@@ -182,20 +160,13 @@ class ScriptedControls:
 
 
 def read_controls_csv(path: Path, *, devices: int = 1) -> ScriptedControls:
-    """Read scripted controls.
+    """Read scripted controls of so many devices.
 
     The columns are `time_s` (end of each period, all of one length: 0.5, 1.0, ... or 0.05, 0.1, ...),
     `translation_mm_s` and `rotation_rad_s`; optional are `world` (several navigations in one file, by whole numbers),
-    and `inserted_length_mm` with `rotation_rad` (state at the end of each period, from which the initial one follows;
-    0 if they are not there). So a rollout that was written as CSV can be simulated again. Columns of catheters begin
-    with `catheter_1_` and `catheter_2_`. `csv_file` says which ways of writing a CSV are read.
-
-    Args:
-        path: the file.
-        devices: how many devices it drives.
-
-    Raises:
-        InputError: not such a table; the line names file, column, row and mend.
+    and `inserted_length_mm` with `rotation_rad` (state at the end of each period, from which the initial one follows; 0
+    if they are not there). So a rollout that was written as CSV can be simulated again. Columns of catheters begin with
+    `catheter_1_` and `catheter_2_`. Raises InputError for another table (`csv_file`).
     """
     prefixes = column_prefixes(devices)
     driven = [prefix + name for prefix in prefixes for name in _COLUMNS[1:]]

@@ -58,18 +58,9 @@ def run_along(
     run: Callable[..., dict[str, np.ndarray]],
     advance: Advance | None = None,
 ) -> dict[str, np.ndarray]:
-    """Run worlds step by step, and before each multiply the friction of every contact by the factor where it lies.
-
-    A step that the core shortens, as in a snap, ends with the friction that the devices have by themselves.
-
-    Args:
-        group: the worlds.
-        control: of each sample.
-        steps: of a sample.
-        factors: as in `factor_at`.
-        run: runs the worlds, as the core's `run` does.
-        advance: called with the number of samples of all worlds that were simulated since the last call.
-    """
+    """Run worlds step by step with the core's `run`, and before each multiply the friction of every contact by the
+    factor (`factor_at`) where it lies. A step that the core shortens, as in a snap, ends with the devices' own
+    friction."""
     samples = []
     for sample in range(control.shape[1]):
         now, results = np.ascontiguousarray(control[:, sample : sample + 1]), []

@@ -30,14 +30,8 @@ _LONGEST_CELL = 40
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Columns of numbers from a file.
-
-    Attributes:
-        path: the file.
-        values: the numbers of each column that is there, by name.
-        lines: the line of the file that each row ends on.
-        header: the names of all columns of the file, in small letters.
-    """
+    """Columns of numbers by name, the line of the file that each row ends on, and the names of all columns, in small
+    letters."""
 
     path: Path
     values: dict[str, Float[np.ndarray, "rows"]]
@@ -52,17 +46,8 @@ class Columns:
 def read_columns(
     path: Path, needed: Sequence[str], optional: Sequence[str] = (), *, sparse: Sequence[str] = ()
 ) -> Columns:
-    """Read columns of finite numbers from a CSV file.
-
-    Args:
-        path: the file.
-        needed: names of the columns that must be there.
-        optional: names of others to read where they are there; all else in the file is left out.
-        sparse: likewise; cells of these may be empty, and are NaN.
-
-    Raises:
-        InputError: not such a table; the line names file, row, column and mend.
-    """
+    """Read columns of finite numbers from a CSV file: needed ones, optional ones, and sparse ones, whose cells may be
+    empty (NaN). Raises InputError for another table; the line names file, row, column and mend."""
     text = read_text(path, what="CSV file", largest=_LARGEST)
     marked = re.match(r"sep=(.)\r?\n", text, flags=re.IGNORECASE)  # by which Excel finds the separator
     skipped = 1 if marked else 0

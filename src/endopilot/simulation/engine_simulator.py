@@ -50,23 +50,12 @@ _BASE_INERTIA = 1e6
 
 
 class EngineWire:
-    """One wire in MuJoCo, from a base that follows a drive to its tip.
-
-    Attributes:
-        inserted_mm: length ahead of the ostium, mm.
-        rotation_rad: of the base, rad.
-    """
+    """One wire in MuJoCo, from a base that follows a drive to its tip: inserted length ahead of the ostium, and the
+    base's rotation."""
 
     def __init__(self, anatomy: Anatomy, rod: RodLayout) -> None:
-        """Lay the wire out straight on the guiding catheter's axis, its tip at the ostium.
-
-        Args:
-            anatomy: the vessel.
-            rod: nodes and stiffnesses.
-
-        Raises:
-            ModuleNotFoundError: MuJoCo is not installed; the message says how it is.
-        """
+        """Lay the wire out straight on the guiding catheter's axis, its tip at the ostium; ModuleNotFoundError without
+        MuJoCo."""
         with extra_named("engine: mujoco"):
             self._mujoco: Any = importlib.import_module("mujoco")
         wall = wall_triangles(anatomy.distance_map, anatomy.insertion, 2 * anatomy.catheter_radius_mm)
@@ -147,13 +136,8 @@ class EngineWire:
 def wall_triangles(
     field: DistanceMap, insertion: Insertion, clear_mm: float
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]:
-    """Return the surface `SHELL_MM` outside a lumen, LPS mm, without the guiding catheter behind the ostium.
-
-    Args:
-        field: of the vessel with its catheter.
-        insertion: the ostium.
-        clear_mm: no triangle stays this near to the catheter's axis.
-    """
+    """Return the surface `SHELL_MM` outside a lumen, LPS mm, without the guiding catheter behind the ostium; no
+    triangle stays within `clear_mm` of the catheter's axis."""
     from skimage.measure import marching_cubes
 
     extent = (np.array(field.values.shape[::-1]) - 1) * field.spacing_mm
@@ -222,23 +206,12 @@ _THROUGH_WALL = 3
 
 
 class EngineSimulator(Simulator):
-    """One wire in one vessel that lies still, moved by MuJoCo; all else is read as of any simulator.
-
-    The drive makes every motion that it is asked for, whatever force it takes.
-    """
+    """One wire in one vessel that lies still, moved by MuJoCo; all else is read as of any simulator. The drive makes
+    every motion that it is asked for, whatever force it takes."""
 
     def __init__(self, anatomy: Anatomy, device: Stack, *, config: SimulatorConfig) -> None:
-        """Lay the wire out.
-
-        Args:
-            anatomy: the vessel.
-            device: the wire.
-            config: settings; of the rod core those of its elements and its introducer count.
-
-        Raises:
-            InputError: there are catheters, or the wall yields, or friction differs along the vessel.
-            ModuleNotFoundError: MuJoCo is not installed.
-        """
+        """Lay the wire out by the rod core's elements and introducer. Raises InputError where there are catheters, the
+        wall yields, or friction differs along the vessel; ModuleNotFoundError without MuJoCo."""
         if device.catheters or config.compliant_wall_n_mm2 is not None or config.friction_along:
             raise InputError(
                 "engine: mujoco; it has a wire alone in a rigid wall of one friction; leave the others out"
@@ -247,11 +220,7 @@ class EngineSimulator(Simulator):
         super().__init__(anatomy, device, config=config)
 
     def set_state(self, state: SimulatorState) -> None:
-        """Refuse another state: only the core's can be restored.
-
-        Raises:
-            InputError: always.
-        """
+        """Raise InputError: only the core's state can be restored."""
         raise InputError("state: another engine's state is not restored; drive it again from its start")
 
     def _run(

@@ -34,17 +34,12 @@ _APART_MM = 0.1
 
 
 def make_wall(anatomy: Anatomy, stack: Stack, config: SimulatorConfig) -> Lumen:
-    """Return an anatomy's wall as the core wants it.
+    """Return an anatomy's wall as the core wants it for a stack.
 
     A spline rounds the ridge off that the distance to the wall has on a vessel's axis, by up to half the map's spacing.
     To a catheter hardly narrower than the vessel or the guiding catheter, the wall then seems to leave no room where
     there is some. For those the spline's grid is finer, and the inscribed spheres of the centerline and the guiding
     catheter make it sharp.
-
-    Args:
-        anatomy: the vessel.
-        stack: the wire, and the catheters around it.
-        config: settings of the rod core.
     """
     radius_mm = stack.outer_radius_mm
     field = _stiffened(anatomy, radius_mm, config.wall_along) if config.wall_along else anatomy.distance_map
@@ -64,13 +59,8 @@ def make_wall(anatomy: Anatomy, stack: Stack, config: SimulatorConfig) -> Lumen:
 def factor_at(
     abscissa_mm: Float[np.ndarray, "*n"], tree: VesselTree, factors: Sequence[float]
 ) -> Float[np.ndarray, "*n"]:
-    """Return a factor that varies along a vessel.
-
-    Args:
-        abscissa_mm: where, along the path from the ostium; behind it, in the guiding catheter, the first counts.
-        tree: centerlines.
-        factors: at even distances from the ostium to the end of the longest path, linear between.
-    """
+    """Return a factor at abscissae, mm; `factors` are at even distances from the ostium, and behind it, to the end of
+    the longest path, linear between."""
     ends = np.linspace(0.0, float(tree.longest_path().abscissa[-1]), len(factors)) if len(factors) > 1 else [0.0]
     return np.interp(abscissa_mm, ends, factors)
 
@@ -103,10 +93,8 @@ def _leaves_room(wall: Lumen, anatomy: Anatomy, radius_mm: float) -> bool:
 
 
 def _inscribed_spheres(wall: Lumen, anatomy: Anatomy) -> Float[np.ndarray, "lines 8"]:
-    """Return the inscribed spheres along the centerlines and the guiding catheter's axis, as `make_lumen` takes them.
-
-    None is wider than the wall, rounded off as it may be, allows.
-    """
+    """Return the inscribed spheres along the centerlines and the guiding catheter's axis, as `make_lumen` takes them,
+    none wider than the rounded wall allows."""
     rounded_off = 0.5 * anatomy.distance_map.spacing_mm
     lines = []
     for branch in anatomy.tree.branches:
@@ -128,17 +116,12 @@ _walls: dict[tuple[Any, ...], Lumen] = {}
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """The worlds with an equal anatomy and equal devices.
+    """The worlds with an equal anatomy and equal devices; `anatomy` and `stack` are those of the first.
 
     Attributes:
-        anatomy: the vessel, as the first of them has it.
-        stack: the wire and its catheters, as the first of them has it.
-        rod: its nodes and stiffnesses.
-        lumen: the wall, as the core has it.
-        wall: how far outside the wall it goes, mm, and how the stiffness of the wall varies along the vessel.
-        motion: of the vessel, as the core has it; None if it lies still.
-        simulation: the worlds, as the core has them.
-        index: their numbers, ascending.
+        wall: how far outside the wall the lumen goes, mm, and how the stiffness of the wall varies along the vessel.
+        motion: of the vessel, as the core has it, as are `lumen` and `simulation`; None if it lies still.
+        index: the worlds' numbers, ascending.
         path_mm: length of the vessel's longest path.
         longest_mm: inserted length that the wire is laid out for.
         project: projection to the vessel's centerline.
@@ -189,17 +172,9 @@ def make_groups(
 ) -> list[Group]:
     """Return the groups of worlds, with their wires laid out and at the ostium.
 
-    Args:
-        anatomies: of each world.
-        stacks: wire and catheters of each world.
-        motion: of every vessel about its ostium; None if they lie still.
-        config: settings of the rod core.
-        sharing: groups whose lumens and projections are taken rather than prepared again.
-        reach_mm: inserted length that devices are laid out for, mm; the far end of each vessel if that is more.
-
-    Raises:
-        InputError: a device that does not fit its anatomy or the catheter around it; a distance map that is not finite,
-            or negative at the ostium; more worlds than the memory holds.
+    Vessels move about their ostium, or lie still without motion; lumens and projections of `sharing` are not prepared
+    again; devices are laid out for `reach_mm`, or the far end of each vessel if that is more. Raises InputError as
+    `Simulator` does.
     """
     core, wall = core_for(config.processor), (config.wall_reach_mm, config.wall_along)
     prepared = [group for group in sharing if isinstance(group.lumen, core.Lumen) and group.wall == wall]

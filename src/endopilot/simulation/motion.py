@@ -117,13 +117,8 @@ def contracted_share(phase: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
 
 
 def motion_named(name: MotionName, seed: int | None = None) -> Motion | None:
-    """Return a motion by its name; None for a vessel that lies still.
-
-    Args:
-        name: "still", "breathing", "heartbeat" or "both".
-        seed: draws the amplitudes of one patient from the published distributions, within the published ranges; the
-            published means if None.
-    """
+    """Return a motion by its name; None for "still". The seed draws one patient's amplitudes from the published
+    distributions, within the published ranges; without it they are the published means."""
     if name == "still":
         return None
     motion = Motion() if seed is None else draw_motion(seed)
@@ -141,11 +136,8 @@ def motion_named(name: MotionName, seed: int | None = None) -> Motion | None:
 
 
 def published_mean(motion: Motion) -> Motion | None:
-    """Return what is published of a patient's motion: the mean amplitudes of what moves, with the patient's periods.
-
-    Args:
-        motion: the patient's own; None is returned where nothing of it moves.
-    """
+    """Return the published mean amplitudes of what moves in a patient's motion, with the patient's periods; None if
+    nothing does."""
     beats = bool(motion.annulus_mm or motion.heart_volume_share or motion.heart_rotation_deg)
     shifts = motion.breathing_caudal_mm or motion.breathing_anterior_mm
     breathes = bool(shifts or motion.breathing_dorsal_deg or motion.breathing_dextral_deg)

@@ -34,14 +34,11 @@ class RodLayout:
 
     Attributes:
         abscissa_mm: distance of the nodes from the tip, mm.
-        shear_n: shear stiffness κGA of the elements, N.
-        stretch_n: axial stiffness EA of the elements, N.
-        bend_n_mm2: EI at the nodes, N·mm².
-        twist_n_mm2: GJ at the nodes, N·mm².
+        shear_n: shear stiffness κGA of the elements, N; `stretch_n` is EA, N.
+        bend_n_mm2: EI at the nodes, N·mm²; `twist_n_mm2` is GJ.
         rest_curvature: curvature and twist of the unloaded rod at the nodes, in the elements' axes, rad/mm.
         radius_mm: outer radius at the nodes, mm.
-        drag_n_s_mm: viscous drag of the nodes, N·s/mm.
-        spin_drag_n_mm_s: viscous drag of the elements' rotation, N·mm·s.
+        drag_n_s_mm: viscous drag of the nodes, N·s/mm; `spin_drag_n_mm_s` of the elements' rotation, N·mm·s.
     """
 
     abscissa_mm: Float[np.ndarray, "n"]
@@ -70,16 +67,11 @@ class RodLayout:
 
 
 def lay_out(device: Wire, *, element_mm: float, length_mm: float) -> RodLayout:
-    """Lay a device out as a rod, with shorter elements near the tip.
+    """Lay a device out as a rod of at least `length_mm` and two elements behind it, with shorter elements near the tip.
 
     The nodes depend on the device and on `element_mm` alone; a longer `length_mm` only adds nodes at the base. So
-    worlds do not notice what other worlds need.
-
-    Args:
-        device: the wire.
-        element_mm: length of the elements at the tip, mm. It is taken somewhat shorter, so that the middle of an
-            element lies where the bend of the tip ends: half a joint's bend would act at the wrong place.
-        length_mm: length that the rod must have at least, mm; two more elements are added behind it.
+    worlds do not notice what other worlds need. Elements at the tip are taken somewhat shorter, so that the middle of
+    one lies where the bend of the tip ends: half a joint's bend would act at the wrong place.
     """
     abscissa = _nodes(element_mm, length_mm, device.tip_bend_length_mm)
     length = np.append(np.diff(abscissa), np.diff(abscissa)[-1])

@@ -22,14 +22,8 @@ _TIP = ("tip_abscissa_mm", "tip_offset_mm")
 
 
 class Signal(NamedTuple):
-    """An array of a trajectory's file.
-
-    Attributes:
-        axes: of the array, apart by spaces; numbers are sizes.
-        unit: of its numbers.
-        meaning: what it is.
-        columns: its columns in a table, one for each number of a sample; none if it has no place there.
-    """
+    """An array of a trajectory's file: its axes (apart by spaces; numbers are sizes), unit and meaning, and its columns
+    in a table, one for each number of a sample; none if it has no place there."""
 
     axes: str
     unit: str
@@ -151,14 +145,8 @@ class SolvedOutputs(Outputs):
 
 
 def table_columns(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return signals as columns of a table: those of the wire, those of each catheter, and those of all together.
-
-    Args:
-        values: signals by name; the first axis is that of the table's rows, the second that of devices if there is one.
-
-    Returns:
-        By the columns' names; those of catheters begin with `catheter_1_` and `catheter_2_`.
-    """
+    """Return signals as columns of a table by name, those of catheters beginning with `catheter_1_` and `catheter_2_`.
+    The first axis of a signal is that of the table's rows, the second that of devices if there is one."""
     of_devices = {name: each for name, each in values.items() if SIGNALS[name].of_devices}
     devices = next((each.shape[1] for each in of_devices.values()), 0)
     parts = [

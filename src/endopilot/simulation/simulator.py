@@ -262,16 +262,8 @@ class Simulator(Readout):
         began_s: Float[np.ndarray, "worlds"],
         result: Mapping[str, np.ndarray],
     ) -> Trajectory:
-        """Return what was recorded of these worlds as a trajectory; `run` and `Recorder` do.
-
-        Args:
-            set_up: what they were simulated with.
-            start: Δ (mm) and φ (rad) before the first sample.
-            command: of each sample.
-            period_s: time between samples, s.
-            began_s: `time` before the first sample, s.
-            result: the arrays of `Step`, with an axis of samples, and of `shape` if it was recorded.
-        """
+        """Return as a trajectory what was recorded of these worlds: their start (Δ mm, φ rad), `time` before it, the
+        commands, and the arrays of `Step`, with an axis of samples, and of `shape` if it was recorded."""
         recorded: dict[str, Any] = {name: result[name] for name in Step.__dataclass_fields__}
         times = began_s[:, None] + period_s * np.arange(1, command.shape[1] + 1)
         return Trajectory(

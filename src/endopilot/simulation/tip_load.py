@@ -108,12 +108,8 @@ def simulate_tip_load(wire: Wire | str | Path) -> TipLoadTest:
 
 
 def tip_load_row(device: Wire) -> dict[str, Any]:
-    """Return what `endopilot devices --tip-load` shows of a device.
-
-    The keys: `name`, `ei_tip_n_mm2`, the catalogue's `tip_load_n` and `tip_load_gf`, the simulated test's
-    `tested_tip_load_n` and `tested_tip_load_gf`, and against the catalogue's load the relative `error`, its `bar` and
-    whether it `passed`; None where the catalogue states no load.
-    """
+    """Return what `endopilot devices --tip-load` shows of a device: the catalogue's tip load, the simulated test's, the
+    relative `error`, its `bar` and whether it `passed`; None where the catalogue states no load."""
     load, stated = simulate_tip_load(device).load_n, device.tip_load_n
     error = None if stated is None else load / stated - 1
     shown = device.summary()

@@ -223,10 +223,7 @@ def trajectory_signals(trajectory: Trajectory) -> dict[str, np.ndarray]:
 
 
 def trajectory_table(trajectory: Trajectory) -> pd.DataFrame:
-    """Return one row for each world and sample; column names end in their units where they have one.
-
-    Columns of the wire have plain names; those of catheters begin with `catheter_1_` and `catheter_2_`.
-    """
+    """Return one row for each world and sample, as `table_columns` names them."""
     import pandas as pd
 
     worlds, samples = trajectory.valid.shape

@@ -265,12 +265,8 @@ def drawn_sides(share: float, random: np.random.Generator) -> dict[str, float]:
 
 
 def world_by(change: Mapping[str, float], anatomy: Anatomy) -> World:
-    """Return the world in which some of `QUANTITIES` differ by a share.
-
-    Args:
-        change: share by quantity; what is not there does not differ.
-        anatomy: the vessel, whose lumen at the ostium is the unit of the ostium's place.
-    """
+    """Return the world in which some of `QUANTITIES` differ by a share; the anatomy's lumen at the ostium is the unit
+    of its place."""
     return _differing(change, anatomy, World())
 
 
