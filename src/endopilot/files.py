@@ -313,7 +313,6 @@ def _version(package: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """Return the commit of the source tree this package runs from, or None for an installed wheel."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None
@@ -380,7 +379,6 @@ def _written_out(node: Any, known: dict[int, int]) -> int:
 
 
 def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the object of a JSON file."""
     content = dict(pairs)
     if len(content) < len(pairs):
         names = [name for name, _ in pairs]

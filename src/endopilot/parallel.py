@@ -124,7 +124,6 @@ def _follow() -> None:
 
 
 def _work(work: Callable[..., T], *args: Any, **kwargs: Any) -> T:
-    """Do a piece of work in a worker process; one that is stopped leaves with it, and begins no other."""
     if not gc.isenabled():
         gc.freeze()
         gc.enable()

@@ -72,7 +72,6 @@ class Registry:
         return f"{file.name} sha256:{sha256(file)}" if file.is_file() else name
 
     def _entry_point(self, name: str) -> Any:  # an EntryPoint, of the standard library or of its backport; or None
-        """Return the entry point of a name, or None if the package ships it or no installed package offers it."""
         points = {point.value: point for point in entry_points(group=self.group) if point.name == name}
         owners = [point.dist.name if point.dist else value for value, point in points.items()]
         owners = ["endopilot", *owners] if name in self.shipped else owners

@@ -277,7 +277,6 @@ def _shown(problem: ErrorDetails) -> str:
 
 
 def _path(place: Sequence[int | str]) -> str:
-    """Return where a field is, such as "cost.tip_weight" or "seeds[0][2]"."""
     return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place).removeprefix(".")
 
 
@@ -286,7 +285,6 @@ def _fields(cls: type) -> list[str]:
 
 
 def _fields_at(cls: Any, place: Sequence[int | str]) -> list[str]:
-    """Return the names of the fields of the settings class that lies at a place within another."""
     for part in place:
         if not isinstance(part, int) and part not in getattr(cls, "__pydantic_fields__", {}):
             return []

@@ -369,7 +369,6 @@ class TipProjection:
 
 
 def _add(digest: hashlib._Hash, values: np.ndarray, kind: type[np.generic]) -> None:
-    """Add an array to a hash, with its shape, as little-endian numbers of one kind."""
     digest.update(repr(values.shape).encode())
     digest.update(np.ascontiguousarray(values, dtype=np.dtype(kind).newbyteorder("<")).data)
 

@@ -58,7 +58,6 @@ def draw_anatomy(anatomy: Anatomy, path: Path, *, volume: Volume | None = None) 
 
 
 def _draw_tree(anatomy: Anatomy, figure: Any) -> None:
-    """Draw the wall from the front, once coloured by section and once by radius."""
     vertices, faces = _wall(anatomy)
     tree = anatomy.tree
     corners = vertices[faces]
@@ -91,7 +90,6 @@ def _draw_tree(anatomy: Anatomy, figure: Any) -> None:
 
 
 def _list_sections(figure: Any, names: Sequence[str], palette: Any) -> None:
-    """List the sections' colours below the tree, in as many columns as fit beside each other."""
     shown = [name if len(name) <= _LONGEST_NAME else f"{name[: _LONGEST_NAME - 1]}…" for name in names[:_MOST_LISTED]]
     handles = [Patch(color=palette(i), label=plain_text(name)) for i, name in enumerate(shown)]
     if len(names) > len(shown):
@@ -113,7 +111,6 @@ def _wall(anatomy: Anatomy) -> tuple[Float[np.ndarray, "n 3"], Any]:
 
 
 def _draw_straightened(anatomy: Anatomy, line: Centerline, half: float, volume: Volume | None, figure: Any) -> None:
-    """Draw the longest path straightened, in the planes of its normal and binormal."""
     count = max(2, int(line.abscissa[-1] / 0.2))
     at = np.linspace(0.0, float(line.abscissa[-1]), count)
     points, normals, directions = (

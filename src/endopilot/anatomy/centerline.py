@@ -186,7 +186,6 @@ def _joined(
     radius: Float[np.ndarray, "n"],
     step_mm: float,
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
-    """Join a side branch's axis to its parent's by a straight piece, rounded where it meets the axis."""
     start = parent.points[place]
     count = max(1, round(float(np.linalg.norm(points[0] - start)) / step_mm))
     share = np.arange(count)[:, None] / count
@@ -200,7 +199,6 @@ def _joined(
 
 
 def _outside(points: Float[np.ndarray, "n 3"], parent: Line) -> int:
-    """Return the index of the first point from which a side branch stays outside its parent's inscribed spheres."""
     distance, nearest = KDTree(parent.points).query(points)
     inside = np.flatnonzero(distance < parent.radius[nearest])
     return int(inside[-1]) + 1 if len(inside) else 1

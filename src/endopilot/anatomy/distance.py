@@ -63,7 +63,6 @@ def distance_map_from_spheres(
 
 
 def _join(distance_map: DistanceMap, lines: Sequence[Centerline], band: float, fillet_mm: float) -> None:
-    """Join the lumen of some lines' tubes to a map that has room for it."""
     values, spacing, origin = distance_map.values, distance_map.spacing_mm, distance_map.origin_mm
     window = _window(Centerline.joined(lines), origin, spacing, values.shape, band)
     corner = origin + spacing * np.array([part.start for part in window[::-1]])
@@ -143,7 +142,6 @@ def sample(distance_map: DistanceMap, points: Float[np.ndarray, "n 3"], *, order
 def _grow(
     distance_map: DistanceMap, lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"], margin: float, fill: float
 ) -> DistanceMap:
-    """Return a copy of the map whose grid covers the box from `lower` to `upper` with `margin` around it."""
     spacing, origin = distance_map.spacing_mm, distance_map.origin_mm
     size = np.array(distance_map.values.shape[::-1])
     before = np.maximum(0, np.ceil((origin - (lower - margin)) / spacing)).astype(int)
@@ -156,7 +154,6 @@ def _grow(
 def _window(
     line: Centerline, origin: Float[np.ndarray, "3"], spacing: float, shape: tuple[int, ...], band: float
 ) -> tuple[slice, slice, slice]:
-    """Return the part of the grid that a line's tube and band can reach."""
     margin = line.radius[:, None] + band
     first = np.floor(((line.points - margin).min(axis=0) - origin) / spacing).astype(int)
     last = np.ceil(((line.points + margin).max(axis=0) - origin) / spacing).astype(int) + 1
@@ -204,7 +201,6 @@ def _tube_field(
 
 
 def _thinned(line: Centerline, step: float) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
-    """Return the points and radii of a line, leaving out points that lie closer together than `step`."""
     length = length_along(line.points)
     if len(length) < 3 or length[-1] < step:
         return line.points, line.radius

@@ -222,7 +222,6 @@ def _wall(
 
 
 def _short(tree: VesselTree, vessel: str) -> list[str]:
-    """Say so if a coronary artery ends sooner than any does."""
     longest = float(tree.longest_path().abscissa[-1])
     if vessel == "generic" or longest >= SHORT_MM:
         return []
@@ -246,14 +245,12 @@ def _other_side(tree: VesselTree, vessel: str) -> list[str]:
 
 
 def _dominance(tree: VesselTree, inlet: CoronaryInlet | None, short: list[str]) -> str | None:
-    """Return the dominance: which of both arteries reaches the crux, or what a single one's tree shows; else None."""
     if inlet is not None and inlet.other is not None:
         return None if inlet.crux is None else inlet.crux.dominance
     return None if short else dominance(tree)
 
 
 def _source_record(source: AnatomySource) -> dict[str, str | None]:
-    """Return what the anatomy was made from: its file and hash, or the hash of arrays that came from no file."""
     digest, content = source.sha256, source.content
     if not digest:
         arrays: list[np.ndarray]

@@ -77,7 +77,6 @@ def _crux_near(labeller: Labeller, route: tuple[int, ...], passed: float | None)
 
 
 def _forks(labeller: Labeller, route: tuple[int, ...]) -> list[int]:
-    """Return the branches of a route at whose ends two or more named vessels leave."""
     return [branch for branch in route if len(labeller.major(branch, MAJOR_MM)) >= 2]
 
 
@@ -244,6 +243,5 @@ def _left_crux(labeller: Labeller, route: tuple[int, ...]) -> float:
 
 
 def _from_crux(labeller: Labeller, leaf: int) -> float:
-    """Return how near the path to an end comes to the known crux, mm."""
     assert labeller.crux is not None
     return float(np.linalg.norm(labeller.tree.path(leaf).points - labeller.crux.position, axis=1).min())

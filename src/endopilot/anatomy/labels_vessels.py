@@ -123,7 +123,6 @@ def label_portal(labeller: Labeller) -> None:
 
 
 def _parting(labeller: Labeller, one: int, other: int) -> float:
-    """Abscissa at which the paths to two ends separate, mm."""
     common = [branch for branch in labeller.tree.route(one) if branch in labeller.tree.route(other)]
     return float(labeller.tree.branches[common[-1]].centerline.abscissa[-1])
 

@@ -95,7 +95,6 @@ def _rivals(
 
 
 def _spacing(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """Return the length of the segment from each vertex of a line on; of that before it at the last one, mm."""
     if len(points) == 1:
         return np.full(1, 1e-9)
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)

@@ -100,7 +100,6 @@ def _draw(
 
 
 def _aorta(generator: np.random.Generator, height_mm: float, width_mm: float) -> Float[np.ndarray, "n 3"]:
-    """Return the aorta's axis from the descending aorta to the root: half an ellipse between two straight legs."""
     turn = np.linspace(np.pi, 0.0, 24)
     across, up = 0.5 * width_mm * np.cos(turn), height_mm * np.sin(turn)
     down, root = np.linspace(-_DESCENDING_MM, -8.0, 12), np.linspace(-8.0, -_ASCENDING_MM, 5)

@@ -149,7 +149,6 @@ def _rounded(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
 def _radius(
     generator: np.random.Generator, points: Float[np.ndarray, "n 3"], marks: dict[str, int]
 ) -> tuple[Float[np.ndarray, "n"], float]:
-    """Return the lumen radius along the main line, mm, and the patient's calibre against the average."""
     calibre = branching.truncated(generator, 1.0, 0.12, 0.72, 1.3)
     place = [0, marks["cavernous"], marks["terminus"], marks["terminus"] + 5, marks["M2"], marks["M2"] + 5, len(points)]
     wide = DIAMETER_MM

@@ -152,7 +152,6 @@ def _similarity(
 
 
 def _square(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
-    """Return squared lengths; numpy's own sum over so short an axis takes several times as long."""
     return x[..., 0] ** 2 + x[..., 1] ** 2 + x[..., 2] ** 2
 
 

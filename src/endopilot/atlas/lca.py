@@ -231,7 +231,6 @@ def _plan_branches(
     calibre: float,
     population: Population,
 ) -> list[branching.SidePlan]:
-    """Draw which branches there are, where they leave, how long and how wide they are; named in their order."""
     plans: list[branching.SidePlan] = []
     presence = factor(generator, population.side_share)
     for parent, kinds in enumerate((side_kinds("lca", "lad"), side_kinds("lca", "lcx"))):

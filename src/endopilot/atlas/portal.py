@@ -95,7 +95,6 @@ def _draw(
 
 
 def _main(generator: np.random.Generator, main_mm: float, size: float) -> tuple[Float[np.ndarray, "n 3"], int]:
-    """Return the line from the confluence into segment 8, and the index of its first division."""
     turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, 8, 3)))
     main = _COURSE * main_mm / length_along(shape.curve_through(_COURSE))[-1]
     right = main[-1] + size * turn.apply(_RIGHT)

@@ -159,7 +159,6 @@ def _main_vessel(generator: np.random.Generator, targets: _Targets) -> tuple[Flo
 def _main_radius(
     generator: np.random.Generator, dominance: str, main: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n"], float]:
-    """Return the lumen radius along the main vessel, mm, and the patient's calibre against the average."""
     calibre = branching.coronary_calibre(generator, _CALIBRE[dominance], 0.55, 1.4)
     share = np.linspace(0.0, 1.0, len(main))
     diameter = PchipInterpolator([0.0, *DIAMETER_MM, 1.0], [4.1, *DIAMETER_MM.values(), 2.15])(share)

@@ -145,7 +145,6 @@ def _turns(
 def _waves(
     generator: np.random.Generator, along: Float[np.ndarray, "n"], population: Population
 ) -> Float[np.ndarray, "n 2"]:
-    """Return the angles of a patient's waves towards the two normals, rad."""
     low, high = population.waves_deg
     amplitude = np.deg2rad(np.exp(generator.uniform(np.log(low), np.log(high))))
     shortest, longest = population.waves_mm
@@ -195,7 +194,6 @@ def _turned_to(
     wanted: Float[np.ndarray, "3"],
     profile: Float[np.ndarray, "m"],
 ) -> Float[np.ndarray, "n 3"]:
-    """Return the curve whose chord from point `at` over `reach` steps has the wanted direction."""
     vector, moved = np.zeros(3), points
     for _ in range(4):
         now = _unit(moved[at + reach] - moved[at])

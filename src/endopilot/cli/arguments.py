@@ -118,7 +118,6 @@ def show_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool) -> None:
 
 
 def _json(content: Any) -> str:
-    """Return content as JSON that every program reads: what is no number or infinite is null."""
     plain = json.loads(json_text(content), parse_constant=lambda _: None)
     return json_text(plain)
 

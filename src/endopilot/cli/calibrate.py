@@ -86,7 +86,6 @@ def command(
 
 
 def _write(found: RobotCalibration, output: Path, names: str) -> None:
-    """Write the robot and the wire, with the source of what was found."""
     by_name = {
         name: f"{each}, 95 %" if each.identified else f"{each.value:.4g}, {each}"
         for name, each in found.estimates.items()

@@ -274,7 +274,6 @@ def _contents(values: Any) -> dict[str, Any]:
 
 
 def _with(values: Any, given: Any) -> Any:
-    """Return settings with the options that an object has as attributes, those of groups without their group."""
     new = {
         name: _with(old, given) if is_settings(type(old)) else getattr(given, name)
         for name, old in _contents(values).items()
@@ -314,7 +313,6 @@ def _first_line(box: str) -> str:
 
 
 def _notes(kind: Any) -> list[Any]:
-    """Return the notes of an annotation, and of those within it."""
     inner = get_args(kind)
     own, kinds = (inner[1:], inner[:1]) if get_origin(kind) is Annotated else ((), inner)
     return [*own, *(note for one in kinds for note in _notes(one))]

@@ -167,7 +167,6 @@ def _stopped_short(
     config: SimulatorConfig,
     record_shape: bool,
 ) -> tuple[Trajectory, np.ndarray]:
-    """Return random navigations that stop short of the ends, and which were stopped."""
     worlds, samples = control.shape[:2]
     with progress("Simulating the wire", total=worlds * samples) as advance:
         return simulate_navigations(

@@ -184,7 +184,6 @@ class Autopilot:
         return self._world.command(())
 
     def _navigation(self, observation: Observation) -> Navigation:
-        """Return the navigation as it begins for the policy, from where the devices are."""
         (inserted, turned), *around = observation.devices
         return replace(
             self._world.navigation,
@@ -202,7 +201,6 @@ class Autopilot:
         return ""
 
     def _decide(self, start: Navigation | None, observation: Observation) -> Decision:
-        """Decide, in a thread of its own; a policy that is new is made and started first."""
         if self._policy is None:
             self._policy = self._world.loop.policy = make_policy(self.policy_name)
         if start is not None:

@@ -137,7 +137,6 @@ class GameSession(Session):
             self.phase = "on"
 
     def _end(self) -> tuple[str, bytes]:
-        """End the game where the navigation has ended, and return the message with the score."""
         self.result = scored(self.world.navigation, self.world.loop.record())
         self.halt("the task is over")
         self.phase, self.sight = "over", True
@@ -147,7 +146,6 @@ class GameSession(Session):
         return self._scores()
 
     def _scores(self) -> tuple[str, bytes]:
-        """Return the message with the person's score, and the agent's once it is known."""
         rival, failure = None, ""
         if self._rival is not None and self._rival.done():
             error = self._rival.exception()

@@ -162,7 +162,6 @@ def read_ct(path: Path | None) -> Volume | None:
 
 
 def _start_of(anatomy: Anatomy, stack: Stack) -> Navigation:
-    """Return a navigation from the ostium to a first target, far down the longest path."""
     tree = anatomy.tree
     leaf = tree.longest_leaf()
     line = tree.branches[leaf].centerline.abscissa
@@ -173,7 +172,6 @@ def _start_of(anatomy: Anatomy, stack: Stack) -> Navigation:
 
 
 def _synthetic(output: Path) -> Path:
-    """Return the folder of the synthetic patient; it is written if need be."""
     folder = output / "synthetic"
     if not (folder / "anatomy.json").exists():
         from endopilot.tasks.task import reference_navigation
@@ -183,7 +181,6 @@ def _synthetic(output: Path) -> Path:
 
 
 def _free(output: Path, name: str) -> Path:
-    """Return a file of that name, or with a number, which does not exist."""
     number, path = 1, output / f"{name}{SUFFIX}"
     while path.exists():
         number, path = number + 1, output / f"{name}-{number + 1}{SUFFIX}"

@@ -191,7 +191,6 @@ class Cockpit:
                     return
 
     def _take(self, page: _Page, text: str | bytes) -> str | None:
-        """Do what a message asks for, and return why it is refused, or None."""
         try:
             message = read_message(text)
         except ValueError as error:

@@ -226,7 +226,6 @@ class Session:
         self._record(move=list(chain.from_iterable(self._command)))
 
     def _think(self) -> list[tuple[str, bytes]]:
-        """Let the autopilot go on, and return what the pages are to see of it."""
         if self.autopilot.status == "off" or (self.autopilot.drives and not self.xray.ready):
             return []
         snapshot, images = self.world.snapshot(), []

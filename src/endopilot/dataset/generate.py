@@ -110,8 +110,6 @@ def generate_dataset(
 
 
 class _Ledger:
-    """The cost of the files, kept over interruptions."""
-
     def __init__(self, layout: Layout) -> None:
         self._path, self._samples = layout.context.output / _WORK_PATH, layout.context.config.samples
         self._cost = read_work(layout.context.output)

@@ -102,7 +102,6 @@ def patient_motion(config: DatasetConfig, anatomy: str) -> Motion | None:
 
 
 def _streams(config: DatasetConfig, anatomy: str) -> list[np.random.SeedSequence]:
-    """Return the random streams of an anatomy: of controls, friction, tip, surplus, motion and robots."""
     name_number = int.from_bytes(hashlib.sha256(anatomy.encode()).digest()[:8], "little")
     return np.random.SeedSequence([config.seed, name_number]).spawn(6)
 

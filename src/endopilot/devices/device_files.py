@@ -80,7 +80,6 @@ def device_yaml(name_or_path: str | Path) -> tuple[Path, str]:
 
 
 def _user_folders() -> list[Path]:
-    """Return the folders that may hold the user's devices, each once."""
     configuration = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
     folders = [configuration / "endopilot" / "devices"]
     if named := os.environ.get(FOLDER_VARIABLE):

@@ -137,7 +137,6 @@ class DriveMotion:
             self._orders.popleft()
 
     def _next(self) -> Float[np.ndarray, "robots"]:
-        """Return when each robot's next order is due, s."""
         times = [np.where(due <= self._clock + _ROUNDING_S, np.inf, due) for due, _ in self._orders]
         return np.min(times, axis=0) if times else np.full_like(self._clock, np.inf)
 

@@ -150,7 +150,6 @@ def _parted(dataset: Dataset, known: Collection[str]) -> tuple[dict[str, Dataset
 
 
 def _chosen(data: Dataset, sequences: int | None) -> Dataset:
-    """Return at most `sequences` episodes, as evenly over the anatomies as they come."""
     if sequences is None or sequences >= len(data):
         return data
     rank = np.empty(len(data), dtype=int)
@@ -170,7 +169,6 @@ def _own_dataset(run: Path, record: Mapping[str, Any]) -> Path:
 
 
 def _metrics(results: Mapping[str, SplitResult], known: Collection[str], seed: int) -> dict[str, Any]:
-    """Return the content of metrics.json but for its manifest; `known` names the patients that were trained on."""
     splits = {
         split: {
             "title": SPLIT_TITLES[split],

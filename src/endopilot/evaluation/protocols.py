@@ -187,7 +187,6 @@ def _driven(
 
 
 def _planned(under_way: Episodes, plan: OpenLoop, begin: int) -> Episodes:
-    """Return episodes with the tips from a sample on as a plan predicts them, where it does."""
     tip = under_way.tip.copy()
     finite = np.isfinite(plan.tip).all(axis=-1, keepdims=True)
     tip[:, begin:] = np.where(finite, plan.tip, tip[:, begin:])
@@ -195,7 +194,6 @@ def _planned(under_way: Episodes, plan: OpenLoop, begin: int) -> Episodes:
 
 
 def _desired(under_way: Episodes, desired: Episodes, begin: int) -> Episodes:
-    """Return episodes under way with everything from a sample on as it is desired."""
     names = ("control", "command", "proximal", "tip", "branch")
     parts = {name: (getattr(under_way, name)[:, :begin], getattr(desired, name)[:, begin:]) for name in names}
     return replace(under_way, **{name: np.concatenate(both, axis=1) for name, both in parts.items()})

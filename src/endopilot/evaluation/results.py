@@ -247,7 +247,6 @@ def over_seeds(result: SplitResult, tips: Sequence[TipSeries]) -> dict[str, Any]
 
 
 def _control(result: SplitResult) -> dict[str, Any]:
-    """Return the errors of the controls that each series chose, over all samples and as RMSE of each sequence."""
     scale = np.array([1.0, np.rad2deg(1.0)])
     errors = {name: (control - result.true_control) * scale for name, control in result.controls.items()}
     out: dict[str, Any] = {}

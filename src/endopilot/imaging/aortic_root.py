@@ -330,7 +330,6 @@ def _middles(
 
 
 def _heading(path: np.ndarray) -> Float[np.ndarray, "3"]:
-    """Return the unit direction of the first millimetres of a path."""
     smooth = ndimage.gaussian_filter1d(path, 3.0, axis=0, mode="nearest")
     step = smooth[min(8, len(path) - 1)] - smooth[0]
     return step / max(float(np.linalg.norm(step)), 1e-9)

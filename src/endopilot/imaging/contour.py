@@ -78,7 +78,6 @@ def _drop_rims(inside: np.ndarray, calcium: np.ndarray, distance: np.ndarray, sp
 
 
 def _large_parts(mask: np.ndarray) -> Bool[np.ndarray, "nz ny nx"]:
-    """Return a mask without specks, which are noise."""
     if not mask.any():
         return mask
     label = connected_components(mask)

@@ -147,7 +147,6 @@ def _change_of_edges(blocks: Float[np.ndarray, "nz ny nx"]) -> Float[np.ndarray,
 
 
 def _over_usual(change: Float[np.ndarray, "_"]) -> Float[np.ndarray, "_"]:
-    """Return a change from slice to slice as a multiple of what is usual around it."""
     return change / np.maximum(ndimage.median_filter(change, _NEIGHBOURS, mode="nearest"), 1e-6)
 
 

@@ -214,7 +214,6 @@ def _slice(file: Path, header: Dataset) -> _Slice:
 
 
 def _choose(slices: Sequence[_Slice], series: str | None, folder: Path) -> list[_Slice]:
-    """Return the slices of the one series there is, or of the one asked for."""
     groups_by: defaultdict[str, list[_Slice]] = defaultdict(list)
     for slice_ in slices:
         groups_by[slice_.series[1]].append(slice_)
@@ -364,7 +363,6 @@ def _pad(slice_: _Slice, plane: Float[np.ndarray, "ny nx"]) -> int:
 
 
 def _decoded(slice_: _Slice, reader: sitk.ImageFileReader) -> np.ndarray:
-    """Return the HU of one slice; any error means that its pixels are damaged."""
     if slice_.transfer_syntax in _ENCAPSULATED:
         content = slice_.path.read_bytes()
         begin = max(content.rfind(mark) for mark in _PIXELS_BEGIN)

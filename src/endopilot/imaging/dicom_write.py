@@ -75,7 +75,6 @@ def slice_headers(volume: Volume) -> list[Dataset]:
 
 
 def _slice_header(volume: Volume, k: int) -> Dataset:
-    """Return the header of slice `k` without its UIDs."""
     header = Dataset()
     header.file_meta = FileMetaDataset()
     header.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian

@@ -108,7 +108,6 @@ def read_nifti(path: Path) -> ImageFile:
 
 
 def _header(content: bytes, path: Path) -> dict[str, Any]:
-    """Return the fields of a header, its size and its byte order, after making sure that it is one of a single file."""
     for order, size in itertools.product("<>", _HEADERS):
         if content[:4] == struct.pack(f"{order}i", size):
             break

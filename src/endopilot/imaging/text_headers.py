@@ -185,7 +185,6 @@ def _nrrd_geometry(
 
 
 def _to_lps(space: str, path: Path) -> np.ndarray:
-    """Return the signs that take the file's world axes to LPS."""
     words = space.strip().lower().split("-")
     if len(words) == 1 and len(words[0]) == 3:
         words = [_LETTERS.get(letter, "") for letter in words[0]]
@@ -200,7 +199,6 @@ def _to_lps(space: str, path: Path) -> np.ndarray:
 def _values(
     fields: dict[str, str], sizes: list[int], stream: BufferedIOBase, path: Path
 ) -> tuple[Shaped[np.ndarray, "..."], tuple[Path, ...]]:
-    """Return the voxels, the slowest axis first, and the files that they are from."""
     kind, packing = fields.get("type", "").lower(), _PACKINGS.get(fields.get("encoding", "").lower())
     if kind not in _NRRD_TYPES:
         raise InputError(f"{path}: type {kind!r} holds no grey levels; export it as short or float")

@@ -154,7 +154,6 @@ def _graphs(number: np.ndarray, voxels: np.ndarray, response: np.ndarray) -> tup
 
 
 def _trace(before: np.ndarray, tip: int, on_path: np.ndarray) -> Int[np.ndarray, "n"]:
-    """Return the voxels from the first one already on a path, or from the root, to the tip."""
     path = [tip]
     while before[path[-1]] >= 0 and not on_path[path[-1]]:
         path.append(int(before[path[-1]]))

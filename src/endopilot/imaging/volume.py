@@ -186,7 +186,6 @@ def write_mask(mask: LumenMask, path: str | Path, *, manifest: Mapping[str, Any]
 
 
 def _suffix(path: Path) -> str | None:
-    """Return the known suffix that the file's name ends in, or None."""
     name = path.name.lower()
     return next((suffix for suffix in (*SUFFIXES, *_READ_ONLY_SUFFIXES) if name.endswith(suffix)), None)
 

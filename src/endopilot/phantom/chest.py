@@ -227,13 +227,11 @@ def _close(depth: Float[np.ndarray, "nz ny nx"], width_mm: float, spacing_mm: fl
 
 
 def _chest(x: Float[np.ndarray, "nz ny nx 3"]) -> Float[np.ndarray, "nz ny nx"]:
-    """Signed distance to the inside of the chest: an elliptical cylinder."""
     across, deep = (x[..., 0] - 12) / 135, (x[..., 1] - 12) / 76
     return 76 * (1 - np.sqrt(across**2 + deep**2))
 
 
 def _bone(x: Float[np.ndarray, "nz ny nx 3"]) -> Float[np.ndarray, "nz ny nx"]:
-    """Signed distance to sternum, ribs and spine."""
     sternum = 4.5 - np.linalg.norm(
         np.stack([np.maximum(np.abs(x[..., 0] - 8) - 11, 0), x[..., 1] + 71 + 0.08 * x[..., 2]], axis=-1), axis=-1
     )

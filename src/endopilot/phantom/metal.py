@@ -122,7 +122,6 @@ def add_metal(
 
 
 def _deposit(image: np.ndarray, index: Float[np.ndarray, "n 3"], hu: Float[np.ndarray, "n"]) -> None:
-    """Share each point's HU among the eight voxels around it."""
     low = np.floor(index).astype(int)
     share = index - low
     for corner in np.ndindex(2, 2, 2):

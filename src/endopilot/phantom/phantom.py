@@ -210,7 +210,6 @@ def _small_vessels(grid: Grid, lines: Sequence[Centerline]) -> Float32[np.ndarra
 
 
 def _plaques(grid: Grid, anatomy: Anatomy, generator: np.random.Generator, mean_count: float) -> list[_Plaque]:
-    """Return soft plaques around stenoses, and calcified ones in the wall."""
     paths = chest.main_paths(anatomy.tree)
     plaques = []
     for stenosis in anatomy.provenance.get("stenoses", ()):
@@ -259,7 +258,6 @@ def _organs(
     generator: np.random.Generator,
     appendage_mm: float,
 ) -> tuple[Grid, tuple[chest.Organ, ...]]:
-    """Return the coarse grid and the organs on it; fat wraps the coronaries too."""
     axes = (np.arange(axis[0] - COARSE_MM, axis[-1] + 2 * COARSE_MM, COARSE_MM) for axis in (grid.x, grid.y, grid.z))
     coarse = Grid(*axes)
     z, y, x = np.meshgrid(coarse.z, coarse.y, coarse.x, indexing="ij")

@@ -284,7 +284,6 @@ def _anatomies(run: _Run, volumes: Sequence[Path]) -> list[Path]:
 
 
 def _drive(run: _Run, anatomy: Path) -> None:
-    """Let the agent drive to the distal end of the longest path."""
     assert run.navigation is not None
     tree = read_anatomy(anatomy).tree
     longest = tree.longest_leaf()
@@ -368,7 +367,6 @@ def _report(run: _Run, names: Sequence[str]) -> None:
 
 
 def _scores(output: Path, names: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Return how well each synthetic patient's anatomy matches the truth that its volume was made from."""
     path = output / "scores.json"
     if path.exists():
         return read_json(path)
@@ -394,7 +392,6 @@ def _replay(output: Path) -> tuple[Path, Trajectory]:
 
 
 def _finish(run: _Run) -> dict[str, Any]:
-    """Write metrics.json and manifest.json unless they are there, and return what the command prints."""
     output, stages = run.output, run.stages
     metrics = read_json(output / "evaluation" / "metrics.json")
     wall_seconds = sum(stages.seconds.values())

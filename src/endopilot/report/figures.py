@@ -155,7 +155,6 @@ def _histograms(table: pd.DataFrame, titles: Mapping[str, str], panels: Sequence
 
 
 def _histogram(ax: Axes, of: Float[np.ndarray, "n"], edges: Float[np.ndarray, "m"], bottom: float, color: str) -> None:
-    """Draw one histogram that stands on `bottom` and is 0.75 high, with its median and the size of its highest bar."""
     if not len(of):
         return
     counts, _ = np.histogram(np.clip(of, 0.0, edges[-1]), edges)
@@ -302,7 +301,6 @@ def _lps_axes(volume: Volume) -> list[int]:
 
 
 def _level(volume: Volume, point: Float[np.ndarray, "3"], levels: int) -> int:
-    """Return the axial slice of `_along_lps` that a point lies in."""
     axis = _lps_axes(volume)[2]
     level = round(float(volume.world_to_index(point)[axis]))
     level = levels - 1 - level if volume.direction[2, axis] < 0 else level
@@ -317,7 +315,6 @@ def _picture(
     *,
     origin: Any,
 ) -> None:
-    """Show one grey picture with the lumen's outline; `spacing` is (columns, rows), mm."""
     rows, columns = picture.shape
     extent = (0.0, columns * spacing[0], rows * spacing[1], 0.0)
     if origin == "lower":

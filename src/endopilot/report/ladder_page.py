@@ -79,7 +79,6 @@ def _section(output: Path, task: Task, patients: int) -> dict[str, Any]:
 
 
 def _replay_scene(task: Task, navigation: Navigation, result: dict[str, Any], path: Path) -> go.Figure:
-    """Return a navigation replayed in space, with its target, what X-ray showed, and what came of it."""
     course = result["course"]
     *_, recording = recorded_navigation(path, task.name, 0)
     record = begun(recording, navigation, seed=navigation_seed(task, 0)).run()
@@ -100,7 +99,6 @@ def _outcome(result: dict[str, Any]) -> str:
 
 
 def _courses(navigations: list[Navigation], results: list[dict[str, Any]]) -> Figure:
-    """Draw trees, viewed across their largest extent, with route, target and the tip's path."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(2.4 * SHOWN, 2.9), layout="constrained")
         for ax, navigation, result in zip(

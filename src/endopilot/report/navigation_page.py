@@ -167,7 +167,6 @@ def navigation_figure(found: PatientNavigation) -> Figure:
 
 
 def _mark_sections(axes: Axes, found: PatientNavigation) -> None:
-    """Write each section's name once, at the middle of its longest piece."""
     tree = found.set_up.navigation.anatomy.tree
     longest: dict[str, np.ndarray] = {}
     for branch in tree.branches:
@@ -239,7 +238,6 @@ def _draw_force(axes: Axes, found: PatientNavigation) -> None:
 
 
 def _draw_pushes(axes: Axes, found: PatientNavigation) -> None:
-    """Draw how hard each drive pushes, or pulls below zero."""
     rollout = found.record.trajectory
     time_s = DECISION_PERIOD_S * np.arange(1, rollout.drive_force.shape[1] + 1)
     pushes = rollout.drive_force[0].T

@@ -134,7 +134,6 @@ def _patient(patient: PatientContent) -> dict[str, Any]:
 
 
 def _driven(navigation: Path | None, beside: Path) -> dict[str, Any] | None:
-    """Return what the agent did: one line, the picture, and where its page is, seen from the report."""
     if navigation is None:
         return None
     figures = read_json(navigation / "manifest.json")["figures"]
@@ -148,7 +147,6 @@ def _driven(navigation: Path | None, beside: Path) -> dict[str, Any] | None:
 
 
 def _scene(content: ReportContent, still: Path, remarks: list[str]) -> dict[str, Any] | None:
-    """Return the plotly scene, its library, and the still picture that is printed in its place."""
     folder = content.replay_anatomy or (content.patients[0].anatomy if content.patients else None)
     if folder is None:
         return None

@@ -111,7 +111,6 @@ def _wall(anatomy: Anatomy) -> go.Mesh3d:
 
 
 def _centerlines(anatomy: Anatomy) -> list[go.Scatter3d]:
-    """Return one line a section; pieces of a section are joined by gaps."""
     tree = anatomy.tree
     pieces: dict[int, list[np.ndarray]] = {}
     for branch in tree.branches:
@@ -256,7 +255,6 @@ def _uncovered(rollout: Trajectory, sample: int) -> list[Float[np.ndarray, "_ 3"
 
 
 def _catheter_state(rollout: Trajectory, sample: int, k: int) -> str:
-    """Return how far device k is inserted and turned, and how its drive pushes it."""
     return (
         f"Δ = {rollout.inserted_length[0, sample, k]:.1f} mm<br>"
         f"φ = {np.rad2deg(rollout.rotation[0, sample, k]):.0f}°<br>"
@@ -278,7 +276,6 @@ def _possible(wires: Wires, deepest_mm: float) -> go.Scatter3d:
 
 
 def _layout(size_mm: Float[np.ndarray, "3"]) -> dict:
-    """Return axes, camera and colours for a vessel of some size along x, y and z, mm."""
     # plotly's box keeps its volume, so that of a tall vessel is longer than the usual view is high
     farther = max(1.0, float(size_mm.max() / size_mm.prod() ** (1 / 3)) / _VIEWED)
     eye = {name: farther * at for name, at in zip("xyz", (0.4, -2.0, 0.5), strict=True)}

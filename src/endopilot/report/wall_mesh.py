@@ -48,7 +48,6 @@ def _march(
 
 
 def _cropped(distance_map: DistanceMap) -> tuple[Float32[np.ndarray, "nz ny nx"], Float[np.ndarray, "3"]]:
-    """Return the part of the map around the lumen with one layer of outside about it, and its origin, LPS mm."""
     inside = np.asarray(distance_map.values) > 0
     found = [np.flatnonzero(inside.any(axis=others)) for others in ((1, 2), (0, 2), (0, 1))]
     start = np.array([max(index[0] - 2, 0) for index in found])

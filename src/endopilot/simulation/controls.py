@@ -190,7 +190,6 @@ def read_controls_csv(path: Path, *, devices: int = 1) -> ScriptedControls:
 
 
 def _rows_of_worlds(table: Columns) -> Int[np.ndarray, "worlds samples"]:
-    """Return the rows of each world, in the order of their numbers; all rows where the file knows no worlds."""
     if "world" not in table.values:
         return np.arange(len(table.lines))[None]
     world = table.values["world"]

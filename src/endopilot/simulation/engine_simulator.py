@@ -247,7 +247,6 @@ class EngineSimulator(Simulator):
         return result | ({"shape": np.stack([row["shape"] for row in rows])[None]} if shape else {})
 
     def _begin(self, group: Group) -> None:
-        """Push the wire from the ostium to where the core has brought its own."""
         values = group.simulation.state()
         length, rotation, friction = (float(values[0, k]) for k in (at.LENGTH, at.ROTATION, at.FRICTION))
         if length <= 0:
@@ -261,7 +260,6 @@ class EngineSimulator(Simulator):
         self._write(group, self._wire, (0.0, 0.0), 0.0)
 
     def _driven(self, group: Group, velocity: tuple[float, float], seconds: float) -> dict[str, np.ndarray]:
-        """Drive the wire for some time, and return what the core would record at its end."""
         wire = self._wire
         assert wire is not None  # a wire that was not begun is at the ostium, where nothing is driven from
         if self.valid[0]:

@@ -258,7 +258,6 @@ class Readout:
         return TipProjection(**{name: self._merge([getattr(tip, name) for tip in found]) for name in names})
 
     def _placements(self, times: Float[np.ndarray, "worlds samples"]) -> Float[np.ndarray, "worlds samples 3 4"]:
-        """Return where each vessel lies at some times, s."""
         still, parts = np.eye(3, 4), []
         for group, at in self._of_groups(times):
             if group.motion is None:
@@ -271,7 +270,6 @@ class Readout:
         return [(group, values[group.index]) for group in self._groups]
 
     def _merge(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """Return one array with a row a world, of one array a group."""
         return parts[0] if len(parts) == 1 else np.concatenate(parts)[self._rows]
 
     def _gather(self, name: str) -> np.ndarray:

@@ -160,7 +160,6 @@ class Robots:
         return np.where(self._at_motor, self.motion.motor, self._counted(simulator))
 
     def _grasp(self, worlds: Sequence[int], seeds: Sequence[Seed]) -> None:
-        """Take what the robots of some worlds measure, and how noisily."""
         devices = self._noise.shape[1]
         for world, seed in zip(worlds, seeds, strict=True):
             config, self._random[world] = self._configs[world], np.random.default_rng([*seed, 8])

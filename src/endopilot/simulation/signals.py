@@ -83,7 +83,6 @@ _FURTHER = {
 
 
 def _columns(name: str, of: str, numbers: int, unit: str) -> tuple[str, ...]:
-    """Return the columns of an output: its name and unit, and those of a vector with its axes."""
     if of not in ("device", "sample"):
         return ()
     name = {"tip_position": "tip", "iterations": "newton_iterations"}.get(name, name)

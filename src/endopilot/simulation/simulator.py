@@ -381,7 +381,6 @@ class Simulator(Readout):
     def _checked(
         self, control: ArrayLike | SupportsDLPack, period_s: float, *, sequence: bool
     ) -> Float[np.ndarray, "worlds samples devices 2"]:
-        """Return controls with all their axes, once they are checked."""
         array: Any = control
         if not isinstance(array, np.ndarray) and hasattr(array, "__dlpack__"):
             array = np.from_dlpack(array)
@@ -484,7 +483,6 @@ class Simulator(Readout):
 
     @cached_property
     def _fingerprint(self) -> str:
-        """Hash of all that a state belongs to."""
         groups = [(group.index.tolist(), group_key(group.anatomy, group.stack)) for group in self._groups]
         return hashlib.sha256(repr((self._settings, groups)).encode()).hexdigest()
 

@@ -124,7 +124,6 @@ def tip_load_row(device: Wire) -> dict[str, Any]:
 
 
 def _distal_rod(device: Wire) -> RodLayout:
-    """Return the distal 10 mm, straight and in elements of one length, with the held nodes behind."""
     size = HELD_MM / (_ELEMENTS - 0.5)  # the clamped element fixes a direction over its length: half of it is held
     abscissa = size * np.arange(_ELEMENTS + 1)
     stretch = 16.0 * device.bend_stiffness(abscissa + 0.5 * size) / device.diameter_mm**2  # a round section, as in rod

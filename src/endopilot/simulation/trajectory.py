@@ -292,7 +292,6 @@ def _arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
 
 
 def _about(trajectory: Trajectory, arrays: Mapping[str, np.ndarray]) -> str:
-    """Return what the arrays mean and what they were simulated with, as JSON."""
     set_up = trajectory.set_up
     meaning = {name: SIGNALS.get(name.removeprefix("column.")) for name in arrays}
     stacks = list({id(stack): stack for stack in set_up.stacks}.values())

@@ -314,7 +314,6 @@ def _with_lumen(
 
 
 def _place(anatomy: Anatomy, stenosis: Stenosis) -> tuple[int, float]:
-    """Return the branch that a stenosis lies in or leads to, and its abscissa, mm."""
     tree = anatomy.tree
     if stenosis.section is None:
         leaf = tree.longest_leaf()

@@ -228,7 +228,6 @@ def objectivity() -> list[Case]:
 
 
 def _ahead(shape: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 m"]:
-    """Return x and y of the nodes in front of the wall."""
     return shape[:ELEMENTS, :2].T
 
 

@@ -194,7 +194,6 @@ def _scores(
 def _merged(
     place: Float[np.ndarray, "n 3"], owner: Int[np.ndarray, "n"], share: Float[np.ndarray, "n"]
 ) -> list[OstiumCandidate]:
-    """Return the ends' shares with those of one stub added up, most probable first."""
     found, left = [], share.copy()
     while left.max(initial=0.0) > 0.0:
         best = int(left.argmax())
@@ -259,7 +258,6 @@ def _aorta_clearance(
 
 
 def _log_t(square: Float[np.ndarray, "..."] | float) -> Float[np.ndarray, "..."] | np.float64:
-    """Return the logarithm of Student's t at a squared deviation, as a share of its peak."""
     return -0.5 * (_FREEDOM + 1) * np.log1p(square / _FREEDOM)
 
 

@@ -156,7 +156,6 @@ def record(lines: MedialLines, wide: Float[np.ndarray, "m 3"], left: list[Stretc
 def _draw_balls(
     voxels: Bool[np.ndarray, "nz ny nx"], centres: Int[np.ndarray, "n 3"], reach: Float[np.ndarray, "3"]
 ) -> None:
-    """Fill a ball around each voxel, with a radius of `reach` voxels along each axis."""
     span = np.ceil(reach).astype(int)
     ball = np.array(list(np.ndindex(*(2 * span + 1)))) - span
     ball = ball[(((ball / reach) ** 2).sum(axis=1)) <= 1.0]

@@ -290,7 +290,6 @@ def _levels(
 
 
 def _length_to_root(points: Float[np.ndarray, "n 3"], before: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Sum the steps of every path to the root at once, by pointer doubling."""
     jump = np.where(before >= 0, before, np.arange(len(points)))
     length = np.linalg.norm(points - points[jump], axis=1)
     while True:

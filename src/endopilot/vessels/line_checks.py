@@ -121,7 +121,6 @@ def closures(tree: VesselTree) -> list[str]:
 
 
 def _graph_of(tree: VesselTree, branch: Int[np.ndarray, "n"]) -> RootedGraph:
-    """Return a tree's points as a graph, the first of each branch joined to the nearest one of its parent."""
     line, before = tree.line, np.arange(len(branch)) - 1
     for start, own in zip(np.flatnonzero(np.diff(branch, prepend=-1)), tree.branches, strict=True):
         if own.parent >= 0:

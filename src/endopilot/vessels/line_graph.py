@@ -172,7 +172,6 @@ def found_lines(source: Polylines, given: Insertion | None, label: str, vessel: 
 
 
 def _rooted(graph: LineGraph, root: int) -> RootedGraph:
-    """Return the graph with the cheapest ways to a root, a way's length being what it costs."""
     length, before = dijkstra(graph.costs, directed=False, indices=root, return_predecessors=True)
     return RootedGraph(graph.points, graph.radius, graph.costs, graph.step_mm, before, length)
 
@@ -381,6 +380,5 @@ def _order(line: Float[np.ndarray, "n 3"], label: str) -> Int[np.ndarray, "n"] |
 
 
 def _turns(line: Float[np.ndarray, "n 3"]) -> int:
-    """Return at how many points a line turns by more than 90°."""
     step = np.diff(line, axis=0)
     return int((np.einsum("ij,ij->i", step[1:], step[:-1]) < 0).sum())

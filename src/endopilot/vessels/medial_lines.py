@@ -179,7 +179,6 @@ def _traced_piece(
 def _clearance(
     voxels: Bool[np.ndarray, "nz ny nx"], index: Int[np.ndarray, "n 3"], edges_mm: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "n"]:
-    """Return the distance from voxels of a mask to its border, mm: half a voxel on the border itself."""
     border, edges = _border(voxels), edges_mm[::-1]
     tree, places = KDTree(np.argwhere(border) * edges), index * edges
     gap = np.asarray(tree.query(places, distance_upper_bound=_NEAR_VOXELS * float(edges.max()))[0])
@@ -192,7 +191,6 @@ def _clearance(
 
 
 def _border(voxels: Bool[np.ndarray, "nz ny nx"]) -> Bool[np.ndarray, "nz ny nx"]:
-    """Return the voxels of a mask with a face outside."""
     inner = np.zeros_like(voxels)
     core = voxels[1:-1, 1:-1, 1:-1].copy()
     for axis in range(3):

@@ -94,7 +94,6 @@ def _cells(cells: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _fields(field_data: Any) -> str:
-    """Return the texts in field data as statements NAME=text."""
     texts = []
     for i in range(field_data.GetNumberOfArrays()):
         array = field_data.GetAbstractArray(i)

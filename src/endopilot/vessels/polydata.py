@@ -112,7 +112,6 @@ def _damaged(path: Path, complaint: str) -> InputError:
 
 
 def _header(path: Path) -> str:
-    """Return the part of a file that may state axes and unit: header, title or comments."""
     with path.open("rb") as stream:
         text = stream.read(_HEADER_BYTES).decode("latin-1")
     kind = path.suffix.lower()
@@ -156,7 +155,6 @@ def _factor(statement: str, data: dict[str, np.ndarray], notes: list[str]) -> tu
 
 
 def _surface(points: np.ndarray, corners: np.ndarray, path: Path) -> Surface:
-    """Return the triangles, points that coincide made one and triangles without an area left out."""
     vertices, index = np.unique(points, axis=0, return_inverse=True)
     faces = index.reshape(-1)[corners]
     first, second, third = faces.T

@@ -87,7 +87,6 @@ def read_source(path: str | Path, *, label: int | str | None = None, threshold: 
 
 
 def _read_curves(folder: Path) -> AnatomySource:
-    """Return all markups curves of a folder as the lines of one tree."""
     entries = sorted(folder.iterdir())
     curves = [path for path in entries if path.name.lower().endswith(".mrk.json")]
     if (folder / "anatomy.json").exists():
@@ -144,7 +143,6 @@ def _read_markups(path: Path) -> AnatomySource:
 
 
 def _no_centerline(kind: Any, control: list[Any]) -> str | None:
-    """Return why a markup is no centerline, or None if it is one."""
     lower = str(kind or "Curve").lower()
     if lower not in ("curve", "line"):
         return _NO_CENTERLINE.get(lower, "only open curves and lines are (type Curve or Line)")

@@ -143,7 +143,6 @@ def connected_mask(
 
 
 def _holds(mask: Volume, voxels: Bool[np.ndarray, "nz ny nx"], place: Float[np.ndarray, "3"]) -> bool:
-    """Return whether some voxels lie at a place, LPS mm, or next to it."""
     at = np.rint(mask.world_to_index(place)).astype(int)[::-1]
     return bool(voxels[tuple(slice(max(0, i - 2), i + 3) for i in at)].any())
 

@@ -189,7 +189,6 @@ def region_places(surface: Surface) -> list[Float[np.ndarray, "3"]]:
 
 
 def _without_duplicates(mesh):
-    """Drop triangles that occur twice, as where a surface was exported together with its own copy."""
     faces = np.asarray(mesh.faces.reshape(-1, 4)[:, 1:])
     _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     if len(first) == len(faces):
@@ -274,7 +273,6 @@ def without_wall(mask: Volume) -> tuple[Volume, list[str]]:
 
 
 def _wall_text(thickness_mm: float) -> str:
-    """Return the remark on a wall that was given for a lumen."""
     return f"what is given is a wall of {thickness_mm:.1f} mm: the lumen inside it is taken"
 
 

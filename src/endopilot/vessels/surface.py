@@ -302,7 +302,6 @@ def _blurred(
 
 
 def _finer(values: Float[np.ndarray, "a b c"], axis: int, factor: int) -> Float[np.ndarray, "d e f"]:
-    """Return values on a grid `factor` times finer along one axis, by a cubic spline from end to end."""
     from scipy.interpolate import CubicSpline
 
     size = values.shape[axis]
@@ -313,7 +312,6 @@ def _finer(values: Float[np.ndarray, "a b c"], axis: int, factor: int) -> Float[
 def _halved(
     faces: Int[np.ndarray, "m 3"], longest: Int[np.ndarray, "m"], vertices: Float[np.ndarray, "n 3"]
 ) -> tuple[Int[np.ndarray, "halves 3"], Float[np.ndarray, "edges 3"]]:
-    """Return triangles split at the middles of their longest edges, and these middles, which follow the vertices."""
     rows = np.arange(len(faces))
     one, two, opposite = faces[rows, longest], faces[rows, (longest + 1) % 3], faces[rows, (longest + 2) % 3]
     edges, inverse = np.unique(np.sort(np.stack([one, two], axis=1), axis=1), axis=0, return_inverse=True)

@@ -170,7 +170,6 @@ def parted(mask: Volume) -> tuple[Volume, list[Touch], MedialLines, MedialLines]
 
 
 def _porous(mask: Volume, thin: MedialLines, rings: list[_Ring]) -> list[Touch]:
-    """Return the places of a mask's rings, the longest first."""
     parting = _Parting(mask)
     for ring in sorted(rings, key=lambda ring: -ring.around_mm):
         parting.say("porous", thin.local[ring.nodes[0]], ring.around_mm)
@@ -281,7 +280,6 @@ def _count(mask: Volume) -> int:
 
 
 def _rings(lines: MedialLines, mask: Volume) -> list[_Ring]:
-    """Return the loops of a mask's middle that are not rough voxels, one for each edge that closes one."""
     rings = []
     for start, end in lines.closing:
         nodes = np.array(lines.tree.way(int(end), int(start)))
@@ -347,7 +345,6 @@ def _segments(lines: MedialLines, rings: list[_Ring]) -> list[list[int]]:
 
 
 def _is_stub(lines: MedialLines, path: list[int]) -> bool:
-    """Return whether a segment that ends is no longer than the middle is wide where it begins."""
     length = float(length_along(lines.local[path])[-1])
     around = np.linalg.norm(lines.local - lines.local[path[0]], axis=1) <= length
     return length < max(2.0 * float(lines.radius[around].max()), _SLIT_VOXELS * float(lines.edges_mm.max()))

@@ -138,7 +138,6 @@ def _find_roots(grid: Volume, config: SegmentConfig) -> list[AorticRoot]:
 
 
 def _hu_at(volume: Volume, seed: tuple[float, float, float]) -> float:
-    """Return the brightest smoothed HU within 2 mm of a seed."""
     index = volume.world_to_index(np.array(seed, dtype=float))[::-1]
     box = box_around(index[None], 2.0 / volume.spacing_mm[::-1], volume.voxels.shape)
     found = float(np.max(ndimage.gaussian_filter(volume.voxels[box].astype(np.float32), 0.7)))
@@ -151,7 +150,6 @@ def _hu_at(volume: Volume, seed: tuple[float, float, float]) -> float:
 
 
 def _find_vessels(grid: Volume, lumen_hu: float) -> Scan:
-    """Tell blood pools and thin vessels apart."""
     hu = np.asarray(ndimage.gaussian_filter(grid.voxels, 0.35 / _GRID_MM, truncate=3.0))
     body = resample(grid, _BODY_GRID_MM)
     above_muscle = _MUSCLE_HU + _LOW_SHARE * (lumen_hu - _MUSCLE_HU)

@@ -140,7 +140,6 @@ def segment_by_program(
 
 
 def _ostium_at_seeds(lumen: Volume, seeds: Sequence[tuple[float, float, float]]) -> Insertion:
-    """Return the ostium at the first seed, with the direction into the lumen."""
     points = lumen.index_to_world(np.argwhere(lumen.voxels)[:, ::-1].astype(float))
     for seed in seeds:
         gap = float(np.linalg.norm(points - np.array(seed), axis=1).min())
