@@ -106,10 +106,11 @@ def side_kinds(vessel: str, of: str) -> dict[str, SideKind]:
 @cache
 def vessel_data(vessel: str) -> dict[str, Any]:
     """Return what `vessels.yaml` holds of a kind of vessel tree."""
-    return _frozen(read_yaml(Path(__file__).parent / "vessels.yaml")[vessel])
+    return frozen(read_yaml(Path(__file__).parent / "vessels.yaml")[vessel])
 
 
-def _frozen(value: Any) -> Any:
+def frozen(value: Any) -> Any:
+    """Return what a YAML file holds, its lists as tuples."""
     if isinstance(value, dict):
-        return {name: _frozen(each) for name, each in value.items()}
-    return tuple(map(_frozen, value)) if isinstance(value, list) else value
+        return {name: frozen(each) for name, each in value.items()}
+    return tuple(map(frozen, value)) if isinstance(value, list) else value

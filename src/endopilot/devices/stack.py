@@ -12,7 +12,7 @@ from jaxtyping import Float
 from endopilot.devices.catheter import Catheter, check_nested, read_catheter
 from endopilot.devices.device import Device, Wire, check_fits, read_wire
 from endopilot.errors import InputError
-from endopilot.lines import length_along
+from endopilot.lines import length_along, places_on
 from endopilot.settings import Within, settings
 from endopilot.types import Anatomy
 
@@ -150,7 +150,7 @@ def lines_from_tips(
     behind = inserted_length_mm.max() - inserted_length_mm
     along = length_along(nodes)
     return [
-        nodes if at == 0 else np.vstack([_at(nodes, along, at), nodes[along > at + _APART_MM]])
+        nodes if at == 0 else np.vstack([places_on(nodes, along, np.array([at])), nodes[along > at + _APART_MM]])
         for at in behind.tolist()
     ]
 
@@ -162,7 +162,3 @@ def shown_part(
     LPS mm. Nodes are NaN beyond the line's end."""
     nodes = nodes[np.isfinite(nodes).all(axis=1)]
     return nodes[length_along(nodes) <= deepest_mm + behind_mm]
-
-
-def _at(nodes: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n"], at_mm: float) -> Float[np.ndarray, "3"]:
-    return np.array([np.interp(at_mm, along, axis) for axis in nodes.T])

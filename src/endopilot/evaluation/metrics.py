@@ -168,18 +168,18 @@ def quantiles_over_time(values: Float[np.ndarray, "episodes samples"]) -> dict[s
 
 def mean_over_time(error: Float[np.ndarray, "episodes samples"]) -> Float[np.ndarray, "samples"]:
     """Return the mean absolute error over the sequences at each time; NaN where no sequence has a value."""
-    finite = np.isfinite(error)
-    count = finite.sum(axis=0)
-    total = np.where(finite, np.abs(error), 0.0).sum(axis=0)
-    return np.divide(total, count, out=np.full(error.shape[1], np.nan), where=count > 0)
+    return _mean_of_finite(np.abs(error), axis=0)
 
 
 def rmse_of_sequences(error: Float[np.ndarray, "episodes samples"]) -> Float[np.ndarray, "episodes"]:
     """Return the RMSE of each sequence over its finite samples, in the unit of the error; NaN where it has none."""
-    finite = np.isfinite(error)
-    count = finite.sum(axis=1)
-    total = np.where(finite, error**2, 0.0).sum(axis=1)
-    return np.sqrt(np.divide(total, count, out=np.full(count.shape, np.nan), where=count > 0))
+    return np.sqrt(_mean_of_finite(error**2, axis=1))
+
+
+def _mean_of_finite(values: Float[np.ndarray, "episodes samples"], axis: int) -> Float[np.ndarray, "n"]:
+    finite = np.isfinite(values)
+    count, total = finite.sum(axis=axis), np.where(finite, values, 0.0).sum(axis=axis)
+    return np.divide(total, count, out=np.full(count.shape, np.nan), where=count > 0)
 
 
 def control_rmse(

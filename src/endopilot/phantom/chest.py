@@ -12,7 +12,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from endopilot.atlas import curves as shape
 from endopilot.atlas import heart_reference as reference
-from endopilot.atlas.heart_reference import HeartFit, ellipsoid, reference_courses, tube
+from endopilot.atlas.heart_reference import HeartFit, chamber, ellipsoid, reference_courses, tube
 from endopilot.lines import length_along
 from endopilot.types import Centerline, VesselTree
 
@@ -45,10 +45,10 @@ def place(tree: VesselTree) -> HeartFit:
     """Fit the reference heart to the tree; without section labels it is a right one, its crux at 60 % of the path."""
     if is_left(tree):
         courses = reference_courses().copy()
-        # Onto the aorta's surface: the direction of its axis is nearly z there.
-        outward = courses[0] - np.array(reference.AORTA[2], dtype=float)
+        # Onto the aorta's surface, away from its axis, which passes here at the ostium's height and is nearly z.
+        outward = courses[0] - [14.5, 5.0, 0.0]
         outward[2] = 0.0
-        courses[0] += reference.aorta(courses[:1])[0] * outward / np.linalg.norm(outward)
+        courses[0] += chamber(courses[:1], "aorta")[0] * outward / np.linalg.norm(outward)
         lad, lcx = courses[:_KNOTS], courses[_KNOTS : 2 * _KNOTS]
         fork = int(np.linalg.norm(lad - lcx[0], axis=1).argmin())
         lcx = np.concatenate([lad[: fork + 1], lcx[1:]])
@@ -98,13 +98,13 @@ def organs(
         return amplitude_mm * noise / noise.std()
 
     rough, wavy = uneven(0.7, 3.0), uneven(0.8, 10.0)
-    lv_wall, lv = shaped(reference.left_ventricle_wall) + wavy, shaped(reference.left_ventricle) + 1.3 * rough
-    rv, ra, la = shaped(reference.right_ventricle), shaped(reference.right_atrium), shaped(reference.left_atrium)
+    lv_wall, lv = shaped(chamber, "left_ventricle_wall") + wavy, shaped(chamber, "left_ventricle") + 1.3 * rough
+    rv, ra, la = shaped(chamber, "right_ventricle"), shaped(chamber, "right_atrium"), shaped(chamber, "left_atrium")
     rv_wall, rv, ra, la = rv + 3 + wavy, rv + wavy + rough, ra + 0.7 * rough, la + 0.5 * wavy
-    aorta, pulmonary = shaped(reference.aorta), shaped(reference.pulmonary_artery)
+    aorta, pulmonary = shaped(chamber, "aorta"), shaped(chamber, "pulmonary_artery")
     cava, lower_cava = shaped(tube, _UPPER_CAVA, (8, 8.5, 9)), shaped(tube, _LOWER_CAVA, (10, 11, 11))
     veins = np.max([shaped(tube, line, (6, 5, 3)) for line in _PULMONARY_VEINS], axis=0)
-    appendage = shaped(reference.left_appendage) + appendage_mm + 0.5 * wavy if appendage_mm > 0 else la
+    appendage = shaped(chamber, "left_appendage") + appendage_mm + 0.5 * wavy if appendage_mm > 0 else la
     epicardium = np.max([lv_wall, rv_wall, ra + 2, np.maximum(la, appendage) + 2], axis=0)
     large_vessels = np.max([aorta, pulmonary, cava, lower_cava], axis=0)
     pericardium = _close(np.max([epicardium + 2.5, large_vessels + 3, around_vessels], axis=0), 26.0, spacing_mm)
