@@ -150,12 +150,9 @@ class Centerline:
 class Branch:
     """A piece of the tree between two branching points, or from one to a distal end.
 
-    The first point of a branch is the last point of its parent, so that every path is one connected line.
-
-    Attributes:
-        centerline: its line; the abscissa counts from the ostium, not from the start of the branch.
-        parent: index of the parent in `VesselTree.branches`, -1 for the root.
-        section: for every point, the index of its anatomical section in `VesselTree.section_names`.
+    The first point of a branch is the last point of its parent, so that every path is one connected line. Its abscissa
+    counts from the ostium; `parent` indexes `VesselTree.branches` (-1 for the root), `section` for every point
+    `VesselTree.section_names`.
     """
 
     centerline: Centerline
@@ -165,12 +162,8 @@ class Branch:
 
 @dataclass(frozen=True, eq=False)
 class VesselTree:
-    """The centerline of a vessel with its branches.
-
-    Attributes:
-        branches: parents stand before their children; `branches[0]` starts at the ostium.
-        section_names: names of the anatomical sections, such as the segments of AHA/SCCT.
-    """
+    """The centerline of a vessel with its branches, parents before their children, the first from the ostium on, and
+    the names of the anatomical sections, such as the segments of AHA/SCCT."""
 
     branches: tuple[Branch, ...]
     section_names: tuple[str, ...]
@@ -303,10 +296,8 @@ class Anatomy:
     ) -> Figure:
         """Draw the centerlines, as thick as the vessel is wide, with the sections by colour, and the ostium.
 
-        Args:
-            axes: where; in a new figure of pyplot if not given. The figure's axes are LPS mm.
-            view: from where one looks; across the vessel's largest extents if not given.
-            color: of the whole vessel, for what is drawn over it, in place of the sections and their legend.
+        Without `axes` (LPS mm) in a new figure of pyplot, without `view` across the vessel's largest extents. A `color`
+        of the whole vessel, for what is drawn over it, takes the place of the sections and their legend.
         """
         import matplotlib.pyplot as plt
 
@@ -349,14 +340,8 @@ class Anatomy:
 
 @dataclass(frozen=True, eq=False)
 class TipProjection:
-    """Where tips lie with respect to the centerline tree.
-
-    Attributes:
-        abscissa: Δtip, distance from the ostium along the path, mm; negative inside the guiding catheter.
-        offset: γtip, distance from the centerline, mm.
-        branch: index of the branch that the tip lies in.
-        radius: lumen radius at the projection, mm.
-    """
+    """Where tips lie with respect to the centerline tree: Δtip, mm (negative inside the guiding catheter), γtip, mm,
+    the branch that the tip lies in, and the lumen radius at the projection, mm."""
 
     abscissa: Float[np.ndarray, "..."]
     offset: Float[np.ndarray, "..."]

@@ -243,15 +243,8 @@ def write_session_episode(session: str | Path, *, output: str | Path) -> None:
     """Write a recorded session as a data set of one episode. `endopilot train` reads that of a wire alone.
 
     The session is driven again and sampled every 0.5 s; what is left after the last whole sample is dropped. The vessel
-    of a task is written beside the episode, into `OUTPUT-anatomy`.
-
-    Args:
-        session: a recording of the cockpit.
-        output: folder of the data set.
-
-    Raises:
-        InputError: no such session, one shorter than a sample, or an output folder that holds
-            something else.
+    of a task is written beside the episode, into `OUTPUT-anatomy`. Raises InputError for no such session, one shorter
+    than a sample, or an output folder that holds something else.
     """
     session, output = Path(session), Path(output)
     recording = read_session(session)

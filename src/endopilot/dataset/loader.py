@@ -102,10 +102,7 @@ class Dataset(Outputs):
 
     def __getitem__(self, episodes: int | slice | Shaped[np.ndarray, "chosen"]) -> Dataset:
         """Return one episode, by its number, or several, by a mask or their numbers; one may stand there several times.
-
-        Raises:
-            InputError: there is no episode of that number.
-        """
+        Raises InputError for a number that no episode has."""
         if isinstance(episodes, int):
             if not 0 <= episodes < len(self):
                 raise InputError(f"world: {episodes}; {self.folder} has episodes 0 to {len(self) - 1}")
@@ -117,11 +114,7 @@ class Dataset(Outputs):
     def set_up(self, anatomy: Anatomy | None = None) -> SimulationSetUp:
         """Return what episodes of one anatomy were simulated with; their `command` then gives them again to the bit.
 
-        Args:
-            anatomy: it; read from its folder if not given.
-
-        Raises:
-            InputError: the anatomy is missing, or is another one than the dataset was made in.
+        The anatomy is read from its folder if not given; InputError if it is missing, or another one.
         """
         anatomy = anatomy or read_anatomy(self.anatomy_folder(str(self.anatomy[0])))
         world, given, config = self.world, self.stack, self.manifest["config"]
@@ -139,14 +132,8 @@ class Dataset(Outputs):
         )
 
     def trajectory(self, episode: int, *, record_shape: bool = False) -> Trajectory:
-        """Return an episode as it was recorded, to the bit: its commands simulated again.
-
-        Args:
-            record_shape: record the positions of all nodes too.
-
-        Raises:
-            InputError: there is no such episode, or its anatomy is missing or another.
-        """
+        """Return an episode as it was recorded, to the bit: its commands simulated again, if asked for with the
+        positions of all nodes. Raises InputError for no such episode, or an anatomy that is missing or another."""
         return self[episode].driven(record_shape=record_shape)
 
     def driven(
@@ -157,25 +144,15 @@ class Dataset(Outputs):
         friction: Float[np.ndarray, "episodes devices"] | None = None,
         record_shape: bool = False,
     ) -> Trajectory:
-        """Simulate episodes of one anatomy again, a world each.
-
-        Args:
-            velocity: of the drives, mm/s and rad/s; the recorded commands if not given.
-            anatomy: theirs; read from its folder if not given.
-            friction: Coulomb coefficients of the devices on the wall; as recorded if not given.
-            record_shape: record the positions of all nodes too.
-        """
+        """Simulate episodes of one anatomy again, a world each: by other velocities (mm/s, rad/s) than the recorded
+        commands, or with other friction, if given; the anatomy is read from its folder if not given."""
         set_up, command = self.set_up(anatomy), self.command if velocity is None else velocity
         set_up = set_up if velocity is None else replace(set_up, actuation="velocity")
         set_up = set_up if friction is None else replace(set_up, friction=friction)
         return run_set_up(set_up, command, period_s=self.sample_period_s, record_shape=record_shape)
 
     def of_split(self, split: str) -> Dataset:
-        """Return the episodes of one split that are valid to the end.
-
-        Raises:
-            InputError: there are none.
-        """
+        """Return the episodes of one split that are valid to the end; InputError if there are none."""
         chosen = (self.split == split) & self.valid.all(axis=1)
         if not chosen.any():
             held = ", ".join(sorted(set(self.split.tolist())))
@@ -193,11 +170,8 @@ class Dataset(Outputs):
 
     @property
     def world(self) -> World:
-        """What reality was, with what the seed drew; the wire, the anatomies and tips' radii aside are as given.
-
-        Raises:
-            InputError: the episodes are of several worlds.
-        """
+        """What reality was, with what the seed drew; the wire, the anatomies and tips' radii aside are as given. Raises
+        InputError if the episodes are of several worlds."""
         record = self.manifest.get("world", {})
         if record is None:
             raise InputError(f"{self.folder}: holds episodes of several worlds; give the dataset of one world")
@@ -217,11 +191,8 @@ class Dataset(Outputs):
         return next(record for record in self.manifest["anatomies"] if record["name"] == anatomy)
 
     def anatomy_folder(self, name: str) -> Path:
-        """Return the folder of an anatomy of the dataset.
-
-        Raises:
-            InputError: the anatomy is missing, or is another one than the dataset was made in.
-        """
+        """Return the folder of an anatomy of the dataset; InputError if it is missing, or another than the dataset was
+        made in."""
         record = self._record(name)
         folder = (self.folder / record["folder"]).resolve()
         if identify(folder) != (name, record["sha256"]):
@@ -260,11 +231,8 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def read_dataset(folder: str | Path) -> Dataset:
-    """Read a whole dataset made by `endopilot dataset`.
-
-    Raises:
-        InputError: the folder holds no finished dataset, or a file of it is missing, damaged or of another version.
-    """
+    """Read a whole dataset made by `endopilot dataset`. Raises InputError for no finished dataset, or one that is
+    damaged or of another version."""
     with extra_named("reading a dataset"):
         import endopilot.dataset.parquet  # noqa: F401
 

@@ -83,11 +83,8 @@ def list_catheters() -> tuple[str, ...]:
 
 
 def read_catheter(name_or_path: str | Path) -> Catheter:
-    """Read a catheter by its name (`list_catheters`), or from a YAML file.
-
-    Raises:
-        InputError: no such catheter, or a file that is not one; the line names file, field, value and mend.
-    """
+    """Read a catheter by its name (`list_catheters`), or from a YAML file. Raises InputError, which names file, field,
+    value and mend."""
     path = named_file("catheter", name_or_path, (_SHIPPED,), list_catheters)
     content = read_settings(path, CatheterFile)
     shape = tuple((length, math.radians(angle)) for length, angle in content.shape.arcs)
@@ -121,15 +118,8 @@ def check_nested(wire: Wire, catheters: Sequence[Catheter]) -> None:
 
 
 def write_device(device: Wire | Catheter, *, output: str | Path) -> None:
-    """Write a wire or a catheter as a YAML file that `read_wire` or `read_catheter` reads, with the same constants.
-
-    Args:
-        device: the wire or the catheter.
-        output: the file.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write a wire or a catheter as a YAML file that `read_wire` or `read_catheter` reads, with the same constants;
+    InputError if it cannot be written."""
     content = _wire(device) if isinstance(device, Wire) else _catheter(device)
     write_yaml(Path(output), content)
 

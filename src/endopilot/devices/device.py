@@ -63,12 +63,7 @@ _LEAST_DEG = math.degrees(math.pi) / 57
 
 @settings
 class TipShaping:
-    """The bends that a hand can give the tip of a wire.
-
-    Attributes:
-        angle_deg: least and largest angle, degrees.
-        length_mm: least and largest length from the tip over which it is bent, mm.
-    """
+    """The bends that a hand can give the tip of a wire: least and largest angle (degrees) and length from the tip (mm)."""
 
     angle_deg: tuple[NonNegative, NonNegative]
     length_mm: tuple[Positive, Positive]
@@ -284,11 +279,8 @@ def file_constants(content: Any) -> dict[str, Any]:
 
 @public
 def read_wire(name_or_path: str | Path) -> Wire:
-    """Read a device by its name (`endopilot.devices.device_files`), or from a YAML file.
-
-    Raises:
-        InputError: no such device, or a file that is not a device; the line names file, field, value and mend.
-    """
+    """Read a device by its name (`list_wires`), or from a YAML file. Raises InputError, which names file, field, value
+    and mend."""
     path = device_file(name_or_path)
     content = read_settings(path, WireFile)
     shaping = content.tip_shaping

@@ -124,11 +124,7 @@ class RobotConfig:
         return self.of_drives(count, "play_mm", "play_rad") * np.maximum(1 + spread * drawn, 0.0)
 
     def run_out(self, velocity: Float[np.ndarray, "devices 2"]) -> Float[np.ndarray, "devices 2"]:
-        """Return how far motors go on before they obey a command to stop, mm and rad.
-
-        Args:
-            velocity: that they have, mm/s and rad/s.
-        """
+        """Return how far motors go on, from a velocity (mm/s, rad/s), before they obey a command to stop, mm and rad."""
         braking = self.of_drives(len(velocity), "max_acceleration_mm_s2", "max_acceleration_rad_s2")
         return velocity * self.latency_s + velocity * np.abs(velocity) / (2 * braking)
 
@@ -137,11 +133,8 @@ class RobotConfig:
         return replace(self, latency_s=self.latency_s * factor)
 
     def write(self, path: Path | str) -> None:
-        """Write the robot as a YAML file that `read_robot` reads, whole or not at all.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
+        """Write the robot as a YAML file that `read_robot` reads, whole or not at all; InputError if it cannot be
+        written."""
         write_yaml(Path(path), asdict(self))
 
 
@@ -152,11 +145,8 @@ def list_robots() -> tuple[str, ...]:
 
 @public
 def read_robot(name_or_path: str | Path) -> RobotConfig:
-    """Read a robot by its name (`list_robots`), or from a YAML file.
-
-    Raises:
-        InputError: no such robot, or a file that is not one; the line names file, field, value and mend.
-    """
+    """Read a robot by its name (`list_robots`), or from a YAML file. Raises InputError, which names file, field, value
+    and mend."""
     if str(name_or_path) == ASSUMED:
         return RobotConfig()
     path = named_file("robot", name_or_path, (_SHIPPED,), list_robots)

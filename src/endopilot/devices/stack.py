@@ -44,13 +44,8 @@ Proximals = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class Stack:
-    """A wire, and the catheters around it from the inside out; a wire alone is a stack of one.
-
-    Attributes:
-        wire: the wire.
-        catheters: around it.
-        transmissions: what lies between drive and ostium, of each device; drives act at the ostium if not given.
-    """
+    """A wire, and the catheters around it from the inside out; a wire alone is a stack of one. `transmissions` are what
+    lies between drive and ostium, of each device; drives act at the ostium if not given."""
 
     wire: Wire
     catheters: tuple[Catheter, ...] = ()
@@ -66,15 +61,8 @@ class Stack:
 
     @staticmethod
     def of(device: Wire | Stack | str | Path, *catheters: Catheter | str | Path) -> Stack:
-        """Return the stack of a wire and catheters, each given itself, by its name or by its YAML file.
-
-        Args:
-            device: the wire, or a stack that the catheters are put around.
-            catheters: from the inside out; their drives act at the ostium.
-
-        Raises:
-            InputError: no such wire or catheter.
-        """
+        """Return the stack of a wire, or a stack, and catheters around it from the inside out, whose drives act at the
+        ostium; each is given itself, by its name or by its YAML file. Raises InputError for no such device."""
         around = tuple(each if isinstance(each, Catheter) else read_catheter(each) for each in catheters)
         if not isinstance(device, Stack):
             return Stack(device if isinstance(device, Wire) else read_wire(device), around)
@@ -127,11 +115,7 @@ class Stack:
         return self.wire.constants + tuple(each.constants for each in self.catheters) + behind
 
     def check(self, anatomy: Anatomy) -> None:
-        """Check that the devices fit into each other, and into an anatomy.
-
-        Raises:
-            InputError: one does not.
-        """
+        """Raise InputError unless the devices fit into each other, and into an anatomy."""
         check_nested(self.wire, self.catheters)
         for device in self.devices:
             check_fits(device, anatomy)

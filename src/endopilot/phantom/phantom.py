@@ -89,15 +89,10 @@ class _Plaque:
 
 @public
 def make_phantom(anatomy: Anatomy, *, config: PhantomConfig | None = None, seed: int = 0) -> Volume:
-    """Return a synthetic CT angiogram of a right or left coronary anatomy, in HU.
+    """Return a synthetic CT angiogram of a right or left coronary anatomy: int16 voxels in HU along the LPS axes.
 
-    Args:
-        anatomy: its tree gives the lumen; a stenosis named in its provenance gets a soft plaque.
-        config: scanner, contrast, disease.
-        seed: seed of contrast, noise, plaques and the surroundings' shapes.
-
-    Returns:
-        int16 voxels along the LPS axes.
+    The tree gives the lumen; a stenosis named in the provenance gets a soft plaque. The seed draws contrast, noise,
+    plaques and the surroundings' shapes.
     """
     config = config or PhantomConfig()
     generator = np.random.Generator(np.random.Philox(key=np.array([seed, 0x7068616E], dtype=np.uint64)))

@@ -58,17 +58,8 @@ def write_navigation(driven: PatientNavigation, *, output: str | Path) -> dict[s
     """Write a navigation in a patient into a folder: page, picture, table, trajectory, episode and manifest.
 
     The anatomy is written beside them if the navigation was given it in memory. A page of the documentation, Navigate
-    in a patient, describes the files.
-
-    Args:
-        driven: what `navigate` returned.
-        output: the folder.
-
-    Returns:
-        The outcome in one line, and figures.
-
-    Raises:
-        InputError: the folder belongs to another run.
+    in a patient, describes the files. Returns the outcome in one line, and figures; InputError if the folder belongs to
+    another run.
     """
     _claim(Path(output), driven.set_up)
     return _write(driven, Path(output), None)

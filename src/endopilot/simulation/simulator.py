@@ -280,26 +280,20 @@ class Simulator(Readout):
 
     @property
     def state(self) -> SimulatorState:
-        """The worlds' state, to be kept and given to `set_state`.
-
-        Example:
-            >>> kept = simulator.state  # kept.write(path) writes it to a file
-        """
+        """The worlds' state, to be kept and given to `set_state`; `simulator.state.write(path)` writes it to a file."""
         return SimulatorState(tuple(group.simulation.state() for group in self._groups), self._fingerprint)
 
     def set_state(self, state: SimulatorState) -> None:
-        """Restore all worlds, bit by bit.
-
-        Raises:
-            InputError: the state is that of other anatomies, devices or settings, of another number of worlds, or of
-                another version of endopilot.
+        """Restore all worlds, bit by bit; InputError for the state of other anatomies, devices, settings or versions.
 
         Example:
-            >>> kept, control = simulator.state, np.tile([5.0, 0.5], (4, 1))
+            >>> kept, control = simulator.state, np.tile([5.0, simulator.config.element_mm], (4, 1))
             >>> once = simulator.step(control, 0.1)
             >>> simulator.set_state(kept)
             >>> np.array_equal(simulator.step(control, 0.1).tip_position, once.tip_position)
             True
+            >>> simulator.set_up.initial.shape
+            (4, 1, 2)
         """
         state.check_version()
         if state.fingerprint != self._fingerprint:
@@ -352,22 +346,12 @@ class Simulator(Readout):
 
     @property
     def set_up(self) -> SimulationSetUp:
-        """What the worlds are simulated with, and where they started.
-
-        Example:
-            >>> simulator.set_up.initial.shape
-            (4, 1, 2)
-        """
+        """What the worlds are simulated with, and where they started."""
         return self._set_up
 
     @property
     def config(self) -> SimulatorConfig:
-        """Settings of the rod core.
-
-        Example:
-            >>> simulator.config.element_mm
-            0.75
-        """
+        """Settings of the rod core."""
         return self._set_up.config
 
     def _random_start(self, seed: int | None) -> tuple[np.ndarray, np.ndarray]:

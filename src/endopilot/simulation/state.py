@@ -82,14 +82,7 @@ class SimulatorState:
     format_version: int = FORMAT_VERSION
 
     def check_version(self, where: str = "state") -> None:
-        """Check that this version of endopilot can read the values.
-
-        Args:
-            where: what a person would look for: a file, or "state".
-
-        Raises:
-            InputError: the state has another format version.
-        """
+        """Raise InputError, which names `where` it is from, unless this version of endopilot can read the values."""
         if self.format_version != FORMAT_VERSION:
             raise InputError(
                 f"{where}: format version {self.format_version}, not {FORMAT_VERSION}; make the state again"
@@ -104,11 +97,7 @@ class SimulatorState:
 
     @staticmethod
     def read(path: Path | str) -> SimulatorState:
-        """Read a state.
-
-        Raises:
-            InputError: the file is missing, is no saved state, or is one of another format version.
-        """
+        """Read a state; InputError if the file is missing, is no saved state, or is one of another format version."""
         try:
             with np.load(regular(path), allow_pickle=False) as stored:
                 fingerprint = str(stored["fingerprint"])

@@ -63,14 +63,8 @@ class TipLoadTest:
 
 
 def simulate_tip_load(wire: Wire | str | Path) -> TipLoadTest:
-    """Push the distal 10 mm of a wire, straight, against a smooth plate until it buckles.
-
-    Args:
-        wire: the wire, its name or its YAML file; its tip shape is left out.
-
-    Raises:
-        RuntimeError: the rod core did not converge.
-    """
+    """Push the distal 10 mm of a wire (or its name, or its YAML file), straight, against a smooth plate until it
+    buckles; RuntimeError if the rod core did not converge."""
     wire = wire if isinstance(wire, Wire) else read_wire(wire)
     rod = _distal_rod(wire)
     nodes = len(rod.abscissa_mm)

@@ -110,12 +110,9 @@ class Trajectory(SolvedOutputs):
     def replay(self, *, record_shape: bool | None = None, **changed: Any) -> Trajectory:
         """Simulate the same commands again from the same start; what nothing changes comes out the same to the bit.
 
-        Args:
-            record_shape: record the positions of all nodes too; if not given, where they were recorded before.
-            changed: attributes of `SimulationSetUp` that are to be others, such as `config`, `motion` or `friction`.
-
-        Raises:
-            InputError: a world was on its way already when the recording began, or its vessel is not given.
+        `changed` are attributes of `SimulationSetUp`, such as `config`, `motion` or `friction`; the positions of all
+        nodes are recorded if they were before. Raises InputError where a world was on its way already when the
+        recording began, or its vessel is not given.
         """
         from endopilot.simulation.simulate import run_set_up  # which returns trajectories
 
@@ -153,11 +150,8 @@ class Trajectory(SolvedOutputs):
         return figure
 
     def write(self, path: Path | str) -> None:
-        """Write it as .npz, which `read_trajectory` reads back to the bit, or as a table, .csv or .parquet.
-
-        Raises:
-            InputError: another suffix, or shapes for a table.
-            ModuleNotFoundError: .parquet without the extra `learn`.
+        """Write it as .npz, which `read_trajectory` reads back to the bit, or as a table, .csv or .parquet. Raises
+        InputError for another suffix or shapes in a table, ModuleNotFoundError for .parquet without the extra `learn`.
         """
         path = Path(path)
         if path.suffix not in (".parquet", ".csv", ".npz"):
@@ -244,15 +238,8 @@ def trajectory_table(trajectory: Trajectory) -> pd.DataFrame:
 
 @public
 def read_trajectory(path: str | Path, *, anatomy: Anatomy | Sequence[Anatomy] | None = None) -> Trajectory:
-    """Read a trajectory from an .npz file.
-
-    Args:
-        path: the file.
-        anatomy: the vessel of all worlds, or one for each; without it the trajectory is not replayed or plotted.
-
-    Raises:
-        InputError: no such file, or one that is no trajectory, of another version, or of another vessel.
-    """
+    """Read a trajectory from an .npz file; without its anatomy (of all worlds, or one for each) it is not replayed or
+    plotted. Raises InputError for another file, version or vessel."""
     try:
         with np.load(regular(path), allow_pickle=False) as stored:
             about = json.loads(str(stored["about"]))

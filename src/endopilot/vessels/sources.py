@@ -64,13 +64,8 @@ _NAMES = {**MM_PER_UNIT, "[in_i]": 25.4}
 
 @dataclass(frozen=True, eq=False)
 class Polylines:
-    """Centerlines as a file holds them: any number of lines, in any order and direction, possibly overlapping.
-
-    Attributes:
-        points: positions of each line, mm.
-        radius: inscribed-sphere radii of each line, mm.
-        names: what messages call each line; its number if none are given.
-    """
+    """Centerlines as a file holds them: positions and inscribed-sphere radii, mm, of any number of lines, in any order
+    and direction, possibly overlapping. Messages call lines by their names, or by their numbers."""
 
     points: tuple[Float[np.ndarray, "_ 3"], ...]
     radius: tuple[Float[np.ndarray, "_"], ...]

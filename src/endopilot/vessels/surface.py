@@ -41,12 +41,7 @@ _SLICES = 16
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A triangulated wall.
-
-    Attributes:
-        vertices: positions, LPS mm.
-        faces: three vertex indices a triangle.
-    """
+    """A triangulated wall: positions, LPS mm, and three vertex indices a triangle."""
 
     vertices: Float[np.ndarray, "n 3"]
     faces: Int[np.ndarray, "m 3"]
