@@ -31,8 +31,7 @@ class Stopped(SystemExit):
 
 
 def stop(number: int, frame: FrameType | None) -> None:
-    """Raise `Stopped` once, as the handler of a signal, but not while an extension module is being loaded: it runs
-    Python code to import others, and VTK's go on where that raises, and crash, or lose the signal."""
+    """Raise `Stopped` once, as a signal's handler, but not while an extension module loads: VTK's would crash."""
     while frame is not None:
         if frame.f_code in _LOADING:
             return stop_soon(number)

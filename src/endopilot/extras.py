@@ -47,8 +47,7 @@ def what_is_missing(error: ModuleNotFoundError) -> str | None:
 
 
 def require_extras(*extras: str) -> None:
-    """Raise InputError, which names them, unless the libraries of some extras are installed: before work that needs
-    them at its end."""
+    """Raise InputError, which names what lacks, unless some extras are installed: before long work."""
     present = extras_present()
     missing = [extra for extra in extras if not present[extra]]
     if missing:

@@ -270,8 +270,7 @@ def sha256(path: Path) -> str:
 
 
 def input_hash(path: Path, read: Sequence[Path] = ()) -> dict[str, str]:
-    """Return the SHA-256 of an input, a file or all files of a folder in order of name, for the manifest; `read` are
-    the files that were read of it."""
+    """Return the SHA-256 of a file, or of a folder's files in order of name; `read` are those that were read."""
     path = Path(path)
     parts = sorted(read) or sorted(part for part in path.rglob("*") if part.is_file())
     if path.is_file() and (not read or parts == [path]):

@@ -14,6 +14,5 @@ def length_along(points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n"]:
 def places_on(
     points: Float[np.ndarray, "n d"], along: Float[np.ndarray, "n"], at: Float[np.ndarray, "m"]
 ) -> Float[np.ndarray, "m d"]:
-    """Return places at lengths along a line, linear between its points, whose own lengths are `length_along`'s or from
-    another begin."""
+    """Return places at lengths along a line, linear between points at `length_along`, or from another begin."""
     return np.stack([np.interp(at, along, part) for part in points.T], axis=-1)

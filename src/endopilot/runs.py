@@ -66,8 +66,7 @@ def claiming(folder: Path, command: str, **identity: Any) -> Iterator[None]:
 
 
 def check_new(path: Path, inputs: Sequence[Path] = (), *, overwrite: bool = False) -> None:
-    """Raise InputError where a file would be written over another, before the work is done; never over an input, over
-    others if the user lets the command `overwrite`."""
+    """Raise InputError, before the work, where a file would go over an input, or over another without `overwrite`."""
     if path.is_dir() or not os.path.lexists(path):
         return
     if not overwrite:

@@ -340,8 +340,7 @@ class Anatomy:
 
 @dataclass(frozen=True, eq=False)
 class TipProjection:
-    """Where tips lie with respect to the centerline tree: Δtip, mm (negative inside the guiding catheter), γtip, mm,
-    the branch that the tip lies in, and the lumen radius at the projection, mm."""
+    """Where tips lie in the tree: Δtip, mm (negative in the catheter), γtip, mm, branch, and lumen radius there, mm."""
 
     abscissa: Float[np.ndarray, "..."]
     offset: Float[np.ndarray, "..."]

@@ -38,8 +38,7 @@ def carried(
 
 
 def with_axis(anatomy: Anatomy, axis: Float[np.ndarray, "3"]) -> Anatomy:
-    """Return the anatomy with its catheter, and φ's zero, turned about the ostium by the shortest turn; where the
-    catheter lay, the map stays open. A zero of the world's axes stays that."""
+    """Return the anatomy with its catheter, and φ's zero, turned about the ostium; its old way stays open in the map."""
     zero = anatomy.insertion.rotation_zero
     if isinstance(zero, np.ndarray):
         zero = carried(zero, anatomy.insertion.direction, axis)
@@ -49,6 +48,5 @@ def with_axis(anatomy: Anatomy, axis: Float[np.ndarray, "3"]) -> Anatomy:
 
 
 def with_world_zero(anatomy: Anatomy) -> Anatomy:
-    """Return the anatomy with φ's zero by the world's axes, as before anatomies held one: recorded controls mean the
-    same in it as they did then."""
+    """Return the anatomy with φ's zero by the world's axes, as before anatomies held one, for controls of then."""
     return replace(anatomy, insertion=replace(anatomy.insertion, rotation_zero="world axes"))

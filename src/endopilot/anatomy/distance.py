@@ -95,8 +95,7 @@ def add_catheter(
 
 
 def catheter_tilt_deg(ostium_radius_mm: float, catheter_radius_mm: float) -> float:
-    """Return how far a catheter (inner radius) may lean off the vessel's axis before its engaged tip meets the wall,
-    degrees."""
+    """Return how far a catheter (inner radius) may lean until its engaged tip meets the wall, degrees."""
     return math.degrees(math.atan2(max(ostium_radius_mm - catheter_radius_mm, 0.0), ENGAGED_MM))
 
 

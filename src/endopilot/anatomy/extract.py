@@ -191,8 +191,7 @@ def extract_anatomy(
 def _wall(
     content: LumenMask | Surface, given: Insertion | None, config: AnatomyConfig, label: str, axes: str | None
 ) -> tuple[Surface, repair.Lumen, Float[np.ndarray, "wide 3"], CoronaryInlet | None]:
-    """Return the closed wall of the wanted vessel, its voxels (whose notes state all repairs), where they were widened,
-    LPS mm, and an artery's inlet."""
+    """Return the vessel's closed wall, its voxels with notes of repairs, where widened (LPS mm), an artery's inlet."""
     inlet, remarks = None, list[str]()
     repair.pieces_of.cache_clear()  # what a caller's mask held before may be another vessel
     if isinstance(content, LumenMask):

@@ -63,8 +63,7 @@ def write_anatomy(anatomy: Anatomy, *, output: str | Path) -> None:
 
 @public
 def read_anatomy(folder: str | Path) -> Anatomy:
-    """Read an anatomy that `write_anatomy` wrote; InputError if the folder or a file of it is missing, damaged or of
-    another version."""
+    """Read an anatomy; InputError if the folder or a file of it is missing, damaged or of another version."""
     folder = Path(folder)
     if folder.is_file():
         raise InputError(f"{folder}: is a file; make an anatomy of it first: `endopilot anatomy {folder} -o FOLDER`")

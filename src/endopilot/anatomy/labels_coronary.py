@@ -81,8 +81,7 @@ def _forks(labeller: Labeller, route: tuple[int, ...]) -> list[int]:
 
 
 def _end_of_distal(line: Centerline, passed: float | None) -> float:
-    """Return where segment 3 ends, mm, in an artery that does not fork where it passes the known crux. One that ends
-    before the crux is a part of the usual way there: a vestige of 35 mm is all segment 1."""
+    """Return segment 3's end, mm, in an artery without a fork at the crux; one that ends before it is cut short."""
     whole = float(line.abscissa[-1])
     if passed is None:
         return max(whole, USUAL_CRUX_MM)

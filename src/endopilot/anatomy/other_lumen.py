@@ -49,8 +49,7 @@ def _moved(anatomy: Anatomy, grown: Float[np.ndarray, "n"]) -> DistanceMap:
 
 @lru_cache(maxsize=1)
 def _owners(anatomy: Anatomy) -> tuple[Int[np.ndarray, "points 3"], Int[np.ndarray, "points"]]:
-    """Return the points of an anatomy's map within its reach, and the sphere (of the centerlines, then the catheter's)
-    that each belongs to. The last anatomy's are kept: lumens of several widths are made of one."""
+    """Return an anatomy's map points within reach, and each one's sphere; the last anatomy's are kept."""
     insertion, field = anatomy.insertion, anatomy.distance_map
     lines = [branch.centerline for branch in anatomy.tree.branches]
     count = max(2, int(np.ceil(CATHETER_LENGTH_MM / anatomy.catheter_radius_mm)))

@@ -102,8 +102,7 @@ def _spacing(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
 
 
 def _shared_tangents(tree: VesselTree, insertion: Insertion) -> list[Float[np.ndarray, "n 3"]]:
-    """Return the tangents at all vertices; a branch and the child that carries it on share that at the joint. So do the
-    catheter and the first branch: the plane through the ostium stands across the catheter's axis."""
+    """Return tangents at all vertices, shared at joints: so the ostium's plane stands across the catheter's axis."""
     result = [tangents(branch.centerline.points) for branch in tree.branches]
     for index in range(len(result)):
         children = [i for i in tree.children(index) if len(result[i]) > 1]

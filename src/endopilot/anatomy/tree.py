@@ -21,8 +21,7 @@ SAMPLE_STEP_MM = 0.1
 
 @dataclass(frozen=True, eq=False)
 class LineTree:
-    """One tree from centerlines, the rule by which its root was chosen, what was done and left out, and
-    `line_checks.left_out`."""
+    """One tree from lines, the rule that chose its root, what was done and left out, and `line_checks.left_out`."""
 
     tree: VesselTree
     rule: str
@@ -44,8 +43,7 @@ def tree_from_polylines(
 
 
 def tree_from_lines(lines: list[Line]) -> VesselTree:
-    """Return the tree of lines that leave each other, parents first, cut into branches, with abscissa and normals.
-    Sections are not named yet: all points carry section 0, "vessel"."""
+    """Return the tree of lines that leave each other, cut into branches, all in section 0, "vessel"."""
     branches: list[Branch] = []
     ends: dict[tuple[int, int], int] = {}
     for index, line in enumerate(lines):
@@ -71,8 +69,7 @@ def make_centerline(
     first_abscissa: float = 0.0,
     first_normal: Float[np.ndarray, "3"] | None = None,
 ) -> Centerline:
-    """Return a centerline (LPS mm, inscribed-sphere radii) with abscissa and parallel-transport normals, which carry
-    `first_normal`, or any perpendicular one, along."""
+    """Return a centerline (LPS mm, radii) with abscissa and parallel-transported `first_normal` (or any)."""
     abscissa = first_abscissa + length_along(points)
     return Centerline(points=points, radius=radius, abscissa=abscissa, normals=parallel_transport(points, first_normal))
 

@@ -111,8 +111,7 @@ def seen_through_ct(
 def rasterised(
     lumen: DistanceMap, voxel_mm: Float[np.ndarray, "3"], taken_in: float, shift: Float[np.ndarray, "3"]
 ) -> Volume:
-    """Return the voxels whose centre lies in a lumen (distance to its wall, mm), or outside by up to a share of their
-    edge in the plane."""
+    """Return the voxels whose centre lies in a lumen, or outside by up to a share of their edge in the plane."""
     k, j, i = np.nonzero(lumen.values > -_MARGIN_MM / 2)
     points = np.stack([i, j, k], axis=1) * lumen.spacing_mm + lumen.origin_mm
     origin = points.min(axis=0) - _MARGIN_MM + shift * voxel_mm

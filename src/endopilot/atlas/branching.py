@@ -116,8 +116,7 @@ def free_origin(generator: np.random.Generator, mean_mm: float, sd_mm: float, ta
 def stenosis(
     generator: np.random.Generator, along: Float[np.ndarray, "n"], shares: tuple[float, float]
 ) -> tuple[dict[str, float], Float[np.ndarray, "n"]]:
-    """Return a narrowing of 30 to 65 % of the diameter over 6 to 14 mm, and the factor on the radius. It lies between
-    `shares` of the vessel's abscissa."""
+    """Return a narrowing of 30 to 65 % of the diameter over 6 to 14 mm within `shares`, and the radius's factor."""
     place, extent = along[0] + generator.uniform(*shares) * (along[-1] - along[0]), generator.uniform(6.0, 14.0)
     degree = generator.uniform(0.3, 0.65)
     narrowing = 1 - degree * np.exp(-0.5 * ((along - place) / (extent / 4)) ** 2)
@@ -128,8 +127,7 @@ def stenosis(
 def stenoses(
     generator: np.random.Generator, along: Float[np.ndarray, "n"], shares: tuple[float, float], tandem_share: float
 ) -> tuple[list[dict[str, Any]], Float[np.ndarray, "n"]]:
-    """Return a stenosis, with a probability of `tandem_share` a second one 12 to 40 mm from it where there is room, and
-    their factor."""
+    """Return a stenosis, by `tandem_share` a second one 12 to 40 mm from it where there is room, and their factor."""
     drawn, narrowing = stenosis(generator, along, shares)
     if tandem_share == 0 or generator.random() > tandem_share:
         return [drawn], narrowing
@@ -278,8 +276,7 @@ def build_tree(vessels: Sequence[Vessel], section_names: tuple[str, ...]) -> Ves
 
 
 def lumens_collide(vessels: Sequence[Vessel], carina_mm: float = _BEND_MM) -> bool:
-    """Return whether lumens touch that lie far apart along the tree: behind a fork, beyond `carina_mm` and twice their
-    radii."""
+    """Return whether lumens touch far apart along the tree: beyond `carina_mm` and twice their radii behind a fork."""
     points = np.concatenate([vessel.points for vessel in vessels])
     radii = np.concatenate([vessel.radius for vessel in vessels])
     place = np.concatenate([length_along(vessel.points) for vessel in vessels])

@@ -181,8 +181,7 @@ _HEIGHT_MM = 3.0
 
 
 def place_from_ostium(distance_cm: float, azimuth_deg: float, elevation_deg: float) -> Float[np.ndarray, "3"]:
-    """Return the LPS position of one of Dodge's points with respect to its ostium, mm. Azimuth counts from the front to
-    the patient's left, elevation towards the head."""
+    """Return the LPS position of a point of Dodge's, mm: azimuth from the front to the left, elevation headward."""
     azimuth, elevation = np.deg2rad([azimuth_deg, elevation_deg])
     flat = np.cos(elevation) * np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
     return 10.0 * distance_cm * (flat + np.array([0.0, 0.0, np.sin(elevation)]))

@@ -82,8 +82,7 @@ class Population:
 
 @dataclass(frozen=True, kw_only=True)
 class SideKind:
-    """How a kind of side branch leaves: mean and SD of its origin's distance from where the vessel begins and of its
-    length, mm, and the share of patients that have it."""
+    """How a side branch leaves: means and SDs of its origin and length, mm, and the share of patients that have it."""
 
     origin_mm: tuple[float, float]
     length_mm: tuple[float, float]

@@ -53,8 +53,7 @@ class _Targets:
 def make_rca(
     generator: np.random.Generator, stenosis_share: float, population: Population
 ) -> tuple[VesselTree, dict[str, Any]]:
-    """Return one right coronary tree and what was drawn for it. Targets are kept when a shape fails, so that failures
-    do not bias the statistics."""
+    """Return one right coronary tree and its draws; targets stay when a shape fails, for failures would bias them."""
     for _ in range(10):
         targets = _targets(generator)
         draw = partial(_draw, generator, targets, stenosis_share, population)

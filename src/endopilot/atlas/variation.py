@@ -38,8 +38,7 @@ _SCATTER_DEG = 30.0
 
 @dataclass(frozen=True)
 class Fork:
-    """A place at which a main vessel gives way, by an angle that is drawn if none, to a branch that leaves in an LPS
-    direction."""
+    """A place at which a main vessel gives way, by an angle (drawn if none), to a branch in an LPS direction."""
 
     index: int
     side: tuple[float, float, float]

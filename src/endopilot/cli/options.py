@@ -136,8 +136,7 @@ class Command:
         return "\n\n".join(part for part in (self._text.short_description, self._text.long_description) if part)
 
     def options(self, values: Any = None) -> list[Option]:
-        """Return its options, set to `values` or the defaults: its function's in their order, then those of its
-        settings."""
+        """Return its options, set to `values` or the defaults: its function's in order, then its settings'."""
         meanings = _meanings(self._config) | _EVERYWHERE
         meanings |= {one.arg_name: _line(one.description) for one in self._text.params}
         found = _options(self.defaults if values is None else values, meanings, self._required)

@@ -159,8 +159,7 @@ def _film(
     about: Mapping[str, Any],
     title: str,
 ) -> Film:
-    """Return a film of one world that is driven again by its commands; `about` has its `target` and `exposures_s`, if
-    known."""
+    """Return a film of one world, driven again; `about` has its `target` and `exposures_s`, if known."""
     (anatomy,), (stack,), (start,) = set_up.anatomies, set_up.stacks, set_up.initial
     if np.isnan(start).any():
         raise InputError(f"{title}: was on its way when the recording began; record from its start")

@@ -68,8 +68,7 @@ class XrayUnit:
     def __init__(
         self, anatomy: Anatomy, make_imager: Callable[[Volume | None], XrayImager], ct: Volume | None = None
     ) -> None:
-        """Compute the first view in the background. Without a CT (HU) a coronary artery lies in a phantom's, others in
-        water."""
+        """Compute the first view in the background; without a CT (HU) a coronary artery lies in a phantom's."""
         self.settings = XraySettings()
         self.pedal, self.frames, self.seconds, self.kerma_ugy = False, 0, 0.0, 0.0
         self.background = "plain" if ct is None else "CT"

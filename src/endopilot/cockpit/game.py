@@ -53,8 +53,7 @@ class Attempt:
 
 
 class GameSession(Session):
-    """A session that "waits", is "on" as a game until it is "over", and then is an ordinary one; `result` scores the
-    person."""
+    """A session that "waits", is "on" as a game until it is "over", and then an ordinary one."""
 
     def __init__(
         self,
@@ -64,8 +63,7 @@ class GameSession(Session):
         recorder: Recorder | None = None,
         policies: tuple[str, ...] = (),
     ) -> None:
-        """Take the world at the task's start, its clock standing still, and the policies that a page may choose at the
-        end."""
+        """Take the world at the task's start, and the policies that a page may choose at the end."""
         super().__init__(world, xray, recorder, policies)
         self.sight, self.phase = False, "waits"
         self.result: dict[str, Any] | None = None

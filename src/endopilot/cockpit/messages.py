@@ -55,8 +55,7 @@ class CArm(_Message):
 
 
 class Target(_Message):
-    """Set the target: the middle of a section by its name, or a place by its distance from the ostium along a branch's
-    path, mm."""
+    """Set the target: the middle of a named section, or a place by its distance along a branch's path, mm."""
 
     type: Literal["target"]
     section: Annotated[str, Field(max_length=80)] | None = None

@@ -95,8 +95,7 @@ class RecordedSession:
 
 
 def read_session(path: Path) -> RecordedSession:
-    """Read a session without a last line that is half-written. Raises InputError for no such file, no session, or one
-    whose vessel is gone or has changed."""
+    """Read a session, without a half-written last line; InputError for none, or one whose vessel is gone or changed."""
     lines = _lines(path)
     header = lines[0] if lines else {}
     if str(header.get("format")).startswith("endopilot cockpit ") and header["format"] != FORMAT:

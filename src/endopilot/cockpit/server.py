@@ -63,8 +63,7 @@ class Cockpit:
     def __init__(
         self, stage: Stage, scene: Callable[[], bytes], *, token: str, hosts: frozenset[str], cycle_s: float
     ) -> None:
-        """Lay the routes out. A page's address must hold the token, and one of `hosts`, or the address that a
-        connection comes in at."""
+        """Lay out the routes; a page's address must hold the token, and one of `hosts` or the connection's own."""
         self._token, self._hosts, self._scene = token, hosts, scene
         self.loop = Loop(stage, cycle_s, self._publish)
         self._pages: list[_Page] = []
@@ -307,8 +306,7 @@ def machine_names() -> set[str]:
 
 
 def _listener(host: str, port: int) -> socket.socket:
-    """Return a socket that is bound to an address; InputError if there is none here, or the port is taken or not for
-    this user."""
+    """Return a socket that is bound to an address; InputError if there is none here, or the port cannot be had."""
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         family, _, _, _, address = found[0]

@@ -35,8 +35,7 @@ AUTOPILOT_SILENCE_S = 1.0
 
 
 class Session:
-    """One world driven from a page, with a policy that may drive; `sight` is whether the page may show the wire in
-    space."""
+    """One world driven from a page, and a policy that may drive; `sight`: may the page show the wire in space?"""
 
     def __init__(
         self, world: LiveWorld, xray: XrayUnit, recorder: Recorder | None = None, policies: tuple[str, ...] = ()

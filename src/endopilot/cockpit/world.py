@@ -92,8 +92,7 @@ class LiveWorld:
         seed: int = 0,
         reality: World | None = None,
     ) -> None:
-        """Bring wire and catheters to the start; InputError if a device does not fit the vessel, or is shorter than its
-        start is deep."""
+        """Bring the devices to the start; InputError if one does not fit the vessel, or is shorter than its start."""
         self.hand, self.config = Hand(), config
         self.loop = NavigationLoop(navigation, self.hand, config=config, seed=seed, world=reality)
         self.reality = self.loop.world
@@ -117,8 +116,7 @@ class LiveWorld:
         return self.config.cycle_s / self._taken_s
 
     def command(self, devices: Proximals) -> Proximals:
-        """Let the hand hold velocities, and return what the robot has taken of them, as `Robot` says; InputError for
-        too many devices."""
+        """Let the hand hold velocities; return what the robot took of them. InputError for too many devices."""
         around = len(self.navigation.catheters)
         if len(devices) > 1 + around:
             raise InputError(f"catheters: {len(devices) - 1}; this wire has {around} around it")
@@ -210,8 +208,7 @@ def take_snapshot(
 def _lines(
     simulator: Simulator, inserted_length_mm: Float[np.ndarray, "devices"]
 ) -> list[tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_"]]]:
-    """Return of each device its nodes from the tip on, LPS mm, and the wall's force at each, N, which presses on the
-    outermost alone."""
+    """Return each device's nodes from the tip on, LPS mm, and the wall's force on them, N, on the outermost alone."""
     nodes, force = shown_part(simulator.position[0], float(inserted_length_mm.max())), simulator.contacts[0]
     found, covered = [], -np.inf
     for device, line in reversed(list(enumerate(lines_from_tips(nodes, inserted_length_mm)))):

@@ -22,8 +22,7 @@ _QUANTILES = {"p5": 0.05, "median": 0.5, "p95": 0.95, "p99": 0.99}
 
 @dataclass(frozen=True, eq=False)
 class Histogram:
-    """How often a quantity took which value, over all valid samples; values beyond the edges count in the outermost
-    bins."""
+    """How often a quantity took which value in valid samples; outermost bins count what lies beyond."""
 
     title: str
     unit: str

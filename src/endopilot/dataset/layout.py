@@ -139,8 +139,7 @@ class BlockContext:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Which navigations of which anatomies, moving how, a dataset holds; a resumed run must share its settings (plain
-    JSON)."""
+    """Which navigations of which anatomies a dataset holds, and their motion; a resumed run must share its settings."""
 
     context: BlockContext
     folders: tuple[Path, ...]
@@ -222,8 +221,7 @@ def version() -> str:
 
 
 def identify(folder: Path) -> tuple[str, str]:
-    """Return an anatomy's name and its identity, from its record; one that does not state it is read whole. Raises
-    InputError."""
+    """Return an anatomy's name and identity, from its record or, where that lacks it, its content; InputError."""
     path = folder / "anatomy.json"
     record = read_json(path) if path.exists() else {}
     if isinstance(record, dict) and {"name", "identity"} <= record.keys():

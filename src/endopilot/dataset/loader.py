@@ -101,8 +101,7 @@ class Dataset(Outputs):
         return Stack(from_record(Wire, self.manifest["device"]), catheters)
 
     def __getitem__(self, episodes: int | slice | Shaped[np.ndarray, "chosen"]) -> Dataset:
-        """Return one episode, by its number, or several, by a mask or their numbers; one may stand there several times.
-        Raises InputError for a number that no episode has."""
+        """Return an episode by its number, or several by a mask or numbers; InputError for one that there is not."""
         if isinstance(episodes, int):
             if not 0 <= episodes < len(self):
                 raise InputError(f"world: {episodes}; {self.folder} has episodes 0 to {len(self) - 1}")
@@ -191,8 +190,7 @@ class Dataset(Outputs):
         return next(record for record in self.manifest["anatomies"] if record["name"] == anatomy)
 
     def anatomy_folder(self, name: str) -> Path:
-        """Return the folder of an anatomy of the dataset; InputError if it is missing, or another than the dataset was
-        made in."""
+        """Return an anatomy's folder; InputError if it is missing, or another than the dataset was made in."""
         record = self._record(name)
         folder = (self.folder / record["folder"]).resolve()
         if identify(folder) != (name, record["sha256"]):
@@ -231,8 +229,7 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def read_dataset(folder: str | Path) -> Dataset:
-    """Read a whole dataset made by `endopilot dataset`. Raises InputError for no finished dataset, or one that is
-    damaged or of another version."""
+    """Read a finished dataset whole. Raises InputError for none, or one that is damaged or of another version."""
     with extra_named("reading a dataset"):
         import endopilot.dataset.parquet  # noqa: F401
 

@@ -54,8 +54,7 @@ class Draw:
     seeds: tuple[tuple[int, int], ...] = ()
 
     def stacks(self, given: Stack) -> list[Stack]:
-        """Return each navigation's devices; those of one tip share one object, and `given` itself where nothing is
-        drawn."""
+        """Return each navigation's devices: one object for each tip, `given` itself where nothing is drawn."""
         made = {(given.wire.tip_bend_rad, 1.0): given}
         tips = list(zip(self.tip_bend_rad.tolist(), self.tip_stiffness_factor.tolist(), strict=True))
         for bend_rad, factor in tips:
@@ -231,8 +230,7 @@ def branch_ends(tree: VesselTree) -> Float[np.ndarray, "branches"]:
 
 
 class _PushRoom:
-    """How far each device (columns, the wire first) may still be pushed in each world; beyond `caught_n` of push, N, it
-    is caught."""
+    """How far each device (columns) may still be pushed in each world; over `caught_n` of push, N, it is caught."""
 
     def __init__(self, tree: VesselTree, stacks: Sequence[Stack]) -> None:
         self._ends = branch_ends(tree)

@@ -77,8 +77,7 @@ def parquet_bytes(table: pa.Table) -> bytes:
 
 
 def read_table(path: Path, key: str) -> pa.Table:
-    """Read a Parquet file of the dataset that has this key; InputError for another's, another version's or a damaged
-    one."""
+    """Read a Parquet file that has this key; InputError for another's, another version's or a damaged one."""
     try:
         table = pq.ParquetFile(regular(path)).read()
     except FileNotFoundError as error:

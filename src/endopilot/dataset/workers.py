@@ -30,8 +30,7 @@ from endopilot.types import Anatomy
 def write_block(
     context: BlockContext, block: Block, *, threads: int = 1, advance: Callable[[int], None] = lambda _: None
 ) -> None:
-    """Simulate one block and write it; `advance` is called with the number of samples that were simulated since the
-    last call."""
+    """Simulate one block and write it; `advance` is called with the numbers of samples simulated."""
     config, anatomy, stack = context.config, _read(block.folder, block.identity), context.stack
     draw = draw_navigations(config, stack.wire, anatomy, block.sequences, devices=len(stack))
     world = context.world.leaning(config.seed)
@@ -131,8 +130,7 @@ class _Interrupted(Exception):
 
 
 def run_locally(context: BlockContext, blocks: Sequence[Block], done: Done, advance: Callable[[int], None]) -> None:
-    """Write blocks with one thread each, as many at a time as there are cores; of fewer blocks the rod core uses the
-    other cores."""
+    """Write blocks with one thread each, one a core at a time; of fewer blocks the rod core uses the other cores."""
     cores = context.config.simulator.threads or CORES
     workers = max(1, min(cores, len(blocks)))
     threads = cores // workers

@@ -83,8 +83,7 @@ def list_catheters() -> tuple[str, ...]:
 
 
 def read_catheter(name_or_path: str | Path) -> Catheter:
-    """Read a catheter by its name (`list_catheters`), or from a YAML file. Raises InputError, which names file, field,
-    value and mend."""
+    """Read a catheter by its name, or from a YAML file; InputError names file, field, value and mend."""
     path = named_file("catheter", name_or_path, (_SHIPPED,), list_catheters)
     content = read_settings(path, CatheterFile)
     shape = tuple((length, math.radians(angle)) for length, angle in content.shape.arcs)
@@ -97,8 +96,7 @@ def read_catheter(name_or_path: str | Path) -> Catheter:
 
 
 def catheter_yaml(name_or_path: str | Path) -> str:
-    """Return the text of a catheter's YAML file, by its name or its path; InputError if there is none, or it is no
-    text."""
+    """Return the text of a catheter's YAML file, by name or path; InputError if there is none, or it is no text."""
     path = named_file("catheter", name_or_path, (_SHIPPED,), list_catheters)
     return read_text(path, what="catheter's YAML file")
 
@@ -118,8 +116,7 @@ def check_nested(wire: Wire, catheters: Sequence[Catheter]) -> None:
 
 
 def write_device(device: Wire | Catheter, *, output: str | Path) -> None:
-    """Write a wire or a catheter as a YAML file that `read_wire` or `read_catheter` reads, with the same constants;
-    InputError if it cannot be written."""
+    """Write a device as a YAML file that `read_wire` or `read_catheter` reads back; InputError if it cannot."""
     content = _wire(device) if isinstance(device, Wire) else _catheter(device)
     write_yaml(Path(output), content)
 

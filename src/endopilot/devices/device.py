@@ -63,7 +63,7 @@ _LEAST_DEG = math.degrees(math.pi) / 57
 
 @settings
 class TipShaping:
-    """The bends that a hand can give the tip of a wire: least and largest angle (degrees) and length from the tip (mm)."""
+    """The bends that a hand can give a wire's tip: least and largest angle (degrees) and length from the tip (mm)."""
 
     angle_deg: tuple[NonNegative, NonNegative]
     length_mm: tuple[Positive, Positive]
@@ -279,8 +279,7 @@ def file_constants(content: Any) -> dict[str, Any]:
 
 @public
 def read_wire(name_or_path: str | Path) -> Wire:
-    """Read a device by its name (`list_wires`), or from a YAML file. Raises InputError, which names file, field, value
-    and mend."""
+    """Read a wire by its name, or from a YAML file; InputError names file, field, value and mend."""
     path = device_file(name_or_path)
     content = read_settings(path, WireFile)
     shaping = content.tip_shaping
@@ -301,8 +300,7 @@ def read_wire(name_or_path: str | Path) -> Wire:
 def check_built(
     device: Device, *, bore_mm: float = 0.0, arcs: Sequence[tuple[float, float]] = (), catheter: bool = False
 ) -> None:
-    """Raise InputError where constants of a device's file cannot be those of one thing; `bore_mm` is 0 for a wire,
-    `arcs` (mm, rad) are of a catheter's shape."""
+    """Raise InputError where a file's constants cannot be one thing's; `bore_mm` is 0 for a wire, `arcs` a catheter's."""
     _check_stiffness(device, bore_mm, catheter)
     shears = _STRENGTH_MPA / math.sqrt(3) * math.pi / 16 * device.diameter_mm**3  # yields in shear by von Mises
     if (torque := device.torque_limit_n_mm) > shears:
@@ -399,7 +397,6 @@ def check_fits(device: Device, anatomy: Anatomy) -> None:
 
 
 def lateral_reach(bend_rad: float, length_mm: float) -> float:
-    """Return how far a bent tip stands beside the wire behind it, mm: L(1 − cos θ)/θ. A tip that is bent by more than
-    half a turn stands farthest beside the wire where it has turned by half of one."""
+    """Return how far a bent tip stands beside the wire, mm: L(1 − cos θ)/θ, farthest where it turned by half a turn."""
     angle = abs(bend_rad)
     return float(length_mm * (1 - np.cos(min(angle, np.pi))) / angle) if angle > 0 else 0.0

@@ -32,15 +32,13 @@ def list_wires() -> tuple[str, ...]:
 
 
 def user_devices() -> tuple[str, ...]:
-    """Return the names of the devices in the user's folders, without the shipped ones; InputError if ENDOPILOT_DEVICES
-    is no folder."""
+    """Return names of the devices in the user's folders; InputError if ENDOPILOT_DEVICES is no folder."""
     names = {path.stem for folder in _user_folders() for path in folder.glob("*.yaml")}
     return tuple(sorted(names - set(list_wires())))
 
 
 def device_file(name_or_path: str | Path) -> Path:
-    """Return the YAML file of a device, by its name or its path; InputError for none, or several folders that hold the
-    name."""
+    """Return a device's YAML file, by name or path; InputError for none, or several folders that hold the name."""
     folders = (_SHIPPED, *_user_folders())
     return named_file("device", name_or_path, folders, lambda: (*list_wires(), *user_devices()))
 
@@ -48,8 +46,7 @@ def device_file(name_or_path: str | Path) -> Path:
 def named_file(
     kind: str, name_or_path: str | Path, folders: Sequence[Path], names: Callable[[], Sequence[str]]
 ) -> Path:
-    """Return a YAML file of some kind, by its name in one of some folders, or by its path; InputError as for
-    `device_file`."""
+    """Return a YAML file by its name in one of some folders, or by its path; InputError as for `device_file`."""
     files = [path for folder in folders if there(path := folder / f"{name_or_path}.yaml")]
     if len(files) > 1:
         raise InputError(f"{kind} '{name_or_path}': {' and '.join(map(str, files))} both hold it; rename yours")

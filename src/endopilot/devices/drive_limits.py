@@ -67,8 +67,7 @@ class DriveLimits:
 
     @staticmethod
     def of(device: Device, anatomy: Anatomy | None = None) -> DriveLimits:
-        """Return the limits of a device in a vessel: the drive's speed, the ostium and the far end (`far_end_mm`; none
-        without a vessel)."""
+        """Return a device's limits in a vessel: its drive's speed, the ostium and the far end (none without a vessel)."""
         return DriveLimits(
             max_velocity_mm_s=device.max_velocity_mm_s,
             max_rotation_rad_s=device.max_rotation_rad_s,
@@ -87,8 +86,7 @@ class DriveLimits:
         return replace(self, travel_mm=(low, high - max(ostium_mm, 0.0) - _HAIR_MM))
 
     def safe(self, translation: Any, rotation: Any) -> tuple[float, float]:
-        """Return one command, mm/s and rad/s, that is finite and within the speed limits, whatever is asked; what is no
-        number stops."""
+        """Return a finite command within the speed limits, mm/s and rad/s, whatever is asked; NaN stops."""
         try:
             asked = np.array([float(translation), float(rotation)])
         except (TypeError, ValueError, OverflowError):
@@ -113,8 +111,7 @@ class DriveLimits:
     def clip_sequence(
         self, control: Float[np.ndarray, "*n samples 2"], inserted_length: Numbers, duration: float
     ) -> Float[np.ndarray, "*n samples 2"]:
-        """Return what a drive can do of sequences of controls, as `clip` one after the other; what follows a NaN is
-        NaN."""
+        """Return `clip` of sequences of controls, one after the other; what follows a NaN is NaN."""
         made, inserted = np.array(control, dtype=float), np.asarray(inserted_length, dtype=float)
         for sample in range(made.shape[-2]):
             made[..., sample, :] = self.clip(made[..., sample, :], inserted, duration)

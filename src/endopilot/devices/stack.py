@@ -129,8 +129,7 @@ def column_prefixes(devices: int) -> tuple[str, ...]:
 def lines_from_tips(
     nodes: Float[np.ndarray, "n 3"], inserted_length_mm: Float[np.ndarray, "devices"]
 ) -> list[Float[np.ndarray, "_ 3"]]:
-    """Return the line that telescoping devices share (nodes from the foremost tip on, LPS mm), as each has it: from its
-    own tip on."""
+    """Return the line that telescoping devices share (nodes, LPS mm) as each has it, from its own tip on."""
     behind = inserted_length_mm.max() - inserted_length_mm
     along = length_along(nodes)
     return [
@@ -142,7 +141,6 @@ def lines_from_tips(
 def shown_part(
     nodes: Float[np.ndarray, "n 3"], deepest_mm: float, behind_mm: float = SHOWN_BEHIND_MM
 ) -> Float[np.ndarray, "shown 3"]:
-    """Return what pictures show of a line: from its tip, inserted by `deepest_mm`, to `behind_mm` behind the ostium,
-    LPS mm. Nodes are NaN beyond the line's end."""
+    """Return what pictures show of a line, from its tip to `behind_mm` behind the ostium; NaN beyond its end."""
     nodes = nodes[np.isfinite(nodes).all(axis=1)]
     return nodes[length_along(nodes) <= deepest_mm + behind_mm]

@@ -75,8 +75,7 @@ def score_anatomy(mask: LumenMask, extracted: Anatomy, truth: Anatomy) -> Anatom
 def compare_trees(
     extracted: VesselTree, truth: VesselTree, *, smallest_radius_mm: float = SMALLEST_RADIUS_MM
 ) -> Agreement:
-    """Return how far an extracted centerline tree agrees with the true one, of which points of a smaller radius do not
-    count."""
+    """Return how a centerline tree agrees with the true one, without the true one's points of a smaller radius."""
     true_points, true_radius = sampled(truth)
     points, radius = sampled(extracted)
     distance, nearest = KDTree(true_points).query(points)

@@ -185,8 +185,7 @@ def _mean_of_finite(values: Float[np.ndarray, "episodes samples"], axis: int) ->
 def control_rmse(
     predicted: Float[np.ndarray, "episodes samples 2"], true: Float[np.ndarray, "episodes samples 2"]
 ) -> Float[np.ndarray, "episodes 2"]:
-    """Return the RMSE of the control of each sequence, mm/s and deg/s; NaN for one without a sample in which both are
-    finite."""
+    """Return the RMSE of each sequence's control, mm/s and deg/s; NaN where no sample is finite in both."""
     error = (predicted - true) * np.array([1.0, np.rad2deg(1.0)])
     return np.stack([rmse_of_sequences(error[..., axis]) for axis in range(2)], axis=-1)
 

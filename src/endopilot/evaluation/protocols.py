@@ -112,8 +112,7 @@ class Replay:
 
 
 def replay(recorded: Recorded, controls: Mapping[str, Control], advance: Advance) -> dict[str, Replay]:
-    """Simulate every episode again with each series of controls (mm/s, rad/s) after the given states, an anatomy at a
-    time."""
+    """Simulate every episode again with each series of controls (mm/s, rad/s) after the given states."""
     shape, signals = recorded.data.valid[:, WINDOW:].shape, [field.name for field in fields(Replay)]
     out = {name: Replay(*np.full((len(signals), *shape), np.nan)) for name in controls}
     for chosen, rollout in recorded.simulated(controls, advance):
@@ -305,8 +304,7 @@ def run_protocols(
 def _predicted(
     predictor: Predictor, episodes: Episodes, anatomy_of: Int[np.ndarray, "episodes"], advance: Advance
 ) -> dict[str, OpenLoop]:
-    """Return what a predictor makes of the episodes by each protocol, one anatomy after the other, so that a slow model
-    shows its first errors early."""
+    """Return a predictor's answers by each protocol, an anatomy at a time: a slow model shows its errors early."""
     order = np.argsort(anatomy_of, kind="stable")
     parts = [
         episodes.select(chosen) for chosen in np.split(order, np.unique(anatomy_of[order], return_index=True)[1][1:])

@@ -69,8 +69,7 @@ CONTROL_BASELINES: tuple[str, ...] = ("hold_control", "training_mean", "follow_s
 
 @dataclass(frozen=True, eq=False)
 class TipSeries:
-    """Where the tip was predicted to be after the given states (Δtip, γtip and the lumen radius there, mm); NaN where
-    that failed."""
+    """Where tips were predicted to be (Δtip, γtip and the lumen radius there, mm); NaN where that failed."""
 
     abscissa: Float[np.ndarray, "episodes samples"]
     offset: Float[np.ndarray, "episodes samples"]

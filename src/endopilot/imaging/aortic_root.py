@@ -175,8 +175,7 @@ def _best_chain(slices: list[list[_Disc]]) -> list[_Disc]:
 
 @dataclass(frozen=True, eq=False)
 class Opening:
-    """Where a vessel comes to the aortic wall: its `voxel` (k, j, i) nearest the wall, and its number among the
-    connected ones."""
+    """Where a vessel comes to the aortic wall: its `voxel` (k, j, i) there, and its number among the connected ones."""
 
     voxel: Int[np.ndarray, "3"]
     vessel: int

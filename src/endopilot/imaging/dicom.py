@@ -66,8 +66,7 @@ _AIR_HU = -1024.0
 
 @dataclass(frozen=True, eq=False)
 class _Slice:
-    """What a file's header says of its image, without identifiers: `numbers` by `_NUMBERS`, `words` by `_WORDS` in
-    capitals."""
+    """What a file's header says of its image, without identifiers: `numbers` and `words`, in capitals."""
 
     path: Path
     transfer_syntax: str
@@ -320,8 +319,7 @@ def _geometry(
 
 
 def _read_pixels(slices: Sequence[_Slice]) -> tuple[np.ndarray, list[str]]:
-    """Decode slices in the order given and return HU, int16 if whole, else float32; pixels that show nothing become
-    air, with a note."""
+    """Return HU of slices in the order given, int16 if whole, else float32; pixels that show nothing become air."""
     padded = 0
     whole = all(number.is_integer() for slice_ in slices for number in slice_.rescale)
     voxels = np.empty((len(slices), *slices[0].size), dtype=np.float32)

@@ -54,8 +54,7 @@ def save(content: Dataset, path: Path) -> None:
 
 
 def slice_headers(volume: Volume) -> list[Dataset]:
-    """Return the header of every slice of a volume, pixels left out. The UIDs follow from the volume's own content
-    (PS3.5 B.2), so that nothing of another header is in them."""
+    """Return each slice's header, pixels left out; UIDs follow from the volume's own content (PS3.5 B.2)."""
     content = hashlib.sha256(np.ascontiguousarray(volume.voxels).tobytes())
     for part in (volume.spacing_mm, volume.origin_mm, volume.direction):
         content.update(np.ascontiguousarray(part).tobytes())

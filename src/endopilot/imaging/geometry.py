@@ -112,8 +112,7 @@ def geometry(
 
 
 def parted(steps_mm: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """Return directions and lengths of the steps along i, j and k, columns of a header's matrix; a step without length
-    stays, for `geometry` to refuse."""
+    """Return directions and lengths of a header's steps along i, j and k; `geometry` refuses one without length."""
     lengths = np.linalg.norm(steps_mm, axis=0)
     with np.errstate(invalid="ignore"):
         return steps_mm / np.where(lengths > 0, lengths, 1.0), lengths
@@ -177,8 +176,7 @@ def slice_grid(
 
 
 def converted(unit: str, sizes: Float[np.ndarray, "3"], *, path: Path, field: str) -> tuple[float, tuple[str, ...]]:
-    """Return the factor from a header's unit of length to mm, and the note that says so. Raises InputError for an
-    unknown unit, or one that makes voxels smaller than 1 µm or larger than 20 mm."""
+    """Return the factor from a unit of length to mm, and its note; InputError if voxels are not of 1 µm to 20 mm."""
     factor = MM_PER_UNIT.get(unit.strip().lower())
     if factor is None:
         raise InputError(f"{path}: {field} {unit!r} is no unit of length that is known; export it in mm")

@@ -85,8 +85,7 @@ def interpolate_like(volume: Volume, like: Volume, outside: float) -> Float[np.n
 def distance_to_outside(
     mask: Bool[np.ndarray, "nz ny nx"], spacing_mm: float | tuple[float, float, float]
 ) -> Float[np.ndarray, "nz ny nx"]:
-    """Return each inside voxel's distance to the nearest voxel centre outside, mm; 0 outside. ITK's transform (Maurer
-    et al. 2003) takes less than half of SciPy's time. `spacing_mm` is along k, j and i, or one for all."""
+    """Return each voxel's distance to the nearest centre outside, mm; `spacing_mm` is along k, j, i, or one for all."""
     outside = sitk.GetImageFromArray((~mask).astype(np.uint8))
     outside.SetSpacing([float(step) for step in np.broadcast_to(spacing_mm, 3)[::-1]])
     signed = sitk.SignedMaurerDistanceMap(outside, insideIsPositive=False, squaredDistance=False, useImageSpacing=True)
@@ -122,8 +121,7 @@ def dilated(mask: Bool[np.ndarray, "nz ny nx"], reach: int | Sequence[int]) -> B
 
 
 def connected_components(mask: Bool[np.ndarray, "nz ny nx"], *, corners: bool = False) -> Int[np.ndarray, "nz ny nx"]:
-    """Return a number from 1 for each connected part of a mask, 0 outside; `corners` also connects at an edge or
-    corner."""
+    """Return numbers from 1 of a mask's connected parts, 0 outside; `corners` connects at edges and corners too."""
     structure = ndimage.generate_binary_structure(3, 3 if corners else 1)
     return ndimage.label(mask, structure)[0]  # pyright: ignore[reportIndexIssue]
 
@@ -140,8 +138,7 @@ class MaskOverlap:
 
 
 def compare_masks(mask: LumenMask, reference: LumenMask) -> MaskOverlap:
-    """Return how far a mask agrees with a reference on any grid; InputError if that is empty or wholly outside the
-    volume."""
+    """Return how far a mask agrees with a reference on any grid; InputError if that is empty or outside the volume."""
     ours, theirs = mask.volume.voxels, mask_like(reference, mask.volume)
     if not theirs.any():
         raise InputError("reference: has no voxel set inside the volume; give a mask of the same scan")

@@ -20,8 +20,7 @@ _LIKE_NEIGHBOURS = 0.25
 
 @dataclass(frozen=True)
 class Segment:
-    """A segment as a file describes it: its name (or empty), the file's label image that it is in, from 0, and its
-    value there."""
+    """A segment of a file: its name (or empty), the label image that it is in, from 0, and its value there."""
 
     name: str
     layer: int
@@ -30,8 +29,7 @@ class Segment:
 
 @dataclass(frozen=True, eq=False)
 class ImageFile:
-    """What an image file holds: the volume of its first layer, all layers (layer first), and the segments that its
-    header names."""
+    """An image file's content: the volume of its first layer, all layers, and the segments that its header names."""
 
     volume: Volume
     layers: Shaped[np.ndarray, "layers nz ny nx"]
@@ -81,8 +79,7 @@ def _inside_threshold(
 def choose(
     numbered: Sequence[tuple[int, Segment]], label: int | str | None, path: Path, *, show_names: bool = True
 ) -> Segment:
-    """Return the one segment there is, or the one with a number or name. Raises InputError, which names them if
-    `show_names`, where there are several, or none or several of that name."""
+    """Return the only segment, or that of a number or name; InputError, which names them if `show_names`."""
     listed = ", ".join(_shown(number, s.name if show_names else "") for number, s in numbered[:_MOST_LISTED])
     listed += ", …" if len(numbered) > _MOST_LISTED else ""
     if label is None:

@@ -122,8 +122,7 @@ def write_volume(volume: Volume, path: str | Path) -> None:
 
 
 def _write_file(volume: Volume, partial: Path) -> None:
-    """Write a volume to a temporary file, and read it again: ITK does not tell all that goes wrong, as on a full disk
-    (OSError)."""
+    """Write a volume to a temporary file, and read it again: ITK does not tell of a full disk (OSError)."""
     try:
         # Level 1 costs a few percent in size and saves most of the time.
         sitk.WriteImage(to_image(volume), partial, useCompression=partial.suffix != ".nii", compressionLevel=1)

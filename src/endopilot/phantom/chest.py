@@ -145,8 +145,7 @@ def other_coronary(heart: HeartFit, tree: VesselTree) -> tuple[Centerline, ...]:
 
 
 def cardiac_veins(heart: HeartFit, tree: VesselTree, *, touching: bool = False) -> tuple[Centerline, ...]:
-    """Return the small cardiac vein beside segments 2 and 3, a vein beside the distal artery, the coronary sinus. Where
-    they touch the artery, only its wall lies between."""
+    """Return veins that touch the artery: beside segments 2 and 3, beside the distal artery, the coronary sinus."""
     line, crux = tree.longest_path(), _crux_abscissa(tree)
     lines = []
     if is_left(tree):

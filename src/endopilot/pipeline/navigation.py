@@ -83,8 +83,7 @@ def _claim(output: Path, set_up: SetUp) -> None:
 
 
 def _write(found: PatientNavigation, output: Path, asked: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Write all files that installed libraries make, the manifest last, and return the figures; `asked` are the names
-    that `endopilot navigate` was given."""
+    """Write what installed libraries make, the manifest last; return the figures. `asked`: the names typed."""
     set_up, present = found.set_up, extras_present()
     driven_in, real = set_up.folder, set_up.true_anatomy
     if driven_in is None or real is not set_up.anatomy:  # the catheter lies otherwise: an anatomy of its own

@@ -63,8 +63,7 @@ RUN_ORIGIN = "One CT angiogram, given by the user; everything is made from it al
 
 
 class Stages:
-    """The finished stages of a run, their seconds and the rejected patients, kept in `stages.json` of the folder that
-    it claimed."""
+    """A run's finished stages, their seconds and rejected patients, kept in `stages.json` of its folder."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / "stages.json"

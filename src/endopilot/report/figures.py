@@ -79,8 +79,7 @@ def tip_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
 
 
 def safety_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
-    """Draw γ/(r − r_w), below it γ/r, against time, a column a split: median, quartiles, 95 % quantile
-    (`tables.safety_table`)."""
+    """Draw γ/(r − r_w), below it γ/r, against time, a column a split: median, quartiles, 95 % (`tables.safety_table`)."""
     splits = distinct(table, "split")
     plate = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
     ratios = (("clearance", "γ / (r − r_w)", "the wire touches"), ("radius", "γ / r", "the wire's axis on the wall"))
@@ -122,8 +121,7 @@ def control_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figu
 
 
 def drive_difference_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
-    """Draw histograms of the RMSE of the drive's force and torque of each sequence where controls are simulated, a row
-    a split."""
+    """Draw histograms of RMSEs of the drive's force and torque where controls are simulated, a row a split."""
     panels = (("force_rmse_n", "Difference in proximal force (RMSE), N"),)
     return _histograms(table, titles, (*panels, ("torque_rmse_nmm", "Difference in proximal torque (RMSE), N mm")))
 

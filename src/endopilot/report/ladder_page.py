@@ -35,8 +35,8 @@ XRAY = {"color": BLACK, "marker": "o", "ms": 4.5, "mfc": "none", "mew": 0.8, "ls
 
 
 def write_page(output: Path) -> Path:
-    """Write index.html, and the replays beside it, into a folder that `climb` has filled, and return its path;
-    InputError if the folder holds no scores."""
+    """Write index.html and replays into a folder that `climb` has filled, and return its path; InputError without
+    scores."""
     content = read_json(output / SCORES_FILE)
     terms = Terms(content["ladder"], request=content.get("request", ""), patients=content["patients"])
     tasks = [terms.task(row["task"]) for row in content["scores"] if row["level"] is not None]

@@ -80,8 +80,7 @@ def mark_target(
 
 
 def visible_devices(rollout: Trajectory, world: int, sample: int) -> list[Float[np.ndarray, "_ 3"]]:
-    """Return the nodes of the wire, then of each catheter, from its tip to a little behind the ostium, LPS mm;
-    ValueError without shape."""
+    """Return nodes of the wire and catheters from the tip to a little behind the ostium; ValueError without shape."""
     if rollout.shape is None:
         raise ValueError("the rollout holds no wire shapes; simulate with record_shape=True")
     inserted = rollout.inserted_length[world, sample]

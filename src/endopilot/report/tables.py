@@ -60,8 +60,7 @@ def control_error_table(results: Mapping[str, SplitResult]) -> pd.DataFrame:
 
 
 def drive_difference_table(results: Mapping[str, SplitResult]) -> pd.DataFrame:
-    """Return the RMSE of each sequence's drive force (N) and torque (N·mm) from the recorded ones, for each split and
-    each series of `DRIVEN_SERIES`."""
+    """Return RMSEs of drive force (N) and torque (N·mm) of each split and series of `DRIVEN_SERIES`."""
     pieces = []
     for split, result in results.items():
         for series in _ordered(result.base_force, DRIVEN_SERIES):

@@ -51,8 +51,7 @@ def check_distance_map(anatomy: Anatomy) -> None:
 
 
 def check_memory(needed: int, what: str, mend: str) -> None:
-    """Raise InputError, which begins with `what` needs it and ends with the mend, for more bytes than 0.8 of the
-    machine's memory."""
+    """Raise InputError, from `what` needs it to the mend, for more bytes than 0.8 of the machine's memory."""
     available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > 0.8 * available:
         raise InputError(f"{what} need {needed / 2**30:.1f} GiB of {available / 2**30:.1f}; {mend}")
@@ -83,8 +82,7 @@ def check_control(
     stacks: Sequence[Stack],
     actuation: Actuation,
 ) -> None:
-    """Raise InputError unless controls (mm/s and rad/s, or N and N·mm) are finite, and no larger than their drives
-    allow."""
+    """Raise InputError unless controls are finite (mm/s and rad/s, or N and N·mm) and within their drives' limits."""
     if (np.abs(control) <= largest[:, None]).all():
         return
     names = ("force in N", "torque in N·mm") if actuation == "force" else ("translation in mm/s", "rotation in rad/s")

@@ -29,8 +29,7 @@ Processor = Literal["cpu", "cuda"]
 
 
 def core_for(processor: Processor) -> Any:
-    """Return the core's module that steps worlds there, with the names of `endopilot._core`; InputError where there is
-    no GPU."""
+    """Return the module that steps worlds there, with the names of `endopilot._core`; InputError without a GPU."""
     if processor == "cpu":
         return _core
     try:

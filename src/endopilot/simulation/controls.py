@@ -151,8 +151,7 @@ def _manoeuvre(config: ControlConfig, generator: np.random.Generator) -> Float[n
 
 @dataclass(frozen=True, eq=False)
 class ScriptedControls:
-    """Controls from a file: the start (Δ mm, φ rad) and velocities (mm/s, rad/s) of each world and device, each held
-    for `period_s`."""
+    """A file's controls: start (Δ mm, φ rad) and velocities (mm/s, rad/s) of each world and device, `period_s` each."""
 
     initial: Float[np.ndarray, "worlds devices 2"]
     control: Float[np.ndarray, "worlds samples devices 2"]

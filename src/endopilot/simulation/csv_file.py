@@ -30,8 +30,7 @@ _LONGEST_CELL = 40
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Columns of numbers by name, the line of the file that each row ends on, and the names of all columns, in small
-    letters."""
+    """Columns of numbers by name, the file's line that each row ends on, and all columns' names in small letters."""
 
     path: Path
     values: dict[str, Float[np.ndarray, "rows"]]

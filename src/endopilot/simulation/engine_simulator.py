@@ -50,12 +50,10 @@ _BASE_INERTIA = 1e6
 
 
 class EngineWire:
-    """One wire in MuJoCo, from a base that follows a drive to its tip: inserted length ahead of the ostium, and the
-    base's rotation."""
+    """One wire in MuJoCo, from a base that follows a drive: inserted length ahead of the ostium, and rotation."""
 
     def __init__(self, anatomy: Anatomy, rod: RodLayout) -> None:
-        """Lay the wire out straight on the guiding catheter's axis, its tip at the ostium; ModuleNotFoundError without
-        MuJoCo."""
+        """Lay the wire out straight on the catheter's axis, tip at the ostium; ModuleNotFoundError without MuJoCo."""
         with extra_named("engine: mujoco"):
             self._mujoco: Any = importlib.import_module("mujoco")
         wall = wall_triangles(anatomy.distance_map, anatomy.insertion, 2 * anatomy.catheter_radius_mm)

@@ -59,8 +59,7 @@ def make_wall(anatomy: Anatomy, stack: Stack, config: SimulatorConfig) -> Lumen:
 def factor_at(
     abscissa_mm: Float[np.ndarray, "*n"], tree: VesselTree, factors: Sequence[float]
 ) -> Float[np.ndarray, "*n"]:
-    """Return a factor at abscissae, mm; `factors` are at even distances from the ostium, and behind it, to the end of
-    the longest path, linear between."""
+    """Return a factor at abscissae, mm; `factors` are at even distances from behind the ostium to the longest end."""
     ends = np.linspace(0.0, float(tree.longest_path().abscissa[-1]), len(factors)) if len(factors) > 1 else [0.0]
     return np.interp(abscissa_mm, ends, factors)
 

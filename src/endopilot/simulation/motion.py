@@ -136,8 +136,7 @@ def motion_named(name: MotionName, seed: int | None = None) -> Motion | None:
 
 
 def published_mean(motion: Motion) -> Motion | None:
-    """Return the published mean amplitudes of what moves in a patient's motion, with the patient's periods; None if
-    nothing does."""
+    """Return published mean amplitudes of what moves in a patient's motion, with the patient's periods, or None."""
     beats = bool(motion.annulus_mm or motion.heart_volume_share or motion.heart_rotation_deg)
     shifts = motion.breathing_caudal_mm or motion.breathing_anterior_mm
     breathes = bool(shifts or motion.breathing_dorsal_deg or motion.breathing_dextral_deg)

@@ -151,8 +151,7 @@ class Readout:
 
     @property
     def reason(self) -> Int[np.ndarray, "worlds"]:
-        """Why a world is invalid: 0 it is valid, 1 it left the finite numbers, 2 it did not converge,
-        3 the wire went through the wall."""
+        """Why a world is invalid: 0 valid, 1 not finite, 2 not converged, 3 the wire went through the wall."""
         return self._gather("reason").astype(int)
 
     def _projected(self, points: Sequence[Float[np.ndarray, "_ *n 3"]]) -> TipProjection:

@@ -144,8 +144,7 @@ class SolvedOutputs(Outputs):
 
 
 def table_columns(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return signals as columns of a table by name, those of catheters beginning with `catheter_1_` and `catheter_2_`.
-    The first axis of a signal is that of the table's rows, the second that of devices if there is one."""
+    """Return signals as table columns by name, of catheters with their prefix; axes are rows, then devices."""
     of_devices = {name: each for name, each in values.items() if SIGNALS[name].of_devices}
     devices = next((each.shape[1] for each in of_devices.values()), 0)
     parts = [

@@ -36,8 +36,7 @@ LONGEST_MM = 5000.0
 
 @dataclass(frozen=True)
 class WallForceEvent:
-    """A world whose wire presses the wall harder than `WALL_FORCE_LIMIT_N`, the end of the first sample in which it
-    does, s, and the largest force in any, N."""
+    """A world that presses the wall beyond `WALL_FORCE_LIMIT_N`, the end of its first such sample, s, and the peak, N."""
 
     world: int
     time_s: float
@@ -117,8 +116,7 @@ def run_set_up(
     period_s: float,
     record_shape: bool,
 ) -> Trajectory:
-    """Drive worlds from their start with a sequence of commands each (mm/s and rad/s, or N and N·mm), as `simulate` has
-    it."""
+    """Drive worlds from their start with a sequence of commands each (mm/s and rad/s, or N and N·mm)."""
     worlds, samples = command.shape[:2]
     check_memory(8 * worlds * samples * 20, f"control: {worlds} worlds of {samples} samples", "simulate fewer at once")
     if not 0 < period_s < np.inf:
@@ -151,8 +149,7 @@ def run_set_up(
 
 
 def wall_force_events(trajectory: Trajectory) -> tuple[WallForceEvent, ...]:
-    """Return the valid worlds whose wire presses the wall harder than it should at the end of a sample, by their
-    numbers."""
+    """Return by their numbers the valid worlds whose wire presses the wall harder than it should."""
     force = np.where(trajectory.valid, trajectory.wall_force, 0.0)
     above = force > WALL_FORCE_LIMIT_N
     return tuple(

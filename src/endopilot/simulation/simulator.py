@@ -262,8 +262,7 @@ class Simulator(Readout):
         began_s: Float[np.ndarray, "worlds"],
         result: Mapping[str, np.ndarray],
     ) -> Trajectory:
-        """Return as a trajectory what was recorded of these worlds: their start (Δ mm, φ rad), `time` before it, the
-        commands, and the arrays of `Step`, with an axis of samples, and of `shape` if it was recorded."""
+        """Return what was recorded as a trajectory: worlds' starts, `time`, commands and the arrays of `Step`."""
         recorded: dict[str, Any] = {name: result[name] for name in Step.__dataclass_fields__}
         times = began_s[:, None] + period_s * np.arange(1, command.shape[1] + 1)
         return Trajectory(

@@ -105,8 +105,7 @@ class TransmissionLayout:
 
 
 def lay_out_transmission(stack: Stack, *, longest_mm: float) -> TransmissionLayout | None:
-    """Return how the drives of a stack, of which `longest_mm` may lie ahead of the catheter, act on it; None if at the
-    ostium."""
+    """Return how a stack's drives, of which `longest_mm` may lie ahead of the catheter, act; None if at the ostium."""
     each = stack.transmissions
     if not any(one.length_mm > 0 for one in each):
         return None

@@ -147,8 +147,7 @@ class World:
         return self
 
     def drawn(self, anatomy: Anatomy, seed: int) -> World:
-        """Return the world with what a navigation's seed draws: `share`'s sides, and the side to which the catheter
-        leans."""
+        """Return the world with what a navigation's seed draws: the sides, also of the catheter's lean."""
         change = drawn_sides(self.share, np.random.default_rng([seed, 3]))
         world = replace(_differing(change, anatomy, self), share=0.0) if self.share else self
         return world.leaning(seed)
@@ -211,8 +210,7 @@ class World:
         return (self.robot or given).delayed(self.latency_factor)
 
     def write(self, path: Path | str) -> None:
-        """Write what differs as a YAML file that `read_world` reads, whole or not at all; InputError if it cannot be
-        written."""
+        """Write what differs as a YAML file for `read_world`, whole or not at all; InputError if it cannot be written."""
         write_yaml(Path(path), self.differences())
 
     def differences(self) -> dict[str, Any]:
@@ -231,8 +229,7 @@ def list_worlds() -> tuple[str, ...]:
 
 
 def read_world(name_or_path: str | Path) -> World:
-    """Read a world by its name (`list_worlds`), or from a YAML file. Raises InputError, which names file, field, value
-    and mend."""
+    """Read a world by its name, or from a YAML file; InputError names file, field, value and mend."""
     if str(name_or_path) == NOMINAL:
         return World()
     path = named_file("world", name_or_path, (_SHIPPED,), list_worlds)
@@ -245,8 +242,7 @@ def drawn_sides(share: float, random: np.random.Generator) -> dict[str, float]:
 
 
 def world_by(change: Mapping[str, float], anatomy: Anatomy) -> World:
-    """Return the world in which some of `QUANTITIES` differ by a share; the anatomy's lumen at the ostium is the unit
-    of its place."""
+    """Return the world whose `QUANTITIES` differ by a share; the unit of its place is the ostium's lumen."""
     return _differing(change, anatomy, World())
 
 

@@ -46,8 +46,7 @@ class Picture:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One comparison with a closed form or another engine: the error is relative, or absolute where the reference is 0;
-    `skipped` says why it could not be made."""
+    """A comparison with a reference: its error is relative, or absolute if that is 0; `skipped` says why not made."""
 
     case: str
     reference: float

@@ -205,8 +205,7 @@ def _merged(
 
 
 def end_score(end: OpenEnd, side: Side, flip: Float[np.ndarray, "3"] | float = 1.0) -> float:
-    """Return the logarithmic likelihood, up to a constant, that an artery begins at an end; `flip` turns its axes into
-    LPS."""
+    """Return the log-likelihood, up to a constant, that an artery begins at an end; `flip` turns its axes to LPS."""
     heading = WEIGHT["heading"] * _log_t((_angle_deg(flip * end.heading, HEADING[side]) / HEADING_SD_DEG) ** 2)
     course = WEIGHT["course"] * _log_t((_angle_deg(flip * end.course, COURSE[side]) / COURSE_SD_DEG) ** 2)
     return shape_score(end) + float(heading + course)
@@ -268,8 +267,7 @@ def _angle_deg(one: Float[np.ndarray, "... 3"], two: Float[np.ndarray, "3"]) -> 
 
 @dataclass(frozen=True, eq=False)
 class Crux:
-    """Where the posterior interventricular groove meets the atrioventricular one, LPS mm within some 15 mm, and which
-    artery reaches it."""
+    """Where the grooves between ventricles and to the atria meet, LPS mm within 15 mm, and which artery reaches it."""
 
     position: Float[np.ndarray, "3"]
     dominance: Dominance
@@ -283,8 +281,7 @@ class Crux:
 def find_crux(
     right_ostium: Float[np.ndarray, "3"], right: Float[np.ndarray, "n 3"], left: Float[np.ndarray, "m 3"]
 ) -> Crux | None:
-    """Return the crux from the right ostium and points along both trees (LPS mm); None where the ends are cut off
-    before it."""
+    """Return the crux from the right ostium and points of both trees (LPS mm); None where they end before it."""
     position = right_ostium + CRUX_FROM_OSTIUM_MM
     reached = [bool(np.linalg.norm(tree - position, axis=1).min() < REACHED_MM) for tree in (right, left)]
     if not any(reached):

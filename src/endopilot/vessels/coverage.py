@@ -49,8 +49,7 @@ class Stretch:
 
 
 def voxelised(surface: Surface, step_mm: float) -> Volume:
-    """Return the mask of all voxels (edge `step_mm`, larger where there would be too many) that a closed wall holds or
-    touches, so that its thinnest neck stays connected."""
+    """Return all voxels (edge `step_mm`, or larger) that a closed wall holds or touches: no thin neck is lost."""
     extent = np.ptp(surface.vertices, axis=0)
     most = max(float(np.prod(extent + 4 * step_mm)) / _MOST_VOXELS, abs(surface.volume) / _MOST_INSIDE)
     step = max(step_mm, most ** (1 / 3))
@@ -103,8 +102,7 @@ def unreached(
 def stretches(
     lines: MedialLines, chosen: Bool[np.ndarray, "n"], order: Float[np.ndarray, "n"] | None = None
 ) -> list[Stretch]:
-    """Return the connected parts of chosen points of a mask's middle, longest first. A part begins at its point of the
-    lowest `order`; by default at that nearest to the widest place."""
+    """Return connected parts of chosen middle points, longest first, from the lowest `order` or the widest place on."""
     length, behind = lines.tree.length, lines.behind_mm
     order = length if order is None else order
     found = []
@@ -116,8 +114,7 @@ def stretches(
 
 
 def left_out_text(left: list[Stretch], ostium: Float[np.ndarray, "3"], reach_mm: float) -> list[str]:
-    """Return what is said of the parts that a tree does not reach: one remark a part, and one for all crumbs. A part
-    that begins within `reach_mm` of the ostium lies behind it."""
+    """Return remarks on parts that a tree does not reach, one for all crumbs; `reach_mm` from the ostium is behind it."""
     left = sorted(left, key=lambda stretch: -stretch.length_mm)
     long = [s for s in left if s.length_mm >= NOTED_MM]
     remarks = []

@@ -52,8 +52,7 @@ _RIVAL = 0.55
 
 @dataclass(frozen=True, eq=False)
 class Skeleton(VesselGraph):
-    """The middle of one connected lumen with its `tips`, stubs included; radii are means of the neighbourhood, costs
-    lengths, mm."""
+    """The middle of one connected lumen with its `tips`; radii are means of the neighbourhood, costs lengths, mm."""
 
     tips: Int[np.ndarray, "t"]
 
@@ -169,8 +168,7 @@ def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
 
 @dataclass(frozen=True, eq=False)
 class InletEnd:
-    """An end of a tree that a device may enter at: its tip, its middle and radius, mm, and how much it looks like the
-    inlet: the radius, less where something speaks against it."""
+    """An end that a device may enter at: tip, middle, radius, mm, and score, the radius less what speaks against it."""
 
     node: int
     position: Float[np.ndarray, "3"]

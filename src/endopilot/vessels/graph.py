@@ -125,8 +125,7 @@ class VesselGraph:
 
 @dataclass(frozen=True, eq=False)
 class RootedGraph(VesselGraph):
-    """A graph with a way of known `length`, mm, from every point to a root; `before` is the next point on it, -1 at the
-    root."""
+    """A graph with the shortest way of `length`, mm, from each point to a root by the next one, `before` (-1 there)."""
 
     before: Int[np.ndarray, "n"]
     length: Float[np.ndarray, "n"]

@@ -76,8 +76,7 @@ def _length_once(nodes: LineGraph, part: Int[np.ndarray, "p"]) -> float:
 
 
 def closures(tree: VesselTree) -> list[str]:
-    """Return a note on each place where lumens close a loop that a tree cannot hold: spheres of two places meet, while
-    on the way between them along the tree some do not."""
+    """Return a note on each loop that a tree cannot hold: spheres meet while some on the way between do not."""
     whole = tree.line
     points, radius, abscissa = whole.points, whole.radius, whole.abscissa
     branch = np.repeat(np.arange(len(tree.branches)), [len(own.section) for own in tree.branches])

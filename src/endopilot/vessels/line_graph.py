@@ -76,8 +76,7 @@ class LineGraph(VesselGraph):
         return replace(part, ends=np.concatenate([[True], cut]) | np.concatenate([cut, [True]]))
 
     def free_ends(self) -> Int[np.ndarray, "e"]:
-        """Return the ends that no vessel passes, or all if there is no such: seen from a free end, what lies about one
-        and a half radii away lies in one direction, or forks there."""
+        """Return the ends that no vessel passes (all near lies on one side), or all if there is no such."""
         tree, free = KDTree(self.points), []
         for end in np.flatnonzero(self.ends):
             reach = max(1.5 * float(self.radius[end]), 4 * STEP_MM)
@@ -207,8 +206,7 @@ def _meeting(graph: LineGraph) -> LineGraph:
 
 
 def _bridges(graph: LineGraph) -> Int[np.ndarray, "m 2"]:
-    """Return the shortest gaps, from line ends, that join pieces within `LONGEST_BRIDGE` radii which nothing shorter
-    joins."""
+    """Return the shortest gaps between ends of pieces within `LONGEST_BRIDGE` radii that are not joined yet."""
     piece, found = graph.pieces, list[tuple[float, int, int]]()
     for end, near, gap in graph.around_ends(LONGEST_BRIDGE) if piece.max() > 0 else ():
         for other in np.setdiff1d(piece[near], piece[end]):
@@ -221,8 +219,7 @@ def _bridges(graph: LineGraph) -> Int[np.ndarray, "m 2"]:
 
 
 def _outside_parent_vessel(graph: LineGraph) -> tuple[Bool[np.ndarray, "n"], Float[np.ndarray, "3"] | None]:
-    """Return which points lie outside the parent vessel that the lines start in, and where they leave it. The parent's
-    spheres are those at the lines' common start that are several times wider than the lines' median."""
+    """Return which points lie outside the parent that the lines start in, by its far wider spheres there, and where."""
     points, radius, owner = graph.points, graph.radius, graph.owner
     everywhere = np.ones(len(points), dtype=bool)
     starts = np.flatnonzero(np.diff(owner, prepend=-1))
@@ -350,8 +347,7 @@ def in_order(source: Polylines, label: str) -> tuple[Polylines, list[str]]:
 
 
 def _order(line: Float[np.ndarray, "n 3"], label: str) -> Int[np.ndarray, "n"] | None:
-    """Return the order of points along the vessel if it is another than theirs: the shortest tree through them, where
-    it has no fork."""
+    """Return points' order along the vessel if it is another: the shortest tree through them, if it has no fork."""
     count = len(line)
     if count < 4:
         return None

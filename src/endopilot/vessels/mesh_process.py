@@ -17,8 +17,7 @@ import numpy as np
 
 
 def read(path: str) -> dict[str, np.ndarray]:
-    """Return the arrays of a mesh file by name, with VTK's complaints instead of on the screen. Called outside a
-    process of its own, it serves files that are known to be whole."""
+    """Return a mesh file's arrays by name, with VTK's complaints; outside its own process, of whole files alone."""
     from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkStringOutputWindow
 
     window, before, level = (

@@ -83,8 +83,7 @@ def read_polydata(path: Path) -> AnatomySource:
 
 
 def arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return what `mesh_process` reads from a file, in a process of its own, which may crash or hang. Raises InputError
-    for a file that cannot be read, or holds neither triangles nor lines."""
+    """Return what `mesh_process`, which may crash or hang, reads; InputError for neither triangles nor lines."""
     limit_s = _LONGEST_S + path.stat().st_size / _BYTES_A_SECOND
     command = [sys.executable, "-P", mesh_process.__file__, str(path.resolve())]
     try:
@@ -191,8 +190,7 @@ def _radius_array(data: dict[str, np.ndarray], path: Path) -> np.ndarray:
 
 
 def _check_size(path: Path) -> None:
-    """Raise InputError for a mesh file that is empty, shorter than its header promises, or a PLY file that cannot be
-    understood."""
+    """Raise InputError for a mesh file that is empty, shorter than its header promises, or PLY of no sense."""
     size = path.stat().st_size
     if size < _FEWEST_BYTES:
         raise InputError(f"{path}: is empty or truncated; export it again")
@@ -212,8 +210,7 @@ def _check_size(path: Path) -> None:
 
 
 def _is_ascii_stl(text: str) -> bool:
-    """Return whether an STL file is of the text format. A binary header may begin with "solid" too, but no facet
-    follows it."""
+    """Return whether an STL file is text: binary ones may begin with "solid" too, but no facet follows."""
     return text.lstrip().lower().startswith("solid") and ("facet" in text.lower() or "endsolid" in text.lower())
 
 

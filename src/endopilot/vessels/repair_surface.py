@@ -106,8 +106,7 @@ def closed_surface(
 
 
 def _lumen_of(mesh: Any) -> tuple[Any, list[str]]:
-    """Return the inner faces of a wall that has a thickness, with a remark; any other mesh as it is. From a wall,
-    unlike from a vessel, many lines along the normals meet the surface again on both sides."""
+    """Return a thick wall's inner faces, with a remark, or the mesh: a normal meets a wall again on both sides."""
     if min(_met_again(mesh, sign) for sign in (1.0, -1.0)) < _FACING:
         return mesh, []
     closed = _surface(_capped(mesh))

@@ -40,8 +40,7 @@ def _far_field(
     spacing: float,
     band: float,
 ) -> Float[np.ndarray, "nz ny nx"]:
-    """Return signed distances from every second grid point, linear between them; far inside, from every fourth. At a
-    distance ρ from the medial axis this errs by at most h²/2ρ, so it serves away from the wall."""
+    """Return signed distances from every second (far inside, fourth) point, linear between: errs by h²/2ρ at most."""
     half = np.full(tuple((np.array(inside.shape) + 1) // 2 + 1), -band, dtype=np.float32)
     second, asked = inside[::2, ::2, ::2], wanted[::2, ::2, ::2]
     if (deep := second & ~dilated(~second, _NEAR_WALL[1])).any():

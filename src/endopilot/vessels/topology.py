@@ -177,8 +177,7 @@ def _porous(mask: Volume, thin: MedialLines, rings: list[_Ring]) -> list[Touch]:
 
 
 def touch_remarks(found: list[Touch], *, parted: bool = True) -> list[str]:
-    """Return what is said of places where a lumen touches itself: one remark a kind, the largest place first. Where the
-    lumen, a surface's, is not parted there, the words are others."""
+    """Return remarks on where a lumen touches itself: one a kind, the largest first, other words if not parted."""
     kinds = [touch.kind if parted else _LEFT.get(touch.kind, touch.kind) for touch in found]
     remarks = []
     for kind, (text, size) in _SAID.items():
