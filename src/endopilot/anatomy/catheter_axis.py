@@ -38,7 +38,7 @@ def carried(
 
 
 def with_axis(anatomy: Anatomy, axis: Float[np.ndarray, "3"]) -> Anatomy:
-    """Return the anatomy with its catheter, and φ's zero, turned about the ostium; its old way stays open in the map."""
+    """Return the anatomy with its catheter, and φ's zero, turned about the ostium; its old way stays open."""
     zero = anatomy.insertion.rotation_zero
     if isinstance(zero, np.ndarray):
         zero = carried(zero, anatomy.insertion.direction, axis)

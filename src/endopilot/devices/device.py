@@ -300,7 +300,7 @@ def read_wire(name_or_path: str | Path) -> Wire:
 def check_built(
     device: Device, *, bore_mm: float = 0.0, arcs: Sequence[tuple[float, float]] = (), catheter: bool = False
 ) -> None:
-    """Raise InputError where a file's constants cannot be one thing's; `bore_mm` is 0 for a wire, `arcs` a catheter's."""
+    """Raise InputError where a file's constants cannot be one thing's; `bore_mm` is 0 for a wire."""
     _check_stiffness(device, bore_mm, catheter)
     shears = _STRENGTH_MPA / math.sqrt(3) * math.pi / 16 * device.diameter_mm**3  # yields in shear by von Mises
     if (torque := device.torque_limit_n_mm) > shears:

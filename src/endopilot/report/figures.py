@@ -79,7 +79,7 @@ def tip_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
 
 
 def safety_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
-    """Draw γ/(r − r_w), below it γ/r, against time, a column a split: median, quartiles, 95 % (`tables.safety_table`)."""
+    """Draw γ/(r − r_w), below it γ/r, against time, a column a split, with median, quartiles and 95 % quantile."""
     splits = distinct(table, "split")
     plate = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
     ratios = (("clearance", "γ / (r − r_w)", "the wire touches"), ("radius", "γ / r", "the wire's axis on the wall"))

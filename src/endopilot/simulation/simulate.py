@@ -36,7 +36,7 @@ LONGEST_MM = 5000.0
 
 @dataclass(frozen=True)
 class WallForceEvent:
-    """A world that presses the wall beyond `WALL_FORCE_LIMIT_N`, the end of its first such sample, s, and the peak, N."""
+    """A world that presses the wall beyond `WALL_FORCE_LIMIT_N`, the end of its first such sample, s, and its peak."""
 
     world: int
     time_s: float

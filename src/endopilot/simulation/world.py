@@ -210,7 +210,7 @@ class World:
         return (self.robot or given).delayed(self.latency_factor)
 
     def write(self, path: Path | str) -> None:
-        """Write what differs as a YAML file for `read_world`, whole or not at all; InputError if it cannot be written."""
+        """Write what differs as a YAML file for `read_world`, whole or not at all; InputError if that fails."""
         write_yaml(Path(path), self.differences())
 
     def differences(self) -> dict[str, Any]:

@@ -114,7 +114,7 @@ def stretches(
 
 
 def left_out_text(left: list[Stretch], ostium: Float[np.ndarray, "3"], reach_mm: float) -> list[str]:
-    """Return remarks on parts that a tree does not reach, one for all crumbs; `reach_mm` from the ostium is behind it."""
+    """Return remarks on parts that a tree does not reach, one for all crumbs; up to `reach_mm` they lie behind it."""
     left = sorted(left, key=lambda stretch: -stretch.length_mm)
     long = [s for s in left if s.length_mm >= NOTED_MM]
     remarks = []
