@@ -67,7 +67,7 @@ class DriveLimits:
 
     @staticmethod
     def of(device: Device, anatomy: Anatomy | None = None) -> DriveLimits:
-        """Return a device's limits in a vessel: its drive's speed, the ostium and the far end (without a vessel, none)."""
+        """Return a device's limits in a vessel: its drive's speed, ostium and far end (none without a vessel)."""
         return DriveLimits(
             max_velocity_mm_s=device.max_velocity_mm_s,
             max_rotation_rad_s=device.max_rotation_rad_s,
