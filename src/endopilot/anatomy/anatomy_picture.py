@@ -39,11 +39,8 @@ _LIGHT = np.array([-0.35, -0.8, 0.5]) / np.linalg.norm([-0.35, -0.8, 0.5])
 
 
 def draw_anatomy(anatomy: Anatomy, path: Path, *, volume: Volume | None = None) -> None:
-    """Write a PNG of the tree, its longest path as a straightened curved planar reformation, and cross-sections.
-
-    The walls are the distance map's zero level (green) and, in the cross-sections, the inscribed circle (yellow).
-    Behind them is a CT in HU, or without one the distance to the wall.
-    """
+    """Write a PNG of the tree, its longest path as a straightened reformation, and cross-sections, with walls (green)
+    and inscribed circles (yellow) on a CT in HU, or on the distance to the wall."""
     figure = plt.figure(figsize=(_WIDTH, 13), facecolor="white", layout="constrained")
     parts: Any = figure.subfigures(3, 1, height_ratios=(2.0, 1.15, 1.0))
     top, middle, bottom = parts

@@ -26,13 +26,9 @@ def extract_all(
     threshold: float | None = None,
     config: AnatomyConfig,
 ) -> tuple[list[Path], dict[str, str]]:
-    """Make one anatomy a file, each in a folder of its own, on as many processes as there are cores, and return the
-    folders and what was wrong with each rejected file.
-
-    A patient's name is that of the file, or of its folder where several files have the same name. The configuration,
-    and which files were rejected and why, are written to `output`/manifest.json. Raises InputError for two patients of
-    one name, one ostium for all, no file that is any good, or a folder of another run.
-    """
+    """Make one anatomy a file, on all cores, each in a folder named after its file, or that's folder where names
+    repeat; return the folders and what was wrong with each rejected file, as `output`/manifest.json does. Raises
+    InputError for two patients of one name, one ostium for all, no good file, or a folder of another run."""
     if config.ostium_mm is not None and len(sources) > 1:
         raise InputError(f"ostium_mm={config.ostium_mm}: cannot serve {len(sources)} patients; make them one by one")
     folders = {source: output / name for source, name in zip(sources, _names(sources), strict=True)}

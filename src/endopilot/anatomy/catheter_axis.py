@@ -1,5 +1,4 @@
-"""The guiding catheter's axis at the ostium, turned, and φ's zero with it: `turned_axis`, `lean_between`, `with_axis`,
-`with_world_zero`."""
+"""The guiding catheter's axis at the ostium, turned, and φ's zero with it."""
 
 from __future__ import annotations
 

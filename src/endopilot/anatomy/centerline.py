@@ -1,8 +1,5 @@
-"""Centerlines on the medial axis: `refined_lines` moves the paths traced through a lumen below the grid.
-
-A point moves by the first harmonic of the exact wall distance on a ring around it, which is zero on the medial axis.
-Side branches are joined to their parents where the two axes meet.
-"""
+"""Centerlines on the medial axis: `refined_lines` moves traced paths below the grid. A point moves by the first
+harmonic of the exact wall distance on a ring around it, which is zero on the axis."""
 
 from __future__ import annotations
 
@@ -69,9 +66,9 @@ def refined_lines(
     step_mm: float,
     ostium: Insertion | None = None,
 ) -> list[Line]:
-    """Return the traced paths on the medial axis, each joined to its parent where its axis meets the parent's. Within
-    one radius of an end the inscribed sphere feels the end's own cap. Lines are cut back from there and, where the
-    lumen keeps its width (a vessel cut flat), drawn out to the cut; the first one to the ostium, if that is known."""
+    """Return traced paths on the medial axis, each joined to its parent where the axes meet. They are cut back from
+    ends, whose caps the inscribed sphere feels, and drawn out to the cut of a vessel cut flat; the first to the ostium,
+    if known."""
     home = np.full(len(graph.points), -1)
     lines: list[Line] = []
     for index, nodes in enumerate(paths):
@@ -147,12 +144,8 @@ def _harmonics(
 def _inscribed_radius(
     surface: Surface, points: Float[np.ndarray, "n 3"], parent: Line | None
 ) -> Float[np.ndarray, "n"]:
-    """Return inscribed-sphere radii that the wall's voxel noise does not shrink.
-
-    The distance at the axis is the least over the whole circumference, and so reads the deepest ripple of the wall.
-    Instead, each direction is measured by itself on a ring near the wall. Their mean is the radius of a round lumen;
-    the second harmonic's amplitude, where it is more than ripple, leads from it to the small half-axis of a flat one.
-    """
+    """Return inscribed-sphere radii that ripples of the wall do not shrink, as the least distance around the axis
+    would: the mean by direction on a ring near the wall, less the second harmonic where that is more than ripple."""
     clearance = surface.distance(points)
     around, ring = _ring_distance(surface, points, _NEAR_WALL * clearance)
     walled = _walled(points, clearance, ring, parent)
@@ -229,9 +222,8 @@ def _meeting_point(distance_map: DistanceMap, body: Float[np.ndarray, "n 3"], ra
 def to_cut(
     distance_map: DistanceMap, points: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, "n"], step_mm: float
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
-    """Draw a line out as long as the lumen keeps its width, to the cut of a vessel that ends flat. Each step goes on
-    along the last ones, bent as they are, centred by the walls beside it alone: the cut ahead does not draw it back.
-    Where the lumen grows narrow or flat, it is no longer the same vessel."""
+    """Draw a line out as long as the lumen keeps its width, to the cut of a vessel that ends flat, each step along the
+    last ones, centred by the walls beside it. Where it grows narrow or flat, it is no longer the same vessel."""
     width = float(radius[-1])
     back = max(3, round(1.5 * width / step_mm))
     line = list(points[-2 * back - 1 :])
@@ -313,9 +305,8 @@ def _from_tip(
 
 
 def _without_inlets(distance_map: DistanceMap, lines: list[Line], ostium: Insertion) -> list[Line]:
-    """Leave out lines that lead back to the ostium's own cut: the other side of a wide inlet, and no branch. Such a
-    line ends in the plane of the ostium, and there the lumen joins it to the first line in a straight line. In the
-    merged lumens of a dissection, a wire beside the first line would seem to lie far ahead, on the returning part."""
+    """Leave out lines that lead back to the ostium's own cut, the other side of a wide inlet, and no branch: in a
+    dissection's merged lumens a wire beside the first line would seem to lie far ahead, on the returning part."""
     first, kept = lines[0].points, [True] * len(lines)
     for index in range(len(lines) - 1, 0, -1):
         points, width = lines[index].points, float(lines[index].radius[-1])

@@ -1,9 +1,5 @@
-"""The signed distance to the vessel wall, from inscribed spheres, and the guiding catheter joined to it.
-
-Inside a tree of inscribed spheres the distance is that to the union of round cones: between two neighbouring points the
-radius is linear, which leaves none of the scallops that a union of the spheres alone has. Branches are joined by a
-smooth union, so that a quadratic B-spline of the values is a good potential for contact.
-"""
+"""The signed distance to the vessel wall, from inscribed spheres, and the guiding catheter joined to it: the union of
+round cones along branches, joined smoothly, so that a quadratic B-spline of it is a good contact potential."""
 
 from __future__ import annotations
 
@@ -73,10 +69,8 @@ def _join(distance_map: DistanceMap, lines: Sequence[Centerline], band: float, f
 def add_catheter(
     distance_map: DistanceMap, insertion: Insertion, radius_mm: float, length_mm: float = CATHETER_LENGTH_MM
 ) -> DistanceMap:
-    """Return the map, grown as needed, joined with a straight guiding catheter of `length_mm` that ends at the ostium.
-
-    The catheter is a tube of constant inner radius with a round end centred on the ostium, so the passage into the
-    vessel is open by at least `radius_mm`. Raises InputError for a radius or length that is not positive.
+    """Return the map, grown as needed, joined with a straight guiding catheter of `length_mm`, a tube with a round end
+    centred on the ostium: open by at least `radius_mm`. Raises InputError for a radius or length that is not positive.
     """
     if not (radius_mm > 0 and length_mm > 0):
         raise InputError(f"catheter: radius {radius_mm} mm and length {length_mm} mm must both be positive")
@@ -106,9 +100,8 @@ def smooth_union(
     spacing_mm: float,
     fillet_mm: float,
 ) -> Float[np.ndarray, "nz ny nx"]:
-    """Return the union of two signed distances (positive inside), with a fillet where their walls cross. It is the
-    polynomial smooth maximum ``max(a, b) + (k − |a − b|)₊² / 4k``. Its width k falls with the angle θ between the two
-    gradients as k = fillet · (1 − cos θ), so that two tubes that carry on into each other do not bulge."""
+    """Return the union of two signed distances with a fillet where walls cross: ``max(a, b) + (k − |a − b|)₊² / 4k``,
+    whose k = fillet · (1 − cos θ) falls with the angle of the gradients, so that tubes that carry on do not bulge."""
     highest = np.maximum(first, second)
     near = np.abs(first - second) < 2 * fillet_mm
     near &= (first > first.min()) & (second > second.min())

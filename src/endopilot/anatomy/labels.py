@@ -1,8 +1,7 @@
 """Anatomical sections for every point of a tree: AHA/SCCT segments, named vessels, or generation and order.
 
 Segments after Austen et al., Circulation 1975;51:5-40 (AHA) and Leipsic et al., J Cardiovasc Comput Tomogr
-2014;8:342-58 (SCCT). Which branch is which follows from where it leaves and where it goes in the patient's axes (LPS):
-left, posterior, up. A tree stored in other axes gets wrong names, not an error.
+2014;8:342-58 (SCCT), by where a branch leaves and goes in LPS axes: other axes give wrong names, not an error.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ _RULES: dict[str, tuple[tuple[str, ...], Callable[[Labeller], None]]] = {
 def label_tree(
     tree: VesselTree, scheme: Scheme, *, naming: Mapping[str, str] | None = None, crux: Crux | None = None
 ) -> VesselTree:
-    """Return the tree (LPS mm) with every point's section.
+    """Return the tree (LPS mm) with every point's section; InputError where `naming` names one that the tree lacks.
 
     Args:
         scheme: "rca" and "lca" name AHA/SCCT segments, "arch", "cerebral" and "portal" the vessels of these anatomies
@@ -53,9 +52,6 @@ def label_tree(
             from the root), then order, widest first.
         crux: where the crux of the heart lies and which artery reaches it, if both are known.
         naming: other names for some sections, such as {"G0": "superficial femoral artery"}.
-
-    Raises:
-        InputError: the naming map names a section that the scheme does not have in this tree.
     """
     if scheme == "generic":
         labelled = _generic(tree)
@@ -73,12 +69,11 @@ def label_tree(
 
 
 def dominance(tree: VesselTree) -> str | None:
-    """Return "right", "balanced" or "left" for a labelled coronary tree, None for any other.
+    """Return "right", "balanced" or "left" for a labelled coronary tree, None for any other or an incomplete one.
 
-    A right coronary that gives a posterolateral branch is right-dominant, one that gives the posterior descending alone
-    balanced, one that ends long before the crux left; a left coronary with a posterior descending branch is
-    left-dominant, and one with a branch to the inferior wall balanced. None also where the right one reaches the crux
-    and gives neither, and where the left one lacks a main vessel: then parts of it are not there.
+    A right coronary with a posterolateral branch is right-dominant, with the posterior descending alone balanced, one
+    that ends long before the crux left; a left one with a posterior descending branch left-dominant, with a branch to
+    the inferior wall balanced.
     """
     used = {tree.section_names[index] for branch in tree.branches for index in np.unique(branch.section)}
     if tree.section_names == RCA_SECTIONS:

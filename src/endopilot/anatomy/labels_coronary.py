@@ -111,9 +111,8 @@ def _crux(labeller: Labeller, route: tuple[int, ...]) -> int | None:
 
 
 def _unforked_crux(labeller: Labeller, route: tuple[int, ...]) -> float:
-    """Return where segment 3 ends in a tree whose end does not fork, mm. If the vessel turns forwards again behind its
-    most posterior point for long enough, what follows is the posterior descending artery; otherwise it ends as segment
-    3."""
+    """Return where segment 3 ends, mm, in a tree whose end does not fork: where it turns forwards behind its most
+    posterior point for long enough, as the posterior descending artery does, or at its end."""
     line = labeller.tree.path(route[-1])
     if line.abscissa[-1] < SHORT_MM:
         return USUAL_CRUX_MM
@@ -154,9 +153,8 @@ def _label_right_sides(labeller: Labeller, trunk: tuple[int, ...], crux: int | N
 
 
 def label_lca(labeller: Labeller) -> None:
-    """Name the sections of a left coronary tree. Where the left main does not fork within `LONGEST_LEFT_MAIN_MM`, one
-    of its main vessels is missing; the other one is the anterior descending artery if it runs forwards, else the
-    circumflex."""
+    """Name the sections of a left coronary tree. Where the left main does not fork within `LONGEST_LEFT_MAIN_MM`, it
+    has one main vessel: the anterior descending artery if it runs forwards, else the circumflex."""
     tree = labeller.tree
     fork = labeller.fork(0, NAMED_MM)
     major = labeller.major(fork, NAMED_MM)

@@ -20,12 +20,8 @@ LEAST_MM = 0.02
 
 
 def with_radii(anatomy: Anatomy, radii: Sequence[Float[np.ndarray, "_"]]) -> Anatomy:
-    """Return the anatomy with other radii of each branch's points, mm; courses and the guiding catheter stay.
-
-    A point of the map belongs to the inscribed sphere, of a centerline or of the catheter, by which it lies deepest: of
-    least d² - r², with d the distance from the sphere's centre and r its radius. The wall moves outwards there by as
-    much as that radius grows; around a tube of radius r that is exact. A closed lumen keeps a radius of `LEAST_MM`.
-    """
+    """Return the anatomy with other radii of each branch's points, mm, at least `LEAST_MM`; courses and the catheter
+    stay. A map point moves with the sphere it lies deepest in, of least d² - r²: exact around a tube."""
     branches = anatomy.tree.branches
     radii = [np.maximum(np.asarray(radius, dtype=float), LEAST_MM) for radius in radii]
     lines = [replace(branch.centerline, radius=r) for branch, r in zip(branches, radii, strict=True)]

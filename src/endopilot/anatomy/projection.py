@@ -26,12 +26,9 @@ _TAPER = 1.25
 
 
 def project_tip(tree: VesselTree, insertion: Insertion, points: Float[np.ndarray, "*n 3"]) -> TipProjection:
-    """Project tips (LPS mm) onto the centerline tree.
-
-    Along a motion inside one branch, abscissa and offset are continuous; from one branch into another the abscissa may
-    step by no more than the shortcut that the tip takes across the bifurcation. Behind the ostium the line goes on
-    along the catheter's axis, with negative abscissa and the radius at the ostium.
-    """
+    """Project tips (LPS mm) onto the centerline tree, continuously inside a branch; into another one the abscissa steps
+    by no more than the tip's shortcut. Behind the ostium the line goes on along the catheter's axis, with negative
+    abscissa and the ostium's radius."""
     return TipProjector(tree, insertion)(points)
 
 
@@ -77,9 +74,8 @@ class TipProjector:
 def _rivals(
     tree: VesselTree, points: Float[np.ndarray, "m 3"], first: Int[np.ndarray, "b"], owner: Int[np.ndarray, "m"]
 ) -> tuple[Float[np.ndarray, "m b"], Int[np.ndarray, "m b"]]:
-    """Return what a point may lie deeper in than in the branch of its nearest vertex, a row for each such vertex: how
-    far a point must lie from it to lie deeper in each other branch, mm, and that branch's nearest vertex. `first` and
-    `owner` are each branch's first vertex and each vertex's branch."""
+    """Return for each nearest vertex how far off a point must lie to lie deeper in each other branch, mm, and that
+    branch's nearest vertex. `first` and `owner` are each branch's first vertex and each vertex's branch."""
     lines = [branch.centerline for branch in tree.branches]
     spacing = np.concatenate([_spacing(line.points) for line in lines])
     rival = np.full((len(points), len(lines)), np.inf)
@@ -120,11 +116,8 @@ Samples = Float[np.ndarray, "*n"]
 
 
 def safety_ratio(offset: Samples, radius: Samples, wire_radius_mm: float) -> Samples:
-    """Return γ/(r − r_w): 0 on the centerline, 1 where the wire touches the wall of a round lumen; NaN stays NaN.
-
-    Where the lumen is no wider than the wire, the wire touches the wall wherever it lies: the ratio is 1. With a wire
-    radius of 0 it is the paper's ratio γ/r, which is 1 − r_w/r where the wire touches. All are in mm.
-    """
+    """Return γ/(r − r_w), mm: 0 on the centerline, 1 where the wire touches a round lumen's wall, or the lumen is no
+    wider than the wire; NaN stays NaN. With r_w = 0 it is the paper's ratio γ/r."""
     room = radius - wire_radius_mm
     filled = room <= 0
     return np.where(filled & ~np.isnan(offset), 1.0, offset / np.where(filled, 1.0, room))

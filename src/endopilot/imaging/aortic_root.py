@@ -1,7 +1,5 @@
-"""The aortic root of a cardiac CT angiogram, where vessels open into it, and where a coronary artery leaves it.
-
-The ascending aorta is the largest round bright disc that goes on slice by slice.
-"""
+"""The aortic root of a cardiac CT angiogram, the largest round bright disc, where vessels open into it, and their
+ostia."""
 
 from __future__ import annotations
 
@@ -77,9 +75,8 @@ class _Disc:
 
 
 def find_aortic_roots(grid: Volume) -> list[AorticRoot]:
-    """Return one to three places that may be the ascending aorta, the likeliest first: a right heart as bright as the
-    left is as likely. `grid` is a CT in HU along the LPS axes, isotropic, of about 1.5 mm. Raises InputError without
-    contrast or such a vessel."""
+    """Return one to three places that may be the ascending aorta, the likeliest first, on a `grid` in HU, of about 1.5
+    mm. Raises InputError without contrast or such a vessel."""
     hu = np.asarray(ndimage.gaussian_filter(grid.voxels, 0.7))
     spacing = float(grid.spacing_mm[0])
     if (ndimage.minimum_filter(hu, round(9.0 / spacing)) > LEAST_BLOOD_HU).sum() == 0:
@@ -233,13 +230,9 @@ def find_ostium(
     aorta: Bool[np.ndarray, "nz ny nx"],
     grid: Volume,
 ) -> tuple[Insertion, Float[np.ndarray, "m 3"]]:
-    """Return the ostium, and the path (LPS mm) begun anew from there.
-
-    The artery's middle is the centroid of its blood at several heights above the aortic wall; a parabola through the
-    lowest of them is carried on to the wall. Where the artery leaves at a slant, the tracked path begins at its edge,
-    and the blood near the path is more of one side than of the other: a second round looks around the parabola. `blood`
-    is above half the lumen's HU; `aorta` is rough; both lie on the isotropic `grid`.
-    """
+    """Return the ostium, and the path (LPS mm) begun anew from there. A parabola through centroids of the artery's
+    blood at several heights is carried on to the wall; a second round looks around it, for the tracked path begins at
+    the mouth's edge. `blood` is above half the lumen's HU; `aorta` is rough; both lie on `grid`."""
     spacing = float(grid.spacing_mm[0])
     half = round(_BOX_MM / spacing)
     centre = np.round(grid.world_to_index(path[0])).astype(int)[::-1]
@@ -272,10 +265,8 @@ def find_ostium(
 def _height_of_wall(
     mouth: Float[np.ndarray, "3"], height: Float[np.ndarray, "nz ny nx"], corner: np.ndarray, grid: Volume
 ) -> float:
-    """Return where the aortic wall goes on under the artery's mouth, mm of height: below 0, as the ball bulges in.
-
-    A quadric through the wall around the mouth estimates it; outliers, such as another vessel's mouth, are left out.
-    """
+    """Return the aortic wall's height under the artery's mouth, mm, by a quadric through the wall around, less
+    outliers."""
     spacing = float(grid.spacing_mm[0])
     near = np.argwhere(np.abs(height) < 0.8 * spacing)
     offset = grid.index_to_world((near + corner)[:, ::-1].astype(float)) - mouth

@@ -37,11 +37,8 @@ def lumen_at_half_height(
     lumen_hu: float,
     excluded: Bool[np.ndarray, "nz ny nx"],
 ) -> Bool[np.ndarray, "nz ny nx"]:
-    """Return the voxels of the lumen around dense points of a vessel's paths (LPS mm) with rough radii, mm.
-
-    The surroundings differ from side to side (fat, muscle, lung), and the wall's level with them: a fixed threshold
-    would make a vessel too wide in muscle or too narrow in fat. `excluded` voxels belong to other blood pools.
-    """
+    """Return the voxels of the lumen around dense points of paths (LPS mm) with rough radii, mm: the wall's level
+    follows what is beside it (fat, muscle, lung). `excluded` voxels belong to other blood pools."""
     spacing = volume.spacing_mm[::-1]
     hu = ndimage.gaussian_filter(volume.voxels.astype(np.float32), _SMOOTHING_MM / spacing, truncate=3.0)
     distance, local_radius = _distance_to_paths(volume, points, radius, margin_mm=4.0)

@@ -85,9 +85,8 @@ class Scan:
 
 @dataclass(frozen=True, eq=False)
 class FoundTree(Scan):
-    """A coronary tree as found in a scan: paths (LPS mm, with radii, mm) from the ostium to every distal end, each from
-    where it leaves those before it. `aorta` and `lumen` lie on the voxels of `volume`, the tree on the grid of the
-    vessels."""
+    """A coronary tree in a scan: paths (LPS mm, radii) from the ostium to every end, each from where it leaves those
+    before it; `aorta` and `lumen` lie on `volume`'s voxels."""
 
     volume: Volume
     aorta: Bool[np.ndarray, "nz ny nx"]

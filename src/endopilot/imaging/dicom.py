@@ -1,9 +1,5 @@
-"""CT from DICOM: one series of axial-like slices, its geometry checked, its identifiers left behind.
-
-Headers are read with pydicom, restricted to the tags below, so that nothing that names a patient is ever asked for.
-Pixels are decoded by GDCM through SimpleITK, which reads more compressions than pydicom alone; but for RLE, where GDCM
-does not come back from some damaged files.
-"""
+"""CT from DICOM: one series of axial-like slices, its geometry checked, its identifiers left behind: only the tags
+below are read. GDCM decodes pixels, but for RLE, where it does not come back from some damaged files."""
 
 from __future__ import annotations
 
@@ -103,11 +99,8 @@ class _Slice:
 
 
 def read_series(path: Path, series: str | None, phase: str | None = None) -> Volume:
-    """Read a CT series in HU from a folder, its subfolders too, or by one of its files.
-
-    `series` is a number or a SeriesInstanceUID, `phase` the number of a cardiac phase. Raises InputError where there is
-    no image, more than one series, or no plain CT volume.
-    """
+    """Read a CT series in HU from a folder with its subfolders, or by one of its files; `series` is a number or a UID,
+    `phase` a number. Raises InputError where there is no image, more than one series, or no plain CT volume."""
     folder = path if path.is_dir() else path.parent
     slices, left_out = _read_headers(_files(folder, deep=path == folder))
     if not slices:

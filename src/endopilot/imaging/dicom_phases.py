@@ -33,12 +33,9 @@ def choose_phase(
     *,
     named: int | None = None,
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the indices of the slices of the one phase there is, or of the one asked for, and what is to be noted.
-
-    `values` has each field of `PHASE_TAGS` for every slice, None where a header lacks it. `named` is the slice whose
-    file was given in place of the folder; its phase is taken if none is asked for. Raises InputError where no or no
-    single phase fits.
-    """
+    """Return the slices of the one phase there is, or was asked for, and notes. `values` has each of `PHASE_TAGS` for
+    every slice, None where it lacks; `named` is the slice given in place of the folder. Raises InputError for no single
+    phase."""
     everything = np.arange(len(positions_mm))
     if np.diff(np.sort(positions_mm)).min(initial=np.inf) >= _POSITION_MM:
         return everything, _single(values, phase, folder)

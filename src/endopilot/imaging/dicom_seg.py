@@ -1,8 +1,5 @@
-"""Masks as DICOM segmentation objects (DICOM-SEG, PS3.3 A.51), written with the optional package `highdicom`.
-
-The object carries its own geometry, on the grid of the mask, and no UID of the CT that it was made from: a study's UIDs
-lead to its patient.
-"""
+"""Masks as DICOM segmentation objects (DICOM-SEG, PS3.3 A.51), written with the optional package `highdicom`, without
+any UID of the CT, which would lead to its patient."""
 
 from __future__ import annotations
 
@@ -85,12 +82,8 @@ def write_seg(mask: LumenMask, path: Path) -> None:
 
 
 def read_seg(path: Path, label: int | str | None = None) -> Volume:
-    """Read one segment of a DICOM-SEG object, by number or SegmentLabel, as a volume of booleans; other segments may
-    overlap it.
-
-    Of a fractional segment, voxels that it fills by half or more are taken, and a note says so. Raises InputError for a
-    damaged file, another object, an irregular grid, or a segment that is not there.
-    """
+    """Read one segment of a DICOM-SEG object, by number or SegmentLabel, as booleans; of a fractional one, voxels that
+    it fills by half or more. Raises InputError for a damaged or another file, an irregular grid, or no such segment."""
     import pydicom  # comes with an extra
 
     try:
@@ -129,9 +122,9 @@ def read_seg(path: Path, label: int | str | None = None) -> Volume:
 
 
 def _frames(content: Dataset) -> tuple[list[int], np.ndarray, tuple[float, ...], tuple[float, ...], float]:
-    """Return of each frame ReferencedSegmentNumber (0 in a label map) and ImagePositionPatient; of all
-    ImageOrientationPatient, PixelSpacing, and SpacingBetweenSlices (0 if absent), mm. Any error means that the object
-    cannot be read."""
+    """Return each frame's ReferencedSegmentNumber (0 in a label map) and ImagePositionPatient; of all
+    ImageOrientationPatient, PixelSpacing and SpacingBetweenSlices (0 if absent), mm. Any error means an unreadable
+    object."""
     shared = content.SharedFunctionalGroupsSequence[0]
 
     def item(frame: Dataset, name: str) -> Dataset:

@@ -1,8 +1,5 @@
-"""CT to DICOM: one series of uncompressed slices that names no patient.
-
-The attributes are those that DICOM requires of a CT image (PS3.3 A.3.3); those of type 2 are present and empty.
-highdicom writes no CT images but needs the same header for a mask: pydicom makes it for both.
-"""
+"""CT to DICOM: one series of uncompressed slices that names no patient, with the attributes that DICOM requires of a CT
+image (PS3.3 A.3.3); highdicom writes no CT images but needs the same header for a mask."""
 
 from __future__ import annotations
 
@@ -28,11 +25,8 @@ _UNNAMED = (
 
 
 def write_series(volume: Volume, folder: Path) -> None:
-    """Write a CT volume in HU, rounded to whole numbers, as a DICOM series without any patient's data, one file a
-    slice.
-
-    The same volume gives the same bytes. Raises InputError where the folder holds files already, or cannot be written.
-    """
+    """Write a CT volume in whole HU as a DICOM series without patient's data, a file a slice; the same volume gives the
+    same bytes. Raises InputError where the folder holds files already, or cannot be written."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: is there already; give a new folder for the DICOM series")
     voxels = np.clip(np.round(volume.voxels), -32768, 32767).astype("<i2")

@@ -1,8 +1,7 @@
 """Where the voxels of an image lie: one rule on spacing, origin and axes for every file format.
 
-Spacings are finite and positive, axes are unit vectors at right angles. Axes that miss this by less than 1e-2 are
-those of a header with few digits: they are straightened, and the volume's notes say so. Beyond, the image is sheared
-(a gantry tilt, for instance), and is refused with the name of the header's field.
+Axes that miss right angles by less than 1e-2 are those of a header with few digits: they are straightened, and noted.
+Beyond, the image is sheared (a gantry tilt, for instance), and is refused with the name of the header's field.
 """
 
 from __future__ import annotations
@@ -70,12 +69,9 @@ def geometry(
     path: Path,
     fields: Fields,
 ) -> Geometry:
-    """Return the geometry of an image of `size` (i, j, k), its axes straightened to the nearest rotation about its
-    centre.
-
-    Columns of `direction` are the LPS unit directions of i, j and k. Raises InputError where a number is not finite, a
-    spacing not positive, an axis no unit vector, or the axes are sheared, and names the header's `fields`.
-    """
+    """Return the geometry of an image of `size` (i, j, k), its axes (columns of `direction`) straightened to the
+    nearest rotation about its centre. Raises InputError, which names the header's `fields`, for what is no such
+    geometry."""
     for name, values in ((fields.spacing, spacing_mm), (fields.origin, origin_mm), (fields.direction, direction.T)):
         if not np.isfinite(values).all():
             raise InputError(f"{path}: {name} holds {_text(values)}, which is not finite; export it again")
@@ -128,9 +124,8 @@ def farthest_apart_mm(one: Geometry | Volume, other: Geometry | Volume, size: Se
 def plane(
     orientation: Sequence[float], spacing_mm: Sequence[float], *, path: Path
 ) -> tuple[Float[np.ndarray, "3 2"], Float[np.ndarray, "3"]]:
-    """Return the directions in which i and j grow in a DICOM slice, from ImageOrientationPatient and PixelSpacing
-    (between rows, between columns), and their unit normal. Raises InputError for axes that are not at right angles, or
-    pixels without size."""
+    """Return the directions of i and j in a DICOM slice, from ImageOrientationPatient and PixelSpacing, and their unit
+    normal. Raises InputError for axes that are not at right angles, or pixels without size."""
     axes = np.array(orientation, dtype=float).reshape(2, 3).T
     normal = np.cross(axes[:, 0], axes[:, 1])
     length = float(np.linalg.norm(normal))
@@ -149,12 +144,9 @@ def slice_grid(
     *,
     path: Path,
 ) -> Geometry:
-    """Return where the voxels of parallel slices of `size` (Rows, Columns) lie (DICOM PS3.3 C.7.6.2.1.1).
-
-    Not the step from slice to slice is bounded, whose errors add up, but how far each slice lies from its place in the
-    even grid from the first to the last, along the slice too. `slots` number the slices from 0: several images may be
-    of one slice, and slices may be left out. Raises InputError for uneven steps or a slant.
-    """
+    """Return where the voxels of parallel slices of `size` (Rows, Columns) lie (DICOM PS3.3 C.7.6.2.1.1). Bounded is
+    how far each lies from its place in the even grid, not the step, whose errors add up; `slots` number the slices from
+    0. Raises InputError for uneven steps or a slant."""
     first, last = positions[slots.argmin()], positions[slots.argmax()]
     travel = (last - first) / slots.max()
     step = float(np.linalg.norm(travel))

@@ -1,6 +1,4 @@
-"""Volumes on other grids, the passage to SimpleITK's images and back, distances and components on a grid,
-and how far two masks of one vessel agree: `compare_masks`.
-"""
+"""Volumes on other grids and as SimpleITK's images, distances and components on a grid, and agreement of two masks."""
 
 from __future__ import annotations
 
@@ -101,10 +99,8 @@ def distance_and_nearest(
 
 
 def dilated(mask: Bool[np.ndarray, "nz ny nx"], reach: int | Sequence[int]) -> Bool[np.ndarray, "nz ny nx"]:
-    """Return the voxels whose box of `reach` voxels to either side (along k, j, i, or one for all) holds any of a mask.
-
-    SciPy's maximum filter in a fourth of the time: a box grown to one size is shifted by that size to make the next.
-    """
+    """Return the voxels whose box of `reach` voxels to either side (along k, j, i, or one for all) holds any of a mask:
+    a box grown to one size is shifted by that size, in a fourth of the time of SciPy's maximum filter."""
     grown = mask
     for axis, least in enumerate(np.broadcast_to(reach, 3).tolist()):
         held, done = np.moveaxis(grown, axis, 0), 0

@@ -1,7 +1,5 @@
-"""NIfTI-1 and NIfTI-2 files (https://nifti.nimh.nih.gov), read as their standard says.
-
-Where sform and qform place the voxels elsewhere, the one in the scanner's anatomical coordinates is taken.
-"""
+"""NIfTI-1 and NIfTI-2 files (https://nifti.nimh.nih.gov), read as their standard says, placed by anatomical
+coordinates."""
 
 from __future__ import annotations
 
@@ -83,11 +81,8 @@ _TYPES = {
 
 
 def read_nifti(path: Path) -> ImageFile:
-    """Read a NIfTI file (.nii, .nii.gz), its voxels as the rescale makes them, and the names of its labels.
-
-    Raises:
-        InputError: the file is damaged, holds no three-dimensional grey levels, or does not say where they are.
-    """
+    """Read a NIfTI file (.nii, .nii.gz), its voxels rescaled, and its labels' names. Raises InputError for a damaged
+    file, one without three-dimensional grey levels, or one that does not say where they are."""
     stream = opened(path)
     try:
         with stream:
@@ -166,10 +161,7 @@ def _offset(header: dict[str, Any], path: Path) -> int:
 
 
 def _named_labels(content: bytes, order: str) -> tuple[Segment, ...]:
-    """Return the names in a header's extensions, as TotalSegmentator and Connectome Workbench write them.
-
-    An extension is its size, its kind and its content; names are XML: `<Label Key="52"><![CDATA[aorta]]></Label>`.
-    """
+    """Return names in a header's extensions, in XML as TotalSegmentator and Connectome Workbench write them."""
     at = 4 if content[:1] not in (b"", b"\0") else len(content)
     while at + 8 <= len(content):
         size, kind = struct.unpack_from(f"{order}2i", content, at)

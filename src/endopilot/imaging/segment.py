@@ -1,7 +1,4 @@
-"""Segmentation of one vessel's lumen: the entry function of the imaging stage, its settings and its methods.
-
-Before a method searches a CT, its histogram must show HU and, where a method needs a pool of blood, contrast.
-"""
+"""Segmentation of one vessel's lumen: the entry function of the imaging stage, settings, methods and first checks."""
 
 from __future__ import annotations
 
@@ -85,11 +82,9 @@ class SegmentationMethod:
     """A method that finds the lumen of a vessel in a CT angiogram.
 
     Attributes:
-        segment_lumen: takes the volume (HU) and the settings, and returns the mask of the lumen on the volume's grid,
-            with the ostium if it finds one.
-        options: the method's own settings with their defaults; `config.settings(options)` returns them as given.
-        blood_pools: whether the method needs an aorta or a heart chamber in the volume; contrast is then looked for
-            before it runs.
+        segment_lumen: from volume (HU) and settings to the lumen's mask on the volume's grid, with any ostium found.
+        options: its own settings with their defaults; `config.settings(options)` returns them as given.
+        blood_pools: whether it needs an aorta or a heart chamber; contrast is then looked for before it runs.
     """
 
     segment_lumen: Callable[[Volume, SegmentConfig], LumenMask]
@@ -190,11 +185,8 @@ def _refuse_cut_root(volume: Volume, ostium: Insertion) -> None:
 
 
 def refuse_other_units(volume: Volume, seeds: Sequence[Sequence[float]] = ()) -> None:
-    """Raise InputError for a volume that cannot be in HU: nothing is below 0, where fat, lung and air are.
-
-    A CT that was cut off at 0, or stripped of all but the brain, holds nothing below 0 either. Seeds (LPS mm) tell it
-    from one whose rescale is lost: at them it has the HU of blood with contrast.
-    """
+    """Raise InputError for a volume that cannot be in HU: nothing is below 0, where fat, lung and air are, and at the
+    seeds (LPS mm) it has not the HU of blood with contrast, as a CT that was cut off at 0 or stripped would."""
     low, high = float(volume.voxels.min()), float(volume.voxels.max())
     if low < 0:
         return
@@ -215,10 +207,8 @@ def refuse_other_units(volume: Volume, seeds: Sequence[Sequence[float]] = ()) ->
 
 
 def refuse_without_contrast(volume: Volume) -> None:
-    """Raise InputError for a CT of the chest or abdomen without 4 connected ml of homogeneous tissue above 130 HU.
-
-    Blood with contrast is the one tissue that fills millilitres there above 130 HU; blood without measures 30 to 60 HU,
-    like muscle. Of a field of view shorter than a pool, a proportionally smaller pool is asked for.
+    """Raise InputError for a CT of chest or abdomen without 4 connected ml (fewer in a short field of view) of
+    homogeneous tissue above 130 HU: only blood with contrast fills millilitres there; without, it measures 30 to 60 HU.
     """
     extent_mm = float((volume.spacing_mm * volume.voxels.shape[::-1]).min())
     blocks, size_mm = _blocks(volume)

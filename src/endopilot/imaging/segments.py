@@ -39,12 +39,9 @@ class ImageFile:
 def inside_segment(
     image: ImageFile, label: int | str | None, threshold: float | None, path: Path
 ) -> tuple[Bool[np.ndarray, "nz ny nx"], tuple[str, ...]]:
-    """Return the voxels of the one segment that holds some, or of the one asked for, and what is to be noted.
-
-    A segment's number is its value; where segments of several layers share values, it is its place in the file, from 1.
-    `threshold` divides grey levels. Raises InputError where a layer is neither labels nor thresholded grey levels,
-    nothing is inside, or the label is not there or not given.
-    """
+    """Return the voxels of the one segment that holds some, or was asked for, and notes. Its number is its value, or
+    its place in the file, from 1, where several layers share values; `threshold` divides grey levels. Raises InputError
+    where a layer is neither, nothing is inside, or the label is not there or not given."""
     layers = image.layers
     if threshold is not None:
         if label is not None or len(layers) > 1:
@@ -129,11 +126,8 @@ def _values(layer: Shaped[np.ndarray, "nz ny nx"], asked: bool, path: Path) -> l
 
 
 def _is_grey(layer: Shaped[np.ndarray, "nz ny nx"], usual: float) -> bool:
-    """Return whether whole numbers are grey levels: neighbours not both 0, nor of the usual value, are seldom alike.
-
-    Along some axis 0 to 24 % of them are in most vessels of 1 to 12 mm that were resampled to 2 to 255 greys, 29 %
-    or more in a label one voxel thick, and 60 % or more in all others that were tried.
-    """
+    """Return whether whole numbers are grey levels: few neighbours are alike, neither both 0 nor of the usual value:
+    along some axis at most 24 % in vessels of 1 to 12 mm in 2 to 255 greys, 29 % or more in thinnest labels."""
     for axis in range(3):
         one, other = (np.moveaxis(layer, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
         pairs = (one != 0) & (other != 0) & ((one != usual) | (other != usual))

@@ -1,11 +1,6 @@
-"""Images with a text header: NRRD (.nrrd, .nhdr), 3D Slicer's segmentations (.seg.nrrd), MetaImage (.mha, .mhd).
-
-NRRD: https://teem.sourceforge.net/nrrd/format.html. A segmentation of Slicer is one label image, or several in layers
-where segments overlap; its header names each segment's layer and value.
-
-MetaImage: https://itk.org/Wiki/MetaIO/Documentation. `AnatomicalOrientation` repeats in words what `TransformMatrix`
-says in numbers, in ITK's way: RAI are axes that run from right, anterior and inferior, which is LPS.
-"""
+"""Images with a text header: NRRD (.nrrd, .nhdr; https://teem.sourceforge.net/nrrd/format.html), Slicer's segmentations
+(.seg.nrrd), whose header names each segment's layer and value, and MetaImage (.mha, .mhd;
+https://itk.org/Wiki/MetaIO/Documentation), where RAI are axes from right, anterior and inferior, which is LPS."""
 
 from __future__ import annotations
 
@@ -79,11 +74,7 @@ _FROM = ("RL", "AP", "IS")
 
 
 def read_nrrd(path: Path) -> ImageFile:
-    """Read an NRRD file.
-
-    Raises:
-        InputError: the file is damaged, holds no grey levels or labels, or does not say where they are.
-    """
+    """Read an NRRD file. Raises InputError if it is damaged, holds no grey levels or labels, or tells no place."""
     with path.open("rb") as stream:
         fields, keys = _nrrd_header(stream, path)
         sizes, vectors = _axes(fields, path)
@@ -234,11 +225,7 @@ def _segments(keys: dict[str, str], path: Path) -> tuple[Segment, ...]:
 
 
 def read_metaimage(path: Path) -> ImageFile:
-    """Read a MetaImage file.
-
-    Raises:
-        InputError: the file is damaged, holds no grey levels or labels, or does not say where they are.
-    """
+    """Read a MetaImage file. Raises InputError if it is damaged, holds no grey levels or labels, or tells no place."""
     with path.open("rb") as stream:
         fields = _meta_header(stream, path)
         size = _meta_size(fields, path)

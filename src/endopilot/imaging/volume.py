@@ -1,9 +1,5 @@
-"""Reading and writing volumes and masks, in LPS mm, whatever the file format.
-
-CT comes from a DICOM series or from NIfTI, NRRD or MHA; masks from the last three or DICOM-SEG. RAS files are turned
-into LPS and the rescale slope and intercept are applied, so that voxels are HU. A file is read right, or its volume's
-notes say what was changed, or it is refused in one line.
-"""
+"""Reading and writing volumes and masks, in LPS mm and HU, whatever the file format: a file is read right, or its
+volume's notes say what was changed, or it is refused in one line."""
 
 from __future__ import annotations
 
@@ -105,11 +101,7 @@ def check_output(path: str | Path, *, mask: bool = False) -> None:
 
 def write_volume(volume: Volume, path: str | Path) -> None:
     """Write a volume; the suffix (.nii.gz, .nii, .nrrd, .mha) chooses the format, and a new folder makes a DICOM
-    series.
-
-    Booleans are written as uint8; a DICOM series holds whole HU. Raises InputError for a suffix or folder that does not
-    do.
-    """
+    series, of whole HU. Booleans become uint8. Raises InputError for a suffix or folder that does not do."""
     path = Path(path)
     check_output(path)
     if path.suffix == "":
@@ -162,10 +154,8 @@ def read_mask(path: str | Path, *, label: int | str | None = None, threshold: fl
 
 def write_mask(mask: LumenMask, path: str | Path, *, manifest: Mapping[str, Any]) -> None:
     """Write a mask (.nii.gz, .nii, .nrrd, .mha, or .dcm for DICOM-SEG), and `<stem>.json` with its ostium, method,
-    warnings and the manifest of the run, or neither.
-
-    The JSON file holds the mask's name and SHA-256, so that no other mask is taken for it. Raises as `check_output`.
-    """
+    warnings, the run's manifest, and the mask's SHA-256, by which it is of no other; or neither. Raises as
+    `check_output`."""
     path = Path(path)
     check_output(path, mask=True)
     ostium = mask.ostium

@@ -49,12 +49,8 @@ _EVERY = 4  # of the skeleton's points, some 0.6 mm apart, are enough to find ve
 
 @dataclass(frozen=True, eq=False)
 class CoronaryInlet:
-    """Where a coronary artery begins (LPS mm), with which probability, and the next best place.
-
-    Attributes:
-        crux: where the arteries meet the crux of the heart, if both are in the lumen and one reaches it.
-        other: where the other coronary artery begins, LPS mm, if it is in the lumen too, as another piece.
-    """
+    """Where a coronary artery begins (LPS mm), with which probability, and the next best place; the `crux` if it is
+    known, and where the `other` artery begins, LPS mm, if it is in the lumen as another piece."""
 
     position: Float[np.ndarray, "3"]
     confidence: float
@@ -76,10 +72,8 @@ class CoronaryInlet:
 def coronary_inlet(
     content: LumenMask | Surface, side: Side, label: str, coordinates: str | None = None
 ) -> CoronaryInlet | None:
-    """Return where an artery begins, or None where the lumen holds a piece of the aorta, which shows it.
-
-    `coordinates` are the axes that the user gave for a file that does not state its own. Raises InputError where the
-    artery is absent or uncertain, or the axes are others; the message names what to give.
+    """Return where an artery begins, or None where a piece of the aorta in the lumen shows it; `coordinates` are axes
+    that the user gave. Raises InputError, which names what to give, for an absent or uncertain artery, or other axes.
     """
     pieces: list[list[OpenEnd]] = []
     skeletons: list[Skeleton] = []

@@ -114,11 +114,8 @@ class OstiumCandidate:
 
 @dataclass(frozen=True, eq=False)
 class OstiumRanking:
-    """How the hypotheses about a lumen's arteries share the probability of 1.
-
-    Attributes:
-        touching: where the artery would begin if one lumen held both, with that probability.
-        axes: the axes, of `OTHER_AXES`, that explain the lumen best, and with which probability.
+    """How the hypotheses about a lumen's arteries share the probability of 1: `touching` is where the artery would
+    begin if one lumen held both, `axes` those of `OTHER_AXES` that explain the lumen best, each with its probability.
     """
 
     candidates: list[OstiumCandidate]
@@ -130,12 +127,9 @@ class OstiumRanking:
 def rank_ostia(
     pieces: Sequence[Sequence[OpenEnd]], vessels: Float[np.ndarray, "n 3"] | None = None, *, stated: bool = True
 ) -> dict[Side, OstiumRanking]:
-    """Return where each artery may begin if it is asked for, and what else the lumen may hold.
-
-    `pieces` are the open ends of every lumen that may be a coronary artery; no point of `vessels` (LPS mm) may lie in
-    the aorta; `stated` is whether the file states its axes. What is missing to 1 is the probability that nothing in the
-    lumen is as coronary arteries are.
-    """
+    """Return where each artery asked for may begin, and what else the lumen may hold. `pieces` are open ends of every
+    lumen that may be an artery; no point of `vessels` (LPS mm) may lie in the aorta; `stated`: are the file's axes?
+    What is missing to 1 is the probability of no coronary arteries."""
     ends = [end for own in pieces for end in own]
     owner = np.array([piece for piece, own in enumerate(pieces) for _ in own])
     place = np.array([end.position for end in ends])

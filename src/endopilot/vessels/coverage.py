@@ -1,8 +1,5 @@
 """Nothing of a lumen is lost unsaid: what is too thin to follow is widened, and what the tree does not reach is stated.
-
-The yardstick is the middle of the mask (`traced_lines`), which has every branch of one voxel. Its length is the sum of
-what the tree reaches, of what it reaches because it was widened, and of what is left out with its length and place.
-"""
+The yardstick is the middle of the mask (`traced_lines`), which has every branch of one voxel."""
 
 from __future__ import annotations
 

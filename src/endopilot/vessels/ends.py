@@ -194,12 +194,10 @@ def likely_inlets(
     wall: Surface | None = None,
     lines: Sequence[Float[np.ndarray, "2 3"]] = (),
 ) -> list[InletEnd]:
-    """Return the ends of a tree, the one that looks most like its inlet first.
+    """Return the ends of a tree, likeliest inlet first: wide, the tree narrows from it, cut flat, lines begin there.
 
-    The inlet is wide, the tree narrows from it, it is cut flat, and lines begin there. An end that bulges behind a neck
-    is an aneurysm's dome: it counts as its neck does, less by how much it bulges. A cut that bulges is none: the root
-    of the aorta does. `paths` are those of `RootedGraph.traced`; the wall shows where a vessel is cut; `lines` are the
-    first and last points of a file's lines.
+    An aneurysm's dome, an end that bulges behind a neck, counts as its neck does, less by how much it bulges; a cut
+    that bulges is none. `paths` are those of `RootedGraph.traced`, `lines` first and last points of a file's lines.
     """
     middle = np.concatenate(paths)
     widths = tree.radius[middle]
@@ -248,13 +246,9 @@ def _bulge(points: Float[np.ndarray, "n 3"], clearance: Float[np.ndarray, "n"], 
 def _flatness(
     points: Float[np.ndarray, "n 3"], place: int, width: float, triangles: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> float:
-    """Return the area of the flattest part of the wall that closes an end, over that of the vessel's section.
-
-    A vessel cut straight or aslant has 1 or more, a dome 0.12 (what lies within 20° of one direction on a sphere).
-
-    The points, mm, are the way inwards from the tip, at `place` of which the vessel has its whole width, a radius, mm;
-    the triangles are the wall's centres, normals and areas.
-    """
+    """Return the area of the flattest part of the wall that closes an end, over that of the vessel's section: 1 or more
+    for a vessel cut straight or aslant, 0.12 for a dome. The points, mm, lead inwards from the tip, to the whole width
+    at `place`, radius mm; the triangles are the wall's centres, normals and areas."""
     centres, normals, areas = triangles
     back = int(np.searchsorted(length_along(points[place:]), 1.5 * width))
     axis = points[place] - points[min(place + max(back, 1), len(points) - 1)]

@@ -161,10 +161,10 @@ class RootedGraph(VesselGraph):
     ) -> list[Int[np.ndarray, "_"]]:
         """Return the tree as paths of points: the first from the root, each other one from a point of an earlier path.
 
-        The farthest uncovered point is traced back to the tree, and its path covers its surroundings, within `coverage`
-        inscribed radii and two steps. What reaches less than `minimum_mm`, `slenderness` times its radius or the local
-        radius out of its parent is a bump, and is dropped. Points `together` are of lines that may repeat each other: a
-        path ends within `TOGETHER` radii, or two steps, of an earlier one.
+        The farthest uncovered point is traced back to the tree; its path covers what is within `coverage` radii and two
+        steps. What reaches less than `minimum_mm`, `slenderness` times its radius or the local radius out of its parent
+        is a bump. Points `together` are of lines that may repeat each other: a path ends within `TOGETHER` radii, or
+        two steps, of an earlier one.
         """
         reach = coverage * self.radius + 2 * self.step_mm
         if together:
@@ -222,10 +222,8 @@ def lumen_graph(
     spacing_mm: float | Float[np.ndarray, "3"],
     root: int | None = None,
 ) -> RootedGraph:
-    """Return the graph of grid points inside one lumen, with their clearance from the wall, mm, and the ways to a root.
-
-    Without `root` that is the point farthest from the widest place. Of several spacings the graph keeps the largest.
-    """
+    """Return the grid points in one lumen (of several spacings the largest), their clearance, mm, and the ways to a
+    root, by default the point farthest from the widest place."""
     if root is None:
         graph = lumen_graph(points, clearance, spacing_mm, int(clearance.argmax()))
         return graph.rooted(int(graph.length.argmax()))

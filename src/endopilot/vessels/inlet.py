@@ -53,12 +53,8 @@ _BRANCH_MM = 4.0
 def piece_on_side(
     sizes: Float[np.ndarray, "n"], centres: Float[np.ndarray, "n 3"], vessel: Vessel
 ) -> tuple[int, list[int]]:
-    """Return which of several separate lumens is the vessel, and which others are nearly as large.
-
-    The right coronary artery lies to the patient's right of the left one (smaller x in LPS), so among pieces of
-    comparable size the side decides; for other vessels it is the largest. Sizes are volumes, or anything that grows
-    with them.
-    """
+    """Return which of several lumens (of sizes in any unit of volume) is the vessel, and which others are nearly as
+    large. Among such the side decides: the right coronary artery has the smaller x in LPS; else the largest is it."""
     large = np.flatnonzero(sizes >= COMPARABLE * sizes.max())
     if vessel == "generic":
         chosen = int(sizes.argmax())
@@ -93,11 +89,8 @@ def beyond_parent(
     side: Side,
     inlet: Float[np.ndarray, "3"] | None,
 ) -> tuple[Insertion | None, Bool[np.ndarray, "nz ny nx"]]:
-    """Return the ostium and the lumen beyond it where the lumen holds a piece of the aorta; else None and the lumen.
-
-    The aorta is looked for on a coarser grid: on that of the coronary artery it has millions of points. `inlet` is
-    where the artery begins (LPS mm) if the lumen holds no aorta; a stub of the aorta may bulge there.
-    """
+    """Return the ostium and the lumen beyond it where the lumen holds a piece of the aorta (looked for on a coarser
+    grid); else None and the lumen. `inlet` is where the artery begins (LPS mm) otherwise; a stub may bulge there."""
     if distance_map.values[inside].max(initial=0.0) < PARENT_RADIUS_MM[0]:
         return None, inside
     coarse = distance_map
@@ -140,12 +133,9 @@ def entrance(
     side: Side | None,
     surface: Surface | None = None,
 ) -> Insertion:
-    """Return where the device enters if a place some millimetres off is given: at an end near it, or in mid-vessel.
-
-    An end that an artery may begin at, no farther than `SNAP_MM`, is the ostium; it gets no direction, since the
-    centerline gives it better. In mid-vessel the direction is away from the vessel's inlet. `clearance` is the distance
-    of the lumen's grid points to the wall, mm.
-    """
+    """Return where the device enters if a place some millimetres off is given: at an end within `SNAP_MM`, without a
+    direction, which the centerline gives better; or in mid-vessel, away from the inlet. `clearance` is the grid points'
+    distance to the wall, mm."""
     spacing = distance_map.spacing_mm
     ends: Sequence[InletEnd | OpenEnd]
     if side is None:
@@ -205,9 +195,8 @@ def inlets(
 def _parent_region(
     distance_map: DistanceMap, inside: Bool[np.ndarray, "nz ny nx"], graph: RootedGraph, usual_mm: float
 ) -> Bool[np.ndarray, "nz ny nx"] | None:
-    """Return the grid points of the parent vessel that the graph's root lies in: what spheres of `PARENT_RATIO` times
-    the usual radius reach, connected and around the root; None if none. A bulge farther along is an aneurysm and stays.
-    """
+    """Return the parent vessel's grid points around the graph's root, reached by spheres of `PARENT_RATIO` times the
+    usual radius; None if none. A bulge farther along is an aneurysm and stays."""
     spacing = distance_map.spacing_mm
     wide = float(np.clip(PARENT_RATIO * usual_mm, *PARENT_RADIUS_MM))
     core = inside & (distance_map.values > wide)

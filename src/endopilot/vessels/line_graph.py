@@ -1,8 +1,5 @@
 """Centerlines as a vessel graph, and the lines of one tree in it: joined along lines, where they meet, over small gaps.
-
-Lines may overlap, as VMTK writes them, or meet end to end, as Slicer writes them. The tree is traced as in a lumen:
-farthest end first, each further line from where it leaves what is there.
-"""
+Lines may overlap, as VMTK writes them, or meet end to end, as Slicer does; the tree is traced as in a lumen."""
 
 from __future__ import annotations
 
@@ -55,13 +52,8 @@ _JUMP_STEPS, _JUMP_RADII = 8.0, 5.0
 
 @dataclass(frozen=True, eq=False)
 class LineGraph(VesselGraph):
-    """Points of all lines, twice as dense as the tree's; what a way costs is its length, more where it changes lines.
-
-    Attributes:
-        owner: index of the line of each point.
-        along: distance from the start of its line, mm.
-        share: length of line that each stands for, mm.
-    """
+    """Points of all lines, twice as dense as the tree's; a way costs its length, more where it changes lines. Points
+    have an `owner` line, `along` mm from its start, and stand for a `share` of it, mm."""
 
     columns = ("points", "radius", "owner", "along", "ends", "share")
     owner: Int[np.ndarray, "n"]
@@ -132,12 +124,9 @@ class FoundLines:
 
 
 def found_lines(source: Polylines, given: Insertion | None, label: str, vessel: str = "generic") -> FoundLines:
-    """Return the lines of one tree in centerlines with radii, LPS mm.
-
-    Where the lines start in a parent vessel (VMTK's coronary centerlines start in the aorta), they are cut at the
-    ostium: where they leave the parent's spheres. Raises InputError where the points of a line are in no order, no line
-    is near the given ostium, or a coronary artery is asked for and the lines are those of two.
-    """
+    """Return the lines of one tree in centerlines with radii, LPS mm, cut where they leave a parent vessel that they
+    start in (VMTK's: the aorta). Raises InputError where a line's points are in no order, no line is near the given
+    ostium, or a coronary artery is asked for and the lines are those of two."""
     source, notes = in_order(source, label)
     whole = line_graph(source)
     keep, cut_at = _outside_parent_vessel(whole)
@@ -300,12 +289,9 @@ def _resampled(
 
 
 def in_order(source: Polylines, label: str) -> tuple[Polylines, list[str]]:
-    """Return lines that follow their vessels, and what was done, a sentence each.
-
-    Points that repeat are dropped. Points in another order are sorted where only one order is the shortest. Where
-    neighbouring spheres do not touch, a line is joined by a straight piece, or cut if it jumps to another vessel.
-    Raises InputError where the points of a line are in no order.
-    """
+    """Return lines that follow their vessels, and what was done: repeated points dropped, points sorted where only one
+    order is the shortest, gaps closed by straight pieces, jumps to another vessel cut. Raises InputError for points in
+    no order."""
     points, radii, notes = [], [], []
     for number, (line, size) in enumerate(zip(source.points, source.radius, strict=True)):
         name = source.name(number)

@@ -1,8 +1,5 @@
-"""The middle of a mask as a graph of single voxels, which keeps every thin branch and every tunnel of the mask.
-
-It does not depend on the smooth wall or on the grid that the centerlines come from, so it is the yardstick for both:
-where it is thinner than they can show, the mask is widened; what the final tree does not reach of it is stated.
-"""
+"""The middle of a mask as a graph of single voxels, with every thin branch and tunnel: independent of the smooth wall
+and the centerlines' grid, it is the yardstick of what these show and reach."""
 
 from __future__ import annotations
 
@@ -37,8 +34,8 @@ _STUB_VOXELS, _SLENDER = 4.0, 1.5
 
 @dataclass(frozen=True, eq=False)
 class MedialLines(VesselGraph):
-    """The middle of a mask: a forest whose ways are as wide as they can be. Its radius is the distance to the mask's
-    border, half a voxel where the mask is one or two voxels thick; its costs are lengths, mm.
+    """The middle of a mask: a forest of widest ways, whose radius is the distance to the mask's border, costs lengths,
+    mm.
 
     Attributes:
         index: voxel indices (z, y, x).

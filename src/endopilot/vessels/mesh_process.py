@@ -1,10 +1,6 @@
-"""Reads one mesh file with VTK and writes its arrays to standard output; `polydata.py` runs it as a process.
-
-VTK's readers crash on some damaged files, and print what they complain of. Here neither reaches the caller. The process
-imports nothing of endopilot, and writes an npz archive: `points`; `corners` of triangles; `line_points` and, where each
-line begins in it, `line_offsets`; arrays of numbers as `point:NAME` and `cell:NAME`; the texts `kind`, `fields` and
-`complaint`.
-"""
+"""Reads one mesh file with VTK, in a process of its own as VTK may crash and print, and writes an npz archive to
+standard output: `points`; `corners` of triangles; `line_points` and `line_offsets`, where each line begins; arrays of
+numbers as `point:NAME` and `cell:NAME`; the texts `kind`, `fields` and `complaint`. It imports nothing of endopilot."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
-"""Surfaces and centerlines from STL, OBJ, PLY, VTP, VTU and VTK, with the axes and the unit that their headers state.
-
-3D Slicer writes its axes as `SPACE=LPS` or `SPACE=RAS`: in the header of an STL, in a comment of a PLY or OBJ, in the
-title of a VTK file, and in the field data of a VTP.
-"""
+"""Surfaces and centerlines from STL, OBJ, PLY, VTP, VTU and VTK, with the axes and the unit that their headers state:
+3D Slicer writes `SPACE=LPS` or `SPACE=RAS` in an STL's header, a PLY's or OBJ's comment, a VTK file's title, a VTP's
+fields."""
 
 from __future__ import annotations
 

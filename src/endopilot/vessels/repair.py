@@ -1,7 +1,4 @@
-"""Repairs of the flaws that masks from elsewhere have: blobs, gaps, cavities. `repair_surface` is that of surfaces.
-
-Every repair returns remarks, which `extract_anatomy` writes into the provenance.
-"""
+"""Repairs of flaws of masks from elsewhere: blobs, gaps, cavities; their remarks go into the provenance."""
 
 from __future__ import annotations
 
@@ -47,9 +44,8 @@ OTHER_SIDE = {"rca": "left coronary artery", "lca": "right coronary artery"}
 class Lumen:
     """One lumen of a mask, ready for its wall, with its middle and remarks on what was joined, parted and left out.
 
-    Attributes:
-        before: middle of all that the file connects with it: what the tree should reach.
-        told: which points of `before` lie in another vessel that was parted from this one, and that a remark names.
+    `before` is the middle of all that the file connects with it, which the tree should reach; `told` those points of it
+    that lie in another vessel, parted from this one with a remark.
     """
 
     mask: Volume
@@ -61,15 +57,8 @@ class Lumen:
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """The pieces of a mask.
-
-    Attributes:
-        joined: voxels as they were read, and over gaps of a few voxels to what carries on.
-        gaps: a voxel at each gap, and whether what lies beyond was joined or runs alongside.
-        parted: the joined voxels, parted where they touch, as `touches` says.
-        before: middle of the joined voxels.
-        lines: middle of the parted ones.
-    """
+    """The pieces of a mask: `joined` over gaps of a few voxels to what carries on, with its middle `before`, and
+    `parted` where they touch, with its middle `lines`; `gaps` has a voxel at each, and whether it was joined."""
 
     joined: Volume
     gaps: list[tuple[Int[np.ndarray, "3"], bool]]
@@ -190,11 +179,8 @@ def pieces_left_out(
     other_ostium: Float[np.ndarray, "3"] | None,
     counted: str,
 ) -> list[str]:
-    """Say which pieces were left out and where they lie, since a real vessel may be lost with them.
-
-    The points of `pieces` (LPS mm) are of `counted`. The lumen is made of `taken`; `severed` touched it and were parted
-    from it; `others` are nearly as large.
-    """
+    """Say which pieces (points, LPS mm, of `counted`) were left out and where they lie: a real vessel may be lost with
+    them. The lumen is made of `taken`; `severed` touched it and were parted from it; `others` are nearly as large."""
     remarks, foreign = list[str](), -1
     lost = [number for number in range(len(pieces)) if number not in taken]
     if lost and other_ostium is not None:
@@ -241,9 +227,8 @@ def pieces_left_out(
 def _joined(
     voxels: Bool[np.ndarray, "nz ny nx"],
 ) -> tuple[Bool[np.ndarray, "nz ny nx"], list[tuple[Int[np.ndarray, "3"], bool]]]:
-    """Join pieces within the largest gap by tubes as wide as the vessels at both ends, unless one runs alongside the
-    other: two vessels that pass each other are not one. Return the voxels, and for each gap a voxel at it and whether
-    it was bridged."""
+    """Join pieces within the largest gap by tubes as wide as the vessels, unless one runs alongside the other; return
+    the voxels, and for each gap a voxel at it and whether it was bridged."""
     labels, index = connected_components(voxels, corners=True), np.argwhere(voxels)
     members = split(index, labels[tuple(index.T)] - 1)
     large = sorted(range(len(members)), key=lambda piece: -len(members[piece]))[:_MOST_JOINED]

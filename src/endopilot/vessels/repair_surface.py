@@ -1,9 +1,5 @@
-"""Repairs of the flaws that surfaces from elsewhere have: separate pieces, holes, inverted normals, walls for lumens.
-
-A printed phantom's shell or a vessel wall's mask is given for a lumen: the lumen is what the wall encloses.
-
-Every repair returns remarks, which `extract_anatomy` writes into the provenance.
-"""
+"""Repairs of flaws of surfaces from elsewhere: separate pieces, holes, inverted normals, walls (a phantom's shell) for
+lumens, which they enclose; their remarks go into the provenance."""
 
 from __future__ import annotations
 
@@ -65,9 +61,8 @@ def closed_surface(
     vessel: Vessel = "generic",
     other_ostium: Float[np.ndarray, "3"] | None = None,
 ) -> tuple[Surface, list[str]]:
-    """Return one closed wall with outward normals: largest piece (or the one at the ostium), holes capped. Arguments
-    are those of `repair.connected_mask`. Raises InputError for holes that cannot be closed, or a surface nowhere near
-    the ostium."""
+    """Return one closed wall with outward normals: largest piece (or that at the ostium), holes capped; arguments as of
+    `connected_mask`. Raises InputError for holes that cannot be closed, or a surface nowhere near the ostium."""
     mesh: Any = _without_duplicates(_polydata(surface.vertices, surface.faces).clean().triangulate())
     mesh, remarks = _lumen_of(mesh)
     regions = mesh.connectivity(extraction_mode="all")

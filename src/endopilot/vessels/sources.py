@@ -189,12 +189,11 @@ def check_unit(
     factor: float = 1.0,
     odds: float = STATED,
 ) -> None:
-    """Refuse a vessel that has another size than vessels have, and ask where its size fits in several units.
+    """Refuse a vessel (points on it, or its box's corners, in mm by `factor`) of another size than vessels have, and
+    ask with the `--scale`s where several units fit.
 
-    Radius and extent together tell the unit: no tree of the body is as long as a coronary artery's in mm and as wide as
-    an aorta's in cm. Each unit is weighed by how usual it makes the two, against the nearest kind of vessel. `points`
-    are on the vessel or corners of its box, in mm as taken with `factor`; `odds` (`ASSUMED`, `BY_ARRAYS`, `STATED`,
-    `ANSWERED`) favour that unit. The InputError names each size and its `--scale`.
+    Radius and extent together tell the unit, each weighed by how usual it makes the two against the nearest kind of
+    vessel; `odds` (`ASSUMED`, `BY_ARRAYS`, `STATED`, `ANSWERED`) favour the one it was taken in.
     """
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     units = {factor: unit_name(factor)} | {one: name for name, one in _UNITS.items()}

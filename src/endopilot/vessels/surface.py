@@ -82,12 +82,8 @@ class Surface:
         return 2.0 * self.volume / float(self.triangles()[2].sum())
 
     def distance(self, points: Float[np.ndarray, "n 3"], *, limit_mm: float = np.inf) -> Float[np.ndarray, "n"]:
-        """Return the unsigned distance in mm from points to the wall, `limit_mm` where it is at least that.
-
-        The triangles are found by their centroids: the nearest four for points close to the wall, the nearest one
-        alone for points so far that its neighbours cannot matter. They must therefore be about as small as the
-        details that matter (see `refined`).
-        """
+        """Return unsigned distances, mm, to the wall, at most `limit_mm`, by the nearest four centroids, or one where
+        far: triangles must be about as small as the details that matter (`refined`)."""
         result = np.full(len(points), limit_mm)
         reach, count = limit_mm + self.longest_edge, min(_NEAREST_TRIANGLES, len(self.faces))
         for start in range(0, len(points), 200_000):
@@ -127,10 +123,8 @@ class Surface:
     def inside(
         self, shape: tuple[int, int, int], origin: Float[np.ndarray, "3"], spacing_mm: float
     ) -> Bool[np.ndarray, "nz ny nx"]:
-        """Return which points of a grid along the LPS axes lie inside a closed wall.
-
-        VTK looks at every triangle for every slice, so that it is given a few slices at a time, and what crosses them.
-        """
+        """Return which points of a grid along the LPS axes lie inside a closed wall, a few slices at a time, for VTK
+        looks at every triangle for every slice."""
         from vtkmodules.util.numpy_support import vtk_to_numpy
         from vtkmodules.vtkImagingStencil import vtkImageStencilToImage, vtkPolyDataToImageStencil
 

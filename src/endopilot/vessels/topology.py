@@ -93,12 +93,11 @@ _LEFT: dict[Kind, Kind | None] = {
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """A place where a mask touches itself or closes a loop, and what was made of it.
+    """A place (LPS mm) where a mask touches itself or closes a loop, and what was made of it.
 
     Attributes:
         kind: parted: the vessel touches itself, a loop is narrowest, distant parts lie side by side, two vessels touch;
             left: two vessels perhaps touch, a flap has an opening, a tunnel is small, or there are many rings.
-        place: where, LPS mm.
         size_mm: length of the vessel between the two sides, or of the contact.
     """
 
@@ -142,9 +141,8 @@ class _Ring:
 
 
 def parted(mask: Volume) -> tuple[Volume, list[Touch], MedialLines, MedialLines]:
-    """Return the mask parted where it touches itself, all places where it touches or closes a loop, and its middle as
-    it was and as it is. No part of a lumen loses its way to the rest, except one of two vessels that certainly only
-    touch."""
+    """Return the mask parted where it touches itself, all its contacts and loops, and its middle before and after. No
+    part loses its way to the rest, except one of two vessels that certainly only touch."""
     parting, before = _Parting(mask), traced_lines(mask)
     for _ in range(_ROUNDS):
         thin = thinned_lines(parting.result)  # has all loops, but not all ends
@@ -458,9 +456,8 @@ def _sever(voxels: Bool[np.ndarray, "nz ny nx"], lines: MedialLines, ends: tuple
 
 
 def _without_sides(mask: Volume, lines: MedialLines) -> tuple[Volume, Touch] | None:
-    """Return the mask with parts far from each other along the vessel parted where they touch over a length; None if
-    there are none. Each voxel belongs to the nearest point of the middle; neighbours of distant points are emptied,
-    unless the lumen falls apart that way."""
+    """Return the mask with distant parts parted where they touch over a length, between voxels whose nearest middle
+    points are distant; None if there are none, or the lumen fell apart."""
     if lines.radius.max(initial=0.0) > AORTA_RADIUS_MM:  # a branch's first part lies inside the aorta's own middle
         return None
     voxel = float(mask.spacing_mm.max())

@@ -52,9 +52,8 @@ _SEED_MM = 6.0
 
 
 def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
-    """Segment the aortic lumen from the first seed, where the device enters, to the last, or to its far end with one
-    seed. Seeds in between guide the path. Raises InputError without a seed, contrast at a seed, or a contrast-filled
-    path."""
+    """Segment the aortic lumen from the first seed, where the device enters, by those between to the last, or to its
+    far end. Raises InputError without a seed, contrast at a seed, or a contrast-filled path."""
     if not config.seeds:
         raise InputError("seeds: the aorta method needs one or two points in the lumen, LPS mm; give --seeds x y z")
     with progress("Segmenting the aorta", 4) as advance:

@@ -89,9 +89,9 @@ left and back."""
 
 
 def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
-    """Segment the right or left coronary tree, without seeds automatically. The first seed overrides where the tree
-    begins, the others add distal ends that must be reached. Raises InputError where voxels are too coarse, or contrast,
-    an aorta, a vessel at its wall or at a seed is missing."""
+    """Segment a coronary tree, without seeds automatically; the first sets where it begins, others add ends to be
+    reached. Raises InputError where voxels are too coarse, or contrast, aorta, or a vessel at its wall or a seed is
+    missing."""
     coarsest = float(volume.spacing_mm.max())
     if coarsest > COARSEST_MM:
         raise InputError(

@@ -1,9 +1,8 @@
 """Segmentation by another program, run as a subprocess with the weights and the licence that its user has.
 
-The program gets the CT in a temporary folder, as a file with no header but its geometry, and writes its labels there.
-TotalSegmentator (https://github.com/wasserth/TotalSegmentator): its task `coronary_arteries` needs a licence of the
-user's own; `--options task=total structure=aorta` does not. nnU-Net v2 (https://github.com/MIC-DKFZ/nnUNet): the user's
-own trained model.
+The program gets the CT in a temporary folder, with no header but its geometry, and writes its labels there. Of
+TotalSegmentator (https://github.com/wasserth/TotalSegmentator) `coronary_arteries` needs a licence of the user's own,
+`--options task=total structure=aorta` none; nnU-Net v2 (https://github.com/MIC-DKFZ/nnUNet) the user's own model.
 """
 
 from __future__ import annotations
@@ -106,12 +105,9 @@ def segment_by_program(
     label: int | None = None,
     mend: str,
 ) -> LumenMask:
-    """Return the lumen that a program finds in a volume; the ostium is at the first of `seeds` (LPS mm).
-
-    `arguments` makes the command from the folder of the CT, which is named `given` there, and that of the `answer`.
-    `label` is the lumen's value there, `mend` what to do if the program fails. Raises InputError then, and if nothing
-    is marked in the CT or a seed lies farther than 5 mm from the lumen.
-    """
+    """Return the lumen that a program finds, with the ostium at the first of `seeds` (LPS mm). `arguments` makes the
+    command from the folder of the CT, there named `given`, and that of the `answer`; `label` is the lumen's value.
+    Raises InputError, with `mend`, if it fails, marks nothing, or a seed lies farther than 5 mm from the lumen."""
     with tempfile.TemporaryDirectory(prefix="endopilot-") as temporary:
         source, target = Path(temporary) / "ct", Path(temporary) / "answer"
         target.mkdir()
