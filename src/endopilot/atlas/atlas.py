@@ -78,10 +78,9 @@ def seen_through_ct(
 ) -> tuple[Anatomy, dict[str, Any]]:
     """Return the anatomy that `endopilot anatomy` makes of a mask of the patient's lumen, and what was drawn for it.
 
-    Whoever draws a mask follows a vessel until it is a few voxels wide, and takes in voxels that the wall cuts. So
-    masks have rough walls, end early, and are wide at their ends: the ends of seven real patients' masks, with voxels
-    of 0.6 to 0.75 mm in the plane and slices of 0.5 mm, have radii of 1.2 to 1.9 mm, median 1.4. `lumen` is the
-    distance to the wall, without a catheter. Raises InputError where no vessel was found in four masks.
+    Masks have rough walls, end early, and are wide at their ends: those of seven real patients, with voxels of 0.6 to
+    0.75 mm and slices of 0.5 mm, end at radii of 1.2 to 1.9 mm, median 1.4. `lumen` is the distance to the wall,
+    without a catheter. Raises InputError where no vessel was found in four masks.
     """
     scheme = vessel if vessel in ("rca", "lca") else "generic"
     config = AnatomyConfig(vessel=scheme, catheter_radius_mm=catheter_radius_mm)  # pyright: ignore[reportArgumentType]

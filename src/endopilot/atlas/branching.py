@@ -36,11 +36,8 @@ class NoShape(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Vessel:
-    """A vessel of a tree before it is cut at its branching points, with a section name at each point.
-
-    Points are evenly spaced, LPS mm; the first one is the point `origin` of the vessel `parent` (-1 for the first
-    vessel).
-    """
+    """A vessel before it is cut at its branching points: evenly spaced points, LPS mm, with a section name each; the
+    first is the point `origin` of the vessel `parent` (-1 for the first vessel)."""
 
     points: Float[np.ndarray, "n 3"]
     radius: Float[np.ndarray, "n"]
@@ -190,11 +187,8 @@ def uneven(generator: np.random.Generator, along: Float[np.ndarray, "n"]) -> Flo
 def with_side_branches(
     generator: np.random.Generator, vessels: Sequence[Vessel], plans: Sequence[SidePlan], carina_mm: float
 ) -> list[Vessel]:
-    """Return the vessels with the planned branches; one that cuts another lumen is drawn again, twelve times at most.
-
-    Over `carina_mm` behind a fork and twice their radii, lumens may be in contact. Raises NoShape where a branch found
-    no place.
-    """
+    """Return the vessels with the planned branches, drawn up to twelve times until none cuts another lumen; over
+    `carina_mm` behind a fork and twice their radii they may touch. Raises NoShape where a branch found no place."""
     grown = list(vessels)
     if not plans and lumens_collide(grown, carina_mm):
         raise NoShape

@@ -72,10 +72,7 @@ def turned(points: Float[np.ndarray, "n 3"], rotations: Float[np.ndarray, "m 3"]
 @dataclass(frozen=True, eq=False)
 class Wiggle:
     """A smooth random displacement along a curve: a sum of sines of random wave number (1/mm) and phase, with weights
-    in mm.
-
-    Amplitudes grow as the wavelength to the power 1.5, so that no single wavelength dominates the curvature.
-    """
+    in mm that grow as the wavelength to the power 1.5, so that no wavelength dominates the curvature."""
 
     wave_number: Float[np.ndarray, "modes"]
     phase: Float[np.ndarray, "modes 2"]
@@ -109,12 +106,9 @@ def steer(
     relaxation_mm: float,
     depth: Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]] | None,
 ) -> Float[np.ndarray, "n 3"]:
-    """Return a smooth curve that leaves `start` along `direction` and follows one course after another on a surface.
-
-    A course is the abscissa from which it holds, mm, and a unit direction, approached by a factor e over
-    `relaxation_mm`. `depth` is how deep points lie below the surface, mm; the curve seeks a height of `_HEIGHT_MM`
-    above it.
-    """
+    """Return a smooth curve from `start` along `direction`, then along one course (abscissa from which it holds, mm,
+    and unit direction) after another, each approached over `relaxation_mm`, `_HEIGHT_MM` above the surface that points
+    lie `depth` below, mm."""
     count = max(round(length_mm / STEP_MM), 8)
     heading, aim, rise, outward = direction, direction, 0.0, np.zeros(3)
     points = [start]

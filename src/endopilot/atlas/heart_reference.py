@@ -40,11 +40,8 @@ _GRID_LOW, _GRID_HIGH = np.array([-70.0, -110.0, -110.0]), np.array([110.0, 90.0
 
 @dataclass(frozen=True, eq=False)
 class HeartFit:
-    """The map from a patient to the reference heart: a similarity about the ostium, then a smooth warp.
-
-    The warp carries the patient's artery onto the reference course, so that chambers keep beside the artery: after the
-    similarity, `shifts` are missing from `knots` of the artery, mm, and the ostium keeps its place at `anchor`.
-    """
+    """The map from a patient to the reference heart: a similarity about the ostium, then a smooth warp of the patient's
+    artery onto the reference course: `shifts` are missing from `knots` of the artery, mm, none at `anchor`."""
 
     origin: Float[np.ndarray, "3"]
     rotation: Float[np.ndarray, "3 3"]
@@ -99,10 +96,8 @@ def fit_heart(main: Float[np.ndarray, "n 3"], crux_mm: float, last_section: str)
 
 
 def fit_heart_along(lines: Sequence[Float[np.ndarray, "_ 3"]], courses: Sequence[Float[np.ndarray, "_ 3"]]) -> HeartFit:
-    """Fit the reference heart to the main vessels of a tree, as far as they go; lines and courses begin at the ostium.
-
-    A patient's point belongs to the reference point at the same length from the ostium, relative to the heart's size.
-    """
+    """Fit the reference heart to the main vessels of a tree, as far as they go, by equal lengths from the ostium, where
+    lines and courses begin, relative to the heart's size."""
     ostium, anchor, scale, rotation = lines[0][0], courses[0][0], 1.0, np.eye(3)
     found = wanted = np.zeros((0, 3))
     for _ in range(4):

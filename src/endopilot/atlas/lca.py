@@ -58,9 +58,8 @@ _SHARPEST_PER_MM = 0.45
 
 @dataclass(frozen=True, eq=False)
 class _Trunk:
-    """A patient's main vessels: courses from the ostium and from the fork, each as far as it could go, the number of
-    points that are there, indices of fork and crux, size and position of the heart.
-    """
+    """A patient's main vessels: courses from the ostium and from the fork as far as they could go, the number of points
+    there, indices of fork and crux, size and position of the heart."""
 
     whole_lad: Float[np.ndarray, "n 3"]
     whole_lcx: Float[np.ndarray, "m 3"]

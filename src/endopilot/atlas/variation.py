@@ -83,9 +83,8 @@ def bent(
     forks: Sequence[Fork] = (),
     first: int = 0,
 ) -> Float[np.ndarray, "n 3"]:
-    """Return a vessel with waves, sharp bends and deflections behind its point `first`; of the same length. The
-    textbook's population leaves the vessel as it is and draws nothing. Raises NoShape where no draw kept the lumen's
-    wall from folding."""
+    """Return a vessel with waves, sharp bends and deflections behind its point `first`, of the same length; the
+    textbook's population draws none. Raises NoShape where no draw kept the lumen's wall from folding."""
     if not population.bends_vessels:
         return points
     mean = population.bends_per_100_mm
@@ -220,10 +219,8 @@ def flattened(
     generator: np.random.Generator, tree: VesselTree, population: Population
 ) -> list[tuple[Centerline, Centerline]]:
     """Return two lines of spheres beside each branch, which make its section longer than wide; none for round ones.
-
-    The lines lie δ to either side, with radius √(r² + δ²): across, the section keeps its radius r, and the branch's
-    own spheres stay inscribed; along, its half-width is √(r² + δ²) + δ. The direction turns along the vessel.
-    """
+    They lie δ to either side, with radius √(r² + δ²): the own spheres stay inscribed. The direction turns along the
+    vessel."""
     if population.flattening[1] == 0:
         return []
     mean = float(generator.uniform(*population.flattening))
@@ -254,12 +251,8 @@ def flattened(
 def catheter_direction(
     generator: np.random.Generator, tree: VesselTree, population: Population, radius_mm: float, length_mm: float
 ) -> tuple[Float[np.ndarray, "3"], dict[str, Any]]:
-    """Return the axis of a guiding catheter at the ostium, and what was drawn for it.
-
-    It makes the drawn angle with the vessel 10 mm beyond the ostium, and turns away from the vessel's first direction
-    by as little as that allows, within a scatter. Its tube keeps clear of every lumen but the first one; where no draw
-    does, and in the textbook's population, the catheter has the vessel's first direction.
-    """
+    """Return the axis of a guiding catheter at the ostium, and its draws: at the drawn angle with the vessel 10 mm on,
+    little turned away from its first direction, and clear of other lumens; else along the first direction."""
     first = shape.tangents(tree.branches[0].centerline.points)[0]
     if population.catheter_deg is None:
         return first, {}

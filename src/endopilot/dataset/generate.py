@@ -1,9 +1,6 @@
-"""Many random navigations of many patients, simulated and stored: `generate_dataset`.
-
-One file holds a block of sequences of one anatomy. It is written under a temporary name and renamed when whole, and
-everything in it follows from the seed, the anatomy's name and the sequence's index; so a run that was killed goes on
-with whole files and ends with the same bits as a run that was not.
-"""
+"""Many random navigations of many patients, simulated and stored. One file holds a block of sequences of one anatomy,
+renamed when whole; all follows from the seed, the anatomy's name and the index, so a killed run goes on to the same
+bits."""
 
 from __future__ import annotations
 
@@ -209,12 +206,10 @@ def write_episode(
     seed: int,
     origin: Mapping[str, Any],
 ) -> None:
-    """Write a navigation of one world that was recorded every 0.5 s as a dataset of one episode. That of a wire alone
-    trains.
+    """Write a navigation of one world that was recorded every 0.5 s as a dataset of one episode; a wire alone's trains.
 
-    `stack` has the devices as they were given: friction may have been another, and the stiffness of the distal 10 mm by
-    `tip_stiffness_factor`. `origin` is what else it followed from, such as target and policy. Raises InputError where
-    the output folder holds something else.
+    `stack` has the devices as given, whatever their friction and `tip_stiffness_factor` were; `origin` is what else it
+    followed from, such as target and policy. Raises InputError where the folder holds something else.
     """
     set_up = trajectory.set_up
     config = DatasetConfig(

@@ -39,13 +39,10 @@ def assign_splits(
 ) -> Shaped[np.ndarray, "anatomies sequences"]:
     """Return the split of every sequence of every anatomy, one of `SPLITS`: fixed by hash, not by chance or order.
 
-    Two splits are nested. By anatomy, whole patients go to train, calibrate or test, so that no data of a test patient
-    are used before. Within the train patients, `seen_test_share` of the navigations are held out as `seen_test`: new
-    controls on known vessels, the paper's likely reading of its 80/20 split.
-
-    Anatomies are ranked by the SHA-256 of their name and dealt out by counts, so that the shares (by default 0.6, 0.2,
-    0.2; a single anatomy is not divided) are met as closely as few patients allow; sequences likewise by the SHA-256 of
-    "name/index". Raises InputError for too few anatomies or sequences.
+    Whole patients go to train, calibrate or test, dealt out by the SHA-256 of their names as close to the shares as few
+    patients allow (a single one is not divided); of those in train `seen_test_share` of the navigations, by that of
+    "name/index", are held out: new controls on known vessels, the paper's likely reading of its 80/20 split. Raises
+    InputError for too few of either.
     """
     if anatomy_shares is None:
         anatomy_shares = (1.0, 0.0, 0.0) if len(names) == 1 else DEFAULT_ANATOMY_SHARES
@@ -100,13 +97,8 @@ FORMAT_VERSION = 7
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Navigations of one anatomy that share a file: the unit of work, on this machine or on a cluster.
-
-    Attributes:
-        identity: SHA-256 of what the simulation depends on in the anatomy.
-        sequences: indices of the navigations among those of the anatomy.
-        first_episode: index of the first one in the dataset.
-    """
+    """Navigations of one anatomy that share a file: the unit of work, on this machine or on a cluster, with the SHA-256
+    of what the simulation depends on in the anatomy, the navigations' indices, and the first one's in the dataset."""
 
     number: int
     folder: Path
@@ -119,14 +111,8 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class BlockContext:
-    """What all blocks share.
-
-    Attributes:
-        key: marks the files of this dataset; it follows from all settings.
-        task: what the navigations do, as LeRobot names it.
-        robot: what makes the motions; None where they are made as drawn.
-        world: what reality is; the stack and the anatomies are as given.
-    """
+    """What all blocks share: the `key` of this dataset's files, from all settings, LeRobot's `task`, the robot, None
+    where motions are made as drawn, and the world (its stack and anatomies are as given)."""
 
     output: Path
     config: DatasetConfig
@@ -171,12 +157,9 @@ def make_layout(
     world: World | None = None,
     origin: Mapping[str, Any] | None = None,
 ) -> Layout:
-    """Read the anatomies' records, and lay out the dataset in blocks.
-
-    `robot` makes the motions, `world` is what reality is, `origin` what else they follow from, where they were not
-    drawn. Raises InputError for a folder without anatomy, two of one name, too few for the split, catheters that do not
-    fit or are to be driven by force, or a world that a dataset cannot hold.
-    """
+    """Read the anatomies' records, and lay out the dataset in blocks; `origin` is what they follow from if not drawn.
+    Raises InputError for a folder without anatomy, two of one name, too few for the split, catheters that do not fit or
+    are to be driven by force, or a world that a dataset cannot hold."""
     world = world or World()
     world.check_engine("datasets")
     for name in ("share", "backs_out_mm"):

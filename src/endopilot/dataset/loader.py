@@ -111,10 +111,8 @@ class Dataset(Outputs):
         return replace(self, **chosen)
 
     def set_up(self, anatomy: Anatomy | None = None) -> SimulationSetUp:
-        """Return what episodes of one anatomy were simulated with; their `command` then gives them again to the bit.
-
-        The anatomy is read from its folder if not given; InputError if it is missing, or another one.
-        """
+        """Return what episodes of one anatomy (read if not given; InputError if missing or another one) were simulated
+        with; their `command` then gives them again to the bit."""
         anatomy = anatomy or read_anatomy(self.anatomy_folder(str(self.anatomy[0])))
         world, given, config = self.world, self.stack, self.manifest["config"]
         tips = list(zip(self.tip_bend.tolist(), self.tip_stiffness_factor.tolist(), strict=True))
@@ -334,12 +332,9 @@ def check_same_wire(dataset: Dataset, other: Mapping[str, Any], of: Path, mend: 
 
 
 def read_joined(folders: Sequence[Path]) -> Dataset:
-    """Read datasets as one: the first one, with the episodes of the others behind its own.
-
-    A patient that the first dataset holds keeps the split that it has there, so nothing that is kept for a test is
-    trained on. Raises InputError where one cannot be read, or has other devices, episodes of another length, another
-    patient of the same name, or the same one who moves otherwise.
-    """
+    """Read datasets as one; a patient that the first holds keeps its split, so nothing kept for a test is trained on.
+    Raises InputError where one cannot be read, or has other devices, episodes of another length, another patient of the
+    same name, or the same one who moves otherwise."""
     if not folders:
         raise InputError("dataset: none given; name at least one folder made by `endopilot dataset`")
     first, *others = (read_dataset(folder) for folder in folders)

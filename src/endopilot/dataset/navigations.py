@@ -1,13 +1,9 @@
 """Random navigations of one anatomy, drawn (`draw_navigations`) and simulated (`simulate_navigations`).
 
-Everything that is drawn, controls, friction and tip of every navigation and the motion of every patient, follows from
-the seed, the anatomy's name and the navigation's index, through random streams of their own.
-
-A segmented vessel ends where the scan no longer shows it, not where blood stops: a wire that is pushed against that end
-buckles against a wall that does not exist. So before every sample the drive checks the tip, as an operator does: it
-stops pushing shortly before the end of the tip's branch. There, and where the wire is caught, it pulls instead of
-pushing until the wire has come back far enough. Simulating the recorded controls without these checks gives the same
-navigation again. Catheters around the wire are held back by the same rules, each by its own tip and load.
+A segmented vessel ends where the scan no longer shows it, not where blood stops: so before every sample the drive
+checks each device's tip, and stops pushing shortly before the end of its branch. There, and where it is caught, it
+pulls instead until it has come back far enough. Simulating the recorded controls without these checks gives the same
+again.
 """
 
 from __future__ import annotations
@@ -157,13 +153,9 @@ def simulate_navigations(
     record_shape: bool = False,
     advance: Callable[[int], None] = lambda samples: None,
 ) -> tuple[Trajectory, Bool[np.ndarray, "worlds"]]:
-    """Simulate drawn navigations, stopped short of the ends of the vessel, and return them and which were stopped
-    short.
-
-    A robot makes the motions and measures them: its columns are what it was commanded (`decided`) and what it measured
-    (`encoders`, `load`); commands, float32 numbers, are then what its drives made of that, as the mean over a sample.
-    The true inserted lengths are `ostium_mm` more than its encoders', mm.
-    """
+    """Simulate drawn navigations, and return them and which were stopped short of the vessel's ends. A robot's columns
+    are what it was commanded (`decided`) and measured (`encoders`, `load`), its commands, float32, the mean of what its
+    drives made of that; true lengths are `ostium_mm` more than its encoders', mm."""
     watch = _PushRoom(anatomy.tree, stacks)
     simulator = Simulator(anatomy, stacks, actuation=actuation, motion=motion, config=config)
     _begin(simulator, watch, initial, friction)

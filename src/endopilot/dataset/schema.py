@@ -1,8 +1,6 @@
-"""The columns of a dataset on disk: LeRobot v3, with the columns of a guidewire.
-
-The layout is that of `LeRobotDataset` v3.0 (https://huggingface.co/docs/lerobot/lerobot-dataset-v3): samples of many
-episodes in one Parquet file, an episode table that says where each lies, and JSON files that describe both.
-"""
+"""The columns of a dataset on disk: those of a guidewire in the layout of `LeRobotDataset` v3.0
+(https://huggingface.co/docs/lerobot/lerobot-dataset-v3): samples of many episodes in a Parquet file, an episode table,
+and JSON files."""
 
 from __future__ import annotations
 
@@ -61,13 +59,9 @@ _MOVES_MM_S, _TURNS_RAD_S = 0.1, 0.02
 
 
 def features(actuation: Actuation, devices: int = 1, *, by_robot: bool = False) -> dict[str, dict[str, Any]]:
-    """Return the `features` entry of `meta/info.json`: type, shape and component names of every column.
-
-    `action` is what the drives were commanded, with all its digits: simulated again it gives the same navigation to the
-    bit. Under force control, `velocity` is the resulting velocity. A column has components of each device, those of
-    catheter k named `catheter_k_...`. A robot adds what it was commanded, `decided`, and what it measured, `encoders`
-    and `load`.
-    """
+    """Return the `features` entry of `meta/info.json`: type, shape and component names of every column. `action` is
+    what the drives were commanded, with all digits; under force control, `velocity` is what resulted. Components of
+    catheter k are named `catheter_k_...`; a robot adds `decided`, `encoders` and `load`."""
     vectors: dict[str, tuple[str, list[str] | None]] = {
         "action": ("float64", LOAD if actuation == "force" else VELOCITY),
         **({"velocity": ("float32", VELOCITY)} if actuation == "force" else {}),

@@ -159,12 +159,9 @@ def run_locally(context: BlockContext, blocks: Sequence[Block], done: Done, adva
 def run_on_cluster(
     work: Callable[[Item], Result], items: Sequence[Item], done: Callable[[Item, Result], None], scheduler: str
 ) -> None:
-    """Do the same work for every item on the workers of a Dask cluster, which must have access to the same folders.
-
-    If a worker dies, another one does its item. `work` is a function of a module, or a `functools.partial` of one.
-    Raises InputError where `distributed` is missing, the scheduler cannot be reached, a worker has another version of
-    endopilot or none, or workers keep dying.
-    """
+    """Do the same work (a module's function, or a `functools.partial` of one) for every item on a Dask cluster's
+    workers, which share the folders; a dead one's item goes to another. Raises InputError without `distributed` or a
+    scheduler, for another version of endopilot, or where workers keep dying."""
     try:
         import distributed
     except ImportError as error:

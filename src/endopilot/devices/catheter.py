@@ -1,9 +1,5 @@
-"""Catheters as data: devices around a wire, with a bore and the shape that they were formed to, read from YAML.
-
-A catheter's file is a device's (`endopilot.devices.device`) with `inner_diameter_mm`, `bore_friction` and, in place
-of a tip bend, `shape`: arcs from the tip on, each `[length_mm, angle_deg]`. All arcs lie in a plane; one with a
-negative angle bends the other side.
-"""
+"""Catheters as data, read from YAML: devices around a wire, with a bore and the shape that they were formed to, arcs in
+a plane from the tip on, each `[length_mm, angle_deg]`; a negative angle bends the other side."""
 
 from __future__ import annotations
 
@@ -33,10 +29,8 @@ class Catheter(Device):
     """A catheter around a wire.
 
     Attributes:
-        inner_diameter_mm: diameter of its bore, mm.
-        bore_friction: Coulomb coefficient between its bore and what lies in it.
-        shape: arcs of constant curvature that it was formed to, from the tip on: length (mm) and angle (rad); straight
-            beyond them.
+        inner_diameter_mm: diameter of its bore, mm; `bore_friction` is its Coulomb coefficient with what lies in it.
+        shape: arcs it was formed to, from the tip on: length (mm) and angle (rad); straight beyond them.
     """
 
     inner_diameter_mm: Positive

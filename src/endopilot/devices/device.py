@@ -1,8 +1,5 @@
-"""Devices as data: stiffness profiles, diameter, tip shape and friction, read from YAML and checked.
-
-In a device's file every constant stands with its source, as `{value: ..., source: ...}`; a file without a source for
-each constant is refused. A profile is piecewise linear between its abscissae, which count from the tip, and constant
-beyond the last one.
+"""Devices as data: stiffness profiles, diameter, tip shape and friction, read from YAML, each with its source, as
+`{value: ..., source: ...}`. A profile is linear between its abscissae, which count from the tip, and constant beyond.
 """
 
 from __future__ import annotations
@@ -196,12 +193,9 @@ class Wire(Device):
         return replace(self, tip_bend_rad=math.radians(angle_deg), tip_bend_length_mm=float(length_mm))
 
     def summary(self) -> dict[str, Any]:
-        """Return what a list of devices shows.
-
-        The keys: `name`, `diameter_mm`, bending stiffness `ei_tip_n_mm2` and `ei_shaft_n_mm2`, torsional stiffness
-        `gj_tip_n_mm2` and `gj_shaft_n_mm2`, the catalogue's `tip_load_n` (N) and `tip_load_gf` (gram-force), which are
-        None where it states none, `tip_bend_deg` and `friction`.
-        """
+        """Return what a list of devices shows: `name`, `diameter_mm`, stiffnesses `ei_tip_n_mm2`, `ei_shaft_n_mm2`,
+        `gj_tip_n_mm2` and `gj_shaft_n_mm2`, the catalogue's `tip_load_n` and `tip_load_gf` (gram-force; None where it
+        states none), `tip_bend_deg` and `friction`."""
         load = self.tip_load_n
         return {
             "name": self.name,

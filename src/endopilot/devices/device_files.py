@@ -1,12 +1,8 @@
-"""Where device files lie, the package's own and folders of the user's, and what the numbers in them can be.
+"""Where device files lie, and what the numbers in them can be (docs/concepts/devices.md says where ranges come from).
 
-A device is called by its file's name without `.yaml`. The files are the shipped ones, those in the folder that the
-environment variable ENDOPILOT_DEVICES names, and those in `endopilot/devices` of the user's configuration folder:
-$XDG_CONFIG_HOME, or ~/.config where that is not set.
-
-docs/concepts/devices.md says where each range comes from. They hold every wire from 0.006 to 0.038 inch, catheters and
-sheaths up to 24 French, and the soft rods of published benchmarks; what lies outside was most likely given in another
-unit.
+A device is called by its file's name without `.yaml`: the shipped ones, those in the folder that the environment
+variable ENDOPILOT_DEVICES names, and those in `endopilot/devices` of the user's configuration folder: $XDG_CONFIG_HOME,
+or ~/.config where that is not set.
 """
 
 from __future__ import annotations

@@ -41,10 +41,8 @@ def within_travel(
     *,
     travel_mm: tuple[Numbers, Numbers] = (0.0, np.inf),
 ) -> Numbers:
-    """Return translations, each held for some time, that leave no wire outside its travel, mm/s; NaN stays NaN.
-
-    A wire that is beyond its travel already is not moved farther out, and is not pushed or pulled back either.
-    """
+    """Return translations, each held for some time, that leave no wire outside its travel, mm/s; one that is beyond it
+    already is not moved farther out, nor back. NaN stays NaN."""
     low, high = travel_mm
     back = np.minimum(-(inserted_length - low) / duration, 0.0)
     ahead = np.maximum((high - inserted_length) / duration, 0.0)
@@ -99,11 +97,8 @@ class DriveLimits:
     def clip(
         self, control: Float[np.ndarray, "*n 2"], inserted_length: Numbers, duration: float
     ) -> Float[np.ndarray, "*n 2"]:
-        """Return what a drive can do of controls (mm/s, rad/s), each held for the whole time, within its speed and its
-        travel.
-
-        A control within the limits stays the same to the last bit; NaN stays NaN. The inserted length is at the start.
-        """
+        """Return what a drive can do of controls (mm/s, rad/s), each held for the whole time, within speed and travel;
+        what is within stays to the last bit, NaN stays NaN. The inserted length is at the start."""
         made = np.clip(control, -self.fastest, self.fastest)
         made[..., 0] = within_travel(made[..., 0], inserted_length, duration, travel_mm=self.travel_mm)
         return made

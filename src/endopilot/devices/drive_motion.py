@@ -1,8 +1,4 @@
-"""The motion of drives under velocity commands: `DriveMotion`, from a command to the proximal end of a device.
-
-Both the simulated robot and the drive process (`endopilot drive`) move by it; environments and data sets move many
-robots at once.
-"""
+"""The motion of drives under velocity commands, of many robots at once."""
 
 from __future__ import annotations
 
@@ -19,12 +15,8 @@ from endopilot.devices.robot import RobotConfig
 def through_play(
     ahead: Float[np.ndarray, "*n"], driven: Float[np.ndarray, "*n"], half_gap: Float[np.ndarray, "..."]
 ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
-    """Let motors go on, and return how far they are ahead of their devices then, and how far the devices went, mm or
-    rad.
-
-    This is the play operator, p ← clip(p, e − half_gap, e + half_gap), of a motor at e and a device at p: the device
-    rests until the motor has gone through the gap, and then goes with it. `ahead` is e − p, no more than half a gap.
-    """
+    """Let motors go on, and return how far they are `ahead` of their devices (e − p, at most half a gap) then, and how
+    far the devices went, mm or rad, by the play operator p ← clip(p, e − half_gap, e + half_gap)."""
     after = np.clip(ahead + driven, -half_gap, half_gap)
     return after, driven - (after - ahead)
 
@@ -33,12 +25,10 @@ _ROUNDING_S = 1e-12
 
 
 class DriveMotion:
-    """The motion of the drives of some robots, which do not depend on each other.
+    """The motion of the drives of some robots, which do not depend on each other: late, limited, with gain and play.
 
-    A drive follows a command late, no faster and no more suddenly than its limits. Gain and play lie between motor and
-    device: after a reversal the device rests until the motor has gone through the play. `motor` is where the devices
-    would be without gain and play, what an encoder there counts; `position` is of their proximal ends, to be set where
-    a device did not follow (mm, rad).
+    `motor` is where the devices would be without gain and play, what an encoder there counts; `position` is of their
+    proximal ends, to be set where a device did not follow (mm, rad).
     """
 
     def __init__(

@@ -19,15 +19,11 @@ from endopilot.types import Anatomy
 
 @settings
 class Transmission:
-    """How a drive's rotation reaches the ostium.
+    """How a drive's rotation reaches the ostium: the device between, of `length_mm` (0: none), twists under a Coulomb
+    friction torque a length, N·mm/mm.
 
-    The device behind the ostium twists under a Coulomb friction torque along it. docs/concepts/transmission.md derives
-    what that does: of a uniform device with the torsional stiffness GJ and free at the ostium, the rotation lags behind
-    the drive's by m L²/2GJ while it turns, and starts after a reversal when the drive has turned by twice that.
-
-    Attributes:
-        length_mm: length of the device between its drive and the ostium, mm; 0: the drive acts at the ostium.
-        twist_friction_n_mm_mm: friction torque a length, m, N·mm/mm.
+    docs/concepts/transmission.md derives it: of a uniform device with stiffness GJ, free at the ostium, the rotation
+    lags by m L²/2GJ while it turns, and starts after a reversal when the drive has turned by twice that.
     """
 
     length_mm: Annotated[float, Within(0, 3000, unit="mm", mistaken=(("m", 1000.0),))] = 0.0

@@ -24,12 +24,8 @@ _SLAB = 8
 
 @dataclass(frozen=True, eq=False)
 class Organ:
-    """One organ of a tissue on the coarse grid.
-
-    Attributes:
-        depth: signed distance to its surface, mm, positive inside, indexed [k, j, i].
-        clearance_mm: the organ keeps this distance from coronary lumens; None where it may touch them.
-    """
+    """One organ of a tissue on the coarse grid, by its `depth`, mm, positive inside, indexed [k, j, i]; it keeps
+    `clearance_mm` from coronary lumens, None where it may touch them."""
 
     name: str
     depth: Float[np.ndarray, "nz ny nx"]
@@ -79,11 +75,9 @@ def organs(
     generator: np.random.Generator,
     appendage_mm: float = 0.0,
 ) -> tuple[Organ, ...]:
-    """Return the organs in painting order, from the chest wall to the blood pools, their surfaces uneven at random.
-
-    `around_vessels` is the signed distance to the surface of the fat that the coronaries need. The left atrial
-    appendage is wider by `appendage_mm`, and touches the coronary walls; at 0 it does not.
-    """
+    """Return the organs in painting order, their surfaces uneven at random. `around_vessels` is the signed distance to
+    the surface of the fat that the coronaries need; the left atrial appendage, wider by `appendage_mm` but at 0,
+    touches their walls."""
     slabs = [
         heart.to_reference(slab.reshape(-1, 3)).reshape(slab.shape).astype(np.float32)
         for slab in np.split(grid, range(_SLAB, len(grid), _SLAB))
@@ -132,9 +126,8 @@ def organs(
 
 
 def other_coronary(heart: HeartFit, tree: VesselTree) -> tuple[Centerline, ...]:
-    """Return the first part of the other coronary artery, by the mean diameters of Dodge 1992: beside a right tree left
-    main (4.5 mm), LAD (3.7 mm) and LCx (3.4 mm); beside a left tree the right one (4.0 mm) nearly to the acute margin.
-    """
+    """Return the first part of the other coronary artery, by mean diameters of Dodge 1992: left main (4.5 mm), LAD (3.7
+    mm) and LCx (3.4 mm), or the right one (4.0 mm) nearly to the acute margin."""
     lines = []
     for waypoints, begin, end in _RIGHT_CORONARY if is_left(tree) else _LEFT_CORONARY:
         points = heart.from_reference(shape.curve_through(np.array(waypoints, dtype=float)))

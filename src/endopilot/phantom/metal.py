@@ -94,11 +94,8 @@ def stents(lines: Sequence[Centerline], count: int, generator: np.random.Generat
 def add_metal(
     image: Float32[np.ndarray, "nz ny nx"], grid: Grid, metal: Sequence[Metal], generator: np.random.Generator
 ) -> None:
-    """Add leads and stents, and their streaks, to an image in HU, in place.
-
-    Streaks are what filtered back-projection makes of the error of the line integrals: behind metal the beam hardens,
-    and metal that moves, in random directions, is elsewhere from view to view.
-    """
+    """Add leads and stents, and their streaks, to an image in HU, in place: what filtered back-projection makes of the
+    errors of line integrals where the beam hardens, and where metal moves from view to view."""
     points = np.concatenate([part.points for part in metal])
     mass = np.concatenate([part.mass for part in metal])
     spacing = np.array([axis[1] - axis[0] for axis in (grid.z, grid.y, grid.x)])

@@ -89,11 +89,8 @@ class _Plaque:
 
 @public
 def make_phantom(anatomy: Anatomy, *, config: PhantomConfig | None = None, seed: int = 0) -> Volume:
-    """Return a synthetic CT angiogram of a right or left coronary anatomy: int16 voxels in HU along the LPS axes.
-
-    The tree gives the lumen; a stenosis named in the provenance gets a soft plaque. The seed draws contrast, noise,
-    plaques and the surroundings' shapes.
-    """
+    """Return a synthetic CT angiogram of a coronary anatomy: int16 HU along the LPS axes. A stenosis named in the
+    provenance gets a soft plaque; the seed draws contrast, noise, plaques and surroundings."""
     config = config or PhantomConfig()
     generator = np.random.Generator(np.random.Philox(key=np.array([seed, 0x7068616E], dtype=np.uint64)))
     heart = chest.place(anatomy.tree)

@@ -24,11 +24,9 @@ def smear(
     motion_mm: float,
     generator: np.random.Generator,
 ) -> None:
-    """Average the heart over the path of its motion during the scan, in a random direction, in place; the chest stays.
-
-    The heart rests longest at the ends of the path, so that edges across it show a ghost. The anatomy is the middle.
-    `heart` is the depth below the pericardium on the painter's coarse grid, mm; voxel sizes are along k, j and i.
-    """
+    """Average the heart over the path of its motion during the scan, in a random direction about the anatomy, in place;
+    it rests longest at the ends. `heart` is the depth below the pericardium on the painter's coarse grid, mm; voxel
+    sizes are along k, j and i."""
     path = generator.normal(size=3)
     path *= motion_mm / (np.linalg.norm(path) * np.array(spacing_mm))
     still = image.copy()
@@ -49,11 +47,8 @@ def misregister(
     slab_mm: float,
     generator: np.random.Generator,
 ) -> None:
-    """Displace the heart from one slab of slices to the next, in place, as heart beats that differ do; the chest stays.
-
-    The heart lies in turn half of `step_mm` to either side of its mean place, along one random direction; the first
-    slab's height is random. `heart` is as for `smear`.
-    """
+    """Displace the heart from slab to slab, in place, as differing heart beats do: in turn half of `step_mm` to either
+    side of its mean along one random direction; the first slab's height is random. `heart` is as for `smear`."""
     path = generator.normal(size=3)
     path *= 0.5 * step_mm / (np.linalg.norm(path) * np.array(spacing_mm))
     still = image.copy()
@@ -84,11 +79,8 @@ def scan(
     grain_mm: float,
     generator: np.random.Generator,
 ) -> None:
-    """Add noise and blur, in place: the reconstruction kernel shapes the image and the noise's grain alike.
-
-    Iterative reconstruction leaves a coarser grain: it takes the noise's fine part away and the edges' not. `psf_mm`
-    and the additional `grain_mm` are widths at half height; `noise_hu` is the standard deviation in the result.
-    """
+    """Add noise and blur, in place, both shaped by the reconstruction kernel; iterative reconstruction's grain is
+    coarser. `psf_mm` and the additional `grain_mm` are widths at half height; `noise_hu` is the result's SD."""
     sigmas = [psf_mm / np.sqrt(8 * np.log(2)) / step for step in spacing_mm]
     if grain_mm == 0:
         gain = _gain(sigmas)

@@ -64,9 +64,8 @@ def check_shape_memory(worlds: int, samples: int, nodes: int) -> None:
 
 
 def with_device_axis(name: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return an array with its axis of devices, which may be left out where a wire is alone: the second axis of the
-    wanted shape if there are two, else the last but one. Raises InputError, which begins with `name`, for another
-    shape."""
+    """Return an array with its axis of devices (the second of a shape of two, else the last but one), which a wire
+    alone may leave out. Raises InputError, which begins with `name`, for another shape."""
     axis = 1 if len(shape) == 2 else len(shape) - 2
     without = shape[:axis] + shape[axis + 1 :]
     if shape[axis] == 1 and array.shape == without:

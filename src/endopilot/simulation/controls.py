@@ -77,12 +77,9 @@ def random_controls(
     first: int = 0,
     devices: int = 1,
 ) -> tuple[Float[np.ndarray, "n devices 2"], Float[np.ndarray, "n samples devices 2"]]:
-    """Draw random navigations, and return their start (Δ mm, φ rad) and controls (mm/s, rad/s) for each device.
-
-    Sequence i, counted from `first`, is the same whatever `n_sequences`; each of `devices` is driven independently of
-    the others. Inserted lengths lie between 0 and `max_inserted_length_mm`. Raises InputError for a number that is not
-    positive.
-    """
+    """Draw random navigations, each the same whatever `n_sequences`, from number `first`; return their start (Δ mm, φ
+    rad) and controls (mm/s, rad/s) of each device, driven independently. Inserted lengths lie between 0 and
+    `max_inserted_length_mm`. Raises InputError for a number that is not positive."""
     if n_sequences < 1 or n_samples < 1:
         raise InputError(f"random controls: {n_sequences} sequences of {n_samples} samples; give at least 1 of 1")
     if not 0 <= seed < 2**64:
@@ -113,11 +110,7 @@ def free_wire_load(
     velocity: Float[np.ndarray, "*n 2"], *, radius_mm: float, friction_n: float, drag_n_s_mm: float, stick_mm_s: float
 ) -> Float[np.ndarray, "*n 2"]:
     """Return the drive's force (N) and torque (N·mm) that move a wire through the introducer alone at (Δ̇ mm/s, φ̇
-    rad/s).
-
-    The wire's surface moves by v = (Δ̇, r φ̇) past the valve, whose smoothed Coulomb friction F and drag c oppose it
-    with F v / √(v² + ε²) + c v, as the rod core has it.
-    """
+    rad/s): its surface's v = (Δ̇, r φ̇) is opposed by F v / √(v² + ε²) + c v, as in the rod core."""
     surface = velocity * np.array([1.0, radius_mm])
     size = np.sqrt((surface**2).sum(axis=-1, keepdims=True) + stick_mm_s**2)
     return (friction_n / size + drag_n_s_mm) * surface * np.array([1.0, radius_mm])
@@ -159,13 +152,12 @@ class ScriptedControls:
 
 
 def read_controls_csv(path: Path, *, devices: int = 1) -> ScriptedControls:
-    """Read scripted controls of so many devices.
+    """Read scripted controls of so many devices; a rollout that was written as CSV can be simulated again.
 
-    The columns are `time_s` (end of each period, all of one length: 0.5, 1.0, ... or 0.05, 0.1, ...),
-    `translation_mm_s` and `rotation_rad_s`; optional are `world` (several navigations in one file, by whole numbers),
-    and `inserted_length_mm` with `rotation_rad` (state at the end of each period, from which the initial one follows; 0
-    if they are not there). So a rollout that was written as CSV can be simulated again. Columns of catheters begin with
-    `catheter_1_` and `catheter_2_`. Raises InputError for another table (`csv_file`).
+    The columns are `time_s` (end of each period, all of one length), `translation_mm_s` and `rotation_rad_s`; optional
+    are `world` (several navigations in one file), and `inserted_length_mm` with `rotation_rad` (state at the end of
+    each period, from which the initial one follows; else 0). Columns of catheters begin with `catheter_1_` and
+    `catheter_2_`. Raises InputError for another table (`csv_file`).
     """
     prefixes = column_prefixes(devices)
     driven = [prefix + name for prefix in prefixes for name in _COLUMNS[1:]]

@@ -59,21 +59,18 @@ def run_core(
     tubes: TubeLayout | None = None,
     transmission: TransmissionLayout | None = None,
 ) -> dict[str, np.ndarray]:
-    """Run the C++ core on rods and walls of one's own making, as the verification does; arguments are those of
-    `make_simulation`.
+    """Run the C++ core on rods and walls of one's own making; arguments are those of `make_simulation`.
 
     Args:
         initial: inserted length (mm) and rotation (rad) of each device before the first period.
         control: mm/s and rad/s, or N and N·mm, as `actuation` says.
-        friction: Coulomb coefficients.
-        record_attitude: record element orientations, quaternions w x y z.
         lanes: worlds stepped side by side by one thread: 1, 4 or 8.
         push_limit_n: force at which the drive slips, N; where it pulls `pull_limit_n`, turns `torque_limit_n_mm`.
 
     Returns:
-        The arrays that `_core.OUTPUTS` lists, with an axis of devices where they are of devices; `reason`: 0 fine, 1
-            not finite, 2 not converged; `contacts`: the force of the wall at each node and on the element behind it at
-            the end, N.
+        The arrays of `_core.OUTPUTS`, with an axis of devices where they are of devices; `reason`: 0 fine, 1 not
+            finite,
+            2 not converged; `contacts`: the wall's force at each node and on the element behind it at the end, N.
     """
     limits = np.array([[push_limit_n, pull_limit_n, torque_limit_n_mm]]) if tubes is None else tubes.limits
     worlds, samples, devices = len(control), control.shape[1], len(limits)
@@ -134,12 +131,9 @@ def make_simulation(
 
     Args:
         rod: nodes and stiffnesses; with tubes, the nodes alone count, and the drag.
-        lumen: the wall, or None for a rod in the open.
         insertion: the point and the direction along which the base slides.
         limits: where each drive slips: push (N), pull (N) and torque (N·mm).
         push_limit_n: what all drives together can push with, N; it sizes the wall's stiffness.
-        motion: of the vessel and the insertion.
-        transmission: how the drives act on the devices; at the ostium if not given.
         loads: dead loads and springs.
         approach: bring devices to their first inserted length from the ostium; else they start there, straight.
         free_behind_mm: nodes farther behind the insertion point follow the drive, mm.
@@ -208,10 +202,8 @@ def make_lumen(
     finer: int = 1,
     spheres: Float[np.ndarray, "lines 8"] | None = None,
 ) -> Lumen:
-    """Return the wall as the core wants it for a wire of some radius, a quadratic B-spline through the map.
-
-    A wire `far_mm` outside the wall has left the map. On a grid that is `finer` by a whole number, `spheres` inside the
-    lumen make the spline sharp: the ends (LPS, mm) of lines of centres, and the radii at these ends, mm.
+    """Return the wall for a wire of some radius, a quadratic B-spline through the map, which ends `far_mm` outside. On
+    a grid `finer` by a whole number, `spheres` (ends of their centres' lines, LPS, and radii there, mm) make it sharp.
     """
     spacing = float(distance_map.spacing_mm)
     return core_for(processor).make_lumen(

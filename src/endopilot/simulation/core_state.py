@@ -1,7 +1,5 @@
-"""Where the numbers stand of which a state of the core is made: `World` in src/core/world.hpp.
-
-Through them friction varies along the vessel: `run_along` prepares each step, as the core has one coefficient a device.
-"""
+"""Where the numbers of a core's state stand (`World` in src/core/world.hpp), through which friction varies along a
+vessel."""
 
 from __future__ import annotations
 
@@ -58,9 +56,8 @@ def run_along(
     run: Callable[..., dict[str, np.ndarray]],
     advance: Advance | None = None,
 ) -> dict[str, np.ndarray]:
-    """Run worlds step by step with the core's `run`, and before each multiply the friction of every contact by the
-    factor (`factor_at`) where it lies. A step that the core shortens, as in a snap, ends with the devices' own
-    friction."""
+    """Run worlds step by step with the core's `run`, and before each multiply every contact's friction by the factor
+    (`factor_at`) where it lies. A step that the core shortens ends with the devices' own friction."""
     samples = []
     for sample in range(control.shape[1]):
         now, results = np.ascontiguousarray(control[:, sample : sample + 1]), []

@@ -1,8 +1,6 @@
-"""Tables that people write: columns of numbers, read from a CSV file whichever way a spreadsheet saved it.
-
-Commas, semicolons, tabs and bars separate; decimal commas are read where commas do not separate; names of columns may
-be in capitals. Whatever was not read as it stands is said in a `Remark`; a cell that is no finite number is refused.
-"""
+"""Tables that people write: columns of numbers, read from a CSV file whichever way a spreadsheet saved it: with commas,
+semicolons, tabs or bars, decimal commas, capitals. What was not read as it stands is said in a `Remark`; a cell that is
+no finite number is refused."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
-"""A simulator whose one wire another engine moves, MuJoCo: rigid links with sprung joints, and contacts of its own.
-
-The rod core shares nothing with it but the wire's stiffnesses, the lumen's surface and the coefficient of friction. Its
-joints get an inertia and a damping of their own by which all come to rest alike, in some hundredths of a second: a wire
-moves as slowly as if it had neither.
-"""
+"""A simulator whose one wire another engine moves, MuJoCo: rigid links with sprung joints, and contacts of its own. It
+shares with the rod core the stiffnesses, the lumen's surface and the friction. Joints get an inertia and a damping by
+which all come to rest in some hundredths of a second: a wire moves as slowly as without."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Worlds in groups: those with an equal anatomy and equal devices are stepped by one simulation of the core.
-
-`make_wall` brings their anatomy to the core: the distance map, on a finer grid where it is too coarse for catheters.
-"""
+"""Worlds in groups: those with an equal anatomy and equal devices are stepped by one simulation of the core."""
 
 from __future__ import annotations
 
@@ -34,13 +31,9 @@ _APART_MM = 0.1
 
 
 def make_wall(anatomy: Anatomy, stack: Stack, config: SimulatorConfig) -> Lumen:
-    """Return an anatomy's wall as the core wants it for a stack.
-
-    A spline rounds the ridge off that the distance to the wall has on a vessel's axis, by up to half the map's spacing.
-    To a catheter hardly narrower than the vessel or the guiding catheter, the wall then seems to leave no room where
-    there is some. For those the spline's grid is finer, and the inscribed spheres of the centerline and the guiding
-    catheter make it sharp.
-    """
+    """Return an anatomy's wall as the core wants it for a stack. A spline rounds the distance's ridge on the axis by up
+    to half the map's spacing; for catheters hardly narrower than the vessel its grid is finer, and the inscribed
+    spheres make it sharp."""
     radius_mm = stack.outer_radius_mm
     field = _stiffened(anatomy, radius_mm, config.wall_along) if config.wall_along else anatomy.distance_map
     wall = make_lumen(field, radius_mm, config.processor, far_mm=config.wall_reach_mm)
@@ -65,12 +58,9 @@ def factor_at(
 
 
 def _stiffened(anatomy: Anatomy, radius_mm: float, factors: Sequence[float]) -> DistanceMap:
-    """Return a map by which the wall is softer than where it is stiffest, as `factor_at` has it.
-
-    A spring K d²/2 of depth d is c² times as stiff where the map gives c d: distances from where a device touches the
-    wall are multiplied by the root of the factor over the largest one. So none grows, for the core takes a wall to be
-    as far as the map says; the largest factor is the core's own stiffness (`core_options`).
-    """
+    """Return a map by which the wall is softer than where it is stiffest, as `factor_at` has it: a spring K d²/2 is c²
+    times as stiff where the map gives c d. So none grows, for the core takes a wall to be as far as the map says; the
+    largest factor is the core's own stiffness (`core_options`)."""
     field, tree = anatomy.distance_map, anatomy.tree
     lines = [branch.centerline for branch in tree.branches]
     nearest = KDTree(np.concatenate([line.points for line in lines]))
@@ -118,12 +108,10 @@ class Group:
     """The worlds with an equal anatomy and equal devices; `anatomy` and `stack` are those of the first.
 
     Attributes:
-        wall: how far outside the wall the lumen goes, mm, and how the stiffness of the wall varies along the vessel.
-        motion: of the vessel, as the core has it, as are `lumen` and `simulation`; None if it lies still.
+        wall: how far outside the wall the lumen goes, mm, and how its stiffness varies along the vessel.
+        motion: of the vessel, None if it lies still; as the core has it, as are `lumen` and `simulation`.
         index: the worlds' numbers, ascending.
-        path_mm: length of the vessel's longest path.
-        longest_mm: inserted length that the wire is laid out for.
-        project: projection to the vessel's centerline.
+        path_mm: length of the vessel's longest path; `longest_mm`: inserted length that the wire is laid out for.
     """
 
     anatomy: Anatomy
@@ -169,11 +157,8 @@ def make_groups(
     sharing: Sequence[Group],
     reach_mm: float,
 ) -> list[Group]:
-    """Return the groups of worlds, with their wires laid out and at the ostium.
-
-    Vessels move about their ostium, or lie still without motion; lumens and projections of `sharing` are not prepared
-    again; devices are laid out for `reach_mm`, or the far end of each vessel if that is more. Raises InputError as
-    `Simulator` does.
+    """Return the groups of worlds, with wires laid out (`reach_mm`, or to the vessel's far end if deeper) at the
+    ostium, about which vessels move by `motion`; `sharing`'s lumens are taken over. Raises InputError as `Simulator`.
     """
     core, wall = core_for(config.processor), (config.wall_reach_mm, config.wall_along)
     prepared = [group for group in sharing if isinstance(group.lumen, core.Lumen) and group.wall == wall]

@@ -1,9 +1,8 @@
 """The patient's motion: heartbeat and breathing move the vessel and with it the guiding catheter.
 
-A point X of the vessel, as CT shows it, lies at x = o + u + R (1 + E) (X - o) in the laboratory, with o the ostium.
-The shift u, the rotation R and the symmetric strain E are smooth and periodic in time. Breathing shifts and turns; the
-heartbeat shifts, turns and contracts. CT shows the vessel at mid-diastole and at the end of expiration; there every
-motion begins.
+A point X of the vessel, as CT shows it, lies at x = o + u + R (1 + E) (X - o), with o the ostium. The shift u, the
+rotation R and the symmetric strain E (of the heartbeat alone) are smooth and periodic in time. CT shows the vessel at
+mid-diastole and at the end of expiration; there every motion begins.
 """
 
 from __future__ import annotations

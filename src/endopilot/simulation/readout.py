@@ -94,9 +94,7 @@ class Readout:
 
     @property
     def drive_load(self) -> Float[np.ndarray, "worlds devices 2"]:
-        """Force (N) and torque (N·mm) of the drives: `base_load` and what the introducer's valve takes.
-
-        As controls of a force-driven simulator they make the same motion."""
+        """Force (N) and torque (N·mm) of the drives: `base_load` and what the valve takes; controls that move alike."""
         return np.stack([self._gather("drive_force"), self._gather("drive_torque")], axis=-1)
 
     @property

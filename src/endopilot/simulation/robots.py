@@ -1,7 +1,4 @@
-"""Robots in front of a simulator's devices: drives, grips, encoders and load cells; one robot a world.
-
-`endopilot.robot.robot.SimulatedRobot` is one of them behind a robot's interface; data sets and environments drive many.
-"""
+"""Robots in front of a simulator's devices: drives, grips, encoders and load cells; one robot a world."""
 
 from __future__ import annotations
 
@@ -71,9 +68,8 @@ Seed = Sequence[int]
 
 
 def in_grip(stack: Stack, robot: RobotConfig, core: SimulatorConfig) -> tuple[Stack, SimulatorConfig]:
-    """Return devices as a robot holds them, and settings by which the wall is as hard as before, which the devices'
-    push limits say if nothing else is given. They slip where its grip yields, and lie behind the ostium as its drives
-    say, or else as the stack says."""
+    """Return devices as a robot holds them, slipping where its grip yields, behind the ostium as its drives say, or
+    else the stack; and settings by which the wall is as hard as before."""
     drives = robot.drives(len(stack))
     wire, *around = drives
     catheters = tuple(drive.gripped(each) for drive, each in zip(around, stack.catheters, strict=True))
@@ -88,11 +84,10 @@ def in_grip(stack: Stack, robot: RobotConfig, core: SimulatorConfig) -> tuple[St
 
 
 class Robots:
-    """What moves the devices of some worlds, and what is measured of them. No world depends on another.
+    """What moves the devices of some worlds, and what is measured of them; worlds are independent.
 
-    Encoders count from the assumed position of the ostium: true inserted lengths are `ostium_mm` more. On the devices
-    they measure what play and a slipping drive leave of a command; at the motors they see neither. The load holds what
-    the introducer's valve takes: its friction, with the sign of the motion.
+    Encoders count from the assumed ostium: true inserted lengths are `ostium_mm` more. On the devices they measure what
+    play and slip leave of a command; at the motors they see neither. The load holds what the introducer's valve takes.
     """
 
     def __init__(

@@ -67,12 +67,9 @@ class RodLayout:
 
 
 def lay_out(device: Wire, *, element_mm: float, length_mm: float) -> RodLayout:
-    """Lay a device out as a rod of at least `length_mm` and two elements behind it, with shorter elements near the tip.
-
-    The nodes depend on the device and on `element_mm` alone; a longer `length_mm` only adds nodes at the base. So
-    worlds do not notice what other worlds need. Elements at the tip are taken somewhat shorter, so that the middle of
-    one lies where the bend of the tip ends: half a joint's bend would act at the wrong place.
-    """
+    """Lay a device out as a rod of at least `length_mm` and two elements behind it. Nodes depend on the device and
+    `element_mm` alone, a longer rod only adds some at the base; those at the tip are shorter, so that the middle of one
+    lies where its bend ends."""
     abscissa = _nodes(element_mm, length_mm, device.tip_bend_length_mm)
     length = np.append(np.diff(abscissa), np.diff(abscissa)[-1])
     middle = abscissa + 0.5 * length

@@ -1,9 +1,6 @@
-"""The signals of a trajectory, each declared once: `Outputs`, what the core records, and `SIGNALS`, all of them.
-
-The core's table `_core.OUTPUTS` says name, shape, unit and meaning of what it records. A new output needs one more line
-here, its field in `Outputs`: `Step`, `Trajectory`, data sets, files, tables and the documentation follow. A signal that
-comes from elsewhere, such as what a robot measures, is one row of `_FURTHER`, and an array in `Trajectory.columns`.
-"""
+"""The signals of a trajectory, each declared once: `Outputs`, what the core records, and `SIGNALS`, all of them. A new
+output of `_core.OUTPUTS` needs one more line here, its field in `Outputs`; one from elsewhere a row of `_FURTHER`, and
+an array in `Trajectory.columns`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields

@@ -1,8 +1,5 @@
-"""Many worlds, driven step by step: for controllers, planners and learning environments.
-
-`Simulator` keeps the state of its worlds between calls; `simulate` runs whole control sequences at once. Both drive the
-same C++ core and give the same answer to the last bit.
-"""
+"""Many worlds, driven step by step: for controllers, planners and learning environments; `simulate` runs whole
+sequences. Both drive the same C++ core, to the same bits."""
 
 from __future__ import annotations
 
@@ -289,10 +286,9 @@ class Simulator(Readout):
             >>> kept, control = simulator.state, np.tile([5.0, simulator.config.element_mm], (4, 1))
             >>> once = simulator.step(control, 0.1)
             >>> simulator.set_state(kept)
-            >>> np.array_equal(simulator.step(control, 0.1).tip_position, once.tip_position)
-            True
-            >>> simulator.set_up.initial.shape
-            (4, 1, 2)
+            >>> np.array_equal(simulator.step(control, 0.1).tip_position, once.tip_position),
+            simulator.set_up.initial.shape
+            (True, (4, 1, 2))
         """
         state.check_version()
         if state.fingerprint != self._fingerprint:
@@ -306,13 +302,8 @@ class Simulator(Readout):
     def copy_worlds(self, source: ArrayLike, *, of: Simulator | None = None) -> None:
         """Put every world where another one, of the same anatomy and device, is now; friction goes with it.
 
-        Args:
-            source: for each world, the number of the one that it becomes a copy of; its own to stay as it is.
-            of: the simulator that the numbers belong to, made with equal anatomies, devices and settings but
-                maybe another number of worlds; this one if not given.
-
-        Raises:
-            InputError: not one number for each world, or a world of another anatomy or device, or other settings.
+        `source` has, for each world, the number of the one that it becomes a copy of, among those `of` another
+        simulator of equal anatomies, devices and settings if given. Raises InputError for other numbers or worlds.
 
         Example:
             >>> simulator.copy_worlds([0, 0, 2, 2])

@@ -33,17 +33,15 @@ class SupportsDLPack(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SimulationSetUp:
-    """What worlds are simulated with. A `Simulator` made of it and the same commands give the same bits.
+    """What worlds are simulated with: a `Simulator` made of it and the same commands give the same bits.
 
     Attributes:
-        anatomies: the vessel of each world.
-        stacks: the devices of each world.
+        anatomies: the vessel of each world; `stacks` its devices.
         initial: Δ (mm) and φ (rad) that the devices are brought to before the first command; NaN in a world that was
             on its way already.
         friction: Coulomb coefficient of each device on the wall.
         actuation: what commands are: "velocity" (mm/s, rad/s) or "force" (N, N·mm).
         motion: how every vessel moves with time; None where they lie still.
-        config: settings of the rod core.
     """
 
     anatomies: Sequence[Anatomy]
@@ -69,12 +67,8 @@ class Step(SolvedOutputs):
 
 @dataclass(frozen=True, eq=False)
 class SimulatorState:
-    """All that the worlds' future depends on. Restored, also in another process, they go on with the same bits.
-
-    Attributes:
-        values: one array of float64 for each pair of anatomy and device, a row a world.
-        fingerprint: hash of the anatomies, devices and settings that the state belongs to.
-        format_version: of the meaning of both.
+    """All that the worlds' future depends on: restored, also in another process, they go on with the same bits.
+    `values` is an array for each pair of anatomy and device, a row a world; `fingerprint` a hash of what it belongs to.
     """
 
     values: tuple[Float[np.ndarray, "_ _"], ...]

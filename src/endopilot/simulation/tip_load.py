@@ -1,15 +1,9 @@
 """The tip-load test: a device's tip pushed against a plate until it buckles, as catalogues state it in gram-force.
 
-Makers publish no common protocol, and no standard fixes one. The usual description is followed here: the wire is held
-10 mm behind its tip, its tip is set upright on the plate of a balance, and the holder is lowered until the tip buckles;
-the tip load is what the balance then shows. The tip is straight, as it leaves its packing, for a shaped tip bends from
-the first touch; the plate is smooth, so that the tip slides. A uniform tip then buckles as a clamped-free column at
-
-    F = π² EI / (4 L²)
-
-(S. P. Timoshenko and J. M. Gere, Theory of Elastic Stability, 1961, §2.1), the formula that the shipped devices' EI at
-the tip is computed from. The simulated test takes the device's whole stiffness profile, so a device whose taper begins
-ahead of 10 mm is held to its catalogue too.
+There is no common protocol; as usually described, the wire is held 10 mm behind its tip, upright on a balance's smooth
+plate, and lowered until the straight tip buckles as a clamped-free column at F = π² EI / (4 L²) (S. P. Timoshenko and
+J. M. Gere, Theory of Elastic Stability, 1961, §2.1), the formula that the shipped devices' EI at the tip is computed
+from. The test takes the whole stiffness profile, so a taper that begins ahead of 10 mm is held to its catalogue too.
 """
 
 from __future__ import annotations
@@ -47,14 +41,8 @@ _DRAG = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class TipLoadTest:
-    """A simulated tip-load test.
-
-    Attributes:
-        pushed_mm: how far the holder was lowered, mm.
-        force_n: force on the plate, N.
-        shape_mm: nodes of the wire at the end, from tip to holder, mm; the wire stands along x on a plate at x = 10.
-        load_n: the tip load, the largest force on the plate, N.
-    """
+    """A simulated tip-load test: how far the holder was lowered, mm, the force on the plate, N, the wire's nodes at the
+    end, from tip to holder along x on a plate at x = 10, mm, and the tip load, the largest force, N."""
 
     pushed_mm: Float[np.ndarray, "samples"]
     force_n: Float[np.ndarray, "samples"]

@@ -109,11 +109,8 @@ class Trajectory(SolvedOutputs):
 
     def replay(self, *, record_shape: bool | None = None, **changed: Any) -> Trajectory:
         """Simulate the same commands again from the same start; what nothing changes comes out the same to the bit.
-
-        `changed` are attributes of `SimulationSetUp`, such as `config`, `motion` or `friction`; the positions of all
-        nodes are recorded if they were before. Raises InputError where a world was on its way already when the
-        recording began, or its vessel is not given.
-        """
+        `changed` are attributes of `SimulationSetUp`. Raises InputError where a world was on its way already when the
+        recording began, or its vessel is not given."""
         from endopilot.simulation.simulate import run_set_up  # which returns trajectories
 
         set_up = replace(self.set_up, **changed)

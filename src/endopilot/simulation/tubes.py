@@ -84,9 +84,8 @@ def lay_out_tubes(stack: Stack, *, length_mm: float) -> TubeLayout | None:
 
 @dataclass(frozen=True, eq=False)
 class TransmissionLayout:
-    """Devices behind the ostium; entry or row k belongs to device k, the innermost first: the length between drive and
-    ostium (0: the drive acts at the ostium), friction torque a length, and GJ of equal stretches from the tip, as in
-    `TubeLayout`."""
+    """Devices behind the ostium, the innermost first: length between drive and ostium (0: the drive acts there),
+    friction torque a length, and GJ of equal stretches from the tip, as in `TubeLayout`."""
 
     spacing_mm: float
     length_mm: Float[np.ndarray, "devices"]
