@@ -15,19 +15,13 @@ _AGAIN_S = 0.02
 
 
 class InputError(Exception):
-    """Bad input; the message is one line that names the file or field, the value found, and the remedy.
-
-    The command line prints the message without a traceback and exits with code 2. Raise it for anything that the
-    user can correct. Other exceptions are defects of endopilot itself.
-    """
+    """Bad input that the user can correct; the message is one line with the file or field, the value found, and the
+    remedy, which the command line prints and exits with code 2. Other exceptions are defects of endopilot itself."""
 
 
 class Stopped(SystemExit):
-    """Ctrl-C or SIGTERM, in a command and in its worker processes; `code` is the exit code, 128 + the signal.
-
-    It is no `KeyboardInterrupt`: one of those that comes out of a user's own code was raised by that code. Nothing but
-    the command line catches it.
-    """
+    """Ctrl-C or SIGTERM, in a command and its workers; `code` is the exit code, 128 + the signal. No
+    `KeyboardInterrupt`: one out of a user's own code was raised by that code. Only the command line catches it."""
 
 
 def stop(number: int, frame: FrameType | None) -> None:

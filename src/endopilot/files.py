@@ -61,9 +61,8 @@ PARTIAL = ".part-"
 
 @contextmanager
 def writing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path` and rename it to `path` when the block ends without an error; else nothing
-    is left behind. The temporary name keeps the suffix, for writers that choose the format by it. Raises InputError
-    where the folder cannot be written, or the disk is full."""
+    """Yield a temporary path beside `path`, of the same suffix, and rename it when the block ends without an error;
+    else nothing is left. Raises InputError where the folder cannot be written, or the disk is full."""
     with _temporary(Path(path)) as partial:
         yield partial
         partial.replace(path)
@@ -71,11 +70,9 @@ def writing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def writing_folder(folder: Path, record: str) -> Iterator[Path]:
-    """Yield a temporary folder whose files go into `folder` when the block ends without an error, `record` last.
-
-    Readers know by `record` that a folder is whole: it is not there while others are replaced. What else lies in
-    `folder` stays as it is. Raises InputError where it cannot be written, or holds other things and no run's record.
-    """
+    """Yield a temporary folder whose files go into `folder` when the block ends without an error, `record` last, by
+    which readers know that it is whole; what else lies there stays. Raises InputError where it cannot be written, or
+    holds other things and no run's record."""
     folder = Path(folder).resolve()  # a link stays
     with _temporary(folder) as partial:
         partial.mkdir()
@@ -182,9 +179,8 @@ def png_image(image: np.ndarray) -> bytes:
 
 
 def read_text(path: Path, *, what: str = "text file", largest: int = _LARGEST_YAML) -> str:
-    """Return what a text file of at most `largest` bytes holds, in UTF-8, or in UTF-16 if it begins with that
-    encoding's mark. Raises InputError, which calls the file `what`, such as "CSV file", where it is missing, too large,
-    or no text."""
+    """Return a text file of at most `largest` bytes in UTF-8, or UTF-16 by its mark. Raises InputError, which calls it
+    `what`, such as "CSV file", where it is missing, too large, or no text."""
     try:
         with regular(path).open("rb") as stream:
             content = stream.read(largest + 1)
@@ -227,12 +223,9 @@ def read_json(path: Path, *, keys: Iterable[str] | None = None, mend: str = "mak
 
 
 def read_yaml(path: Path) -> Any:
-    """Read a YAML file, whose plain scalars mean what YAML 1.2 has them mean.
-
-    So `3e-1` is a number, `no` and `2024-05-01` are text, and numbers that two versions of YAML read differently
-    (`017`, `0o17`, `1_000`, `1:30`) are text, which no number's field takes. Raises InputError where it is missing, is
-    not YAML, names a field twice, nests too deeply, or holds more than 100 000 values once its aliases are written out.
-    """
+    """Read a YAML file, whose plain scalars mean what YAML 1.2 has them mean: `3e-1` is a number, `no` and `2024-05-01`
+    are text, as are numbers that two versions read differently (`017`, `0o17`, `1_000`, `1:30`). Raises InputError
+    where it is missing, not YAML, names a field twice, nests too deeply, or holds over 100 000 values."""
     text = read_text(path, what="YAML file")
     try:
         return yaml.load(text, _YamlLoader)

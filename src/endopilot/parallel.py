@@ -30,12 +30,9 @@ TO_CLEAN_UP_S = 5.0
 def each(
     title: str, items: Sequence[Path], work: Callable[[Path], None], pool: Workers | None = None
 ) -> dict[Path, InputError]:
-    """Do the same work for every item, in as many processes as there are cores, under one progress bar.
-
-    `work` is a function of a module, or a `functools.partial` of one; a given `pool` goes on afterwards. Returns the
-    items whose work raised `InputError`, each with its error; any other exception ends the work. Raises InputError
-    where a process died.
-    """
+    """Do the same work (a module's function, or a `functools.partial` of one) for every item, on all cores or in a
+    given `pool`, under one progress bar; return the items whose work raised `InputError`, each with its error. Raises
+    InputError where a process died."""
     bad: dict[Path, InputError] = {}
 
     def settle(item: Path, result: Callable[[], None]) -> None:
@@ -66,9 +63,8 @@ def each(
 
 
 class Workers(ProcessPoolExecutor):
-    """Processes for work that other processes can import; they end with this one, however it ends. Leaving the block by
-    an exception stops them at once; they remove their half-written files. (joblib's loky kills its workers, which
-    leaves those files, and lets them live on where this process is killed.)"""
+    """Processes for importable work that end with this one, however it ends, at once if the block is left by an
+    exception; they remove half-written files, which joblib's loky would leave."""
 
     def __init__(self, processes: int = min(CORES, MOST_PROCESSES)) -> None:
         """Make ready for so many processes; work starts them."""

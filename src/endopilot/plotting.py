@@ -71,9 +71,8 @@ def draw_vessel(
     names: Sequence[str],
     one_color: str | None = None,
 ) -> None:
-    """Draw straight pieces of a vessel's centerlines (both ends of each, and its lumen's radius, mm) with the sections
-    by colour, and a legend beside them; lines are as thick as the vessel is wide. `one_color` is of all, without a
-    legend."""
+    """Draw straight pieces of centerlines (both ends of each, and its radius, mm), as thick as the vessel is wide, with
+    sections by colour and a legend, or in `one_color`."""
     present = np.unique(section)
     palette, width = section_colors(len(present)), _THICKEST * radius / radius.max()
     for number, index in enumerate(present):

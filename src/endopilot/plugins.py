@@ -1,8 +1,5 @@
-"""What a user may add without touching the package: `Registry` finds an implementation by its name.
-
-A name is one of the package's own, one that an installed package offers as an entry point, or MODULE:OBJECT, an object
-of a module in the current directory or on Python's path.
-"""
+"""What a user may add without touching the package: `Registry` finds an implementation by its name, the package's own,
+an installed package's entry point, or MODULE:OBJECT, in the current directory or on Python's path."""
 
 from __future__ import annotations
 
@@ -27,13 +24,8 @@ _LONGEST_MESSAGE = 200
 
 @dataclass(frozen=True)
 class Registry:
-    """Implementations of one thing by name.
-
-    Attributes:
-        setting: name of the setting that chooses one; error messages begin with it.
-        shipped: name and MODULE:OBJECT of each of the package's. Only the one that is asked for is imported.
-        group: group of the entry points by which installed packages offer theirs.
-    """
+    """Implementations of one thing by name. Messages begin with `setting`; `shipped` has MODULE:OBJECT of each of the
+    package's, imported if asked for; `group` is that of entry points by which installed packages offer theirs."""
 
     setting: str
     shipped: Mapping[str, str]
@@ -117,9 +109,8 @@ class Registry:
 
     @contextlib.contextmanager
     def running(self, name: str, failure: str) -> Iterator[None]:
-        """Run what is behind a name, as the block does: an exception out of a user's own code, if only `SystemExit`,
-        becomes an InputError that names that code and begins with `failure`. What that code prints goes to standard
-        error."""
+        """Run what is behind a name, as the block does: an exception out of a user's code, if only `SystemExit`,
+        becomes an InputError that names it and begins with `failure`; what it prints goes to standard error."""
         if name in self.shipped:
             yield
             return

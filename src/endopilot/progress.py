@@ -32,11 +32,8 @@ _shown = False
 
 @contextmanager
 def progress(title: str, total: int | float) -> Iterator[Advance]:
-    """Show a bar of `total` units of work on standard error while the block runs, but not within another.
-
-    Standard output stays free for results. If standard error is no terminal, one line is printed at the end of work
-    that took more than two seconds.
-    """
+    """Show a bar of `total` units of work on standard error while the block runs, but not within another; without a
+    terminal, one line at the end of work that took more than two seconds."""
     global _shown
     console = Console(stderr=True)
     outermost, _shown = not _shown, True

@@ -1,9 +1,6 @@
-"""A policy at the wheel of the cockpit's world.
-
-The world's navigation loop is handed over to it, and back to the hand. A policy that plans takes its time: it decides
-in a thread of its own, and the world's clock stands still meanwhile. While a hand drives, a policy that can be led
-watches.
-"""
+"""A policy at the wheel of the cockpit's world, which hands its navigation loop over to it, and back to the hand. One
+that plans decides in a thread of its own while the world's clock stands still; while a hand drives, one that can be led
+watches."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
-"""What can be replayed: a session, or a trajectory: a simulated or planned one, an episode, a navigation of the ladder.
-
-Each becomes a `Film`: the wire every 50 ms, driven again by its recorded commands while the page shows its begin.
-"""
+"""What can be replayed, as a `Film`: the wire every 50 ms, driven again by the recorded commands of a session,
+trajectory, episode or navigation while the page shows its begin."""
 
 from __future__ import annotations
 
@@ -74,11 +72,9 @@ class Film:
 
 def open_film(path: Path, patient: Path | None = None, *, world: int = 0, task: str | None = None) -> Film:
     """Open what is to be replayed: a session (.cockpit.jsonl), a trajectory (.npz), a folder of a plan, of `endopilot
-    navigate` or of a data set, a submission.json, or a navigation's result of the ladder.
-
-    `world` is a trajectory's world, a data set's episode, or a task's patient; `task` is of the ladder's files. Raises
-    InputError where it cannot be read, or lacks its patient or task.
-    """
+    navigate` or of a data set, a submission.json, or a ladder's result, `task` being of its files; `world` is a
+    trajectory's, an episode, or a task's patient. Raises InputError where it cannot be read, or lacks its patient or
+    task."""
     if path.name.endswith(SUFFIX):
         return _session(path)
     if (path / "meta").is_dir():

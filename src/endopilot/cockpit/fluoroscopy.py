@@ -1,8 +1,5 @@
-"""The X-ray unit of the cockpit: C-arm, pedal, contrast, roadmap, last image hold, and what is counted.
-
-A C-arm that is turned takes its time: what does not move in a view is computed in a thread of its own, first coarsely,
-then finely. Until then there is no X-ray.
-"""
+"""The X-ray unit of the cockpit: C-arm, pedal, contrast, roadmap, last image hold, and counters. What does not move in
+a view is computed in a thread of its own, first coarsely, then finely; until then there is no X-ray."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
-"""What the server sends: binary messages of a JSON header and raw arrays, one layout for all kinds.
-
-A message is the header's length (uint32), the header (UTF-8 JSON, padded with spaces to a multiple of four bytes), and
-the arrays one after the other, little-endian, each padded to a multiple of four bytes. `header["arrays"]` lists their
-name, type ("f4", "u4" or "u1") and shape.
-"""
+"""What the server sends: binary messages of a JSON header and raw arrays, one layout for all kinds: the header's length
+(uint32), the header (UTF-8 JSON, padded with spaces to a multiple of four bytes), and the arrays, little-endian, each
+padded alike. `header["arrays"]` lists their name, type ("f4", "u4" or "u1") and shape."""
 
 from __future__ import annotations
 
@@ -60,9 +57,8 @@ def device_arrays(snapshot: Snapshot) -> dict[str, np.ndarray]:
 
 
 def motion_values(snapshot: Snapshot, counted: Float[np.ndarray, "devices 2"] | None = None) -> dict[str, Any]:
-    """Return how far wire and catheters are inserted and turned, and what their drives do, for the page's figures.
-    `counted` is inserted length (mm) and rotation (rad) as a robot's encoders have them; as they truly are if not
-    given."""
+    """Return insertion, rotation and drives' figures of wire and catheters; `counted` are lengths (mm) and rotations
+    (rad) as encoders have them, the true ones if not given."""
 
     true = [(device.inserted_length_mm, device.rotation) for device in (snapshot, *snapshot.catheters)]
     wire, *catheters = (

@@ -1,8 +1,7 @@
 """A task of the ladder, driven by hand with X-ray as the only sight, and scored as policies are.
 
-The clock begins when the page says so. The wire in space, the tip and the wall's force are not sent to the page until
-the end. A hand drives the same loop as policies do, and is scored by the same code (`ladder.attempt.scored`); the agent
-drives the same patient in a process of its own, so that both scores stand side by side.
+The clock begins when the page says so; wire in space, tip and wall force are sent at the end. The agent drives the same
+patient in a process of its own, so that both scores (`ladder.attempt.scored`) stand side by side.
 """
 
 from __future__ import annotations

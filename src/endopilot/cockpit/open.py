@@ -52,11 +52,8 @@ def open_session(
     ct: Path | None = None,
     output: Path = Path("runs/cockpit"),
 ) -> Opened:
-    """Open a patient to be driven by hand or by a policy; a synthetic one, written into `output`, if no folder is
-    given.
-
-    The CT is for the X-ray's background. Raises InputError for a missing or bad file, or a device that does not fit.
-    """
+    """Open a patient (a synthetic one, written into `output`, if no folder is given) to be driven by hand or policy,
+    with the CT as X-ray's background. Raises InputError for a missing or bad file, or a device that does not fit."""
     patient = patient or _synthetic(output)
     navigation = _start_of(read_anatomy(patient), Stack.of(device, *catheters))
     return _driven(LiveWorld(navigation, replace(BY_HAND, robot=robot)), Where(patient=patient), output, ct)
@@ -91,11 +88,8 @@ def open_replay(
 
 
 def resume_session(path: Path, *, ct: Path | None = None) -> Opened:
-    """Go on with a session that a killed server left: it is driven again up to its last event, and recorded on.
-
-    A task that was not over goes on, and is scored: its clock waits for the page's start. Raises InputError for no such
-    session, or one that does not replay to the bit.
-    """
+    """Go on with a session that a killed server left, driven again up to its last event, and recorded on; a task that
+    was not over waits for the page's start. Raises InputError for none, or one that does not replay to the bit."""
     recording = read_session(path)
     history = replayed(recording)
     first = next(history)

@@ -1,9 +1,8 @@
 """A session on disk: one line an event, written as it happens, so that nothing is lost when the server is killed.
 
-The first line says what the session was held in: vessel, wire, robot, rod core, seed. Each further line is a JSON
-object with the cycle at which it acted: `move` (mm/s, rad/s of the wire, then of each catheter, after the drives'
-limits), `stop` (and why), `exposure`, `contrast`, and every quarter of a second `check`, a hash of wire and catheters.
-The same commands in the same cycles give the same bits, so `replayed` drives a session again and proves each check.
+The first line says what the session was held in. Each further one is a JSON object with the cycle at which it acted:
+`move` (mm/s, rad/s of each device, after the drives' limits), `stop` (and why), `exposure`, `contrast`, and every
+quarter of a second `check`, a hash of wire and catheters, which `replayed` proves.
 """
 
 from __future__ import annotations
@@ -239,12 +238,9 @@ def _lines(path: Path) -> list[dict[str, Any]]:
 
 
 def write_session_episode(session: str | Path, *, output: str | Path) -> None:
-    """Write a recorded session as a data set of one episode. `endopilot train` reads that of a wire alone.
-
-    The session is driven again and sampled every 0.5 s; what is left after the last whole sample is dropped. The vessel
-    of a task is written beside the episode, into `OUTPUT-anatomy`. Raises InputError for no such session, one shorter
-    than a sample, or an output folder that holds something else.
-    """
+    """Write a recorded session, driven again and sampled every 0.5 s, as a data set of one episode, and a task's vessel
+    beside it, into `OUTPUT-anatomy`. Raises InputError for no such session, one shorter than a sample, or an output
+    folder that holds something else."""
     session, output = Path(session), Path(output)
     recording = read_session(session)
     per_sample = round(DECISION_PERIOD_S / recording.config.cycle_s)

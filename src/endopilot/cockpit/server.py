@@ -103,12 +103,8 @@ class Cockpit:
             page.put(channel, message)
 
     def _allowed(self, connection: HTTPConnection, *, need_origin: bool) -> bool:
-        """Return whether host, origin and token are right.
-
-        The host must be this machine's: one of `hosts`, or the very address that the connection came in at. Another
-        name for that address would be a foreign page's that has turned its own name to it (DNS rebinding). The origin
-        must be the page itself.
-        """
+        """Return whether host, origin and token are right: the host one of `hosts`, or the very address that the
+        connection came in at, as another name may be a foreign page's (DNS rebinding); the origin the page itself."""
         host, origin = connection.headers.get("host", ""), connection.headers.get("origin")
         address, port = connection.scope.get("server") or ("", None)
         name, asked_port = _host_and_port(host)

@@ -1,7 +1,5 @@
-"""A session: what happens in a cycle. Messages come in, the world moves on, X-ray pulses, frames go out.
-
-Everything in `Session` runs in one thread, `Loop`, by the world's clock. The only real time in it is the watchdog's.
-"""
+"""A session: what happens in a cycle. Messages come in, the world moves on, X-ray pulses, frames go out. All of it runs
+in one thread, `Loop`, by the world's clock; the only real time is the watchdog's."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
-"""The world behind the page: a wire, alone or in catheters, in one vessel, held by the simulated robot.
-
-It advances in short cycles.
-"""
+"""The world behind the page: a wire, alone or in catheters, in one vessel, moved by the simulated robot in short
+cycles."""
 
 from __future__ import annotations
 
@@ -77,12 +75,9 @@ class Snapshot(ShownDevice):
 
 
 class LiveWorld:
-    """A navigation loop that a hand drives in short cycles, beyond its end too, until it is handed over, and what pages
-    show of it.
-
-    The same commands in the same cycles give the same bits. `force_n` is the largest wall force on one node in the last
-    cycle, `peak_force_n` so far, N.
-    """
+    """A navigation loop that a hand drives in short cycles, beyond its end too, and what pages show of it: the same
+    commands in the same cycles give the same bits. `force_n` is the largest wall force on one node in the last cycle,
+    `peak_force_n` so far, N."""
 
     def __init__(
         self,

@@ -21,10 +21,8 @@ SMALLEST_RADIUS_MM = 0.75
 
 @dataclass(frozen=True, kw_only=True)
 class AnatomyScore:
-    """Agreement of an extracted vessel with the true one, over true vessels of radius 0.75 mm or more.
-
-    Dice is of the lumen's voxels beyond the ostium; clDice as in `cl_dice`; the other measures as in `Agreement`.
-    """
+    """Agreement of an extracted vessel with the true one, over true vessels of radius 0.75 mm or more: Dice of the
+    lumen's voxels beyond the ostium, `cl_dice`, and the measures of `Agreement`."""
 
     dice: float
     cldice: float

@@ -61,13 +61,10 @@ def evaluate(
 ) -> dict[str, Any]:
     """Evaluate a run on navigations and on patients that it was not trained on.
 
-    Every navigation of a patient that the run was not trained on counts, whatever its split in the dataset; together
-    they are the split "test" of the result. Of patients that the run was trained on, the navigations outside the split
-    "train" count; they are the split "seen_test". The baseline "training mean" is taken over the split "train" of the
-    patients that the run was trained on, and left out where the dataset has none of them.
-
-    Writes `evaluation.npz` (the predictions) and `metrics.json` (every number, and how it was made), each whole or not
-    at all. `report.report_evaluation` makes figures and a page of them.
+    Every navigation of a new patient counts, as the split "test"; of patients that the run was trained on, those
+    outside the split "train", as "seen_test". The baseline "training mean" is over the split "train" of the latter, and
+    left out where there is none. Writes `evaluation.npz` (the predictions) and `metrics.json` (every number, and how it
+    was made), each whole or not at all, and returns the latter's content.
 
     Args:
         run: made by `endopilot train`, or "wires", the simulated wires.
@@ -76,13 +73,9 @@ def evaluate(
         dataset: folder of the dataset to evaluate on; the one that the run was trained on if not given.
         other_seeds: runs of the same training with other seeds, whose errors in P1 shall stand beside the run's.
 
-    Returns:
-        The content of `metrics.json`.
-
     Raises:
-        InputError: the run, its dataset or one of its anatomies is missing or damaged, nothing was held out, the
-            dataset was made with another wire, another seed was trained on other patients, there is no such robot, or
-            the output belongs to another run.
+        InputError: the run, its dataset or an anatomy is missing or damaged, nothing was held out, the dataset has
+            another wire, another seed other patients, there is no such robot, or the output belongs to another run.
     """
     with extra_named("evaluate"):
         from endopilot.evaluation.protocols import count_steps, run_protocols  # brings torch, slow to import

@@ -1,8 +1,6 @@
-"""The numbers that say how good a prediction is. Pure numpy; NaN marks a sample that counts for nothing.
-
-Errors are `predicted − true`. A sample is left out only where the truth is not valid; a prediction that is not
-finite where the truth is counts as lost, and its sequence as diverged: both shares stand beside the errors.
-"""
+"""The numbers that say how good a prediction is. Errors are `predicted − true`; NaN marks a sample that counts for
+nothing, where the truth is not valid. A prediction that is not finite where the truth is counts as lost, its sequence
+as diverged."""
 
 from __future__ import annotations
 
@@ -89,9 +87,8 @@ def span_slices(n_samples: int, sample_period_s: float) -> dict[str, slice]:
 
 
 def error_statistics(error: Float[np.ndarray, "episodes samples"]) -> dict[str, float | int | None]:
-    """Return the statistics of the absolute error over all finite samples, in its unit; without any, all but `count`
-    are None. `mae` and `sd` are its mean and standard deviation (what the paper publishes), `rmse` the root of the mean
-    squared error, `bias` the mean of the signed error."""
+    """Return the statistics of the absolute error over finite samples, in its unit (None without any): `mae` and `sd`
+    of it (what the paper publishes), `rmse`, quantiles, and `bias`, the mean of the signed error."""
     finite = error[np.isfinite(error)]
     if finite.size == 0:
         return dict.fromkeys(("mae", "sd", "median", "p95", "rmse", "bias"), None) | {"count": 0}
@@ -123,8 +120,7 @@ def bootstrap_intervals(
     error: Float[np.ndarray, "episodes samples"], anatomy: Int[np.ndarray, "episodes"], *, seed: int, draws: int = 1000
 ) -> dict[str, tuple[float, float]] | None:
     """Return the 95 % percentile intervals of mae, sd, rmse and p95 when anatomies are drawn with replacement (cluster
-    bootstrap: Davison & Hinkley 1997, §3.8): sequences of one patient are alike. None with fewer than two anatomies. Of
-    p95 the samples count as the next of 2000 evenly filled steps."""
+    bootstrap: Davison & Hinkley 1997, §3.8); None with fewer than two. Of p95 the next of 2000 steps counts."""
     finite = np.isfinite(error)
     absolute = np.abs(error[finite])
     names, owner = np.unique(np.broadcast_to(anatomy[:, None], error.shape)[finite], return_inverse=True)
@@ -208,9 +204,8 @@ def tip_statistics(
     sample_period_s: float,
     seed: int,
 ) -> dict[str, dict]:
-    """Return, for each span and for "all" samples, the statistics of one tip coordinate's error, mm; `over_radius`
-    holds those of the error over the lumen radius at the true tip. `baselines` has errors on the same samples, mm, by
-    name."""
+    """Return for each span and for "all" samples the statistics of a tip coordinate's error, mm, and, as `over_radius`,
+    of that over the lumen radius at the true tip. `baselines` has errors on the same samples, mm, by name."""
     spans: dict[str, slice] = {**span_slices(error.shape[1], sample_period_s), "all": slice(None)}
     statistics = {}
     for name, samples in spans.items():

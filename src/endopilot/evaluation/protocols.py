@@ -46,9 +46,8 @@ class Recorded:
         return Recorded(data, tuple(map(str, names)), anatomies, anatomy_of, data.stack.wire, robot)
 
     def drivable(self, control: Control) -> Control:
-        """Return what a drive makes of controls: no faster than it can, nor out of the catheter or beyond the vessel.
-        Controls that are not finite stay so. A robot's drives begin at rest, in the middle of their play, after the
-        given states."""
+        """Return what a drive makes of controls, within its speed and travel; NaN stays NaN. A robot's drives begin at
+        rest, in the middle of their play, after the given states."""
         driven, inserted = np.empty(control.shape), self.data.inserted_length[:, WINDOW - 1, 0].astype(float)
         for index, anatomy in enumerate(self.anatomies):
             mine, limits = self.anatomy_of == index, DriveLimits.of(self.device, anatomy)
@@ -76,11 +75,9 @@ class Recorded:
     def simulated(
         self, controls: Mapping[str, Control], advance: Advance | None = None
     ) -> Iterator[tuple[Int[np.ndarray, "chosen"], Trajectory]]:
-        """Drive episodes as they were driven while states are given, and the wire by each series of controls after;
-        catheters go on as they were commanded. Series of `REPLAYED` with another friction have it from the start.
-
-        Yields the episodes of one anatomy, and their simulation: a world for each series and episode, series by series.
-        """
+        """Yield the episodes of one anatomy and their simulation, a world for each series and episode, series by
+        series: driven as they were while states are given, then the wire by each series, catheters as commanded. Series
+        of `REPLAYED` with another friction have it from the start."""
         for index, anatomy in enumerate(self.anatomies):
             mine = np.flatnonzero(self.anatomy_of == index)
             worlds = self.data[np.tile(mine, len(controls))]
@@ -144,10 +141,9 @@ def replanned(
 ) -> Control:
     """Return controls (mm/s, rad/s) after the given states that are planned anew at each of `exposures`.
 
-    Each plan is driven in the simulator up to the next exposure. For the next one the predictor is given the motion of
-    the drive, the given tips, the observed tips, and in between the tips that it predicted itself; the desired tips,
-    those of `episodes`, stay the same. Where the simulation fails, or no finite control is planned, controls are NaN
-    from there on.
+    Each plan is driven in the simulator up to the next exposure, for which the predictor is given the motion of the
+    drive, the given and observed tips, and in between those it predicted; the desired tips stay. Where the simulation
+    fails, or no finite control is planned, controls are NaN from there on.
     """
     control, under_way, observed = first.control.copy(), _planned(episodes, first, WINDOW), given_states(episodes)
     for now in exposures(recorded.data):
@@ -251,10 +247,10 @@ def run_protocols(
     """Predict the samples after the 30 given states by every protocol, and simulate the controls that were chosen.
 
     P1 is the forward network under the true controls; P2 the inverse network with the true tip as desired; P3 the
-    paper's loop of both; P4 the controls of P3 simulated again from the start of the episode, in the anatomy and with
-    the device and friction that it was recorded with, within the limits of the drive, or after `robot`. P4 is driven
-    once more with plans made anew at X-ray images (`replanned`). Baselines that are means are taken over `training`,
-    and left out without it. `advance` is called with P1's error so far, each new plan and each anatomy's simulation.
+    paper's loop of both; P4 the controls of P3 simulated again from the episode's start, as it was recorded, within the
+    limits of the drive, or after `robot`, and once more with plans made anew at X-ray images (`replanned`). Baselines
+    that are means are over `training`, if any. `advance` is called with P1's error, each new plan and each anatomy's
+    simulation.
     """
     recorded, episodes = Recorded.of(data, robot), Episodes.of_dataset(data)
     predicted = _predicted(predictor, episodes, recorded.anatomy_of, advance)

@@ -285,9 +285,8 @@ def _drive(result: SplitResult, series: str) -> dict[str, Any]:
 
 
 def generalisation_gap(splits: Mapping[str, Any]) -> dict[str, Any]:
-    """Return how much larger the mean absolute errors are in new patients than in those that were trained on: by
-    series, coordinate and span `difference` (mm) and `ratio`, None where unknown. Empty unless there are both kinds of
-    patients."""
+    """Return how much larger mean absolute errors are in new patients than in those trained on: by series, coordinate
+    and span `difference` (mm) and `ratio`, None where unknown; empty without both kinds of patients."""
     if not {"seen_test", "test"} <= splits.keys():
         return {}
     known, new = splits["seen_test"], splits["test"]

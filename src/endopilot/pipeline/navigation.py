@@ -40,12 +40,9 @@ def navigate_into(
     catheter: Sequence[str] = (),
     config: NavigateConfig | None = None,
 ) -> dict[str, Any]:
-    """Drive a wire to a place in a patient's vessel, as `navigate` does, and write what happened into a folder.
-
-    A folder that was finished with the same arguments is left as it is. `target` is a section such as "4" or "LAD", or
-    a point "X,Y,Z" in LPS mm, which is moved to the centerline. Returns the outcome in one line, and figures. Raises
-    InputError where the navigation cannot be begun, or the folder belongs to another run.
-    """
+    """Drive a wire to a place in a patient's vessel, as `navigate` does, and write what happened into a folder, unless
+    the same was finished there. `target` is a section such as "4" or "LAD", or a point "X,Y,Z" in LPS mm. Returns the
+    outcome in one line, and figures. Raises InputError where it cannot begin, or the folder is another run's."""
     stack = Stack.of(device, *catheter)
     set_up = set_up_navigation(anatomy, target, policy=policy, device=stack, config=config)
     _claim(Path(output), set_up)
@@ -55,12 +52,9 @@ def navigate_into(
 
 
 def write_navigation(driven: PatientNavigation, *, output: str | Path) -> dict[str, Any]:
-    """Write a navigation in a patient into a folder: page, picture, table, trajectory, episode and manifest.
-
-    The anatomy is written beside them if the navigation was given it in memory. A page of the documentation, Navigate
-    in a patient, describes the files. Returns the outcome in one line, and figures; InputError if the folder belongs to
-    another run.
-    """
+    """Write a navigation in a patient into a folder: page, picture, table, trajectory, episode and manifest, and an
+    anatomy in memory (docs: Navigate in a patient). Returns the outcome in one line, and figures; InputError if the
+    folder belongs to another run."""
     _claim(Path(output), driven.set_up)
     return _write(driven, Path(output), None)
 

@@ -1,9 +1,6 @@
-"""All stages in a row: a CT angiogram goes in, a report comes out.
-
-`run_demo` makes its own patients first; `run_volume` takes one volume of yours, and drives a wire to a target in it if
-one is given. Both record the finished stages, so that an interrupted run goes on where it stopped, and both end with
-report.html, metrics.json and manifest.json.
-"""
+"""All stages in a row: a CT angiogram goes in, a report comes out. `run_demo` makes its own patients first;
+`run_volume` takes one volume of yours, with a target if given. Both record the finished stages, so that an interrupted
+run goes on, and end with report.html, metrics.json and manifest.json."""
 
 from __future__ import annotations
 
@@ -157,12 +154,9 @@ class _Run:
 
 
 def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
-    """Run all stages on synthetic patients, write `output`/report.html, and return its path and figures.
-
-    Everything after the CT volumes is made from them alone; the generator's truth only scores the result. Raises
-    InputError where a library of some stage is missing, the folder belongs to another run, or too few patients could be
-    segmented.
-    """
+    """Run all stages on synthetic patients, from their CT volumes alone; write `output`/report.html, and return its
+    path and figures. Raises InputError where a stage's library is missing, the folder is another run's, or too few
+    patients could be segmented."""
     require_extras(*_EXTRAS)
     device = read_wire(config.device)
     claim(output, "endopilot demo", config=config, device=device, version=__version__)
@@ -196,13 +190,9 @@ def run_volume(
     phase: str | None = None,
     target: str | None = None,
 ) -> dict[str, Any]:
-    """Run all stages on one CT angiogram in HU (DICOM, NIfTI, NRRD or MHA) and write `output`/report.html; return as
-    `run_demo`.
-
-    With a target (a section such as "4" or "LAD", or a point "X,Y,Z" in LPS mm), the agent drives the wire there, and
-    its page is in `output`/navigation. Another target may be given to the same folder later. Raises InputError as
-    `read_volume`, `segment` and `navigate`, and where the folder belongs to another run.
-    """
+    """Run all stages on one CT angiogram in HU, as `run_demo`. With a target (a section such as "4" or "LAD", or a
+    point "X,Y,Z" in LPS mm; another one later), the agent drives the wire there, into `output`/navigation. Raises
+    InputError as `read_volume`, `segment` and `navigate`, and where the folder belongs to another run."""
     require_extras(*_EXTRAS)
     content, device = read_volume(volume, series=series, phase=phase), read_wire(config.device)
     identity = {"volume_sha256": _digest(content), "method": METHODS.origin(config.segmentation.method)}

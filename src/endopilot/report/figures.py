@@ -1,7 +1,5 @@
-"""The figures of an evaluation and of a report, drawn with matplotlib: each function returns one and saves nothing.
-
-`titles` says what a reader calls each split.
-"""
+"""The figures of an evaluation and of a report: each function returns one; `titles` says what a reader calls each
+split."""
 
 from __future__ import annotations
 
@@ -127,9 +125,8 @@ def drive_difference_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> F
 
 
 def _histograms(table: pd.DataFrame, titles: Mapping[str, str], panels: Sequence[tuple[str, str]]) -> Figure:
-    """Draw histograms of columns with one value a sequence, one row a split; the series stand above one another.
-    Sequences beyond the 98 % quantile of the second-widest series are counted in the last bar; the tick below a
-    histogram marks its median. The highest bar of each histogram says how many sequences it holds."""
+    """Draw histograms of columns with one value a sequence, a row a split, a series above another, medians as ticks,
+    with numbers; what lies beyond the second-widest series' 98 % quantile is in the last bar."""
     splits, series = distinct(table, "split"), distinct(table, "series")
     with matplotlib.rc_context(STYLE):
         figure, axes = _grid(len(splits), len(panels), height=0.9 + 0.55 * len(series))
@@ -196,9 +193,8 @@ def stage_figure(table: pd.DataFrame) -> Figure:
 
 
 def volume_figure(volume: Volume, mask: LumenMask, anatomy: Anatomy | None = None) -> Figure:
-    """Draw the CTA with the outline of a mask on its grid (axial and coronal) and, if given, the extracted tree. The
-    axial slice goes through the ostium; the coronal picture is the maximum over a slab as deep as the vessel. Both are
-    cropped to the vessel and laid out as radiologists read them: the patient's right on the left, the head on top."""
+    """Draw the CTA with the outline of a mask on its grid and, if given, the extracted tree, cropped, as radiologists
+    read: axial through the ostium, coronal the maximum over a slab as deep as the vessel."""
     ostium = mask.ostium or (anatomy.insertion if anatomy is not None else None)
     voxels, lumen = _along_lps(volume, volume.voxels), _along_lps(volume, mask.volume.voxels).astype(bool)
     spacing = volume.spacing_mm[_lps_axes(volume)]  # along x, y and z

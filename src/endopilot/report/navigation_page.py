@@ -1,8 +1,5 @@
-"""The page of a navigation in a patient: what came of it, its replay in space, its course in time, how to repeat it.
-
-`navigation_figure` draws that course: paths of the tips, Δtip with what was believed, safety ratio, forces, controls,
-X-ray.
-"""
+"""The page of a navigation in a patient: what came of it, its replay in space, its course in time
+(`navigation_figure`), how to repeat it."""
 
 from __future__ import annotations
 

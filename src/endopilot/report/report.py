@@ -1,7 +1,4 @@
-"""The report: one HTML file that needs nothing beside it, for a surgeon or a reviewer to read.
-
-`report_evaluation` makes one, with the figures, of what `evaluate` left on disk.
-"""
+"""The report: one HTML file that needs nothing beside it; `report_evaluation` makes one of what `evaluate` left."""
 
 from __future__ import annotations
 
@@ -79,11 +76,9 @@ class ReportContent:
 
 
 def write_report(output_html: Path, content: ReportContent) -> list[str]:
-    """Write the report as one self-contained HTML file, and the still picture `scene.png` beside it.
-
-    Returns remarks for the user, such as which system library a left-out picture needs. Raises InputError for a missing
-    or damaged file of the content, or a report that cannot be written.
-    """
+    """Write the report as one HTML file, and the still picture `scene.png` beside it; return remarks, such as which
+    library a left-out picture needs. Raises InputError for a missing or damaged file, or a report that cannot be
+    written."""
     output_html = Path(output_html)
     remarks: list[str] = []
     metrics = read_json(content.evaluation / METRICS_FILE) if content.evaluation is not None else None

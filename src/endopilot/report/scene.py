@@ -41,12 +41,8 @@ def navigation_scene(
     devices: Sequence[Device] = (),
     believed: Sequence[Wires] | None = None,
 ) -> go.Figure:
-    """Return a plotly figure of the wall, the centerline by section, and the first world of a rollout (with `shape`)
-    replayed.
-
-    `devices` are its wire and catheters; `believed` are wires that a policy holds possible at each sample, nodes from
-    the tip on, LPS mm.
-    """
+    """Return a plotly figure of the wall, the centerline by section, and a rollout's first world (with `shape`)
+    replayed; `believed` are wires that a policy holds possible at each sample, nodes from the tip on, LPS mm."""
     wall = _wall(anatomy)
     figure = go.Figure([wall, *_centerlines(anatomy)])
     figure.update_layout(_layout(np.ptp([np.asarray(axis) for axis in (wall.x, wall.y, wall.z)], axis=1)))

@@ -1,8 +1,5 @@
-"""A still picture of the vessel, wire and catheters in it, rendered by VTK without a screen in a process of its own.
-
-VTK aborts its process where it finds no graphics library, so it must not run in ours: `render_still` writes what is to
-be seen to a file and starts `still_process` as a program, whose failure is then one clear line.
-"""
+"""A still picture of the vessel, wire and catheters in it, by VTK in a process of its own, `still_process`: VTK aborts
+where it finds no graphics library, and its failure is then one clear line."""
 
 from __future__ import annotations
 
@@ -33,11 +30,8 @@ TIMEOUT_S = 180
 def render_still(
     anatomy: Anatomy, lines: Sequence[Float[np.ndarray, "_ 3"]], path: Path, *, devices: Sequence[Device] = ()
 ) -> str | None:
-    """Render the vessel's translucent wall, its centerline, the wire and translucent catheters to a PNG.
-
-    `lines` are nodes of the wire, then of each catheter, from its tip backwards, LPS mm. Returns None when the picture
-    is there; otherwise one line that says what to install.
-    """
+    """Render the vessel's wall, its centerline, and `lines` (nodes of the wire, then of each catheter, from the tip,
+    LPS mm) to a PNG; return None, or a line that says what to install."""
     surface = wall_mesh(anatomy.distance_map, max_triangles=400_000)
     centerlines = [branch.centerline.points for branch in anatomy.tree.branches]
     widths = [device.diameter_mm / devices[0].diameter_mm for device in devices] or [1.0] * len(lines)

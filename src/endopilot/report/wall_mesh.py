@@ -24,9 +24,8 @@ class WallMesh:
 
 
 def wall_mesh(distance_map: DistanceMap, *, max_triangles: int = MAX_TRIANGLES) -> WallMesh:
-    """Return the surface where the distance to the wall is zero (marching cubes). Above `max_triangles`, the distance
-    map is resampled on a coarser grid first: it is smooth, so this keeps the wall's shape better than removing
-    triangles."""
+    """Return the surface where the distance to the wall is zero. Above `max_triangles`, the smooth distance map is
+    first resampled on a coarser grid, which keeps the shape better than removing triangles."""
     values, origin = _cropped(distance_map)
     spacing = np.full(3, distance_map.spacing_mm)
     vertices, triangles = _march(values, spacing)

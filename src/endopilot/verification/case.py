@@ -98,12 +98,11 @@ def straight_rod(
     drag: float = 1e-12,
     clamp: int = 3,
 ) -> RodLayout:
-    """Return a uniform straight rod whose free length begins in the middle of its first free element.
+    """Return a uniform straight rod whose free length begins in the middle of its first free element (a clamped one
+    fixes a direction, and the joint behind it stands for half of it): (elements - 1/2) element lengths.
 
-    A clamped element fixes a direction over its whole length, and the joint behind it stands for half of it: so a rod
-    clamped at a wall has its wall in the middle of the clamped element, and the free length is (elements - 1/2) element
-    lengths. EI and GJ are in N·mm², κGA and EA in N (very stiff if not given), a node's drag in N·s/mm; the drive holds
-    `clamp` nodes behind the wall.
+    EI and GJ are in N·mm², κGA and EA in N (very stiff if not given), a node's drag in N·s/mm; the drive holds `clamp`
+    nodes behind the wall.
     """
     stiff = 1e5 * bend / length_mm**2
     return uniform_rod(
@@ -220,13 +219,8 @@ def driven(
     push_limit_n: float = np.inf,
 ) -> dict[str, np.ndarray]:
     """Drive one rod, or tubes in each other, and return the core's arrays, without the axis of worlds; only tubes have
-    one of devices.
-
-    Controls (mm/s, rad/s) and the start (mm, rad) have a row for each of `tubes`, from the inside out, which replace
-    the rod's stiffnesses. With `approach` the rod comes to its first inserted length from the ostium; else it starts
-    there, straight. Nodes more than `free_behind_mm` behind the insertion follow the drive, which slips at
-    `push_limit_n`, N. Raises RuntimeError where the core did not converge.
-    """
+    one of devices. Controls (mm/s, rad/s) and the start (mm, rad) have a row for each of `tubes`; all else is as of
+    `run_core`. Raises RuntimeError where the core did not converge."""
     result = run_core(
         rod,
         lumen,
