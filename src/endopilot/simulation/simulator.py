@@ -286,9 +286,10 @@ class Simulator(Readout):
             >>> kept, control = simulator.state, np.tile([5.0, simulator.config.element_mm], (4, 1))
             >>> once = simulator.step(control, 0.1)
             >>> simulator.set_state(kept)
-            >>> np.array_equal(simulator.step(control, 0.1).tip_position, once.tip_position),
-            simulator.set_up.initial.shape
-            (True, (4, 1, 2))
+            >>> np.array_equal(simulator.step(control, 0.1).tip_position, once.tip_position)
+            True
+            >>> simulator.set_up.initial.shape
+            (4, 1, 2)
         """
         state.check_version()
         if state.fingerprint != self._fingerprint:
