@@ -10,8 +10,7 @@ from endopilot.errors import InputError
 
 FOR_DEVELOPERS = ("dev", "docs")
 """Extras that no command needs."""
-_IMPORTED_AS = {"mujoco-core": "mujoco"}
-"""Libraries that are imported by another name."""
+_IMPORTED_AS = {"mujoco-core": "mujoco"}  # libraries that are imported by another name
 
 
 def requirements_of_extras() -> dict[str, tuple[str, ...]]:

@@ -36,8 +36,7 @@ RECORD_FILE = "run.json"
 """Says which run a folder belongs to."""
 _LARGEST_JSON, _LARGEST_YAML = 512 * _MIB, _MIB // 4
 """Bytes of a file that is read whole: recordings of long navigations have some MiB, settings some KiB."""
-_MOST_NODES = 100_000
-"""Values that a YAML file may hold once its aliases are written out."""
+_MOST_NODES = 100_000  # values that a YAML file may hold once its aliases are written out
 _ENCODINGS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF16_LE, "utf-16"),

@@ -18,8 +18,7 @@ from endopilot import __version__
 from endopilot.errors import InputError, Stopped
 from endopilot.files import sha256
 
-_LONGEST_MESSAGE = 200
-"""More of an exception's message is left out, characters."""
+_LONGEST_MESSAGE = 200  # more of an exception's message is left out, characters
 
 
 @dataclass(frozen=True)

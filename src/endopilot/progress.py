@@ -26,8 +26,7 @@ class Advance(Protocol):
         ...
 
 
-_shown = False
-"""Whether a bar is shown."""
+_shown = False  # whether a bar is shown
 
 
 @contextmanager

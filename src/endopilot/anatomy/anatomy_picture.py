@@ -30,8 +30,7 @@ SECTIONS = 6
 """Cross-sections that are drawn, evenly along the longest path."""
 
 WINDOW_HU = (-150.0, 650.0)
-_WIDTH = 15.0
-"""Of the picture, inches."""
+_WIDTH = 15.0  # of the picture, inches
 _LONGEST_NAME, _MOST_LISTED = 24, 120
 """Letters of a section's name, and number of sections, that are listed."""
 _LARGEST_GRID = 1_500_000

@@ -23,39 +23,22 @@ _RING = 12
 _FEWEST_DIRECTIONS = 5
 """With fewer directions than this on the ring, a vessel has too little wall of its own to be centred by."""
 
-_STRAIGHT = 10
-"""This many steps of a branch from where it leaves its parent show where it comes from."""
-
-_NEAR_WALL = 0.8
-"""The ring on which the radius is measured, in distances to the wall."""
+_STRAIGHT = 10  # this many steps of a branch from where it leaves its parent show where it comes from
+_NEAR_WALL = 0.8  # the ring on which the radius is measured, in distances to the wall
 
 _CROSSED = 0.25
 """A straight way narrower than this share of a branch's radius crosses a wall: at flaps of one voxel 0.0 to 0.1."""
 
-_WAY = 12
-"""Places at which such a way is looked at."""
-
-_FLAT = 0.75
-"""A vessel whose smaller half-axis falls below this share of its radius is not drawn out any farther."""
-
-_ROUND = 0.9
-"""A half-axis counts as different from the radius where it is smaller than this share of it."""
-
-_AHEAD = 0.87
-"""Cosine of the largest angle at which a line may leave a known ostium off the catheter's axis."""
-
-_SIGHT = np.linspace(0.0, 1.0, 50)
-"""Shares of a line of sight at which the lumen is looked at."""
-
-_LED_ELSEWHERE = 2.0
-"""A line drawn out to its cut ends within this many radii of the tip that it was traced from."""
-
-_LONGEST_BRIDGE = 4.0
-"""A known ostium is joined to a line that begins at most this many radii away."""
+_WAY = 12  # places at which such a way is looked at
+_FLAT = 0.75  # a vessel whose smaller half-axis falls below this share of its radius is not drawn out any farther
+_ROUND = 0.9  # a half-axis counts as different from the radius where it is smaller than this share of it
+_AHEAD = 0.87  # cosine of the largest angle at which a line may leave a known ostium off the catheter's axis
+_SIGHT = np.linspace(0.0, 1.0, 50)  # shares of a line of sight at which the lumen is looked at
+_LED_ELSEWHERE = 2.0  # a line drawn out to its cut ends within this many radii of the tip that it was traced from
+_LONGEST_BRIDGE = 4.0  # a known ostium is joined to a line that begins at most this many radii away
 
 _REFINEMENTS = 8
-_STEP_LIMIT = 0.3
-"""A refinement moves a point by at most this share of its distance to the wall."""
+_STEP_LIMIT = 0.3  # a refinement moves a point by at most this share of its distance to the wall
 
 
 def refined_lines(

@@ -53,8 +53,7 @@ from endopilot.vessels.topology import parted, touch_remarks
 CORONARY_RADIUS_MM = 1.6
 """Mean radius of a coronary tree at most: what counts for the grid where a lumen holds a piece of the aorta too."""
 
-_RESOLVED_STEPS = 1.25
-"""A catheter's radius in steps of the distance map, at least: wide vessels have coarse maps."""
+_RESOLVED_STEPS = 1.25  # a catheter's radius in steps of the distance map, at least: wide vessels have coarse maps
 
 _OTHER_SIDE_DEG = 5.0
 """A coronary artery is in doubt if its course is nearer to that of the other one by this, degrees; in 48 of the

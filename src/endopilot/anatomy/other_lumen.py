@@ -13,8 +13,7 @@ from scipy.spatial import KDTree
 from endopilot.anatomy.distance import CATHETER_LENGTH_MM, add_catheter
 from endopilot.types import Anatomy, DistanceMap
 
-_CHUNK = 1 << 18
-"""Points of the grid that are looked at together."""
+_CHUNK = 1 << 18  # points of the grid that are looked at together
 LEAST_MM = 0.02
 """Radius of a lumen that is closed, mm."""
 

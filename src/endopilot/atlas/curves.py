@@ -15,8 +15,7 @@ from endopilot.lines import length_along
 STEP_MM = 0.5
 """Distance between neighbouring centerline points, mm."""
 
-_HEIGHT_MM = 3.0
-"""Side branches run this far above the surface that they follow, mm: in epicardial fat."""
+_HEIGHT_MM = 3.0  # side branches run this far above the surface that they follow, mm: in epicardial fat
 
 
 def curve_through(waypoints: Float[np.ndarray, "n 3"], step_mm: float = STEP_MM) -> Float[np.ndarray, "m 3"]:

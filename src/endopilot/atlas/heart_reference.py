@@ -171,8 +171,7 @@ def _solid_grid() -> Float32[np.ndarray, "nz ny nx"]:
 
 
 _KNOTS = 16
-_HEIGHT_MM = 3.0
-"""The reference courses lie this far above the reference heart's surface, mm: in epicardial fat."""
+_HEIGHT_MM = 3.0  # the reference courses lie this far above the reference heart's surface, mm: in epicardial fat
 
 
 def place_from_ostium(distance_cm: float, azimuth_deg: float, elevation_deg: float) -> Float[np.ndarray, "3"]:

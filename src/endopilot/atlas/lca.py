@@ -50,10 +50,8 @@ the crux into the posterior descending artery."""
 
 _ORDERED = (("9", "10"), ("12",))
 """Names of the first branches of the anterior descending artery and of the circumflex, septals aside."""
-_FLARE_MM = 3.0
-"""Over this length before and behind its fork the left main artery widens, mm."""
-_SHARPEST_PER_MM = 0.45
-"""Greatest curvature of the main vessels, 1/mm."""
+_FLARE_MM = 3.0  # over this length before and behind its fork the left main artery widens, mm
+_SHARPEST_PER_MM = 0.45  # greatest curvature of the main vessels, 1/mm
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,8 +42,7 @@ _COURSE = np.array([[0, 0, 0], [-18, 4, 13], [-36, 9, 29], [-52, 12, 45], [-64, 
 _RIGHT = np.array([[-10, -1, 3], [-19, -5, 6], [-27, -12, 13], [-33, -17, 25], [-37, -19, 40], [-41, -18, 54.0]])
 """Onwards along the right branch, its anterior one and the vein of segment 8, mm from the porta hepatis."""
 _SEGMENT_DIAMETER_MM = 5.0
-_SHARPEST_PER_MM = 0.15
-"""Greatest curvature of the widest line, 1/mm: its wall must not fold."""
+_SHARPEST_PER_MM = 0.15  # greatest curvature of the widest line, 1/mm: its wall must not fold
 
 
 def make_portal(

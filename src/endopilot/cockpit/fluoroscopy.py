@@ -24,8 +24,7 @@ CONTRAST_S = 2.0
 """How long an injection fills the vessel, s; then the blood washes it out."""
 _FILL_S, _WASH_S, _GONE = 0.2, 0.4, 0.02
 _COARSE, _FINE = 96, 256
-_NICE = 10
-"""Of the thread that computes views: the wire goes first."""
+_NICE = 10  # of the thread that computes views: the wire goes first
 
 
 @dataclass(frozen=True)

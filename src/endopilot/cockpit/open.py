@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     from endopilot.cockpit.game import Attempt
 
 _START_MM = 5.0
-_DEEP = 0.8
-"""Where the first target lies, as a share of the longest path."""
+_DEEP = 0.8  # where the first target lies, as a share of the longest path
 
 
 @dataclass(frozen=True, eq=False)

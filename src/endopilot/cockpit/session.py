@@ -253,8 +253,7 @@ def _images(images: list[bytes]) -> list[tuple[str, bytes]]:
     return [(f"image{number}", image) for number, image in enumerate(images)]
 
 
-_LATE_S = 0.25
-"""A loop that is later than this lets the time go, s."""
+_LATE_S = 0.25  # a loop that is later than this lets the time go, s
 
 
 @runtime_checkable

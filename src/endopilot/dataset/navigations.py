@@ -133,8 +133,7 @@ PULL_BACK_MM = 15.0
 """Length by which a wire that came to an end, or is caught, is pulled back before it is pushed again, mm."""
 CAUGHT = 0.5
 """Share of the device's push limit at which a wire counts as caught."""
-_ROUNDING_MM = 1e-2
-"""A wire this near to its pull-back target counts as pulled back."""
+_ROUNDING_MM = 1e-2  # a wire this near to its pull-back target counts as pulled back
 
 
 def simulate_navigations(

@@ -17,12 +17,9 @@ from endopilot.progress import Advance
 from endopilot.simulation.trajectory import Trajectory, trajectory_signals
 
 _KEY = b"endopilot_key"
-_LEVEL = 5
-"""Of Zstandard; higher ones take longer and save next to nothing."""
-_QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
-"""Those that LeRobot 0.4 normalises by."""
-_FEW_VALUES = {"timestamp"}
-"""Columns that repeat their values: a dictionary is the smallest."""
+_LEVEL = 5  # of Zstandard; higher ones take longer and save next to nothing
+_QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)  # those that LeRobot 0.4 normalises by
+_FEW_VALUES = {"timestamp"}  # columns that repeat their values: a dictionary is the smallest
 
 
 def sample_table(trajectory: Trajectory, first_episode: int, key: str) -> pa.Table:

@@ -121,8 +121,7 @@ def _episodes(
 Done = Callable[[Block, float], None]
 """Called with each block that has been written and the processor time that it took, s."""
 Item, Result = TypeVar("Item"), TypeVar("Result")
-_CONNECT_TIMEOUT_S = 10
-"""Time limit for a scheduler to answer, s."""
+_CONNECT_TIMEOUT_S = 10  # time limit for a scheduler to answer, s
 
 
 class _Interrupted(Exception):

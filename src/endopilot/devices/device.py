@@ -42,20 +42,15 @@ Value = TypeVar("Value")
 _MODULUS_MPA = (0.1, 250e3)
 """Young's modulus that EI and the section may imply, MPa: from a tenth of the softest published rod's, 1 MPa, to just
 above that of cobalt alloys, 233 GPa; steel has 200 GPa."""
-_WIRE_RATIO = (0.63, 1.05)
-"""GJ/EI of a wire: 1/(1 + ν) of a round section, ν from 0 to 0.5, and 5 % for rounding."""
-_CATHETER_RATIO = (0.63, 3.0)
-"""The same of a catheter, whose braid may raise GJ."""
-_FALL = 3.0
-"""Factor by which EI may fall from the tip on; devices stiffen towards the shaft."""
-_STIFFENING = 1e5
-"""Largest ratio of EI along a device."""
+_WIRE_RATIO = (0.63, 1.05)  # GJ/EI of a wire: 1/(1 + ν) of a round section, ν from 0 to 0.5, and 5 % for rounding
+_CATHETER_RATIO = (0.63, 3.0)  # the same of a catheter, whose braid may raise GJ
+_FALL = 3.0  # factor by which EI may fall from the tip on; devices stiffen towards the shaft
+_STIFFENING = 1e5  # largest ratio of EI along a device
 _LOAD_FACTOR = 10.0
 """Factor between a catalogue's tip load and that of the tip's EI: protocols differ, and 1 gf is 1/102 N."""
 _STRENGTH_MPA = 3000.0
 """Tensile strength of the strongest steel wire, MPa: EN 10270-1 has up to 3000 for patented wire of 0.3 mm."""
-_LEAST_DEG = math.degrees(math.pi) / 57
-"""A bend up to this, some 3.16 °, is one in rad: half a turn has π of them."""
+_LEAST_DEG = math.degrees(math.pi) / 57  # a bend up to this, some 3.16 °, is one in rad: half a turn has π of them
 
 
 @settings

@@ -16,8 +16,7 @@ from endopilot.types import Anatomy
 SPARE_MM = 20.0
 """Length that a wire can be driven beyond the end of the vessel's longest path, mm. A wire lies slack along the wall:
 it takes more wire than centerline to reach the end."""
-_HAIR_MM = 1e-9
-"""What rounding may add to an inserted length, mm."""
+_HAIR_MM = 1e-9  # what rounding may add to an inserted length, mm
 WIDE_MM, SPARE_WIDTHS = 16.0, 3.0
 """In a lumen wider than this, such as an aorta, a wire lies down on the outer walls of bends and in loops, mm; that
 takes up to so many widths of it."""

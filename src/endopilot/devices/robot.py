@@ -25,8 +25,7 @@ ASSUMED, IDEAL = "assumed", "ideal"
 """Names of the robot whose numbers are assumptions, which is the default, and of the one that does as commanded."""
 _SHIPPED = Path(__file__).parent / "robots"
 Kind = TypeVar("Kind", bound=Device)
-_MOST_SPREADS = 3.0
-"""A gain that is drawn lies no farther from its mean than this many standard deviations."""
+_MOST_SPREADS = 3.0  # a gain that is drawn lies no farther from its mean than this many standard deviations
 
 
 @settings

@@ -14,20 +14,15 @@ from endopilot.types import Volume
 
 _SMOOTHING_MM = 0.3
 """Width of the Gaussian against noise, mm; about the scanner's own blur, so that little detail is lost."""
-_BLUR_MM = 0.4
-"""Width of that Gaussian and of a scanner's point-spread function (0.6 mm at half height) together, mm."""
-_SURROUNDINGS_MM = 1.2
-"""Width of the window in which the surroundings' HU are averaged, mm."""
+_BLUR_MM = 0.4  # width of that Gaussian and of a scanner's point-spread function (0.6 mm at half height) together, mm
+_SURROUNDINGS_MM = 1.2  # width of the window in which the surroundings' HU are averaged, mm
 _WALL_HU = 0.0
 """Even in fat and lung, the vessel's own wall lies next to the lumen: half a millimetre of soft tissue, blurred."""
-_BLOCK = 8
-"""Edge of the blocks in which voxels near the vessel are looked for, voxels."""
+_BLOCK = 8  # edge of the blocks in which voxels near the vessel are looked for, voxels
 CALCIUM = 1.5
 """Times the lumen's HU; brighter voxels are calcium or metal."""
-_FEWEST_VOXELS = 5
-"""Smaller bright specks are noise."""
-_RIM_MM = 1.2
-"""Blur spreads calcium's brightness this far: at a distance of three of its widths nothing is left."""
+_FEWEST_VOXELS = 5  # smaller bright specks are noise
+_RIM_MM = 1.2  # blur spreads calcium's brightness this far: at a distance of three of its widths nothing is left
 
 
 def lumen_at_half_height(

@@ -56,8 +56,7 @@ _FEWEST_SLICES = 4
 _HU_TYPES = ("", "HU")
 _PERHAPS_HU_TYPES = ("US", "HU_MOD")
 """RescaleType of HU that the scanner modified, and of converters that leave the type open (unspecified)."""
-_AIR_HU = -1024.0
-"""What pixels are given that lie outside the scanned circle (PixelPaddingValue)."""
+_AIR_HU = -1024.0  # what pixels are given that lie outside the scanned circle (PixelPaddingValue)
 
 
 @dataclass(frozen=True, eq=False)

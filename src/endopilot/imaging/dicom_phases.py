@@ -21,8 +21,7 @@ PHASE_TAGS = {
 }
 """Fields that may tell phases apart, the clearest first, and the unit of each."""
 
-_POSITION_MM = 1e-3
-"""Slices nearer to each other than this are at one position."""
+_POSITION_MM = 1e-3  # slices nearer to each other than this are at one position
 
 
 def choose_phase(

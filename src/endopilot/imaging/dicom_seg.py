@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from pydicom.dataset import Dataset
 
 SUFFIX = ".dcm"
-_SAME_MM = 1e-3
-"""Frames nearer to each other than this are of one slice."""
+_SAME_MM = 1e-3  # frames nearer to each other than this are of one slice
 
 
 def need_highdicom(path: Path) -> Any:

@@ -14,12 +14,9 @@ from scipy.spatial import KDTree
 
 from endopilot.imaging.grid import distance_to_outside
 
-_SHORTEST_BRANCH_MM = 4.0
-"""Shorter side branches are bumps of the wall."""
-_COST_FLOOR = 0.05
-"""Added to the vesselness, so that a path through a gap has a finite cost."""
-_SMOOTHING_MM = 1.5
-"""Width of the Gaussian that takes the voxel steps out of a path, mm."""
+_SHORTEST_BRANCH_MM = 4.0  # shorter side branches are bumps of the wall
+_COST_FLOOR = 0.05  # added to the vesselness, so that a path through a gap has a finite cost
+_SMOOTHING_MM = 1.5  # width of the Gaussian that takes the voxel steps out of a path, mm
 
 
 def vesselness(

@@ -30,8 +30,7 @@ MASK_SUFFIXES = (*SUFFIXES, dicom_seg.SUFFIX)
 """File formats of masks, by suffix; the last is a DICOM-SEG object."""
 
 _READ_ONLY_SUFFIXES = (".mhd", ".nhdr")
-_SMALLEST_SIZE = 4
-"""Fewer voxels than this along an axis are no volume: a slice, or a scout view."""
+_SMALLEST_SIZE = 4  # fewer voxels than this along an axis are no volume: a slice, or a scout view
 
 
 @public

@@ -16,10 +16,8 @@ from endopilot.atlas.heart_reference import HeartFit, chamber, ellipsoid, refere
 from endopilot.lines import length_along
 from endopilot.types import Centerline, VesselTree
 
-_KNOTS = 16
-"""Points of each of the left reference courses."""
-_SLAB = 8
-"""Slices of the coarse grid whose depths are computed at once: they stay in the processor's cache."""
+_KNOTS = 16  # points of each of the left reference courses
+_SLAB = 8  # slices of the coarse grid whose depths are computed at once: they stay in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,8 +193,7 @@ _PULMONARY_VEINS = [
     [(44, 46, -2), (62, 54, 4), (90, 50, 14)],
     [(44, 46, -16), (60, 58, -24), (88, 64, -36)],
 ]
-_TOUCHING_MM = 0.7
-"""Gap between the lumens of an artery and a vein that touches it, mm."""
+_TOUCHING_MM = 0.7  # gap between the lumens of an artery and a vein that touches it, mm
 _LEFT_GRAFT = [(9, -9, 22), (9, -20, 27), (16, -36, 21), (28, -44, 10), (44, -48, -6)]
 _RIGHT_GRAFT = [(2, -8, 20), (-6, -19, 20), (-26, -22, 6), (-38, -20, -14), (-41, -14, -36)]
 """From within the aorta's front wall over the pulmonary trunk, and beside the right atrium."""

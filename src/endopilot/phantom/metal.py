@@ -26,14 +26,11 @@ _STRUT_MM2, _STRUT_HU = 0.01, 25000.0
 """Cross-section of a strut (0.1 mm by 0.1 mm), and its metal's CT number."""
 _CROWN_MM, _CROWNS = 1.4, 6
 """A stent is a row of zigzag rings this long, each with so many peaks."""
-_WATER = 2e-5
-"""Attenuation of water divided by 1000: 1 HU along 1 mm adds this to the line integral."""
+_WATER = 2e-5  # attenuation of water divided by 1000: 1 HU along 1 mm adds this to the line integral
 _SATURATION = 4.0
 """Line integral that a beam of many energies approaches behind ever more metal: the softer photons are gone."""
-_VIEWS = 120
-"""Views of half a turn."""
-_BIN_MM = 1.0
-"""Width of the detector's bins, and spacing of the grid on which streaks are reconstructed, mm."""
+_VIEWS = 120  # views of half a turn
+_BIN_MM = 1.0  # width of the detector's bins, and spacing of the grid on which streaks are reconstructed, mm
 _SWAY_MM = 1.5
 """Metal in the heart moves this far while one slice is scanned, mm: the views disagree, and streaks result."""
 

@@ -22,12 +22,9 @@ from endopilot.phantom.scanner import misregister, scan, smear
 from endopilot.settings import Ascending, NonNegative, Share, Within, public, settings
 from endopilot.types import Anatomy, Centerline, Volume
 
-_REACH_MM = 5.0
-"""Distances to small vessels are computed up to this far, mm."""
-_FAT_MM = 5.5
-"""Fat reaches at least this far from a coronary's axis, mm."""
-_WALL_MM = 0.5
-"""Thickness of a coronary wall, mm."""
+_REACH_MM = 5.0  # distances to small vessels are computed up to this far, mm
+_FAT_MM = 5.5  # fat reaches at least this far from a coronary's axis, mm
+_WALL_MM = 0.5  # thickness of a coronary wall, mm
 
 
 _Side = Annotated[int, Within(16, 2048)]

@@ -10,10 +10,8 @@ from scipy.ndimage import gaussian_filter1d, shift
 
 from endopilot.phantom.painter import SLAB, Painter
 
-_PHASES = 7
-"""Positions of a moving heart that are averaged."""
-_HELD_MM = 4.0
-"""The motion fades over this depth below the pericardium, mm."""
+_PHASES = 7  # positions of a moving heart that are averaged
+_HELD_MM = 4.0  # the motion fades over this depth below the pericardium, mm
 
 
 def smear(

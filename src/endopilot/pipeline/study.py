@@ -46,8 +46,7 @@ EVALUATED = 16
 """Navigations that are evaluated in each split; each takes some 13 s of a core, and the demo five minutes of two."""
 MISMATCH = (0.8, 1.2)
 """Friction and tip stiffness of the navigations that simulated wires are evaluated on, over those they are given."""
-_EXTRAS = ("learn", "report")
-"""Extras that the stages need, the last one after minutes of work."""
+_EXTRAS = ("learn", "report")  # extras that the stages need, the last one after minutes of work
 DEMO_ORIGIN = (
     "The patients are synthetic: right coronary arteries drawn from published statistics, and a CT angiogram of each, "
     "made with noise, blur, calcium, chambers and veins. Everything after the CT is made from it alone."

@@ -136,8 +136,7 @@ def _exposures(found: PatientNavigation) -> list[dict[str, str]]:
 
 
 _DEVICE_COLORS = (BLUE, *CATHETER_COLORS)
-_LABEL_SHARE = 0.06
-"""Labels of forks are this share of the axis apart, at least."""
+_LABEL_SHARE = 0.06  # labels of forks are this share of the axis apart, at least
 
 
 def navigation_figure(found: PatientNavigation) -> Figure:

@@ -21,8 +21,7 @@ BACKGROUND, INK, FAINT = "#0d1424", "#dfe6f2", "#31405c"
 WALL, WIRE, TIP, BELIEVED = "#d98a8a", "#f6f7fb", "#ffd34d", "#5fb8ff"
 Wires = Float[np.ndarray, "wires nodes 3"]
 
-_WIRE_WIDTH = 7.0
-"""Width of the wire's line, pixels; a catheter's is as much wider as its diameter."""
+_WIRE_WIDTH = 7.0  # width of the wire's line, pixels; a catheter's is as much wider as its diameter
 
 TRAIL_S = 20.0
 """How long the path of the tip stays in the picture, s."""

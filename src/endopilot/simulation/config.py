@@ -62,14 +62,11 @@ LANES = _core.LANES
 """Worlds that one thread steps side by side."""
 _DENT_MM = 0.015
 """Depth to which a node that bears all that the drives can push with dents a wall of no given stiffness, mm."""
-_HARD_PUSH_N = 2.0
-"""Push that stands for the limit of a drive that has none, N."""
+_HARD_PUSH_N = 2.0  # push that stands for the limit of a drive that has none, N
 _RIGID_REACH_MM, _COMPLIANT_REACH_MM = 0.5, 2.4
 """How far outside the wall a wire may lie, mm; distance maps reach 2.5 mm."""
-_SOFTEST_N_MM2 = 0.01
-"""A softer wall would yield farther than distance maps reach, N/mm²."""
-_ARTERY_MM = 4.0
-"""Width of the artery that displaces the muscle around it, mm."""
+_SOFTEST_N_MM2 = 0.01  # a softer wall would yield farther than distance maps reach, N/mm²
+_ARTERY_MM = 4.0  # width of the artery that displaces the muscle around it, mm
 COMPLIANT_WALL_STIFFENING_MM2 = 8.023 / _ARTERY_MM**2
 """A compliant wall yields by d to K d exp(s d²), s in 1/mm²: muscle in simple shear by γ = d/4 mm bears γ exp(8.023 γ²)
 times its modulus (Holzapfel and Ogden, Phil Trans R Soc A 2009, isotropic part, from shear tests of porcine muscle)."""

@@ -28,8 +28,7 @@ PERIODS_S = (1e-3, 4.0)
 """How long a control of a file may hold, s: drives take a command a millisecond at best, and nobody drives blindly for
 longer."""
 _KINDS = ("insertion", "retraction", "spin", "pause")
-_DRIVE = 2**32
-"""From the key of a navigation's wire to that of its catheter; no study has that many navigations."""
+_DRIVE = 2**32  # from the key of a navigation's wire to that of its catheter; no study has that many navigations
 
 
 @settings

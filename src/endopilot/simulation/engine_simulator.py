@@ -40,10 +40,8 @@ BEHIND_MM = 3.0
 LEAP_MM = 0.1
 """A node that would move farther in a step is damped more, as where the wire snaps over, mm."""
 _SLOWEST = 256
-_HELD = 1e3
-"""Inertia of a joint that is held, N·mm·s²."""
-_BASE_INERTIA = 1e6
-"""Of the base, which follows the drive, N·s²/mm and N·mm·s²."""
+_HELD = 1e3  # inertia of a joint that is held, N·mm·s²
+_BASE_INERTIA = 1e6  # of the base, which follows the drive, N·s²/mm and N·mm·s²
 
 
 class EngineWire:
@@ -194,10 +192,8 @@ def _text(values: np.ndarray) -> str:
     return " ".join(f"{value:.5g}" if isinstance(value, float) else str(value) for value in values.ravel().tolist())
 
 
-_RESULTANT_MM = 2.0
-"""Length of wire whose forces of the wall are added up, mm, as the core does."""
-_THROUGH_WALL = 3
-"""Reason of a world whose wire has left the vessel."""
+_RESULTANT_MM = 2.0  # length of wire whose forces of the wall are added up, mm, as the core does
+_THROUGH_WALL = 3  # reason of a world whose wire has left the vessel
 
 
 class EngineSimulator(Simulator):

@@ -26,8 +26,7 @@ from endopilot.types import Anatomy, DistanceMap, VesselTree
 FINE_MM = 0.2
 """Spacing of a finer grid, mm, at most: a tube's axis then reads at most 0.1 mm too near to the wall."""
 
-_APART_MM = 0.1
-"""Distance between the points of the guiding catheter's axis that are looked at, mm."""
+_APART_MM = 0.1  # distance between the points of the guiding catheter's axis that are looked at, mm
 
 
 def make_wall(anatomy: Anatomy, stack: Stack, config: SimulatorConfig) -> Lumen:
@@ -97,10 +96,8 @@ def _inscribed_spheres(wall: Lumen, anatomy: Anatomy) -> Float[np.ndarray, "line
 
 GroupKey = tuple[str, tuple[Any, ...]]
 """Identity of an anatomy, and constants of its devices."""
-_KEPT = 4
-"""Walls that are kept for the next simulator; each takes 4 bytes a point of the distance map."""
-_walls: dict[tuple[Any, ...], Lumen] = {}
-"""The last walls that were made, the latest last."""
+_KEPT = 4  # walls that are kept for the next simulator; each takes 4 bytes a point of the distance map
+_walls: dict[tuple[Any, ...], Lumen] = {}  # the last walls that were made, the latest last
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,18 +35,15 @@ AMPLITUDES = {
 
 _LONG_AXIS = np.array(LEFT_VENTRICLE_AXIS) / np.linalg.norm(LEFT_VENTRICLE_AXIS)
 """From the base of the heart to its apex, LPS."""
-_LONG_AXIS_MM = 94.0
-"""Length of the left ventricle's outside along it, mm, as in the atlas."""
-_KNOTS = 64
-"""Knots of the spline through a period."""
+_LONG_AXIS_MM = 94.0  # length of the left ventricle's outside along it, mm, as in the atlas
+_KNOTS = 64  # knots of the spline through a period
 _PHASES, _CONTRACTED = (0.03, 0.34, 0.54, 0.74), (0.0, 1.0, 0.42, 0.22)
 """Shares of the contraction that are done at phases of the heartbeat, as shares of its period: where systole begins
 and ends, where the rapid filling ends and where the filling by the atria begins. Shortening is greatest at 0.34 (4D CT
 of 25 normal hearts; McVeigh et al., J Cardiovasc Comput Tomogr 2018). The others are such that the proximal and middle
 right coronary artery stays within 1 mm for about as long as published (Shechter et al., Med Phys 2005): 94 ms at
 end-systole, for 76 ± 34 ms, and 88 ms in mid-diastole, for 65 ± 42 ms."""
-_MID_DIASTOLE = 0.68
-"""Phase at which CT shows the vessel."""
+_MID_DIASTOLE = 0.68  # phase at which CT shows the vessel
 
 
 @settings

@@ -27,8 +27,7 @@ HELD_MM = 10.0
 TOLERANCE = 0.05
 """Relative error of the simulated tip load against the catalogue's that passes."""
 _ELEMENTS = 40
-_PLATE_N_MM = 100.0
-"""Stiffness of the plate, N/mm: a tip load moves it by some µm."""
+_PLATE_N_MM = 100.0  # stiffness of the plate, N/mm: a tip load moves it by some µm
 _PUSH_SHARE = 0.02
 """The holder is lowered by this share of the length. A buckled column's load grows by half of it, 1 %."""
 _SAMPLES = 20

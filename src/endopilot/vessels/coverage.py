@@ -30,8 +30,7 @@ _MOST_VOXELS, _MOST_INSIDE = 10_000_000, 300_000
 """A wall becomes at most as many voxels, and as many inside it: their middle is found in 4 s. Thin vessels stay whole
 in coarser voxels, since all that the wall touches are kept."""
 
-_DIAGONAL = 0.87
-"""A ball of this many grid steps in radius holds a grid point wherever it lies (√3/2)."""
+_DIAGONAL = 0.87  # a ball of this many grid steps in radius holds a grid point wherever it lies (√3/2)
 
 
 @dataclass(frozen=True, eq=False)

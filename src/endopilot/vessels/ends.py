@@ -19,22 +19,13 @@ from endopilot.vessels.surface import Surface
 STUB_COVERAGE, STUB_SLENDERNESS, STUB_MM = 1.2, 1.0, 1.0
 """How little of a branch counts as an end: a left main may be as short as it is wide."""
 
-_NEAR_MM = (1.5, 8.0)
-"""The calibre of an end is that of the lumen between these distances from it."""
-
-_HEADING_MM = (8.0, 16.0)
-"""An artery's first heading is that from its end to where it is between these distances."""
+_NEAR_MM = (1.5, 8.0)  # the calibre of an end is that of the lumen between these distances from it
+_HEADING_MM = (8.0, 16.0)  # an artery's first heading is that from its end to where it is between these distances
 
 _SMOOTH_MM = 1.5
-_BEGUN_RADII = 2.0
-"""Beyond this many of its radii from an end, a lumen's width is no longer that of its cap."""
-
-_MAJOR_MM = 15.0
-"""A branch with at least this much length behind it counts at the first fork."""
-
-
-_BLIND = 0.6
-"""An end whose cap is as round as a sphere counts this share of one that is cut flat."""
+_BEGUN_RADII = 2.0  # beyond this many of its radii from an end, a lumen's width is no longer that of its cap
+_MAJOR_MM = 15.0  # a branch with at least this much length behind it counts at the first fork
+_BLIND = 0.6  # an end whose cap is as round as a sphere counts this share of one that is cut flat
 
 _ROUND_CAP, _FLAT_CAP = 0.3, 0.7
 """Flat part of a cap over the section: at 0.4 mm voxels domes of 2 to 6 mm have 0.2 to 0.5, cuts 0.6 to 0.9."""
@@ -46,8 +37,7 @@ _LINE_ENDS, _NO_LINE = 0.5, 0.1
 """Lines run from the inlet, as VMTK writes them: one that ends at a place says this share of what one that begins there
 says for it; a place where no line begins or ends is as little likely as the second."""
 
-_RIVAL = 0.55
-"""Ends that look this much like the inlet as the best one are named."""
+_RIVAL = 0.55  # ends that look this much like the inlet as the best one are named
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,14 +13,9 @@ from endopilot.types import VesselTree
 from endopilot.vessels.graph import RootedGraph, groups, pieces
 from endopilot.vessels.line_graph import STEP_MM, FoundLines, LineGraph
 
-_SHORTEST_MM = 2.0
-"""Shorter stretches are left out together in one note, mm."""
-
-_MOST_NOTES = 12
-"""As many stretches or loops are noted one by one."""
-
-_OPEN_MM = 0.2
-"""A loop has a hole where the spheres on its two sides are this far apart, mm."""
+_SHORTEST_MM = 2.0  # shorter stretches are left out together in one note, mm
+_MOST_NOTES = 12  # as many stretches or loops are noted one by one
+_OPEN_MM = 0.2  # a loop has a hole where the spheres on its two sides are this far apart, mm
 
 
 def left_out(found: FoundLines, tree: VesselTree) -> tuple[list[str], dict[str, float]]:

@@ -40,11 +40,8 @@ _SHORTEST_MM = 2.0
 _RIVAL = 0.4
 """A coronary artery's lines that are not connected to a piece this share as long are those of another artery."""
 
-_NEIGHBOURS = 6
-"""Points of a line are compared with this many nearest ones."""
-
-_DISORDER = 2.0
-"""A line this many times as long as the shortest tree through its points is in no order."""
+_NEIGHBOURS = 6  # points of a line are compared with this many nearest ones
+_DISORDER = 2.0  # a line this many times as long as the shortest tree through its points is in no order
 
 _JUMP_STEPS, _JUMP_RADII = 8.0, 5.0
 """A step of more than this many usual ones, and of both radii this many times, leads to another vessel."""

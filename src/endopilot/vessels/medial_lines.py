@@ -21,8 +21,7 @@ from endopilot.vessels.graph import RootedGraph, VesselGraph, lumen_graph
 SMALLEST_PIECE = 12
 """A piece of fewer voxels is noise."""
 
-_NEIGHBOURS_APART = 1.8
-"""Voxels that share a corner lie this near each other, in voxels."""
+_NEIGHBOURS_APART = 1.8  # voxels that share a corner lie this near each other, in voxels
 
 _NEAR_VOXELS, _MOSTLY_DEEP = 5.0, 0.5
 """A search for the nearest border takes long from voxels deeper than this. Where this share of them is, as in an aorta

@@ -30,8 +30,7 @@ from endopilot.vessels.sources import (
 )
 from endopilot.vessels.surface import Surface
 
-_HEADER_BYTES = 65536
-"""Statements of axes and unit stand in the first bytes of a file."""
+_HEADER_BYTES = 65536  # statements of axes and unit stand in the first bytes of a file
 
 _LONGEST_S, _BYTES_A_SECOND = 30.0, 1e6
 """A file that takes longer to read than this, and than its size at this speed, is damaged."""
@@ -42,8 +41,7 @@ _SIMVASCULAR = {"ModelFaceID", "BranchId", "CenterlineSectionArea", "GlobalNodeI
 _SPACE = re.compile(r"\bSPACE\s*[=:]\s*[\"']?([A-Za-z][A-Za-z-]*)", re.IGNORECASE)
 _UNIT = re.compile(r"\bUNITS?\s*[=:]\s*[\"']?([A-Za-zµμ]+)", re.IGNORECASE)
 
-_FEWEST_BYTES = 16
-"""No format holds a vessel in fewer bytes."""
+_FEWEST_BYTES = 16  # no format holds a vessel in fewer bytes
 
 _PLY_KINDS = {"char": "i1", "uchar": "u1", "int8": "i1", "uint8": "u1", "short": "i2", "ushort": "u2", "int16": "i2",
               "uint16": "u2", "int": "i4", "uint": "u4", "int32": "i4", "uint32": "u4", "float": "f4", "float32": "f4",

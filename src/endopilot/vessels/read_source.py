@@ -37,8 +37,7 @@ _CONVERT = {
 """How a file that is not read becomes one that is, by its suffix."""
 
 
-_NUMBERED_AXES = {"0": "ras", "1": "lps"}
-"""Axes by the numbers of Slicer's older files."""
+_NUMBERED_AXES = {"0": "ras", "1": "lps"}  # axes by the numbers of Slicer's older files
 
 _NO_CENTERLINE = {
     "fiducial": "its points are in no order; convert it to a curve in Slicer's Markups module",

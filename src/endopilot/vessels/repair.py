@@ -25,17 +25,13 @@ NEAR_OSTIUM_MM = 5.0
 LARGEST_GAP_VOXELS = 4.0
 """Pieces of a mask that are this near each other are taken for one interrupted vessel."""
 
-_DIRECTION_VOXELS = 12.0
-"""A piece's direction at its end is that of its voxels within this distance."""
-
-_ONWARDS = 0.5
-"""Cosine of the largest angle between a piece and the gap that it is joined across."""
+_DIRECTION_VOXELS = 12.0  # a piece's direction at its end is that of its voxels within this distance
+_ONWARDS = 0.5  # cosine of the largest angle between a piece and the gap that it is joined across
 
 NOTED_MM = 5.0
 """What is left out or widened gets a remark of its own from this length; shorter pieces are summed up."""
 
-_MOST_JOINED = 200
-"""At most this many pieces of a mask are looked at as vessels or parts of them."""
+_MOST_JOINED = 200  # at most this many pieces of a mask are looked at as vessels or parts of them
 
 OTHER_SIDE = {"rca": "left coronary artery", "lca": "right coronary artery"}
 

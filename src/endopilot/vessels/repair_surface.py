@@ -23,35 +23,23 @@ from endopilot.vessels.surface import Surface, filled_box, surface_from_mask
 MOST_PIECES = 12
 """At most this many pieces of a surface are looked at as coronary arteries or parts of them."""
 
-_ACROSS = 120.0
-"""A surface is looked at in voxels of this share of its box's mean edge: 2 million."""
-
-_FACING = 0.12
-"""Of a wall of 1 to 3 mm round lumens of 2 to 6 mm 0.15 to 0.5 of the surface faces itself on both sides."""
-
-_HOLDS = 0.08
-"""A shell of voxels holds at least this share of its own number: half a sixth."""
-
-_OVERLAP = 20
-"""Surfaces that have no more voxels than this in common touch."""
-
-
-_MOST_VOXELS = 2_000_000
-"""A mask of more is looked at in blocks: 0.5 s."""
+_ACROSS = 120.0  # a surface is looked at in voxels of this share of its box's mean edge: 2 million
+_FACING = 0.12  # of a wall of 1 to 3 mm round lumens of 2 to 6 mm 0.15 to 0.5 of the surface faces itself on both sides
+_HOLDS = 0.08  # a shell of voxels holds at least this share of its own number: half a sixth
+_OVERLAP = 20  # surfaces that have no more voxels than this in common touch
+_MOST_VOXELS = 2_000_000  # a mask of more is looked at in blocks: 0.5 s
 
 _ENCLOSED = 16
 """A void is enclosed where the wall is met in this many of the 26 directions: 16 in the plane of a tube's open end,
 13 or fewer between two branches."""
 
-_REACH = 5
-"""The wall is looked for within 2 to the power of this many voxels."""
+_REACH = 5  # the wall is looked for within 2 to the power of this many voxels
 
 _UNIFORM, _LINING = 0.4, 0.9
 """A wall's thickness varies by at most this share of it (SD), and this share of it lines the lumen: not so a vessel
 with a catheter or an island in it."""
 
-_THICKEST = 4.0
-"""A wall is at most this many times as thick as its lumen's radius."""
+_THICKEST = 4.0  # a wall is at most this many times as thick as its lumen's radius
 
 
 def closed_surface(

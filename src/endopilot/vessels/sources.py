@@ -45,8 +45,7 @@ _LONGER_SD, _SHORTER_SD = 0.3, 0.9
 """Spread of ln(extent) about a kind's own; a file may hold a piece of the vessel, so that shorter costs less."""
 
 _UNITS = {"mm": 1.0, "cm": 10.0, "inches": 25.4, "dm": 100.0, "m": 1000.0, "tenths of mm": 0.1, "µm": 0.001}
-_RARE = {"tenths of mm": 0.02, "µm": 0.02}
-"""How likely a unit is against cm, before the sizes are looked at."""
+_RARE = {"tenths of mm": 0.02, "µm": 0.02}  # how likely a unit is against cm, before the sizes are looked at
 
 ASSUMED, BY_ARRAYS, STATED, ANSWERED = 4.0, 100.0, 1e4, 1e6
 """How much likelier a file's unit is what it was taken for than any other: by default, since arrays of a program that
@@ -55,8 +54,7 @@ has a usual unit are in it, since the file states the unit, and since the user d
 _CERTAIN, _FITS = 0.9, 0.05
 """A unit less probable than the first is asked for; the message names what has this share of the best one's chances."""
 
-_NONE = 1e-6
-"""Likelihood of sizes that are no vessel's; those of a kind's medians have 1."""
+_NONE = 1e-6  # likelihood of sizes that are no vessel's; those of a kind's medians have 1
 
 _NAMES = {**MM_PER_UNIT, "[in_i]": 25.4}
 """mm in each unit of length, by its names; `[in_i]` is the inch of UCUM, which Slicer writes."""

@@ -21,8 +21,7 @@ ACROSS_EDGES = 0.75
 thick slices keeps their steps, which are long in the plane; at 1, the crotch of two lumens at 30° fills."""
 
 _FIT_ITERATIONS = 8
-_BLOCK = 24
-"""Edge in voxels of the blocks that a mask is smoothed in."""
+_BLOCK = 24  # edge in voxels of the blocks that a mask is smoothed in
 
 BAND_MM = 2.5
 """How far outside the wall the distance map reaches, mm; beyond, it holds the constant −`BAND_MM`."""
@@ -31,8 +30,7 @@ MAXIMUM_GRID_POINTS = 20_000_000
 """A distance map holds at most this many grid points (80 MB of float32); the spacing grows until it fits."""
 
 _NEAREST_TRIANGLES = 4
-_WORTH_THREADS = 20_000
-"""With fewer points than this, starting threads takes longer than they save."""
+_WORTH_THREADS = 20_000  # with fewer points than this, starting threads takes longer than they save
 
 
 _SLICES = 16

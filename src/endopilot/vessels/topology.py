@@ -43,8 +43,7 @@ SHORTEST_TUNNEL_MM = 6.0
 MOST_LISTED = 8
 """As many places or pieces are listed one by one."""
 
-_SLIT_VOXELS = 3.0
-"""So are those whose opposite sides come as near each other as this, in voxels."""
+_SLIT_VOXELS = 3.0  # so are those whose opposite sides come as near each other as this, in voxels
 
 _APART, _STRAIGHT = (0.35, 0.5, 0.8), (0.6, 0.8)
 """Axes that stay apart by these shares of both radii together: of one vessel that touches itself, of two that perhaps

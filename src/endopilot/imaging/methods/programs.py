@@ -26,10 +26,8 @@ from endopilot.imaging.volume import SUFFIXES, read_volume, write_volume
 from endopilot.progress import progress
 from endopilot.types import Insertion, LumenMask, Volume
 
-_SEED_MM = 5.0
-"""A seed belongs to the lumen within this distance."""
-_MOUTH_MM = 8.0
-"""The vessel's direction at the first seed is that to the middle of the lumen within this distance."""
+_SEED_MM = 5.0  # a seed belongs to the lumen within this distance
+_MOUTH_MM = 8.0  # the vessel's direction at the first seed is that to the middle of the lumen within this distance
 _LONGEST_MESSAGE = 200
 _TOTALSEGMENTATOR = {"task": "coronary_arteries", "structure": "", "device": ""}
 """Task (`-ta`); structure whose mask is taken, by default the task's name; device (`-d`): gpu, cpu, gpu:1."""
