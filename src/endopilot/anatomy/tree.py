@@ -152,25 +152,3 @@ def cross_axes(direction: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "
     one = np.cross(direction, helper)
     one /= np.linalg.norm(one, axis=1, keepdims=True)
     return one, np.cross(direction, one)
-
-
-def curvature_torsion(centerline: Centerline) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Return curvature and torsion along a line, 1/mm, from the derivatives of a quartic fitted to the nine points
-    around each: κ = |r′×r″|/|r′|³ and τ = (r′×r″)·r‴/|r′×r″|², which is set to zero where the line is straight."""
-    count = len(centerline.points)
-    width = min(9, count)
-    if width < 5:
-        return np.zeros(count), np.zeros(count)
-    start = np.clip(np.arange(count) - width // 2, 0, count - width)
-    window = start[:, None] + np.arange(width)
-    offset = centerline.abscissa[window] - centerline.abscissa[:, None]
-    scale = np.abs(offset).max(axis=1)
-    powers = (offset / scale[:, None])[..., None] ** np.arange(5)
-    fit = np.linalg.pinv(powers) @ centerline.points[window]
-    first, second, third = (fit[:, k] * factor / scale[:, None] ** k for k, factor in ((1, 1.0), (2, 2.0), (3, 6.0)))
-    cross = np.cross(first, second)
-    size = np.linalg.norm(cross, axis=1)
-    speed = np.linalg.norm(first, axis=1)
-    curvature = size / np.maximum(speed, 1e-12) ** 3
-    torsion = np.einsum("ij,ij->i", cross, third) / np.maximum(size, 1e-12) ** 2
-    return curvature, np.where(curvature > 1e-4, torsion, 0.0)
