@@ -54,8 +54,18 @@ LISTED: Mapping[str, str] = MappingProxyType(
     }
 )
 """What `--help` lists of commands that have more than `LISTED_AT_MOST` flags: those that are set most often."""
-_EVERYWHERE = {"json": "print the figures as JSON.", "overwrite": "replace files that lie where this command writes."}
-"""Options that commands have without naming them."""
+_USUAL = {
+    "anatomy": "folder made by `endopilot anatomy` or `endopilot atlas`.",
+    "device": "name of a device (`endopilot devices`) or a YAML file.",
+    "json": "print the figures as JSON.",
+    "overwrite": "replace files that lie where this command writes.",
+    "phase": "cardiac phase, such as 75 (per cent), where a DICOM series holds several.",
+    "scheduler": "address of a Dask scheduler (tcp://host:8786) whose workers simulate and share these folders; the "
+    "cores of this machine if not given.",
+    "series": "number or instance UID of the series, where a DICOM folder holds several.",
+    "volume": "DICOM folder or file, NIfTI, NRRD or MHA, in HU.",
+}
+"""What options of several commands mean where a command says nothing else."""
 _WORDS = {bool: "", int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
 _POSITIONAL = get_args(Positional[Any])[1]
 
@@ -137,7 +147,7 @@ class Command:
 
     def options(self, values: Any = None) -> list[Option]:
         """Return its options, set to `values` or the defaults: its function's in order, then its settings'."""
-        meanings = _meanings(self._config) | _EVERYWHERE
+        meanings = _USUAL | _meanings(self._config)
         meanings |= {one.arg_name: _line(one.description) for one in self._text.params}
         found = _options(self.defaults if values is None else values, meanings, self._required)
         tree = {one.name: one for one in found}
