@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import pytest
 from analytic_shapes import forked_tree
 
 from endopilot.anatomy.labels import dominance, label_tree
 from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
-from endopilot.errors import InputError
 
 
 def test_right_coronary_sections_agree_with_the_atlas():
@@ -27,13 +25,6 @@ def test_right_coronary_sections_agree_with_the_atlas():
 
 def test_generic_names_count_generations():
     assert label_tree(forked_tree(), "generic").section_names == ("G0", "G1.1", "G1.2")
-
-
-def test_a_naming_map_renames_sections():
-    named = label_tree(forked_tree(), "generic", naming={"G0": "common iliac", "G1.2": "internal iliac"})
-    assert named.section_names == ("common iliac", "G1.1", "internal iliac")
-    with pytest.raises(InputError, match="no section 'G7'; this tree has G0"):
-        label_tree(forked_tree(), "generic", naming={"G7": "femoral"})
 
 
 def test_a_tree_names_only_the_sections_that_it_has():

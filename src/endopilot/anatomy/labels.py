@@ -6,7 +6,7 @@ Segments after Austen et al., Circulation 1975;51:5-40 (AHA) and Leipsic et al.,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -21,7 +21,6 @@ from endopilot.anatomy.labels_tree import (
     Labeller,
 )
 from endopilot.anatomy.labels_vessels import label_arch, label_cerebral, label_portal
-from endopilot.errors import InputError
 from endopilot.types import Branch, VesselTree
 from endopilot.vessels.coronary_ostia import Crux
 
@@ -41,31 +40,22 @@ _RULES: dict[str, tuple[tuple[str, ...], Callable[[Labeller], None]]] = {
 }
 
 
-def label_tree(
-    tree: VesselTree, scheme: Scheme, *, naming: Mapping[str, str] | None = None, crux: Crux | None = None
-) -> VesselTree:
-    """Return the tree (LPS mm) with every point's section; InputError where `naming` names one that the tree lacks.
+def label_tree(tree: VesselTree, scheme: Scheme, *, crux: Crux | None = None) -> VesselTree:
+    """Return the tree (LPS mm) with every point's section.
 
     Args:
         scheme: "rca" and "lca" name AHA/SCCT segments, "arch", "cerebral" and "portal" the vessels of these anatomies
             (`labels_tree` lists all names); "generic" names branches "G0", "G1.1", "G1.2", …: generation (bifurcations
             from the root), then order, widest first.
         crux: where the crux of the heart lies and which artery reaches it, if both are known.
-        naming: other names for some sections, such as {"G0": "superficial femoral artery"}.
     """
     if scheme == "generic":
-        labelled = _generic(tree)
-    else:
-        names, rules = _RULES[scheme]
-        sections = [np.zeros(len(branch.centerline.points), dtype=np.int64) for branch in tree.branches]
-        rules(Labeller(tree, names, sections, crux))
-        named = zip(tree.branches, sections, strict=True)
-        labelled = VesselTree(tuple(Branch(branch.centerline, branch.parent, own) for branch, own in named), names)
-    unknown = sorted(set(naming or ()) - set(labelled.section_names))
-    if unknown:
-        raise InputError(f"naming: no section '{unknown[0]}'; this tree has {', '.join(labelled.section_names)}")
-    renamed = tuple((naming or {}).get(name, name) for name in labelled.section_names)
-    return VesselTree(labelled.branches, renamed)
+        return _generic(tree)
+    names, rules = _RULES[scheme]
+    sections = [np.zeros(len(branch.centerline.points), dtype=np.int64) for branch in tree.branches]
+    rules(Labeller(tree, names, sections, crux))
+    named = zip(tree.branches, sections, strict=True)
+    return VesselTree(tuple(Branch(branch.centerline, branch.parent, own) for branch, own in named), names)
 
 
 def dominance(tree: VesselTree) -> str | None:

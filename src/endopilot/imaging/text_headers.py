@@ -118,8 +118,6 @@ def _nrrd_header(stream: BufferedIOBase, path: Path) -> tuple[dict[str, str], di
             raise InputError(f"{path}: its header is damaged ({text[:60]!r} is no field of its own); export it again")
         fields[name] = description.strip()
         if name == "data file" and fields[name].split()[:1] == ["LIST"]:
-            rest = stream.read(_LONGEST_HEADER).decode("utf-8", errors="replace").split("\n")
-            fields[name] += "\n" + "\n".join(part.strip() for part in rest if part.strip())
             return fields, keys
     if "data file" not in fields:
         raise InputError(f"{path}: truncated or damaged (its header does not end); copy or export it again")
@@ -254,9 +252,6 @@ def _meta_header(stream: BufferedIOBase, path: Path) -> dict[str, str]:
             raise InputError(f"{path}: its header is damaged ({name[:40]!r} is no field of its own); export it again")
         fields[name] = value.strip()
         if name == "ElementDataFile":
-            if fields[name].split()[:1] == ["LIST"]:
-                rest = stream.read().decode("utf-8", errors="replace").split("\n")
-                fields[name] = "LIST\n" + "\n".join(part.strip() for part in rest if part.strip())
             return fields
     raise InputError(f"{path}: truncated or damaged (its header does not end); copy or export it again")
 

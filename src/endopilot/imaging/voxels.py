@@ -17,7 +17,6 @@ from jaxtyping import Shaped
 
 from endopilot.errors import InputError
 
-_MOST_FILES = 100_000
 _GZIP = b"\x1f\x8b"
 
 
@@ -91,36 +90,17 @@ def _unpacked(stream: BufferedIOBase, packing: str, most: int) -> bytearray:
 def read_voxels_beside(
     spec: str | None, stream: BufferedIOBase, encoding: Encoding, shape: Sequence[int], *, header: Path
 ) -> tuple[Shaped[np.ndarray, "..."], tuple[Path, ...]]:
-    """Return the array (last axis fastest) of a text header, at the end of its stream or in files beside it, and all
-    files.
-
-    `spec` is what NRRD and MetaImage write: a name; a pattern such as `slice%03d.raw 1 300 1`; or LIST and names, one a
-    line, each file with the same share of the array; None where the array follows. Raises InputError where a file is
-    missing or damaged, or their number is wrong.
-    """
+    """Return the array (last axis fastest) of a text header, at its stream's end (`spec` None) or in the file beside
+    it that `spec` names, and all files. Raises InputError where that is missing or damaged."""
     if spec is None:
         return read_voxels(stream, encoding, shape, path=header), (header,)
-    first, *others = spec.split("\n")
-    words, names = first.split(), others
-    try:
-        if words[:1] != ["LIST"]:
-            low, high, step = (int(word) for word in words[1:4]) if "%" in first else (0, 0, 1)
-            numbers = range(low, high + 1, step)[:_MOST_FILES]
-            names = [words[0] % number for number in numbers] if "%" in first else [first]
-    except (TypeError, ValueError):
-        raise InputError(f"{header}: {first[:60]!r} names no files of voxels; export it as one file") from None
-    files, count = [header.parent / name for name in names], math.prod(int(extent) for extent in shape)
-    if not files or count % len(files):
-        shown = "×".join(map(str, shape[::-1]))
-        raise InputError(f"{header}: names {len(files)} files for {shown} voxels; export it again")
-    missing = next((file for file in files if not file.is_file()), None)
-    if missing is not None:
-        raise InputError(f"{header}: the file of voxels that it names is missing ({missing.name}); put it beside it")
-    parts = []
-    for file in files:
-        with file.open("rb") as content:
-            parts.append(read_voxels(content, encoding, (count // len(files),), path=file))
-    return np.concatenate(parts).reshape(tuple(shape)), (header, *files)
+    if "%" in spec or spec.split()[:1] == ["LIST"]:
+        raise InputError(f"{header}: its voxels are in several files; export it as one file")
+    file = header.parent / spec
+    if not file.is_file():
+        raise InputError(f"{header}: the file of voxels that it names is missing ({file.name}); put it beside it")
+    with file.open("rb") as content:
+        return read_voxels(content, encoding, shape, path=file), (header, file)
 
 
 def _numbers(content: bytes, dtype: np.dtype, count: int, path: Path) -> np.ndarray:
