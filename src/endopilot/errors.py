@@ -7,8 +7,7 @@ from collections.abc import Iterable
 from importlib.machinery import ExtensionFileLoader
 from types import FrameType
 
-STOPPING = (signal.SIGINT, signal.SIGTERM)
-"""Signals that stop a command and its worker processes."""
+STOPPING = (signal.SIGINT, signal.SIGTERM)  # signals that stop a command and its worker processes
 _LOADING = {each.__code__ for each in (ExtensionFileLoader.create_module, ExtensionFileLoader.exec_module)}
 _AGAIN_S = 0.02  # a signal that cannot stop the work where it arrives does so this much later, s: nobody notices
 

@@ -8,8 +8,7 @@ from contextlib import contextmanager
 
 from endopilot.errors import InputError
 
-FOR_DEVELOPERS = ("dev", "docs")
-"""Extras that no command needs."""
+FOR_DEVELOPERS = ("dev", "docs")  # extras that no command needs
 _IMPORTED_AS = {"mujoco-core": "mujoco"}  # libraries that are imported by another name
 
 

@@ -32,8 +32,7 @@ from endopilot import __version__
 from endopilot.errors import InputError
 
 _MIB = 2**20
-RECORD_FILE = "run.json"
-"""Says which run a folder belongs to."""
+RECORD_FILE = "run.json"  # says which run a folder belongs to
 _LARGEST_JSON, _LARGEST_YAML = 512 * _MIB, _MIB // 4
 """Bytes of a file that is read whole: recordings of long navigations have some MiB, settings some KiB."""
 _MOST_NODES = 100_000  # values that a YAML file may hold once its aliases are written out
@@ -54,8 +53,7 @@ _FULL = re.compile("no space left|disk quota exceeded|disk is full|file too larg
 """How libraries say it in exceptions of their own."""
 _LEAST_FREE = 64 * 1024
 """A disk with fewer free bytes than a page of some file systems takes is full, whatever a library says."""
-PARTIAL = ".part-"
-"""What the names of files begin with that are not whole yet."""
+PARTIAL = ".part-"  # what the names of files begin with that are not whole yet
 
 
 @contextmanager

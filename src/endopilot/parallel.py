@@ -21,10 +21,8 @@ from endopilot.progress import progress, silence
 T = TypeVar("T")
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 """Processor cores that this process may use: a batch system may leave it fewer than the machine has."""
-MOST_PROCESSES = 8
-"""A volume being processed takes some 1 GB of memory."""
-TO_CLEAN_UP_S = 5.0
-"""Time that a process which is stopped has to remove its half-written files, s; then it is killed."""
+MOST_PROCESSES = 8  # a volume being processed takes some 1 GB of memory
+TO_CLEAN_UP_S = 5.0  # time that a process which is stopped has to remove its half-written files, s; then it is killed
 
 
 def each(

@@ -36,8 +36,7 @@ if TYPE_CHECKING:  # slow to import
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SAMPLE_PERIOD_S = 0.5
-"""Time between two recorded samples, s: the paper records at 2 Hz."""
+SAMPLE_PERIOD_S = 0.5  # time between two recorded samples, s: the paper records at 2 Hz
 
 _AXES = ("x (to the patient's left), mm", "y (to the back), mm", "z (to the head), mm")
 _VIEWS = {"side": (1, 2), "front": (0, 2), "above": (0, 1)}

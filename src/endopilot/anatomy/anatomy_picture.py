@@ -26,8 +26,7 @@ from endopilot.files import writing
 from endopilot.plotting import plain_text, section_colors
 from endopilot.types import Anatomy, Centerline, Volume
 
-SECTIONS = 6
-"""Cross-sections that are drawn, evenly along the longest path."""
+SECTIONS = 6  # cross-sections that are drawn, evenly along the longest path
 
 WINDOW_HU = (-150.0, 650.0)
 _WIDTH = 15.0  # of the picture, inches

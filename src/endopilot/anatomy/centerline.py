@@ -16,8 +16,7 @@ from endopilot.types import DistanceMap, Insertion
 from endopilot.vessels.graph import Line, RootedGraph
 from endopilot.vessels.surface import Surface
 
-ROUNDNESS = 0.05
-"""A cross-section whose half-axes differ by less than twice this share of its radius counts as round."""
+ROUNDNESS = 0.05  # a cross-section whose half-axes differ by less than twice this share of its radius counts as round
 
 _RING = 12
 _FEWEST_DIRECTIONS = 5

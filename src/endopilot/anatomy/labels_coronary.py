@@ -14,20 +14,14 @@ ACUTE_MARGIN = 0.64
 USUAL_CRUX_MM, NEAREST_CRUX_MM = 140.0, 120.0
 """Path from the right ostium to the crux; 122 to 170 mm in six real patients."""
 
-SHORT_MM = 60.0
-"""A coronary artery whose longest path is shorter than this is cut off, occluded, or a vestige."""
-
-CRUX_FORK_MM = 25.0
-"""The fork at the crux lies within this much of the path from where the path passes the crux, mm."""
+SHORT_MM = 60.0  # a coronary artery whose longest path is shorter than this is cut off, occluded, or a vestige
+CRUX_FORK_MM = 25.0  # the fork at the crux lies within this much of the path from where the path passes the crux, mm
 
 BEYOND_CRUX_MM, FORWARDS_MM = 15.0, 8.0
 """A vessel that goes on for the first beyond the crux and turns forwards by the second is a posterior descending."""
 
-MAJOR_MM = 6.0
-"""A branch with at least this much length behind it counts as a named end vessel, mm."""
-
-NAMED_MM = 15.0
-"""Branches of the left main, and a ramus intermedius, have at least this much length behind them, mm."""
+MAJOR_MM = 6.0  # a branch with at least this much length behind it counts as a named end vessel, mm
+NAMED_MM = 15.0  # branches of the left main, and a ramus intermedius, have at least this much length behind them, mm
 
 USUAL_LEFT_MAIN_MM, LONGEST_LEFT_MAIN_MM = 5.0, 30.0
 """Length of the left main: the median of sixteen real ones (5 to 95 %: 1 to 15 mm), and more than any has, mm."""

@@ -14,8 +14,7 @@ from endopilot.anatomy.distance import CATHETER_LENGTH_MM, add_catheter
 from endopilot.types import Anatomy, DistanceMap
 
 _CHUNK = 1 << 18  # points of the grid that are looked at together
-LEAST_MM = 0.02
-"""Radius of a lumen that is closed, mm."""
+LEAST_MM = 0.02  # radius of a lumen that is closed, mm
 
 
 def with_radii(anatomy: Anatomy, radii: Sequence[Float[np.ndarray, "_"]]) -> Anatomy:

@@ -15,8 +15,7 @@ from endopilot.vessels.line_checks import closures, left_out
 from endopilot.vessels.line_graph import found_lines
 from endopilot.vessels.sources import Polylines
 
-SAMPLE_STEP_MM = 0.1
-"""Distance of the points by which two trees are compared."""
+SAMPLE_STEP_MM = 0.1  # distance of the points by which two trees are compared
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,10 +28,8 @@ from endopilot.types import Anatomy, Branch, Centerline, DistanceMap, Insertion,
 
 IN_PLANE_MM, SLICE_MM = (0.6, 0.75), (0.5, 0.5)
 """Range of the voxels' edges, mm."""
-TAKEN_IN = (0.4, 0.8)
-"""Voxels count as lumen up to this share of their edge outside of the wall."""
-NARROWEST_MM = (0.6, 0.9)
-"""A vessel ends in the mask where it stays narrower than this radius, mm."""
+TAKEN_IN = (0.4, 0.8)  # voxels count as lumen up to this share of their edge outside of the wall
+NARROWEST_MM = (0.6, 0.9)  # a vessel ends in the mask where it stays narrower than this radius, mm
 _SCANS = 4
 _MARGIN_MM = 3.0
 
@@ -123,8 +121,7 @@ def rasterised(
     return Volume(voxels, voxel_mm, origin, np.eye(3))
 
 
-CATHETER_LENGTH_MM = 30.0
-"""Length of catheter behind the ostium that the distance map holds, mm."""
+CATHETER_LENGTH_MM = 30.0  # length of catheter behind the ostium that the distance map holds, mm
 
 _KINDS: dict[str, Callable[[np.random.Generator, float, Population], tuple[VesselTree, dict[str, Any]]]] = {
     "rca": make_rca,
@@ -134,8 +131,7 @@ _KINDS: dict[str, Callable[[np.random.Generator, float, Population], tuple[Vesse
     "arch": make_arch,
 }
 
-VESSELS = tuple(_KINDS)
-"""Names of the kinds of vessel trees."""
+VESSELS = tuple(_KINDS)  # names of the kinds of vessel trees
 
 
 @settings

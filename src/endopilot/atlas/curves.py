@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from endopilot.lines import length_along
 
-STEP_MM = 0.5
-"""Distance between neighbouring centerline points, mm."""
+STEP_MM = 0.5  # distance between neighbouring centerline points, mm
 
 _HEIGHT_MM = 3.0  # side branches run this far above the surface that they follow, mm: in epicardial fat
 

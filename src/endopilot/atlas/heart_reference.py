@@ -30,8 +30,7 @@ from endopilot.lines import length_along, places_on
 
 LEFT_VENTRICLE_AXIS = (38.0, -68.0, -22.0)
 
-Numbers = Sequence[float | int]
-"""Coordinates or sizes, mm."""
+Numbers = Sequence[float | int]  # coordinates or sizes, mm
 
 _WARP_WIDTH_MM = 22.0
 _GRID_MM = 2.0
@@ -191,11 +190,9 @@ def _course(name: str) -> Float[np.ndarray, "n 3"]:
 
 TO_CRUX, LAD, LCX, INFERIOR = map(_course, ("to_crux", "lad", "lcx", "inferior"))
 BEYOND_CRUX = {section: _course(section) for section in ("4", "16")}
-FORK = LAD[0]
-"""End of the left main artery, mm from the left ostium, as the courses of the left artery are."""
+FORK = LAD[0]  # end of the left main artery, mm from the left ostium, as the courses of the left artery are
 _REFERENCE_LAD, _REFERENCE_LCX = map(_course, ("reference_lad", "reference_lcx"))
-LEFT_OSTIUM = _REFERENCE_LAD[0]
-"""The left coronary ostium on the reference heart's aortic root, mm."""
+LEFT_OSTIUM = _REFERENCE_LAD[0]  # the left coronary ostium on the reference heart's aortic root, mm
 
 
 def fit_left_heart(

@@ -18,8 +18,7 @@ from endopilot.atlas.branching import NoShape, SidePlan, truncated
 from endopilot.atlas.population import Population, Spread
 from endopilot.types import Centerline, VesselTree
 
-TIGHTEST = 0.97
-"""Greatest curvature times radius of a main vessel: at 1 the lumen's inner wall shrinks to a point."""
+TIGHTEST = 0.97  # greatest curvature times radius of a main vessel: at 1 the lumen's inner wall shrinks to a point
 
 _TRIES = 12
 _MOST_BENDS = 2.5  # no patient's mean number of sharp bends is more than this many times that of all

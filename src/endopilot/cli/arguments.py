@@ -51,11 +51,9 @@ class ListenConfig:
 
 
 MUST_EXIST = "must exist"
-Existing = Annotated[Path, MUST_EXIST]
-"""A file or folder that must be there when the command begins."""
+Existing = Annotated[Path, MUST_EXIST]  # a file or folder that must be there when the command begins
 IS_FOLDER, IS_FILE = "folder that is written", "file that is written"
-Picture = Annotated[Path, AfterValidator(_named_png), IS_FILE]
-"""A picture to be written."""
+Picture = Annotated[Path, AfterValidator(_named_png), IS_FILE]  # a picture to be written
 OutputFolder = Annotated[Path, arg(aliases=("-o",), metavar="DIR"), IS_FOLDER]
 OutputFile = Annotated[Path, arg(aliases=("-o",), metavar="FILE"), IS_FILE]
 

@@ -29,8 +29,7 @@ EXIT_BAD_INPUT = 2
 EXIT_DEFECT = 70
 EXIT_INTERRUPTED = 128 + signal.SIGINT
 EXIT_UNREAD = 141
-TO_END_S = 10.0
-"""Time in which a command that is stopped tidies up, s; then it leaves."""
+TO_END_S = 10.0  # time in which a command that is stopped tidies up, s; then it leaves
 LEAST_MEMORY = 2**30
 """Address space, bytes, that the libraries of a command take: `endopilot anatomy` of the smallest mask maps 1.0 GB. In
 less, OpenBLAS hangs or ends the process while it is loaded."""

@@ -19,8 +19,7 @@ from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import BelievedTip, Believer, Decision, Led, Observation, Policy
 from endopilot.tasks.navigation import Navigation, Target
 
-SECONDS = 600.0
-"""Time that a policy is given, s."""
+SECONDS = 600.0  # time that a policy is given, s
 _SEED = 1
 _UNTURNED_RAD = np.radians(5.0)
 

@@ -30,8 +30,7 @@ from endopilot.simulation.trajectory import TRAJECTORY, Trajectory, read_traject
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.tasks.task import Task
 
-FRAME_S = 0.05
-"""Time from one frame of a film to the next, s."""
+FRAME_S = 0.05  # time from one frame of a film to the next, s
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,8 +20,7 @@ from endopilot.xray.absorbers import is_coronary, surroundings
 from endopilot.xray.carm import view_at
 from endopilot.xray.image import Plane, XrayImager
 
-CONTRAST_S = 2.0
-"""How long an injection fills the vessel, s; then the blood washes it out."""
+CONTRAST_S = 2.0  # how long an injection fills the vessel, s; then the blood washes it out
 _FILL_S, _WASH_S, _GONE = 0.2, 0.4, 0.02
 _COARSE, _FINE = 96, 256
 _NICE = 10  # of the thread that computes views: the wire goes first

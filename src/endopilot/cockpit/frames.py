@@ -16,8 +16,7 @@ from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import Anatomy
 
 _TYPES = {np.dtype("<f4"): "f4", np.dtype("<u4"): "u4", np.dtype("u1"): "u1"}
-WALL_TRIANGLES = 14_000
-"""Triangles of the lumen in the page at most: software rendering must keep up."""
+WALL_TRIANGLES = 14_000  # triangles of the lumen in the page at most: software rendering must keep up
 _POINT_MM = 1.0  # distance between the points of the centerline in the page, mm
 
 

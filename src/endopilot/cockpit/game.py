@@ -23,8 +23,7 @@ from endopilot.ladder.attempt import Terms, attempt, navigation_seed, scored
 from endopilot.parallel import Workers
 from endopilot.tasks.task import CORE, Task
 
-RIVAL = "agent"
-"""The policy whose score stands beside a person's."""
+RIVAL = "agent"  # the policy whose score stands beside a person's
 _SHOWN = ("success", "safe", "seconds", "exposures", "peak_force_n", "path_ratio", "reason")
 
 

@@ -8,8 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from endopilot.devices.catheter import MOST_CATHETERS
 
-LONGEST_MESSAGE = 2048
-"""A longer message closes the connection, bytes."""
+LONGEST_MESSAGE = 2048  # a longer message closes the connection, bytes
 _LONGEST_ANSWER = 300
 _Speed = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]
 _Angle = Annotated[float, Field(ge=-180, le=180, allow_inf_nan=False)]

@@ -31,8 +31,7 @@ from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 
 FORMAT = "endopilot cockpit 3"
 SUFFIX = ".cockpit.jsonl"
-CHECK_S = 0.25
-"""Time from one check to the next, s."""
+CHECK_S = 0.25  # time from one check to the next, s
 
 
 @dataclass(frozen=True)

@@ -33,12 +33,9 @@ from endopilot.cockpit.session import Loop, Stage
 from endopilot.errors import InputError
 
 WEB = Path(__file__).parent / "web"
-MOST_PAGES = 8
-"""Pages that may look at once."""
-MOST_PER_SECOND = 200
-"""Messages that a page may send in a second."""
-MOST_FAULTS = 20
-"""Messages of a page that may be refused before its connection is closed."""
+MOST_PAGES = 8  # pages that may look at once
+MOST_PER_SECOND = 200  # messages that a page may send in a second
+MOST_FAULTS = 20  # messages of a page that may be refused before its connection is closed
 REFUSED, BUSY = 4403, 4429
 """Why a WebSocket is closed: wrong token or origin; too many pages, messages or faults."""
 
@@ -254,8 +251,7 @@ def _headers(index: str) -> dict[str, str]:
     }
 
 
-MOST_CONNECTIONS = 64
-"""Connections at once, those that have not asked for anything yet included."""
+MOST_CONNECTIONS = 64  # connections at once, those that have not asked for anything yet included
 _TOKEN_BYTES = 16
 
 

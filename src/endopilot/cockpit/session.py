@@ -24,12 +24,9 @@ from endopilot.errors import InputError
 from endopilot.tasks.navigation import Target
 from endopilot.tasks.targets import find_target
 
-SILENCE_S = 0.2
-"""The drive stops after this time without a message from whose hand drives, s."""
-HICCUP_S = 0.5
-"""What a hand holds goes on after a silence up to this long; after a longer one it must let go first, s."""
-AUTOPILOT_SILENCE_S = 1.0
-"""The autopilot pauses after this time without a message from the page that started it, s."""
+SILENCE_S = 0.2  # the drive stops after this time without a message from whose hand drives, s
+HICCUP_S = 0.5  # what a hand holds goes on after a silence up to this long; after a longer one it must let go first, s
+AUTOPILOT_SILENCE_S = 1.0  # the autopilot pauses after this time without a message from the page that started it, s
 
 
 class Session:

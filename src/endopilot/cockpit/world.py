@@ -21,8 +21,7 @@ from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation
 from endopilot.types import TipProjection
 
-BY_HAND = LoopConfig(cycle_s=0.0125)
-"""A hand's commands act sooner than a policy's, and pages show as many pictures."""
+BY_HAND = LoopConfig(cycle_s=0.0125)  # a hand's commands act sooner than a policy's, and pages show as many pictures
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,8 +26,7 @@ from endopilot.simulation.motion import Motion
 from endopilot.simulation.world import World
 
 SPLITS = ("train", "seen_test", "calibrate", "test")
-DEFAULT_ANATOMY_SHARES = (0.6, 0.2, 0.2)
-"""Shares of the anatomies that train, calibrate and test."""
+DEFAULT_ANATOMY_SHARES = (0.6, 0.2, 0.2)  # shares of the anatomies that train, calibrate and test
 
 
 def assign_splits(
@@ -91,8 +90,7 @@ def _digest(text: str) -> bytes:
     return hashlib.sha256(text.encode()).digest()
 
 
-FORMAT_VERSION = 7
-"""Counts changes of the columns or of their meaning."""
+FORMAT_VERSION = 7  # counts changes of the columns or of their meaning
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,8 +30,7 @@ from endopilot.simulation.state import Step
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, TipProjection, VesselTree
 
-TIP_GROUP = 8
-"""Navigations, from the first on, that share a drawn tip: a simulation has one rod."""
+TIP_GROUP = 8  # navigations, from the first on, that share a drawn tip: a simulation has one rod
 SURPLUS = (1.0, 3.0)
 """Range of what a navigation's drawn velocities are multiplied by before they become loads of the drive: how much more
 than a free wire needs. It is drawn uniformly, and the result kept within the device's fastest velocities."""
@@ -127,12 +126,10 @@ def _loads(
     )
 
 
-STOP_SHORT_MM = 5.0
-"""A tip is driven no nearer than this to the end of its branch, mm."""
+STOP_SHORT_MM = 5.0  # a tip is driven no nearer than this to the end of its branch, mm
 PULL_BACK_MM = 15.0
 """Length by which a wire that came to an end, or is caught, is pulled back before it is pushed again, mm."""
-CAUGHT = 0.5
-"""Share of the device's push limit at which a wire counts as caught."""
+CAUGHT = 0.5  # share of the device's push limit at which a wire counts as caught
 _ROUNDING_MM = 1e-2  # a wire this near to its pull-back target counts as pulled back
 
 

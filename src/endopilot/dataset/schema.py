@@ -31,8 +31,7 @@ INDEX_COLUMNS = ("index", "episode_index", "frame_index", "task_index")
 
 VELOCITY = list(SIGNALS["control"].columns)
 LOAD = ["drive_force_n", "drive_torque_nmm"]
-STATE = ("inserted_length", "rotation", "tip_abscissa", "tip_offset")
-"""Signals that `observation.state` is made of."""
+STATE = ("inserted_length", "rotation", "tip_abscissa", "tip_offset")  # signals that `observation.state` is made of
 _TYPES = {"slip": "float64", "rotation_slip": "float64", "tip_branch": "int64", "valid": "bool"}
 """Of columns that are not float32."""
 

@@ -20,8 +20,7 @@ from endopilot.files import read_text, write_yaml
 from endopilot.settings import NonNegative, Positive, Text, Within, read_settings, settings
 
 _SHIPPED = Path(__file__).parent / "catheters"
-MOST_CATHETERS = 2
-"""Catheters that a wire can have around it."""
+MOST_CATHETERS = 2  # catheters that a wire can have around it
 
 
 @settings

@@ -30,8 +30,7 @@ class Transmission:
     twist_friction_n_mm_mm: Annotated[float, Within(0, 1)] = 0.0
 
 
-SHOWN_BEHIND_MM = 20.0
-"""Length of devices that pictures show behind the ostium, in the guiding catheter, mm."""
+SHOWN_BEHIND_MM = 20.0  # length of devices that pictures show behind the ostium, in the guiding catheter, mm
 _APART_MM = 1e-6  # nodes nearer to a tip than this are the tip, mm
 Proximals = tuple[tuple[float, float], ...]
 """Of each of some devices' proximal ends a length and an angle, or their rates."""

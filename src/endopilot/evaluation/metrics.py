@@ -21,11 +21,8 @@ PAPER_ERRORS: Mapping[str, Mapping[str, Mapping[str, float]]] = {
 }
 """Mean and SD of the absolute tip error, mm, as Kim et al. publish them (Hamlyn 2023, arXiv 2304.09286)."""
 
-DIVERGED_MM = 2.0
-"""A rollout whose absolute error of Δtip passes this, mm, once or more, has diverged."""
-
-OFF_WALL_MM = 0.1
-"""A tip with more than this between wire and wall, mm, is off the wall."""
+DIVERGED_MM = 2.0  # a rollout whose absolute error of Δtip passes this, mm, once or more, has diverged
+OFF_WALL_MM = 0.1  # a tip with more than this between wire and wall, mm, is off the wall
 
 
 DEPTHS_MM: tuple[float, ...] = (0.0, 30.0, 60.0, 90.0, math.inf)

@@ -126,8 +126,7 @@ def replay(recorded: Recorded, controls: Mapping[str, Control], advance: Advance
     return out
 
 
-EXPOSURE_PERIOD_S = 10.0
-"""Time between X-ray images after the given states, s."""
+EXPOSURE_PERIOD_S = 10.0  # time between X-ray images after the given states, s
 
 
 def exposures(data: Dataset) -> list[int]:
@@ -228,8 +227,7 @@ def follow_slack(data: Dataset, given: int) -> Float[np.ndarray, "episodes sampl
     return np.stack([travel / data.sample_period_s, np.zeros_like(travel)], axis=-1)
 
 
-PROTOCOLS = ("forward", "inverse", "dual")
-"""What a predictor does with the episodes of each patient."""
+PROTOCOLS = ("forward", "inverse", "dual")  # what a predictor does with the episodes of each patient
 
 
 def count_steps(data: Dataset) -> int:

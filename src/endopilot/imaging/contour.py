@@ -19,8 +19,7 @@ _SURROUNDINGS_MM = 1.2  # width of the window in which the surroundings' HU are 
 _WALL_HU = 0.0
 """Even in fat and lung, the vessel's own wall lies next to the lumen: half a millimetre of soft tissue, blurred."""
 _BLOCK = 8  # edge of the blocks in which voxels near the vessel are looked for, voxels
-CALCIUM = 1.5
-"""Times the lumen's HU; brighter voxels are calcium or metal."""
+CALCIUM = 1.5  # times the lumen's HU; brighter voxels are calcium or metal
 _FEWEST_VOXELS = 5  # smaller bright specks are noise
 _RIM_MM = 1.2  # blur spreads calcium's brightness this far: at a distance of three of its widths nothing is left
 

@@ -23,11 +23,8 @@ from endopilot.imaging.voxels import compact
 from endopilot.settings import public
 from endopilot.types import Insertion, LumenMask, Volume
 
-SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha")
-"""File formats that are read and written, by suffix."""
-
-MASK_SUFFIXES = (*SUFFIXES, dicom_seg.SUFFIX)
-"""File formats of masks, by suffix; the last is a DICOM-SEG object."""
+SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha")  # file formats that are read and written, by suffix
+MASK_SUFFIXES = (*SUFFIXES, dicom_seg.SUFFIX)  # file formats of masks, by suffix; the last is a DICOM-SEG object
 
 _READ_ONLY_SUFFIXES = (".mhd", ".nhdr")
 _SMALLEST_SIZE = 4  # fewer voxels than this along an axis are no volume: a slice, or a scout view

@@ -50,11 +50,8 @@ SERIES_STYLE: dict[str, dict] = {
 }
 
 
-WINDOW_HU = (-150.0, 650.0)
-"""Grey window of CTA pictures, HU: from fat to well-filled lumen."""
-
-CROP_MARGIN_MM = 18.0
-"""What is shown of the volume around the vessel, mm."""
+WINDOW_HU = (-150.0, 650.0)  # grey window of CTA pictures, HU: from fat to well-filled lumen
+CROP_MARGIN_MM = 18.0  # what is shown of the volume around the vessel, mm
 
 
 def tip_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:

@@ -26,12 +26,10 @@ from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import Task, list_tasks
 
 PAGE_FILE = "index.html"
-SHOWN = 5
-"""Patients of each task that the pictures show."""
+SHOWN = 5  # patients of each task that the pictures show
 OUTCOMES = {"safe success": GREEN, "success, but too large a force": ORANGE, "not reached": VERMILLION}
 
-XRAY = {"color": BLACK, "marker": "o", "ms": 4.5, "mfc": "none", "mew": 0.8, "ls": "none"}
-"""How an exposure is drawn."""
+XRAY = {"color": BLACK, "marker": "o", "ms": 4.5, "mfc": "none", "mew": 0.8, "ls": "none"}  # how an exposure is drawn
 
 
 def write_page(output: Path) -> Path:

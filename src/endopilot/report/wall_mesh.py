@@ -11,8 +11,7 @@ from skimage.measure import marching_cubes
 
 from endopilot.types import DistanceMap
 
-MAX_TRIANGLES = 45_000
-"""Triangles of a wall at most: some 1.5 MB in a page."""
+MAX_TRIANGLES = 45_000  # triangles of a wall at most: some 1.5 MB in a page
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,7 @@ from endopilot.errors import InputError
 from endopilot.simulation.config import FREE_BEHIND_MM, Actuation
 from endopilot.types import Anatomy
 
-ROUNDING_MM = 1e-2
-"""An inserted length may be rounded this far below 0, mm."""
+ROUNDING_MM = 1e-2  # an inserted length may be rounded this far below 0, mm
 
 
 def check_distance_map(anatomy: Anatomy) -> None:

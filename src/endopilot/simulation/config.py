@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 else:  # each build of the core has classes of its own
     CoreMotion = CoreTransmission = Lumen = Options = RodModel = Simulation = Tubes = Any
 
-Processor = Literal["cpu", "cuda"]
-"""Where worlds are stepped: the processor's threads, or a CUDA GPU."""
+Processor = Literal["cpu", "cuda"]  # where worlds are stepped: the processor's threads, or a CUDA GPU
 
 
 def core_for(processor: Processor) -> Any:
@@ -56,10 +55,8 @@ def gpu_errors(processor: Processor) -> Iterator[None]:
         raise InputError(f"processor: 'cuda': {error}; simulate fewer worlds at once, or give 'cpu'") from None
 
 
-FREE_BEHIND_MM = 3.0
-"""Nodes farther behind the ostium than this follow the drive exactly, mm."""
-LANES = _core.LANES
-"""Worlds that one thread steps side by side."""
+FREE_BEHIND_MM = 3.0  # nodes farther behind the ostium than this follow the drive exactly, mm
+LANES = _core.LANES  # worlds that one thread steps side by side
 _DENT_MM = 0.015
 """Depth to which a node that bears all that the drives can push with dents a wall of no given stiffness, mm."""
 _HARD_PUSH_N = 2.0  # push that stands for the limit of a drive that has none, N
@@ -151,8 +148,7 @@ class SimulatorConfig:
         return min(self.threads or CORES, -(-worlds // lanes))
 
 
-Preset = Literal["default", "fast", "accurate"]
-"""Names of `PRESETS`."""
+Preset = Literal["default", "fast", "accurate"]  # names of `PRESETS`
 PRESETS: Mapping[Preset, SimulatorConfig] = MappingProxyType(
     {
         "default": SimulatorConfig(),

@@ -26,19 +26,15 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState, Step
 from endopilot.types import Anatomy, DistanceMap, Insertion
 
-STEP_S = 0.002
-"""Time step of MuJoCo, s."""
+STEP_S = 0.002  # time step of MuJoCo, s
 SETTLE_S = 0.06
 """Time in which the joints come to rest, s. Velocities are taken away after each step, so that an inertia of stiffness
 times this and the step damps a joint, in the equations that contacts solve too, and nothing swings."""
 SHELL_MM = 0.4
 """Thickness of the wall's triangles, mm: they lie so far outside the lumen. A thinner wall lets a node through."""
-MESH_MM = 0.4
-"""Spacing of the grid that the wall's triangles are found on, mm."""
-BEHIND_MM = 3.0
-"""Joints farther behind the ostium are held straight, mm; no wall is needed there."""
-LEAP_MM = 0.1
-"""A node that would move farther in a step is damped more, as where the wire snaps over, mm."""
+MESH_MM = 0.4  # spacing of the grid that the wall's triangles are found on, mm
+BEHIND_MM = 3.0  # joints farther behind the ostium are held straight, mm; no wall is needed there
+LEAP_MM = 0.1  # a node that would move farther in a step is damped more, as where the wire snaps over, mm
 _SLOWEST = 256
 _HELD = 1e3  # inertia of a joint that is held, N·mm·s²
 _BASE_INERTIA = 1e6  # of the base, which follows the drive, N·s²/mm and N·mm·s²

@@ -23,8 +23,7 @@ from endopilot.simulation.rod import LONGEST_ELEMENTS, RodLayout, lay_out
 from endopilot.simulation.tubes import lay_out_transmission, lay_out_tubes
 from endopilot.types import Anatomy, DistanceMap, VesselTree
 
-FINE_MM = 0.2
-"""Spacing of a finer grid, mm, at most: a tube's axis then reads at most 0.1 mm too near to the wall."""
+FINE_MM = 0.2  # spacing of a finer grid, mm, at most: a tube's axis then reads at most 0.1 mm too near to the wall
 
 _APART_MM = 0.1  # distance between the points of the guiding catheter's axis that are looked at, mm
 
@@ -94,8 +93,7 @@ def _inscribed_spheres(wall: Lumen, anatomy: Anatomy) -> Float[np.ndarray, "line
     return np.concatenate([*lines, [guiding]])
 
 
-GroupKey = tuple[str, tuple[Any, ...]]
-"""Identity of an anatomy, and constants of its devices."""
+GroupKey = tuple[str, tuple[Any, ...]]  # identity of an anatomy, and constants of its devices
 _KEPT = 4  # walls that are kept for the next simulator; each takes 4 bytes a point of the distance map
 _walls: dict[tuple[Any, ...], Lumen] = {}  # the last walls that were made, the latest last
 

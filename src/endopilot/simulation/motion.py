@@ -19,8 +19,7 @@ from endopilot.atlas.heart_reference import LEFT_VENTRICLE_AXIS
 from endopilot.settings import Finite, Within, settings
 from endopilot.simulation.config import CoreMotion, Processor, core_for
 
-MotionName = Literal["still", "breathing", "heartbeat", "both"]
-"""Names of motions: see `motion_named`."""
+MotionName = Literal["still", "breathing", "heartbeat", "both"]  # names of motions: see `motion_named`
 Axis = Float[np.ndarray, "3"]
 
 AMPLITUDES = {

@@ -63,8 +63,7 @@ class Recorder:
         )
 
 
-Seed = Sequence[int]
-"""Seed of one robot: of its gains, its jitter and its noise."""
+Seed = Sequence[int]  # seed of one robot: of its gains, its jitter and its noise
 
 
 def in_grip(stack: Stack, robot: RobotConfig, core: SimulatorConfig) -> tuple[Stack, SimulatorConfig]:

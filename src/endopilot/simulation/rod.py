@@ -12,8 +12,7 @@ from scipy.optimize import brentq
 from endopilot.devices.device import Wire
 from endopilot.simulation.config import Processor, RodModel, core_for
 
-POISSON_RATIO = 0.3
-"""Of steel and nitinol; it ties shear to bending stiffness."""
+POISSON_RATIO = 0.3  # of steel and nitinol; it ties shear to bending stiffness
 SHEAR_CORRECTION = 6 * (1 + POISSON_RATIO) / (7 + 6 * POISSON_RATIO)
 """Cowper's shear coefficient of a round section (J. Appl. Mech. 33, 1966)."""
 _DRAG_N_S_MM2, _SOFT_N_MM2 = 5e-6, 0.1

@@ -30,8 +30,7 @@ blunt tip of a 7 French catheter (pigs; Shah et al., Europace 2011). No such fig
 or cerebral artery."""
 
 
-LONGEST_MM = 5000.0
-"""No wire or catheter is longer, mm: exchange wires have up to 4.5 m."""
+LONGEST_MM = 5000.0  # no wire or catheter is longer, mm: exchange wires have up to 4.5 m
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ from endopilot.simulation.motion import Motion
 from endopilot.simulation.signals import SolvedOutputs, described
 from endopilot.types import Anatomy
 
-FORMAT_VERSION = 4
-"""Of `SimulatorState`: raised when its values or its fingerprint come to mean something else."""
+FORMAT_VERSION = 4  # of `SimulatorState`: raised when its values or its fingerprint come to mean something else
 
 
 @runtime_checkable

@@ -22,10 +22,8 @@ from endopilot.simulation.core import run_core
 from endopilot.simulation.rod import POISSON_RATIO, SHEAR_CORRECTION, RodLayout
 from endopilot.types import Insertion
 
-HELD_MM = 10.0
-"""Distance from the tip at which the test holds the wire, mm."""
-TOLERANCE = 0.05
-"""Relative error of the simulated tip load against the catalogue's that passes."""
+HELD_MM = 10.0  # distance from the tip at which the test holds the wire, mm
+TOLERANCE = 0.05  # relative error of the simulated tip load against the catalogue's that passes
 _ELEMENTS = 40
 _PLATE_N_MM = 100.0  # stiffness of the plate, N/mm: a tip load moves it by some µm
 _PUSH_SHARE = 0.02

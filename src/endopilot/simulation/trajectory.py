@@ -40,10 +40,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure  # slow to import
 
-TRAJECTORY = "trajectory.npz"
-"""Name of the file in a folder that holds one navigation or plan."""
-FORMAT_VERSION = 1
-"""Of the .npz file: raised when an array comes to mean something else."""
+TRAJECTORY = "trajectory.npz"  # name of the file in a folder that holds one navigation or plan
+FORMAT_VERSION = 1  # of the .npz file: raised when an array comes to mean something else
 _FORMAT = "endopilot trajectory"
 _REASONS = {1: "left the finite numbers", 2: "did not converge", 3: "went through the wall"}
 """Meaning of `Trajectory.reason` for an invalid world."""

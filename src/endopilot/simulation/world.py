@@ -38,8 +38,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion, MotionName, motion_named
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
-NOMINAL = "nominal"
-"""Name of the world that is as it is given."""
+NOMINAL = "nominal"  # name of the world that is as it is given
 QUANTITIES = ("friction", "stiffness", "latency", "ostium")
 """What `World.share` makes differ: friction coefficient, stiffness of the tip, the robot's latency, and the position of
 the ostium along the catheter's axis, the last in units of the lumen's diameter there."""

@@ -28,17 +28,10 @@ from endopilot.vessels.sources import check_unit
 from endopilot.vessels.surface import Surface, filled_box, surface_from_mask
 from endopilot.vessels.surface_distance import distance_map_from_surface
 
-CERTAIN = 0.8
-"""An ostium less probable than this is asked for."""
-
-PRESENT = 0.5
-"""The other artery is in the lumen if it begins in another piece with at least this probability."""
-
-SHORTEST_MM = 15.0
-"""A lumen whose branches together are shorter than this is no artery but a crumb."""
-
-GRID_MM = 0.5
-"""Grid spacing at which the arteries are compared, mm."""
+CERTAIN = 0.8  # an ostium less probable than this is asked for
+PRESENT = 0.5  # the other artery is in the lumen if it begins in another piece with at least this probability
+SHORTEST_MM = 15.0  # a lumen whose branches together are shorter than this is no artery but a crumb
+GRID_MM = 0.5  # grid spacing at which the arteries are compared, mm
 
 _NAMES = {"rca": "right coronary artery", "lca": "left coronary artery"}
 _NAMED, _WORTH_NAMING = 4, 0.02

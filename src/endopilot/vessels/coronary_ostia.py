@@ -34,8 +34,7 @@ LEFT_FROM_RIGHT_SD_DEG = 14.0
 BETWEEN_MM, BETWEEN_SD = 35.6, 0.12
 """Distance of the two ostia, mm, and the SD of its logarithm; 31 to 39 mm in seven real patients."""
 
-AORTA_UP = np.array([-0.40, -0.30, 0.87])
-"""Axis of the aortic root, LPS: up, to the right, and forwards."""
+AORTA_UP = np.array([-0.40, -0.30, 0.87])  # axis of the aortic root, LPS: up, to the right, and forwards
 
 AORTA_BEHIND_MM = 7.0
 """The aorta's axis passes this far behind and to the right of the middle between the ostia, which lie some 125° apart
@@ -63,20 +62,11 @@ OPENING_DEG, OPENING_SD_DEG = 105.0, 20.0
 WEIGHT = {"calibre": 0.6, "taper": 0.4, "widening": 0.4, "opening": 0.6, "heading": 2.0, "course": 1.2}
 """What each likelihood counts: those of the lumen's width say in part the same."""
 
-ABSENT = -14.0
-"""Score of an artery that the lumen does not hold: below that of any ostium that looks like one."""
-
-ASKED = 1.0
-"""Logarithm of how much likelier the artery asked for is in the lumen than not, before it is looked at."""
-
-NEITHER = -14.0
-"""Score below which two arteries are rather something else. Both of a patient score −1 to −6."""
-
-ALONE = -9.0
-"""The same for a single artery, which scores 0 to −5."""
-
-TOUCHING = -8.0
-"""What it costs to take one lumen for both arteries, which touch or run together with their veins."""
+ABSENT = -14.0  # score of an artery that the lumen does not hold: below that of any ostium that looks like one
+ASKED = 1.0  # logarithm of how much likelier the artery asked for is in the lumen than not, before it is looked at
+NEITHER = -14.0  # score below which two arteries are rather something else. Both of a patient score −1 to −6
+ALONE = -9.0  # the same for a single artery, which scores 0 to −5
+TOUCHING = -8.0  # what it costs to take one lumen for both arteries, which touch or run together with their veins
 
 OTHER_AXES: dict[str, tuple[Float[np.ndarray, "3"], float]] = {
     "ras": (np.array([-1.0, -1.0, 1.0]), -2.5),
@@ -89,8 +79,7 @@ OTHER_AXES: dict[str, tuple[Float[np.ndarray, "3"], float]] = {
 }
 """Axes that a file may be in instead of LPS: the signs that turn it over, and the logarithm of how likely that is."""
 
-UNSTATED = 1.5
-"""What is added for RAS axes where the file does not state its own."""
+UNSTATED = 1.5  # what is added for RAS axes where the file does not state its own
 
 _FREEDOM = 3.0
 

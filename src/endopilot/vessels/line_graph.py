@@ -20,11 +20,8 @@ from endopilot.vessels.ends import likely_inlets
 from endopilot.vessels.graph import Line, RootedGraph, VesselGraph
 from endopilot.vessels.sources import Polylines
 
-STEP_MM = 0.5
-"""Distance between the points of the tree, mm."""
-
-LONGEST_BRIDGE = 4.0
-"""Lines that end within this many radii of another are joined to it; the gap is noted."""
+STEP_MM = 0.5  # distance between the points of the tree, mm
+LONGEST_BRIDGE = 4.0  # lines that end within this many radii of another are joined to it; the gap is noted
 
 PARENT_VESSEL_RATIO = 2.5
 """Where lines start in spheres this many times wider than their own median, they start in a parent vessel."""

@@ -18,8 +18,7 @@ from endopilot.imaging.grid import connected_components
 from endopilot.types import Volume
 from endopilot.vessels.graph import RootedGraph, VesselGraph, lumen_graph
 
-SMALLEST_PIECE = 12
-"""A piece of fewer voxels is noise."""
+SMALLEST_PIECE = 12  # a piece of fewer voxels is noise
 
 _NEIGHBOURS_APART = 1.8  # voxels that share a corner lie this near each other, in voxels
 

@@ -19,17 +19,13 @@ from endopilot.vessels.medial_lines import MedialLines, piece_labels
 from endopilot.vessels.surface import filled_box
 from endopilot.vessels.topology import MOST_LISTED, SMALLEST_PIECE, Touch, parted, touch_remarks
 
-NEAR_OSTIUM_MM = 5.0
-"""A lumen farther than this from a given ostium does not belong to it."""
-
-LARGEST_GAP_VOXELS = 4.0
-"""Pieces of a mask that are this near each other are taken for one interrupted vessel."""
+NEAR_OSTIUM_MM = 5.0  # a lumen farther than this from a given ostium does not belong to it
+LARGEST_GAP_VOXELS = 4.0  # pieces of a mask that are this near each other are taken for one interrupted vessel
 
 _DIRECTION_VOXELS = 12.0  # a piece's direction at its end is that of its voxels within this distance
 _ONWARDS = 0.5  # cosine of the largest angle between a piece and the gap that it is joined across
 
-NOTED_MM = 5.0
-"""What is left out or widened gets a remark of its own from this length; shorter pieces are summed up."""
+NOTED_MM = 5.0  # what is left out or widened gets a remark of its own from this length; shorter pieces are summed up
 
 _MOST_JOINED = 200  # at most this many pieces of a mask are looked at as vessels or parts of them
 

@@ -20,8 +20,7 @@ from endopilot.vessels.inlet import Vessel
 from endopilot.vessels.repair import NEAR_OSTIUM_MM, chosen_piece, pieces_left_out
 from endopilot.vessels.surface import Surface, filled_box, surface_from_mask
 
-MOST_PIECES = 12
-"""At most this many pieces of a surface are looked at as coronary arteries or parts of them."""
+MOST_PIECES = 12  # at most this many pieces of a surface are looked at as coronary arteries or parts of them
 
 _ACROSS = 120.0  # a surface is looked at in voxels of this share of its box's mean edge: 2 million
 _FACING = 0.12  # of a wall of 1 to 3 mm round lumens of 2 to 6 mm 0.15 to 0.5 of the surface faces itself on both sides

@@ -22,11 +22,8 @@ AXES = {"LPS": "lps", "LEFT-POSTERIOR-SUPERIOR": "lps", "RAS": "ras", "RIGHT-ANT
 
 RAS_TO_LPS = np.array([-1.0, -1.0, 1.0])
 
-SMALLEST_RADIUS_MM = 0.25
-"""Vessels that a guidewire enters have mean radii from this on."""
-
-LARGEST_EXTENT_MM = 2500.0
-"""No vessel of the body reaches farther."""
+SMALLEST_RADIUS_MM = 0.25  # vessels that a guidewire enters have mean radii from this on
+LARGEST_EXTENT_MM = 2500.0  # no vessel of the body reaches farther
 
 _KINDS = {
     "coronary": (1.2, 0.35, 120.0),

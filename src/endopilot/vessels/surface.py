@@ -23,8 +23,7 @@ thick slices keeps their steps, which are long in the plane; at 1, the crotch of
 _FIT_ITERATIONS = 8
 _BLOCK = 24  # edge in voxels of the blocks that a mask is smoothed in
 
-BAND_MM = 2.5
-"""How far outside the wall the distance map reaches, mm; beyond, it holds the constant −`BAND_MM`."""
+BAND_MM = 2.5  # how far outside the wall the distance map reaches, mm; beyond, it holds the constant −`BAND_MM`
 
 MAXIMUM_GRID_POINTS = 20_000_000
 """A distance map holds at most this many grid points (80 MB of float32); the spacing grows until it fits."""

@@ -37,11 +37,8 @@ SHORTEST_LOOP_MM = 20.0
 """Loops from this length are cut. In shorter ones two branches touch again just behind their fork, or a wall has a
 hole: which way a line takes hardly matters."""
 
-SHORTEST_TUNNEL_MM = 6.0
-"""Tunnels shorter than this, or no longer than round the vessel itself, are rough voxels."""
-
-MOST_LISTED = 8
-"""As many places or pieces are listed one by one."""
+SHORTEST_TUNNEL_MM = 6.0  # tunnels shorter than this, or no longer than round the vessel itself, are rough voxels
+MOST_LISTED = 8  # as many places or pieces are listed one by one
 
 _SLIT_VOXELS = 3.0  # so are those whose opposite sides come as near each other as this, in voxels
 

@@ -63,8 +63,7 @@ _GAP_MM = 1.0  # voxels between vessels this close together are bridged, if they
 _SEED_MM = 5.0  # a seed belongs to the vessel within this distance
 _LEAST_TREE_MM3 = 250.0  # a smaller connected vessel is no coronary tree: 50 mm of 2.5 mm width hold as much
 _RIVAL_SHARE = 0.85  # what is dimmer than this share of the aorta's blood is no second candidate for it
-COARSEST_MM = 1.25
-"""Longest edge of voxels in which a coronary artery of 2 mm still shows."""
+COARSEST_MM = 1.25  # longest edge of voxels in which a coronary artery of 2 mm still shows
 
 _MOUTH_MM = 4.0  # length of the artery's beginning where the aorta's blood hides its radius, mm
 _WIDEST_MM = 5.0  # largest radius expected of a coronary artery, mm
