@@ -115,9 +115,7 @@ def _draw_straightened(anatomy: Anatomy, line: Centerline, half: float, volume: 
     across = np.linspace(-half, half, 81)
     rows = figure.subplots(2, 1, sharex=True)
     for axes, (title, side) in zip(
-        rows,
-        (("normal", normals), ("binormal", np.cross(directions, normals))),
-        strict=True,
+        rows, (("normal", normals), ("binormal", np.cross(directions, normals))), strict=True
     ):
         grid = points[None] + across[:, None, None] * side[None]
         _show(axes, anatomy, grid, (0.0, float(at[-1]), -half, half), volume)

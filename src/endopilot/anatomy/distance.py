@@ -32,10 +32,7 @@ def automatic_spacing(radius: Float[np.ndarray, "n"], extent_mm: Float[np.ndarra
 
 
 def distance_map_from_spheres(
-    tree: VesselTree,
-    *,
-    beside: Sequence[Sequence[Centerline]] = (),
-    spacing_mm: float | None = None,
+    tree: VesselTree, *, beside: Sequence[Sequence[Centerline]] = (), spacing_mm: float | None = None
 ) -> DistanceMap:
     """Return the signed distance to the smooth union of a tree's inscribed spheres; `beside` are further lines of
     spheres of each branch's lumen. The spacing, mm, is `automatic_spacing`'s if None."""
@@ -90,11 +87,7 @@ def catheter_tilt_deg(ostium_radius_mm: float, catheter_radius_mm: float) -> flo
 
 
 def smooth_union(
-    first: Float[np.ndarray, "nz ny nx"],
-    second: Float[np.ndarray, "nz ny nx"],
-    *,
-    spacing_mm: float,
-    fillet_mm: float,
+    first: Float[np.ndarray, "nz ny nx"], second: Float[np.ndarray, "nz ny nx"], *, spacing_mm: float, fillet_mm: float
 ) -> Float[np.ndarray, "nz ny nx"]:
     """Return the union of two signed distances with a fillet where walls cross: ``max(a, b) + (k − |a − b|)₊² / 4k``,
     whose k = fillet · (1 − cos θ) falls with the angle of the gradients, so that tubes that carry on do not bulge."""

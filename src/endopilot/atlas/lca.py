@@ -94,11 +94,7 @@ def make_lca(
 
 
 def _draw(
-    generator: np.random.Generator,
-    dominance: str,
-    main_mm: float | None,
-    stenosis_share: float,
-    population: Population,
+    generator: np.random.Generator, dominance: str, main_mm: float | None, stenosis_share: float, population: Population
 ) -> tuple[VesselTree, dict[str, Any]]:
     trunk = _trunk(generator, dominance, main_mm, population)
     calibre = branching.coronary_calibre(generator, 1.0, 0.65, 1.4)

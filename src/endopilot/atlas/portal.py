@@ -150,12 +150,7 @@ def _grown(
     )
     turn = round(size * transverse / shape.STEP_MM)
     low = round(size * float(generator.uniform(22.0, 28.0)) / shape.STEP_MM)
-    places = {
-        "S2": (1, min(turn, len(vessels[1].points) - 20)),
-        "S4": (1, -1),
-        "S3": (1, -1),
-        "S6": (2, low),
-    }
+    places = {"S2": (1, min(turn, len(vessels[1].points) - 20)), "S4": (1, -1), "S3": (1, -1), "S6": (2, low)}
     plans = [
         plan(name, parent, place, length_mm[name], _SEGMENT_DIAMETER_MM, 0.4)
         for name, (parent, place) in places.items()

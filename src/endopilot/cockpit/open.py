@@ -69,12 +69,7 @@ def open_task(
 
 
 def open_replay(
-    path: Path,
-    patient: Path | None = None,
-    *,
-    world: int = 0,
-    task: str | None = None,
-    ct: Path | None = None,
+    path: Path, patient: Path | None = None, *, world: int = 0, task: str | None = None, ct: Path | None = None
 ) -> Opened:
     """Open what was recorded, simulated, planned or scored (`film.open_film`), to be looked at with a time slider; the
     CT is for the X-ray's background."""

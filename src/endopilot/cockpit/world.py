@@ -79,12 +79,7 @@ class LiveWorld:
     `peak_force_n` so far, N."""
 
     def __init__(
-        self,
-        navigation: Navigation,
-        config: LoopConfig = BY_HAND,
-        *,
-        seed: int = 0,
-        reality: World | None = None,
+        self, navigation: Navigation, config: LoopConfig = BY_HAND, *, seed: int = 0, reality: World | None = None
     ) -> None:
         """Bring the devices to the start; InputError if one does not fit the vessel, or is shorter than its start."""
         self.hand, self.config = Hand(), config
@@ -169,13 +164,7 @@ def loop_snapshot(loop: NavigationLoop, *, cycle: int, force_n: float) -> Snapsh
 
 
 def take_snapshot(
-    simulator: Simulator,
-    step: Step | None,
-    *,
-    cycle: int,
-    time_s: float,
-    force_n: float,
-    velocity: tuple[float, ...],
+    simulator: Simulator, step: Step | None, *, cycle: int, time_s: float, force_n: float, velocity: tuple[float, ...]
 ) -> Snapshot:
     """Return how the one world of a simulator is now; `force_n` and `velocity` as in `Snapshot`."""
     inserted, turned, tip = simulator.inserted_length[0], simulator.rotation[0].tolist(), simulator.project()

@@ -90,8 +90,7 @@ _LENGTHS = (("m", 1000.0), ("inch", 25.4), ("cm", 10.0), ("µm", 0.001))
 _FORCES = (("gf", GRAM_FORCE_N), ("mN", 0.001), ("kgf", 1000 * GRAM_FORCE_N))
 
 Width = Annotated[
-    float,
-    Within(0.15, 10, unit="mm", mistaken=(("inch", 25.4), ("m", 1000.0), ("French", 1 / 3), ("µm", 0.001))),
+    float, Within(0.15, 10, unit="mm", mistaken=(("inch", 25.4), ("m", 1000.0), ("French", 1 / 3), ("µm", 0.001)))
 ]
 """An outer or an inner diameter, mm."""
 Abscissa = Annotated[float, Within(0, 5000, unit="mm", mistaken=(("µm", 0.001),))]  # a distance from the tip, mm

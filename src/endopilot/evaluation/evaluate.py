@@ -114,12 +114,7 @@ def evaluate(
         "training_mean": None
         if training is None
         else {"navigations": len(training), "patients": len(set(training.anatomy.tolist()))},
-        "manifest": manifest(
-            config=config,
-            seed=config.seed,
-            inputs=inputs,
-            wall_seconds=time.perf_counter() - start,
-        ),
+        "manifest": manifest(config=config, seed=config.seed, inputs=inputs, wall_seconds=time.perf_counter() - start),
     }
     for split, data in chosen.items() if others else ():
         episodes = Episodes.of_dataset(data)
@@ -163,10 +158,7 @@ def _own_dataset(run: Path, record: Mapping[str, Any]) -> Path:
 
 def _metrics(results: Mapping[str, SplitResult], known: Collection[str], seed: int) -> dict[str, Any]:
     splits = {
-        split: {
-            "title": SPLIT_TITLES[split],
-            "known_patients": len(set(result.anatomies) & set(known)),
-        }
+        split: {"title": SPLIT_TITLES[split], "known_patients": len(set(result.anatomies) & set(known))}
         | summarize(result, seed=seed)
         for split, result in results.items()
     }

@@ -236,11 +236,7 @@ def count_steps(data: Dataset) -> int:
 
 
 def run_protocols(
-    predictor: Predictor,
-    data: Dataset,
-    training: Dataset | None,
-    advance: Advance,
-    robot: RobotConfig | None = None,
+    predictor: Predictor, data: Dataset, training: Dataset | None, advance: Advance, robot: RobotConfig | None = None
 ) -> SplitResult:
     """Predict the samples after the 30 given states by every protocol, and simulate the controls that were chosen.
 

@@ -241,11 +241,7 @@ def _plaque(
 
 
 def _organs(
-    grid: Grid,
-    heart: HeartFit,
-    coronaries: Sequence[Centerline],
-    generator: np.random.Generator,
-    appendage_mm: float,
+    grid: Grid, heart: HeartFit, coronaries: Sequence[Centerline], generator: np.random.Generator, appendage_mm: float
 ) -> tuple[Grid, tuple[chest.Organ, ...]]:
     axes = (np.arange(axis[0] - COARSE_MM, axis[-1] + 2 * COARSE_MM, COARSE_MM) for axis in (grid.x, grid.y, grid.z))
     coarse = Grid(*axes)

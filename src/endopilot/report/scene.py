@@ -284,11 +284,7 @@ def _layout(size_mm: Float[np.ndarray, "3"]) -> dict:
     axes = {f"{name}axis": axis | {"title": {"text": title}} for name, title in zip("xyz", titles, strict=True)}
     return {
         # View from the front, as a surgeon stands before the patient: the patient's left is on the right.
-        "scene": {
-            "aspectmode": "data",
-            **axes,
-            "camera": {"eye": eye, "center": {"x": 0, "y": 0, "z": -0.12}},
-        },
+        "scene": {"aspectmode": "data", **axes, "camera": {"eye": eye, "center": {"x": 0, "y": 0, "z": -0.12}}},
         "paper_bgcolor": BACKGROUND,
         "font": {"color": INK, "family": "system-ui, sans-serif"},
         "legend": {"font": {"size": 11}, "x": 0.99, "xanchor": "right", "y": 0.93, "bgcolor": BACKGROUND},

@@ -9,12 +9,7 @@ import numpy as np
 import pandas as pd
 
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.evaluation.metrics import (
-    control_rmse,
-    mean_over_time,
-    quantiles_over_time,
-    rmse_of_sequences,
-)
+from endopilot.evaluation.metrics import control_rmse, mean_over_time, quantiles_over_time, rmse_of_sequences
 from endopilot.evaluation.results import CONTROL_BASELINES, TIP_BASELINES, SplitResult
 
 SAFETY_SERIES = ("true", "P3", "P4")

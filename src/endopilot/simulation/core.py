@@ -161,18 +161,11 @@ def of_device(result: Mapping[str, np.ndarray], device: int) -> dict[str, np.nda
 
 def insertion_arguments(insertion: Insertion) -> dict[str, np.ndarray]:
     """Return an insertion as the core wants it: `origin`, mm, and `orientation`, a quaternion w x y z."""
-    return {
-        "origin": np.asarray(insertion.position, dtype=float),
-        "orientation": _base_orientation(insertion),
-    }
+    return {"origin": np.asarray(insertion.position, dtype=float), "orientation": _base_orientation(insertion)}
 
 
 def core_options(
-    config: SimulatorConfig,
-    *,
-    push_limit_n: float,
-    free_behind_mm: float,
-    approach: bool = True,
+    config: SimulatorConfig, *, push_limit_n: float, free_behind_mm: float, approach: bool = True
 ) -> Options:
     """Return the settings as the core wants them; what all drives can push with, N, sizes the wall's stiffness."""
     options = core_for(config.processor).Options()

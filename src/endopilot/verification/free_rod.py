@@ -218,10 +218,7 @@ def objectivity() -> list[Case]:
         change = float(np.abs(energy[3:]).max() if load == 0 else abs(energy[-1] - energy[2])) / reference
         turned = np.cumsum(control[:, 1]) * 0.5
         start = np.full(2, energy[2])
-        curves = (
-            Curve("energy before the turn", turned[[0, -1]], start, "reference"),
-            Curve("core", turned, energy),
-        )
+        curves = (Curve("energy before the turn", turned[[0, -1]], start, "reference"), Curve("core", turned, energy))
         picture = Picture("turned, rad", "elastic energy, N mm", curves)
         cases.append(Case(f"energy, {name}", 0.0, change, change, 1e-10, picture))
     return cases

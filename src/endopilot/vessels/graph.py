@@ -150,12 +150,7 @@ class RootedGraph(VesselGraph):
         return max(int(clear[-1]) + 2 if len(clear) else 0, min(4, len(nodes)))
 
     def traced(
-        self,
-        minimum_mm: float,
-        *,
-        coverage: float = COVERAGE,
-        slenderness: float = SLENDERNESS,
-        together: bool = False,
+        self, minimum_mm: float, *, coverage: float = COVERAGE, slenderness: float = SLENDERNESS, together: bool = False
     ) -> list[Int[np.ndarray, "_"]]:
         """Return the tree as paths of points: the first from the root, each other one from a point of an earlier path.
 
