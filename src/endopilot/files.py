@@ -33,8 +33,7 @@ from endopilot.errors import InputError
 
 _MIB = 2**20
 RECORD_FILE = "run.json"  # says which run a folder belongs to
-_LARGEST_JSON, _LARGEST_YAML = 512 * _MIB, _MIB // 4
-"""Bytes of a file that is read whole: recordings of long navigations have some MiB, settings some KiB."""
+_LARGEST_JSON, _LARGEST_YAML = 512 * _MIB, _MIB // 4  # of files read whole: long recordings have MiB, settings KiB
 _MOST_NODES = 100_000  # values that a YAML file may hold once its aliases are written out
 _ENCODINGS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
@@ -51,8 +50,7 @@ _OF_THE_PATH = (
 """Errors that another path mends."""
 _FULL = re.compile("no space left|disk quota exceeded|disk is full|file too large", re.IGNORECASE)
 """How libraries say it in exceptions of their own."""
-_LEAST_FREE = 64 * 1024
-"""A disk with fewer free bytes than a page of some file systems takes is full, whatever a library says."""
+_LEAST_FREE = 64 * 1024  # a disk with fewer free bytes than some file systems' page is full, whatever a library says
 PARTIAL = ".part-"  # what the names of files begin with that are not whole yet
 
 

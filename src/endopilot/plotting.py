@@ -18,8 +18,7 @@ from matplotlib.figure import Figure
 BLACK, ORANGE, SKY, GREEN = "#1a1a1a", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, VERMILLION, PURPLE, GREY = "#F0E442", "#0072B2", "#D55E00", "#CC79A7", "#8a8f98"
 CATHETER_COLORS = ("#19b5c8", "#8e6cf0")  # from the inside out; the first is that of the cockpit
-_SECTION_COLORS = ListedColormap(mpl.colormaps["tab10"]([0, 1, 2, 3, 4, 5, 6, 8, 9]))
-"""Without grey, which is the catheter's."""
+_SECTION_COLORS = ListedColormap(mpl.colormaps["tab10"]([0, 1, 2, 3, 4, 5, 6, 8, 9]))  # without the catheter's grey
 _THICKEST = 9.0  # of the line of a vessel, points
 
 STYLE: dict[Any, Any] = {

@@ -145,11 +145,9 @@ Finite = Annotated[float, Within()]  # any finite number
 Positive = Annotated[float, Within(0, above_low=True)]  # a number above 0
 NonNegative = Annotated[float, Within(0)]  # a number of 0 or more
 Share = Annotated[float, Within(0, 1)]  # a number from 0 to 1
-OpenShare = Annotated[float, Within(0, 1, above_low=True, below_high=True)]
-"""A number between 0 and 1, neither included."""
+OpenShare = Annotated[float, Within(0, 1, above_low=True, below_high=True)]  # between 0 and 1, neither included
 ShareBelowOne = Annotated[float, Within(0, 1, below_high=True)]  # a number from 0 to below 1
-Count = Annotated[int, Within(1, 10**6)]
-"""A whole number from 1 to a million; more would run for ever or take all memory."""
+Count = Annotated[int, Within(1, 10**6)]  # from 1 to a million; more would run for ever or take all memory
 CountOrZero = Annotated[int, Within(0, 10**6)]  # a whole number from 0 to a million
 LONGEST_S = 86_400.0  # longest time that anything is simulated for, s: a day
 Seconds = Annotated[float, Within(0, LONGEST_S, above_low=True)]  # a time above 0, at most a day, s

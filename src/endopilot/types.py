@@ -39,8 +39,7 @@ if TYPE_CHECKING:  # slow to import
 SAMPLE_PERIOD_S = 0.5  # time between two recorded samples, s: the paper records at 2 Hz
 
 _AXES = ("x (to the patient's left), mm", "y (to the back), mm", "z (to the head), mm")
-_VIEWS = {"side": (1, 2), "front": (0, 2), "above": (0, 1)}
-"""World axes to the right and up of each view, in the order of the axis along which one looks."""
+_VIEWS = {"side": (1, 2), "front": (0, 2), "above": (0, 1)}  # axes to the right and up, by the axis looked along
 _ON_AXIS = 0.05
 """A vessel whose mean lies off the catheter's axis by less than this share of its distance from the ostium lies to no
 side. In atlas patients of all kinds it lies off by 0.12 at least (0.2 to 0.8 in the median of each kind)."""

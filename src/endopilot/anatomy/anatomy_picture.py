@@ -30,8 +30,7 @@ SECTIONS = 6  # cross-sections that are drawn, evenly along the longest path
 
 WINDOW_HU = (-150.0, 650.0)
 _WIDTH = 15.0  # of the picture, inches
-_LONGEST_NAME, _MOST_LISTED = 24, 120
-"""Letters of a section's name, and number of sections, that are listed."""
+_LONGEST_NAME, _MOST_LISTED = 24, 120  # letters of a section's name, and sections, that are listed
 _LARGEST_GRID = 1_500_000
 _LIGHT = np.array([-0.35, -0.8, 0.5]) / np.linalg.norm([-0.35, -0.8, 0.5])
 

@@ -19,15 +19,10 @@ from endopilot.vessels.surface import Surface
 ROUNDNESS = 0.05  # a cross-section whose half-axes differ by less than twice this share of its radius counts as round
 
 _RING = 12
-_FEWEST_DIRECTIONS = 5
-"""With fewer directions than this on the ring, a vessel has too little wall of its own to be centred by."""
-
+_FEWEST_DIRECTIONS = 5  # with fewer directions on the ring a vessel has too little wall to be centred by
 _STRAIGHT = 10  # this many steps of a branch from where it leaves its parent show where it comes from
 _NEAR_WALL = 0.8  # the ring on which the radius is measured, in distances to the wall
-
-_CROSSED = 0.25
-"""A straight way narrower than this share of a branch's radius crosses a wall: at flaps of one voxel 0.0 to 0.1."""
-
+_CROSSED = 0.25  # a way narrower than this share of a branch's radius crosses a wall: 0.0 to 0.1 at thin flaps
 _WAY = 12  # places at which such a way is looked at
 _FLAT = 0.75  # a vessel whose smaller half-axis falls below this share of its radius is not drawn out any farther
 _ROUND = 0.9  # a half-axis counts as different from the radius where it is smaller than this share of it

@@ -15,10 +15,7 @@ from endopilot.types import Centerline, DistanceMap, Insertion, VesselTree
 from endopilot.vessels.surface import BAND_MM, MAXIMUM_GRID_POINTS, grid_of
 
 FILLET = 0.5  # strength of the fillet where a branch leaves its parent, in radii of the branch
-
-CATHETER_RADIUS_MM = 0.9
-"""Inner radius of a 6 French guiding catheter, mm: 0.071 inch across (Medtronic Launcher, instructions for use)."""
-
+CATHETER_RADIUS_MM = 0.9  # inside of a 6 French guiding catheter, 0.071 inch across (Medtronic Launcher)
 CATHETER_LENGTH_MM = 20.0  # length of catheter behind the ostium that a distance map holds, mm
 ENGAGED_MM = 3.0  # a guiding catheter's tip lies this deep in the ostium, mm
 

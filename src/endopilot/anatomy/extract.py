@@ -50,17 +50,14 @@ from endopilot.vessels.surface import MAXIMUM_GRID_POINTS, Surface, surface_from
 from endopilot.vessels.surface_distance import distance_map_from_surface
 from endopilot.vessels.topology import parted, touch_remarks
 
-CORONARY_RADIUS_MM = 1.6
-"""Mean radius of a coronary tree at most: what counts for the grid where a lumen holds a piece of the aorta too."""
-
+CORONARY_RADIUS_MM = 1.6  # mean radius of a coronary tree at most, for the grid where the aorta is there too
 _RESOLVED_STEPS = 1.25  # a catheter's radius in steps of the distance map, at least: wide vessels have coarse maps
 
 _OTHER_SIDE_DEG = 5.0
 """A coronary artery is in doubt if its course is nearer to that of the other one by this, degrees; in 48 of the
 atlas and 2 real ones its own is the nearer one by 16° at least."""
 
-SHORTEST_IN_DIAMETERS = 1.5
-"""A lumen whose longest path is shorter than this many of its own mean diameters is no vessel."""
+SHORTEST_IN_DIAMETERS = 1.5  # a lumen whose longest path is shorter than so many mean diameters is no vessel
 
 _DONE = {
     "joined": r"bridged|united|capped|closed by filling|joined by|joined to one",

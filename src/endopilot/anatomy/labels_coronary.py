@@ -11,26 +11,18 @@ ACUTE_MARGIN = 0.64
 """The acute margin lies at this share of the path from the ostium to the crux (Dodge et al., Circulation
 1988;78:1167-80, R2 distal); segment 1 ends halfway to it."""
 
-USUAL_CRUX_MM, NEAREST_CRUX_MM = 140.0, 120.0
-"""Path from the right ostium to the crux; 122 to 170 mm in six real patients."""
-
+USUAL_CRUX_MM, NEAREST_CRUX_MM = 140.0, 120.0  # path from ostium to crux; 122 to 170 in six patients
 SHORT_MM = 60.0  # a coronary artery whose longest path is shorter than this is cut off, occluded, or a vestige
 CRUX_FORK_MM = 25.0  # the fork at the crux lies within this much of the path from where the path passes the crux, mm
-
-BEYOND_CRUX_MM, FORWARDS_MM = 15.0, 8.0
-"""A vessel that goes on for the first beyond the crux and turns forwards by the second is a posterior descending."""
-
+BEYOND_CRUX_MM, FORWARDS_MM = 15.0, 8.0  # beyond the crux, and turned forwards: a posterior descending
 MAJOR_MM = 6.0  # a branch with at least this much length behind it counts as a named end vessel, mm
 NAMED_MM = 15.0  # branches of the left main, and a ramus intermedius, have at least this much length behind them, mm
 
 USUAL_LEFT_MAIN_MM, LONGEST_LEFT_MAIN_MM = 5.0, 30.0
 """Length of the left main: the median of sixteen real ones (5 to 95 %: 1 to 15 mm), and more than any has, mm."""
 
-_EARLY, _LATE = 0.22, 0.4
-"""A conus branch leaves within the first share of the path to the crux, a sinus node branch within the second."""
-
-_RAMUS_MM = 4.0
-"""Where LAD and LCx divide again this near the left main's end, the middle branch is the ramus intermedius."""
+_EARLY, _LATE = 0.22, 0.4  # shares of the path to the crux: conus branches leave within one, sinus node's within two
+_RAMUS_MM = 4.0  # where LAD and LCx divide so near the left main's end, the middle branch is the ramus
 
 GROOVE = np.array([-0.7, 0.6, -0.3])
 """Direction (LPS) in which the circumflex's course round the left atrioventricular groove reaches farthest at its end,

@@ -13,9 +13,7 @@ _LONG_MM = 35.0  # where two branches with this much behind them part, the inter
 _TRUNK_MM = 15.0  # where two branches with this much behind them part, M1 ends
 _SHORTEST_A1_MM = 5.0
 _TURN_MM = 1.0  # the anterior cerebral artery has turned up this far behind the end of A1
-
-_RIGHT_SHARE = 0.3
-"""Veins that end in this share of the tree's width, from the right, belong to the right lobe for certain."""
+_RIGHT_SHARE = 0.3  # veins that end in this right share of the tree's width are of the right lobe for certain
 
 
 def label_arch(labeller: Labeller) -> None:

@@ -21,8 +21,7 @@ from endopilot import _core
 from endopilot.anatomy.tree import tangents
 from endopilot.types import Insertion, TipProjection, VesselTree
 
-_TAPER = 1.25
-"""A branch is at most this many times wider where a point is projected to than where it is nearest to a vertex."""
+_TAPER = 1.25  # a branch is at most this much wider where a point projects to than at the nearest vertex
 
 
 def project_tip(tree: VesselTree, insertion: Insertion, points: Float[np.ndarray, "*n 3"]) -> TipProjection:

@@ -38,14 +38,12 @@ DIAMETER_MM = {
     "left common carotid": (8.28, 1.51),
     "left subclavian": (10.41, 2.2),
 }
-DIAMETER_MM_BEYOND = {"right common carotid": 7.0, "right subclavian": 9.0}
-"""Beyond the trunk: a little less than its area together."""
+DIAMETER_MM_BEYOND = {"right common carotid": 7.0, "right subclavian": 9.0}  # a little less than the trunk's area
 GAP_MM = {"left common carotid": (4.39, 2.49), "left subclavian": (6.43, 3.98)}
 """Between the wall of a branch and that of the one before it in the direction of flow, mm."""
 TRUNK_MM = (38.2, 9.5)
 
-_DESCENDING_MM, _ASCENDING_MM = 100.0, 35.0
-"""Aorta before and behind the arch, mm: from the middle of the chest, and to the root."""
+_DESCENDING_MM, _ASCENDING_MM = 100.0, 35.0  # aorta before and behind the arch, from mid-chest and to the root
 
 
 def make_arch(

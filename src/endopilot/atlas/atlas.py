@@ -26,8 +26,7 @@ from endopilot.errors import InputError
 from endopilot.settings import Seed, Share, Within, settings
 from endopilot.types import Anatomy, Branch, Centerline, DistanceMap, Insertion, LumenMask, VesselTree, Volume
 
-IN_PLANE_MM, SLICE_MM = (0.6, 0.75), (0.5, 0.5)
-"""Range of the voxels' edges, mm."""
+IN_PLANE_MM, SLICE_MM = (0.6, 0.75), (0.5, 0.5)  # ranges of the voxels' edges, mm
 TAKEN_IN = (0.4, 0.8)  # voxels count as lumen up to this share of their edge outside of the wall
 NARROWEST_MM = (0.6, 0.9)  # a vessel ends in the mask where it stays narrower than this radius, mm
 _SCANS = 4

@@ -15,16 +15,12 @@ from endopilot.atlas import curves as shape
 from endopilot.lines import length_along
 from endopilot.types import Branch, Centerline, VesselTree
 
-Depth = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]
-"""How deep points lie below the surface that vessels keep to, mm."""
-
+Depth = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]  # how deep points lie below the surface, mm
 _CLEARANCE_MM = 0.6  # tissue between two lumens that do not belong together, mm: two walls
-_BEND_MM = 4.0
-"""Two places of one vessel that lie farther apart along it than this and twice their radii must not touch, mm."""
+_BEND_MM = 4.0  # places of one vessel farther apart along it than this and twice their radii must not touch, mm
 
 
-_RIGHT_SHARE, _BALANCED_SHARE = 0.88, 0.06
-"""Shares of right and balanced dominance; the rest is left. Chosen within the range that the literature reports."""
+_RIGHT_SHARE, _BALANCED_SHARE = 0.88, 0.06  # shares of right and balanced dominance, within the literature's range
 _FEMALE_CALIBRE = 0.91  # women's coronary lumens against men's (Dodge JT et al., Circulation 1992;86:232-46)
 
 

@@ -42,10 +42,8 @@ _SIPHON = np.array(
      [-14, -23.5, 38]]
 )  # fmt: skip
 """Left internal carotid artery, LPS mm from the entrance of the carotid canal; the midline lies at x = -27."""
-_BEYOND_M1 = np.array([[4, 4, 5], [5, 12, 10], [7, 23, 15], [13, 34, 19.0]])
-"""Inferior trunk of M2 over the insula, mm from the end of M1."""
-_PCOM_SHARE = 0.6
-"""Share of patients in whom the posterior communicating artery is wide enough to be visible: an assumption."""
+_BEYOND_M1 = np.array([[4, 4, 5], [5, 12, 10], [7, 23, 15], [13, 34, 19.0]])  # inferior trunk of M2, mm from M1's end
+_PCOM_SHARE = 0.6  # share of patients with a visible posterior communicating artery: an assumption
 _SHARPEST_PER_MM = 0.4  # greatest curvature of the carotid's axis, 1/mm: its wall must not fold
 
 

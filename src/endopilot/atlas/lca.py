@@ -48,8 +48,7 @@ _ENDS = {"right": (66.0, 9.0, 40.0, 76.0), "balanced": (88.0, 4.0, 82.0, 97.0)}
 the crux into the posterior descending artery."""
 
 
-_ORDERED = (("9", "10"), ("12",))
-"""Names of the first branches of the anterior descending artery and of the circumflex, septals aside."""
+_ORDERED = (("9", "10"), ("12",))  # first branches of the LAD and of the circumflex, septals aside
 _FLARE_MM = 3.0  # over this length before and behind its fork the left main artery widens, mm
 _SHARPEST_PER_MM = 0.45  # greatest curvature of the main vessels, 1/mm
 

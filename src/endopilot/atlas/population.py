@@ -18,8 +18,7 @@ from endopilot.files import read_yaml
 
 PopulationName = Literal["patients", "textbook"]
 
-Spread = tuple[float, float, float, float]
-"""Median, SD of the logarithm, smallest and largest value of a log-normal distribution."""
+Spread = tuple[float, float, float, float]  # median, SD of the logarithm, bounds of a log-normal distribution
 
 Courses = tuple[tuple[float, tuple[float, float, float]], ...]
 """Where a side branch heads: (abscissa from which it holds, mm; LPS direction), in order."""

@@ -34,8 +34,7 @@ MAIN_MM, MAIN_SD_MM = 78.0, 9.0
 MAIN_DIAMETER_MM, MAIN_DIAMETER_SD_MM = 12.0, 1.3
 VARIANT_SHARES = {"bifurcation": 75.5, "trifurcation": 11.1, "right posterior first": 9.7}
 RIGHT_MM, RIGHT_SD_MM = 20.0, 5.0
-LEFT_MM, LEFT_SD_MM = 35.0, 6.0
-"""Right branch, and transverse part of the left one, mm."""
+LEFT_MM, LEFT_SD_MM = 35.0, 6.0  # right branch, and transverse part of the left one, mm
 
 _COURSE = np.array([[0, 0, 0], [-18, 4, 13], [-36, 9, 29], [-52, 12, 45], [-64, 13, 56.0]])
 """The main portal vein from the confluence to the porta hepatis, mm."""

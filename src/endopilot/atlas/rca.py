@@ -32,11 +32,8 @@ from endopilot.types import VesselTree
 LENGTH_MM, LENGTH_SD_MM, LENGTH_RANGE_MM = 164.0, 30.0, (112.0, 223.0)
 TORTUOSITY, TORTUOSITY_SD = 2.07, 0.23
 CURVATURE, CURVATURE_SD = 0.061, 0.017
-DIAMETER_MM = {0.1: 4.0, 0.2: 3.8, 0.5: 3.5, 0.7: 2.7, 0.9: 2.3}
-"""Lumen diameter, mm, at fractions of the path from the ostium to the farthest tip."""
-
-_CALIBRE = {"right": 1.025, "balanced": 0.9, "left": 0.74}
-"""Lumen against the average of all patients (Dodge 1992: balanced 0.78, left 0.70 of right dominance)."""
+DIAMETER_MM = {0.1: 4.0, 0.2: 3.8, 0.5: 3.5, 0.7: 2.7, 0.9: 2.3}  # at fractions of the path to the farthest tip, mm
+_CALIBRE = {"right": 1.025, "balanced": 0.9, "left": 0.74}  # against all patients' (Dodge 1992: 0.78, 0.70 of right)
 
 
 @dataclass(frozen=True, kw_only=True)

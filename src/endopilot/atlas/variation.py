@@ -24,8 +24,7 @@ _TRIES = 12
 _MOST_BENDS = 2.5  # no patient's mean number of sharp bends is more than this many times that of all
 _QUIET_MM = 4.0  # over this length behind a vessel's start its waves fade in, mm
 _STRAIGHT_MM = 12.0  # no sharp bend lies nearer than this to the ostium, mm: the catheter's tip lies there
-_STEEPEST_DEG = 75.0
-"""Greatest angle between the catheter and the vessel's first direction: beyond, the wire meets the wall head-on."""
+_STEEPEST_DEG = 75.0  # greatest angle of catheter and vessel: beyond, the wire meets the wall head-on
 _GIVES_WAY_MM = 10.0  # over this length behind a fork the deflection dies out by a factor e, mm
 _SCATTER_DEG = 30.0  # a parent gives way to the side opposite to the branch, within this SD
 

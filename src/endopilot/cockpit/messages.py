@@ -99,8 +99,7 @@ class Ping(_Message):
     number: Annotated[int, Field(ge=0, le=2**31)]
 
 
-Message = Drive | Pedal | Contrast | CArm | Target | Autopilot | Game | Replay | Wheel | Ping
-"""All that a page may send."""
+Message = Drive | Pedal | Contrast | CArm | Target | Autopilot | Game | Replay | Wheel | Ping  # all a page may send
 _READER: TypeAdapter[Message] = TypeAdapter(Annotated[Message, Field(discriminator="type")])
 
 

@@ -36,8 +36,7 @@ WEB = Path(__file__).parent / "web"
 MOST_PAGES = 8  # pages that may look at once
 MOST_PER_SECOND = 200  # messages that a page may send in a second
 MOST_FAULTS = 20  # messages of a page that may be refused before its connection is closed
-REFUSED, BUSY = 4403, 4429
-"""Why a WebSocket is closed: wrong token or origin; too many pages, messages or faults."""
+REFUSED, BUSY = 4403, 4429  # why a WebSocket is closed: wrong token or origin; too many pages, messages, faults
 
 
 @dataclass(eq=False)

@@ -33,8 +33,7 @@ from endopilot.simulation.robots import in_grip
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.simulation.world import World
 
-_WORK_PATH = "meta/work.json"
-"""What the files written so far have cost; it moves into the manifest when the dataset is complete."""
+_WORK_PATH = "meta/work.json"  # what the files so far have cost; moves into the manifest in the end
 
 
 def generate_dataset(

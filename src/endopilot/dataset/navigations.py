@@ -127,8 +127,7 @@ def _loads(
 
 
 STOP_SHORT_MM = 5.0  # a tip is driven no nearer than this to the end of its branch, mm
-PULL_BACK_MM = 15.0
-"""Length by which a wire that came to an end, or is caught, is pulled back before it is pushed again, mm."""
+PULL_BACK_MM = 15.0  # a wire at an end, or caught, is pulled back by this length before it is pushed again
 CAUGHT = 0.5  # share of the device's push limit at which a wire counts as caught
 _ROUNDING_MM = 1e-2  # a wire this near to its pull-back target counts as pulled back
 

@@ -26,8 +26,7 @@ TASKS_PATH = "meta/tasks.parquet"
 MANIFEST_PATH = "meta/manifest.json"
 TASK = "random navigation"
 
-INDEX_COLUMNS = ("index", "episode_index", "frame_index", "task_index")
-"""Integer columns that LeRobot requires; `timestamp` (s, float32) is the fifth."""
+INDEX_COLUMNS = ("index", "episode_index", "frame_index", "task_index")  # LeRobot's; with `timestamp`, s, float32
 
 VELOCITY = list(SIGNALS["control"].columns)
 LOAD = ["drive_force_n", "drive_torque_nmm"]
@@ -50,11 +49,9 @@ OWN_COLUMNS = dict(
     if name not in STATE
 )
 """Signals that have a column of their own: by the column, the signal, its type and the names of its components."""
-OF_ROBOT = ("decided", "encoders", "load")
-"""Signals that a dataset made by a robot has besides: what the robot was commanded, and what it measured."""
+OF_ROBOT = ("decided", "encoders", "load")  # what a dataset's robot was commanded, and what it measured
 MANOEUVRES = ("insertion", "retraction", "spin", "pause")
-_MOVES_MM_S, _TURNS_RAD_S = 0.1, 0.02
-"""Below these a drive rests: mm/s, rad/s."""
+_MOVES_MM_S, _TURNS_RAD_S = 0.1, 0.02  # below these a drive rests: mm/s, rad/s
 
 
 def features(actuation: Actuation, devices: int = 1, *, by_robot: bool = False) -> dict[str, dict[str, Any]]:

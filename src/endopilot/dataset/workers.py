@@ -118,8 +118,7 @@ def _episodes(
     }
 
 
-Done = Callable[[Block, float], None]
-"""Called with each block that has been written and the processor time that it took, s."""
+Done = Callable[[Block, float], None]  # called with each written block and its processor time, s
 Item, Result = TypeVar("Item"), TypeVar("Result")
 _CONNECT_TIMEOUT_S = 10  # time limit for a scheduler to answer, s
 

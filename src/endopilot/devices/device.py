@@ -46,10 +46,8 @@ _WIRE_RATIO = (0.63, 1.05)  # GJ/EI of a wire: 1/(1 + ν) of a round section, ν
 _CATHETER_RATIO = (0.63, 3.0)  # the same of a catheter, whose braid may raise GJ
 _FALL = 3.0  # factor by which EI may fall from the tip on; devices stiffen towards the shaft
 _STIFFENING = 1e5  # largest ratio of EI along a device
-_LOAD_FACTOR = 10.0
-"""Factor between a catalogue's tip load and that of the tip's EI: protocols differ, and 1 gf is 1/102 N."""
-_STRENGTH_MPA = 3000.0
-"""Tensile strength of the strongest steel wire, MPa: EN 10270-1 has up to 3000 for patented wire of 0.3 mm."""
+_LOAD_FACTOR = 10.0  # between a catalogue's tip load and that of the tip's EI: protocols differ
+_STRENGTH_MPA = 3000.0  # tensile strength of the strongest steel wire, 0.3 mm thick, MPa (EN 10270-1)
 _LEAST_DEG = math.degrees(math.pi) / 57  # a bend up to this, some 3.16 °, is one in rad: half a turn has π of them
 
 

@@ -81,10 +81,8 @@ def _user_folders() -> list[Path]:
     return list(dict.fromkeys(folder.resolve() for folder in folders))
 
 
-GRAM_FORCE_N = 9.80665e-3
-"""One gram-force in N, by the standard acceleration of gravity; catalogues give tip loads in it."""
-TIP_LENGTH_MM = 10.0
-"""Length of the floppy tip, mm: the buckling length of catalogues' tip loads, and the distal coil of coronary wires."""
+GRAM_FORCE_N = 9.80665e-3  # one gram-force in N, in which catalogues give tip loads
+TIP_LENGTH_MM = 10.0  # floppy tip, mm: the buckling length of catalogues' tip loads, and a distal coil
 MOST_VALUES = 1000  # values that a profile or a shape may have
 _LENGTHS = (("m", 1000.0), ("inch", 25.4), ("cm", 10.0), ("µm", 0.001))
 _FORCES = (("gf", GRAM_FORCE_N), ("mN", 0.001), ("kgf", 1000 * GRAM_FORCE_N))
@@ -95,10 +93,8 @@ Width = Annotated[
 """An outer or an inner diameter, mm."""
 Abscissa = Annotated[float, Within(0, 5000, unit="mm", mistaken=(("µm", 0.001),))]  # a distance from the tip, mm
 Stiffness = Annotated[float, Within(1e-4, 1e6, unit="N·mm²", mistaken=(("N·m²", 1e6),))]  # EI or GJ, N·mm²
-BendLength = Annotated[float, Within(0, 200, unit="mm", mistaken=(("µm", 0.001),))]
-"""Length of a bend of the tip, mm; 0 for a straight one."""
-ArcLength = Annotated[float, Within(0.1, 500, unit="mm", mistaken=_LENGTHS)]
-"""Length of an arc of a catheter's shape, or that a hand can bend a tip over, mm."""
+BendLength = Annotated[float, Within(0, 200, unit="mm", mistaken=(("µm", 0.001),))]  # of the tip, mm; 0: straight
+ArcLength = Annotated[float, Within(0.1, 500, unit="mm", mistaken=_LENGTHS)]  # of a shape, or of a hand's bend, mm
 Angle = Annotated[float, Within(0, 360, unit="°")]  # angle that a hand can bend a tip by, °
 TipLoad = Annotated[float, Within(3e-4, 0.6, unit="N", mistaken=_FORCES)]  # load at which the tip buckles, N
 Friction = Annotated[float, Within(0, 2, mistaken=(("%", 0.01),))]  # a Coulomb coefficient

@@ -20,8 +20,7 @@ _HAIR_MM = 1e-9  # what rounding may add to an inserted length, mm
 WIDE_MM, SPARE_WIDTHS = 16.0, 3.0
 """In a lumen wider than this, such as an aorta, a wire lies down on the outer walls of bends and in loops, mm; that
 takes up to so many widths of it."""
-SLACK_WIDTHS = 2.0
-"""A wire that is pushed by so many widths of such a lumen, while its tip does not come forward, folds."""
+SLACK_WIDTHS = 2.0  # a wire pushed by so many widths of such a lumen, while its tip does not come forward, folds
 Numbers = float | Float[np.ndarray, "..."]
 
 

@@ -21,8 +21,7 @@ from endopilot.devices.stack import Transmission
 from endopilot.files import write_yaml
 from endopilot.settings import NonNegative, Positive, Within, public, read_settings, settings
 
-ASSUMED, IDEAL = "assumed", "ideal"
-"""Names of the robot whose numbers are assumptions, which is the default, and of the one that does as commanded."""
+ASSUMED, IDEAL = "assumed", "ideal"  # the robot of assumed numbers, the default, and the one that does as commanded
 _SHIPPED = Path(__file__).parent / "robots"
 Kind = TypeVar("Kind", bound=Device)
 _MOST_SPREADS = 3.0  # a gain that is drawn lies no farther from its mean than this many standard deviations

@@ -32,8 +32,7 @@ class Transmission:
 
 SHOWN_BEHIND_MM = 20.0  # length of devices that pictures show behind the ostium, in the guiding catheter, mm
 _APART_MM = 1e-6  # nodes nearer to a tip than this are the tip, mm
-Proximals = tuple[tuple[float, float], ...]
-"""Of each of some devices' proximal ends a length and an angle, or their rates."""
+Proximals = tuple[tuple[float, float], ...]  # of each device's proximal end a length and an angle, or rates
 
 
 @dataclass(frozen=True)

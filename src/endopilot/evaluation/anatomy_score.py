@@ -15,8 +15,7 @@ from endopilot.anatomy.tree import SAMPLE_STEP_MM, sampled
 from endopilot.types import Anatomy, DistanceMap, LumenMask, VesselTree, Volume
 from endopilot.vessels.graph import groups
 
-SMALLEST_RADIUS_MM = 0.75
-"""Vessels thinner than this are not scored: two voxels of a coronary CTA across, CAT08 scores from 0.75 mm up too."""
+SMALLEST_RADIUS_MM = 0.75  # thinner vessels are not scored: two voxels of a coronary CTA, as CAT08 does
 
 
 @dataclass(frozen=True, kw_only=True)

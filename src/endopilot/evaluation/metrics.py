@@ -25,8 +25,7 @@ DIVERGED_MM = 2.0  # a rollout whose absolute error of Δtip passes this, mm, on
 OFF_WALL_MM = 0.1  # a tip with more than this between wire and wall, mm, is off the wall
 
 
-DEPTHS_MM: tuple[float, ...] = (0.0, 30.0, 60.0, 90.0, math.inf)
-"""Edges of the parts of the vessel, by the true Δtip, over which errors are reported too, mm."""
+DEPTHS_MM: tuple[float, ...] = (0.0, 30.0, 60.0, 90.0, math.inf)  # edges of parts of the vessel, by true Δtip, mm
 
 _PUSHED_MM, _STUCK_SHARE = 0.5, 0.1
 _SLIP_MM = 1.0

@@ -30,8 +30,7 @@ from endopilot.files import reading, regular, writing
 METRICS_FILE, RESULTS_FILE, FIGURES_FOLDER, REPORT_FILE = "metrics.json", "evaluation.npz", "figures", "report.html"
 """What an evaluation writes into its folder."""
 
-SPLITS: tuple[str, ...] = ("seen_test", "test")
-"""Splits of a result: navigations of patients that the run was trained on, and of all other patients."""
+SPLITS: tuple[str, ...] = ("seen_test", "test")  # navigations of patients known to the run, and of all others
 
 SERIES_TITLES: Mapping[str, str] = {
     "P1": "Forward network, true controls (P1)",

@@ -15,16 +15,13 @@ from endopilot.imaging.grid import LEAST_BLOOD_HU, connected_components, distanc
 from endopilot.lines import length_along
 from endopilot.types import Insertion, Volume
 
-_LEVELS_HU = (180.0, 230.0, 290.0, 360.0)
-"""Thresholds tried one after another: at one of them the aorta stands apart from its neighbours."""
-_RADIUS_MM = (9.0, 24.0)
-"""Inner radii of ascending aortas, mm: normal 12-18 (Wolak 2008), with room for small women and aneurysms."""
+_LEVELS_HU = (180.0, 230.0, 290.0, 360.0)  # thresholds tried one after another, until the aorta stands apart
+_RADIUS_MM = (9.0, 24.0)  # inner radii of ascending aortas, mm: normal 12-18 (Wolak 2008), and small or dilated ones
 _ROUND_SHARE = 0.6  # share of the directions in which the edge must lie near the circle; neighbours touch in the others
 _FEWEST_SLICES_MM = 10.0  # length over which the disc must persist, mm
 _MOST_ROOTS = 3  # chains of discs that are returned at most: the pulmonary trunk may be one, and the descending aorta
 _DIRECTIONS = 32
-_BRIGHTEST_HU = 600.0
-"""Undiluted contrast in the superior vena cava is brighter than this, and no more likely to be the aorta."""
+_BRIGHTEST_HU = 600.0  # contrast in the superior vena cava is brighter, and no more likely to be the aorta
 _BALL_MM = 7.0  # ball that opens the aorta: its surface goes on under the artery's mouth
 _BOX_MM = 18.0  # half the edge of the box around the artery's beginning that is looked at, mm
 _SECTIONS_MM = np.arange(1.0, 6.01, 0.5)  # heights above the aortic wall at which the artery's middle is measured, mm
@@ -34,10 +31,8 @@ _MOUTH_MM = 3.0  # nearer than this to the artery's axis, the opened aorta bulge
 _WALL_MM = 3.0  # width of the wall around the mouth from which the wall without the mouth is estimated, mm
 _FEWEST_OF_WALL = 100  # with fewer voxels of wall around the mouth, the wall is not estimated
 _DEEPEST_MM = 1.0  # a ball that opens the aorta bulges no deeper into a mouth: its cap of 3.5 mm radius is 0.9 mm high
-TO_WALL_MM = 3.5
-"""Vesselness fades where an artery opens into the aorta: a tree starts within this distance of the wall."""
-_OPENING_MM = 5.0
-"""Blood that joins a vessel to the aorta is looked for this far around the vessel's voxel nearest the wall."""
+TO_WALL_MM = 3.5  # a tree starts within this distance of the aorta's wall, where vesselness fades
+_OPENING_MM = 5.0  # blood that joins a vessel to the aorta is looked for this far around its voxel nearest the wall
 
 
 @dataclass(frozen=True, eq=False)

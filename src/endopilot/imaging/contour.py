@@ -12,12 +12,10 @@ from scipy.spatial import KDTree
 from endopilot.imaging.grid import connected_components, dilated, distance_to_outside
 from endopilot.types import Volume
 
-_SMOOTHING_MM = 0.3
-"""Width of the Gaussian against noise, mm; about the scanner's own blur, so that little detail is lost."""
+_SMOOTHING_MM = 0.3  # width of the Gaussian against noise, mm: about the scanner's own blur
 _BLUR_MM = 0.4  # width of that Gaussian and of a scanner's point-spread function (0.6 mm at half height) together, mm
 _SURROUNDINGS_MM = 1.2  # width of the window in which the surroundings' HU are averaged, mm
-_WALL_HU = 0.0
-"""Even in fat and lung, the vessel's own wall lies next to the lumen: half a millimetre of soft tissue, blurred."""
+_WALL_HU = 0.0  # even in fat and lung the vessel's wall lies next to the lumen: half a millimetre of tissue, blurred
 _BLOCK = 8  # edge of the blocks in which voxels near the vessel are looked for, voxels
 CALCIUM = 1.5  # times the lumen's HU; brighter voxels are calcium or metal
 _FEWEST_VOXELS = 5  # smaller bright specks are noise

@@ -26,27 +26,21 @@ _TISSUE_HU = (-100.0, 700.0)  # ribs and lung do not jump with the heart: edges 
 _STEP = 1.35  # between slabs of two heart beats, both change by this factor more than from slice to slice around it
 _NEIGHBOURS = 9  # slices around a pair that tell its usual change
 _LUNG_HU = -300.0
-_WIDE_END_MM = 1.5
-"""Distal ends of coronary arteries are thinner than this radius: a wider one is where the vessel was lost."""
+_WIDE_END_MM = 1.5  # distal ends of coronary arteries are thinner: at a wider one the vessel was lost
 _END_MM = 4.0  # length of a vessel's end whose radius counts
-_STUB_MM = 10.0
-"""Shorter paths are stubs and bumps, such as at the artery's mouth: their ends are wide, and nothing is lost."""
-_AHEAD_MM, _AHEAD_COSINE = 7.0, 0.8
-"""A vessel that begins this far beyond an end, and in its direction, is its continuation behind a gap."""
+_STUB_MM = 10.0  # shorter paths are stubs and bumps, as at the artery's mouth: nothing is lost at their wide ends
+_AHEAD_MM, _AHEAD_COSINE = 7.0, 0.8  # a vessel so far beyond an end, and in its direction, continues it behind a gap
 _LEAST_CONTINUATION_MM = 8.0  # a continuation is at least so long
-_SHORTEST_MM = {"rca": 60.0, "lca": 60.0}
-"""Length of the shortest main vessels, mm: of a right artery that ends before the crux, of an LAD."""
+_SHORTEST_MM = {"rca": 60.0, "lca": 60.0}  # shortest main vessels, mm: a right artery before the crux, an LAD
 _SECOND_MM = 30.0  # a left tree has two vessels of at least this length, LAD and LCx
-_VEIN_SHARE, _VEIN_MM, _VEIN_RADIUS_MM = 0.8, 15.0, 1.0
-"""Blood is as bright everywhere in arteries: a vessel this wide that is dimmer over this length is a vein."""
+_VEIN_SHARE, _VEIN_MM, _VEIN_RADIUS_MM = 0.8, 15.0, 1.0  # a vessel this wide, dimmer over this length, is a vein
 _GRAFT_MM = 12.0  # a vessel that leaves the aorta so far above the ostium is a bypass graft,
 _LEFT_ABOVE_MM = 26.0
 """unless it may be the left artery: in seven patients' CT angiograms the left ostium lies 9 to 24 mm above the right
 one, on the other side of the aorta, since the aortic root is tilted."""
 _LEAST_GRAFT_MM3 = 100.0
 _METAL_HU = 2000.0  # brighter than calcium: leads, stents, clips
-_METAL_MM3, _METAL_NEAR_MM = 4.0, 15.0
-"""Metal of this volume, so near to the tree, disturbs it."""
+_METAL_MM3, _METAL_NEAR_MM = 4.0, 15.0  # metal of this volume, so near to the tree, disturbs it
 _BEYOND_MM = 10.0  # the mask of a thin distal end may be this much shorter than its path
 _FILLED_MM = 2.0  # calcium or metal so near to where the mask ends fills the vessel
 _WALL_HU = 50.0  # the aortic wall

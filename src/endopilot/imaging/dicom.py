@@ -54,8 +54,7 @@ _PREAMBLE = 128
 _MOST_NAMED = 10
 _FEWEST_SLICES = 4
 _HU_TYPES = ("", "HU")
-_PERHAPS_HU_TYPES = ("US", "HU_MOD")
-"""RescaleType of HU that the scanner modified, and of converters that leave the type open (unspecified)."""
+_PERHAPS_HU_TYPES = ("US", "HU_MOD")  # RescaleType of modified HU, and of converters that leave the type open
 _AIR_HU = -1024.0  # what pixels are given that lie outside the scanned circle (PixelPaddingValue)
 
 

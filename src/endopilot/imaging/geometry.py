@@ -17,12 +17,9 @@ from jaxtyping import Float, Int, Shaped
 from endopilot.errors import InputError
 from endopilot.types import Volume
 
-AXES_TOLERANCE = 1e-2
-"""Cosine between two axes, and share by which a unit vector's length may err, below which axes are straightened."""
-_PLACE_TOLERANCE = 0.05
-"""A slice may lie off its place by this share of the step: positions are written with few digits."""
-_ROUNDING = 1e-5
-"""What single precision and six decimals leave: it moves no voxel by more than some micrometres, and is not noted."""
+AXES_TOLERANCE = 1e-2  # cosine between axes, and error of a unit vector's length, below which they are straightened
+_PLACE_TOLERANCE = 0.05  # a slice may lie off its place by this share of the step: positions have few digits
+_ROUNDING = 1e-5  # what single precision and six decimals leave, some micrometres: it is not noted
 
 MM_PER_UNIT = {
     **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1.0),
@@ -33,8 +30,7 @@ MM_PER_UNIT = {
     **dict.fromkeys(("in", "inch", "inches"), 25.4),
 }
 """Millimetres in each unit of length that a header may name, in lower case."""
-_CONVERTED_MM = (1e-3, 20.0)
-"""Voxel sizes that a unit other than mm may lead to, mm: others show that the header names the wrong unit."""
+_CONVERTED_MM = (1e-3, 20.0)  # voxel sizes that a unit other than mm may lead to, mm: else the unit is wrong
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from scipy import ndimage
 from endopilot.errors import InputError, Remark, box_text
 from endopilot.types import Anatomy, LumenMask, Volume
 
-LEAST_BLOOD_HU = 130.0
-"""Without contrast, blood measures 30-60 HU; below this value no method here can separate lumen from wall."""
+LEAST_BLOOD_HU = 130.0  # without contrast blood measures 30-60 HU; below this no method here separates lumen from wall
 
 
 def to_image(volume: Volume) -> sitk.Image:

@@ -20,16 +20,14 @@ from endopilot.imaging.geometry import Fields, Geometry, converted, farthest_apa
 from endopilot.imaging.segments import ImageFile, Segment
 from endopilot.imaging.voxels import Encoding, opened, read_voxels, rescaled
 
-_SPACING_TOLERANCE = 0.01
-"""Voxel sizes that a header gives twice may differ by this share: they are written with few digits."""
+_SPACING_TOLERANCE = 0.01  # voxel sizes given twice may differ by this share: they have few digits
 _RAS_TO_LPS = np.array([-1.0, -1.0, 1.0])
 _SCANNER = 1  # code of a transform to the scanner's anatomical coordinates
 _LARGEST_OFFSET = 1 << 40
 _LONGEST_EXTENSION = 1 << 24
 _XML_EXTENSION = 30  # code of an extension of Caret, whose XML may name labels (NIFTI_ECODE_CARET in nifti1_io.h)
 _UNITS = {0: "mm", 1: "m", 2: "mm", 3: "µm"}
-_INTENTS = (0, 1001, 1002, 1003)
-"""What a grey-level image or a mask may be meant as: nothing, an estimate, labels, or names of regions."""
+_INTENTS = (0, 1001, 1002, 1003)  # a grey-level image or a mask: nothing, an estimate, labels, names of regions
 
 _HEADERS = {
     348: {

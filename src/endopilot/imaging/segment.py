@@ -31,16 +31,12 @@ METHODS = Registry(
     group="endopilot.segmentation",
 )
 """Where the segmentation methods are. Each is a `SegmentationMethod`, or just its function `segment_lumen`."""
-_ROOT_MM = 5.0
-"""An ostium is on an aorta of 9 mm radius or more: where it is nearer to the volume's edge, the root is cut off."""
+_ROOT_MM = 5.0  # an ostium is on an aorta of 9 mm or more: nearer to the volume's edge, the root is cut off
 _BLOCK_MM = 2.0  # voxels are averaged to blocks of about this size: noise goes, pools of blood stay
-_CALM_HU = 25.0
-"""Tissue is homogeneous where its standard deviation over 3 × 3 × 3 blocks is smaller: blood is, bone is not."""
-_NOISE_FACTOR = 1.3
-"""In a noisy scan, the limit is this many times the lower quartile of that deviation in fat, muscle and blood."""
+_CALM_HU = 25.0  # tissue with a smaller SD over 3 × 3 × 3 blocks is homogeneous: blood is, bone is not
+_NOISE_FACTOR = 1.3  # in a noisy scan, the limit in lower quartiles of that SD in fat, muscle and blood
 _BRIGHTEST_HU = 900.0  # metal and dense bone lie above this, no blood does
-_LEAST_POOL_ML = 4.0
-"""Less than the inside of any heart chamber; homogeneous bone of the thorax comes in smaller pieces."""
+_LEAST_POOL_ML = 4.0  # less than any heart chamber holds; homogeneous bone of the thorax is smaller
 _POOL_MM = 20.0  # diameter of a ball of that volume: a field of view that is shorter holds only a slice of a pool
 
 

@@ -68,8 +68,7 @@ _META_SYNONYMS = {
     "ElementByteOrderMSB": "BinaryDataByteOrderMSB",
 }
 _META_FIELDS = Fields("TransformMatrix", "ElementSpacing", "Offset")
-_FROM = ("RL", "AP", "IS")
-"""Letters of `AnatomicalOrientation` along x, y and z of LPS: where an axis along it begins, and one against it."""
+_FROM = ("RL", "AP", "IS")  # letters of `AnatomicalOrientation` where an axis along x, y, z begins, or one against it
 
 
 def read_nrrd(path: Path) -> ImageFile:

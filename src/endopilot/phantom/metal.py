@@ -20,19 +20,14 @@ _LEADS = (
     [(-11, 18, 60), (-15, 21, -8), (-20, 14, -16), (-19, 2, 2), (-13, -5, 8)],
 )
 """From the upper vena cava to the right ventricle's apex, and to the right atrium's appendage (reference heart, mm)."""
-_LEAD_MM, _LEAD_HU = 0.9, 9000.0
-"""Radius of a lead, and the mean CT number of its conductors and insulation."""
-_STRUT_MM2, _STRUT_HU = 0.01, 25000.0
-"""Cross-section of a strut (0.1 mm by 0.1 mm), and its metal's CT number."""
-_CROWN_MM, _CROWNS = 1.4, 6
-"""A stent is a row of zigzag rings this long, each with so many peaks."""
+_LEAD_MM, _LEAD_HU = 0.9, 9000.0  # radius of a lead, and mean CT number of conductors and insulation
+_STRUT_MM2, _STRUT_HU = 0.01, 25000.0  # cross-section of a strut (0.1 mm by 0.1 mm), its metal's CT number
+_CROWN_MM, _CROWNS = 1.4, 6  # a stent is a row of zigzag rings this long, each with so many peaks
 _WATER = 2e-5  # attenuation of water divided by 1000: 1 HU along 1 mm adds this to the line integral
-_SATURATION = 4.0
-"""Line integral that a beam of many energies approaches behind ever more metal: the softer photons are gone."""
+_SATURATION = 4.0  # line integral that the beam approaches behind ever more metal: softer photons are gone
 _VIEWS = 120  # views of half a turn
 _BIN_MM = 1.0  # width of the detector's bins, and spacing of the grid on which streaks are reconstructed, mm
-_SWAY_MM = 1.5
-"""Metal in the heart moves this far while one slice is scanned, mm: the views disagree, and streaks result."""
+_SWAY_MM = 1.5  # metal in the heart moves this far during a slice's scan, mm: views disagree, streaks result
 
 
 @dataclass(frozen=True, eq=False)

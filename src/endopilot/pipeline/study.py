@@ -42,10 +42,8 @@ from endopilot.types import Volume
 from endopilot.vessels.read_source import read_source
 
 VOLUME_SUFFIX = ".nii.gz"
-EVALUATED = 16
-"""Navigations that are evaluated in each split; each takes some 13 s of a core, and the demo five minutes of two."""
-MISMATCH = (0.8, 1.2)
-"""Friction and tip stiffness of the navigations that simulated wires are evaluated on, over those they are given."""
+EVALUATED = 16  # navigations evaluated in each split; each takes some 13 s of a core
+MISMATCH = (0.8, 1.2)  # friction and tip stiffness of the navigations over those that simulated wires are given
 _EXTRAS = ("learn", "report")  # extras that the stages need, the last one after minutes of work
 DEMO_ORIGIN = (
     "The patients are synthetic: right coronary arteries drawn from published statistics, and a CT angiogram of each, "

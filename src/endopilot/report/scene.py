@@ -22,12 +22,8 @@ WALL, WIRE, TIP, BELIEVED = "#d98a8a", "#f6f7fb", "#ffd34d", "#5fb8ff"
 Wires = Float[np.ndarray, "wires nodes 3"]
 
 _WIRE_WIDTH = 7.0  # width of the wire's line, pixels; a catheter's is as much wider as its diameter
-
 TRAIL_S = 20.0  # how long the path of the tip stays in the picture, s
-
-_VIEWED = 1.3
-"""Length, in units of the cube root of its box's volume, that the camera sees of a vessel from its usual place."""
-
+_VIEWED = 1.3  # length that the camera sees of a vessel, in cube roots of its box's volume
 FRAME_MS = 90  # time between two samples when the navigation is played, ms
 
 

@@ -57,11 +57,9 @@ def gpu_errors(processor: Processor) -> Iterator[None]:
 
 FREE_BEHIND_MM = 3.0  # nodes farther behind the ostium than this follow the drive exactly, mm
 LANES = _core.LANES  # worlds that one thread steps side by side
-_DENT_MM = 0.015
-"""Depth to which a node that bears all that the drives can push with dents a wall of no given stiffness, mm."""
+_DENT_MM = 0.015  # depth to which a node that bears all that drives can push dents a wall of no stiffness, mm
 _HARD_PUSH_N = 2.0  # push that stands for the limit of a drive that has none, N
-_RIGID_REACH_MM, _COMPLIANT_REACH_MM = 0.5, 2.4
-"""How far outside the wall a wire may lie, mm; distance maps reach 2.5 mm."""
+_RIGID_REACH_MM, _COMPLIANT_REACH_MM = 0.5, 2.4  # how far outside the wall a wire may lie; maps reach 2.5 mm
 _SOFTEST_N_MM2 = 0.01  # a softer wall would yield farther than distance maps reach, N/mm²
 _ARTERY_MM = 4.0  # width of the artery that displaces the muscle around it, mm
 COMPLIANT_WALL_STIFFENING_MM2 = 8.023 / _ARTERY_MM**2
@@ -70,8 +68,7 @@ times its modulus (Holzapfel and Ogden, Phil Trans R Soc A 2009, isotropic part,
 COMPLIANT_WALL_AT_TIP_MM = 6.4
 """The tip bears on a point, and takes along as much wall as this length has, mm: a rigid disc as wide as the artery, on
 the muscle of docs/concepts/wall.md, is held by E B/(1 - ν²) = 0.064 N/mm (Boussinesq), and K is 0.01 N/mm²."""
-Actuation = Literal["velocity", "force"]
-"""What a control is: translation (mm/s) and rotation (rad/s), or the drive's axial force (N) and torque (N·mm)."""
+Actuation = Literal["velocity", "force"]  # mm/s and rad/s, or the drive's axial force (N) and torque (N·mm)
 
 
 @settings

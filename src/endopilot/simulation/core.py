@@ -30,10 +30,8 @@ from endopilot.simulation.rod import RodLayout
 from endopilot.simulation.tubes import TransmissionLayout, TubeLayout
 from endopilot.types import SAMPLE_PERIOD_S, DistanceMap, Insertion
 
-_LARGEST_NEWTON_STEP = 0.3
-"""Displacement of a node (mm) that one Newton step is clamped to; larger ones can tangle the wire for good."""
-_MAX_ITERATIONS = 400
-"""Newton iterations after which a time step is halved, down to 1/64; a wire that snaps over needs some hundred."""
+_LARGEST_NEWTON_STEP = 0.3  # a node's displacement (mm) in a Newton step at most; larger ones tangle the wire
+_MAX_ITERATIONS = 400  # then a time step is halved, down to 1/64; a wire that snaps over needs some hundred
 _OF_DEVICES = frozenset(name for name, of, *_ in _core.OUTPUTS if of == "device")
 
 

@@ -11,19 +11,14 @@ from jaxtyping import Float
 from endopilot.progress import Advance
 from endopilot.simulation.groups import Group, factor_at
 
-SCALARS, DEVICE, NODE = 10, 27, 35
-"""Numbers of a world, then of each device, then of each node."""
-INSERTED, ACTIVE, REASON, TIME = 0, 5, 6, 9
-"""Of a world: inserted length, mm, number of nodes ahead of the catheter, why it is invalid, and time, s."""
+SCALARS, DEVICE, NODE = 10, 27, 35  # numbers of a world, then of each device, then of each node
+INSERTED, ACTIVE, REASON, TIME = 0, 5, 6, 9  # of a world: length, mm, nodes ahead of the catheter, reason, s
 LENGTH, ROTATION, FRICTION, LOADS = SCALARS, SCALARS + 1, SCALARS + 5, slice(SCALARS + 7, SCALARS + 11)
 """Of the wire: inserted length, mm, rotation, rad, coefficient of friction, and force and torque at the base, then of
 the drive, N and N·mm."""
-DRIVE_ROTATIONS = slice(SCALARS + 18, SCALARS + DEVICE)
-"""Of the wire: rotations of the drive and between it and the ostium, rad."""
-POSITION, ATTITUDE = slice(0, 3), slice(3, 7)
-"""Of a node: where it lies, mm, and the quaternion of the element behind it."""
-CONTACTS = (13, 24)
-"""Of a node: where the numbers of its two contact points begin, at the node and at the middle of the element."""
+DRIVE_ROTATIONS = slice(SCALARS + 18, SCALARS + DEVICE)  # the drive's, and between it and the ostium, rad
+POSITION, ATTITUDE = slice(0, 3), slice(3, 7)  # of a node, mm, and the quaternion of the element behind it
+CONTACTS = (13, 24)  # where a node's two contact points begin, at the node and at its element's middle
 LIMIT, NORMAL_FORCE, OFFSET = 0, 7, slice(8, 11)
 """Of a contact point: limit of friction in the coming step, N, the wall's force, N, and how far the wire's curve lies
 beside the polygon there, mm."""

@@ -19,8 +19,7 @@ from jaxtyping import Float, Int
 from endopilot.errors import InputError, Remark
 from endopilot.files import read_text
 
-_LARGEST, _MOST_ROWS = 2**28, 5_000_000
-"""Bytes and rows of a table; a rollout of 10 000 navigations of a minute has 1.2 million rows."""
+_LARGEST, _MOST_ROWS = 2**28, 5_000_000  # bytes and rows of a table; 10 000 minutes have 1.2 million rows
 _SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars"}
 _NUMBER = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
 _LONGEST_CELL = 40

@@ -30,8 +30,7 @@ STEP_S = 0.002  # time step of MuJoCo, s
 SETTLE_S = 0.06
 """Time in which the joints come to rest, s. Velocities are taken away after each step, so that an inertia of stiffness
 times this and the step damps a joint, in the equations that contacts solve too, and nothing swings."""
-SHELL_MM = 0.4
-"""Thickness of the wall's triangles, mm: they lie so far outside the lumen. A thinner wall lets a node through."""
+SHELL_MM = 0.4  # the wall's triangles lie so far outside the lumen, mm; a thinner one lets nodes through
 MESH_MM = 0.4  # spacing of the grid that the wall's triangles are found on, mm
 BEHIND_MM = 3.0  # joints farther behind the ostium are held straight, mm; no wall is needed there
 LEAP_MM = 0.1  # a node that would move farther in a step is damped more, as where the wire snaps over, mm

@@ -32,8 +32,7 @@ AMPLITUDES = {
 }
 """Amplitudes in which patients differ: published mean, standard deviation, least and most; `Motion` has the sources."""
 
-_LONG_AXIS = np.array(LEFT_VENTRICLE_AXIS) / np.linalg.norm(LEFT_VENTRICLE_AXIS)
-"""From the base of the heart to its apex, LPS."""
+_LONG_AXIS = np.array(LEFT_VENTRICLE_AXIS) / np.linalg.norm(LEFT_VENTRICLE_AXIS)  # from the heart's base to its apex
 _LONG_AXIS_MM = 94.0  # length of the left ventricle's outside along it, mm, as in the atlas
 _KNOTS = 64  # knots of the spline through a period
 _PHASES, _CONTRACTED = (0.03, 0.34, 0.54, 0.74), (0.0, 1.0, 0.42, 0.22)

@@ -13,18 +13,15 @@ from endopilot.devices.device import Wire
 from endopilot.simulation.config import Processor, RodModel, core_for
 
 POISSON_RATIO = 0.3  # of steel and nitinol; it ties shear to bending stiffness
-SHEAR_CORRECTION = 6 * (1 + POISSON_RATIO) / (7 + 6 * POISSON_RATIO)
-"""Cowper's shear coefficient of a round section (J. Appl. Mech. 33, 1966)."""
+SHEAR_CORRECTION = 6 * (1 + POISSON_RATIO) / (7 + 6 * POISSON_RATIO)  # round section (Cowper, J. Appl. Mech. 33)
 _DRAG_N_S_MM2, _SOFT_N_MM2 = 5e-6, 0.1
 """Drag on one mm of wire, N·s/mm²; far below friction. On a wire softer than the latter anywhere, N·mm², it falls with
 the square of that: it would fold as it is pushed."""
 _LEAST_N_S_MM2 = 1e-10
 """Drag is no less than this, N·s/mm². That of blood would be more, 2πη / ln(length / diameter) = 1e-8 with η = 0.0035
 Pa·s, and fold a wire of less than some 0.005 N·mm² as it is pushed; no blood is modelled."""
-_GROWTH_MM = 40.0
-"""Distance from the tip at which elements are twice as long as there; they grow in proportion to it, mm."""
-LONGEST_ELEMENTS = 5.0
-"""Longest elements, as a multiple of those at the tip: the shaft is stiffer and bends less sharply."""
+_GROWTH_MM = 40.0  # elements so far from the tip are twice as long as there, mm; they grow in proportion
+LONGEST_ELEMENTS = 5.0  # in elements at the tip: the shaft is stiffer and bends less sharply
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,8 +31,7 @@ from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 _DEEPEST_START = 0.8  # share of the longest path that a random start may lie at
-_LEAST_BYTES = 4000
-"""No world takes less memory, bytes; a number of worlds that needs more is refused before they are listed."""
+_LEAST_BYTES = 4000  # no world takes less memory; too many are refused before they are listed
 
 
 class Simulator(Readout):

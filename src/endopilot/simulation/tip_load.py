@@ -26,13 +26,10 @@ HELD_MM = 10.0  # distance from the tip at which the test holds the wire, mm
 TOLERANCE = 0.05  # relative error of the simulated tip load against the catalogue's that passes
 _ELEMENTS = 40
 _PLATE_N_MM = 100.0  # stiffness of the plate, N/mm: a tip load moves it by some µm
-_PUSH_SHARE = 0.02
-"""The holder is lowered by this share of the length. A buckled column's load grows by half of it, 1 %."""
+_PUSH_SHARE = 0.02  # of the length, lowered; a buckled column's load grows by half of it, 1 %
 _SAMPLES = 20
-_IMPERFECTION = 1e-3
-"""Sideways load on the tip as a share of the load at which a uniform tip buckles: no real tip is perfectly straight."""
-_STATIC = SimulatorConfig(time_step_s=0.5, tolerance_mm=1e-7, threads=1)
-"""One step a sample and next to no drag: each sample is an equilibrium."""
+_IMPERFECTION = 1e-3  # sideways load as a share of the buckling load: no real tip is perfectly straight
+_STATIC = SimulatorConfig(time_step_s=0.5, tolerance_mm=1e-7, threads=1)  # each sample is an equilibrium
 _DRAG = 1e-12
 
 

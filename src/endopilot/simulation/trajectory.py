@@ -43,8 +43,7 @@ if TYPE_CHECKING:
 TRAJECTORY = "trajectory.npz"  # name of the file in a folder that holds one navigation or plan
 FORMAT_VERSION = 1  # of the .npz file: raised when an array comes to mean something else
 _FORMAT = "endopilot trajectory"
-_REASONS = {1: "left the finite numbers", 2: "did not converge", 3: "went through the wall"}
-"""Meaning of `Trajectory.reason` for an invalid world."""
+_REASONS = {1: "left the finite numbers", 2: "did not converge", 3: "went through the wall"}  # of an invalid world
 
 
 @described

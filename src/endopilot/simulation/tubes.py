@@ -11,8 +11,7 @@ from endopilot.devices.stack import Stack
 from endopilot.simulation.config import CoreTransmission, Processor, Tubes, core_for
 from endopilot.simulation.rod import POISSON_RATIO, SHEAR_CORRECTION
 
-_SPACING_MM, _BEHIND_SPACING_MM = 0.25, 1.0
-"""Distance between the points of a profile, mm; of those behind the ostium."""
+_SPACING_MM, _BEHIND_SPACING_MM = 0.25, 1.0  # between a profile's points, mm; of those behind the ostium
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,10 +17,8 @@ from endopilot.simulation.rod import RodLayout
 from endopilot.simulation.tubes import TubeLayout
 from endopilot.types import Insertion
 
-X_AXIS = Insertion(position=np.zeros(3), direction=np.array([1.0, 0.0, 0.0]))
-"""Free rods are clamped at the origin and point along x."""
-STATIC = SimulatorConfig(time_step_s=0.5, tolerance_mm=1e-8, largest_jump=1e6, threads=1)
-"""One time step a sample: with drag of next to nothing, each sample is a static equilibrium."""
+X_AXIS = Insertion(position=np.zeros(3), direction=np.array([1.0, 0.0, 0.0]))  # free rods point along x from 0
+STATIC = SimulatorConfig(time_step_s=0.5, tolerance_mm=1e-8, largest_jump=1e6, threads=1)  # samples are equilibria
 
 
 @dataclass(frozen=True, eq=False)

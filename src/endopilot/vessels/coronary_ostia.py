@@ -22,8 +22,7 @@ from endopilot.vessels.ends import OpenEnd
 
 Side = Literal["rca", "lca"]
 
-SAME_MM = 8.0
-"""Ends of one lumen nearer each other than this are ends of one stub: corners of one cut, or a branch at the ostium."""
+SAME_MM = 8.0  # ends of one lumen nearer than this are of one stub: corners of a cut, or a branch at the ostium
 
 LEFT_FROM_RIGHT = np.array([0.40, 0.79, 0.46])
 """Direction of the left ostium as seen from the right one, LPS: the right sinus of Valsalva faces forwards and lies
@@ -31,20 +30,15 @@ lower. In seven real patients within 13° of this."""
 
 LEFT_FROM_RIGHT_SD_DEG = 14.0
 
-BETWEEN_MM, BETWEEN_SD = 35.6, 0.12
-"""Distance of the two ostia, mm, and the SD of its logarithm; 31 to 39 mm in seven real patients."""
-
+BETWEEN_MM, BETWEEN_SD = 35.6, 0.12  # distance of the ostia, mm, and its logarithm's SD; 31 to 39 in seven patients
 AORTA_UP = np.array([-0.40, -0.30, 0.87])  # axis of the aortic root, LPS: up, to the right, and forwards
 
 AORTA_BEHIND_MM = 7.0
 """The aorta's axis passes this far behind and to the right of the middle between the ostia, which lie some 125° apart
 on its wall."""
 
-AORTA_MM, AORTA_SD_MM = 15.0, 3.0
-"""No coronary artery comes nearer to the aorta's axis than this, mm; 15.8 to 19.4 mm in seven real patients."""
-
-AORTA_REACH_MM = (-5.0, 40.0)
-"""The stretch of the aorta's axis, from the level between the ostia, that is looked at, mm."""
+AORTA_MM, AORTA_SD_MM = 15.0, 3.0  # no artery comes nearer to the aorta's axis; 15.8 to 19.4 mm in seven patients
+AORTA_REACH_MM = (-5.0, 40.0)  # stretch of the aorta's axis, from the level between the ostia, looked at
 
 HEADING = {"rca": np.array([-0.78, -0.5, 0.37]), "lca": np.array([0.96, -0.12, 0.24])}
 """First heading: the right artery leaves to the right and forwards, the left main to the left."""
@@ -56,8 +50,7 @@ CALIBRE, CALIBRE_SD = 1.0, 0.25
 TAPER, TAPER_SD = 0.6, 0.2
 WIDENING_SD = 0.15
 HEADING_SD_DEG, COURSE_SD_DEG = 40.0, 35.0
-OPENING_DEG, OPENING_SD_DEG = 105.0, 20.0
-"""Branches leave forwards: a fork whose branches open farther than this is entered from the side."""
+OPENING_DEG, OPENING_SD_DEG = 105.0, 20.0  # branches leave forwards: a wider fork is entered from the side
 
 WEIGHT = {"calibre": 0.6, "taper": 0.4, "widening": 0.4, "opening": 0.6, "heading": 2.0, "course": 1.2}
 """What each likelihood counts: those of the lumen's width say in part the same."""
@@ -88,8 +81,7 @@ Dominance = Literal["right", "balanced", "left"]
 CRUX_FROM_OSTIUM_MM = np.array([12.0, 43.0, -44.0])
 """The crux as seen from the right ostium, LPS mm: behind and below it. In six real patients within 13 mm of this."""
 
-REACHED_MM = 20.0
-"""An artery that comes this near to the crux reaches it; in seven real patients the other one stays 34 mm away."""
+REACHED_MM = 20.0  # an artery so near to the crux reaches it; in seven patients the other stays 34 mm away
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,8 +17,7 @@ from endopilot.vessels.repair import NOTED_MM
 from endopilot.vessels.surface import MAXIMUM_GRID_POINTS, Surface, blur_voxels, smooth_level
 from endopilot.vessels.topology import MOST_LISTED
 
-_REACH_VOXELS = 1.5
-"""The tree reaches what lies within its radius and this many voxels of its axis: the mask's middle is not smooth."""
+_REACH_VOXELS = 1.5  # the tree reaches so many voxels beyond its radius: the mask's middle is not smooth
 
 _NARROWEST, _NARROWEST_STEPS = 0.75, 1.2
 """A stretch is widened to a radius of this many widths of the wall's blur, and grid steps: such a tube has no gap.

@@ -16,9 +16,7 @@ from endopilot.lines import length_along
 from endopilot.vessels.graph import RootedGraph, VesselGraph, lumen_graph
 from endopilot.vessels.surface import Surface
 
-STUB_COVERAGE, STUB_SLENDERNESS, STUB_MM = 1.2, 1.0, 1.0
-"""How little of a branch counts as an end: a left main may be as short as it is wide."""
-
+STUB_COVERAGE, STUB_SLENDERNESS, STUB_MM = 1.2, 1.0, 1.0  # a left main may be as short as it is wide
 _NEAR_MM = (1.5, 8.0)  # the calibre of an end is that of the lumen between these distances from it
 _HEADING_MM = (8.0, 16.0)  # an artery's first heading is that from its end to where it is between these distances
 
@@ -26,12 +24,8 @@ _SMOOTH_MM = 1.5
 _BEGUN_RADII = 2.0  # beyond this many of its radii from an end, a lumen's width is no longer that of its cap
 _MAJOR_MM = 15.0  # a branch with at least this much length behind it counts at the first fork
 _BLIND = 0.6  # an end whose cap is as round as a sphere counts this share of one that is cut flat
-
-_ROUND_CAP, _FLAT_CAP = 0.3, 0.7
-"""Flat part of a cap over the section: at 0.4 mm voxels domes of 2 to 6 mm have 0.2 to 0.5, cuts 0.6 to 0.9."""
-
-_NECK, _DOME = 1.3, 4.0
-"""An end this many times as wide as its neck, which lies no more of its radii behind than the second, is a dome."""
+_ROUND_CAP, _FLAT_CAP = 0.3, 0.7  # flat share of a section's cap: domes have 0.2 to 0.5, cuts 0.6 to 0.9
+_NECK, _DOME = 1.3, 4.0  # an end this much wider than its neck, at most the second of its radii behind, is a dome
 
 _LINE_ENDS, _NO_LINE = 0.5, 0.1
 """Lines run from the inlet, as VMTK writes them: one that ends at a place says this share of what one that begins there

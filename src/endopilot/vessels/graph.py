@@ -21,10 +21,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import KDTree
 
 COVERAGE = 1.6  # a path covers what lies within this many inscribed radii (and two grid steps) of it
-
-SLENDERNESS = 2.2
-"""A side branch is kept if it reaches this many times its own radius out of its parent's inscribed sphere."""
-
+SLENDERNESS = 2.2  # a kept side branch reaches this many of its radii out of its parent's inscribed sphere
 TOGETHER = 0.5  # lines nearer each other than this share of the local radius run together and become one
 
 _FINE_STEPS = 10.0

@@ -20,22 +20,14 @@ from endopilot.vessels.surface_distance import distance_map_from_surface
 Vessel = Literal["rca", "lca", "generic"]
 
 PARENT_RATIO = 2.5  # a lumen this many times wider than the tree's median, at its inlet, is the parent vessel
-
-PARENT_RADIUS_MM = (3.5, 6.0)
-"""The aorta's root is never narrower than the first, a coronary artery never wider than the second (an aneurysm is)."""
-
+PARENT_RADIUS_MM = (3.5, 6.0)  # no aortic root is narrower, no coronary artery wider (an aneurysm is)
 AORTA_RADIUS_MM = 7.0  # a lumen with a coronary artery that is as wide as this somewhere holds the aorta itself
 GRID_MM = 0.6  # grid spacing at which the parent vessel is looked for, mm
 COMPARABLE = 0.25  # a piece with at least this share of the largest one's size may be the other coronary artery
 ENTRANCE_RADII = 3.0  # an ostium given nearer than this many radii to an end of the vessel enters at that end
-
-SNAP_MM, SNAP_SD_MM = 10.0, 4.0
-"""A given ostium enters at an open end at most the first away; its likely error is the second."""
-
+SNAP_MM, SNAP_SD_MM = 10.0, 4.0  # a given ostium enters at an end so near at most; its likely error
 PLAUSIBLE = -5.0  # an end that scores less than this does not look like an inlet: the tip of a side branch
-
-LIKENESS_SD = 0.25
-"""Spread of the logarithm of how much an end looks like the inlet: half the likeness is worth as much as 9 mm."""
+LIKENESS_SD = 0.25  # spread of the logarithm of likeness to an inlet: half of it is worth as much as 9 mm
 
 _BRANCH_MM = 4.0
 

@@ -22,26 +22,16 @@ from endopilot.vessels.sources import Polylines
 
 STEP_MM = 0.5  # distance between the points of the tree, mm
 LONGEST_BRIDGE = 4.0  # lines that end within this many radii of another are joined to it; the gap is noted
-
-PARENT_VESSEL_RATIO = 2.5
-"""Where lines start in spheres this many times wider than their own median, they start in a parent vessel."""
-
-_OPPOSITE = -0.5
-"""Cosine of the angle between two directions from which on a vessel passes a place rather than forks there."""
-
-_OWN_MM = 2.0
-"""A line's points that coincide and lie farther than this apart along it are a place that it comes back to, mm."""
+PARENT_VESSEL_RATIO = 2.5  # lines that start in spheres so much wider than their median start in a parent vessel
+_OPPOSITE = -0.5  # cosine of two directions from which on a vessel passes a place rather than forks there
+_OWN_MM = 2.0  # a line comes back to a place where coinciding points lie farther apart along it than this, mm
 
 _SHORTEST_MM = 2.0
 
-_RIVAL = 0.4
-"""A coronary artery's lines that are not connected to a piece this share as long are those of another artery."""
-
+_RIVAL = 0.4  # lines that are not connected to a piece this share as long are another artery's
 _NEIGHBOURS = 6  # points of a line are compared with this many nearest ones
 _DISORDER = 2.0  # a line this many times as long as the shortest tree through its points is in no order
-
-_JUMP_STEPS, _JUMP_RADII = 8.0, 5.0
-"""A step of more than this many usual ones, and of both radii this many times, leads to another vessel."""
+_JUMP_STEPS, _JUMP_RADII = 8.0, 5.0  # a step of more usual ones, and radii, leads to another vessel
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,15 +19,13 @@ from endopilot.types import Volume
 from endopilot.vessels.graph import RootedGraph, VesselGraph, lumen_graph
 
 SMALLEST_PIECE = 12  # a piece of fewer voxels is noise
-
 _NEIGHBOURS_APART = 1.8  # voxels that share a corner lie this near each other, in voxels
 
 _NEAR_VOXELS, _MOSTLY_DEEP = 5.0, 0.5
 """A search for the nearest border takes long from voxels deeper than this. Where this share of them is, as in an aorta
 of fine voxels (33 against 3 s), distances are swept over the whole box instead."""
 
-_STUB_VOXELS, _SLENDER = 4.0, 1.5
-"""A side branch of the middle reaches this far out of its parent: in voxels, and in its own radii."""
+_STUB_VOXELS, _SLENDER = 4.0, 1.5  # a side branch reaches so far out of its parent, in voxels and own radii
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,9 +31,7 @@ from endopilot.vessels.sources import (
 from endopilot.vessels.surface import Surface
 
 _HEADER_BYTES = 65536  # statements of axes and unit stand in the first bytes of a file
-
-_LONGEST_S, _BYTES_A_SECOND = 30.0, 1e6
-"""A file that takes longer to read than this, and than its size at this speed, is damaged."""
+_LONGEST_S, _BYTES_A_SECOND = 30.0, 1e6  # a file that takes longer than this, and at this speed, is damaged
 
 _SIMVASCULAR = {"ModelFaceID", "BranchId", "CenterlineSectionArea", "GlobalNodeID"}
 """Arrays that SimVascular writes into models, centerlines and meshes, all in cm."""

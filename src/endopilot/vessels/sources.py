@@ -38,8 +38,7 @@ _KINDS = {
 published statistics (rca 1.2 and 123, lca 1.0 and 147, cerebral 1.5 and 140, portal 3.3 and 177, arch 8 and 304), and
 of public patients. Calibres of small vessels spread more: some files hold their thinnest branches, others do not."""
 
-_LONGER_SD, _SHORTER_SD = 0.3, 0.9
-"""Spread of ln(extent) about a kind's own; a file may hold a piece of the vessel, so that shorter costs less."""
+_LONGER_SD, _SHORTER_SD = 0.3, 0.9  # spread of ln(extent) of a kind; a file may hold a piece: shorter costs less
 
 _UNITS = {"mm": 1.0, "cm": 10.0, "inches": 25.4, "dm": 100.0, "m": 1000.0, "tenths of mm": 0.1, "µm": 0.001}
 _RARE = {"tenths of mm": 0.02, "µm": 0.02}  # how likely a unit is against cm, before the sizes are looked at
@@ -52,9 +51,7 @@ _CERTAIN, _FITS = 0.9, 0.05
 """A unit less probable than the first is asked for; the message names what has this share of the best one's chances."""
 
 _NONE = 1e-6  # likelihood of sizes that are no vessel's; those of a kind's medians have 1
-
-_NAMES = {**MM_PER_UNIT, "[in_i]": 25.4}
-"""mm in each unit of length, by its names; `[in_i]` is the inch of UCUM, which Slicer writes."""
+_NAMES = {**MM_PER_UNIT, "[in_i]": 25.4}  # mm in each unit, by its names; `[in_i]` is UCUM's inch, which Slicer writes
 
 
 @dataclass(frozen=True, eq=False)

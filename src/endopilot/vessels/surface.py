@@ -13,8 +13,7 @@ from scipy.spatial import KDTree
 from endopilot.errors import InputError
 from endopilot.types import Volume
 
-SMOOTHING_VOXELS = 1.75
-"""Standard deviation, in longest edges, of the Gaussian under which the surface must look like the mask."""
+SMOOTHING_VOXELS = 1.75  # SD, in longest edges, of the Gaussian under which the surface looks like the mask
 
 ACROSS_EDGES = 0.75
 """It is wider in voxels along shorter edges, by this power of the edges' ratio: at 0, a wall nearly in the plane of
@@ -22,18 +21,14 @@ thick slices keeps their steps, which are long in the plane; at 1, the crotch of
 
 _FIT_ITERATIONS = 8
 _BLOCK = 24  # edge in voxels of the blocks that a mask is smoothed in
-
 BAND_MM = 2.5  # how far outside the wall the distance map reaches, mm; beyond, it holds the constant −`BAND_MM`
-
-MAXIMUM_GRID_POINTS = 20_000_000
-"""A distance map holds at most this many grid points (80 MB of float32); the spacing grows until it fits."""
+MAXIMUM_GRID_POINTS = 20_000_000  # of a distance map (80 MB of float32); the spacing grows until it fits
 
 _NEAREST_TRIANGLES = 4
 _WORTH_THREADS = 20_000  # with fewer points than this, starting threads takes longer than they save
 
 
-_SLICES = 16
-"""A wall's inside is found this many slices at a time: of 170 000 triangles in 0.15 s, in 1.2 s all at once."""
+_SLICES = 16  # a wall's inside is found so many slices at a time: 170 000 triangles in 0.15 s, all at once 1.2 s
 
 
 @dataclass(frozen=True, eq=False)

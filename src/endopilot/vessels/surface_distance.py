@@ -11,8 +11,7 @@ from endopilot.imaging.grid import dilated
 from endopilot.types import DistanceMap
 from endopilot.vessels.surface import BAND_MM, Surface, grid_of
 
-_NEAR_WALL = (2, 5)
-"""This many grid steps outside and inside the wall are computed exactly, the rest on every second grid point."""
+_NEAR_WALL = (2, 5)  # grid steps outside and inside the wall that are exact, the rest at every second point
 
 
 def distance_map_from_surface(surface: Surface, *, spacing_mm: float, band_mm: float = BAND_MM) -> DistanceMap:

@@ -30,8 +30,7 @@ from endopilot.vessels.graph import pieces
 from endopilot.vessels.inlet import AORTA_RADIUS_MM
 from endopilot.vessels.medial_lines import SMALLEST_PIECE, MedialLines, piece_labels, thinned_lines, traced_lines
 
-CONTACT = 0.6
-"""A place whose clearance is less than this share of the vessels' on both sides is a contact, not a stenosis."""
+CONTACT = 0.6  # a place with less clearance than this share of both sides' is a contact, not a stenosis
 
 SHORTEST_LOOP_MM = 20.0
 """Loops from this length are cut. In shorter ones two branches touch again just behind their fork, or a wall has a
@@ -39,7 +38,6 @@ hole: which way a line takes hardly matters."""
 
 SHORTEST_TUNNEL_MM = 6.0  # tunnels shorter than this, or no longer than round the vessel itself, are rough voxels
 MOST_LISTED = 8  # as many places or pieces are listed one by one
-
 _SLIT_VOXELS = 3.0  # so are those whose opposite sides come as near each other as this, in voxels
 
 _APART, _STRAIGHT = (0.35, 0.5, 0.8), (0.6, 0.8)

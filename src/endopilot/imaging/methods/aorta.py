@@ -35,12 +35,10 @@ from endopilot.types import Insertion, LumenMask, Volume
 
 _GRID_MM = 1.5  # working voxel: a tenth of the aorta's radius, and the walls between it and its neighbours still show
 _WALL_HU = 50.0  # soft tissue around the lumen: vessel wall and muscle without contrast
-_PATH_LEVELS = (0.6, 0.5, 0.4)
-"""Shares of the blood's HU that the path stays above; a lower one is tried where the seeds are not connected."""
+_PATH_LEVELS = (0.6, 0.5, 0.4)  # shares of the blood's HU that the path stays above; lower ones where seeds are apart
 _REACH_MM = 30.0  # bright voxels farther from the path are not the aorta: half of 60 mm, a large aneurysm
 _CORE = 0.6  # share of the inscribed radius around the path that is aorta without question
-_WIDEST_MM = 18.0
-"""With one seed the far end is free; a wider inscribed sphere than this means that a heart chamber was entered."""
+_WIDEST_MM = 18.0  # with one seed the far end is free: a wider inscribed sphere is in a heart chamber
 _THINNEST_MM = 3.0  # radius of the opening: branches and leaks thinner than this go
 _SEED_MM = 6.0  # a seed is moved to the middle of the lumen within this distance
 

@@ -47,13 +47,10 @@ _BODY_GRID_MM = 1.0
 _GRID_MM = 0.5  # grids on which the aorta, the large blood pools and the vessels are sought
 _MUSCLE_HU = 100.0  # myocardium in the arterial phase
 _FAT_HU = -90.0  # epicardial fat
-_LOW_SHARE = 0.25
-"""A vessel's voxels rise by this share of the step from what surrounds them to lumen; the blur dims small vessels."""
-_POOL_RADIUS_MM = 3.5
-"""A ball of this radius fits in chambers and great vessels, and in no coronary artery but a dilated one."""
+_LOW_SHARE = 0.25  # a vessel's voxels rise by this share of the step to lumen; the blur dims small vessels
+_POOL_RADIUS_MM = 3.5  # such a ball fits in chambers, great vessels, and no coronary artery but a dilated one
 _CORE_RADIUS_MM = 5.5
-_NEAR_CORE_MM = 4.0
-"""A ball of this radius fits in no dilated artery either: what is wide so near to where it fits is a pool."""
+_NEAR_CORE_MM = 4.0  # such a ball fits in no dilated artery either: what is wide so near to it is a pool
 _CORE_MEDIAN = 3
 """Edge of the median filter against noise where the large balls are sought, voxels of the body's grid. A Gaussian would
 close the fat between an artery and a pool."""
@@ -64,7 +61,6 @@ _SEED_MM = 5.0  # a seed belongs to the vessel within this distance
 _LEAST_TREE_MM3 = 250.0  # a smaller connected vessel is no coronary tree: 50 mm of 2.5 mm width hold as much
 _RIVAL_SHARE = 0.85  # what is dimmer than this share of the aorta's blood is no second candidate for it
 COARSEST_MM = 1.25  # longest edge of voxels in which a coronary artery of 2 mm still shows
-
 _MOUTH_MM = 4.0  # length of the artery's beginning where the aorta's blood hides its radius, mm
 _WIDEST_MM = 5.0  # largest radius expected of a coronary artery, mm
 _MARGIN_MM = 8.0  # width of surroundings kept around the tree for the contour, mm
