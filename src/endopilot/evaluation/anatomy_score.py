@@ -5,31 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import SimpleITK as sitk
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from scipy import ndimage
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.projection import project_tip
 from endopilot.anatomy.tree import SAMPLE_STEP_MM, sampled
-from endopilot.types import Anatomy, DistanceMap, LumenMask, VesselTree, Volume
+from endopilot.imaging.grid import interpolate_like
+from endopilot.types import Anatomy, LumenMask, VesselTree, Volume
 from endopilot.vessels.graph import groups
 
 SMALLEST_RADIUS_MM = 0.75  # thinner vessels are not scored: two voxels of a coronary CTA, as CAT08 does
-
-
-@dataclass(frozen=True, kw_only=True)
-class AnatomyScore:
-    """Agreement of an extracted vessel with the true one, over true vessels of radius 0.75 mm or more: Dice of the
-    lumen's voxels beyond the ostium, `cl_dice`, and the measures of `Agreement`."""
-
-    dice: float
-    cldice: float
-    overlap: float
-    inside_accuracy_mm: float
-    radius_mae_mm: float
-    ostium_error_mm: float
-    false_length_mm: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,19 +40,26 @@ class Agreement:
     false_length_mm: float
 
 
+@dataclass(frozen=True, kw_only=True)
+class AnatomyScore:
+    """Agreement of an extracted vessel with the true one, over true vessels of radius 0.75 mm or more: Dice of the
+    lumen's voxels beyond the ostium, `cl_dice`, and the measures of `Agreement`."""
+
+    dice: float
+    cldice: float
+    overlap: float
+    inside_accuracy_mm: float
+    radius_mae_mm: float
+    ostium_error_mm: float
+    false_length_mm: float
+
+
 def score_anatomy(mask: LumenMask, extracted: Anatomy, truth: Anatomy) -> AnatomyScore:
     """Compare a mask and the anatomy extracted from it with the anatomy that the volume was made of."""
-    agreement = compare_trees(extracted.tree, truth.tree)
     dice, cldice = _mask_scores(mask, truth)
-    return AnatomyScore(
-        dice=dice,
-        cldice=cldice,
-        overlap=agreement.overlap,
-        inside_accuracy_mm=agreement.inside_accuracy_mm,
-        radius_mae_mm=agreement.radius_mae_mm,
-        ostium_error_mm=float(np.linalg.norm(extracted.insertion.position - truth.insertion.position)),
-        false_length_mm=agreement.false_length_mm,
-    )
+    ostium_error_mm = float(np.linalg.norm(extracted.insertion.position - truth.insertion.position))
+    agreement = vars(compare_trees(extracted.tree, truth.tree))
+    return AnatomyScore(dice=dice, cldice=cldice, ostium_error_mm=ostium_error_mm, **agreement)
 
 
 def compare_trees(
@@ -110,7 +103,9 @@ def _mask_scores(mask: LumenMask, truth: Anatomy) -> tuple[float, float]:
     is the true centerline; the mask's is thinned out of it (Lee et al. 1994)."""
     from skimage.morphology import skeletonize
 
-    true = _resample(truth.distance_map, mask.volume) > 0
+    wall = truth.distance_map
+    whole = Volume(wall.values, np.full(3, wall.spacing_mm), wall.origin_mm, np.eye(3))
+    true = interpolate_like(whole, mask.volume, outside=-1.0) > 0
     box = ndimage.find_objects((mask.volume.voxels | true).astype(np.uint8))[0]
     ours, true = np.pad(mask.volume.voxels[box], 1), np.pad(true[box], 1)
     corner = np.array([part.start - 1 for part in box])
@@ -124,17 +119,3 @@ def _mask_scores(mask: LumenMask, truth: Anatomy) -> tuple[float, float]:
     line[tuple((np.rint(mask.volume.world_to_index(points)).astype(int)[:, ::-1] - corner).T)] = True
     dice = 2 * (true & ours & scored).sum() / max((true & scored).sum() + (ours & scored).sum(), 1)
     return float(dice), cl_dice(ours, true, skeletonize(ours) & scored, line & true & scored)
-
-
-def _resample(distance_map: DistanceMap, grid: Volume) -> Float[np.ndarray, "nz ny nx"]:
-    """Return the distance map at the voxel centres of `grid`, and a negative number outside the map, mm."""
-    image = sitk.GetImageFromArray(np.asarray(distance_map.values, dtype=np.float32))
-    image.SetSpacing([distance_map.spacing_mm] * 3)
-    image.SetOrigin(distance_map.origin_mm.tolist())
-    resample = sitk.ResampleImageFilter()
-    resample.SetSize(grid.voxels.shape[::-1])
-    resample.SetOutputSpacing(grid.spacing_mm.tolist())
-    resample.SetOutputOrigin(grid.origin_mm.tolist())
-    resample.SetOutputDirection(grid.direction.ravel().tolist())
-    resample.SetDefaultPixelValue(-1.0)
-    return sitk.GetArrayFromImage(resample.Execute(image))

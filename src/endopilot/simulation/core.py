@@ -67,8 +67,7 @@ def run_core(
 
     Returns:
         The arrays of `_core.OUTPUTS`, with an axis of devices where they are of devices; `reason`: 0 fine, 1 not
-            finite,
-            2 not converged; `contacts`: the wall's force at each node and on the element behind it at the end, N.
+        finite, 2 not converged; `contacts`: the wall's force at each node and on the element behind it, N.
     """
     limits = np.array([[push_limit_n, pull_limit_n, torque_limit_n_mm]]) if tubes is None else tubes.limits
     worlds, samples, devices = len(control), control.shape[1], len(limits)

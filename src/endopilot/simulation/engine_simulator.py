@@ -216,12 +216,11 @@ class EngineSimulator(Simulator):
         time_step: float,
         steps: int,
         *,
-        by_force: bool,
         shape: bool = False,
         advance: Advance | None = None,
     ) -> dict[str, np.ndarray]:
         if not control.shape[1]:
-            begun = super()._run(group, control, time_step, steps, by_force=by_force, shape=shape, advance=advance)
+            begun = super()._run(group, control, time_step, steps, shape=shape, advance=advance)
             self._begin(group)
             return begun
         rows = []

@@ -178,7 +178,7 @@ class Simulator(Readout):
                 sample_period=SAMPLE_PERIOD_S,
             )
             no_control = np.zeros((len(group.index), 0, self._devices, 2))
-            self._run(group, no_control, self.config.time_step_s, self.config.steps_per_sample, by_force=False)
+            self._run(group, no_control, self.config.time_step_s, self.config.steps_per_sample)
         resets = np.isin(np.arange(self.worlds), chosen)
         self._set_up = replace(
             self._set_up,
@@ -379,11 +379,8 @@ class Simulator(Readout):
         advance: Advance | None = None,
     ) -> dict[str, np.ndarray]:
         """Step all worlds; from now on they are on their way."""
-        by_force = self._set_up.actuation == "force"
         results = [
-            self._run(
-                group, control[group.index], time_step, steps, by_force=by_force, shape=record_shape, advance=advance
-            )
+            self._run(group, control[group.index], time_step, steps, shape=record_shape, advance=advance)
             for group in self._groups
         ]
         if control.size and not np.isnan(self._set_up.initial).all():
@@ -425,13 +422,12 @@ class Simulator(Readout):
         time_step: float,
         steps: int,
         *,
-        by_force: bool,
         shape: bool = False,
         advance: Advance | None = None,
     ) -> dict[str, np.ndarray]:
         run = partial(
             group.simulation.run,
-            force_driven=by_force,
+            force_driven=self._set_up.actuation == "force",
             time_step=time_step,
             record_shape=shape,
             record_attitude=False,
