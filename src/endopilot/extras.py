@@ -45,7 +45,7 @@ def what_is_missing(error: ModuleNotFoundError) -> str | None:
 
 
 def require_extras(*extras: str) -> None:
-    """Raise InputError, which names what lacks, unless some extras are installed: before long work."""
+    """Raise InputError, which names what is missing, unless some extras are installed: before long work."""
     present = extras_present()
     missing = [extra for extra in extras if not present[extra]]
     if missing:

@@ -67,7 +67,7 @@ def _forks(labeller: Labeller, route: tuple[int, ...]) -> list[int]:
 
 
 def _end_of_distal(line: Centerline, passed: float | None) -> float:
-    """Return segment 3's end, mm, in an artery without a fork at the crux; one that ends before it is cut short."""
+    """Return segment 3's end, mm, in an artery that does not fork at the crux, or ends on its usual way there."""
     whole = float(line.abscissa[-1])
     if passed is None:
         return max(whole, USUAL_CRUX_MM)

@@ -384,6 +384,6 @@ def check_fits(device: Device, anatomy: Anatomy) -> None:
 
 
 def lateral_reach(bend_rad: float, length_mm: float) -> float:
-    """Return how far a bent tip stands beside the wire, mm: L(1 − cos θ)/θ, farthest where it turned by half a turn."""
+    """Return how far a bent tip stands beside the wire, mm: L(1 − cos θ)/θ, with half a turn at most."""
     angle = abs(bend_rad)
     return float(length_mm * (1 - np.cos(min(angle, np.pi))) / angle) if angle > 0 else 0.0

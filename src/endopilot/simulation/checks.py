@@ -50,7 +50,7 @@ def check_distance_map(anatomy: Anatomy) -> None:
 
 
 def check_memory(needed: int, what: str, mend: str) -> None:
-    """Raise InputError, from `what` needs it to the mend, for more bytes than 0.8 of the machine's memory."""
+    """Raise InputError, which begins with `what` needs it, for more bytes than 0.8 of the machine's memory."""
     available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > 0.8 * available:
         raise InputError(f"{what} need {needed / 2**30:.1f} GiB of {available / 2**30:.1f}; {mend}")

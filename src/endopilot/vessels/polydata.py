@@ -184,7 +184,7 @@ def _radius_array(data: dict[str, np.ndarray], path: Path) -> np.ndarray:
 
 
 def _check_size(path: Path) -> None:
-    """Raise InputError for a mesh file that is empty, shorter than its header promises, or PLY of no sense."""
+    """Raise InputError for a mesh file that is empty, shorter than its header promises, or no proper PLY."""
     size = path.stat().st_size
     if size < _FEWEST_BYTES:
         raise InputError(f"{path}: is empty or truncated; export it again")
