@@ -16,12 +16,12 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.patches import Patch
-from scipy.ndimage import map_coordinates, zoom
-from skimage.measure import marching_cubes
+from scipy.ndimage import map_coordinates
 
 from endopilot.anatomy.distance import sample
 from endopilot.anatomy.projection import project_tip
 from endopilot.anatomy.tree import tangents
+from endopilot.anatomy.wall_mesh import wall_mesh
 from endopilot.files import writing
 from endopilot.plotting import plain_text, section_colors
 from endopilot.types import Anatomy, Centerline, Volume
@@ -31,7 +31,7 @@ SECTIONS = 6  # cross-sections that are drawn, evenly along the longest path
 WINDOW_HU = (-150.0, 650.0)
 _WIDTH = 15.0  # of the picture, inches
 _LONGEST_NAME, _MOST_LISTED = 24, 120  # letters of a section's name, and sections, that are listed
-_LARGEST_GRID = 1_500_000
+_MOST_TRIANGLES = 200_000
 _LIGHT = np.array([-0.35, -0.8, 0.5]) / np.linalg.norm([-0.35, -0.8, 0.5])
 
 
@@ -52,7 +52,7 @@ def draw_anatomy(anatomy: Anatomy, path: Path, *, volume: Volume | None = None) 
 
 
 def _draw_tree(anatomy: Anatomy, figure: Any) -> None:
-    vertices, faces = _wall(anatomy)
+    vertices, faces = wall_mesh(anatomy.distance_map, max_triangles=_MOST_TRIANGLES)
     tree = anatomy.tree
     corners = vertices[faces]
     place = project_tip(tree, anatomy.insertion, corners.mean(axis=1))
@@ -92,16 +92,6 @@ def _list_sections(figure: Any, names: Sequence[str], palette: Any) -> None:
     width = 0.45 + 0.075 * max(len("catheter"), *map(len, shown))  # of a column, inches
     columns = min(len(handles), int(_WIDTH / width))
     figure.legend(handles=handles, fontsize=8, loc="outside lower center", ncols=columns, columnspacing=1.0)
-
-
-def _wall(anatomy: Anatomy) -> tuple[Float[np.ndarray, "n 3"], Any]:
-    field, spacing = anatomy.distance_map, anatomy.distance_map.spacing_mm
-    values = np.pad(field.values, 1, constant_values=float(field.values.min()))
-    factor = min(1.0, (_LARGEST_GRID / values.size) ** (1 / 3))
-    coarse = np.asarray(zoom(values, factor, order=1, grid_mode=False)) if factor < 1 else values
-    vertices, faces, _, _ = marching_cubes(coarse, 0.0)
-    step = spacing * (np.array(values.shape) - 1) / (np.array(coarse.shape) - 1)
-    return (vertices * step)[:, ::-1] + field.origin_mm - spacing, faces
 
 
 def _draw_straightened(anatomy: Anatomy, line: Centerline, half: float, volume: Volume | None, figure: Any) -> None:

@@ -92,7 +92,7 @@ def tip_values(anatomy: Anatomy, snapshot: Snapshot) -> dict[str, Any]:
 
 def scene(navigation: Navigation, about: dict[str, Any]) -> bytes:
     """Return what does not move: the lumen, the centerlines with the names of their sections, devices and target."""
-    from endopilot.report.wall_mesh import wall_mesh  # slow to import, and needed in the thread that makes the scene
+    from endopilot.anatomy.wall_mesh import wall_mesh  # slow to import, and needed in the thread that makes the scene
 
     anatomy, device = navigation.anatomy, navigation.device
     wall = wall_mesh(anatomy.distance_map, max_triangles=WALL_TRIANGLES)

@@ -12,28 +12,12 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Shaped
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from endopilot.evaluation.results import SERIES_TITLES
-from endopilot.plotting import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, STYLE, VERMILLION, YELLOW
+from endopilot.plotting import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, STYLE, VERMILLION
 from endopilot.report.tables import distinct, rows, values
 from endopilot.types import Anatomy, LumenMask, Volume
-
-SECTION_COLORS = (
-    BLUE,
-    ORANGE,
-    GREEN,
-    VERMILLION,
-    SKY,
-    PURPLE,
-    YELLOW,
-    "#7f5aa2",
-    "#6b4f2a",
-    "#44aa99",
-    "#882255",
-    GREY,
-)
 
 SERIES_STYLE: dict[str, dict] = {
     "true": {"color": BLACK, "label": "Recorded"},
@@ -210,7 +194,7 @@ def volume_figure(volume: Volume, mask: LumenMask, anatomy: Anatomy | None = Non
         _picture(axes[1], slab, np.any(lumen, axis=1)[crop[0], crop[2]], spacing[[0, 2]], origin="lower")
         axes[1].set_title("Coronal maximum projection")
         if anatomy is not None:
-            draw_tree(axes[2], anatomy)
+            anatomy.plot(axes=axes[2], view="front")
             axes[2].set_title("Extracted centerline")
     return figure
 
@@ -219,34 +203,8 @@ def tree_figure(anatomy: Anatomy) -> Figure:
     """Draw the extracted tree alone, where there is no CT."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(6.0, 4.2), layout="constrained")
-        draw_tree(figure.subplots(), anatomy)
+        anatomy.plot(axes=figure.subplots(), view="front")
     return figure
-
-
-def draw_tree(ax: Axes, anatomy: Anatomy) -> None:
-    """Draw the centerline tree from the front, coloured by section, as thick as the lumen."""
-    tree = anatomy.tree
-    shown: set[int] = set()
-    for branch in tree.branches:
-        line = branch.centerline
-        points = line.points[:, [0, 2]]
-        segments = np.stack([points[:-1], points[1:]], axis=1)
-        sections = branch.section[1:]
-        colors = [section_color(int(section)) for section in sections]
-        ax.add_collection(LineCollection(list(segments), colors=colors, linewidths=1.6 * line.radius[1:], alpha=0.9))
-        shown |= {int(section) for section in sections}
-    for section in sorted(shown):
-        ax.plot([], [], color=section_color(section), lw=4, label=tree.section_names[section])
-    ax.plot(*anatomy.insertion.position[[0, 2]], marker="o", color=BLACK, ms=5, ls="none", label="ostium")
-    ax.set_aspect("equal")
-    ax.autoscale_view()
-    ax.set(xlabel="x (to the patient's left), mm", ylabel="z (to the head), mm")
-    ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.2)
-
-
-def section_color(section: int) -> str:
-    """Return the colour of a section, the same in all pictures."""
-    return SECTION_COLORS[section % len(SECTION_COLORS)]
 
 
 def _grid(rows: int, columns: int, *, height: float) -> tuple[Figure, Shaped[np.ndarray, "rows columns"]]:

@@ -8,12 +8,12 @@ import numpy as np
 import plotly.graph_objects as go
 from jaxtyping import Float
 from markupsafe import Markup
+from matplotlib.colors import to_hex
 
+from endopilot.anatomy.wall_mesh import wall_mesh
 from endopilot.devices.device import Device
 from endopilot.devices.stack import lines_from_tips, shown_part
-from endopilot.plotting import CATHETER_COLORS
-from endopilot.report.figures import section_color
-from endopilot.report.wall_mesh import wall_mesh
+from endopilot.plotting import CATHETER_COLORS, section_colors
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import Anatomy
 
@@ -108,8 +108,8 @@ def _centerlines(anatomy: Anatomy) -> list[go.Scatter3d]:
             # One point before the section joins it to the one that it leaves.
             chosen = points[max(at[0] - 1, 0) : at[-1] + 1]
             pieces.setdefault(int(section), []).extend([chosen, np.full((1, 3), np.nan)])
-    lines = []
-    for section, parts in sorted(pieces.items()):
+    lines, palette = [], section_colors(len(pieces))
+    for number, (section, parts) in enumerate(sorted(pieces.items())):
         x, y, z = np.concatenate(parts).astype(np.float32).T
         lines.append(
             go.Scatter3d(
@@ -117,7 +117,7 @@ def _centerlines(anatomy: Anatomy) -> list[go.Scatter3d]:
                 y=y,
                 z=z,
                 mode="lines",
-                line={"color": section_color(section), "width": 5},
+                line={"color": to_hex(palette(number)), "width": 5},
                 name=f"Section {tree.section_names[section]}",
                 hovertemplate=f"section {tree.section_names[section]}<extra></extra>",
             )

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from endopilot.anatomy.wall_mesh import wall_mesh
 from endopilot.devices.device import Device
 from endopilot.files import writing
 from endopilot.plotting import CATHETER_COLORS
 from endopilot.report import still_process
-from endopilot.report.wall_mesh import wall_mesh
 from endopilot.types import Anatomy
 
 LIBRARIES_MISSING = (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
@@ -14,8 +14,7 @@ from endopilot.types import DistanceMap
 MAX_TRIANGLES = 45_000  # triangles of a wall at most: some 1.5 MB in a page
 
 
-@dataclass(frozen=True, eq=False)
-class WallMesh:
+class WallMesh(NamedTuple):
     """Vertices, LPS mm, and the indices of the corners of each triangle."""
 
     vertices: Float[np.ndarray, "vertices 3"]
