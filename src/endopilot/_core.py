@@ -1,10 +1,6 @@
-"""The C++ core, in the build that suits this processor.
-
-The same sources are built for up to three levels of x86-64 instructions: `baseline`, `avx2` and `avx512`
-(F, BW, CD, DQ, VL). On other processors there is `baseline` alone. All give the same results to the bit. The highest
-level that is built and that the processor supports is taken, or the one that the environment variable `ENDOPILOT_CORE`
-names. Importing this module gives the module of that level; its `LEVEL` says which it is.
-"""
+"""The C++ core, in the build that suits this processor: `baseline`, or on x86-64 `avx2` or `avx512` (F, BW, CD, DQ,
+VL), all of the same bits. The highest level that is built and supported is taken, or that of the environment variable
+`ENDOPILOT_CORE`; its `LEVEL` says which it is."""
 
 from __future__ import annotations
 

@@ -7,34 +7,23 @@ from collections.abc import Iterable
 from importlib.machinery import ExtensionFileLoader
 from types import FrameType
 
-STOPPING = (signal.SIGINT, signal.SIGTERM)
-"""Signals that stop a command and its worker processes."""
+STOPPING = (signal.SIGINT, signal.SIGTERM)  # signals that stop a command and its worker processes
 _LOADING = {each.__code__ for each in (ExtensionFileLoader.create_module, ExtensionFileLoader.exec_module)}
-_AGAIN_S = 0.02
-"""A signal that cannot stop the work where it arrives does so this much later, s: nobody notices."""
+_AGAIN_S = 0.02  # a signal that cannot stop the work where it arrives does so this much later, s: nobody notices
 
 
 class InputError(Exception):
-    """Bad input; the message is one line that names the file or field, the value found, and the remedy.
-
-    The command line prints the message without a traceback and exits with code 2. Raise it for anything that the
-    user can correct. Other exceptions are defects of endopilot itself.
-    """
+    """Bad input that the user can correct; the message is one line with the file or field, the value found, and the
+    remedy, which the command line prints and exits with code 2. Other exceptions are defects of endopilot itself."""
 
 
 class Stopped(SystemExit):
-    """Ctrl-C or SIGTERM, in a command and in its worker processes; `code` is the exit code, 128 + the signal.
-
-    It is no `KeyboardInterrupt`: one of those that comes out of a user's own code was raised by that code. Nothing but
-    the command line catches it.
-    """
+    """Ctrl-C or SIGTERM, in a command and its workers; `code` is the exit code, 128 + the signal. No
+    `KeyboardInterrupt`: one out of a user's own code was raised by that code. Only the command line catches it."""
 
 
 def stop(number: int, frame: FrameType | None) -> None:
-    """Raise `Stopped` once, as the handler of a signal, but not while an extension module is being loaded.
-
-    Such a module runs Python code to import others. VTK's go on where that raises, and crash, or lose the signal.
-    """
+    """Raise `Stopped` once, as a signal's handler, but not while an extension module loads: VTK's would crash."""
     while frame is not None:
         if frame.f_code in _LOADING:
             return stop_soon(number)

@@ -8,10 +8,8 @@ from contextlib import contextmanager
 
 from endopilot.errors import InputError
 
-FOR_DEVELOPERS = ("dev", "docs")
-"""Extras that no command needs."""
-_IMPORTED_AS = {"mujoco-core": "mujoco"}
-"""Libraries that are imported by another name."""
+FOR_DEVELOPERS = ("dev", "docs")  # extras that no command needs
+_IMPORTED_AS = {"mujoco-core": "mujoco"}  # libraries that are imported by another name
 
 
 def requirements_of_extras() -> dict[str, tuple[str, ...]]:
@@ -47,11 +45,7 @@ def what_is_missing(error: ModuleNotFoundError) -> str | None:
 
 
 def require_extras(*extras: str) -> None:
-    """Make sure that the libraries of some extras are installed, before work that needs them only at its end.
-
-    Raises:
-        InputError: some are not; the message names the extras that bring them.
-    """
+    """Raise InputError, which names what is missing, unless some extras are installed: before long work."""
     present = extras_present()
     missing = [extra for extra in extras if not present[extra]]
     if missing:
@@ -60,14 +54,7 @@ def require_extras(*extras: str) -> None:
 
 @contextmanager
 def extra_named(what: str) -> Iterator[None]:
-    """Say which extra to install where an import inside fails for want of it.
-
-    Args:
-        what: what needs the library; the message begins with it.
-
-    Raises:
-        ModuleNotFoundError: as the import raised it, with the mend in its message.
-    """
+    """Let a ModuleNotFoundError inside say which extra to install for `what` needs the library."""
     try:
         yield
     except ModuleNotFoundError as error:

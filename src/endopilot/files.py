@@ -32,12 +32,9 @@ from endopilot import __version__
 from endopilot.errors import InputError
 
 _MIB = 2**20
-RECORD_FILE = "run.json"
-"""Says which run a folder belongs to."""
-_LARGEST_JSON, _LARGEST_YAML = 512 * _MIB, _MIB // 4
-"""Bytes of a file that is read whole: recordings of long navigations have some MiB, settings some KiB."""
-_MOST_NODES = 100_000
-"""Values that a YAML file may hold once its aliases are written out."""
+RECORD_FILE = "run.json"  # says which run a folder belongs to
+_LARGEST_JSON, _LARGEST_YAML = 512 * _MIB, _MIB // 4  # of files read whole: long recordings have MiB, settings KiB
+_MOST_NODES = 100_000  # values that a YAML file may hold once its aliases are written out
 _ENCODINGS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF16_LE, "utf-16"),
@@ -53,22 +50,14 @@ _OF_THE_PATH = (
 """Errors that another path mends."""
 _FULL = re.compile("no space left|disk quota exceeded|disk is full|file too large", re.IGNORECASE)
 """How libraries say it in exceptions of their own."""
-_LEAST_FREE = 64 * 1024
-"""A disk with fewer free bytes than a page of some file systems takes is full, whatever a library says."""
-PARTIAL = ".part-"
-"""What the names of files begin with that are not whole yet."""
+_LEAST_FREE = 64 * 1024  # a disk with fewer free bytes than some file systems' page is full, whatever a library says
+PARTIAL = ".part-"  # what the names of files begin with that are not whole yet
 
 
 @contextmanager
 def writing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path` and rename it to `path` when the block ends without an error.
-
-    The temporary name keeps the suffix of `path`, for writers that choose the format by it. A block that fails
-    leaves neither `path` nor the temporary behind.
-
-    Raises:
-        InputError: the folder cannot be written, or the disk is full.
-    """
+    """Yield a temporary path beside `path`, of the same suffix, and rename it when the block ends without an error;
+    else nothing is left. Raises InputError where the folder cannot be written, or the disk is full."""
     with _temporary(Path(path)) as partial:
         yield partial
         partial.replace(path)
@@ -76,14 +65,9 @@ def writing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def writing_folder(folder: Path, record: str) -> Iterator[Path]:
-    """Yield a temporary folder whose files go into `folder` when the block ends without an error, `record` last.
-
-    Readers know by `record` that a folder is whole: it is not there while others are replaced. What else lies in
-    `folder` stays as it is.
-
-    Raises:
-        InputError: the folder cannot be written, or holds other things and not all of these files, and no run's record.
-    """
+    """Yield a temporary folder whose files go into `folder` when the block ends without an error, `record` last, by
+    which readers know that it is whole; what else lies there stays. Raises InputError where it cannot be written, or
+    holds other things and no run's record."""
     folder = Path(folder).resolve()  # a link stays
     with _temporary(folder) as partial:
         partial.mkdir()
@@ -148,11 +132,7 @@ def _problem(partial: Path, error: Exception) -> str | None:
 
 
 def regular(path: str | Path) -> Path:
-    """Return a path, whose reader finds out whether something lies there, if that is a file or a folder.
-
-    Raises:
-        InputError: it is a FIFO, a socket or a device, which may have no end.
-    """
+    """Return a path; InputError for a FIFO, a socket or a device, which may have no end."""
     with suppress(OSError, ValueError):  # missing, or no path at all
         if stat.S_IFMT(Path(path).stat().st_mode) not in (stat.S_IFREG, stat.S_IFDIR):
             raise InputError(f"{path}: is a FIFO, a socket or a device; give a file or a folder")
@@ -184,10 +164,8 @@ def _lists(content: Any) -> Any:
 
 
 def png_image(image: np.ndarray) -> bytes:
-    """Return an image as the content of a PNG file: rows and columns of bytes, grey, or red, green and blue.
-
-    Of a noisy image, looking for nothing but runs of equal bytes takes less time and leaves a smaller file.
-    """
+    """Return an image as a PNG file's content: rows and columns of bytes, grey, or red, green and blue. Of a noisy
+    image, looking for nothing but runs of equal bytes takes less time and leaves a smaller file."""
     from PIL import Image  # slow to import
 
     file = io.BytesIO()
@@ -196,16 +174,8 @@ def png_image(image: np.ndarray) -> bytes:
 
 
 def read_text(path: Path, *, what: str = "text file", largest: int = _LARGEST_YAML) -> str:
-    """Return what a text file holds, in UTF-8, or in UTF-16 if it begins with that encoding's mark.
-
-    Args:
-        path: the file.
-        what: what it should be, for the message, such as "CSV file".
-        largest: bytes that it may have at most; no more than these are read.
-
-    Raises:
-        InputError: the file is missing, cannot be read, is too large, or is no text.
-    """
+    """Return a text file of at most `largest` bytes in UTF-8, or UTF-16 by its mark. Raises InputError, which calls it
+    `what`, such as "CSV file", where it is missing, too large, or no text."""
     try:
         with regular(path).open("rb") as stream:
             content = stream.read(largest + 1)
@@ -226,16 +196,8 @@ def read_text(path: Path, *, what: str = "text file", largest: int = _LARGEST_YA
 
 
 def read_json(path: Path, *, keys: Iterable[str] | None = None, mend: str = "make it again") -> Any:
-    """Read a JSON file.
-
-    Args:
-        path: the file.
-        keys: what it must hold; None for a file that need not hold an object with names.
-        mend: what to do about a damaged file.
-
-    Raises:
-        InputError: the file is missing, is not JSON, names a key twice, or lacks one of `keys`.
-    """
+    """Read a JSON file, an object with `keys` if these are given. Raises InputError, which ends with the mend, where it
+    is missing, is not JSON, names a key twice, or lacks one."""
     if not Path(path).exists():
         raise InputError(f"{path}: no such file; run the command that makes it first")
     text = read_text(path, what="JSON file", largest=_LARGEST_JSON)
@@ -256,15 +218,9 @@ def read_json(path: Path, *, keys: Iterable[str] | None = None, mend: str = "mak
 
 
 def read_yaml(path: Path) -> Any:
-    """Read a YAML file, whose plain scalars mean what YAML 1.2 has them mean.
-
-    So `3e-1` is a number, `no` and `2024-05-01` are text, and numbers that two versions of YAML read differently
-    (`017`, `0o17`, `1_000`, `1:30`) are text, which no number's field takes.
-
-    Raises:
-        InputError: the file is missing, is not YAML, names a field twice, nests too deeply, or holds more than 100 000
-            values once its aliases are written out.
-    """
+    """Read a YAML file, whose plain scalars mean what YAML 1.2 has them mean: `3e-1` is a number, `no` and `2024-05-01`
+    are text, as are numbers that two versions read differently (`017`, `0o17`, `1_000`, `1:30`). Raises InputError
+    where it is missing, not YAML, names a field twice, nests too deeply, or holds over 100 000 values."""
     text = read_text(path, what="YAML file")
     try:
         return yaml.load(text, _YamlLoader)
@@ -281,13 +237,8 @@ def read_yaml(path: Path) -> Any:
 
 @contextmanager
 def reading(path: Path, mend: str) -> Iterator[None]:
-    """Answer what the odd content of a damaged file or folder raises in the block, in one line that names it.
-
-    It stands around the lines that take a record of ours apart, and around nothing else.
-
-    Raises:
-        InputError: the content is not what belongs there; `mend` ends the line.
-    """
+    """Answer what the odd content of a damaged file or folder raises in the block with an InputError that names it and
+    ends with the mend. It stands around the lines that take a record of ours apart, and around nothing else."""
     try:
         yield
     except KeyError as error:
@@ -307,12 +258,7 @@ def sha256(path: Path) -> str:
 
 
 def input_hash(path: Path, read: Sequence[Path] = ()) -> dict[str, str]:
-    """Return the SHA-256 of an input for the manifest.
-
-    Args:
-        path: a file, or a folder, all files of which count in order of name.
-        read: the files that were read, where `path` is one of several (a header without voxels), or a folder of more.
-    """
+    """Return the SHA-256 of a file, or of a folder's files in order of name; `read` are those that were read."""
     path = Path(path)
     parts = sorted(read) or sorted(part for part in path.rglob("*") if part.is_file())
     if path.is_file() and (not read or parts == [path]):
@@ -321,14 +267,8 @@ def input_hash(path: Path, read: Sequence[Path] = ()) -> dict[str, str]:
 
 
 def manifest(*, config: Any, seed: int | None = None, inputs: Mapping[str, str] | None = None, **facts: Any) -> dict:
-    """Return the record that every run writes beside its result.
-
-    Args:
-        config: the configuration of the run, a dataclass or a mapping.
-        seed: the seed of the run's random streams, if it has any.
-        inputs: name of each input file and its SHA-256.
-        facts: further entries, such as `wall_seconds` or what was rejected and why.
-    """
+    """Return the record that every run writes beside its result: its configuration, seed, inputs (name and SHA-256),
+    and further facts such as `wall_seconds` or what was rejected and why."""
     packages = ("numpy", "scipy", "SimpleITK", "torch", "pyarrow")
     return {
         "config": asdict(config) if is_dataclass(config) and not isinstance(config, type) else config,
@@ -360,7 +300,6 @@ def _version(package: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """Return the commit of the source tree this package runs from, or None for an installed wheel."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None
@@ -427,7 +366,6 @@ def _written_out(node: Any, known: dict[int, int]) -> int:
 
 
 def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the object of a JSON file."""
     content = dict(pairs)
     if len(content) < len(pairs):
         names = [name for name, _ in pairs]

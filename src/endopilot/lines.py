@@ -14,11 +14,5 @@ def length_along(points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n"]:
 def places_on(
     points: Float[np.ndarray, "n d"], along: Float[np.ndarray, "n"], at: Float[np.ndarray, "m"]
 ) -> Float[np.ndarray, "m d"]:
-    """Return places on a line between its points, linearly.
-
-    Args:
-        points: of the line.
-        along: length along it up to each of them, as `length_along` gives it or from another begin.
-        at: lengths along it of the places.
-    """
+    """Return places at lengths along a line, linear between points at `length_along`, or from another begin."""
     return np.stack([np.interp(at, along, part) for part in points.T], axis=-1)

@@ -21,29 +21,16 @@ from endopilot.progress import progress, silence
 T = TypeVar("T")
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 """Processor cores that this process may use: a batch system may leave it fewer than the machine has."""
-MOST_PROCESSES = 8
-"""A volume being processed takes some 1 GB of memory."""
-TO_CLEAN_UP_S = 5.0
-"""Time that a process which is stopped has to remove its half-written files, s; then it is killed."""
+MOST_PROCESSES = 8  # a volume being processed takes some 1 GB of memory
+TO_CLEAN_UP_S = 5.0  # time that a process which is stopped has to remove its half-written files, s; then it is killed
 
 
 def each(
     title: str, items: Sequence[Path], work: Callable[[Path], None], pool: Workers | None = None
 ) -> dict[Path, InputError]:
-    """Do the same work for every item, in as many processes as there are cores, under one progress bar.
-
-    Args:
-        title: name of the work, for the progress bar.
-        items: files or folders to work on.
-        work: a function of a module, or a `functools.partial` of one, since other processes import it.
-        pool: the processes, which go on afterwards; own ones if not given.
-
-    Returns:
-        The items whose work raised `InputError`, each with its error. Any other exception ends the work and is raised.
-
-    Raises:
-        InputError: a process died.
-    """
+    """Do the same work (a module's function, or a `functools.partial` of one) for every item, on all cores or in a
+    given `pool`, under one progress bar; return the items whose work raised `InputError`, each with its error. Raises
+    InputError where a process died."""
     bad: dict[Path, InputError] = {}
 
     def settle(item: Path, result: Callable[[], None]) -> None:
@@ -74,11 +61,8 @@ def each(
 
 
 class Workers(ProcessPoolExecutor):
-    """Processes for work that other processes can import; they end with this one, however it ends.
-
-    Leaving the block by an exception stops them at once; they remove their half-written files. (joblib's loky kills its
-    workers, which leaves those files, and lets them live on where this process is killed.)
-    """
+    """Processes for importable work that end with this one, however it ends, at once if the block is left by an
+    exception; they remove half-written files, which joblib's loky would leave."""
 
     def __init__(self, processes: int = min(CORES, MOST_PROCESSES)) -> None:
         """Make ready for so many processes; work starts them."""
@@ -134,7 +118,6 @@ def _follow() -> None:
 
 
 def _work(work: Callable[..., T], *args: Any, **kwargs: Any) -> T:
-    """Do a piece of work in a worker process; one that is stopped leaves with it, and begins no other."""
     if not gc.isenabled():
         gc.freeze()
         gc.enable()

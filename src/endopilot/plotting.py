@@ -18,10 +18,8 @@ from matplotlib.figure import Figure
 BLACK, ORANGE, SKY, GREEN = "#1a1a1a", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, VERMILLION, PURPLE, GREY = "#F0E442", "#0072B2", "#D55E00", "#CC79A7", "#8a8f98"
 CATHETER_COLORS = ("#19b5c8", "#8e6cf0")  # from the inside out; the first is that of the cockpit
-_SECTION_COLORS = ListedColormap(mpl.colormaps["tab10"]([0, 1, 2, 3, 4, 5, 6, 8, 9]))
-"""Without grey, which is the catheter's."""
-_THICKEST = 9.0
-"""Of the line of a vessel, points."""
+_SECTION_COLORS = ListedColormap(mpl.colormaps["tab10"]([0, 1, 2, 3, 4, 5, 6, 8, 9]))  # without the catheter's grey
+_THICKEST = 9.0  # of the line of a vessel, points
 
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -71,16 +69,8 @@ def draw_vessel(
     names: Sequence[str],
     one_color: str | None = None,
 ) -> None:
-    """Draw straight pieces of a vessel's centerlines with the sections by colour, and a legend beside them.
-
-    Args:
-        axes: where.
-        pieces: both ends of each piece in the picture, mm.
-        radius: of its lumen; lines are as thick as the vessel is wide, the widest some points.
-        section: index of its section.
-        names: of the sections.
-        one_color: of all, without a legend.
-    """
+    """Draw straight pieces of centerlines (both ends of each, and its radius, mm), as thick as the vessel is wide, with
+    sections by colour and a legend, or in `one_color`."""
     present = np.unique(section)
     palette, width = section_colors(len(present)), _THICKEST * radius / radius.max()
     for number, index in enumerate(present):

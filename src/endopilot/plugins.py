@@ -1,8 +1,5 @@
-"""What a user may add without touching the package: `Registry` finds an implementation by its name.
-
-A name is one of the package's own, one that an installed package offers as an entry point, or MODULE:OBJECT, an object
-of a module in the current directory or on Python's path.
-"""
+"""What a user may add without touching the package: `Registry` finds an implementation by its name, the package's own,
+an installed package's entry point, or MODULE:OBJECT, in the current directory or on Python's path."""
 
 from __future__ import annotations
 
@@ -21,20 +18,13 @@ from endopilot import __version__
 from endopilot.errors import InputError, Stopped
 from endopilot.files import sha256
 
-_LONGEST_MESSAGE = 200
-"""More of an exception's message is left out, characters."""
+_LONGEST_MESSAGE = 200  # more of an exception's message is left out, characters
 
 
 @dataclass(frozen=True)
 class Registry:
-    """Implementations of one thing by name.
-
-    Attributes:
-        setting: name of the setting that chooses one; error messages begin with it.
-        shipped: name of each implementation of the package, and its MODULE:OBJECT. Only the one that is asked for is
-            imported.
-        group: group of the entry points by which installed packages offer theirs.
-    """
+    """Implementations of one thing by name. Messages begin with `setting`; `shipped` has MODULE:OBJECT of each of the
+    package's, imported if asked for; `group` is that of entry points by which installed packages offer theirs."""
 
     setting: str
     shipped: Mapping[str, str]
@@ -46,12 +36,8 @@ class Registry:
         return (*self.shipped, *offered)
 
     def load(self, name: str) -> Any:
-        """Return the object behind a name.
-
-        Raises:
-            InputError: no such name, a name that two packages offer, a module that cannot be imported, or an object
-                that it does not hold.
-        """
+        """Return the object behind a name; InputError for no such name, one that two packages offer, or a module that
+        cannot be imported or lacks it."""
         point = self._entry_point(name)
         if point is not None:
             return self._import(name, point.value)
@@ -61,20 +47,12 @@ class Registry:
         return self._import(name, name)
 
     def check(self, name: str) -> None:
-        """Refuse a name that `load` would refuse, without importing what the package ships.
-
-        Raises:
-            InputError: as for `load`.
-        """
+        """Refuse a name that `load` would refuse, without importing what the package ships."""
         if self._entry_point(name) is not None or name not in self.shipped:
             self.load(name)
 
     def origin(self, name: str) -> str:
-        """Return where an implementation comes from: package and version, or a module's file and its SHA-256.
-
-        Raises:
-            InputError: as for `load`.
-        """
+        """Return where an implementation comes from: package and version, or a module's file and its SHA-256."""
         point = self._entry_point(name)
         if point is not None:
             return f"{point.dist.name} {point.dist.version}" if point.dist else point.value
@@ -85,7 +63,6 @@ class Registry:
         return f"{file.name} sha256:{sha256(file)}" if file.is_file() else name
 
     def _entry_point(self, name: str) -> Any:  # an EntryPoint, of the standard library or of its backport; or None
-        """Return the entry point of a name, or None if the package ships it or no installed package offers it."""
         points = {point.value: point for point in entry_points(group=self.group) if point.name == name}
         owners = [point.dist.name if point.dist else value for value, point in points.items()]
         owners = ["endopilot", *owners] if name in self.shipped else owners
@@ -131,17 +108,8 @@ class Registry:
 
     @contextlib.contextmanager
     def running(self, name: str, failure: str) -> Iterator[None]:
-        """Run what is behind a name, as the block does: an exception out of a user's own code names that code.
-
-        What that code prints goes to standard error: standard output is for results.
-
-        Args:
-            name: of the implementation; exceptions of the package's own pass.
-            failure: what has failed after an exception, in words.
-
-        Raises:
-            InputError: the code raised something, if only `SystemExit` or `KeyboardInterrupt`.
-        """
+        """Run what is behind a name, as the block does: an exception out of a user's code, if only `SystemExit`,
+        becomes an InputError that names it and begins with `failure`; what it prints goes to standard error."""
         if name in self.shipped:
             yield
             return

@@ -26,21 +26,13 @@ class Advance(Protocol):
         ...
 
 
-_shown = False
-"""Whether a bar is shown."""
+_shown = False  # whether a bar is shown
 
 
 @contextmanager
 def progress(title: str, total: int | float) -> Iterator[Advance]:
-    """Show a bar on standard error while the block runs.
-
-    Standard output stays free for results. If standard error is no terminal, one line is printed at the end of work
-    that took more than two seconds. A bar within a bar is not shown.
-
-    Args:
-        title: name of the work.
-        total: number of units of work.
-    """
+    """Show a bar of `total` units of work on standard error while the block runs, but not within another; without a
+    terminal, one line at the end of work that took more than two seconds."""
     global _shown
     console = Console(stderr=True)
     outermost, _shown = not _shown, True

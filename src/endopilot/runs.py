@@ -1,8 +1,6 @@
-"""What a command may write: folders that it claims (`claim`), new files (`check_new`), and what is still missing.
-
-A command replaces what the same command wrote from the same inputs and settings, as a folder's `run.json` tells, and a
-file only where `--overwrite` says so. It writes to no folder in which other things lie, and never over its own input.
-"""
+"""What a command may write: folders that it claims (`claim`), new files (`check_new`), and what is still missing. It
+replaces what the same command wrote from the same inputs and settings, as `run.json` tells, and a file only where
+`--overwrite` says so; it never writes over its own input, or into a folder of other things."""
 
 from __future__ import annotations
 
@@ -22,20 +20,11 @@ _LONGEST_VALUE = 60
 
 
 def claim(folder: Path, command: str, **identity: Any) -> None:
-    """Claim a folder for a run, or check that the run that began in it is the same one.
+    """Claim a folder for a run, or check that the run that began in it is the same one; InputError if it is not.
 
-    The first run of a folder writes `run.json`: the command, and everything that its results follow from. A later run
-    may go on only where all of that is equal. Half-written files that a killed run left behind are removed. A folder
-    in which nothing but `run.json` stands goes to the new run.
-
-    Args:
-        folder: the run's folder; it is made if need be.
-        command: what makes the results, such as "endopilot dataset".
-        identity: what the results follow from, by name: settings, the hash of every input's content, the content of
-            the device, the package's version. Dataclasses, paths and numpy values are understood.
-
-    Raises:
-        InputError: the folder belongs to another run, or holds something else.
+    The first run writes `run.json`: the command, and everything that its results follow from; a later one may go on
+    only where all that is equal. What a killed run left half-written is removed; a folder of `run.json` alone goes to
+    the new run. `identity` is by name: dataclasses, paths and numpy values are understood.
     """
     folder = Path(folder)
     now = json.loads(json_text({"command": command} | identity))  # as a file gives it back, so that it compares equal
@@ -74,16 +63,7 @@ def claiming(folder: Path, command: str, **identity: Any) -> Iterator[None]:
 
 
 def check_new(path: Path, inputs: Sequence[Path] = (), *, overwrite: bool = False) -> None:
-    """Refuse to write a file over another, before the work is done.
-
-    Args:
-        path: of the file.
-        inputs: files and folders that the command reads.
-        overwrite: the user lets the command replace a file that is none of `inputs`.
-
-    Raises:
-        InputError: a file lies there already.
-    """
+    """Raise InputError, before the work, where a file would go over an input, or over another without `overwrite`."""
     if path.is_dir() or not os.path.lexists(path):
         return
     if not overwrite:
@@ -94,32 +74,15 @@ def check_new(path: Path, inputs: Sequence[Path] = (), *, overwrite: bool = Fals
 
 
 def check_outside(folder: Path, inputs: Sequence[Path]) -> None:
-    """Refuse an output folder in which an input lies.
-
-    Args:
-        folder: of the results.
-        inputs: files and folders that the command reads.
-
-    Raises:
-        InputError: one of them lies in it, or is it.
-    """
+    """Raise InputError where an input lies in, or is, an output folder."""
     for source in inputs:
         if source.resolve().is_relative_to(folder.resolve()):
             raise InputError(f"{source}: lies in the output, {folder}; choose another output folder")
 
 
 def make_missing(title: str, paths: Sequence[Path], make: Callable[[Path], None], pool: Workers | None = None) -> None:
-    """Make those result files of a run that are not there yet, in several processes.
-
-    Args:
-        title: name of the work, for the progress bar.
-        paths: all files of the run.
-        make: writes one of them; a function of a module, or a `functools.partial` of one.
-        pool: the processes, as `each` takes them.
-
-    Raises:
-        InputError: some could not be made, of which the first is named; the others are there.
-    """
+    """Make those result files of a run that are not there yet, on all cores, each by `make`, importable. Raises
+    InputError, which names the first, if some could not be made; the others are there."""
     bad = each(title, [path for path in paths if not path.exists()], make, pool)
     if bad:
         path, error = next(iter(bad.items()))

@@ -71,10 +71,7 @@ class Within:
     """The range of a number, as an annotation of `int` (whole numbers alone) or `float` (finite numbers).
 
     Attributes:
-        low: least value.
-        high: largest value.
-        above_low: whether `low` itself is refused.
-        below_high: whether `high` itself is refused.
+        above_low: whether `low` itself is refused; `below_high` likewise.
         unit: of the number, such as "mm".
         mistaken: other units that it may have been given in by mistake: name, and size in `unit`.
     """
@@ -144,32 +141,19 @@ def _ascending(pair: tuple[Number, Number]) -> tuple[Number, Number]:
     return pair
 
 
-Finite = Annotated[float, Within()]
-"""Any finite number."""
-Positive = Annotated[float, Within(0, above_low=True)]
-"""A number above 0."""
-NonNegative = Annotated[float, Within(0)]
-"""A number of 0 or more."""
-Share = Annotated[float, Within(0, 1)]
-"""A number from 0 to 1."""
-OpenShare = Annotated[float, Within(0, 1, above_low=True, below_high=True)]
-"""A number between 0 and 1, neither included."""
-ShareBelowOne = Annotated[float, Within(0, 1, below_high=True)]
-"""A number from 0 to below 1."""
-Count = Annotated[int, Within(1, 10**6)]
-"""A whole number from 1 to a million; more would run for ever or take all memory."""
-CountOrZero = Annotated[int, Within(0, 10**6)]
-"""A whole number from 0 to a million."""
-LONGEST_S = 86_400.0
-"""Longest time that anything is simulated for, s: a day."""
-Seconds = Annotated[float, Within(0, LONGEST_S, above_low=True)]
-"""A time above 0, at most a day, s."""
-Seed = Annotated[int, Within(0, 2**64 - 1)]
-"""Seed of a random stream."""
-Text = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1)]
-"""Text that is not empty."""
-Ascending = AfterValidator(_ascending)
-"""Annotation of a pair of numbers: the first is not above the second."""
+Finite = Annotated[float, Within()]  # any finite number
+Positive = Annotated[float, Within(0, above_low=True)]  # a number above 0
+NonNegative = Annotated[float, Within(0)]  # a number of 0 or more
+Share = Annotated[float, Within(0, 1)]  # a number from 0 to 1
+OpenShare = Annotated[float, Within(0, 1, above_low=True, below_high=True)]  # between 0 and 1, neither included
+ShareBelowOne = Annotated[float, Within(0, 1, below_high=True)]  # a number from 0 to below 1
+Count = Annotated[int, Within(1, 10**6)]  # from 1 to a million; more would run for ever or take all memory
+CountOrZero = Annotated[int, Within(0, 10**6)]  # a whole number from 0 to a million
+LONGEST_S = 86_400.0  # longest time that anything is simulated for, s: a day
+Seconds = Annotated[float, Within(0, LONGEST_S, above_low=True)]  # a time above 0, at most a day, s
+Seed = Annotated[int, Within(0, 2**64 - 1)]  # seed of a random stream
+Text = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1)]  # text that is not empty
+Ascending = AfterValidator(_ascending)  # annotation of a pair of numbers: the first is not above the second
 
 
 @overload
@@ -187,10 +171,7 @@ def settings(cls: type[T] | None = None, /, *, eq: bool = True) -> Any:
 
     Its construction raises `InputError`, in one line that names the field, its value and what to give instead. It takes
     mappings for fields that are settings classes themselves, and lists for tuples, as JSON and YAML files have them.
-
-    Args:
-        cls: the class.
-        eq: whether instances of equal fields are equal.
+    With `eq`, instances of equal fields are equal.
     """
     if cls is None:
         return lambda decorated: _made(decorated, eq)
@@ -205,14 +186,8 @@ def is_settings(cls: Any) -> bool:
 def from_record(cls: type[T], record: Any, *, onto: T | None = None) -> T:
     """Return settings from the names and values of their fields, as `dataclasses.asdict` or a file gives them.
 
-    Args:
-        cls: their class.
-        record: the names and values.
-        onto: settings that hold the fields which are not there; if not given, all must be there but those that are None
-            by default.
-
-    Raises:
-        InputError: it is no such record; the line names field, value and what to give instead.
+    `onto` holds the fields which are not there; without it all must be there but those that are None by default. Raises
+    InputError, in a line that names field, value and what to give instead.
     """
     if not isinstance(record, Mapping) or not all(isinstance(name, str) for name in record):
         raise InputError(f"holds no mapping of fields; the fields are {', '.join(_fields(cls))}")
@@ -224,17 +199,8 @@ def from_record(cls: type[T], record: Any, *, onto: T | None = None) -> T:
 
 
 def read_settings(path: Path, cls: type[T], *, onto: T | None = None, remedy: str = "") -> T:
-    """Read settings from a JSON file (by its suffix) or a YAML file.
-
-    Args:
-        path: the file.
-        cls: the class of the settings.
-        onto: settings that hold the fields which the file leaves out; all must be there if not given.
-        remedy: what else to do about a bad file, such as "run `endopilot advise` again".
-
-    Raises:
-        InputError: the file is missing or holds no such settings; the line names file, field, value and what to give.
-    """
+    """Read settings from a JSON file (by its suffix) or a YAML file, as `from_record` has it; `remedy` is what else to
+    do about a bad file, such as "run `endopilot advise` again"."""
     content = read_json(path) if Path(path).suffix == ".json" else read_yaml(path)
     try:
         return from_record(cls, content, onto=onto)
@@ -298,7 +264,6 @@ def _shown(problem: ErrorDetails) -> str:
 
 
 def _path(place: Sequence[int | str]) -> str:
-    """Return where a field is, such as "cost.tip_weight" or "seeds[0][2]"."""
     return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place).removeprefix(".")
 
 
@@ -307,7 +272,6 @@ def _fields(cls: type) -> list[str]:
 
 
 def _fields_at(cls: Any, place: Sequence[int | str]) -> list[str]:
-    """Return the names of the fields of the settings class that lies at a place within another."""
     for part in place:
         if not isinstance(part, int) and part not in getattr(cls, "__pydantic_fields__", {}):
             return []
@@ -337,13 +301,9 @@ _MADE_BY = {
 
 
 def public(function: Callable[..., T]) -> Callable[..., T]:
-    """Make a function check the kinds of its arguments by their annotations, before it does anything.
-
-    Lists of numbers become arrays, and NumPy's numbers plain ones. What an annotation says of shapes is not checked.
-
-    Raises:
-        InputError: an argument is of no kind that is taken; the line says which are, and what makes them.
-    """
+    """Make a function check the kinds of its arguments by their annotations, before it does anything; InputError says
+    which are taken, and what makes them. Lists of numbers become arrays, and NumPy's numbers plain ones. What an
+    annotation says of shapes is not checked."""
     signature, hints_of = inspect.signature(function), cache(get_type_hints)
 
     @wraps(function)

@@ -36,12 +36,10 @@ if TYPE_CHECKING:  # slow to import
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SAMPLE_PERIOD_S = 0.5
-"""Time between two recorded samples, s: the paper records at 2 Hz."""
+SAMPLE_PERIOD_S = 0.5  # time between two recorded samples, s: the paper records at 2 Hz
 
 _AXES = ("x (to the patient's left), mm", "y (to the back), mm", "z (to the head), mm")
-_VIEWS = {"side": (1, 2), "front": (0, 2), "above": (0, 1)}
-"""World axes to the right and up of each view, in the order of the axis along which one looks."""
+_VIEWS = {"side": (1, 2), "front": (0, 2), "above": (0, 1)}  # axes to the right and up, by the axis looked along
 _ON_AXIS = 0.05
 """A vessel whose mean lies off the catheter's axis by less than this share of its distance from the ostium lies to no
 side. In atlas patients of all kinds it lies off by 0.12 at least (0.2 to 0.8 in the median of each kind)."""
@@ -150,12 +148,9 @@ class Centerline:
 class Branch:
     """A piece of the tree between two branching points, or from one to a distal end.
 
-    The first point of a branch is the last point of its parent, so that every path is one connected line.
-
-    Attributes:
-        centerline: its line; the abscissa counts from the ostium, not from the start of the branch.
-        parent: index of the parent in `VesselTree.branches`, -1 for the root.
-        section: for every point, the index of its anatomical section in `VesselTree.section_names`.
+    The first point of a branch is the last point of its parent, so that every path is one connected line. Its abscissa
+    counts from the ostium; `parent` indexes `VesselTree.branches` (-1 for the root), `section` for every point
+    `VesselTree.section_names`.
     """
 
     centerline: Centerline
@@ -165,12 +160,8 @@ class Branch:
 
 @dataclass(frozen=True, eq=False)
 class VesselTree:
-    """The centerline of a vessel with its branches.
-
-    Attributes:
-        branches: parents stand before their children; `branches[0]` starts at the ostium.
-        section_names: names of the anatomical sections, such as the segments of AHA/SCCT.
-    """
+    """The centerline of a vessel with its branches, parents before their children, the first from the ostium on, and
+    the names of the anatomical sections, such as the segments of AHA/SCCT."""
 
     branches: tuple[Branch, ...]
     section_names: tuple[str, ...]
@@ -303,10 +294,8 @@ class Anatomy:
     ) -> Figure:
         """Draw the centerlines, as thick as the vessel is wide, with the sections by colour, and the ostium.
 
-        Args:
-            axes: where; in a new figure of pyplot if not given. The figure's axes are LPS mm.
-            view: from where one looks; across the vessel's largest extents if not given.
-            color: of the whole vessel, for what is drawn over it, in place of the sections and their legend.
+        Without `axes` (LPS mm) in a new figure of pyplot, without `view` across the vessel's largest extents. A `color`
+        of the whole vessel, for what is drawn over it, takes the place of the sections and their legend.
         """
         import matplotlib.pyplot as plt
 
@@ -349,14 +338,7 @@ class Anatomy:
 
 @dataclass(frozen=True, eq=False)
 class TipProjection:
-    """Where tips lie with respect to the centerline tree.
-
-    Attributes:
-        abscissa: Δtip, distance from the ostium along the path, mm; negative inside the guiding catheter.
-        offset: γtip, distance from the centerline, mm.
-        branch: index of the branch that the tip lies in.
-        radius: lumen radius at the projection, mm.
-    """
+    """Where tips lie in the tree: Δtip, mm (negative in the catheter), γtip, mm, branch, and lumen radius there, mm."""
 
     abscissa: Float[np.ndarray, "..."]
     offset: Float[np.ndarray, "..."]
@@ -369,7 +351,6 @@ class TipProjection:
 
 
 def _add(digest: hashlib._Hash, values: np.ndarray, kind: type[np.generic]) -> None:
-    """Add an array to a hash, with its shape, as little-endian numbers of one kind."""
     digest.update(repr(values.shape).encode())
     digest.update(np.ascontiguousarray(values, dtype=np.dtype(kind).newbyteorder("<")).data)
 

@@ -1,28 +1,19 @@
-"""Differential geometry of a line against the helix's closed forms: κ = a/(a² + b²), τ = b/(a² + b²)."""
+"""Frames along a line against the helix's closed forms."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from endopilot.anatomy.tree import curvature_torsion, make_centerline, parallel_transport, tangents
+from endopilot.anatomy.tree import parallel_transport, tangents
 
 A_MM, B_MM = 8.0, 2.0
 SPEED = np.hypot(A_MM, B_MM)
 
 
-def helix(hand: float = 1.0, step_mm: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
+def helix(step_mm: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
     angle = np.arange(0.0, 4 * np.pi, step_mm / SPEED)
-    points = np.stack([A_MM * np.cos(angle), hand * A_MM * np.sin(angle), B_MM * angle], axis=1)
+    points = np.stack([A_MM * np.cos(angle), A_MM * np.sin(angle), B_MM * angle], axis=1)
     return angle, points
-
-
-@pytest.mark.parametrize("hand", [1.0, -1.0])
-def test_curvature_and_torsion_of_a_helix(hand):
-    _, points = helix(hand)
-    curvature, torsion = curvature_torsion(make_centerline(points, np.full(len(points), 1.5)))
-    assert np.abs(curvature - A_MM / SPEED**2).max() < 1e-3 * A_MM / SPEED**2
-    assert np.abs(torsion[4:-4] - hand * B_MM / SPEED**2).max() < 0.02 * B_MM / SPEED**2
 
 
 def test_normals_turn_against_the_frenet_frame_by_the_integral_of_torsion():

@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates, maximum_filter
 from endopilot.anatomy.tree import tangents
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.atlas.curves import curve_through
-from endopilot.atlas.heart_reference import TO_CRUX, aorta, fit_heart
+from endopilot.atlas.heart_reference import TO_CRUX, chamber, fit_heart
 from endopilot.errors import InputError
 from endopilot.lines import length_along
 from endopilot.phantom import phantom
@@ -202,7 +202,7 @@ def test_a_left_tree_leaves_the_aorta_and_runs_on_its_own_heart(left):
         wide = path.radius > 1.2
         assert np.quantile(at(volume, path.points[wide]), 0.1) > 320
     heart = phantom.chest.place(left.tree)
-    assert abs(aorta(heart.to_reference(left.insertion.position[None]))[0]) < 0.3
+    assert abs(chamber(heart.to_reference(left.insertion.position[None]), "aorta")[0]) < 0.3
     (right,) = phantom.chest.other_coronary(heart, left.tree)
     inside = np.all((volume.world_to_index(right.points) > 0), axis=1)
     assert np.median(at(volume, right.points[inside][:40])) > 300
@@ -227,7 +227,7 @@ def test_fit_recovers_a_moved_heart():
     np.testing.assert_allclose(heart.to_reference(moved), course, atol=0.2)
     np.testing.assert_allclose(heart.from_reference(course), moved, atol=0.3)
     assert heart.scale == pytest.approx(1.2, rel=1e-2)
-    assert abs(aorta(heart.to_reference(moved[:1]))[0]) < 0.5
+    assert abs(chamber(heart.to_reference(moved[:1]), "aorta")[0]) < 0.5
 
 
 @pytest.mark.parametrize(

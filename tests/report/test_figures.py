@@ -62,7 +62,7 @@ def test_the_axial_slice_goes_through_the_ostium():
 def test_the_tree_shows_every_section_in_its_colour(anatomy):
     ax = figures.tree_figure(anatomy).axes[0]
     labels = [text.get_text() for text in ax.get_legend().get_texts()]
-    assert labels == ["1", "2", "ostium"]
+    assert labels == ["ostium", "1", "2"]
 
 
 def test_series_are_drawn_with_their_values(results):

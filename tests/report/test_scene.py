@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from endopilot.anatomy.wall_mesh import wall_mesh
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.stack import SHOWN_BEHIND_MM, Stack
 from endopilot.report import still
 from endopilot.report.scene import navigation_scene, visible_devices
 from endopilot.report.still import LIBRARIES_MISSING, render_still
-from endopilot.report.wall_mesh import wall_mesh
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import DistanceMap, TipProjection
 

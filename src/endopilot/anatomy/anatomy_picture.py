@@ -16,38 +16,28 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.patches import Patch
-from scipy.ndimage import map_coordinates, zoom
-from skimage.measure import marching_cubes
+from scipy.ndimage import map_coordinates
 
 from endopilot.anatomy.distance import sample
 from endopilot.anatomy.projection import project_tip
 from endopilot.anatomy.tree import tangents
+from endopilot.anatomy.wall_mesh import wall_mesh
 from endopilot.files import writing
 from endopilot.plotting import plain_text, section_colors
 from endopilot.types import Anatomy, Centerline, Volume
 
-SECTIONS = 6
-"""Cross-sections that are drawn, evenly along the longest path."""
+SECTIONS = 6  # cross-sections that are drawn, evenly along the longest path
 
 WINDOW_HU = (-150.0, 650.0)
-_WIDTH = 15.0
-"""Of the picture, inches."""
-_LONGEST_NAME, _MOST_LISTED = 24, 120
-"""Letters of a section's name, and number of sections, that are listed."""
-_LARGEST_GRID = 1_500_000
+_WIDTH = 15.0  # of the picture, inches
+_LONGEST_NAME, _MOST_LISTED = 24, 120  # letters of a section's name, and sections, that are listed
+_MOST_TRIANGLES = 200_000
 _LIGHT = np.array([-0.35, -0.8, 0.5]) / np.linalg.norm([-0.35, -0.8, 0.5])
 
 
 def draw_anatomy(anatomy: Anatomy, path: Path, *, volume: Volume | None = None) -> None:
-    """Write a PNG of the tree, its longest path as a straightened curved planar reformation, and cross-sections.
-
-    The walls are the distance map's zero level (green) and, in the cross-sections, the inscribed circle (yellow).
-
-    Args:
-        anatomy: the vessel.
-        path: the PNG.
-        volume: the CT in HU that is shown behind the walls; without one it is the distance to the wall.
-    """
+    """Write a PNG of the tree, its longest path as a straightened reformation, and cross-sections, with walls (green)
+    and inscribed circles (yellow) on a CT in HU, or on the distance to the wall."""
     figure = plt.figure(figsize=(_WIDTH, 13), facecolor="white", layout="constrained")
     parts: Any = figure.subfigures(3, 1, height_ratios=(2.0, 1.15, 1.0))
     top, middle, bottom = parts
@@ -62,8 +52,7 @@ def draw_anatomy(anatomy: Anatomy, path: Path, *, volume: Volume | None = None) 
 
 
 def _draw_tree(anatomy: Anatomy, figure: Any) -> None:
-    """Draw the wall from the front, once coloured by section and once by radius."""
-    vertices, faces = _wall(anatomy)
+    vertices, faces = wall_mesh(anatomy.distance_map, max_triangles=_MOST_TRIANGLES)
     tree = anatomy.tree
     corners = vertices[faces]
     place = project_tip(tree, anatomy.insertion, corners.mean(axis=1))
@@ -95,7 +84,6 @@ def _draw_tree(anatomy: Anatomy, figure: Any) -> None:
 
 
 def _list_sections(figure: Any, names: Sequence[str], palette: Any) -> None:
-    """List the sections' colours below the tree, in as many columns as fit beside each other."""
     shown = [name if len(name) <= _LONGEST_NAME else f"{name[: _LONGEST_NAME - 1]}…" for name in names[:_MOST_LISTED]]
     handles = [Patch(color=palette(i), label=plain_text(name)) for i, name in enumerate(shown)]
     if len(names) > len(shown):
@@ -106,18 +94,7 @@ def _list_sections(figure: Any, names: Sequence[str], palette: Any) -> None:
     figure.legend(handles=handles, fontsize=8, loc="outside lower center", ncols=columns, columnspacing=1.0)
 
 
-def _wall(anatomy: Anatomy) -> tuple[Float[np.ndarray, "n 3"], Any]:
-    field, spacing = anatomy.distance_map, anatomy.distance_map.spacing_mm
-    values = np.pad(field.values, 1, constant_values=float(field.values.min()))
-    factor = min(1.0, (_LARGEST_GRID / values.size) ** (1 / 3))
-    coarse = np.asarray(zoom(values, factor, order=1, grid_mode=False)) if factor < 1 else values
-    vertices, faces, _, _ = marching_cubes(coarse, 0.0)
-    step = spacing * (np.array(values.shape) - 1) / (np.array(coarse.shape) - 1)
-    return (vertices * step)[:, ::-1] + field.origin_mm - spacing, faces
-
-
 def _draw_straightened(anatomy: Anatomy, line: Centerline, half: float, volume: Volume | None, figure: Any) -> None:
-    """Draw the longest path straightened, in the planes of its normal and binormal."""
     count = max(2, int(line.abscissa[-1] / 0.2))
     at = np.linspace(0.0, float(line.abscissa[-1]), count)
     points, normals, directions = (
@@ -127,9 +104,7 @@ def _draw_straightened(anatomy: Anatomy, line: Centerline, half: float, volume: 
     across = np.linspace(-half, half, 81)
     rows = figure.subplots(2, 1, sharex=True)
     for axes, (title, side) in zip(
-        rows,
-        (("normal", normals), ("binormal", np.cross(directions, normals))),
-        strict=True,
+        rows, (("normal", normals), ("binormal", np.cross(directions, normals))), strict=True
     ):
         grid = points[None] + across[:, None, None] * side[None]
         _show(axes, anatomy, grid, (0.0, float(at[-1]), -half, half), volume)

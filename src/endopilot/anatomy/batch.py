@@ -26,25 +26,9 @@ def extract_all(
     threshold: float | None = None,
     config: AnatomyConfig,
 ) -> tuple[list[Path], dict[str, str]]:
-    """Make one anatomy a file, each in a folder of its own, on as many processes as there are cores.
-
-    A patient's name is that of the file, or of its folder where several files have the same name. The
-    configuration, and which files were rejected and why, are written to `output`/manifest.json.
-
-    Args:
-        sources: masks, surfaces or centerlines.
-        output: folder that takes one anatomy folder a patient.
-        label: number or name of the segment that is the lumen, where masks have several.
-        threshold: of masks of grey levels, the value at the wall.
-        config: how to make them all.
-
-    Returns:
-        The folders that were made, and of every rejected file what was wrong with it.
-
-    Raises:
-        InputError: two patients would have the same name, one ostium is given for all, no file was any good, or the
-            folder belongs to another run.
-    """
+    """Make one anatomy a file, on all cores, each in a folder named after its file, or that's folder where names
+    repeat; return the folders and what was wrong with each rejected file, as `output`/manifest.json does. Raises
+    InputError for two patients of one name, one ostium for all, no good file, or a folder of another run."""
     if config.ostium_mm is not None and len(sources) > 1:
         raise InputError(f"ostium_mm={config.ostium_mm}: cannot serve {len(sources)} patients; make them one by one")
     folders = {source: output / name for source, name in zip(sources, _names(sources), strict=True)}

@@ -1,5 +1,4 @@
-"""The guiding catheter's axis at the ostium, turned, and φ's zero with it: `turned_axis`, `lean_between`, `with_axis`,
-`with_world_zero`."""
+"""The guiding catheter's axis at the ostium, turned, and φ's zero with it."""
 
 from __future__ import annotations
 
@@ -14,13 +13,7 @@ from endopilot.types import Anatomy, Insertion
 
 
 def turned_axis(axis: Float[np.ndarray, "3"], tilt_deg: float, side_deg: float) -> Float[np.ndarray, "3"]:
-    """Return an axis turned to some side.
-
-    Args:
-        axis: unit vector.
-        tilt_deg: angle between it and what is returned, degrees.
-        side_deg: to which side, degrees around the axis from the first of its `cross_axes`.
-    """
+    """Return an axis turned by `tilt_deg` to the side `side_deg`, degrees about it from the first `cross_axes`."""
     one, two = (side[0] for side in cross_axes(axis[None]))
     tilt, side = np.radians(tilt_deg), np.radians(side_deg)
     return np.cos(tilt) * axis + np.sin(tilt) * (np.cos(side) * one + np.sin(side) * two)
@@ -36,10 +29,7 @@ def lean_between(axis: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) ->
 def carried(
     across: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
-    """Return where the shortest turn from an axis to another takes a unit vector across the first.
-
-    Where they are opposite, no turn is the shortest: the vector stays where it is.
-    """
+    """Return where the shortest turn between axes takes a vector across the first; it stays if they are opposite."""
     cosine = float(axis @ other)
     turned = across - (across @ other) / (1.0 + cosine) * (axis + other) if cosine > -1 + 1e-12 else across
     turned = turned - (turned @ other) * other
@@ -47,10 +37,7 @@ def carried(
 
 
 def with_axis(anatomy: Anatomy, axis: Float[np.ndarray, "3"]) -> Anatomy:
-    """Return the anatomy with its catheter turned about the ostium; where the catheter lay, the map stays open.
-
-    φ's zero turns with the catheter, by the shortest turn; one of the world's axes stays that of the world's axes.
-    """
+    """Return the anatomy with its catheter, and φ's zero, turned about the ostium; its old way stays open."""
     zero = anatomy.insertion.rotation_zero
     if isinstance(zero, np.ndarray):
         zero = carried(zero, anatomy.insertion.direction, axis)
@@ -60,6 +47,5 @@ def with_axis(anatomy: Anatomy, axis: Float[np.ndarray, "3"]) -> Anatomy:
 
 
 def with_world_zero(anatomy: Anatomy) -> Anatomy:
-    """Return the anatomy with φ's zero by the world's axes, as before anatomies held one: recorded controls mean the
-    same in it as they did then."""
+    """Return the anatomy with φ's zero by the world's axes, as before anatomies held one, for controls of then."""
     return replace(anatomy, insertion=replace(anatomy.insertion, rotation_zero="world axes"))

@@ -1,8 +1,5 @@
-"""Centerlines on the medial axis: `refined_lines` moves the paths traced through a lumen below the grid.
-
-A point moves by the first harmonic of the exact wall distance on a ring around it, which is zero on the medial axis.
-Side branches are joined to their parents where the two axes meet.
-"""
+"""Centerlines on the medial axis: `refined_lines` moves traced paths below the grid. A point moves by the first
+harmonic of the exact wall distance on a ring around it, which is zero on the axis."""
 
 from __future__ import annotations
 
@@ -19,46 +16,23 @@ from endopilot.types import DistanceMap, Insertion
 from endopilot.vessels.graph import Line, RootedGraph
 from endopilot.vessels.surface import Surface
 
-ROUNDNESS = 0.05
-"""A cross-section whose half-axes differ by less than twice this share of its radius counts as round."""
+ROUNDNESS = 0.05  # a cross-section whose half-axes differ by less than twice this share of its radius counts as round
 
 _RING = 12
-_FEWEST_DIRECTIONS = 5
-"""With fewer directions than this on the ring, a vessel has too little wall of its own to be centred by."""
-
-_STRAIGHT = 10
-"""This many steps of a branch from where it leaves its parent show where it comes from."""
-
-_NEAR_WALL = 0.8
-"""The ring on which the radius is measured, in distances to the wall."""
-
-_CROSSED = 0.25
-"""A straight way narrower than this share of a branch's radius crosses a wall: at flaps of one voxel 0.0 to 0.1."""
-
-_WAY = 12
-"""Places at which such a way is looked at."""
-
-_FLAT = 0.75
-"""A vessel whose smaller half-axis falls below this share of its radius is not drawn out any farther."""
-
-_ROUND = 0.9
-"""A half-axis counts as different from the radius where it is smaller than this share of it."""
-
-_AHEAD = 0.87
-"""Cosine of the largest angle at which a line may leave a known ostium off the catheter's axis."""
-
-_SIGHT = np.linspace(0.0, 1.0, 50)
-"""Shares of a line of sight at which the lumen is looked at."""
-
-_LED_ELSEWHERE = 2.0
-"""A line drawn out to its cut ends within this many radii of the tip that it was traced from."""
-
-_LONGEST_BRIDGE = 4.0
-"""A known ostium is joined to a line that begins at most this many radii away."""
+_FEWEST_DIRECTIONS = 5  # with fewer directions on the ring a vessel has too little wall to be centred by
+_STRAIGHT = 10  # this many steps of a branch from where it leaves its parent show where it comes from
+_NEAR_WALL = 0.8  # the ring on which the radius is measured, in distances to the wall
+_CROSSED = 0.25  # a way narrower than this share of a branch's radius crosses a wall: 0.0 to 0.1 at thin flaps
+_WAY = 12  # places at which such a way is looked at
+_FLAT = 0.75  # a vessel whose smaller half-axis falls below this share of its radius is not drawn out any farther
+_ROUND = 0.9  # a half-axis counts as different from the radius where it is smaller than this share of it
+_AHEAD = 0.87  # cosine of the largest angle at which a line may leave a known ostium off the catheter's axis
+_SIGHT = np.linspace(0.0, 1.0, 50)  # shares of a line of sight at which the lumen is looked at
+_LED_ELSEWHERE = 2.0  # a line drawn out to its cut ends within this many radii of the tip that it was traced from
+_LONGEST_BRIDGE = 4.0  # a known ostium is joined to a line that begins at most this many radii away
 
 _REFINEMENTS = 8
-_STEP_LIMIT = 0.3
-"""A refinement moves a point by at most this share of its distance to the wall."""
+_STEP_LIMIT = 0.3  # a refinement moves a point by at most this share of its distance to the wall
 
 
 def refined_lines(
@@ -69,11 +43,9 @@ def refined_lines(
     step_mm: float,
     ostium: Insertion | None = None,
 ) -> list[Line]:
-    """Return the traced paths on the medial axis, each joined to its parent where its axis meets the parent's.
-
-    Within one radius of an end the inscribed sphere feels the end's own cap. Lines are cut back from there and, where
-    the lumen keeps its width (a vessel cut flat), drawn out to the cut; the first one to the ostium, if that is known.
-    """
+    """Return traced paths on the medial axis, each joined to its parent where the axes meet. They are cut back from
+    ends, whose caps the inscribed sphere feels, and drawn out to the cut of a vessel cut flat; the first to the ostium,
+    if known."""
     home = np.full(len(graph.points), -1)
     lines: list[Line] = []
     for index, nodes in enumerate(paths):
@@ -106,10 +78,8 @@ def refined_lines(
 def _to_axis(
     surface: Surface, distance_map: DistanceMap, points: Float[np.ndarray, "n 3"], parent: Line | None
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
-    """Move a line onto its vessel's axis; return it with its radii.
-
-    Where a branch runs together with its parent, the directions in which it opens into the parent do not count.
-    """
+    """Move a line onto its vessel's axis; return it with its radii. Where a branch runs together with its parent, the
+    directions in which it opens into the parent do not count."""
     for iteration in range(_REFINEMENTS):
         clearance = surface.distance(points)
         around, ring = _ring_distance(surface, points, 0.5 * clearance)
@@ -151,12 +121,8 @@ def _harmonics(
 def _inscribed_radius(
     surface: Surface, points: Float[np.ndarray, "n 3"], parent: Line | None
 ) -> Float[np.ndarray, "n"]:
-    """Return inscribed-sphere radii that the wall's voxel noise does not shrink.
-
-    The distance at the axis is the least over the whole circumference, and so reads the deepest ripple of the wall.
-    Instead, each direction is measured by itself on a ring near the wall. Their mean is the radius of a round lumen;
-    the second harmonic's amplitude, where it is more than ripple, leads from it to the small half-axis of a flat one.
-    """
+    """Return inscribed-sphere radii that ripples of the wall do not shrink, as the least distance around the axis
+    would: the mean by direction on a ring near the wall, less the second harmonic where that is more than ripple."""
     clearance = surface.distance(points)
     around, ring = _ring_distance(surface, points, _NEAR_WALL * clearance)
     walled = _walled(points, clearance, ring, parent)
@@ -190,7 +156,6 @@ def _joined(
     radius: Float[np.ndarray, "n"],
     step_mm: float,
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
-    """Join a side branch's axis to its parent's by a straight piece, rounded where it meets the axis."""
     start = parent.points[place]
     count = max(1, round(float(np.linalg.norm(points[0] - start)) / step_mm))
     share = np.arange(count)[:, None] / count
@@ -204,17 +169,14 @@ def _joined(
 
 
 def _outside(points: Float[np.ndarray, "n 3"], parent: Line) -> int:
-    """Return the index of the first point from which a side branch stays outside its parent's inscribed spheres."""
     distance, nearest = KDTree(parent.points).query(points)
     inside = np.flatnonzero(distance < parent.radius[nearest])
     return int(inside[-1]) + 1 if len(inside) else 1
 
 
 def _meeting_point(distance_map: DistanceMap, body: Float[np.ndarray, "n 3"], radius_mm: float, parent: Line) -> int:
-    """Return the index of the parent's point that the side branch's axis, drawn back, comes nearest to.
-
-    The straight way to it does not cross a wall, such as a flap beside the tear that the branch comes through.
-    """
+    """Return the parent's point that the side branch's axis, drawn back, comes nearest to, on a straight way that
+    crosses no wall, such as a flap beside the tear that the branch comes through."""
     start = body[: min(len(body), _STRAIGHT + 1)]
     back = np.linalg.svd(start - start.mean(axis=0))[2][0]
     back *= np.sign(back @ (start[0] - start[-1]))
@@ -237,11 +199,8 @@ def _meeting_point(distance_map: DistanceMap, body: Float[np.ndarray, "n 3"], ra
 def to_cut(
     distance_map: DistanceMap, points: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, "n"], step_mm: float
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
-    """Draw a line out as long as the lumen keeps its width, to the cut of a vessel that ends flat.
-
-    Each step goes on along the last ones, bent as they are, and is centred by the walls beside it alone: the cut ahead
-    does not draw it back. Where the lumen grows narrow or flat, it is no longer the same vessel that runs to a cut.
-    """
+    """Draw a line out as long as the lumen keeps its width, to the cut of a vessel that ends flat, each step along the
+    last ones, centred by the walls beside it. Where it grows narrow or flat, it is no longer the same vessel."""
     width = float(radius[-1])
     back = max(3, round(1.5 * width / step_mm))
     line = list(points[-2 * back - 1 :])
@@ -307,10 +266,8 @@ def _from_tip(
     traced: Float[np.ndarray, "t 3"],
     step_mm: float,
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k"]]:
-    """Return the first line so that it begins at the tip that it was traced from, if drawing it out led elsewhere.
-
-    Where a short left main meets its branches, a line that is cut back from the cap is cut back round the bend.
-    """
+    """Return the first line so that it begins at the tip that it was traced from: where a short left main meets its
+    branches, a line that is cut back from the cap is cut back round the bend."""
     if np.linalg.norm(drawn[0] - traced[0]) < _LED_ELSEWHERE * width[0]:
         return drawn, width
     first = int(np.linalg.norm(traced - points[0], axis=1).argmin())
@@ -325,11 +282,8 @@ def _from_tip(
 
 
 def _without_inlets(distance_map: DistanceMap, lines: list[Line], ostium: Insertion) -> list[Line]:
-    """Leave out lines that lead back to the ostium's own cut: the other side of a wide inlet, and no branch.
-
-    Such a line ends in the plane of the ostium, and there the lumen joins it to the first line in a straight line. In
-    the merged lumens of a dissection, a wire beside the first line would seem to lie far ahead, on the returning part.
-    """
+    """Leave out lines that lead back to the ostium's own cut, the other side of a wide inlet, and no branch: in a
+    dissection's merged lumens a wire beside the first line would seem to lie far ahead, on the returning part."""
     first, kept = lines[0].points, [True] * len(lines)
     for index in range(len(lines) - 1, 0, -1):
         points, width = lines[index].points, float(lines[index].radius[-1])

@@ -1,9 +1,5 @@
-"""The signed distance to the vessel wall, from inscribed spheres, and the guiding catheter joined to it.
-
-Inside a tree of inscribed spheres the distance is that to the union of round cones: between two neighbouring points the
-radius is linear, which leaves none of the scallops that a union of the spheres alone has. Branches are joined by a
-smooth union, so that a quadratic B-spline of the values is a good potential for contact.
-"""
+"""The signed distance to the vessel wall, from inscribed spheres, and the guiding catheter joined to it: the union of
+round cones along branches, joined smoothly, so that a quadratic B-spline of it is a good contact potential."""
 
 from __future__ import annotations
 
@@ -18,47 +14,25 @@ from endopilot.lines import length_along
 from endopilot.types import Centerline, DistanceMap, Insertion, VesselTree
 from endopilot.vessels.surface import BAND_MM, MAXIMUM_GRID_POINTS, grid_of
 
-FILLET = 0.5
-"""Strength of the fillet where a branch leaves its parent, in radii of the branch."""
-
-CATHETER_RADIUS_MM = 0.9
-"""Inner radius of a 6 French guiding catheter, mm: 0.071 inch across (Medtronic Launcher, instructions for use)."""
-
-CATHETER_LENGTH_MM = 20.0
-"""Length of catheter behind the ostium that a distance map holds, mm."""
-
-ENGAGED_MM = 3.0
-"""A guiding catheter's tip lies this deep in the ostium, mm."""
+FILLET = 0.5  # strength of the fillet where a branch leaves its parent, in radii of the branch
+CATHETER_RADIUS_MM = 0.9  # inside of a 6 French guiding catheter, 0.071 inch across (Medtronic Launcher)
+CATHETER_LENGTH_MM = 20.0  # length of catheter behind the ostium that a distance map holds, mm
+ENGAGED_MM = 3.0  # a guiding catheter's tip lies this deep in the ostium, mm
 
 
 def automatic_spacing(radius: Float[np.ndarray, "n"], extent_mm: Float[np.ndarray, "3"]) -> float:
-    """Return a grid spacing in mm that resolves the lumen and keeps the map small.
-
-    It is 0.45 times the radius that all but the narrowest twentieth of the centerline exceeds, from 0.3 to 1.5 mm,
-    and no smaller than `MAXIMUM_GRID_POINTS` allows over `extent_mm`.
-
-    Args:
-        radius: inscribed-sphere radii along the centerline, mm.
-        extent_mm: edges of the box that the map must cover, mm.
-    """
+    """Return a grid spacing in mm that resolves the lumen: 0.45 times the radius that all but the narrowest twentieth
+    of the centerline exceeds, from 0.3 to 1.5 mm, and no smaller than `MAXIMUM_GRID_POINTS` allows over `extent_mm`."""
     spacing = float(np.clip(0.45 * np.quantile(radius, 0.05), 0.3, 1.5))
     smallest = float(np.prod(np.maximum(extent_mm, 1.0)) / MAXIMUM_GRID_POINTS) ** (1 / 3)
     return round(max(spacing, smallest), 3)
 
 
 def distance_map_from_spheres(
-    tree: VesselTree,
-    *,
-    beside: Sequence[Sequence[Centerline]] = (),
-    spacing_mm: float | None = None,
+    tree: VesselTree, *, beside: Sequence[Sequence[Centerline]] = (), spacing_mm: float | None = None
 ) -> DistanceMap:
-    """Return the signed distance to the smooth union of a tree's inscribed spheres.
-
-    Args:
-        tree: centerlines with radii.
-        beside: for each branch, further lines of spheres that belong to its lumen; none for round sections.
-        spacing_mm: grid spacing, mm; chosen by `automatic_spacing` if None.
-    """
+    """Return the signed distance to the smooth union of a tree's inscribed spheres; `beside` are further lines of
+    spheres of each branch's lumen. The spacing, mm, is `automatic_spacing`'s if None."""
     lumens = [[branch.centerline] for branch in tree.branches]
     for own, others in zip(lumens, beside, strict=False):
         own.extend(others)
@@ -75,7 +49,6 @@ def distance_map_from_spheres(
 
 
 def _join(distance_map: DistanceMap, lines: Sequence[Centerline], band: float, fillet_mm: float) -> None:
-    """Join the lumen of some lines' tubes to a map that has room for it."""
     values, spacing, origin = distance_map.values, distance_map.spacing_mm, distance_map.origin_mm
     window = _window(Centerline.joined(lines), origin, spacing, values.shape, band)
     corner = origin + spacing * np.array([part.start for part in window[::-1]])
@@ -86,19 +59,8 @@ def _join(distance_map: DistanceMap, lines: Sequence[Centerline], band: float, f
 def add_catheter(
     distance_map: DistanceMap, insertion: Insertion, radius_mm: float, length_mm: float = CATHETER_LENGTH_MM
 ) -> DistanceMap:
-    """Return the map joined with a straight guiding catheter that ends at the ostium.
-
-    The catheter is a tube of constant radius with a round end centred on the ostium, so the passage into the vessel is
-    open by at least `radius_mm`. The grid grows as needed.
-
-    Args:
-        distance_map: the vessel.
-        insertion: the ostium and the catheter's axis, pointing into the vessel.
-        radius_mm: inner radius of the catheter, mm.
-        length_mm: length of the tube behind the ostium, mm.
-
-    Raises:
-        InputError: the radius or the length is not positive.
+    """Return the map, grown as needed, joined with a straight guiding catheter of `length_mm`, a tube with a round end
+    centred on the ostium: open by at least `radius_mm`. Raises InputError for a radius or length that is not positive.
     """
     if not (radius_mm > 0 and length_mm > 0):
         raise InputError(f"catheter: radius {radius_mm} mm and length {length_mm} mm must both be positive")
@@ -117,27 +79,15 @@ def add_catheter(
 
 
 def catheter_tilt_deg(ostium_radius_mm: float, catheter_radius_mm: float) -> float:
-    """Return how far a catheter may lean off the vessel's axis before its engaged tip meets the wall, degrees.
-
-    Args:
-        ostium_radius_mm: the lumen's radius at the ostium, mm.
-        catheter_radius_mm: the catheter's inner radius, mm.
-    """
+    """Return how far a catheter (inner radius) may lean until its engaged tip meets the wall, degrees."""
     return math.degrees(math.atan2(max(ostium_radius_mm - catheter_radius_mm, 0.0), ENGAGED_MM))
 
 
 def smooth_union(
-    first: Float[np.ndarray, "nz ny nx"],
-    second: Float[np.ndarray, "nz ny nx"],
-    *,
-    spacing_mm: float,
-    fillet_mm: float,
+    first: Float[np.ndarray, "nz ny nx"], second: Float[np.ndarray, "nz ny nx"], *, spacing_mm: float, fillet_mm: float
 ) -> Float[np.ndarray, "nz ny nx"]:
-    """Return the union of two signed distances (positive inside), with a fillet where their walls cross.
-
-    It is the polynomial smooth maximum ``max(a, b) + (k − |a − b|)₊² / 4k``. Its width k falls with the angle θ between
-    the two gradients as k = fillet · (1 − cos θ), so that two tubes that carry on into each other do not bulge.
-    """
+    """Return the union of two signed distances with a fillet where walls cross: ``max(a, b) + (k − |a − b|)₊² / 4k``,
+    whose k = fillet · (1 − cos θ) falls with the angle of the gradients, so that tubes that carry on do not bulge."""
     highest = np.maximum(first, second)
     near = np.abs(first - second) < 2 * fillet_mm
     near &= (first > first.min()) & (second > second.min())
@@ -170,7 +120,6 @@ def sample(distance_map: DistanceMap, points: Float[np.ndarray, "n 3"], *, order
 def _grow(
     distance_map: DistanceMap, lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"], margin: float, fill: float
 ) -> DistanceMap:
-    """Return a copy of the map whose grid covers the box from `lower` to `upper` with `margin` around it."""
     spacing, origin = distance_map.spacing_mm, distance_map.origin_mm
     size = np.array(distance_map.values.shape[::-1])
     before = np.maximum(0, np.ceil((origin - (lower - margin)) / spacing)).astype(int)
@@ -183,7 +132,6 @@ def _grow(
 def _window(
     line: Centerline, origin: Float[np.ndarray, "3"], spacing: float, shape: tuple[int, ...], band: float
 ) -> tuple[slice, slice, slice]:
-    """Return the part of the grid that a line's tube and band can reach."""
     margin = line.radius[:, None] + band
     first = np.floor(((line.points - margin).min(axis=0) - origin) / spacing).astype(int)
     last = np.ceil(((line.points + margin).max(axis=0) - origin) / spacing).astype(int) + 1
@@ -231,7 +179,6 @@ def _tube_field(
 
 
 def _thinned(line: Centerline, step: float) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
-    """Return the points and radii of a line, leaving out points that lie closer together than `step`."""
     length = length_along(line.points)
     if len(length) < 3 or length[-1] < step:
         return line.points, line.radius

@@ -50,18 +50,14 @@ from endopilot.vessels.surface import MAXIMUM_GRID_POINTS, Surface, surface_from
 from endopilot.vessels.surface_distance import distance_map_from_surface
 from endopilot.vessels.topology import parted, touch_remarks
 
-CORONARY_RADIUS_MM = 1.6
-"""Mean radius of a coronary tree at most: what counts for the grid where a lumen holds a piece of the aorta too."""
-
-_RESOLVED_STEPS = 1.25
-"""A catheter's radius in steps of the distance map, at least: wide vessels have coarse maps."""
+CORONARY_RADIUS_MM = 1.6  # mean radius of a coronary tree at most, for the grid where the aorta is there too
+_RESOLVED_STEPS = 1.25  # a catheter's radius in steps of the distance map, at least: wide vessels have coarse maps
 
 _OTHER_SIDE_DEG = 5.0
 """A coronary artery is in doubt if its course is nearer to that of the other one by this, degrees; in 48 of the
 atlas and 2 real ones its own is the nearer one by 16° at least."""
 
-SHORTEST_IN_DIAMETERS = 1.5
-"""A lumen whose longest path is shorter than this many of its own mean diameters is no vessel."""
+SHORTEST_IN_DIAMETERS = 1.5  # a lumen whose longest path is shorter than so many mean diameters is no vessel
 
 _DONE = {
     "joined": r"bridged|united|capped|closed by filling|joined by|joined to one",
@@ -191,10 +187,7 @@ def extract_anatomy(
 def _wall(
     content: LumenMask | Surface, given: Insertion | None, config: AnatomyConfig, label: str, axes: str | None
 ) -> tuple[Surface, repair.Lumen, Float[np.ndarray, "wide 3"], CoronaryInlet | None]:
-    """Return the closed wall of the wanted vessel, its voxels, where they were widened, LPS mm, and an artery's inlet.
-
-    The notes of the voxels state all repairs.
-    """
+    """Return the vessel's closed wall, its voxels with notes of repairs, where widened (LPS mm), an artery's inlet."""
     inlet, remarks = None, list[str]()
     repair.pieces_of.cache_clear()  # what a caller's mask held before may be another vessel
     if isinstance(content, LumenMask):
@@ -224,7 +217,6 @@ def _wall(
 
 
 def _short(tree: VesselTree, vessel: str) -> list[str]:
-    """Say so if a coronary artery ends sooner than any does."""
     longest = float(tree.longest_path().abscissa[-1])
     if vessel == "generic" or longest >= SHORT_MM:
         return []
@@ -248,14 +240,12 @@ def _other_side(tree: VesselTree, vessel: str) -> list[str]:
 
 
 def _dominance(tree: VesselTree, inlet: CoronaryInlet | None, short: list[str]) -> str | None:
-    """Return the dominance: which of both arteries reaches the crux, or what a single one's tree shows; else None."""
     if inlet is not None and inlet.other is not None:
         return None if inlet.crux is None else inlet.crux.dominance
     return None if short else dominance(tree)
 
 
 def _source_record(source: AnatomySource) -> dict[str, str | None]:
-    """Return what the anatomy was made from: its file and hash, or the hash of arrays that came from no file."""
     digest, content = source.sha256, source.content
     if not digest:
         arrays: list[np.ndarray]

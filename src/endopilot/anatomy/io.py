@@ -39,14 +39,7 @@ _CENTERLINE, _LUMEN, _RECORD = "centerline.vtp", "lumen.nrrd", "anatomy.json"
 @public
 def write_anatomy(anatomy: Anatomy, *, output: str | Path) -> None:
     """Write an anatomy as a folder, whole or not at all; an anatomy in it is replaced, and what else it holds stays.
-
-    Args:
-        anatomy: the vessel.
-        output: the folder.
-
-    Raises:
-        InputError: the folder cannot be written, or holds something that is not an anatomy.
-    """
+    Raises InputError where the folder cannot be written, or holds something that is not an anatomy."""
     with files.writing_folder(Path(output), _RECORD) as partial:
         _write_tree(anatomy.tree, partial / _CENTERLINE)
         _write_distance_map(anatomy.distance_map, partial / _LUMEN)
@@ -70,11 +63,7 @@ def write_anatomy(anatomy: Anatomy, *, output: str | Path) -> None:
 
 @public
 def read_anatomy(folder: str | Path) -> Anatomy:
-    """Read an anatomy that `write_anatomy` wrote.
-
-    Raises:
-        InputError: the folder or one of its files is missing, damaged or of another version.
-    """
+    """Read an anatomy; InputError if the folder or a file of it is missing, damaged or of another version."""
     folder = Path(folder)
     if folder.is_file():
         raise InputError(f"{folder}: is a file; make an anatomy of it first: `endopilot anatomy {folder} -o FOLDER`")

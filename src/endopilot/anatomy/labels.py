@@ -1,13 +1,12 @@
 """Anatomical sections for every point of a tree: AHA/SCCT segments, named vessels, or generation and order.
 
 Segments after Austen et al., Circulation 1975;51:5-40 (AHA) and Leipsic et al., J Cardiovasc Comput Tomogr
-2014;8:342-58 (SCCT). Which branch is which follows from where it leaves and where it goes in the patient's axes (LPS):
-left, posterior, up. A tree stored in other axes gets wrong names, not an error.
+2014;8:342-58 (SCCT), by where a branch leaves and goes in LPS axes: other axes give wrong names, not an error.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -22,7 +21,6 @@ from endopilot.anatomy.labels_tree import (
     Labeller,
 )
 from endopilot.anatomy.labels_vessels import label_arch, label_cerebral, label_portal
-from endopilot.errors import InputError
 from endopilot.types import Branch, VesselTree
 from endopilot.vessels.coronary_ostia import Crux
 
@@ -42,45 +40,30 @@ _RULES: dict[str, tuple[tuple[str, ...], Callable[[Labeller], None]]] = {
 }
 
 
-def label_tree(
-    tree: VesselTree, scheme: Scheme, *, naming: Mapping[str, str] | None = None, crux: Crux | None = None
-) -> VesselTree:
-    """Return the tree with every point's section.
+def label_tree(tree: VesselTree, scheme: Scheme, *, crux: Crux | None = None) -> VesselTree:
+    """Return the tree (LPS mm) with every point's section.
 
     Args:
-        tree: centerlines in LPS mm.
         scheme: "rca" and "lca" name AHA/SCCT segments, "arch", "cerebral" and "portal" the vessels of these anatomies
             (`labels_tree` lists all names); "generic" names branches "G0", "G1.1", "G1.2", …: generation (bifurcations
             from the root), then order, widest first.
-        crux: where the crux of the heart lies and which artery reaches it, if both are known; otherwise the tree's own
-            shape decides.
-        naming: other names for some sections, such as {"G0": "superficial femoral artery"}.
-
-    Raises:
-        InputError: the naming map names a section that the scheme does not have in this tree.
+        crux: where the crux of the heart lies and which artery reaches it, if both are known.
     """
     if scheme == "generic":
-        labelled = _generic(tree)
-    else:
-        names, rules = _RULES[scheme]
-        sections = [np.zeros(len(branch.centerline.points), dtype=np.int64) for branch in tree.branches]
-        rules(Labeller(tree, names, sections, crux))
-        named = zip(tree.branches, sections, strict=True)
-        labelled = VesselTree(tuple(Branch(branch.centerline, branch.parent, own) for branch, own in named), names)
-    unknown = sorted(set(naming or ()) - set(labelled.section_names))
-    if unknown:
-        raise InputError(f"naming: no section '{unknown[0]}'; this tree has {', '.join(labelled.section_names)}")
-    renamed = tuple((naming or {}).get(name, name) for name in labelled.section_names)
-    return VesselTree(labelled.branches, renamed)
+        return _generic(tree)
+    names, rules = _RULES[scheme]
+    sections = [np.zeros(len(branch.centerline.points), dtype=np.int64) for branch in tree.branches]
+    rules(Labeller(tree, names, sections, crux))
+    named = zip(tree.branches, sections, strict=True)
+    return VesselTree(tuple(Branch(branch.centerline, branch.parent, own) for branch, own in named), names)
 
 
 def dominance(tree: VesselTree) -> str | None:
-    """Return "right", "balanced" or "left" for a labelled coronary tree, None for any other.
+    """Return "right", "balanced" or "left" for a labelled coronary tree, None for any other or an incomplete one.
 
-    A right coronary that gives a posterolateral branch is right-dominant, one that gives the posterior descending alone
-    balanced, one that ends long before the crux left; a left coronary with a posterior descending branch is
-    left-dominant, and one with a branch to the inferior wall balanced. None also where the right one reaches the crux
-    and gives neither, and where the left one lacks a main vessel: then parts of it are not there.
+    A right coronary with a posterolateral branch is right-dominant, with the posterior descending alone balanced, one
+    that ends long before the crux left; a left one with a posterior descending branch left-dominant, with a branch to
+    the inferior wall balanced.
     """
     used = {tree.section_names[index] for branch in tree.branches for index in np.unique(branch.section)}
     if tree.section_names == RCA_SECTIONS:

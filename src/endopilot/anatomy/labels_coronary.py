@@ -11,32 +11,18 @@ ACUTE_MARGIN = 0.64
 """The acute margin lies at this share of the path from the ostium to the crux (Dodge et al., Circulation
 1988;78:1167-80, R2 distal); segment 1 ends halfway to it."""
 
-USUAL_CRUX_MM, NEAREST_CRUX_MM = 140.0, 120.0
-"""Path from the right ostium to the crux; 122 to 170 mm in six real patients."""
-
-SHORT_MM = 60.0
-"""A coronary artery whose longest path is shorter than this is cut off, occluded, or a vestige."""
-
-CRUX_FORK_MM = 25.0
-"""The fork at the crux lies within this much of the path from where the path passes the crux, mm."""
-
-BEYOND_CRUX_MM, FORWARDS_MM = 15.0, 8.0
-"""A vessel that goes on for the first beyond the crux and turns forwards by the second is a posterior descending."""
-
-MAJOR_MM = 6.0
-"""A branch with at least this much length behind it counts as a named end vessel, mm."""
-
-NAMED_MM = 15.0
-"""Branches of the left main, and a ramus intermedius, have at least this much length behind them, mm."""
+USUAL_CRUX_MM, NEAREST_CRUX_MM = 140.0, 120.0  # path from ostium to crux; 122 to 170 in six patients
+SHORT_MM = 60.0  # a coronary artery whose longest path is shorter than this is cut off, occluded, or a vestige
+CRUX_FORK_MM = 25.0  # the fork at the crux lies within this much of the path from where the path passes the crux, mm
+BEYOND_CRUX_MM, FORWARDS_MM = 15.0, 8.0  # beyond the crux, and turned forwards: a posterior descending
+MAJOR_MM = 6.0  # a branch with at least this much length behind it counts as a named end vessel, mm
+NAMED_MM = 15.0  # branches of the left main, and a ramus intermedius, have at least this much length behind them, mm
 
 USUAL_LEFT_MAIN_MM, LONGEST_LEFT_MAIN_MM = 5.0, 30.0
 """Length of the left main: the median of sixteen real ones (5 to 95 %: 1 to 15 mm), and more than any has, mm."""
 
-_EARLY, _LATE = 0.22, 0.4
-"""A conus branch leaves within the first share of the path to the crux, a sinus node branch within the second."""
-
-_RAMUS_MM = 4.0
-"""Where LAD and LCx divide again this near the left main's end, the middle branch is the ramus intermedius."""
+_EARLY, _LATE = 0.22, 0.4  # shares of the path to the crux: conus branches leave within one, sinus node's within two
+_RAMUS_MM = 4.0  # where LAD and LCx divide so near the left main's end, the middle branch is the ramus
 
 GROOVE = np.array([-0.7, 0.6, -0.3])
 """Direction (LPS) in which the circumflex's course round the left atrioventricular groove reaches farthest at its end,
@@ -77,15 +63,11 @@ def _crux_near(labeller: Labeller, route: tuple[int, ...], passed: float | None)
 
 
 def _forks(labeller: Labeller, route: tuple[int, ...]) -> list[int]:
-    """Return the branches of a route at whose ends two or more named vessels leave."""
     return [branch for branch in route if len(labeller.major(branch, MAJOR_MM)) >= 2]
 
 
 def _end_of_distal(line: Centerline, passed: float | None) -> float:
-    """Return where segment 3 ends, mm, in an artery that does not fork where it passes the known crux.
-
-    One that ends before the crux is a part of the usual way there: a vestige of 35 mm is all segment 1.
-    """
+    """Return segment 3's end, mm, in an artery that does not fork at the crux, or ends on its usual way there."""
     whole = float(line.abscissa[-1])
     if passed is None:
         return max(whole, USUAL_CRUX_MM)
@@ -100,10 +82,8 @@ def _turns_forwards(line: Centerline, crux_mm: float, beyond_mm: float = 0.0) ->
 
 
 def _crux(labeller: Labeller, route: tuple[int, ...]) -> int | None:
-    """Return the branch that ends at the crux: the first low fork into two branches after the turn to the back.
-
-    Before the acute margin the vessel runs down and to the right; from there to the crux, to the left and the back.
-    """
+    """Return the branch that ends at the crux: the first low fork into two branches after the turn to the back. Before
+    the acute margin the vessel runs down and to the right; from there to the crux, to the left and the back."""
     back = np.array([1.0, 1.0, 0.0]) / np.sqrt(2.0)
     height = labeller.tree.path(route[-1]).points[:, 2]
     low = height.min() + 0.4 * float(np.ptp(height))
@@ -117,11 +97,8 @@ def _crux(labeller: Labeller, route: tuple[int, ...]) -> int | None:
 
 
 def _unforked_crux(labeller: Labeller, route: tuple[int, ...]) -> float:
-    """Return where segment 3 ends in a tree whose end does not fork, mm.
-
-    If the vessel turns forwards again behind its most posterior point for long enough, what follows is the posterior
-    descending artery; otherwise it ends as segment 3.
-    """
+    """Return where segment 3 ends, mm, in a tree whose end does not fork: where it turns forwards behind its most
+    posterior point for long enough, as the posterior descending artery does, or at its end."""
     line = labeller.tree.path(route[-1])
     if line.abscissa[-1] < SHORT_MM:
         return USUAL_CRUX_MM
@@ -162,11 +139,8 @@ def _label_right_sides(labeller: Labeller, trunk: tuple[int, ...], crux: int | N
 
 
 def label_lca(labeller: Labeller) -> None:
-    """Name the sections of a left coronary tree.
-
-    Where the left main does not fork within `LONGEST_LEFT_MAIN_MM`, one of its main vessels is missing; the other one's
-    name follows from its course: the anterior descending artery runs forwards, the circumflex back.
-    """
+    """Name the sections of a left coronary tree. Where the left main does not fork within `LONGEST_LEFT_MAIN_MM`, it
+    has one main vessel: the anterior descending artery if it runs forwards, else the circumflex."""
     tree = labeller.tree
     fork = labeller.fork(0, NAMED_MM)
     major = labeller.major(fork, NAMED_MM)
@@ -252,6 +226,5 @@ def _left_crux(labeller: Labeller, route: tuple[int, ...]) -> float:
 
 
 def _from_crux(labeller: Labeller, leaf: int) -> float:
-    """Return how near the path to an end comes to the known crux, mm."""
     assert labeller.crux is not None
     return float(np.linalg.norm(labeller.tree.path(leaf).points - labeller.crux.position, axis=1).min())

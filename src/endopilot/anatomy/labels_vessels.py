@@ -9,16 +9,11 @@ from endopilot.anatomy.labels_tree import Labeller
 
 LEFT, FRONT = np.array([1.0, 0.0, 0.0]), np.array([0.0, -1.0, 0.0])
 
-_LONG_MM = 35.0
-"""Where two branches with this much behind them part, the internal carotid ends."""
-_TRUNK_MM = 15.0
-"""Where two branches with this much behind them part, M1 ends."""
+_LONG_MM = 35.0  # where two branches with this much behind them part, the internal carotid ends
+_TRUNK_MM = 15.0  # where two branches with this much behind them part, M1 ends
 _SHORTEST_A1_MM = 5.0
-_TURN_MM = 1.0
-"""The anterior cerebral artery has turned up this far behind the end of A1."""
-
-_RIGHT_SHARE = 0.3
-"""Veins that end in this share of the tree's width, from the right, belong to the right lobe for certain."""
+_TURN_MM = 1.0  # the anterior cerebral artery has turned up this far behind the end of A1
+_RIGHT_SHARE = 0.3  # veins that end in this right share of the tree's width are of the right lobe for certain
 
 
 def label_arch(labeller: Labeller) -> None:
@@ -123,7 +118,6 @@ def label_portal(labeller: Labeller) -> None:
 
 
 def _parting(labeller: Labeller, one: int, other: int) -> float:
-    """Abscissa at which the paths to two ends separate, mm."""
     common = [branch for branch in labeller.tree.route(one) if branch in labeller.tree.route(other)]
     return float(labeller.tree.branches[common[-1]].centerline.abscissa[-1])
 

@@ -13,23 +13,13 @@ from scipy.spatial import KDTree
 from endopilot.anatomy.distance import CATHETER_LENGTH_MM, add_catheter
 from endopilot.types import Anatomy, DistanceMap
 
-_CHUNK = 1 << 18
-"""Points of the grid that are looked at together."""
-LEAST_MM = 0.02
-"""Radius of a lumen that is closed, mm."""
+_CHUNK = 1 << 18  # points of the grid that are looked at together
+LEAST_MM = 0.02  # radius of a lumen that is closed, mm
 
 
 def with_radii(anatomy: Anatomy, radii: Sequence[Float[np.ndarray, "_"]]) -> Anatomy:
-    """Return the anatomy with other radii; branches, their courses and the guiding catheter stay.
-
-    A point of the map belongs to the inscribed sphere, of a centerline or of the catheter, by which it lies deepest: of
-    least d² - r², with d the distance from the sphere's centre and r its radius. The wall moves outwards there by as
-    much as that radius grows; around a tube of radius r that is exact. A closed lumen keeps a radius of `LEAST_MM`.
-
-    Args:
-        anatomy: the vessel.
-        radii: of each branch at each point of its centerline, mm.
-    """
+    """Return the anatomy with other radii of each branch's points, mm, at least `LEAST_MM`; courses and the catheter
+    stay. A map point moves with the sphere it lies deepest in, of least d² - r²: exact around a tube."""
     branches = anatomy.tree.branches
     radii = [np.maximum(np.asarray(radius, dtype=float), LEAST_MM) for radius in radii]
     lines = [replace(branch.centerline, radius=r) for branch, r in zip(branches, radii, strict=True)]
@@ -53,11 +43,7 @@ def _moved(anatomy: Anatomy, grown: Float[np.ndarray, "n"]) -> DistanceMap:
 
 @lru_cache(maxsize=1)
 def _owners(anatomy: Anatomy) -> tuple[Int[np.ndarray, "points 3"], Int[np.ndarray, "points"]]:
-    """Return the points of an anatomy's map within its reach, and the inscribed sphere that each belongs to.
-
-    The spheres are those of the branches' centerlines, then the guiding catheter's. The last anatomy's are kept: lumens
-    of several widths are made of one.
-    """
+    """Return an anatomy's map points within reach, and each one's sphere; the last anatomy's are kept."""
     insertion, field = anatomy.insertion, anatomy.distance_map
     lines = [branch.centerline for branch in anatomy.tree.branches]
     count = max(2, int(np.ceil(CATHETER_LENGTH_MM / anatomy.catheter_radius_mm)))

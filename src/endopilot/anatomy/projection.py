@@ -21,22 +21,13 @@ from endopilot import _core
 from endopilot.anatomy.tree import tangents
 from endopilot.types import Insertion, TipProjection, VesselTree
 
-_TAPER = 1.25
-"""A branch is at most this many times wider where a point is projected to than where it is nearest to a vertex."""
+_TAPER = 1.25  # a branch is at most this much wider where a point projects to than at the nearest vertex
 
 
 def project_tip(tree: VesselTree, insertion: Insertion, points: Float[np.ndarray, "*n 3"]) -> TipProjection:
-    """Project tips onto the centerline tree.
-
-    Along a motion inside one branch, abscissa and offset are continuous; from one branch into another the abscissa
-    may step by no more than the shortcut that the tip takes across the bifurcation. Behind the ostium the line goes
-    on along the catheter's axis, with negative abscissa and the radius at the ostium.
-
-    Args:
-        tree: centerlines.
-        insertion: the ostium and the catheter's axis.
-        points: tip positions, LPS mm.
-    """
+    """Project tips (LPS mm) onto the centerline tree, continuously inside a branch; into another one the abscissa steps
+    by no more than the tip's shortcut. Behind the ostium the line goes on along the catheter's axis, with negative
+    abscissa and the ostium's radius."""
     return TipProjector(tree, insertion)(points)
 
 
@@ -82,18 +73,8 @@ class TipProjector:
 def _rivals(
     tree: VesselTree, points: Float[np.ndarray, "m 3"], first: Int[np.ndarray, "b"], owner: Int[np.ndarray, "m"]
 ) -> tuple[Float[np.ndarray, "m b"], Int[np.ndarray, "m b"]]:
-    """Return what a point may lie deeper in than in the branch of its nearest vertex, a row for each such vertex.
-
-    Args:
-        tree: centerlines.
-        points: all their vertices.
-        first: the first vertex of every branch.
-        owner: the branch of every vertex.
-
-    Returns:
-        How far a point must lie from the vertex to lie deeper in each other branch, mm; and the branch's vertex that is
-        nearest to this one.
-    """
+    """Return for each nearest vertex how far off a point must lie to lie deeper in each other branch, mm, and that
+    branch's nearest vertex. `first` and `owner` are each branch's first vertex and each vertex's branch."""
     lines = [branch.centerline for branch in tree.branches]
     spacing = np.concatenate([_spacing(line.points) for line in lines])
     rival = np.full((len(points), len(lines)), np.inf)
@@ -109,7 +90,6 @@ def _rivals(
 
 
 def _spacing(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """Return the length of the segment from each vertex of a line on; of that before it at the last one, mm."""
     if len(points) == 1:
         return np.full(1, 1e-9)
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
@@ -117,10 +97,7 @@ def _spacing(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
 
 
 def _shared_tangents(tree: VesselTree, insertion: Insertion) -> list[Float[np.ndarray, "n 3"]]:
-    """Return the tangents at all vertices; a branch and the child that carries it on share that at the joint.
-
-    So do the catheter and the first branch: the plane through the ostium stands across the catheter's axis.
-    """
+    """Return tangents at all vertices, shared at joints: so the ostium's plane stands across the catheter's axis."""
     result = [tangents(branch.centerline.points) for branch in tree.branches]
     for index in range(len(result)):
         children = [i for i in tree.children(index) if len(result[i]) > 1]
@@ -138,16 +115,8 @@ Samples = Float[np.ndarray, "*n"]
 
 
 def safety_ratio(offset: Samples, radius: Samples, wire_radius_mm: float) -> Samples:
-    """Return γ/(r − r_w): 0 on the centerline, 1 where the wire touches the wall of a round lumen.
-
-    Where the lumen is no wider than the wire, the wire touches the wall wherever it lies: the ratio is 1. What is NaN
-    stays NaN. With a wire radius of 0 it is the paper's ratio γ/r, which is 1 − r_w/r where the wire touches.
-
-    Args:
-        offset: γ of the wire's axis, mm.
-        radius: of the lumen there, r, mm.
-        wire_radius_mm: r_w, mm.
-    """
+    """Return γ/(r − r_w), mm: 0 on the centerline, 1 where the wire touches a round lumen's wall, or the lumen is no
+    wider than the wire; NaN stays NaN. With r_w = 0 it is the paper's ratio γ/r."""
     room = radius - wire_radius_mm
     filled = room <= 0
     return np.where(filled & ~np.isnan(offset), 1.0, offset / np.where(filled, 1.0, room))

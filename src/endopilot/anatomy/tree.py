@@ -15,20 +15,12 @@ from endopilot.vessels.line_checks import closures, left_out
 from endopilot.vessels.line_graph import found_lines
 from endopilot.vessels.sources import Polylines
 
-SAMPLE_STEP_MM = 0.1
-"""Distance of the points by which two trees are compared."""
+SAMPLE_STEP_MM = 0.1  # distance of the points by which two trees are compared
 
 
 @dataclass(frozen=True, eq=False)
 class LineTree:
-    """One tree from centerlines, and what became of the lines.
-
-    Attributes:
-        tree: the tree.
-        rule: by which its root was chosen.
-        notes: what was done and left out, a sentence each.
-        coverage: see `line_checks.left_out`.
-    """
+    """One tree from lines, the rule that chose its root, what was done and left out, and `line_checks.left_out`."""
 
     tree: VesselTree
     rule: str
@@ -50,10 +42,7 @@ def tree_from_polylines(
 
 
 def tree_from_lines(lines: list[Line]) -> VesselTree:
-    """Return the tree of lines that leave each other, cut into branches, with abscissa and normals.
-
-    Parents stand before their children in `lines`. Sections are not named yet: all points carry section 0, "vessel".
-    """
+    """Return the tree of lines that leave each other, cut into branches, all in section 0, "vessel"."""
     branches: list[Branch] = []
     ends: dict[tuple[int, int], int] = {}
     for index, line in enumerate(lines):
@@ -79,14 +68,7 @@ def make_centerline(
     first_abscissa: float = 0.0,
     first_normal: Float[np.ndarray, "3"] | None = None,
 ) -> Centerline:
-    """Return a centerline with abscissa and parallel-transport normals.
-
-    Args:
-        points: positions, LPS mm.
-        radius: inscribed-sphere radii, mm.
-        first_abscissa: abscissa of the first point, mm.
-        first_normal: normal to carry along; any perpendicular one if None.
-    """
+    """Return a centerline (LPS mm, radii) with abscissa and parallel-transported `first_normal` (or any)."""
     abscissa = first_abscissa + length_along(points)
     return Centerline(points=points, radius=radius, abscissa=abscissa, normals=parallel_transport(points, first_normal))
 
@@ -169,28 +151,3 @@ def cross_axes(direction: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "
     one = np.cross(direction, helper)
     one /= np.linalg.norm(one, axis=1, keepdims=True)
     return one, np.cross(direction, one)
-
-
-def curvature_torsion(centerline: Centerline) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Return curvature and torsion along a line, 1/mm.
-
-    They come from the derivatives of a quartic fitted to the nine points around each point:
-    κ = |r′×r″|/|r′|³ and τ = (r′×r″)·r‴/|r′×r″|². Where the line is straight, the torsion is set to zero.
-    """
-    count = len(centerline.points)
-    width = min(9, count)
-    if width < 5:
-        return np.zeros(count), np.zeros(count)
-    start = np.clip(np.arange(count) - width // 2, 0, count - width)
-    window = start[:, None] + np.arange(width)
-    offset = centerline.abscissa[window] - centerline.abscissa[:, None]
-    scale = np.abs(offset).max(axis=1)
-    powers = (offset / scale[:, None])[..., None] ** np.arange(5)
-    fit = np.linalg.pinv(powers) @ centerline.points[window]
-    first, second, third = (fit[:, k] * factor / scale[:, None] ** k for k, factor in ((1, 1.0), (2, 2.0), (3, 6.0)))
-    cross = np.cross(first, second)
-    size = np.linalg.norm(cross, axis=1)
-    speed = np.linalg.norm(first, axis=1)
-    curvature = size / np.maximum(speed, 1e-12) ** 3
-    torsion = np.einsum("ij,ij->i", cross, third) / np.maximum(size, 1e-12) ** 2
-    return curvature, np.where(curvature > 1e-4, torsion, 0.0)

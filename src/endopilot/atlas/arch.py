@@ -38,14 +38,12 @@ DIAMETER_MM = {
     "left common carotid": (8.28, 1.51),
     "left subclavian": (10.41, 2.2),
 }
-DIAMETER_MM_BEYOND = {"right common carotid": 7.0, "right subclavian": 9.0}
-"""Beyond the trunk: a little less than its area together."""
+DIAMETER_MM_BEYOND = {"right common carotid": 7.0, "right subclavian": 9.0}  # a little less than the trunk's area
 GAP_MM = {"left common carotid": (4.39, 2.49), "left subclavian": (6.43, 3.98)}
 """Between the wall of a branch and that of the one before it in the direction of flow, mm."""
 TRUNK_MM = (38.2, 9.5)
 
-_DESCENDING_MM, _ASCENDING_MM = 100.0, 35.0
-"""Aorta before and behind the arch, mm: from the middle of the chest, and to the root."""
+_DESCENDING_MM, _ASCENDING_MM = 100.0, 35.0  # aorta before and behind the arch, from mid-chest and to the root
 
 
 def make_arch(
@@ -100,7 +98,6 @@ def _draw(
 
 
 def _aorta(generator: np.random.Generator, height_mm: float, width_mm: float) -> Float[np.ndarray, "n 3"]:
-    """Return the aorta's axis from the descending aorta to the root: half an ellipse between two straight legs."""
     turn = np.linspace(np.pi, 0.0, 24)
     across, up = 0.5 * width_mm * np.cos(turn), height_mm * np.sin(turn)
     down, root = np.linspace(-_DESCENDING_MM, -8.0, 12), np.linspace(-8.0, -_ASCENDING_MM, 5)
@@ -120,11 +117,8 @@ def _origins(
     wide: dict[str, float],
     bovine: bool,
 ) -> dict[str, int]:
-    """Return where the branches leave the aorta, as indices of its points.
-
-    The brachiocephalic trunk leaves `drop_mm` below the top of the arch, the others between there and the descending
-    aorta.
-    """
+    """Return the points of the aorta where branches leave: the brachiocephalic trunk `drop_mm` below the top of the
+    arch, the others between there and the descending aorta."""
     top = int(points[:, 2].argmax())
     last = top + int(np.searchsorted(points[top, 2] - points[top:, 2], drop_mm))
     origins, before = {"brachiocephalic trunk": last}, "brachiocephalic trunk"

@@ -26,22 +26,16 @@ from endopilot.errors import InputError
 from endopilot.settings import Seed, Share, Within, settings
 from endopilot.types import Anatomy, Branch, Centerline, DistanceMap, Insertion, LumenMask, VesselTree, Volume
 
-IN_PLANE_MM, SLICE_MM = (0.6, 0.75), (0.5, 0.5)
-"""Range of the voxels' edges, mm."""
-TAKEN_IN = (0.4, 0.8)
-"""Voxels count as lumen up to this share of their edge outside of the wall."""
-NARROWEST_MM = (0.6, 0.9)
-"""A vessel ends in the mask where it stays narrower than this radius, mm."""
+IN_PLANE_MM, SLICE_MM = (0.6, 0.75), (0.5, 0.5)  # ranges of the voxels' edges, mm
+TAKEN_IN = (0.4, 0.8)  # voxels count as lumen up to this share of their edge outside of the wall
+NARROWEST_MM = (0.6, 0.9)  # a vessel ends in the mask where it stays narrower than this radius, mm
 _SCANS = 4
 _MARGIN_MM = 3.0
 
 
 def visible(generator: np.random.Generator, tree: VesselTree) -> VesselTree:
-    """Return what of a tree is wide enough to be drawn: each branch up to its last point that is, or whole if what
-    leaves its end is.
-
-    The first branch stays whole.
-    """
+    """Return what of a tree is wide enough to be drawn: the first branch whole, each other up to its last point that
+    is, or whole if what leaves its end is."""
     narrowest = float(generator.uniform(*NARROWEST_MM))
     ends = [int(np.flatnonzero(np.r_[True, b.centerline.radius >= narrowest])[-1]) for b in tree.branches]
     for index in reversed(range(len(tree.branches))):
@@ -81,18 +75,9 @@ def seen_through_ct(
 ) -> tuple[Anatomy, dict[str, Any]]:
     """Return the anatomy that `endopilot anatomy` makes of a mask of the patient's lumen, and what was drawn for it.
 
-    Whoever draws a mask follows a vessel until it is a few voxels wide, and takes in voxels that the wall cuts. So
-    masks have rough walls, end early, and are wide at their ends: the ends of seven real patients' masks, with voxels
-    of 0.6 to 0.75 mm in the plane and slices of 0.5 mm, have radii of 1.2 to 1.9 mm, median 1.4.
-
-    Args:
-        tree: the patient's vessels.
-        lumen: distance to the wall, without a catheter.
-        direction: the vessel's first direction.
-        catheter_radius_mm: inner radius of the guiding catheter, mm.
-
-    Raises:
-        InputError: no vessel was found in four masks.
+    Masks have rough walls, end early, and are wide at their ends: those of seven real patients, with voxels of 0.6 to
+    0.75 mm and slices of 0.5 mm, end at radii of 1.2 to 1.9 mm, median 1.4. `lumen` is the distance to the wall,
+    without a catheter. Raises InputError where no vessel was found in four masks.
     """
     scheme = vessel if vessel in ("rca", "lca") else "generic"
     config = AnatomyConfig(vessel=scheme, catheter_radius_mm=catheter_radius_mm)  # pyright: ignore[reportArgumentType]
@@ -122,11 +107,7 @@ def seen_through_ct(
 def rasterised(
     lumen: DistanceMap, voxel_mm: Float[np.ndarray, "3"], taken_in: float, shift: Float[np.ndarray, "3"]
 ) -> Volume:
-    """Return the voxels whose centre lies in a lumen, or outside by up to a share of their edge in the plane.
-
-    Args:
-        lumen: distance to the wall, mm.
-    """
+    """Return the voxels whose centre lies in a lumen, or outside by up to a share of their edge in the plane."""
     k, j, i = np.nonzero(lumen.values > -_MARGIN_MM / 2)
     points = np.stack([i, j, k], axis=1) * lumen.spacing_mm + lumen.origin_mm
     origin = points.min(axis=0) - _MARGIN_MM + shift * voxel_mm
@@ -139,8 +120,7 @@ def rasterised(
     return Volume(voxels, voxel_mm, origin, np.eye(3))
 
 
-CATHETER_LENGTH_MM = 30.0
-"""Length of catheter behind the ostium that the distance map holds, mm."""
+CATHETER_LENGTH_MM = 30.0  # length of catheter behind the ostium that the distance map holds, mm
 
 _KINDS: dict[str, Callable[[np.random.Generator, float, Population], tuple[VesselTree, dict[str, Any]]]] = {
     "rca": make_rca,
@@ -150,8 +130,7 @@ _KINDS: dict[str, Callable[[np.random.Generator, float, Population], tuple[Vesse
     "arch": make_arch,
 }
 
-VESSELS = tuple(_KINDS)
-"""Names of the kinds of vessel trees."""
+VESSELS = tuple(_KINDS)  # names of the kinds of vessel trees
 
 
 @settings
@@ -190,11 +169,8 @@ def make_atlas(*, config: AtlasConfig | None = None) -> Iterator[Anatomy]:
 
 
 def make_patient(config: AtlasConfig, index: int) -> Anatomy:
-    """Return patient `index`, made from its exact centerline and radii.
-
-    The random stream is keyed by (seed, index), so that a patient does not depend on the others. `provenance` holds
-    what was drawn: dominance, length, tortuosity, curvature, stenoses.
-    """
+    """Return patient `index`, made from its exact centerline and radii; `provenance` holds what was drawn. The random
+    stream is keyed by (seed, index), so that a patient does not depend on the others."""
     tree, drawn = make_patient_tree(config, index)
     population = population_of(config.vessel, config.population)
     generator = _stream(config, index, 1)

@@ -15,19 +15,13 @@ from endopilot.atlas import curves as shape
 from endopilot.lines import length_along
 from endopilot.types import Branch, Centerline, VesselTree
 
-Depth = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]
-"""How deep points lie below the surface that vessels keep to, mm."""
-
-_CLEARANCE_MM = 0.6
-"""Tissue between two lumens that do not belong together, mm: two walls."""
-_BEND_MM = 4.0
-"""Two places of one vessel that lie farther apart along it than this and twice their radii must not touch, mm."""
+Depth = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]  # how deep points lie below the surface, mm
+_CLEARANCE_MM = 0.6  # tissue between two lumens that do not belong together, mm: two walls
+_BEND_MM = 4.0  # places of one vessel farther apart along it than this and twice their radii must not touch, mm
 
 
-_RIGHT_SHARE, _BALANCED_SHARE = 0.88, 0.06
-"""Shares of right and balanced dominance; the rest is left. Chosen within the range that the literature reports."""
-_FEMALE_CALIBRE = 0.91
-"""Women's coronary lumens against men's (Dodge JT et al., Circulation 1992;86:232-46)."""
+_RIGHT_SHARE, _BALANCED_SHARE = 0.88, 0.06  # shares of right and balanced dominance, within the literature's range
+_FEMALE_CALIBRE = 0.91  # women's coronary lumens against men's (Dodge JT et al., Circulation 1992;86:232-46)
 
 
 class NoShape(Exception):
@@ -36,15 +30,8 @@ class NoShape(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Vessel:
-    """A vessel of a tree before it is cut at its branching points.
-
-    Attributes:
-        points: positions, evenly spaced, LPS mm; the first one is the parent's point `origin`.
-        radius: lumen radius, mm.
-        section: name of the anatomical section at each point.
-        parent: index of the vessel that it leaves, -1 for the first.
-        origin: index of the parent's point where it leaves.
-    """
+    """A vessel before it is cut at its branching points: evenly spaced points, LPS mm, with a section name each; the
+    first is the point `origin` of the vessel `parent` (-1 for the first vessel)."""
 
     points: Float[np.ndarray, "n 3"]
     radius: Float[np.ndarray, "n"]
@@ -58,9 +45,7 @@ class SidePlan:
     """A side branch to be drawn.
 
     Attributes:
-        parent: index of the vessel that it leaves.
-        origin: index of the parent's point where it leaves; -1 for its end.
-        diameter_mm: lumen diameter at its origin.
+        origin: index of the point of the vessel `parent` where it leaves; -1 for its end.
         courses: (abscissa from which it holds, mm; LPS direction), in order.
         taper: share of the diameter that is lost towards the end.
         angle_deg: range of the angle at which it leaves.
@@ -81,11 +66,7 @@ class SidePlan:
 def until_it_fits(
     draw: Callable[[], tuple[VesselTree, dict[str, Any]]], what: str
 ) -> tuple[VesselTree, dict[str, Any]]:
-    """Draw trees until one fits; its record states how many failed before (`redrawn`).
-
-    Raises:
-        NoShape: 60 draws failed.
-    """
+    """Draw trees until one fits, whose record states how many failed (`redrawn`); NoShape after 60 draws."""
     for attempt in range(60):
         try:
             tree, drawn = draw()
@@ -126,12 +107,7 @@ def free_origin(generator: np.random.Generator, mean_mm: float, sd_mm: float, ta
 def stenosis(
     generator: np.random.Generator, along: Float[np.ndarray, "n"], shares: tuple[float, float]
 ) -> tuple[dict[str, float], Float[np.ndarray, "n"]]:
-    """Return a narrowing of 30 to 65 % of the diameter over 6 to 14 mm, and the factor on the radius.
-
-    Args:
-        along: abscissa of the vessel's points, mm.
-        shares: it lies between these shares of the vessel's abscissa.
-    """
+    """Return a narrowing of 30 to 65 % of the diameter over 6 to 14 mm within `shares`, and the radius's factor."""
     place, extent = along[0] + generator.uniform(*shares) * (along[-1] - along[0]), generator.uniform(6.0, 14.0)
     degree = generator.uniform(0.3, 0.65)
     narrowing = 1 - degree * np.exp(-0.5 * ((along - place) / (extent / 4)) ** 2)
@@ -142,10 +118,7 @@ def stenosis(
 def stenoses(
     generator: np.random.Generator, along: Float[np.ndarray, "n"], shares: tuple[float, float], tandem_share: float
 ) -> tuple[list[dict[str, Any]], Float[np.ndarray, "n"]]:
-    """Return a stenosis, with a probability of `tandem_share` a second one 12 to 40 mm from it, and their factor.
-
-    Arguments and factor as for `stenosis`; where the vessel has no room for it, the second one is left out.
-    """
+    """Return a stenosis, by `tandem_share` a second one 12 to 40 mm from it where there is room, and their factor."""
     drawn, narrowing = stenosis(generator, along, shares)
     if tandem_share == 0 or generator.random() > tandem_share:
         return [drawn], narrowing
@@ -163,10 +136,8 @@ def narrowed(
     shares: tuple[float, float],
     tandem_share: float = 0.0,
 ) -> tuple[list[dict[str, Any]], list[Vessel]]:
-    """Return the stenoses of one vessel (abscissa from the ostium, and section), and the vessels with them.
-
-    The mouths of its branches, which lie in its lumen, narrow with it.
-    """
+    """Return the stenoses of one vessel (abscissa from the ostium, and section), and the vessels with them; the mouths
+    of its branches, which lie in its lumen, narrow with it."""
     vessel = vessels[index]
     along, above = length_along(vessel.points), vessel
     while above.parent >= 0:
@@ -210,14 +181,8 @@ def uneven(generator: np.random.Generator, along: Float[np.ndarray, "n"]) -> Flo
 def with_side_branches(
     generator: np.random.Generator, vessels: Sequence[Vessel], plans: Sequence[SidePlan], carina_mm: float
 ) -> list[Vessel]:
-    """Return the vessels with the planned branches; one that cuts another lumen is drawn again, twelve times at most.
-
-    Args:
-        carina_mm: over this length behind a fork and twice their radii lumens may be in contact, mm.
-
-    Raises:
-        NoShape: a branch found no place.
-    """
+    """Return the vessels with the planned branches, drawn up to twelve times until none cuts another lumen; over
+    `carina_mm` behind a fork and twice their radii they may touch. Raises NoShape where a branch found no place."""
     grown = list(vessels)
     if not plans and lumens_collide(grown, carina_mm):
         raise NoShape
@@ -257,10 +222,8 @@ def mouth(
     parent_direction: Float[np.ndarray, "3"],
     parent_radius: float,
 ) -> Float[np.ndarray, "n"]:
-    """Return a branch's radius with its mouth: inside the parent's lumen the inscribed sphere is the parent's.
-
-    The distance from the parent's axis is taken off that sphere; a smooth maximum rounds the carina.
-    """
+    """Return a branch's radius with its mouth: inside the parent's lumen the inscribed sphere is the parent's, less the
+    distance from the parent's axis; a smooth maximum rounds the carina."""
     away = points - points[0]
     off_axis = np.linalg.norm(away - (away @ parent_direction)[:, None] * parent_direction, axis=1)
     inside = parent_radius - off_axis
@@ -272,12 +235,8 @@ def mouth(
 
 
 def build_tree(vessels: Sequence[Vessel], section_names: tuple[str, ...]) -> VesselTree:
-    """Cut vessels at their branching points; branches are in the order in which they leave.
-
-    Args:
-        vessels: parents before their children.
-        section_names: all names, in the order that numbers them.
-    """
+    """Cut vessels, parents first, at their branching points; branches are in the order in which they leave, and
+    `section_names` in that which numbers them."""
     number = {name: i for i, name in enumerate(section_names)}
     branches: list[Branch] = []
 
@@ -305,11 +264,7 @@ def build_tree(vessels: Sequence[Vessel], section_names: tuple[str, ...]) -> Ves
 
 
 def lumens_collide(vessels: Sequence[Vessel], carina_mm: float = _BEND_MM) -> bool:
-    """Return whether lumens touch that lie far apart along the tree.
-
-    Args:
-        carina_mm: behind a fork two vessels are far apart from this length and twice their radii on, mm.
-    """
+    """Return whether lumens touch far apart along the tree: beyond `carina_mm` and twice their radii behind a fork."""
     points = np.concatenate([vessel.points for vessel in vessels])
     radii = np.concatenate([vessel.radius for vessel in vessels])
     place = np.concatenate([length_along(vessel.points) for vessel in vessels])
@@ -330,11 +285,8 @@ def lumens_collide(vessels: Sequence[Vessel], carina_mm: float = _BEND_MM) -> bo
 
 
 def _meetings(vessels: Sequence[Vessel]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return for each pair of vessels a, b where their paths to the root meet.
-
-    That is: the vessel that they meet on, the place (mm) where a's path enters it, and the length of a's path between
-    the vessel a itself and that place, mm.
-    """
+    """Return for each pair of vessels a, b the vessel that their paths to the root meet on, the place (mm) where a's
+    path enters it, and the length of a's path between the vessel a itself and that place, mm."""
     lengths = [length_along(vessel.points) for vessel in vessels]
     paths: list[dict[int, tuple[float, float]]] = []
     for vessel in vessels:

@@ -42,12 +42,9 @@ _SIPHON = np.array(
      [-14, -23.5, 38]]
 )  # fmt: skip
 """Left internal carotid artery, LPS mm from the entrance of the carotid canal; the midline lies at x = -27."""
-_BEYOND_M1 = np.array([[4, 4, 5], [5, 12, 10], [7, 23, 15], [13, 34, 19.0]])
-"""Inferior trunk of M2 over the insula, mm from the end of M1."""
-_PCOM_SHARE = 0.6
-"""Share of patients in whom the posterior communicating artery is wide enough to be visible: an assumption."""
-_SHARPEST_PER_MM = 0.4
-"""Greatest curvature of the carotid's axis, 1/mm: its wall must not fold."""
+_BEYOND_M1 = np.array([[4, 4, 5], [5, 12, 10], [7, 23, 15], [13, 34, 19.0]])  # inferior trunk of M2, mm from M1's end
+_PCOM_SHARE = 0.6  # share of patients with a visible posterior communicating artery: an assumption
+_SHARPEST_PER_MM = 0.4  # greatest curvature of the carotid's axis, 1/mm: its wall must not fold
 
 
 def make_cerebral(
@@ -149,7 +146,6 @@ def _rounded(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
 def _radius(
     generator: np.random.Generator, points: Float[np.ndarray, "n 3"], marks: dict[str, int]
 ) -> tuple[Float[np.ndarray, "n"], float]:
-    """Return the lumen radius along the main line, mm, and the patient's calibre against the average."""
     calibre = branching.truncated(generator, 1.0, 0.12, 0.72, 1.3)
     place = [0, marks["cavernous"], marks["terminus"], marks["terminus"] + 5, marks["M2"], marks["M2"] + 5, len(points)]
     wide = DIAMETER_MM
@@ -201,10 +197,8 @@ def _plans(
 def _opened_trunks(
     generator: np.random.Generator, plans: list[branching.SidePlan], population: Population
 ) -> tuple[list[branching.SidePlan], list[Fork]]:
-    """Return the plans and where the main line gives way; the trunks of M2 part at the population's angle.
-
-    The inferior trunk, which goes on from M1, and the superior one each take their half of it.
-    """
+    """Return the plans and where the main line gives way; the inferior trunk of M2, which goes on from M1, and the
+    superior one each take half of the population's angle."""
     forks = forks_of(plans, 0)
     if population.trunks_angle_deg is None:
         return plans, forks

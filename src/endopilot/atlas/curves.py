@@ -12,11 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from endopilot.lines import length_along
 
-STEP_MM = 0.5
-"""Distance between neighbouring centerline points, mm."""
+STEP_MM = 0.5  # distance between neighbouring centerline points, mm
 
-_HEIGHT_MM = 3.0
-"""Side branches run this far above the surface that they follow, mm: in epicardial fat."""
+_HEIGHT_MM = 3.0  # side branches run this far above the surface that they follow, mm: in epicardial fat
 
 
 def curve_through(waypoints: Float[np.ndarray, "n 3"], step_mm: float = STEP_MM) -> Float[np.ndarray, "m 3"]:
@@ -48,11 +46,7 @@ def tortuosity(points: Float[np.ndarray, "n 3"]) -> float:
 def parallel_normals(
     tangent: Float[np.ndarray, "n 3"], first: Float[np.ndarray, "3"] | None = None
 ) -> Float[np.ndarray, "n 3"]:
-    """Return unit vectors perpendicular to the tangents, carried along without twist.
-
-    Args:
-        first: direction that the first normal takes as nearly as it can.
-    """
+    """Return unit vectors perpendicular to the tangents, carried without twist from about the direction `first`."""
     start = np.eye(3)[np.argmin(np.abs(tangent[0]))] if first is None else first
     normals = np.empty_like(tangent)
     for i in range(len(tangent)):
@@ -75,15 +69,8 @@ def turned(points: Float[np.ndarray, "n 3"], rotations: Float[np.ndarray, "m 3"]
 
 @dataclass(frozen=True, eq=False)
 class Wiggle:
-    """A smooth random displacement along a curve: a sum of sines of random wavelength and phase.
-
-    Amplitudes grow as the wavelength to the power 1.5, so that no single wavelength dominates the curvature.
-
-    Attributes:
-        wave_number: 1/mm, one a mode.
-        phase: rad, one a mode and normal direction.
-        weight: mm, one a mode and normal direction.
-    """
+    """A smooth random displacement along a curve: a sum of sines of random wave number (1/mm) and phase, with weights
+    in mm that grow as the wavelength to the power 1.5, so that no wavelength dominates the curvature."""
 
     wave_number: Float[np.ndarray, "modes"]
     phase: Float[np.ndarray, "modes 2"]
@@ -99,10 +86,7 @@ class Wiggle:
     def apply(
         self, points: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"], amplitude: float, quiet_mm: float
     ) -> Float[np.ndarray, "n 3"]:
-        """Displace a curve across its direction; the first `quiet_mm` mm fade in, so that the start keeps its place.
-
-        `normal` holds unit vectors across the curve that turn smoothly along it.
-        """
+        """Displace a curve along smoothly turning unit normals; the start keeps its place: `quiet_mm` fade in."""
         tangent = tangents(points)
         along = length_along(points)
         sines = np.sin(along[:, None, None] * self.wave_number[:, None] + self.phase)
@@ -120,16 +104,9 @@ def steer(
     relaxation_mm: float,
     depth: Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]] | None,
 ) -> Float[np.ndarray, "n 3"]:
-    """Return a smooth curve that leaves `start` along `direction` and follows one course after another on a surface.
-
-    Args:
-        start: first point, LPS mm.
-        direction: unit tangent there.
-        courses: (abscissa from which it holds, mm; unit direction), in order.
-        relaxation_mm: length over which the direction approaches the course by a factor e.
-        depth: how deep points lie below the surface, mm; the curve seeks a height of `_HEIGHT_MM` above it. None for
-            no surface.
-    """
+    """Return a smooth curve from `start` along `direction`, then along one course (abscissa from which it holds, mm,
+    and unit direction) after another, each approached over `relaxation_mm`, `_HEIGHT_MM` above the surface that points
+    lie `depth` below, mm."""
     count = max(round(length_mm / STEP_MM), 8)
     heading, aim, rise, outward = direction, direction, 0.0, np.zeros(3)
     points = [start]

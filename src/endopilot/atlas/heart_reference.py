@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -23,38 +24,13 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from endopilot.atlas import curves as shape
+from endopilot.atlas.population import frozen
+from endopilot.files import read_yaml
 from endopilot.lines import length_along, places_on
 
-TO_CRUX = np.array(
-    [
-        [0.0, 0.0, 0.0],
-        [-4.4, -1.5, -1.9],
-        [-14.4, -5.8, -6.9],
-        [-20.6, -9.2, -13.0],
-        [-24.7, -9.5, -21.4],
-        [-29.3, -9.5, -34.2],
-        [-31.3, -7.2, -45.9],
-        [-29.0, -3.0, -54.7],
-        [-22.9, 0.4, -59.7],
-        [-13.5, 12.5, -64.0],
-    ]
-)
-"""The right coronary artery from its ostium over R1p m d, R2p m d, R3p m to the crux (R3d), mm."""
-BEYOND_CRUX = {
-    "4": np.array([[-1, 6, -70], [14, -8, -72.5], [32, -25, -71], [50, -43, -66], [66, -60, -58.0]]),
-    "16": np.array([[-1, 25, -58], [7, 34, -53], [17, 39, -55], [29, 37, -64], [43, 30, -72], [58, 20, -76.0]]),
-}
-"""Onwards along the inferior interventricular groove (section 4), or over R4 to the posterolateral wall (16), mm."""
+LEFT_VENTRICLE_AXIS = (38.0, -68.0, -22.0)
 
-LEFT_VENTRICLE_AXIS, RIGHT_VENTRICLE_AXIS = (38.0, -68.0, -22.0), (46.0, -36.0, -16.0)
-AORTA = [(22, 6, -26), (17, 5.5, -12), (14.5, 5, 0), (12.5, 4, 14), (9, 2, 40), (8, 3, 90)]
-AORTA_RADIUS = (9.0, 13.0, 15.5, 14.5, 15.0, 15.0)
-OUTFLOW = [(8, -28, -30), (16, -29, -12), (24, -27, 4)]
-PULMONARY = [(24, -27, 4), (32, -19, 22), (36, 0, 36)]
-PULMONARY_RADIUS = (12.0, 13.0, 12.0)
-
-Numbers = Sequence[float | int]
-"""Coordinates or sizes, mm."""
+Numbers = Sequence[float | int]  # coordinates or sizes, mm
 
 _WARP_WIDTH_MM = 22.0
 _GRID_MM = 2.0
@@ -63,18 +39,8 @@ _GRID_LOW, _GRID_HIGH = np.array([-70.0, -110.0, -110.0]), np.array([110.0, 90.0
 
 @dataclass(frozen=True, eq=False)
 class HeartFit:
-    """The map from a patient to the reference heart: a similarity about the ostium, then a smooth warp.
-
-    The warp carries the patient's artery onto the reference course, so that chambers keep beside the artery.
-
-    Attributes:
-        origin: the patient's ostium, mm.
-        rotation: from the reference frame to the patient.
-        scale: size of the patient's heart against the reference.
-        knots: points of the patient's artery after the similarity, mm.
-        shifts: what is missing from each knot to the reference course, mm.
-        anchor: where the patient's ostium lies after the similarity, mm: the warp leaves it in its place.
-    """
+    """The map from a patient to the reference heart: a similarity about the ostium, then a smooth warp of the patient's
+    artery onto the reference course: `shifts` are missing from `knots` of the artery, mm, none at `anchor`."""
 
     origin: Float[np.ndarray, "3"]
     rotation: Float[np.ndarray, "3 3"]
@@ -110,13 +76,8 @@ class HeartFit:
 
 
 def fit_heart(main: Float[np.ndarray, "n 3"], crux_mm: float, last_section: str) -> HeartFit:
-    """Fit the reference heart to a right coronary artery.
-
-    Args:
-        main: the artery from the ostium to the farthest tip, LPS mm.
-        crux_mm: abscissa of the crux.
-        last_section: "4" or "16", where the tip lies; anything else ignores what lies beyond the crux.
-    """
+    """Fit the reference heart to a right coronary artery from the ostium to its farthest tip, LPS mm. What lies beyond
+    the crux (abscissa `crux_mm`) counts where the tip lies in section "4" or "16"."""
     along = length_along(main)
     course = places_on(main, along, np.linspace(0.0, crux_mm, 20))
     to_crux = shape.curve_through(TO_CRUX)
@@ -134,14 +95,8 @@ def fit_heart(main: Float[np.ndarray, "n 3"], crux_mm: float, last_section: str)
 
 
 def fit_heart_along(lines: Sequence[Float[np.ndarray, "_ 3"]], courses: Sequence[Float[np.ndarray, "_ 3"]]) -> HeartFit:
-    """Fit the reference heart to the main vessels of a tree, as far as they go.
-
-    A patient's point belongs to the reference point at the same length from the ostium, relative to the heart's size.
-
-    Args:
-        lines: the patient's main vessels, each from the ostium, LPS mm.
-        courses: their courses on the reference heart, each from the ostium, mm.
-    """
+    """Fit the reference heart to the main vessels of a tree, as far as they go, by equal lengths from the ostium, where
+    lines and courses begin, relative to the heart's size."""
     ostium, anchor, scale, rotation = lines[0][0], courses[0][0], 1.0, np.eye(3)
     found = wanted = np.zeros((0, 3))
     for _ in range(4):
@@ -168,7 +123,7 @@ def _similarity(
 
 
 def _square(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
-    """Return squared lengths; numpy's own sum over so short an axis takes several times as long."""
+    # numpy's own sum over so short an axis takes several times as long
     return x[..., 0] ** 2 + x[..., 1] ** 2 + x[..., 2] ** 2
 
 
@@ -198,45 +153,10 @@ def tube(x: Float[np.ndarray, "*n 3"], waypoints: Sequence[Numbers], radius: Num
     return depth
 
 
-def left_ventricle_wall(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
-    """Depth below the left ventricle's epicardium."""
-    return ellipsoid(x, (44, -21, -37), (47, 28, 28), LEFT_VENTRICLE_AXIS)
-
-
-def left_ventricle(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
-    """Depth in the left ventricle's cavity."""
-    return ellipsoid(x, (42, -17, -36), (38, 18.5, 18.5), LEFT_VENTRICLE_AXIS)
-
-
-def right_ventricle(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
-    """Depth in the right ventricle's cavity and its outflow tract, the septum not yet taken off."""
-    return np.maximum(ellipsoid(x, (10, -25, -42), (38, 22, 19), RIGHT_VENTRICLE_AXIS), tube(x, OUTFLOW, (12, 11, 12)))
-
-
-def right_atrium(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
-    """Depth in the right atrium and its appendage, which lies over the first centimetres of the artery."""
-    body = ellipsoid(x, (-19, 18, -29), (27, 21, 22), (0.1, 0.2, 1.0))
-    return np.maximum(body, ellipsoid(x, (-17, 0, 6), (17, 8, 9), (0.6, -0.7, 0.2)))
-
-
-def left_atrium(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
-    """Depth in the left atrium and its appendage, which lies beside the left main artery."""
-    return np.maximum(ellipsoid(x, (24, 41, -9), (27, 17, 22), (1.0, 0.1, 0.1)), left_appendage(x))
-
-
-def left_appendage(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
-    """Depth in the left atrial appendage."""
-    return ellipsoid(x, (47, 17, 7), (15, 7, 8), (0.3, -0.8, 0.2))
-
-
-def aorta(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
-    """Depth in the left ventricle's outflow, the aortic root and the ascending aorta; the ostium is on its surface."""
-    return tube(x, AORTA, AORTA_RADIUS)
-
-
-def pulmonary_artery(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
-    """Depth in the pulmonary trunk."""
-    return tube(x, PULMONARY, PULMONARY_RADIUS)
+def chamber(x: Float[np.ndarray, "*n 3"], name: str) -> Float[np.ndarray, "*n"]:
+    """Return the depth in a chamber or a great vessel of `heart.yaml`, mm."""
+    shapes = {"ellipsoid": ellipsoid, "tube": tube}
+    return np.max([shapes[kind](x, *of) for part in _HEART["chambers"][name] for kind, of in part.items()], axis=0)
 
 
 @cache
@@ -244,93 +164,42 @@ def _solid_grid() -> Float32[np.ndarray, "nz ny nx"]:
     axes = [np.arange(low, high, _GRID_MM) for low, high in zip(_GRID_LOW, _GRID_HIGH, strict=True)]
     z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
     at = np.stack([x, y, z], axis=-1).astype(np.float32)
-    walls = (
-        left_ventricle_wall(at),
-        right_ventricle(at) + 3,
-        right_atrium(at) + 2,
-        left_atrium(at) + 2,
-        aorta(at) + 1.3,
-        pulmonary_artery(at) + 1.3,
-    )
-    return np.max(walls, axis=0)
+    thick = {"left_ventricle_wall": 0, "right_ventricle": 3, "right_atrium": 2, "left_atrium": 2}
+    thick |= {"aorta": 1.3, "pulmonary_artery": 1.3}
+    return np.max([chamber(at, name) + wall for name, wall in thick.items()], axis=0)
 
-
-LEFT_OSTIUM = np.array([26.0, 14.0, 2.0])
-"""The left coronary ostium on the reference heart's aortic root, mm."""
 
 _KNOTS = 16
-_HEIGHT_MM = 3.0
-"""The reference courses lie this far above the reference heart's surface, mm: in epicardial fat."""
+_HEIGHT_MM = 3.0  # the reference courses lie this far above the reference heart's surface, mm: in epicardial fat
 
 
 def place_from_ostium(distance_cm: float, azimuth_deg: float, elevation_deg: float) -> Float[np.ndarray, "3"]:
-    """Return the LPS position of one of Dodge's points with respect to its ostium, mm.
-
-    Azimuth counts from the front to the patient's left, elevation towards the head.
-    """
+    """Return the LPS position of a point of Dodge's, mm: azimuth from the front to the left, elevation headward."""
     azimuth, elevation = np.deg2rad([azimuth_deg, elevation_deg])
     flat = np.cos(elevation) * np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
     return 10.0 * distance_cm * (flat + np.array([0.0, 0.0, np.sin(elevation)]))
 
 
-FORK = np.array([13.0, -3.0, -1.2])
-"""End of the left main artery: halfway between the first points of LAD (L1p) and circumflex (C1p), mm."""
+_HEART = frozen(read_yaml(Path(__file__).parent / "heart.yaml"))
 
-LAD = np.array(
-    [
-        FORK,
-        place_from_ostium(2.3, 63.0, -5.0),
-        place_from_ostium(3.25, 59.0, -8.5),
-        place_from_ostium(5.15, 44.0, -12.0),
-        place_from_ostium(6.8, 38.5, -18.5),
-        place_from_ostium(10.1, 30.0, -32.0),
-        place_from_ostium(12.2, 32.0, -46.0),
-        place_from_ostium(11.8, 33.0, -49.0),
-        [26.0, -44.0, -84.0],
-    ]
-)
-"""Anterior descending artery: fork, L1m, first and second diagonal and septal, third, L3m, apex (L4p), L4m, and on
-along the inferior interventricular groove, mm from the left ostium."""
 
-LCX = np.array(
-    [
-        FORK,
-        place_from_ostium(1.8, 94.0, -24.0),
-        place_from_ostium(2.2, 102.0, -31.0),
-        place_from_ostium(3.25, 117.0, -39.0),
-        place_from_ostium(4.75, 132.0, -50.0),
-        place_from_ostium(6.0, 156.0, -66.0),
-        [-16.0, 9.0, -64.4],
-    ]
-)
-"""Circumflex artery: fork, C1m, first, second and third marginal, posterior branch and C4m, crux, mm from the left
-ostium."""
+def _course(name: str) -> Float[np.ndarray, "n 3"]:
+    places = (place_from_ostium(*at["dodge"]) if isinstance(at, dict) else at for at in _HEART["courses"][name])
+    return np.array(list(places), dtype=float)
 
-INFERIOR = np.array([LCX[-1], [0.0, -5.0, -72.0], [17.0, -24.0, -80.0], [32.0, -46.0, -87.0]])
-"""Left posterior descending artery from the crux along the inferior interventricular groove, mm from the left ostium;
-elevations and distances of CDo, CDp and CDm, azimuth interpolated."""
 
-_REFERENCE_LAD = np.array(
-    [LEFT_OSTIUM, [31, 12, 2.5], [40, 3, 0], [45, -6, -4], [50, -17, -8], [54, -29, -13], [57, -42, -20],
-     [61, -54, -30], [65, -61, -45], [63, -59, -58], [50, -45, -67]]
-)  # fmt: skip
-_REFERENCE_LCX = np.array(
-    [[40, 3, 0], [45.5, 4, -5], [50, 10, -11], [53, 17, -20], [52, 23, -31], [46, 28, -41], [33, 33, -45],
-     [18, 31, -49], [2, 23, -56.0]]
-)  # fmt: skip
-"""Both courses around the reference heart, mm in its frame; they are laid onto its surface."""
+TO_CRUX, LAD, LCX, INFERIOR = map(_course, ("to_crux", "lad", "lcx", "inferior"))
+BEYOND_CRUX = {section: _course(section) for section in ("4", "16")}
+FORK = LAD[0]  # end of the left main artery, mm from the left ostium, as the courses of the left artery are
+_REFERENCE_LAD, _REFERENCE_LCX = map(_course, ("reference_lad", "reference_lcx"))
+LEFT_OSTIUM = _REFERENCE_LAD[0]  # the left coronary ostium on the reference heart's aortic root, mm
 
 
 def fit_left_heart(
     lad: Float[np.ndarray, "n 3"], lcx: Float[np.ndarray, "m 3"], inferior: Float[np.ndarray, "k 3"]
 ) -> HeartFit:
-    """Fit the reference heart to a left coronary artery.
-
-    Args:
-        lad: the patient's left main and anterior descending artery over the whole course of `LAD`, LPS mm.
-        lcx: circumflex artery and what would carry it on over the whole course of `LCX`.
-        inferior: the course of `INFERIOR` in this patient, whatever runs there.
-    """
+    """Fit the reference heart to a left coronary artery: left main and anterior descending artery, circumflex and what
+    would carry it on, and whatever runs along `INFERIOR`, over the whole courses of the reference, LPS mm."""
     course = np.concatenate([_evenly(line) for line in (lad, lcx, inferior)])
     reference = reference_courses()
     ostium = lad[0]

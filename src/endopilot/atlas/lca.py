@@ -48,19 +48,15 @@ _ENDS = {"right": (66.0, 9.0, 40.0, 76.0), "balanced": (88.0, 4.0, 82.0, 97.0)}
 the crux into the posterior descending artery."""
 
 
-_ORDERED = (("9", "10"), ("12",))
-"""Names of the first branches of the anterior descending artery and of the circumflex, septals aside."""
-_FLARE_MM = 3.0
-"""Over this length before and behind its fork the left main artery widens, mm."""
-_SHARPEST_PER_MM = 0.45
-"""Greatest curvature of the main vessels, 1/mm."""
+_ORDERED = (("9", "10"), ("12",))  # first branches of the LAD and of the circumflex, septals aside
+_FLARE_MM = 3.0  # over this length before and behind its fork the left main artery widens, mm
+_SHARPEST_PER_MM = 0.45  # greatest curvature of the main vessels, 1/mm
 
 
 @dataclass(frozen=True, eq=False)
 class _Trunk:
-    """A patient's main vessels: courses from the ostium and from the fork, each as far as it could go, the number of
-    points that are there, indices of fork and crux, size and position of the heart.
-    """
+    """A patient's main vessels: courses from the ostium and from the fork as far as they could go, the number of points
+    there, indices of fork and crux, size and position of the heart."""
 
     whole_lad: Float[np.ndarray, "n 3"]
     whole_lcx: Float[np.ndarray, "m 3"]
@@ -97,11 +93,7 @@ def make_lca(
 
 
 def _draw(
-    generator: np.random.Generator,
-    dominance: str,
-    main_mm: float | None,
-    stenosis_share: float,
-    population: Population,
+    generator: np.random.Generator, dominance: str, main_mm: float | None, stenosis_share: float, population: Population
 ) -> tuple[VesselTree, dict[str, Any]]:
     trunk = _trunk(generator, dominance, main_mm, population)
     calibre = branching.coronary_calibre(generator, 1.0, 0.65, 1.4)
@@ -231,7 +223,6 @@ def _plan_branches(
     calibre: float,
     population: Population,
 ) -> list[branching.SidePlan]:
-    """Draw which branches there are, where they leave, how long and how wide they are; named in their order."""
     plans: list[branching.SidePlan] = []
     presence = factor(generator, population.side_share)
     for parent, kinds in enumerate((side_kinds("lca", "lad"), side_kinds("lca", "lcx"))):

@@ -18,8 +18,7 @@ from endopilot.files import read_yaml
 
 PopulationName = Literal["patients", "textbook"]
 
-Spread = tuple[float, float, float, float]
-"""Median, SD of the logarithm, smallest and largest value of a log-normal distribution."""
+Spread = tuple[float, float, float, float]  # median, SD of the logarithm, bounds of a log-normal distribution
 
 Courses = tuple[tuple[float, tuple[float, float, float]], ...]
 """Where a side branch heads: (abscissa from which it holds, mm; LPS direction), in order."""
@@ -82,13 +81,7 @@ class Population:
 
 @dataclass(frozen=True, kw_only=True)
 class SideKind:
-    """How a kind of side branch leaves.
-
-    Attributes:
-        origin_mm: mean and SD of its origin's distance from where the vessel begins, mm.
-        length_mm: mean and SD, mm.
-        share: of the patients that have it.
-    """
+    """How a side branch leaves: means and SDs of its origin and length, mm, and the share of patients that have it."""
 
     origin_mm: tuple[float, float]
     length_mm: tuple[float, float]
@@ -111,10 +104,11 @@ def side_kinds(vessel: str, of: str) -> dict[str, SideKind]:
 @cache
 def vessel_data(vessel: str) -> dict[str, Any]:
     """Return what `vessels.yaml` holds of a kind of vessel tree."""
-    return _frozen(read_yaml(Path(__file__).parent / "vessels.yaml")[vessel])
+    return frozen(read_yaml(Path(__file__).parent / "vessels.yaml")[vessel])
 
 
-def _frozen(value: Any) -> Any:
+def frozen(value: Any) -> Any:
+    """Return what a YAML file holds, its lists as tuples."""
     if isinstance(value, dict):
-        return {name: _frozen(each) for name, each in value.items()}
-    return tuple(map(_frozen, value)) if isinstance(value, list) else value
+        return {name: frozen(each) for name, each in value.items()}
+    return tuple(map(frozen, value)) if isinstance(value, list) else value

@@ -34,16 +34,14 @@ MAIN_MM, MAIN_SD_MM = 78.0, 9.0
 MAIN_DIAMETER_MM, MAIN_DIAMETER_SD_MM = 12.0, 1.3
 VARIANT_SHARES = {"bifurcation": 75.5, "trifurcation": 11.1, "right posterior first": 9.7}
 RIGHT_MM, RIGHT_SD_MM = 20.0, 5.0
-LEFT_MM, LEFT_SD_MM = 35.0, 6.0
-"""Right branch, and transverse part of the left one, mm."""
+LEFT_MM, LEFT_SD_MM = 35.0, 6.0  # right branch, and transverse part of the left one, mm
 
 _COURSE = np.array([[0, 0, 0], [-18, 4, 13], [-36, 9, 29], [-52, 12, 45], [-64, 13, 56.0]])
 """The main portal vein from the confluence to the porta hepatis, mm."""
 _RIGHT = np.array([[-10, -1, 3], [-19, -5, 6], [-27, -12, 13], [-33, -17, 25], [-37, -19, 40], [-41, -18, 54.0]])
 """Onwards along the right branch, its anterior one and the vein of segment 8, mm from the porta hepatis."""
 _SEGMENT_DIAMETER_MM = 5.0
-_SHARPEST_PER_MM = 0.15
-"""Greatest curvature of the widest line, 1/mm: its wall must not fold."""
+_SHARPEST_PER_MM = 0.15  # greatest curvature of the widest line, 1/mm: its wall must not fold
 
 
 def make_portal(
@@ -95,7 +93,6 @@ def _draw(
 
 
 def _main(generator: np.random.Generator, main_mm: float, size: float) -> tuple[Float[np.ndarray, "n 3"], int]:
-    """Return the line from the confluence into segment 8, and the index of its first division."""
     turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, 8, 3)))
     main = _COURSE * main_mm / length_along(shape.curve_through(_COURSE))[-1]
     right = main[-1] + size * turn.apply(_RIGHT)
@@ -152,12 +149,7 @@ def _grown(
     )
     turn = round(size * transverse / shape.STEP_MM)
     low = round(size * float(generator.uniform(22.0, 28.0)) / shape.STEP_MM)
-    places = {
-        "S2": (1, min(turn, len(vessels[1].points) - 20)),
-        "S4": (1, -1),
-        "S3": (1, -1),
-        "S6": (2, low),
-    }
+    places = {"S2": (1, min(turn, len(vessels[1].points) - 20)), "S4": (1, -1), "S3": (1, -1), "S6": (2, low)}
     plans = [
         plan(name, parent, place, length_mm[name], _SEGMENT_DIAMETER_MM, 0.4)
         for name, (parent, place) in places.items()

@@ -32,11 +32,8 @@ from endopilot.types import VesselTree
 LENGTH_MM, LENGTH_SD_MM, LENGTH_RANGE_MM = 164.0, 30.0, (112.0, 223.0)
 TORTUOSITY, TORTUOSITY_SD = 2.07, 0.23
 CURVATURE, CURVATURE_SD = 0.061, 0.017
-DIAMETER_MM = {0.1: 4.0, 0.2: 3.8, 0.5: 3.5, 0.7: 2.7, 0.9: 2.3}
-"""Lumen diameter, mm, at fractions of the path from the ostium to the farthest tip."""
-
-_CALIBRE = {"right": 1.025, "balanced": 0.9, "left": 0.74}
-"""Lumen against the average of all patients (Dodge 1992: balanced 0.78, left 0.70 of right dominance)."""
+DIAMETER_MM = {0.1: 4.0, 0.2: 3.8, 0.5: 3.5, 0.7: 2.7, 0.9: 2.3}  # at fractions of the path to the farthest tip, mm
+_CALIBRE = {"right": 1.025, "balanced": 0.9, "left": 0.74}  # against all patients' (Dodge 1992: 0.78, 0.70 of right)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,10 +50,7 @@ class _Targets:
 def make_rca(
     generator: np.random.Generator, stenosis_share: float, population: Population
 ) -> tuple[VesselTree, dict[str, Any]]:
-    """Return one right coronary tree and what was drawn for it.
-
-    Targets are kept when a shape fails, so that failures do not bias the statistics.
-    """
+    """Return one right coronary tree and its draws; targets stay when a shape fails, for failures would bias them."""
     for _ in range(10):
         targets = _targets(generator)
         draw = partial(_draw, generator, targets, stenosis_share, population)
@@ -116,11 +110,8 @@ def _draw(
 
 
 def _main_vessel(generator: np.random.Generator, targets: _Targets) -> tuple[Float[np.ndarray, "n 3"], int]:
-    """Return the path from the ostium to the farthest tip, and the index of the crux on it.
-
-    Size, closure of the C and amplitude of the wiggles are solved for so that length, tortuosity and mean curvature
-    take the drawn values.
-    """
+    """Return the path from the ostium to the farthest tip, and the index of the crux on it. Size, closure of the C and
+    amplitude of the wiggles are solved for so that length, tortuosity and mean curvature take the drawn values."""
     length, ends_in = targets.length_mm, targets.ends_in
     waypoints = TO_CRUX if ends_in == "3" else np.concatenate([TO_CRUX, BEYOND_CRUX[ends_in]])
     template = shape.curve_through(waypoints, 1.0)
@@ -164,7 +155,6 @@ def _main_vessel(generator: np.random.Generator, targets: _Targets) -> tuple[Flo
 def _main_radius(
     generator: np.random.Generator, dominance: str, main: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n"], float]:
-    """Return the lumen radius along the main vessel, mm, and the patient's calibre against the average."""
     calibre = branching.coronary_calibre(generator, _CALIBRE[dominance], 0.55, 1.4)
     share = np.linspace(0.0, 1.0, len(main))
     diameter = PchipInterpolator([0.0, *DIAMETER_MM, 1.0], [4.1, *DIAMETER_MM.values(), 2.15])(share)

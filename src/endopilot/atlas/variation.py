@@ -18,33 +18,20 @@ from endopilot.atlas.branching import NoShape, SidePlan, truncated
 from endopilot.atlas.population import Population, Spread
 from endopilot.types import Centerline, VesselTree
 
-TIGHTEST = 0.97
-"""Greatest curvature times radius of a main vessel: at 1 the lumen's inner wall shrinks to a point."""
+TIGHTEST = 0.97  # greatest curvature times radius of a main vessel: at 1 the lumen's inner wall shrinks to a point
 
 _TRIES = 12
-_MOST_BENDS = 2.5
-"""No patient's mean number of sharp bends is more than this many times that of all."""
-_QUIET_MM = 4.0
-"""Over this length behind a vessel's start its waves fade in, mm."""
-_STRAIGHT_MM = 12.0
-"""No sharp bend lies nearer than this to the ostium, mm: the catheter's tip lies there."""
-_STEEPEST_DEG = 75.0
-"""Greatest angle between the catheter and the vessel's first direction: beyond, the wire meets the wall head-on."""
-_GIVES_WAY_MM = 10.0
-"""Over this length behind a fork the deflection dies out by a factor e, mm."""
-_SCATTER_DEG = 30.0
-"""A parent gives way to the side opposite to the branch, within this SD."""
+_MOST_BENDS = 2.5  # no patient's mean number of sharp bends is more than this many times that of all
+_QUIET_MM = 4.0  # over this length behind a vessel's start its waves fade in, mm
+_STRAIGHT_MM = 12.0  # no sharp bend lies nearer than this to the ostium, mm: the catheter's tip lies there
+_STEEPEST_DEG = 75.0  # greatest angle of catheter and vessel: beyond, the wire meets the wall head-on
+_GIVES_WAY_MM = 10.0  # over this length behind a fork the deflection dies out by a factor e, mm
+_SCATTER_DEG = 30.0  # a parent gives way to the side opposite to the branch, within this SD
 
 
 @dataclass(frozen=True)
 class Fork:
-    """A place at which a main vessel gives way.
-
-    Attributes:
-        index: of the vessel's point where the branch leaves.
-        side: LPS direction in which it leaves.
-        deflection_deg: by how much the vessel gives way; drawn if none.
-    """
+    """A place at which a main vessel gives way, by an angle (drawn if none), to a branch in an LPS direction."""
 
     index: int
     side: tuple[float, float, float]
@@ -89,17 +76,8 @@ def bent(
     forks: Sequence[Fork] = (),
     first: int = 0,
 ) -> Float[np.ndarray, "n 3"]:
-    """Return a vessel with waves, sharp bends and deflections behind its point `first`; of the same length.
-
-    Args:
-        points: evenly spaced, LPS mm.
-        radius: lumen radius, mm.
-        population: how patients vary; the textbook's leaves the vessel as it is and draws nothing.
-        first: what lies before this point is left.
-
-    Raises:
-        NoShape: no draw kept the lumen's wall from folding.
-    """
+    """Return a vessel with waves, sharp bends and deflections behind its point `first`, of the same length; the
+    textbook's population draws none. Raises NoShape where no draw kept the lumen's wall from folding."""
     if not population.bends_vessels:
         return points
     mean = population.bends_per_100_mm
@@ -158,7 +136,6 @@ def _turns(
 def _waves(
     generator: np.random.Generator, along: Float[np.ndarray, "n"], population: Population
 ) -> Float[np.ndarray, "n 2"]:
-    """Return the angles of a patient's waves towards the two normals, rad."""
     low, high = population.waves_deg
     amplitude = np.deg2rad(np.exp(generator.uniform(np.log(low), np.log(high))))
     shortest, longest = population.waves_mm
@@ -183,14 +160,8 @@ def opened_fork(
     wide: float,
     turns_deg: tuple[Spread, Spread],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:
-    """Return a vessel that goes on behind a fork, and the one that leaves there, at drawn angles to what arrives.
-
-    Args:
-        trunk: the vessel that goes on, LPS mm.
-        other: the one that leaves, from the fork on.
-        wide: lumen radius at the fork, mm: directions are chords over two radii.
-        turns_deg: angles by which the two turn away from what arrives, to opposite sides, degrees.
-    """
+    """Return a vessel that goes on behind a fork, and the one that leaves there, turned by `turns_deg` to opposite
+    sides of what arrives. Directions are chords over two lumen radii (`wide`)."""
     reach = max(round(2 * wide / shape.STEP_MM), 2)
     arriving = _unit(trunk[fork] - trunk[max(fork - reach, 0)])
     across = _unit(trunk[fork + reach] - trunk[fork]) - _unit(other[reach] - other[0])
@@ -214,7 +185,6 @@ def _turned_to(
     wanted: Float[np.ndarray, "3"],
     profile: Float[np.ndarray, "m"],
 ) -> Float[np.ndarray, "n 3"]:
-    """Return the curve whose chord from point `at` over `reach` steps has the wanted direction."""
     vector, moved = np.zeros(3), points
     for _ in range(4):
         now = _unit(moved[at + reach] - moved[at])
@@ -242,10 +212,8 @@ def flattened(
     generator: np.random.Generator, tree: VesselTree, population: Population
 ) -> list[tuple[Centerline, Centerline]]:
     """Return two lines of spheres beside each branch, which make its section longer than wide; none for round ones.
-
-    The lines lie δ to either side, with radius √(r² + δ²): across, the section keeps its radius r, and the branch's
-    own spheres stay inscribed; along, its half-width is √(r² + δ²) + δ. The direction turns along the vessel.
-    """
+    They lie δ to either side, with radius √(r² + δ²): the own spheres stay inscribed. The direction turns along the
+    vessel."""
     if population.flattening[1] == 0:
         return []
     mean = float(generator.uniform(*population.flattening))
@@ -276,15 +244,8 @@ def flattened(
 def catheter_direction(
     generator: np.random.Generator, tree: VesselTree, population: Population, radius_mm: float, length_mm: float
 ) -> tuple[Float[np.ndarray, "3"], dict[str, Any]]:
-    """Return the axis of a guiding catheter at the ostium, and what was drawn for it.
-
-    It makes the drawn angle with the vessel 10 mm beyond the ostium, and turns away from the vessel's first direction
-    by as little as that allows, within a scatter. Its tube keeps clear of every lumen but the first one; where no draw
-    does, the catheter has the vessel's first direction.
-
-    Args:
-        population: how patients vary; the textbook's catheter has the vessel's first direction, and draws nothing.
-    """
+    """Return the axis of a guiding catheter at the ostium, and its draws: at the drawn angle with the vessel 10 mm on,
+    little turned away from its first direction, and clear of other lumens; else along the first direction."""
     first = shape.tangents(tree.branches[0].centerline.points)[0]
     if population.catheter_deg is None:
         return first, {}

@@ -31,7 +31,6 @@ def command(
         output: folder of advice.json and advice.png.
         also_test: datasets that were made otherwise, with another wall or other elements: the same calibration is
             measured on their test patients too, which the bands must not have been fitted to.
-        config: the events that X-ray must show, and the errors of X-ray.
     """
     found = advise(run, dataset, output, config, also_test=also_test)
     at, cover, left_out = found["adviser"], found["coverage"], found["patients_not_registered"]

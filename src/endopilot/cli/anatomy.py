@@ -46,7 +46,6 @@ def command(
         threshold: value at the wall of a mask of grey levels: probabilities, a resampled mask, a signed distance.
         picture: PNG of the tree by section and by radius, its longest path straightened, and cross-sections.
         ct: CT angiogram in HU, shown behind the walls in the picture.
-        config: how to extract.
     """
     if not sources:
         raise InputError("no file was given; name a mask, a surface or a centerline")

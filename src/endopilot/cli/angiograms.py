@@ -27,11 +27,7 @@ def command(
     Args:
         patients: folders made by `endopilot anatomy` or `endopilot atlas`, or CT angiograms, which are segmented.
         output: folder of the data set.
-        device: name of a device (`endopilot devices`) or a YAML file.
         catheter: up to two catheters around it, from the inside out: names (docs/concepts/devices.md) or YAML files.
-        scheduler: address of a Dask scheduler (tcp://host:8786) whose workers make the cines and share these folders;
-            the cores of this machine if not given.
-        config: how many cines, and what they show.
     """
     from endopilot.angiograms.config import MANIFEST_FILE, SAMPLES_FILE  # slow to import; --help needs none
     from endopilot.angiograms.make import make_angiograms

@@ -25,11 +25,7 @@ Figures = Mapping[str, Any] | Sequence[Mapping[str, Any]]
 
 
 def existing(path: Path) -> Path:
-    """Return `path` if a file or a folder is there.
-
-    Raises:
-        InputError: there is none, or it may not be looked at.
-    """
+    """Return `path` if a file or a folder is there; InputError if not, or if it may not be looked at."""
     try:
         path.stat()
     except OSError as error:
@@ -55,11 +51,9 @@ class ListenConfig:
 
 
 MUST_EXIST = "must exist"
-Existing = Annotated[Path, MUST_EXIST]
-"""A file or folder that must be there when the command begins."""
+Existing = Annotated[Path, MUST_EXIST]  # a file or folder that must be there when the command begins
 IS_FOLDER, IS_FILE = "folder that is written", "file that is written"
-Picture = Annotated[Path, AfterValidator(_named_png), IS_FILE]
-"""A picture to be written."""
+Picture = Annotated[Path, AfterValidator(_named_png), IS_FILE]  # a picture to be written
 OutputFolder = Annotated[Path, arg(aliases=("-o",), metavar="DIR"), IS_FOLDER]
 OutputFile = Annotated[Path, arg(aliases=("-o",), metavar="FILE"), IS_FILE]
 
@@ -70,7 +64,7 @@ class Answer:
 
     Attributes:
         figures: all of them, which `--json` prints.
-        shown: what is printed else, one below another: figures, rows or text; `figures` if not given.
+        shown: what is printed else, one below another; `figures` if not given.
         passed: whether the command leaves with exit code 0, and not 1.
     """
 
@@ -122,7 +116,6 @@ def show_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool) -> None:
 
 
 def _json(content: Any) -> str:
-    """Return content as JSON that every program reads: what is no number or infinite is null."""
     plain = json.loads(json_text(content), parse_constant=lambda _: None)
     return json_text(plain)
 

@@ -10,16 +10,11 @@ from endopilot.progress import progress
 from endopilot.runs import claiming
 
 
-def command(
-    *,
-    output: OutputFolder,
-    config: AtlasConfig = AtlasConfig(),
-) -> Figures:
+def command(*, output: OutputFolder, config: AtlasConfig = AtlasConfig()) -> Figures:
     """Make synthetic patients whose vessels match published statistics: an anatomy folder for each.
 
     Args:
         output: folder that takes an anatomy folder for each patient.
-        config: the patients to make.
     """
     rows = []
     with progress("Synthetic patients", config.count) as advance:

@@ -45,8 +45,6 @@ def command(
         output: robot.yaml; beside it robot.device.yaml, the wire, and robot.json, all intervals.
         device: name of a device (`endopilot devices`) or a YAML file, as the wire is known.
         robot: name of a robot or a YAML file, as the robot is known.
-        overwrite: replace files that lie where this command writes.
-        config: how logs are fitted.
     """
     for path in (_beside(output), output.with_suffix(".json")):
         check_new(path, (*logs, anatomy), overwrite=overwrite)
@@ -86,7 +84,6 @@ def command(
 
 
 def _write(found: RobotCalibration, output: Path, names: str) -> None:
-    """Write the robot and the wire, with the source of what was found."""
     by_name = {
         name: f"{each}, 95 %" if each.identified else f"{each.value:.4g}, {each}"
         for name, each in found.estimates.items()

@@ -31,15 +31,11 @@ def command(
     Args:
         anatomies: folders made by `endopilot anatomy` or `endopilot atlas`.
         output: folder of the dataset.
-        device: name of a device (`endopilot devices`) or a YAML file.
         catheter: up to two catheters around it, from the inside out: names (docs/concepts/devices.md) or YAML files;
             each is driven at random and independently, by velocity.
         robot: name of a robot (docs/concepts/robot.md) or a YAML file that makes the motions, and measures them; if not
             given, they are made as drawn.
         world: name of the world that reality is (docs/concepts/worlds.md), or a YAML file.
-        scheduler: address of a Dask scheduler (tcp://host:8786) whose workers simulate and share these folders; the
-            cores of this machine if not given.
-        config: how many navigations, how long, and how they are split.
     """
     from endopilot.dataset.generate import generate_dataset  # an extra brings its libraries; --help needs none
 

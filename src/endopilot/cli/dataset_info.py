@@ -9,12 +9,7 @@ from endopilot.cli.arguments import Existing, Figures, OutputFolder
 from endopilot.runs import claim
 
 
-def command(
-    dataset: Positional[Existing],
-    /,
-    *,
-    output: OutputFolder | None = None,
-) -> Figures:
+def command(dataset: Positional[Existing], /, *, output: OutputFolder | None = None) -> Figures:
     """Describe a dataset: distributions of depth, offset and force, branches, failures with their reasons.
 
     Args:

@@ -36,9 +36,7 @@ def command(
     """
     wire = read_wire(device)
     limits = DriveLimits(
-        max_velocity_mm_s=wire.max_velocity_mm_s,
-        max_rotation_rad_s=wire.max_rotation_rad_s,
-        travel_mm=travel_mm,
+        max_velocity_mm_s=wire.max_velocity_mm_s, max_rotation_rad_s=wire.max_rotation_rad_s, travel_mm=travel_mm
     )
     context = tls_context(certificates, of_drive=True)
     low, high = travel_mm

@@ -29,7 +29,6 @@ def command(
         dataset: dataset to evaluate on; the one that the run was trained on if not given.
         other_seeds: runs of the same training with other seeds; their errors in P1 are reported beside the run's, with
             mean and standard deviation.
-        config: what to evaluate.
     """
     from endopilot.report.report import report_evaluation  # matplotlib and plotly are slow to import
 

@@ -35,7 +35,6 @@ def command(
         dataset: folder of a LeRobot data set of the navigations, with X-ray images, their recordings being driven again
             (docs/concepts/dataset.md).
         page: write index.html with pictures and replays; --no-page leaves it out.
-        config: which policy, tasks and patients.
     """
     if dataset is not None and mismatch:
         raise InputError("dataset: with --mismatch, which writes no submission; leave one of them out")

@@ -57,7 +57,6 @@ def command(
         picture: PNG of some frames.
         page: HTML page of what was found.
         device: name of the wire (`endopilot devices`) or a YAML file, for images.
-        config: what is known of patient and device before the first frame.
     """
     if not seen:
         raise InputError("seen: no file; give a cine (DICOM), PNG images or a CSV file of lines")

@@ -54,24 +54,25 @@ LISTED: Mapping[str, str] = MappingProxyType(
     }
 )
 """What `--help` lists of commands that have more than `LISTED_AT_MOST` flags: those that are set most often."""
-_EVERYWHERE = {"json": "print the figures as JSON.", "overwrite": "replace files that lie where this command writes."}
-"""Options that commands have without naming them."""
+_USUAL = {
+    "anatomy": "folder made by `endopilot anatomy` or `endopilot atlas`.",
+    "device": "name of a device (`endopilot devices`) or a YAML file.",
+    "json": "print the figures as JSON.",
+    "overwrite": "replace files that lie where this command writes.",
+    "phase": "cardiac phase, such as 75 (per cent), where a DICOM series holds several.",
+    "scheduler": "address of a Dask scheduler (tcp://host:8786) whose workers simulate and share these folders; the "
+    "cores of this machine if not given.",
+    "series": "number or instance UID of the series, where a DICOM folder holds several.",
+    "volume": "DICOM folder or file, NIfTI, NRRD or MHA, in HU.",
+}
+"""What options of several commands mean where a command says nothing else."""
 _WORDS = {bool: "", int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
 _POSITIONAL = get_args(Positional[Any])[1]
 
 
 @dataclass(frozen=True)
 class Option:
-    """An option of a command, or a group of options.
-
-    Attributes:
-        name: of its field.
-        kind: what it takes, as annotated.
-        value: what it is set to; None where it must be given and is not.
-        meaning: in words, with the unit.
-        required: whether it must be given.
-        group: the options of a group.
-    """
+    """An option of a command, with what its field is called, takes, is set to and means; or a group of options."""
 
     name: str
     kind: Any
@@ -116,13 +117,8 @@ class Option:
 
 
 class Command:
-    """A command: a function whose parameters and settings are its options.
-
-    Attributes:
-        name: how it is called, such as `endopilot plan`.
-        settings: the settings class of all its options; a file for `--config` holds it.
-        defaults: what its options are set to if nothing is given, an instance of `settings`.
-    """
+    """A command, such as `endopilot plan`: a function whose parameters and settings are its options. `settings` is the
+    class of all of them, which a file for `--config` holds, `defaults` what they are set to if nothing is given."""
 
     def __init__(self, name: str, function: Callable[..., Any]) -> None:
         """Read the signature of `function`; if it returns something, that is shown and the command has `--json`."""
@@ -150,23 +146,16 @@ class Command:
         return "\n\n".join(part for part in (self._text.short_description, self._text.long_description) if part)
 
     def options(self, values: Any = None) -> list[Option]:
-        """Return its options: its function's in their order, then those of its settings.
-
-        Args:
-            values: what they are set to, an instance of `settings`; the defaults if not given.
-        """
-        meanings = _meanings(self._config) | _EVERYWHERE
+        """Return its options, set to `values` or the defaults: its function's in order, then its settings'."""
+        meanings = _USUAL | _meanings(self._config)
         meanings |= {one.arg_name: _line(one.description) for one in self._text.params}
         found = _options(self.defaults if values is None else values, meanings, self._required)
         tree = {one.name: one for one in found}
         return [tree.pop(name) for name in self._own] + list(tree.values())
 
     def run(self, arguments: Sequence[str]) -> None:
-        """Do what the arguments ask for, and print what comes of it.
-
-        Raises:
-            InputError: the arguments or the file of `--config` are bad; the line says which, and how to mend it.
-        """
+        """Do what the arguments ask for, and print what comes of it; InputError for bad arguments, or a bad file of
+        `--config`."""
         values = self._asked(arguments)
         if values is not None:
             answer = self._called(values)
@@ -174,11 +163,7 @@ class Command:
                 show_answer(answer, as_json=values.json)
 
     def answer(self, arguments: Sequence[str]) -> Any:
-        """Do what the arguments ask for, and return what comes of it; None where they ask for help.
-
-        Raises:
-            InputError: as `run`.
-        """
+        """Do what the arguments ask for, and return what comes of it; None where they ask for help."""
         values = self._asked(arguments)
         return None if values is None else self._called(values)
 
@@ -214,11 +199,7 @@ class Command:
         return self._function(*places, **given)
 
     def read(self, arguments: Sequence[str]) -> Any:
-        """Return what the arguments set the options to, an instance of `settings`.
-
-        Raises:
-            InputError: as `run`.
-        """
+        """Return what the arguments set the options to, an instance of `settings`; InputError as `run`."""
         rest = [word for word in arguments if word != "--print-config"]
         file = _taken(rest, "--config")
         start = self.defaults if file is None else read_settings(Path(file), self.settings, onto=self.defaults)
@@ -272,11 +253,7 @@ class Command:
         return parser.format_help()
 
     def file(self, values: Any = None) -> str:
-        """Return the text of a file for `--config`.
-
-        Args:
-            values: what the options are set to, an instance of `settings`; the defaults if not given.
-        """
+        """Return the text of a file for `--config` that holds `values`, an instance of `settings`, or the defaults."""
         head = f"# Options of `{self.name}` for --config. Flags on the command line win over them."
         return "\n".join([head, *_yaml(self.options(values), ""), ""])
 
@@ -306,7 +283,6 @@ def _contents(values: Any) -> dict[str, Any]:
 
 
 def _with(values: Any, given: Any) -> Any:
-    """Return settings with the options that an object has as attributes, those of groups without their group."""
     new = {
         name: _with(old, given) if is_settings(type(old)) else getattr(given, name)
         for name, old in _contents(values).items()
@@ -346,7 +322,6 @@ def _first_line(box: str) -> str:
 
 
 def _notes(kind: Any) -> list[Any]:
-    """Return the notes of an annotation, and of those within it."""
     inner = get_args(kind)
     own, kinds = (inner[1:], inner[:1]) if get_origin(kind) is Annotated else ((), inner)
     return [*own, *(note for one in kinds for note in _notes(one))]

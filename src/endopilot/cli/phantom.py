@@ -12,20 +12,13 @@ from endopilot.settings import Seed
 
 
 def command(
-    anatomy: Positional[Existing],
-    /,
-    *,
-    output: OutputFile,
-    seed: Seed = 0,
-    config: PhantomConfig = PhantomConfig(),
+    anatomy: Positional[Existing], /, *, output: OutputFile, seed: Seed = 0, config: PhantomConfig = PhantomConfig()
 ) -> Figures:
     """Make a synthetic CT angiogram of an anatomy.
 
     Args:
-        anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
         output: the volume in HU: .nii.gz, .nrrd, .mha, or a new folder without suffix for DICOM slices.
         seed: seed of the noise and of the surrounding tissue.
-        config: scanner and contrast.
     """
     check_output(output)
     volume = make_phantom(read_anatomy(anatomy), config=config, seed=seed)

@@ -33,7 +33,6 @@ def command(
     """Plan a navigation to a target.
 
     Args:
-        anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
         target: section label such as 4 or PDA, point X,Y,Z in LPS mm, or CSV of desired tips (time_s, tip_abscissa_mm,
             tip_offset_mm).
         output: folder of plan.csv, plan.png and manifest.json.
@@ -44,7 +43,6 @@ def command(
         catheter: one around the wire, which is planned for too (method search): a name such as microcatheter-1.7f, or a
             YAML file.
         xray: also predict when X-ray will be needed, by the bands of the agent's simulated wires.
-        config: method, limits and cost.
     """
     stack = Stack.of(device or "workhorse-014", *catheter) if device or catheter else None
     patient, asked = read_anatomy(anatomy), {"target": target, "device": stack, "config": config, "xray": xray}

@@ -29,8 +29,7 @@ EXIT_BAD_INPUT = 2
 EXIT_DEFECT = 70
 EXIT_INTERRUPTED = 128 + signal.SIGINT
 EXIT_UNREAD = 141
-TO_END_S = 10.0
-"""Time in which a command that is stopped tidies up, s; then it leaves."""
+TO_END_S = 10.0  # time in which a command that is stopped tidies up, s; then it leaves
 LEAST_MEMORY = 2**30
 """Address space, bytes, that the libraries of a command take: `endopilot anatomy` of the smallest mask maps 1.0 GB. In
 less, OpenBLAS hangs or ends the process while it is loaded."""
@@ -44,12 +43,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def carry_out(name: str, work: Callable[[], object]) -> int:
-    """Do the work of a command and return its exit code: 0, or the one that it leaves with.
-
-    Args:
-        name: of the command.
-        work: what it does.
-    """
+    """Do the work of a command and return its exit code: 0, or the one that it leaves with."""
     with _signals() as arrived, _remarks(name):
         try:
             code = _code_of(work)
@@ -66,11 +60,7 @@ def carry_out(name: str, work: Callable[[], object]) -> int:
 
 
 def check_memory_limit() -> None:
-    """Check, before libraries are loaded, that the shell leaves this process the memory for them (`ulimit -v`).
-
-    Raises:
-        InputError: it does not.
-    """
+    """Raise InputError, before libraries are loaded, if the shell does not leave the memory for them (`ulimit -v`)."""
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     if 0 <= limit < LEAST_MEMORY:
         raise InputError(
@@ -91,11 +81,9 @@ def _code_of(work: Callable[[], object]) -> int:
 
 def own_streams() -> None:
     """Keep standard error for our own lines and standard output for results, in a process that runs one command.
-
     Libraries in C++ (VTK, ITK, Mesa, libtorch), logs and worker processes write to the file descriptors. What they
     write to standard error is kept for the record of a defect; what they write to standard output goes to standard
-    error.
-    """
+    error."""
     sys.stdout.flush()
     for name, number in (("stdout", 1), ("stderr", 2)):
         stream = os.fdopen(

@@ -40,9 +40,7 @@ def command(
         anatomy: folder made by `endopilot anatomy` of what the wire was driven through.
         output: folder of replay.png, replay.csv (both tips at each time), errors.csv (each episode's) and
             manifest.json.
-        device: name of a device (`endopilot devices`) or a YAML file.
         robot: name of a robot or a YAML file, such as `endopilot calibrate` writes.
-        config: what is given, and which starts are tried.
     """
     from endopilot.report.replay_figure import replay_figure  # matplotlib is slow to import
 

@@ -27,11 +27,7 @@ def command(
     An interrupted run goes on where it stopped when the same command is given again.
 
     Args:
-        volume: DICOM folder or file, NIfTI, NRRD or MHA, in HU.
         output: folder of all results; the report is report.html.
         target: section label such as 4 or LAD, or point X,Y,Z in LPS mm, to which the agent drives the wire.
-        series: number or instance UID of the series, where a DICOM folder holds several.
-        phase: cardiac phase, such as 75 (per cent), where a DICOM series holds several.
-        config: segmentation, device and size of the study.
     """
     return run_volume(volume, output, config, series=series, phase=phase, target=target)

@@ -29,13 +29,9 @@ def command(
     A JSON file beside the mask holds the ostium, the method, the manifest, and warnings of what is doubtful.
 
     Args:
-        volume: DICOM folder or file, NIfTI, NRRD or MHA, in HU.
         output: mask: .nii.gz, .nrrd, .mha, or .dcm for DICOM-SEG (needs the extra dicom-seg).
-        series: number or instance UID of the series, where a DICOM folder holds several.
-        phase: cardiac phase, such as 75 (per cent), where a DICOM series holds several.
         reference: another mask of the same vessel; the agreement is printed, and its outline is red in the picture.
         picture: PNG of three slices with the mask's outline in green.
-        config: method, vessel and seeds.
     """
     check_output(output, mask=True)
     other = read_mask(reference) if reference is not None else None

@@ -59,7 +59,6 @@ def command(
     """Drive a guidewire through an anatomy and record it at 2 Hz, or at the end of each control of a file.
 
     Args:
-        anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
         output: .parquet or .csv with a row for each sample, or .npz with all arrays.
         device: name of a device (`endopilot devices`) or a YAML file; workhorse-014 if not given.
         catheter: up to two catheters around it, from the inside out: names (`microcatheter-1.7f`, `microcatheter-2.4f`,
@@ -73,7 +72,6 @@ def command(
         shape: also record the positions of all nodes, mm (.npz only).
         picture: PNG of the vessel with the first navigation's wire and catheters at its end.
         random: the random controls, if no others are given.
-        config: settings of the rod core.
     """
     patient = read_anatomy(anatomy)
     stack = Stack.of(device or "workhorse-014", *catheter)
@@ -167,7 +165,6 @@ def _stopped_short(
     config: SimulatorConfig,
     record_shape: bool,
 ) -> tuple[Trajectory, np.ndarray]:
-    """Return random navigations that stop short of the ends, and which were stopped."""
     worlds, samples = control.shape[:2]
     with progress("Simulating the wire", total=worlds * samples) as advance:
         return simulate_navigations(

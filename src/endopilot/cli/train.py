@@ -12,11 +12,7 @@ from endopilot.models.config import TrainConfig
 
 
 def command(
-    dataset: Positional[tuple[Existing, ...]],
-    /,
-    *,
-    output: OutputFolder,
-    config: TrainConfig = TrainConfig(),
+    dataset: Positional[tuple[Existing, ...]], /, *, output: OutputFolder, config: TrainConfig = TrainConfig()
 ) -> Answer | None:
     """Train the paper's forward and inverse network on a dataset.
 
@@ -26,7 +22,6 @@ def command(
         dataset: folders made by `endopilot dataset`, or the folder `episode` that `endopilot navigate` leaves; several,
             of one wire and with episodes of one length, are trained on together.
         output: folder of the run.
-        config: model and training.
     """
     from endopilot.models.train import train  # torch takes seconds to import; --help must not wait for it
 

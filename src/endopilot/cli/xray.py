@@ -21,10 +21,8 @@ def command(
     """Push a wire, alone or in a catheter, into a vessel, and take an X-ray image: fluoroscopy, contrast, DSA, roadmap.
 
     Args:
-        anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
         output: the image, .png.
         ct: CT angiogram of the patient, HU; a synthetic chest around a coronary artery, else water, if not given.
-        config: what is shown, from where, at which dose.
     """
     volume = None if ct is None else read_volume(ct)
     image = take_image(read_anatomy(anatomy), config=config, ct=volume)

@@ -1,9 +1,6 @@
-"""A policy at the wheel of the cockpit's world.
-
-The world's navigation loop is handed over to it, and back to the hand. A policy that plans takes its time: it decides
-in a thread of its own, and the world's clock stands still meanwhile. While a hand drives, a policy that can be led
-watches.
-"""
+"""A policy at the wheel of the cockpit's world, which hands its navigation loop over to it, and back to the hand. One
+that plans decides in a thread of its own while the world's clock stands still; while a hand drives, one that can be led
+watches."""
 
 from __future__ import annotations
 
@@ -22,8 +19,7 @@ from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import BelievedTip, Believer, Decision, Led, Observation, Policy
 from endopilot.tasks.navigation import Navigation, Target
 
-SECONDS = 600.0
-"""Time that a policy is given, s."""
+SECONDS = 600.0  # time that a policy is given, s
 _SEED = 1
 _UNTURNED_RAD = np.radians(5.0)
 
@@ -33,7 +29,6 @@ class Autopilot:
 
     Attributes:
         status: "off", "thinking", "drives", "paused", "watches", "reached", "gave up" or "failed".
-        policy_name: of the policy, once there is one.
         asks: why it asks for X-ray at its next decision; empty if it does not.
         failure: what went wrong or why the policy gave up, in a line.
     """
@@ -185,7 +180,6 @@ class Autopilot:
         return self._world.command(())
 
     def _navigation(self, observation: Observation) -> Navigation:
-        """Return the navigation as it begins for the policy, from where the devices are."""
         (inserted, turned), *around = observation.devices
         return replace(
             self._world.navigation,
@@ -203,7 +197,6 @@ class Autopilot:
         return ""
 
     def _decide(self, start: Navigation | None, observation: Observation) -> Decision:
-        """Decide, in a thread of its own; a policy that is new is made and started first."""
         if self._policy is None:
             self._policy = self._world.loop.policy = make_policy(self.policy_name)
         if start is not None:
@@ -216,13 +209,7 @@ class Autopilot:
 
 
 def check_policy(name: str | None, offered: tuple[str, ...]) -> str:
-    """Return the name of a policy that the page may choose.
-
-    A page names no module of its own: only what is offered is imported.
-
-    Raises:
-        InputError: it is not offered.
-    """
+    """Return a policy's name that the page may choose: one that is offered, for a page names no module of its own."""
     if name not in offered:
         raise InputError(f"policy: {name!r}; choose from {', '.join(offered)}")
     return name

@@ -1,7 +1,5 @@
-"""What can be replayed: a session, or a trajectory: a simulated or planned one, an episode, a navigation of the ladder.
-
-Each becomes a `Film`: the wire every 50 ms, driven again by its recorded commands while the page shows its begin.
-"""
+"""What can be replayed, as a `Film`: the wire every 50 ms, driven again by the recorded commands of a session,
+trajectory, episode or navigation while the page shows its begin."""
 
 from __future__ import annotations
 
@@ -32,17 +30,12 @@ from endopilot.simulation.trajectory import TRAJECTORY, Trajectory, read_traject
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.tasks.task import Task
 
-FRAME_S = 0.05
-"""Time from one frame of a film to the next, s."""
+FRAME_S = 0.05  # time from one frame of a film to the next, s
 
 
 @dataclass(frozen=True, eq=False)
 class FilmFrame:
-    """The world at one moment of a film.
-
-    Attributes:
-        peak_n: largest wall force on one node so far, N.
-    """
+    """The world at one moment of a film, and the largest wall force on one node so far, N."""
 
     snapshot: Snapshot
     exposed: bool = False
@@ -51,13 +44,7 @@ class FilmFrame:
 
 @dataclass(eq=False)
 class Film:
-    """A navigation that is driven again, frame by frame, in a thread of its own.
-
-    Attributes:
-        navigation: vessel, wire and target.
-        frames: those that are there so far.
-        failure: why it ended early, in a line; empty if it did not.
-    """
+    """A navigation driven again in a thread of its own: its frames so far, and why it ended early, in a line."""
 
     navigation: Navigation
     seconds: float
@@ -83,17 +70,10 @@ class Film:
 
 
 def open_film(path: Path, patient: Path | None = None, *, world: int = 0, task: str | None = None) -> Film:
-    """Open what is to be replayed.
-
-    Args:
-        path: a session (.cockpit.jsonl); a trajectory (.npz); a folder of a plan, of `endopilot navigate` or of a data
-            set; a submission.json, or a navigation's result of the ladder.
-        world: which of a trajectory's worlds, a data set's episodes, or a task's patients.
-        task: of the ladder's files.
-
-    Raises:
-        InputError: it cannot be read, or lacks its patient or task.
-    """
+    """Open what is to be replayed: a session (.cockpit.jsonl), a trajectory (.npz), a folder of a plan, of `endopilot
+    navigate` or of a data set, a submission.json, or a ladder's result, `task` being of its files; `world` is a
+    trajectory's, an episode, or a task's patient. Raises InputError where it cannot be read, or lacks its patient or
+    task."""
     if path.name.endswith(SUFFIX):
         return _session(path)
     if (path / "meta").is_dir():
@@ -174,11 +154,7 @@ def _film(
     about: Mapping[str, Any],
     title: str,
 ) -> Film:
-    """Return a film of one world that is driven again by its commands.
-
-    Args:
-        about: its `target` and `exposures_s`, if they are known.
-    """
+    """Return a film of one world, driven again; `about` has its `target` and `exposures_s`, if known."""
     (anatomy,), (stack,), (start,) = set_up.anatomies, set_up.stacks, set_up.initial
     if np.isnan(start).any():
         raise InputError(f"{title}: was on its way when the recording began; record from its start")
@@ -219,11 +195,7 @@ def _film(
 
 
 class ReplayStage:
-    """A film in place of a session.
-
-    Attributes:
-        at: index of the frame that is shown.
-    """
+    """A film in place of a session, at the index of the frame that is shown."""
 
     def __init__(self, film: Film, xray: XrayUnit) -> None:
         """Begin at the start; the film is driven meanwhile."""

@@ -1,8 +1,5 @@
-"""The X-ray unit of the cockpit: C-arm, pedal, contrast, roadmap, last image hold, and what is counted.
-
-A C-arm that is turned takes its time: what does not move in a view is computed in a thread of its own, first coarsely,
-then finely. Until then there is no X-ray.
-"""
+"""The X-ray unit of the cockpit: C-arm, pedal, contrast, roadmap, last image hold, and counters. What does not move in
+a view is computed in a thread of its own, first coarsely, then finely; until then there is no X-ray."""
 
 from __future__ import annotations
 
@@ -23,12 +20,10 @@ from endopilot.xray.absorbers import is_coronary, surroundings
 from endopilot.xray.carm import view_at
 from endopilot.xray.image import Plane, XrayImager
 
-CONTRAST_S = 2.0
-"""How long an injection fills the vessel, s; then the blood washes it out."""
+CONTRAST_S = 2.0  # how long an injection fills the vessel, s; then the blood washes it out
 _FILL_S, _WASH_S, _GONE = 0.2, 0.4, 0.02
 _COARSE, _FINE = 96, 256
-_NICE = 10
-"""Of the thread that computes views: the wire goes first."""
+_NICE = 10  # of the thread that computes views: the wire goes first
 
 
 @dataclass(frozen=True)
@@ -37,7 +32,6 @@ class XraySettings:
 
     Attributes:
         angles_deg: LAO (positive) or RAO, and cranial (positive) or caudal, of each plane, degrees.
-        zoom: magnification of the images.
         biplane: two planes, or the first alone.
         frames_per_s: pulses of fluoroscopy, 1/s.
         dose: of a frame, as a multiple of the usual one.
@@ -58,13 +52,10 @@ class XraySettings:
 
 
 class XrayUnit:
-    """C-arm, pedal and contrast of one patient.
+    """C-arm, pedal and contrast of one patient; `configure` changes its settings.
 
     Attributes:
-        settings: how it stands; `configure` changes it.
-        pedal: whether it is pressed.
-        frames: exposures so far, of both planes together as one.
-        seconds: time of fluoroscopy so far, s.
+        frames: exposures so far, of both planes together as one; `seconds` of fluoroscopy, s.
         kerma_ugy: air kerma at the patient's entrance reference point so far, both planes, µGy.
         background: what the patient looks like: "CT", "phantom", or "plain" water.
     """
@@ -72,11 +63,7 @@ class XrayUnit:
     def __init__(
         self, anatomy: Anatomy, make_imager: Callable[[Volume | None], XrayImager], ct: Volume | None = None
     ) -> None:
-        """Set the C-arm up; its first view is computed in the background.
-
-        Args:
-            ct: of the patient, HU; a phantom's for a coronary artery if not given, else plain water.
-        """
+        """Compute the first view in the background; without a CT (HU) a coronary artery lies in a phantom's."""
         self.settings = XraySettings()
         self.pedal, self.frames, self.seconds, self.kerma_ugy = False, 0, 0.0, 0.0
         self.background = "plain" if ct is None else "CT"
@@ -129,11 +116,7 @@ class XrayUnit:
         return self.expose(snapshot, seconds=period)
 
     def expose(self, snapshot: Snapshot, *, seconds: float = 0.0) -> list[bytes]:
-        """Expose once and return the images as messages for the page.
-
-        Args:
-            seconds: of fluoroscopy that the exposure counts for, s.
-        """
+        """Expose once, which counts for some seconds of fluoroscopy, and return the images as messages for the page."""
         self.frames, self.seconds, self._image_s = self.frames + 1, self.seconds + seconds, snapshot.time_s
         share = self.contrast(snapshot.time_s)
         messages = []

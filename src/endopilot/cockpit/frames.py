@@ -1,9 +1,6 @@
-"""What the server sends: binary messages of a JSON header and raw arrays, one layout for all kinds.
-
-A message is the header's length (uint32), the header (UTF-8 JSON, padded with spaces to a multiple of four bytes), and
-the arrays one after the other, little-endian, each padded to a multiple of four bytes. `header["arrays"]` lists their
-name, type ("f4", "u4" or "u1") and shape.
-"""
+"""What the server sends: binary messages of a JSON header and raw arrays, one layout for all kinds: the header's length
+(uint32), the header (UTF-8 JSON, padded with spaces to a multiple of four bytes), and the arrays, little-endian, each
+padded alike. `header["arrays"]` lists their name, type ("f4", "u4" or "u1") and shape."""
 
 from __future__ import annotations
 
@@ -19,18 +16,12 @@ from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import Anatomy
 
 _TYPES = {np.dtype("<f4"): "f4", np.dtype("<u4"): "u4", np.dtype("u1"): "u1"}
-WALL_TRIANGLES = 14_000
-"""Triangles of the lumen in the page at most: software rendering must keep up."""
-_POINT_MM = 1.0
-"""Distance between the points of the centerline in the page, mm."""
+WALL_TRIANGLES = 14_000  # triangles of the lumen in the page at most: software rendering must keep up
+_POINT_MM = 1.0  # distance between the points of the centerline in the page, mm
 
 
 def encode(kind: str, header: dict[str, Any], **arrays: np.ndarray) -> bytes:
-    """Return a message.
-
-    Args:
-        arrays: float32, uint32 or uint8.
-    """
+    """Return a message of a header and arrays of float32, uint32 or uint8."""
     listed = [{"name": name, "type": _TYPES[array.dtype], "shape": array.shape} for name, array in arrays.items()]
     text = json.dumps(header | {"type": kind, "arrays": listed}, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
@@ -64,12 +55,8 @@ def device_arrays(snapshot: Snapshot) -> dict[str, np.ndarray]:
 
 
 def motion_values(snapshot: Snapshot, counted: Float[np.ndarray, "devices 2"] | None = None) -> dict[str, Any]:
-    """Return how far wire and catheters are inserted and turned, and what their drives do, for the page's figures.
-
-    Args:
-        counted: inserted length, mm, and rotation, rad, as the drives' encoders have them, which a robot shows; as they
-            truly are if not given.
-    """
+    """Return insertion, rotation and drives' figures of wire and catheters; `counted` are lengths (mm) and rotations
+    (rad) as encoders have them, the true ones if not given."""
 
     true = [(device.inserted_length_mm, device.rotation) for device in (snapshot, *snapshot.catheters)]
     wire, *catheters = (
@@ -105,7 +92,7 @@ def tip_values(anatomy: Anatomy, snapshot: Snapshot) -> dict[str, Any]:
 
 def scene(navigation: Navigation, about: dict[str, Any]) -> bytes:
     """Return what does not move: the lumen, the centerlines with the names of their sections, devices and target."""
-    from endopilot.report.wall_mesh import wall_mesh  # slow to import, and needed in the thread that makes the scene
+    from endopilot.anatomy.wall_mesh import wall_mesh  # slow to import, and needed in the thread that makes the scene
 
     anatomy, device = navigation.anatomy, navigation.device
     wall = wall_mesh(anatomy.distance_map, max_triangles=WALL_TRIANGLES)

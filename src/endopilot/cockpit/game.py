@@ -1,8 +1,7 @@
 """A task of the ladder, driven by hand with X-ray as the only sight, and scored as policies are.
 
-The clock begins when the page says so. The wire in space, the tip and the wall's force are not sent to the page until
-the end. A hand drives the same loop as policies do, and is scored by the same code (`ladder.attempt.scored`); the agent
-drives the same patient in a process of its own, so that both scores stand side by side.
+The clock begins when the page says so; wire in space, tip and wall force are sent at the end. The agent drives the same
+patient in a process of its own, so that both scores (`ladder.attempt.scored`) stand side by side.
 """
 
 from __future__ import annotations
@@ -24,19 +23,13 @@ from endopilot.ladder.attempt import Terms, attempt, navigation_seed, scored
 from endopilot.parallel import Workers
 from endopilot.tasks.task import CORE, Task
 
-RIVAL = "agent"
-"""The policy whose score stands beside a person's."""
+RIVAL = "agent"  # the policy whose score stands beside a person's
 _SHOWN = ("success", "safe", "seconds", "exposures", "peak_force_n", "path_ratio", "reason")
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """Which task in which patient.
-
-    Attributes:
-        place: of the patient in the task's list.
-        robot: what drives, for a person and for the agent.
-    """
+    """Which task in which patient (`place` in the task's list), with which robot, for a person and for the agent."""
 
     task: Task
     place: int
@@ -58,12 +51,7 @@ class Attempt:
 
 
 class GameSession(Session):
-    """A session that is a game until its end, and an ordinary one afterwards.
-
-    Attributes:
-        phase: "waits", "on" or "over".
-        result: the figures that the person is scored by, at the end.
-    """
+    """A session that "waits", is "on" as a game until it is "over", and then an ordinary one."""
 
     def __init__(
         self,
@@ -73,12 +61,7 @@ class GameSession(Session):
         recorder: Recorder | None = None,
         policies: tuple[str, ...] = (),
     ) -> None:
-        """Take the parts; the clock stands still.
-
-        Args:
-            world: at the task's start.
-            policies: names of those that a page may choose at the end.
-        """
+        """Take the world at the task's start, and the policies that a page may choose at the end."""
         super().__init__(world, xray, recorder, policies)
         self.sight, self.phase = False, "waits"
         self.result: dict[str, Any] | None = None
@@ -150,7 +133,6 @@ class GameSession(Session):
             self.phase = "on"
 
     def _end(self) -> tuple[str, bytes]:
-        """End the game where the navigation has ended, and return the message with the score."""
         self.result = scored(self.world.navigation, self.world.loop.record())
         self.halt("the task is over")
         self.phase, self.sight = "over", True
@@ -160,7 +142,6 @@ class GameSession(Session):
         return self._scores()
 
     def _scores(self) -> tuple[str, bytes]:
-        """Return the message with the person's score, and the agent's once it is known."""
         rival, failure = None, ""
         if self._rival is not None and self._rival.done():
             error = self._rival.exception()

@@ -8,8 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from endopilot.devices.catheter import MOST_CATHETERS
 
-LONGEST_MESSAGE = 2048
-"""A longer message closes the connection, bytes."""
+LONGEST_MESSAGE = 2048  # a longer message closes the connection, bytes
 _LONGEST_ANSWER = 300
 _Speed = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]
 _Angle = Annotated[float, Field(ge=-180, le=180, allow_inf_nan=False)]
@@ -20,13 +19,8 @@ class _Message(BaseModel):
 
 
 class Drive(_Message):
-    """Move wire and catheters at a velocity until the next such message, which must come within 200 ms.
-
-    Attributes:
-        translation: of the wire, mm/s.
-        rotation: of the wire, rad/s.
-        catheters: both of each catheter, from the inside out; those that are not given stand still.
-    """
+    """Move wire and catheters (from the inside out, the rest stands still) at mm/s and rad/s until the next such
+    message, which must come within 200 ms."""
 
     type: Literal["drive"]
     translation: _Speed
@@ -48,16 +42,7 @@ class Contrast(_Message):
 
 
 class CArm(_Message):
-    """Turn and set the C-arm; what is not given stays.
-
-    Attributes:
-        angles_deg: LAO (positive) or RAO, and cranial (positive) or caudal, of each plane, degrees.
-        zoom: of the detector's image.
-        biplane: two planes, or the first alone.
-        frames_per_s: pulses of fluoroscopy, 1/s.
-        dose: of a frame at the detector, as a multiple of the usual one.
-        roadmap: lay the contrasted vessel under the live image.
-    """
+    """Turn and set the C-arm, as `fluoroscopy.XraySettings` describes; what is not given stays."""
 
     type: Literal["c_arm"]
     angles_deg: tuple[tuple[_Angle, _Angle], tuple[_Angle, _Angle]] | None = None
@@ -69,12 +54,7 @@ class CArm(_Message):
 
 
 class Target(_Message):
-    """Set the target: a section by its name, or a place on a branch.
-
-    Attributes:
-        section: name; the target lies in the middle of it.
-        abscissa: distance from the ostium along that branch's path, mm.
-    """
+    """Set the target: the middle of a named section, or a place by its distance along a branch's path, mm."""
 
     type: Literal["target"]
     section: Annotated[str, Field(max_length=80)] | None = None
@@ -83,12 +63,7 @@ class Target(_Message):
 
 
 class Autopilot(_Message):
-    """Hand the wire to a policy, let it pause, or take over.
-
-    Attributes:
-        action: "start" (or hand back), "pause", "resume" or "stop".
-        policy: name of one of the policies offered.
-    """
+    """Hand the wire to one of the policies offered ("start"), let it "pause" or "resume", or take over ("stop")."""
 
     type: Literal["autopilot"]
     action: Literal["start", "pause", "resume", "stop"]
@@ -124,17 +99,12 @@ class Ping(_Message):
     number: Annotated[int, Field(ge=0, le=2**31)]
 
 
-Message = Drive | Pedal | Contrast | CArm | Target | Autopilot | Game | Replay | Wheel | Ping
-"""All that a page may send."""
+Message = Drive | Pedal | Contrast | CArm | Target | Autopilot | Game | Replay | Wheel | Ping  # all a page may send
 _READER: TypeAdapter[Message] = TypeAdapter(Annotated[Message, Field(discriminator="type")])
 
 
 def read_message(text: str | bytes) -> Message:
-    """Return the message in a text.
-
-    Raises:
-        ValueError: it is too long, no JSON, or no such message; one line says why.
-    """
+    """Return the message in a text; ValueError says in one line why it is none."""
     if len(text) > LONGEST_MESSAGE:
         raise ValueError(f"message of {len(text)} bytes; the longest is {LONGEST_MESSAGE}")
     try:

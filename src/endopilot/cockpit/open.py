@@ -29,17 +29,12 @@ if TYPE_CHECKING:
     from endopilot.cockpit.game import Attempt
 
 _START_MM = 5.0
-_DEEP = 0.8
-"""Where the first target lies, as a share of the longest path."""
+_DEEP = 0.8  # where the first target lies, as a share of the longest path
 
 
 @dataclass(frozen=True, eq=False)
 class Opened:
-    """What the server needs.
-
-    Attributes:
-        recording: where the session is kept; None for a replay.
-    """
+    """What the server needs; the recording is where the session is kept, None for a replay."""
 
     stage: Stage
     scene: Callable[[], bytes]
@@ -56,15 +51,8 @@ def open_session(
     ct: Path | None = None,
     output: Path = Path("runs/cockpit"),
 ) -> Opened:
-    """Open a patient to be driven by hand or by a policy.
-
-    Args:
-        patient: folder of an anatomy; a synthetic one is written into `output` if not given.
-        ct: CT angiogram of the patient, for the X-ray's background.
-
-    Raises:
-        InputError: a file that is missing or bad, or a device that does not fit.
-    """
+    """Open a patient (a synthetic one, written into `output`, if no folder is given) to be driven by hand or policy,
+    with the CT as X-ray's background. Raises InputError for a missing or bad file, or a device that does not fit."""
     patient = patient or _synthetic(output)
     navigation = _start_of(read_anatomy(patient), Stack.of(device, *catheters))
     return _driven(LiveWorld(navigation, replace(BY_HAND, robot=robot)), Where(patient=patient), output, ct)
@@ -73,38 +61,18 @@ def open_session(
 def open_task(
     name: str, place: int = 0, *, robot: RobotConfig = BY_HAND.robot, output: Path = Path("runs/cockpit")
 ) -> Opened:
-    """Open a task of the ladder, to be driven by hand under X-ray alone.
-
-    Args:
-        place: of the patient in the task's list.
-        robot: what drives; the agent, whose score stands beside a person's, drives the same one.
-
-    Raises:
-        InputError: the ladder has no such task, or the task no such patient.
-    """
+    """Open a task of the ladder, in patient `place` of its list, to be driven by hand under X-ray alone. The agent,
+    whose score stands beside a person's, drives the same robot. Raises InputError for an unknown task or patient."""
     tried = _attempt(name, place, robot)
     where = Where(task=name, place=place)
     return _driven(tried.world(), where, output, None, seed=tried.seed, make=tried.session)
 
 
 def open_replay(
-    path: Path,
-    patient: Path | None = None,
-    *,
-    world: int = 0,
-    task: str | None = None,
-    ct: Path | None = None,
+    path: Path, patient: Path | None = None, *, world: int = 0, task: str | None = None, ct: Path | None = None
 ) -> Opened:
-    """Open what was recorded, simulated, planned or scored, to be looked at with a time slider.
-
-    Args:
-        world: which of a trajectory's worlds, a data set's episodes, or a task's patients.
-        task: of the ladder's files.
-        ct: CT angiogram of the patient, for the X-ray's background.
-
-    Raises:
-        InputError: it cannot be read, or lacks its patient or task.
-    """
+    """Open what was recorded, simulated, planned or scored (`film.open_film`), to be looked at with a time slider; the
+    CT is for the X-ray's background."""
     from endopilot.cockpit.film import ReplayStage, open_film  # slow to import, and needed for replays alone
 
     film = open_film(path, patient, world=world, task=task)
@@ -114,13 +82,8 @@ def open_replay(
 
 
 def resume_session(path: Path, *, ct: Path | None = None) -> Opened:
-    """Go on with a session that a killed server left: it is driven again up to its last event, and recorded on.
-
-    A task that was not over goes on, and is scored: its clock waits for the page's start.
-
-    Raises:
-        InputError: no such session, or one that does not replay to the bit.
-    """
+    """Go on with a session that a killed server left, driven again up to its last event, and recorded on; a task that
+    was not over waits for the page's start. Raises InputError for none, or one that does not replay to the bit."""
     recording = read_session(path)
     history = replayed(recording)
     first = next(history)
@@ -175,11 +138,7 @@ def scene_of(navigation: Navigation, about: dict[str, Any]) -> Callable[[], byte
 
 
 def read_ct(path: Path | None) -> Volume | None:
-    """Read a CT, HU, if one is given.
-
-    Raises:
-        InputError: it cannot be read.
-    """
+    """Read a CT, HU, if one is given; InputError if it cannot be read."""
     if path is None:
         return None
     from endopilot.imaging.volume import read_volume  # slow to import
@@ -191,7 +150,6 @@ def read_ct(path: Path | None) -> Volume | None:
 
 
 def _start_of(anatomy: Anatomy, stack: Stack) -> Navigation:
-    """Return a navigation from the ostium to a first target, far down the longest path."""
     tree = anatomy.tree
     leaf = tree.longest_leaf()
     line = tree.branches[leaf].centerline.abscissa
@@ -202,7 +160,6 @@ def _start_of(anatomy: Anatomy, stack: Stack) -> Navigation:
 
 
 def _synthetic(output: Path) -> Path:
-    """Return the folder of the synthetic patient; it is written if need be."""
     folder = output / "synthetic"
     if not (folder / "anatomy.json").exists():
         from endopilot.tasks.task import reference_navigation
@@ -212,7 +169,6 @@ def _synthetic(output: Path) -> Path:
 
 
 def _free(output: Path, name: str) -> Path:
-    """Return a file of that name, or with a number, which does not exist."""
     number, path = 1, output / f"{name}{SUFFIX}"
     while path.exists():
         number, path = number + 1, output / f"{name}-{number + 1}{SUFFIX}"

@@ -1,9 +1,8 @@
 """A session on disk: one line an event, written as it happens, so that nothing is lost when the server is killed.
 
-The first line says what the session was held in: vessel, wire, robot, rod core, seed. Each further line is a JSON
-object with the cycle at which it acted: `move` (mm/s, rad/s of the wire, then of each catheter, after the drives'
-limits), `stop` (and why), `exposure`, `contrast`, and every quarter of a second `check`, a hash of wire and catheters.
-The same commands in the same cycles give the same bits, so `replayed` drives a session again and proves each check.
+The first line says what the session was held in. Each further one is a JSON object with the cycle at which it acted:
+`move` (mm/s, rad/s of each device, after the drives' limits), `stop` (and why), `exposure`, `contrast`, and every
+quarter of a second `check`, a hash of wire and catheters, which `replayed` proves.
 """
 
 from __future__ import annotations
@@ -32,19 +31,12 @@ from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 
 FORMAT = "endopilot cockpit 3"
 SUFFIX = ".cockpit.jsonl"
-CHECK_S = 0.25
-"""Time from one check to the next, s."""
+CHECK_S = 0.25  # time from one check to the next, s
 
 
 @dataclass(frozen=True)
 class Where:
-    """Where a session takes place.
-
-    Attributes:
-        patient: folder of the anatomy; None for a task.
-        task: name of a task of the ladder; None for a patient.
-        place: of the patient in the task's list.
-    """
+    """Where a session takes place: in the folder of an anatomy, or in patient `place` of a task of the ladder."""
 
     patient: Path | None = None
     task: str | None = None
@@ -55,11 +47,7 @@ class Recorder:
     """Writes a session while it goes on."""
 
     def __init__(self, path: Path, world: LiveWorld, where: Where, seed: int) -> None:
-        """Begin a new file, or go on with one that was resumed.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
+        """Begin a new file, or go on with one that was resumed; InputError if it cannot be written."""
         self.path, self._world = path, world
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -92,12 +80,7 @@ class Recorder:
 
 @dataclass(frozen=True, eq=False)
 class RecordedSession:
-    """A session that was recorded.
-
-    Attributes:
-        navigation: vessel, wire, target and start.
-        seed: of the encoders' noise.
-    """
+    """A session that was recorded: vessel, wire, target and start, and the seed of the encoders' noise."""
 
     path: Path
     navigation: Navigation
@@ -110,11 +93,7 @@ class RecordedSession:
 
 
 def read_session(path: Path) -> RecordedSession:
-    """Read a session. A last line that a killed server left half-written is ignored.
-
-    Raises:
-        InputError: no such file, no session, or one whose vessel is gone or has changed.
-    """
+    """Read a session, without a half-written last line; InputError for none, or one whose vessel is gone or changed."""
     lines = _lines(path)
     header = lines[0] if lines else {}
     if str(header.get("format")).startswith("endopilot cockpit ") and header["format"] != FORMAT:
@@ -149,10 +128,7 @@ def _between_checks(config: LoopConfig) -> int:
 
 def replayed(recording: RecordedSession) -> Iterator[tuple[LiveWorld, list[dict[str, Any]]]]:
     """Drive a session again and yield the world before the first cycle and after each, with the events of that cycle.
-
-    Raises:
-        InputError: the wire is not where it was: another version of endopilot, or another processor.
-    """
+    Raises InputError where the wire is not where it was: another version of endopilot, or another processor."""
     world = LiveWorld(recording.navigation, recording.config, seed=recording.seed, reality=recording.reality)
     at: dict[int, list[dict[str, Any]]] = {}
     for event in recording.events:
@@ -261,19 +237,9 @@ def _lines(path: Path) -> list[dict[str, Any]]:
 
 
 def write_session_episode(session: str | Path, *, output: str | Path) -> None:
-    """Write a recorded session as a data set of one episode. `endopilot train` reads that of a wire alone.
-
-    The session is driven again and sampled every 0.5 s; what is left after the last whole sample is dropped. The vessel
-    of a task is written beside the episode, into `OUTPUT-anatomy`.
-
-    Args:
-        session: a recording of the cockpit.
-        output: folder of the data set.
-
-    Raises:
-        InputError: no such session, one shorter than a sample, or an output folder that holds
-            something else.
-    """
+    """Write a recorded session, driven again and sampled every 0.5 s, as a data set of one episode, and a task's vessel
+    beside it, into `OUTPUT-anatomy`. Raises InputError for no such session, one shorter than a sample, or an output
+    folder that holds something else."""
     session, output = Path(session), Path(output)
     recording = read_session(session)
     per_sample = round(DECISION_PERIOD_S / recording.config.cycle_s)

@@ -33,14 +33,10 @@ from endopilot.cockpit.session import Loop, Stage
 from endopilot.errors import InputError
 
 WEB = Path(__file__).parent / "web"
-MOST_PAGES = 8
-"""Pages that may look at once."""
-MOST_PER_SECOND = 200
-"""Messages that a page may send in a second."""
-MOST_FAULTS = 20
-"""Messages of a page that may be refused before its connection is closed."""
-REFUSED, BUSY = 4403, 4429
-"""Why a WebSocket is closed: wrong token or origin; too many pages, messages or faults."""
+MOST_PAGES = 8  # pages that may look at once
+MOST_PER_SECOND = 200  # messages that a page may send in a second
+MOST_FAULTS = 20  # messages of a page that may be refused before its connection is closed
+REFUSED, BUSY = 4403, 4429  # why a WebSocket is closed: wrong token or origin; too many pages, messages, faults
 
 
 @dataclass(eq=False)
@@ -63,12 +59,7 @@ class Cockpit:
     def __init__(
         self, stage: Stage, scene: Callable[[], bytes], *, token: str, hosts: frozenset[str], cycle_s: float
     ) -> None:
-        """Lay the routes out.
-
-        Args:
-            token: that a page's address must hold.
-            hosts: names under which the page may be asked for, besides the address that a connection comes in at.
-        """
+        """Lay out the routes; a page's address must hold the token, and one of `hosts` or the connection's own."""
         self._token, self._hosts, self._scene = token, hosts, scene
         self.loop = Loop(stage, cycle_s, self._publish)
         self._pages: list[_Page] = []
@@ -108,12 +99,8 @@ class Cockpit:
             page.put(channel, message)
 
     def _allowed(self, connection: HTTPConnection, *, need_origin: bool) -> bool:
-        """Return whether host, origin and token are right.
-
-        The host must be this machine's: one of `hosts`, or the very address that the connection came in at. Another
-        name for that address would be a foreign page's that has turned its own name to it (DNS rebinding). The origin
-        must be the page itself.
-        """
+        """Return whether host, origin and token are right: the host one of `hosts`, or the very address that the
+        connection came in at, as another name may be a foreign page's (DNS rebinding); the origin the page itself."""
         host, origin = connection.headers.get("host", ""), connection.headers.get("origin")
         address, port = connection.scope.get("server") or ("", None)
         name, asked_port = _host_and_port(host)
@@ -195,7 +182,6 @@ class Cockpit:
                     return
 
     def _take(self, page: _Page, text: str | bytes) -> str | None:
-        """Do what a message asks for, and return why it is refused, or None."""
         try:
             message = read_message(text)
         except ValueError as error:
@@ -264,8 +250,7 @@ def _headers(index: str) -> dict[str, str]:
     }
 
 
-MOST_CONNECTIONS = 64
-"""Connections at once, those that have not asked for anything yet included."""
+MOST_CONNECTIONS = 64  # connections at once, those that have not asked for anything yet included
 _TOKEN_BYTES = 16
 
 
@@ -278,17 +263,8 @@ def serve(
     port: int = 0,
     listening: Callable[[str], None] = lambda url: print(url, flush=True),
 ) -> None:
-    """Serve a stage until Ctrl-C.
-
-    Args:
-        host: address to listen on; by default only this machine can connect. 0.0.0.0 or :: listens on all of this
-            machine's addresses.
-        port: TCP port; 0 for a free one.
-        listening: called with the page's address, token included.
-
-    Raises:
-        InputError: the address cannot be listened on.
-    """
+    """Serve a stage until Ctrl-C; `listening` is called with the page's address, token included. InputError if `host`
+    (0.0.0.0 or :: for all addresses of this machine) and `port` (0 for a free one) cannot be listened on."""
     token = secrets.token_urlsafe(_TOKEN_BYTES)
     with _listener(host, port) as listener:
         address, number = listener.getsockname()[:2]
@@ -321,11 +297,7 @@ def machine_names() -> set[str]:
 
 
 def _listener(host: str, port: int) -> socket.socket:
-    """Return a socket that is bound to an address.
-
-    Raises:
-        InputError: there is no such address here, or the port is taken or not for this user.
-    """
+    """Return a socket that is bound to an address; InputError if there is none here, or the port cannot be had."""
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         family, _, _, _, address = found[0]

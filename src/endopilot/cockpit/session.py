@@ -1,7 +1,5 @@
-"""A session: what happens in a cycle. Messages come in, the world moves on, X-ray pulses, frames go out.
-
-Everything in `Session` runs in one thread, `Loop`, by the world's clock. The only real time in it is the watchdog's.
-"""
+"""A session: what happens in a cycle. Messages come in, the world moves on, X-ray pulses, frames go out. All of it runs
+in one thread, `Loop`, by the world's clock; the only real time is the watchdog's."""
 
 from __future__ import annotations
 
@@ -26,31 +24,18 @@ from endopilot.errors import InputError
 from endopilot.tasks.navigation import Target
 from endopilot.tasks.targets import find_target
 
-SILENCE_S = 0.2
-"""The drive stops after this time without a message from whose hand drives, s."""
-HICCUP_S = 0.5
-"""What a hand holds goes on after a silence up to this long; after a longer one it must let go first, s."""
-AUTOPILOT_SILENCE_S = 1.0
-"""The autopilot pauses after this time without a message from the page that started it, s."""
+SILENCE_S = 0.2  # the drive stops after this time without a message from whose hand drives, s
+HICCUP_S = 0.5  # what a hand holds goes on after a silence up to this long; after a longer one it must let go first, s
+AUTOPILOT_SILENCE_S = 1.0  # the autopilot pauses after this time without a message from the page that started it, s
 
 
 class Session:
-    """One world driven from a page.
-
-    Attributes:
-        autopilot: a policy that may drive.
-        sight: whether the page may show the wire in space.
-    """
+    """One world driven from a page, and a policy that may drive; `sight`: may the page show the wire in space?"""
 
     def __init__(
         self, world: LiveWorld, xray: XrayUnit, recorder: Recorder | None = None, policies: tuple[str, ...] = ()
     ) -> None:
-        """Take the parts.
-
-        Args:
-            recorder: writes what happens; nothing is kept without one.
-            policies: names of those that a page may choose.
-        """
+        """Take the parts: nothing is kept without a recorder; `policies` are the names that a page may choose from."""
         self.world, self.xray, self._recorder, self._policies = world, xray, recorder, policies
         self._rest = ((0.0, 0.0),) * len(world.navigation.devices)
         self.autopilot = Autopilot(world)
@@ -67,11 +52,7 @@ class Session:
         return self.world.navigation.target
 
     def handle(self, message: messages.Message, now_s: float) -> None:
-        """Do what the page of who drives asks for.
-
-        Raises:
-            InputError: it cannot be done; one line says why.
-        """
+        """Do what the page of who drives asks for; InputError says in one line why it cannot be done."""
         if isinstance(message, messages.Drive):
             self._hear(now_s)
             self._drive(((message.translation, message.rotation), *message.catheters))
@@ -94,11 +75,7 @@ class Session:
             raise InputError(f"{message.type}: not here")
 
     def restore(self, history: Iterable[tuple[LiveWorld, Sequence[dict[str, Any]]]]) -> None:
-        """Live through a recorded session again: take over what it says of target and exposures, and stop.
-
-        Args:
-            history: the session's world after each cycle, and the events of that cycle (`recording.replayed`).
-        """
+        """Live through what `recording.replayed` yields of a session: take over its target and exposures, and stop."""
         for _, events in history:
             self._relive(events)
         self.world.stop()
@@ -243,7 +220,6 @@ class Session:
         self._record(move=list(chain.from_iterable(self._command)))
 
     def _think(self) -> list[tuple[str, bytes]]:
-        """Let the autopilot go on, and return what the pages are to see of it."""
         if self.autopilot.status == "off" or (self.autopilot.drives and not self.xray.ready):
             return []
         snapshot, images = self.world.snapshot(), []
@@ -274,8 +250,7 @@ def _images(images: list[bytes]) -> list[tuple[str, bytes]]:
     return [(f"image{number}", image) for number, image in enumerate(images)]
 
 
-_LATE_S = 0.25
-"""A loop that is later than this lets the time go, s."""
+_LATE_S = 0.25  # a loop that is later than this lets the time go, s
 
 
 @runtime_checkable
@@ -301,17 +276,10 @@ class Stage(Protocol):
 
 class Loop:
     """Runs a stage in a thread of its own. What pages send goes through a queue; what they get, to `publish`.
-
-    Attributes:
-        late_cycles: how often time was let go because a cycle took too long.
-    """
+    `late_cycles` counts how often time was let go because a cycle took too long."""
 
     def __init__(self, stage: Stage, cycle_s: float, publish: Callable[[str, bytes], None]) -> None:
-        """Take the stage.
-
-        Args:
-            publish: called in the thread with a channel's name and a message.
-        """
+        """Take the stage; `publish` is called in the thread with a channel's name and a message."""
         self._stage, self._cycle_s, self._publish = stage, cycle_s, publish
         self._inbox: queue.SimpleQueue[Message | str] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="cockpit", daemon=True)

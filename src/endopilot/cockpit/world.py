@@ -1,7 +1,5 @@
-"""The world behind the page: a wire, alone or in catheters, in one vessel, held by the simulated robot.
-
-It advances in short cycles.
-"""
+"""The world behind the page: a wire, alone or in catheters, in one vessel, moved by the simulated robot in short
+cycles."""
 
 from __future__ import annotations
 
@@ -23,8 +21,7 @@ from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation
 from endopilot.types import TipProjection
 
-BY_HAND = LoopConfig(cycle_s=0.0125)
-"""A hand's commands act sooner than a policy's, and pages show as many pictures."""
+BY_HAND = LoopConfig(cycle_s=0.0125)  # a hand's commands act sooner than a policy's, and pages show as many pictures
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +32,7 @@ class ShownDevice:
         nodes: of its axis from its tip to a little behind the ostium, LPS mm.
         node_force: of the wall at each of them, N; 0 where it lies in a catheter.
         tip: Δtip, γtip, branch and lumen radius, as arrays of one.
-        inserted_length_mm: Δ, mm, as it truly is.
-        rotation: φ of its drive, rad.
+        inserted_length_mm: Δ, mm, as it truly is; `rotation` is φ of its drive, rad.
     """
 
     nodes: Float[np.ndarray, "n 3"]
@@ -51,9 +47,6 @@ class Snapshot(ShownDevice):
     """The wire, and the world around it, at the end of a cycle.
 
     Attributes:
-        cycle: how many have passed.
-        time_s: since the start, s.
-        tip_direction: unit vector along the wire at its tip.
         velocity: of the drive's motor, mm/s and rad/s of the wire, then of each catheter.
         force_n: largest wall force on one node during the cycle, N.
         wall_force_n: largest resultant of the wall on 2 mm of the wire, N.
@@ -81,30 +74,14 @@ class Snapshot(ShownDevice):
 
 
 class LiveWorld:
-    """A navigation loop that a hand drives in short cycles, and what pages show of it.
-
-    It goes on after the loop's end. The same commands in the same cycles give the same bits.
-
-    Attributes:
-        loop: wire, catheters, robot and C-arm; the hand drives it until it is handed over.
-        hand: what the hand holds.
-        force_n: largest wall force on one node in the last cycle, N.
-        peak_force_n: the same so far, N.
-    """
+    """A navigation loop that a hand drives in short cycles, beyond its end too, and what pages show of it: the same
+    commands in the same cycles give the same bits. `force_n` is the largest wall force on one node in the last cycle,
+    `peak_force_n` so far, N."""
 
     def __init__(
-        self,
-        navigation: Navigation,
-        config: LoopConfig = BY_HAND,
-        *,
-        seed: int = 0,
-        reality: World | None = None,
+        self, navigation: Navigation, config: LoopConfig = BY_HAND, *, seed: int = 0, reality: World | None = None
     ) -> None:
-        """Bring wire and catheters to the navigation's start.
-
-        Raises:
-            InputError: a device does not fit the vessel, or starts deeper than it is long.
-        """
+        """Bring the devices to the start; InputError if one does not fit the vessel, or is shorter than its start."""
         self.hand, self.config = Hand(), config
         self.loop = NavigationLoop(navigation, self.hand, config=config, seed=seed, world=reality)
         self.reality = self.loop.world
@@ -128,11 +105,7 @@ class LiveWorld:
         return self.config.cycle_s / self._taken_s
 
     def command(self, devices: Proximals) -> Proximals:
-        """Let the hand hold velocities, and return what the robot has taken of them, as `Robot` says.
-
-        Raises:
-            InputError: more catheters are given than there are.
-        """
+        """Let the hand hold velocities; return what the robot took of them. InputError for too many devices."""
         around = len(self.navigation.catheters)
         if len(devices) > 1 + around:
             raise InputError(f"catheters: {len(devices) - 1}; this wire has {around} around it")
@@ -179,12 +152,7 @@ class LiveWorld:
 
 
 def loop_snapshot(loop: NavigationLoop, *, cycle: int, force_n: float) -> Snapshot:
-    """Return how the world of a navigation is now.
-
-    Args:
-        cycle: how many of the drives' cycles have passed.
-        force_n: largest wall force on one node in the last one, N.
-    """
+    """Return how the world of a navigation is after a number of the drives' cycles; `force_n` as in `Snapshot`."""
     return take_snapshot(
         loop.simulator,
         loop.robot.last_step,
@@ -196,20 +164,9 @@ def loop_snapshot(loop: NavigationLoop, *, cycle: int, force_n: float) -> Snapsh
 
 
 def take_snapshot(
-    simulator: Simulator,
-    step: Step | None,
-    *,
-    cycle: int,
-    time_s: float,
-    force_n: float,
-    velocity: tuple[float, ...],
+    simulator: Simulator, step: Step | None, *, cycle: int, time_s: float, force_n: float, velocity: tuple[float, ...]
 ) -> Snapshot:
-    """Return how the one world of a simulator is now.
-
-    Args:
-        force_n: largest wall force on one node in the cycle, N.
-        velocity: of the drives, mm/s and rad/s of the wire, then of each catheter.
-    """
+    """Return how the one world of a simulator is now; `force_n` and `velocity` as in `Snapshot`."""
     inserted, turned, tip = simulator.inserted_length[0], simulator.rotation[0].tolist(), simulator.project()
     wire, *catheters = (
         ShownDevice(*line, tip[:, k], float(inserted[k]), turned[k])
@@ -234,10 +191,7 @@ def take_snapshot(
 def _lines(
     simulator: Simulator, inserted_length_mm: Float[np.ndarray, "devices"]
 ) -> list[tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_"]]]:
-    """Return what is shown of each device: nodes from its tip on, LPS mm, and the wall's force at each, N.
-
-    The wall presses on the outermost device alone.
-    """
+    """Return each device's nodes from the tip on, LPS mm, and the wall's force on them, N, on the outermost alone."""
     nodes, force = shown_part(simulator.position[0], float(inserted_length_mm.max())), simulator.contacts[0]
     found, covered = [], -np.inf
     for device, line in reversed(list(enumerate(lines_from_tips(nodes, inserted_length_mm)))):

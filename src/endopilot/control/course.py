@@ -41,8 +41,9 @@ class Course:
 
 
 _STRETCH_MM, _LONG_STRETCH_MM = 20.0, 40.0
-"""Devices pass the route in stretches of this length at most, mm: of the former where wire and catheter move in turn, of
-the latter else. What is hard is then tried from near by, and what is before it is driven while the search goes on."""
+"""Devices pass the route in stretches of this length at most, mm: of the former where wire and catheter move in turn,
+of the latter else. What is hard is tried from near by then, and what is before it is driven while the search goes on.
+"""
 
 
 def places_of(route: Route, begun: float, *, alone: bool, together: bool) -> list[float]:

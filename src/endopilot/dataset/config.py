@@ -15,11 +15,8 @@ from endopilot.types import SAMPLE_PERIOD_S
 
 
 def dataset_simulator() -> SimulatorConfig:
-    """Return the settings that datasets are simulated with: the default's elements and a coarser Newton.
-
-    What they cost in accuracy stands in docs/evidence/dataset.md. Longer elements would be cheaper, but they catch in
-    the hairpins of real vessels.
-    """
+    """Return the settings that datasets are simulated with: the default's elements and a coarser Newton, whose cost in
+    accuracy stands in docs/evidence/dataset.md. Longer elements would catch in the hairpins of real vessels."""
     return SimulatorConfig(tolerance_mm=1e-2)
 
 

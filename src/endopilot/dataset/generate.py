@@ -1,9 +1,6 @@
-"""Many random navigations of many patients, simulated and stored: `generate_dataset`.
-
-One file holds a block of sequences of one anatomy. It is written under a temporary name and renamed when whole, and
-everything in it follows from the seed, the anatomy's name and the sequence's index; so a run that was killed goes on
-with whole files and ends with the same bits as a run that was not.
-"""
+"""Many random navigations of many patients, simulated and stored. One file holds a block of sequences of one anatomy,
+renamed when whole; all follows from the seed, the anatomy's name and the index, so a killed run goes on to the same
+bits."""
 
 from __future__ import annotations
 
@@ -36,8 +33,7 @@ from endopilot.simulation.robots import in_grip
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.simulation.world import World
 
-_WORK_PATH = "meta/work.json"
-"""What the files written so far have cost; it moves into the manifest when the dataset is complete."""
+_WORK_PATH = "meta/work.json"  # what the files so far have cost; moves into the manifest in the end
 
 
 def generate_dataset(
@@ -110,8 +106,6 @@ def generate_dataset(
 
 
 class _Ledger:
-    """The cost of the files, kept over interruptions."""
-
     def __init__(self, layout: Layout) -> None:
         self._path, self._samples = layout.context.output / _WORK_PATH, layout.context.config.samples
         self._cost = read_work(layout.context.output)
@@ -211,16 +205,10 @@ def write_episode(
     seed: int,
     origin: Mapping[str, Any],
 ) -> None:
-    """Write a navigation that was recorded every 0.5 s as a dataset of one episode. That of a wire alone trains.
+    """Write a navigation of one world that was recorded every 0.5 s as a dataset of one episode; a wire alone's trains.
 
-    Args:
-        trajectory: the navigation, of one world.
-        stack: the devices as they were given; friction and stiffness of the wire's tip may have been others.
-        tip_stiffness_factor: the true factor on the stiffness of the distal 10 mm.
-        origin: what else it followed from, such as target and policy.
-
-    Raises:
-        InputError: the output folder holds something else.
+    `stack` has the devices as given, whatever their friction and `tip_stiffness_factor` were; `origin` is what else it
+    followed from, such as target and policy. Raises InputError where the folder holds something else.
     """
     set_up = trajectory.set_up
     config = DatasetConfig(

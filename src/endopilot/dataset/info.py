@@ -22,13 +22,7 @@ _QUANTILES = {"p5": 0.05, "median": 0.5, "p95": 0.95, "p99": 0.99}
 
 @dataclass(frozen=True, eq=False)
 class Histogram:
-    """How often a quantity took which value, over all valid samples.
-
-    Attributes:
-        unit: "" if it has none.
-        edges: of the bins, increasing; values beyond count in the outermost.
-        counts: samples in each bin.
-    """
+    """How often a quantity took which value in valid samples; outermost bins count what lies beyond."""
 
     title: str
     unit: str
@@ -43,13 +37,8 @@ class Histogram:
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """A dataset in figures.
-
-    Attributes:
-        histograms: by the name of their picture.
-        branch_visits: share of the navigations whose tip was in n branches, for n = 0, 1, 2, ...
-        manoeuvres: share of the samples that are insertion, retraction, spin and pause.
-    """
+    """A dataset in figures: histograms by the name of their picture, the share of the navigations whose tip was in n =
+    0, 1, ... branches, and the share of the samples of each manoeuvre."""
 
     figures: dict[str, Any]
     histograms: dict[str, Histogram]
@@ -58,13 +47,8 @@ class Description:
 
 
 def describe_dataset(folder: Path) -> Description:
-    """Count what a dataset holds.
-
-    γ/r is the paper's offset ratio; a wire of radius r_w touches the wall where γ/(r − r_w) is 1.
-
-    Raises:
-        InputError: the folder holds no finished dataset, or a file of it is missing, damaged or of another version.
-    """
+    """Count what a dataset holds; γ/r is the paper's offset ratio, and a wire of radius r_w touches the wall where γ/(r
+    − r_w) is 1. Raises InputError for no finished dataset, or a file that is missing, damaged or of another version."""
     data = read_dataset(folder)
     with reading(data.folder, "make the dataset again"):
         return _described(data)

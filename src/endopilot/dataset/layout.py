@@ -26,8 +26,7 @@ from endopilot.simulation.motion import Motion
 from endopilot.simulation.world import World
 
 SPLITS = ("train", "seen_test", "calibrate", "test")
-DEFAULT_ANATOMY_SHARES = (0.6, 0.2, 0.2)
-"""Shares of the anatomies that train, calibrate and test."""
+DEFAULT_ANATOMY_SHARES = (0.6, 0.2, 0.2)  # shares of the anatomies that train, calibrate and test
 
 
 def assign_splits(
@@ -39,21 +38,10 @@ def assign_splits(
 ) -> Shaped[np.ndarray, "anatomies sequences"]:
     """Return the split of every sequence of every anatomy, one of `SPLITS`: fixed by hash, not by chance or order.
 
-    Two splits are nested. By anatomy, whole patients go to train, calibrate or test, so that no data of a test patient
-    are used before. Within the train patients, some navigations are held out as `seen_test`: new controls on known
-    vessels, the paper's likely reading of its 80/20 split.
-
-    Anatomies are ranked by the SHA-256 of their name and dealt out by counts, so that the shares are met as closely
-    as few patients allow; sequences likewise by the SHA-256 of "name/index". Neither a seed nor the order of `names`
-    matters.
-
-    Args:
-        anatomy_shares: shares of train, calibrate and test. None means 0.6, 0.2, 0.2, and for a single anatomy, which
-            cannot be divided, a split by sequence alone.
-        seen_test_share: share of the sequences of a train anatomy that are held out as `seen_test`.
-
-    Raises:
-        InputError: too few anatomies for the requested splits, or too few sequences.
+    Whole patients go to train, calibrate or test, dealt out by the SHA-256 of their names as close to the shares as few
+    patients allow (a single one is not divided); of those in train `seen_test_share` of the navigations, by that of
+    "name/index", are held out: new controls on known vessels, the paper's likely reading of its 80/20 split. Raises
+    InputError for too few of either.
     """
     if anatomy_shares is None:
         anatomy_shares = (1.0, 0.0, 0.0) if len(names) == 1 else DEFAULT_ANATOMY_SHARES
@@ -102,19 +90,13 @@ def _digest(text: str) -> bytes:
     return hashlib.sha256(text.encode()).digest()
 
 
-FORMAT_VERSION = 7
-"""Counts changes of the columns or of their meaning."""
+FORMAT_VERSION = 7  # counts changes of the columns or of their meaning
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Navigations of one anatomy that share a file: the unit of work, on this machine or on a cluster.
-
-    Attributes:
-        identity: SHA-256 of what the simulation depends on in the anatomy.
-        sequences: indices of the navigations among those of the anatomy.
-        first_episode: index of the first one in the dataset.
-    """
+    """Navigations of one anatomy that share a file: the unit of work, on this machine or on a cluster, with the SHA-256
+    of what the simulation depends on in the anatomy, the navigations' indices, and the first one's in the dataset."""
 
     number: int
     folder: Path
@@ -127,14 +109,8 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class BlockContext:
-    """What all blocks share.
-
-    Attributes:
-        key: marks the files of this dataset; it follows from all settings.
-        task: what the navigations do, as LeRobot names it.
-        robot: what makes the motions; None where they are made as drawn.
-        world: what reality is; the stack and the anatomies are as given.
-    """
+    """What all blocks share: the `key` of this dataset's files, from all settings, LeRobot's `task`, the robot, None
+    where motions are made as drawn, and the world (its stack and anatomies are as given)."""
 
     output: Path
     config: DatasetConfig
@@ -147,12 +123,7 @@ class BlockContext:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Which navigations of which anatomies a dataset holds.
-
-    Attributes:
-        motions: how the vessel of each anatomy moves; None for one that lies still.
-        settings: what a resumed run must share with the run it continues, as plain JSON values.
-    """
+    """Which navigations of which anatomies a dataset holds, and their motion; a resumed run must share its settings."""
 
     context: BlockContext
     folders: tuple[Path, ...]
@@ -184,17 +155,9 @@ def make_layout(
     world: World | None = None,
     origin: Mapping[str, Any] | None = None,
 ) -> Layout:
-    """Read the anatomies' records, and lay out the dataset in blocks.
-
-    Args:
-        robot: what makes the motions; they are made as drawn if not given.
-        world: what reality is; as given if not given.
-        origin: what else they follow from, where they were not drawn at random.
-
-    Raises:
-        InputError: no anatomy, or a folder that is none; two of one name; too few for the split; catheters that do not
-            fit around the wire, or are to be driven by force; a world that a dataset cannot hold.
-    """
+    """Read the anatomies' records, and lay out the dataset in blocks; `origin` is what they follow from if not drawn.
+    Raises InputError for a folder without anatomy, two of one name, too few for the split, catheters that do not fit or
+    are to be driven by force, or a world that a dataset cannot hold."""
     world = world or World()
     world.check_engine("datasets")
     for name in ("share", "backs_out_mm"):
@@ -239,11 +202,7 @@ def version() -> str:
 
 
 def identify(folder: Path) -> tuple[str, str]:
-    """Return an anatomy's name and its identity, from its record; one that does not state it is read whole.
-
-    Raises:
-        InputError: the folder holds no anatomy, or a damaged one.
-    """
+    """Return an anatomy's name and identity, from its record or, where that lacks it, its content; InputError."""
     path = folder / "anatomy.json"
     record = read_json(path) if path.exists() else {}
     if isinstance(record, dict) and {"name", "identity"} <= record.keys():

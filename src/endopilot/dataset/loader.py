@@ -101,11 +101,7 @@ class Dataset(Outputs):
         return Stack(from_record(Wire, self.manifest["device"]), catheters)
 
     def __getitem__(self, episodes: int | slice | Shaped[np.ndarray, "chosen"]) -> Dataset:
-        """Return one episode, by its number, or several, by a mask or their numbers; one may stand there several times.
-
-        Raises:
-            InputError: there is no episode of that number.
-        """
+        """Return an episode by its number, or several by a mask or numbers; InputError for one that there is not."""
         if isinstance(episodes, int):
             if not 0 <= episodes < len(self):
                 raise InputError(f"world: {episodes}; {self.folder} has episodes 0 to {len(self) - 1}")
@@ -115,14 +111,8 @@ class Dataset(Outputs):
         return replace(self, **chosen)
 
     def set_up(self, anatomy: Anatomy | None = None) -> SimulationSetUp:
-        """Return what episodes of one anatomy were simulated with; their `command` then gives them again to the bit.
-
-        Args:
-            anatomy: it; read from its folder if not given.
-
-        Raises:
-            InputError: the anatomy is missing, or is another one than the dataset was made in.
-        """
+        """Return what episodes of one anatomy (read if not given; InputError if missing or another one) were simulated
+        with; their `command` then gives them again to the bit."""
         anatomy = anatomy or read_anatomy(self.anatomy_folder(str(self.anatomy[0])))
         world, given, config = self.world, self.stack, self.manifest["config"]
         tips = list(zip(self.tip_bend.tolist(), self.tip_stiffness_factor.tolist(), strict=True))
@@ -139,14 +129,8 @@ class Dataset(Outputs):
         )
 
     def trajectory(self, episode: int, *, record_shape: bool = False) -> Trajectory:
-        """Return an episode as it was recorded, to the bit: its commands simulated again.
-
-        Args:
-            record_shape: record the positions of all nodes too.
-
-        Raises:
-            InputError: there is no such episode, or its anatomy is missing or another.
-        """
+        """Return an episode as it was recorded, to the bit: its commands simulated again, if asked for with the
+        positions of all nodes. Raises InputError for no such episode, or an anatomy that is missing or another."""
         return self[episode].driven(record_shape=record_shape)
 
     def driven(
@@ -157,25 +141,15 @@ class Dataset(Outputs):
         friction: Float[np.ndarray, "episodes devices"] | None = None,
         record_shape: bool = False,
     ) -> Trajectory:
-        """Simulate episodes of one anatomy again, a world each.
-
-        Args:
-            velocity: of the drives, mm/s and rad/s; the recorded commands if not given.
-            anatomy: theirs; read from its folder if not given.
-            friction: Coulomb coefficients of the devices on the wall; as recorded if not given.
-            record_shape: record the positions of all nodes too.
-        """
+        """Simulate episodes of one anatomy again, a world each: by other velocities (mm/s, rad/s) than the recorded
+        commands, or with other friction, if given; the anatomy is read from its folder if not given."""
         set_up, command = self.set_up(anatomy), self.command if velocity is None else velocity
         set_up = set_up if velocity is None else replace(set_up, actuation="velocity")
         set_up = set_up if friction is None else replace(set_up, friction=friction)
         return run_set_up(set_up, command, period_s=self.sample_period_s, record_shape=record_shape)
 
     def of_split(self, split: str) -> Dataset:
-        """Return the episodes of one split that are valid to the end.
-
-        Raises:
-            InputError: there are none.
-        """
+        """Return the episodes of one split that are valid to the end; InputError if there are none."""
         chosen = (self.split == split) & self.valid.all(axis=1)
         if not chosen.any():
             held = ", ".join(sorted(set(self.split.tolist())))
@@ -193,11 +167,8 @@ class Dataset(Outputs):
 
     @property
     def world(self) -> World:
-        """What reality was, with what the seed drew; the wire, the anatomies and tips' radii aside are as given.
-
-        Raises:
-            InputError: the episodes are of several worlds.
-        """
+        """What reality was, with what the seed drew; the wire, the anatomies and tips' radii aside are as given. Raises
+        InputError if the episodes are of several worlds."""
         record = self.manifest.get("world", {})
         if record is None:
             raise InputError(f"{self.folder}: holds episodes of several worlds; give the dataset of one world")
@@ -217,11 +188,7 @@ class Dataset(Outputs):
         return next(record for record in self.manifest["anatomies"] if record["name"] == anatomy)
 
     def anatomy_folder(self, name: str) -> Path:
-        """Return the folder of an anatomy of the dataset.
-
-        Raises:
-            InputError: the anatomy is missing, or is another one than the dataset was made in.
-        """
+        """Return an anatomy's folder; InputError if it is missing, or another than the dataset was made in."""
         record = self._record(name)
         folder = (self.folder / record["folder"]).resolve()
         if identify(folder) != (name, record["sha256"]):
@@ -230,11 +197,8 @@ class Dataset(Outputs):
 
 
 def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Read how a finished dataset was made, `meta/manifest.json`, and what it holds, `meta/info.json`.
-
-    Raises:
-        InputError: the folder holds no finished dataset, or one of another version.
-    """
+    """Read how a finished dataset was made, `meta/manifest.json`, and what it holds, `meta/info.json`; InputError if
+    there is none, or one of another version."""
     if not (folder / schema.MANIFEST_PATH).exists():
         if (folder / RECORD_FILE).exists():
             raise InputError(f"{folder}: the dataset is unfinished; run the same `endopilot dataset` command again")
@@ -263,11 +227,7 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def read_dataset(folder: str | Path) -> Dataset:
-    """Read a whole dataset made by `endopilot dataset`.
-
-    Raises:
-        InputError: the folder holds no finished dataset, or a file of it is missing, damaged or of another version.
-    """
+    """Read a finished dataset whole. Raises InputError for none, or one that is damaged or of another version."""
     with extra_named("reading a dataset"):
         import endopilot.dataset.parquet  # noqa: F401
 
@@ -361,16 +321,7 @@ _WIRE = (
 
 
 def check_same_wire(dataset: Dataset, other: Mapping[str, Any], of: Path, mend: str) -> None:
-    """Check that a dataset was made with the wire that another dataset, or a run, was made with.
-
-    Args:
-        other: that wire, as its record has it.
-        of: the other dataset, or the run.
-        mend: what to do else.
-
-    Raises:
-        InputError: it was made with another wire.
-    """
+    """Raise InputError, with the mend, unless a dataset was made with the wire of another dataset or run (`of`)."""
     ours = dataset.manifest["device"]
     for name in _WIRE:
         if not np.array_equal(ours[name], other[name]):
@@ -381,18 +332,9 @@ def check_same_wire(dataset: Dataset, other: Mapping[str, Any], of: Path, mend: 
 
 
 def read_joined(folders: Sequence[Path]) -> Dataset:
-    """Read datasets as one: the first one, with the episodes of the others behind its own.
-
-    A patient that the first dataset holds keeps the split that it has there, so nothing that is kept for a test is
-    trained on.
-
-    Args:
-        folders: of the datasets, made with the same devices and with episodes of one length.
-
-    Raises:
-        InputError: none is given; one cannot be read, was made with another wire or other catheters, has episodes of
-            another length, or has another patient of the same name, or the same one who moves otherwise.
-    """
+    """Read datasets as one; a patient that the first holds keeps its split, so nothing kept for a test is trained on.
+    Raises InputError where one cannot be read, or has other devices, episodes of another length, another patient of the
+    same name, or the same one who moves otherwise."""
     if not folders:
         raise InputError("dataset: none given; name at least one folder made by `endopilot dataset`")
     first, *others = (read_dataset(folder) for folder in folders)

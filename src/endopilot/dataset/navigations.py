@@ -1,13 +1,9 @@
 """Random navigations of one anatomy, drawn (`draw_navigations`) and simulated (`simulate_navigations`).
 
-Everything that is drawn, controls, friction and tip of every navigation and the motion of every patient, follows from
-the seed, the anatomy's name and the navigation's index, through random streams of their own.
-
-A segmented vessel ends where the scan no longer shows it, not where blood stops: a wire that is pushed against that end
-buckles against a wall that does not exist. So before every sample the drive checks the tip, as an operator does: it
-stops pushing shortly before the end of the tip's branch. There, and where the wire is caught, it pulls instead of
-pushing until the wire has come back far enough. Simulating the recorded controls without these checks gives the same
-navigation again. Catheters around the wire are held back by the same rules, each by its own tip and load.
+A segmented vessel ends where the scan no longer shows it, not where blood stops: so before every sample the drive
+checks each device's tip, and stops pushing shortly before the end of its branch. There, and where it is caught, it
+pulls instead until it has come back far enough. Simulating the recorded controls without these checks gives the same
+again.
 """
 
 from __future__ import annotations
@@ -34,8 +30,7 @@ from endopilot.simulation.state import Step
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, TipProjection, VesselTree
 
-TIP_GROUP = 8
-"""Navigations, from the first on, that share a drawn tip: a simulation has one rod."""
+TIP_GROUP = 8  # navigations, from the first on, that share a drawn tip: a simulation has one rod
 SURPLUS = (1.0, 3.0)
 """Range of what a navigation's drawn velocities are multiplied by before they become loads of the drive: how much more
 than a free wire needs. It is drawn uniformly, and the result kept within the device's fastest velocities."""
@@ -43,14 +38,8 @@ than a free wire needs. It is drawn uniformly, and the result kept within the de
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """The drawn controls, friction and tips of navigations.
-
-    Attributes:
-        initial: Δ (mm) and φ (rad) of each device before the first period.
-        control: velocities (mm/s, rad/s) or loads (N, N·mm) of the drives.
-        tip_stiffness_factor: factor on the stiffness of the distal 10 mm.
-        seeds: of each navigation's robot.
-    """
+    """What was drawn of navigations: the devices' start (Δ mm, φ rad), velocities (mm/s, rad/s) or loads (N, N·mm) of
+    their drives, friction, tips (the factor is on the stiffness of the distal 10 mm) and seeds of the robots."""
 
     initial: Float[np.ndarray, "n devices 2"]
     control: Float[np.ndarray, "n samples devices 2"]
@@ -60,8 +49,7 @@ class Draw:
     seeds: tuple[tuple[int, int], ...] = ()
 
     def stacks(self, given: Stack) -> list[Stack]:
-        """Return each navigation's devices; those of one tip share one object, and `given` itself where nothing is
-        drawn."""
+        """Return each navigation's devices: one object for each tip, `given` itself where nothing is drawn."""
         made = {(given.wire.tip_bend_rad, 1.0): given}
         tips = list(zip(self.tip_bend_rad.tolist(), self.tip_stiffness_factor.tolist(), strict=True))
         for bend_rad, factor in tips:
@@ -74,11 +62,8 @@ class Draw:
 def draw_navigations(
     config: DatasetConfig, device: Wire, anatomy: Anatomy, sequences: range, *, devices: int = 1
 ) -> Draw:
-    """Draw some navigations of an anatomy; each is the same whatever the number of the others.
-
-    Args:
-        devices: their number, each driven independently; the wire's draw is the same with and without catheters.
-    """
+    """Draw some navigations of an anatomy; each is the same whatever the number of the others. Each of `devices` is
+    driven independently; the wire's draw is the same with and without catheters."""
     controls, friction, tip, surplus, _, robots = _streams(config, anatomy.name)
     initial, control = random_controls(
         config.navigation,
@@ -111,7 +96,6 @@ def patient_motion(config: DatasetConfig, anatomy: str) -> Motion | None:
 
 
 def _streams(config: DatasetConfig, anatomy: str) -> list[np.random.SeedSequence]:
-    """Return the random streams of an anatomy: of controls, friction, tip, surplus, motion and robots."""
     name_number = int.from_bytes(hashlib.sha256(anatomy.encode()).digest()[:8], "little")
     return np.random.SeedSequence([config.seed, name_number]).spawn(6)
 
@@ -142,14 +126,10 @@ def _loads(
     )
 
 
-STOP_SHORT_MM = 5.0
-"""A tip is driven no nearer than this to the end of its branch, mm."""
-PULL_BACK_MM = 15.0
-"""Length by which a wire that came to an end, or is caught, is pulled back before it is pushed again, mm."""
-CAUGHT = 0.5
-"""Share of the device's push limit at which a wire counts as caught."""
-_ROUNDING_MM = 1e-2
-"""A wire this near to its pull-back target counts as pulled back."""
+STOP_SHORT_MM = 5.0  # a tip is driven no nearer than this to the end of its branch, mm
+PULL_BACK_MM = 15.0  # a wire at an end, or caught, is pulled back by this length before it is pushed again
+CAUGHT = 0.5  # share of the device's push limit at which a wire counts as caught
+_ROUNDING_MM = 1e-2  # a wire this near to its pull-back target counts as pulled back
 
 
 def simulate_navigations(
@@ -168,21 +148,9 @@ def simulate_navigations(
     record_shape: bool = False,
     advance: Callable[[int], None] = lambda samples: None,
 ) -> tuple[Trajectory, Bool[np.ndarray, "worlds"]]:
-    """Simulate navigations, stopped short of the ends of the vessel.
-
-    Args:
-        initial: (Δ mm, φ rad) of each device before the first period.
-        control: velocities (mm/s, rad/s) or loads (N, N·mm) that were drawn.
-        robot: what makes the motions and measures them, its drives' mean over a sample moves the devices; they are made
-            as drawn if not given.
-        seeds: of each world's robot.
-        ostium_mm: the true inserted lengths are this much more than its encoders', mm.
-
-    Returns:
-        What was driven, and which worlds were stopped short. Commands are float32 numbers. With a robot, its columns
-        are what the robot was commanded (`decided`), and what it measured (`encoders`, `load`); commands are then what
-        its drives made of that.
-    """
+    """Simulate drawn navigations, and return them and which were stopped short of the vessel's ends. A robot's columns
+    are what it was commanded (`decided`) and measured (`encoders`, `load`), its commands, float32, the mean of what its
+    drives made of that; true lengths are `ostium_mm` more than its encoders', mm."""
     watch = _PushRoom(anatomy.tree, stacks)
     simulator = Simulator(anatomy, stacks, actuation=actuation, motion=motion, config=config)
     _begin(simulator, watch, initial, friction)
@@ -249,11 +217,7 @@ def branch_ends(tree: VesselTree) -> Float[np.ndarray, "branches"]:
 
 
 class _PushRoom:
-    """How far each device may still be pushed. Arrays have a row a world and a column a device, the wire first.
-
-    Attributes:
-        caught_n: push at which each counts as caught, N.
-    """
+    """How far each device (columns) may still be pushed in each world; over `caught_n` of push, N, it is caught."""
 
     def __init__(self, tree: VesselTree, stacks: Sequence[Stack]) -> None:
         self._ends = branch_ends(tree)

@@ -17,12 +17,9 @@ from endopilot.progress import Advance
 from endopilot.simulation.trajectory import Trajectory, trajectory_signals
 
 _KEY = b"endopilot_key"
-_LEVEL = 5
-"""Of Zstandard; higher ones take longer and save next to nothing."""
-_QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
-"""Those that LeRobot 0.4 normalises by."""
-_FEW_VALUES = {"timestamp"}
-"""Columns that repeat their values: a dictionary is the smallest."""
+_LEVEL = 5  # of Zstandard; higher ones take longer and save next to nothing
+_QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)  # those that LeRobot 0.4 normalises by
+_FEW_VALUES = {"timestamp"}  # columns that repeat their values: a dictionary is the smallest
 
 
 def sample_table(trajectory: Trajectory, first_episode: int, key: str) -> pa.Table:
@@ -77,11 +74,7 @@ def parquet_bytes(table: pa.Table) -> bytes:
 
 
 def read_table(path: Path, key: str) -> pa.Table:
-    """Read a Parquet file of the dataset that has this key.
-
-    Raises:
-        InputError: the file is missing or damaged, or belongs to another dataset or version.
-    """
+    """Read a Parquet file that has this key; InputError for another's, another version's or a damaged one."""
     try:
         table = pq.ParquetFile(regular(path)).read()
     except FileNotFoundError as error:
@@ -107,13 +100,8 @@ def column_values(table: pa.Table, name: str) -> np.ndarray:
 def statistics(
     described: Mapping[str, Any], paths: Iterable[Path], key: str, advance: Advance
 ) -> tuple[dict[str, dict[str, list[float]]], dict[str, float]]:
-    """Return the content of `meta/stats.json`, and the share of each manoeuvre in what was driven.
-
-    The first holds min, max, mean, std, count and quantiles of every numeric signal's valid samples.
-
-    Args:
-        described: the dataset's `schema.features`; the manoeuvres are the wire's.
-    """
+    """Return the content of `meta/stats.json` (min, max, mean, std, count and quantiles of every numeric signal's valid
+    samples), and the share of each of the wire's manoeuvres in what was driven."""
     sums, count, driven = Sums(), 0, np.zeros(len(schema.MANOEUVRES))
     for path in paths:
         table = read_table(path, key)

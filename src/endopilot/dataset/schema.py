@@ -1,8 +1,6 @@
-"""The columns of a dataset on disk: LeRobot v3, with the columns of a guidewire.
-
-The layout is that of `LeRobotDataset` v3.0 (https://huggingface.co/docs/lerobot/lerobot-dataset-v3): samples of many
-episodes in one Parquet file, an episode table that says where each lies, and JSON files that describe both.
-"""
+"""The columns of a dataset on disk: those of a guidewire in the layout of `LeRobotDataset` v3.0
+(https://huggingface.co/docs/lerobot/lerobot-dataset-v3): samples of many episodes in a Parquet file, an episode table,
+and JSON files."""
 
 from __future__ import annotations
 
@@ -28,13 +26,11 @@ TASKS_PATH = "meta/tasks.parquet"
 MANIFEST_PATH = "meta/manifest.json"
 TASK = "random navigation"
 
-INDEX_COLUMNS = ("index", "episode_index", "frame_index", "task_index")
-"""Integer columns that LeRobot requires; `timestamp` (s, float32) is the fifth."""
+INDEX_COLUMNS = ("index", "episode_index", "frame_index", "task_index")  # LeRobot's; with `timestamp`, s, float32
 
 VELOCITY = list(SIGNALS["control"].columns)
 LOAD = ["drive_force_n", "drive_torque_nmm"]
-STATE = ("inserted_length", "rotation", "tip_abscissa", "tip_offset")
-"""Signals that `observation.state` is made of."""
+STATE = ("inserted_length", "rotation", "tip_abscissa", "tip_offset")  # signals that `observation.state` is made of
 _TYPES = {"slip": "float64", "rotation_slip": "float64", "tip_branch": "int64", "valid": "bool"}
 """Of columns that are not float32."""
 
@@ -53,21 +49,15 @@ OWN_COLUMNS = dict(
     if name not in STATE
 )
 """Signals that have a column of their own: by the column, the signal, its type and the names of its components."""
-OF_ROBOT = ("decided", "encoders", "load")
-"""Signals that a dataset made by a robot has besides: what the robot was commanded, and what it measured."""
+OF_ROBOT = ("decided", "encoders", "load")  # what a dataset's robot was commanded, and what it measured
 MANOEUVRES = ("insertion", "retraction", "spin", "pause")
-_MOVES_MM_S, _TURNS_RAD_S = 0.1, 0.02
-"""Below these a drive rests: mm/s, rad/s."""
+_MOVES_MM_S, _TURNS_RAD_S = 0.1, 0.02  # below these a drive rests: mm/s, rad/s
 
 
 def features(actuation: Actuation, devices: int = 1, *, by_robot: bool = False) -> dict[str, dict[str, Any]]:
-    """Return the `features` entry of `meta/info.json`: type, shape and component names of every column.
-
-    `action` is what the drives were commanded, with all its digits: simulated again it gives the same navigation to the
-    bit. Under force control, `velocity` is the resulting velocity. The load of a drive is always in `drive_force_n` and
-    `drive_torque_nmm`. With catheters, a column has components of each device, those of catheter k named
-    `catheter_k_...`. A robot adds what it was commanded, `decided`, and what it measured, `encoders` and `load`.
-    """
+    """Return the `features` entry of `meta/info.json`: type, shape and component names of every column. `action` is
+    what the drives were commanded, with all digits; under force control, `velocity` is what resulted. Components of
+    catheter k are named `catheter_k_...`; a robot adds `decided`, `encoders` and `load`."""
     vectors: dict[str, tuple[str, list[str] | None]] = {
         "action": ("float64", LOAD if actuation == "force" else VELOCITY),
         **({"velocity": ("float32", VELOCITY)} if actuation == "force" else {}),
@@ -97,10 +87,8 @@ def _components(names: list[str] | None, devices: int) -> list[str] | None:
 
 
 def manoeuvres(velocity: np.ndarray) -> np.ndarray:
-    """Return the wire's manoeuvre in each row of velocities (mm/s, rad/s), as an index of `MANOEUVRES`.
-
-    A wire that advances is inserted, whether it turns or not; slower than 0.1 mm/s and 0.02 rad/s it rests.
-    """
+    """Return the wire's manoeuvre in each row of velocities (mm/s, rad/s), as an index of `MANOEUVRES`. A wire that
+    advances is inserted, whether it turns or not; slower than 0.1 mm/s and 0.02 rad/s it rests."""
     along, turn = velocity[..., 0], np.abs(velocity[..., 1])
     return np.select([along > _MOVES_MM_S, along < -_MOVES_MM_S, turn > _TURNS_RAD_S], [0, 1, 2], 3)
 
@@ -113,10 +101,8 @@ def paths_of_file(folder: Path, number: int) -> tuple[Path, Path]:
 
 
 def info(described: Mapping[str, Any], *, episodes: int, samples: int, tasks: int = 1) -> dict[str, Any]:
-    """Return the content of `meta/info.json`.
-
-    LeRobot's `splits` are ranges of episodes, which ours are not: they are in the episode table, column `split`.
-    """
+    """Return the content of `meta/info.json`. LeRobot's `splits` are ranges of episodes, which ours are not: they are
+    in the episode table, column `split`."""
     return {
         "codebase_version": LEROBOT_VERSION,
         "robot_type": "endovascular guidewire",

@@ -30,14 +30,7 @@ from endopilot.types import Anatomy
 def write_block(
     context: BlockContext, block: Block, *, threads: int = 1, advance: Callable[[int], None] = lambda _: None
 ) -> None:
-    """Simulate one block and write its episodes, then its samples: the sample file marks both as complete.
-
-    Args:
-        context: what all blocks share.
-        block: which navigations.
-        threads: of the rod core.
-        advance: called with the number of samples that were simulated since the last call.
-    """
+    """Simulate one block and write it; `advance` is called with the numbers of samples simulated."""
     config, anatomy, stack = context.config, _read(block.folder, block.identity), context.stack
     draw = draw_navigations(config, stack.wire, anatomy, block.sequences, devices=len(stack))
     world = context.world.leaning(config.seed)
@@ -66,15 +59,7 @@ def write_block(
 def store_block(
     context: BlockContext, block: Block, draw: Draw, trajectory: Trajectory, stopped: Bool[np.ndarray, "n"]
 ) -> None:
-    """Write navigations: their episodes, then their samples, which mark both as complete.
-
-    Args:
-        context: what all blocks share.
-        block: which navigations.
-        draw: their tips.
-        trajectory: their motion, one world each.
-        stopped: which were stopped short of an end of the vessel.
-    """
+    """Write a block's navigations, one world each: their episodes, then their samples, which mark both as complete."""
     data_path, episodes_path = schema.paths_of_file(context.output, block.number)
     samples = parquet.sample_table(trajectory, block.first_episode, context.key)
     for path, table in (
@@ -87,11 +72,7 @@ def store_block(
 
 @lru_cache(maxsize=4)
 def _read(folder: Path, identity: str) -> Anatomy:
-    """Read an anatomy; the blocks of one anatomy follow each other.
-
-    Raises:
-        InputError: it is not the anatomy that the dataset was begun with.
-    """
+    """Read an anatomy, kept for the next block; InputError if it is not the one that the dataset was begun with."""
     anatomy = read_anatomy(folder)
     if anatomy.identity != identity:
         raise InputError(f"{folder}: is not the anatomy that the dataset was begun with; restore that anatomy")
@@ -137,11 +118,9 @@ def _episodes(
     }
 
 
-Done = Callable[[Block, float], None]
-"""Called with each block that has been written and the processor time that it took, s."""
+Done = Callable[[Block, float], None]  # called with each written block and its processor time, s
 Item, Result = TypeVar("Item"), TypeVar("Result")
-_CONNECT_TIMEOUT_S = 10
-"""Time limit for a scheduler to answer, s."""
+_CONNECT_TIMEOUT_S = 10  # time limit for a scheduler to answer, s
 
 
 class _Interrupted(Exception):
@@ -149,10 +128,7 @@ class _Interrupted(Exception):
 
 
 def run_locally(context: BlockContext, blocks: Sequence[Block], done: Done, advance: Callable[[int], None]) -> None:
-    """Write blocks with one thread each, as many at a time as there are cores.
-
-    Where there are fewer blocks than cores, the rod core uses the remaining cores.
-    """
+    """Write blocks with one thread each, one a core at a time; of fewer blocks the rod core uses the other cores."""
     cores = context.config.simulator.threads or CORES
     workers = max(1, min(cores, len(blocks)))
     threads = cores // workers
@@ -181,18 +157,9 @@ def run_locally(context: BlockContext, blocks: Sequence[Block], done: Done, adva
 def run_on_cluster(
     work: Callable[[Item], Result], items: Sequence[Item], done: Callable[[Item, Result], None], scheduler: str
 ) -> None:
-    """Do the same work for every item on the workers of a Dask cluster, which must have access to the same folders.
-
-    If a worker dies, another one does its item.
-
-    Args:
-        work: a function of a module, or a `functools.partial` of one.
-        scheduler: address, such as tcp://host:8786.
-
-    Raises:
-        InputError: `distributed` is not installed, the scheduler cannot be reached, a worker has another version of
-            endopilot or none, or workers keep dying.
-    """
+    """Do the same work (a module's function, or a `functools.partial` of one) for every item on a Dask cluster's
+    workers, which share the folders; a dead one's item goes to another. Raises InputError without `distributed` or a
+    scheduler, for another version of endopilot, or where workers keep dying."""
     try:
         import distributed
     except ImportError as error:

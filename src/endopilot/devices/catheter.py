@@ -1,9 +1,5 @@
-"""Catheters as data: devices around a wire, with a bore and the shape that they were formed to, read from YAML.
-
-A catheter's file is a device's (`endopilot.devices.device`) with `inner_diameter_mm`, `bore_friction` and, in place
-of a tip bend, `shape`: arcs from the tip on, each `[length_mm, angle_deg]`. All arcs lie in a plane; one with a
-negative angle bends the other side.
-"""
+"""Catheters as data, read from YAML: devices around a wire, with a bore and the shape that they were formed to, arcs in
+a plane from the tip on, each `[length_mm, angle_deg]`; a negative angle bends the other side."""
 
 from __future__ import annotations
 
@@ -17,27 +13,14 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import model_validator
 
-from endopilot.devices.device import Device, Sourced, Wire, WireFile, check_built, file_constants
-from endopilot.devices.device_files import (
-    MOST_VALUES,
-    Abscissa,
-    ArcLength,
-    Force,
-    Friction,
-    Rotation,
-    Stiffness,
-    Torque,
-    Velocity,
-    Width,
-    named_file,
-)
+from endopilot.devices.device import Device, DeviceFile, Sourced, Wire, WireFile, check_built, file_constants
+from endopilot.devices.device_files import MOST_VALUES, ArcLength, Friction, Width, named_file
 from endopilot.errors import InputError
 from endopilot.files import read_text, write_yaml
 from endopilot.settings import NonNegative, Positive, Text, Within, read_settings, settings
 
 _SHIPPED = Path(__file__).parent / "catheters"
-MOST_CATHETERS = 2
-"""Catheters that a wire can have around it."""
+MOST_CATHETERS = 2  # catheters that a wire can have around it
 
 
 @settings
@@ -45,10 +28,8 @@ class Catheter(Device):
     """A catheter around a wire.
 
     Attributes:
-        inner_diameter_mm: diameter of its bore, mm.
-        bore_friction: Coulomb coefficient between its bore and what lies in it.
-        shape: arcs of constant curvature that it was formed to, from the tip on: length (mm) and angle (rad); straight
-            beyond them.
+        inner_diameter_mm: diameter of its bore, mm; `bore_friction` is its Coulomb coefficient with what lies in it.
+        shape: arcs it was formed to, from the tip on: length (mm) and angle (rad); straight beyond them.
     """
 
     inner_diameter_mm: Positive
@@ -81,23 +62,12 @@ class _Shape:
 
 
 @settings
-class CatheterFile:
-    """What a catheter's file holds; `Wire` and `Catheter` say what each constant means."""
+class CatheterFile(DeviceFile):
+    """What a catheter's file holds; `Catheter` says what each constant means."""
 
-    name: Text
-    diameter_mm: Sourced[Width]
     inner_diameter_mm: Sourced[Width]
-    abscissa_mm: Sourced[tuple[Abscissa, ...]]
-    bend_stiffness_n_mm2: Sourced[tuple[Stiffness, ...]]
-    twist_stiffness_n_mm2: Sourced[tuple[Stiffness, ...]]
-    shape: _Shape
-    friction: Sourced[Friction]
     bore_friction: Sourced[Friction]
-    max_velocity_mm_s: Sourced[Velocity]
-    max_rotation_rad_s: Sourced[Rotation]
-    push_limit_n: Sourced[Force]
-    pull_limit_n: Sourced[Force]
-    torque_limit_n_mm: Sourced[Torque]
+    shape: _Shape
 
 
 def list_catheters() -> tuple[str, ...]:
@@ -106,11 +76,7 @@ def list_catheters() -> tuple[str, ...]:
 
 
 def read_catheter(name_or_path: str | Path) -> Catheter:
-    """Read a catheter by its name (`list_catheters`), or from a YAML file.
-
-    Raises:
-        InputError: no such catheter, or a file that is not one; the line names file, field, value and mend.
-    """
+    """Read a catheter by its name, or from a YAML file; InputError names file, field, value and mend."""
     path = named_file("catheter", name_or_path, (_SHIPPED,), list_catheters)
     content = read_settings(path, CatheterFile)
     shape = tuple((length, math.radians(angle)) for length, angle in content.shape.arcs)
@@ -123,21 +89,13 @@ def read_catheter(name_or_path: str | Path) -> Catheter:
 
 
 def catheter_yaml(name_or_path: str | Path) -> str:
-    """Return the text of a catheter's YAML file, by its name or its path.
-
-    Raises:
-        InputError: no such catheter, or a file that is no text.
-    """
+    """Return the text of a catheter's YAML file, by name or path; InputError if there is none, or it is no text."""
     path = named_file("catheter", name_or_path, (_SHIPPED,), list_catheters)
     return read_text(path, what="catheter's YAML file")
 
 
 def check_nested(wire: Wire, catheters: Sequence[Catheter]) -> None:
-    """Check that a wire and catheters, from the inside out, fit into each other.
-
-    Raises:
-        InputError: more catheters than two, or one that is too narrow for what lies in it.
-    """
+    """Raise InputError unless a wire and at most two catheters, from the inside out, fit into each other."""
     if len(catheters) > MOST_CATHETERS:
         raise InputError(f"catheters: {len(catheters)}; give at most {MOST_CATHETERS}")
     inner: Device = wire
@@ -151,15 +109,7 @@ def check_nested(wire: Wire, catheters: Sequence[Catheter]) -> None:
 
 
 def write_device(device: Wire | Catheter, *, output: str | Path) -> None:
-    """Write a wire or a catheter as a YAML file that `read_wire` or `read_catheter` reads, with the same constants.
-
-    Args:
-        device: the wire or the catheter.
-        output: the file.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write a device as a YAML file that `read_wire` or `read_catheter` reads back; InputError if it cannot."""
     content = _wire(device) if isinstance(device, Wire) else _catheter(device)
     write_yaml(Path(output), content)
 

@@ -1,8 +1,5 @@
-"""Devices as data: stiffness profiles, diameter, tip shape and friction, read from YAML and checked.
-
-In a device's file every constant stands with its source, as `{value: ..., source: ...}`; a file without a source for
-each constant is refused. A profile is piecewise linear between its abscissae, which count from the tip, and constant
-beyond the last one.
+"""Devices as data: stiffness profiles, diameter, tip shape and friction, read from YAML, each with its source, as
+`{value: ..., source: ...}`. A profile is linear between its abscissae, which count from the tip, and constant beyond.
 """
 
 from __future__ import annotations
@@ -45,30 +42,18 @@ Value = TypeVar("Value")
 _MODULUS_MPA = (0.1, 250e3)
 """Young's modulus that EI and the section may imply, MPa: from a tenth of the softest published rod's, 1 MPa, to just
 above that of cobalt alloys, 233 GPa; steel has 200 GPa."""
-_WIRE_RATIO = (0.63, 1.05)
-"""GJ/EI of a wire: 1/(1 + ν) of a round section, ν from 0 to 0.5, and 5 % for rounding."""
-_CATHETER_RATIO = (0.63, 3.0)
-"""The same of a catheter, whose braid may raise GJ."""
-_FALL = 3.0
-"""Factor by which EI may fall from the tip on; devices stiffen towards the shaft."""
-_STIFFENING = 1e5
-"""Largest ratio of EI along a device."""
-_LOAD_FACTOR = 10.0
-"""Factor between a catalogue's tip load and that of the tip's EI: protocols differ, and 1 gf is 1/102 N."""
-_STRENGTH_MPA = 3000.0
-"""Tensile strength of the strongest steel wire, MPa: EN 10270-1 has up to 3000 for patented wire of 0.3 mm."""
-_LEAST_DEG = math.degrees(math.pi) / 57
-"""A bend up to this, some 3.16 °, is one in rad: half a turn has π of them."""
+_WIRE_RATIO = (0.63, 1.05)  # GJ/EI of a wire: 1/(1 + ν) of a round section, ν from 0 to 0.5, and 5 % for rounding
+_CATHETER_RATIO = (0.63, 3.0)  # the same of a catheter, whose braid may raise GJ
+_FALL = 3.0  # factor by which EI may fall from the tip on; devices stiffen towards the shaft
+_STIFFENING = 1e5  # largest ratio of EI along a device
+_LOAD_FACTOR = 10.0  # between a catalogue's tip load and that of the tip's EI: protocols differ
+_STRENGTH_MPA = 3000.0  # tensile strength of the strongest steel wire, 0.3 mm thick, MPa (EN 10270-1)
+_LEAST_DEG = math.degrees(math.pi) / 57  # a bend up to this, some 3.16 °, is one in rad: half a turn has π of them
 
 
 @settings
 class TipShaping:
-    """The bends that a hand can give the tip of a wire.
-
-    Attributes:
-        angle_deg: least and largest angle, degrees.
-        length_mm: least and largest length from the tip over which it is bent, mm.
-    """
+    """The bends that a hand can give a wire's tip: least and largest angle (degrees) and length from the tip (mm)."""
 
     angle_deg: tuple[NonNegative, NonNegative]
     length_mm: tuple[Positive, Positive]
@@ -201,12 +186,9 @@ class Wire(Device):
         return replace(self, tip_bend_rad=math.radians(angle_deg), tip_bend_length_mm=float(length_mm))
 
     def summary(self) -> dict[str, Any]:
-        """Return what a list of devices shows.
-
-        The keys: `name`, `diameter_mm`, bending stiffness `ei_tip_n_mm2` and `ei_shaft_n_mm2`, torsional stiffness
-        `gj_tip_n_mm2` and `gj_shaft_n_mm2`, the catalogue's `tip_load_n` (N) and `tip_load_gf` (gram-force), which are
-        None where it states none, `tip_bend_deg` and `friction`.
-        """
+        """Return what a list of devices shows: `name`, `diameter_mm`, stiffnesses `ei_tip_n_mm2`, `ei_shaft_n_mm2`,
+        `gj_tip_n_mm2` and `gj_shaft_n_mm2`, the catalogue's `tip_load_n` and `tip_load_gf` (gram-force; None where it
+        states none), `tip_bend_deg` and `friction`."""
         load = self.tip_load_n
         return {
             "name": self.name,
@@ -249,8 +231,8 @@ class _Shaping(TipShaping):
 
 
 @settings
-class WireFile:
-    """What a device's file holds; `Wire` says what each constant means."""
+class DeviceFile:
+    """What the files of wires and catheters hold; `Device` says what each constant means."""
 
     name: Text
     diameter_mm: Sourced[Width]
@@ -263,6 +245,12 @@ class WireFile:
     abscissa_mm: Sourced[tuple[Abscissa, ...]]
     bend_stiffness_n_mm2: Sourced[tuple[Stiffness, ...]]
     twist_stiffness_n_mm2: Sourced[tuple[Stiffness, ...]]
+
+
+@settings
+class WireFile(DeviceFile):
+    """What a wire's file holds."""
+
     tip_load_n: Sourced[TipLoad | None]
     tip_bend: _TipBend
     tip_shaping: _Shaping | None = None
@@ -278,11 +266,7 @@ def file_constants(content: Any) -> dict[str, Any]:
 
 @public
 def read_wire(name_or_path: str | Path) -> Wire:
-    """Read a device by its name (`endopilot.devices.device_files`), or from a YAML file.
-
-    Raises:
-        InputError: no such device, or a file that is not a device; the line names file, field, value and mend.
-    """
+    """Read a wire by its name, or from a YAML file; InputError names file, field, value and mend."""
     path = device_file(name_or_path)
     content = read_settings(path, WireFile)
     shaping = content.tip_shaping
@@ -303,17 +287,7 @@ def read_wire(name_or_path: str | Path) -> Wire:
 def check_built(
     device: Device, *, bore_mm: float = 0.0, arcs: Sequence[tuple[float, float]] = (), catheter: bool = False
 ) -> None:
-    """Check that the constants of a device can be those of one and the same thing.
-
-    Args:
-        device: what its file says.
-        bore_mm: diameter of its bore, mm; 0 for a wire.
-        arcs: the arcs of a catheter's shape: mm, rad.
-        catheter: whether it is a catheter.
-
-    Raises:
-        InputError: two of them contradict each other; the line names field, value and what to give.
-    """
+    """Raise InputError where a file's constants cannot be one thing's; `bore_mm` is 0 for a wire."""
     _check_stiffness(device, bore_mm, catheter)
     shears = _STRENGTH_MPA / math.sqrt(3) * math.pi / 16 * device.diameter_mm**3  # yields in shear by von Mises
     if (torque := device.torque_limit_n_mm) > shears:
@@ -325,14 +299,7 @@ def check_built(
 
 
 def check_tip(device: Wire) -> None:
-    """Check that the tip of a wire can be one: its load, its bend, and the bends that a hand can give it.
-
-    Args:
-        device: what its file says.
-
-    Raises:
-        InputError: it cannot; the line names field, value and what to give.
-    """
+    """Raise InputError where a wire's tip cannot be one: its load, its bend, and the bends that a hand can give it."""
     if device.tip_load_n is not None:
         _check_tip_load(device.tip_load_n, device)
     if device.tip_bend_rad:
@@ -406,11 +373,7 @@ def _check_bends(name: str, bends: Sequence[tuple[float, float]], device: Device
 
 
 def check_fits(device: Device, anatomy: Anatomy) -> None:
-    """Check that the device passes through the guiding catheter and the ostium.
-
-    Raises:
-        InputError: the device is wider than one of them.
-    """
+    """Raise InputError where the device is wider than the guiding catheter or the ostium."""
     lumen = float(anatomy.tree.branches[0].centerline.radius[0])
     for what, radius in (("lumen at the ostium", lumen), ("guiding catheter", anatomy.catheter_radius_mm)):
         if device.tip_radius_mm >= radius:
@@ -421,13 +384,6 @@ def check_fits(device: Device, anatomy: Anatomy) -> None:
 
 
 def lateral_reach(bend_rad: float, length_mm: float) -> float:
-    """Return how far a tip stands beside the wire behind it, mm: L(1 − cos θ)/θ.
-
-    A tip that is bent by more than half a turn stands farthest beside the wire where it has turned by half of one.
-
-    Args:
-        bend_rad: angle by which it is bent, rad.
-        length_mm: length over which it is bent, with constant curvature, mm.
-    """
+    """Return how far a bent tip stands beside the wire, mm: L(1 − cos θ)/θ, with half a turn at most."""
     angle = abs(bend_rad)
     return float(length_mm * (1 - np.cos(min(angle, np.pi))) / angle) if angle > 0 else 0.0

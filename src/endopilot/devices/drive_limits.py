@@ -16,13 +16,11 @@ from endopilot.types import Anatomy
 SPARE_MM = 20.0
 """Length that a wire can be driven beyond the end of the vessel's longest path, mm. A wire lies slack along the wall:
 it takes more wire than centerline to reach the end."""
-_HAIR_MM = 1e-9
-"""What rounding may add to an inserted length, mm."""
+_HAIR_MM = 1e-9  # what rounding may add to an inserted length, mm
 WIDE_MM, SPARE_WIDTHS = 16.0, 3.0
 """In a lumen wider than this, such as an aorta, a wire lies down on the outer walls of bends and in loops, mm; that
 takes up to so many widths of it."""
-SLACK_WIDTHS = 2.0
-"""A wire that is pushed by so many widths of such a lumen, while its tip does not come forward, folds."""
+SLACK_WIDTHS = 2.0  # a wire pushed by so many widths of such a lumen, while its tip does not come forward, folds
 Numbers = float | Float[np.ndarray, "..."]
 
 
@@ -41,16 +39,8 @@ def within_travel(
     *,
     travel_mm: tuple[Numbers, Numbers] = (0.0, np.inf),
 ) -> Numbers:
-    """Return translations, mm/s, that leave no wire outside its travel.
-
-    A wire that is beyond its travel already is not moved farther out, and is not pushed or pulled back either.
-
-    Args:
-        translation: each is held for the whole time, mm/s; NaN stays NaN.
-        inserted_length: Δ at the start, mm, one for each translation.
-        duration: s.
-        travel_mm: least and largest inserted length, mm, of all wires or of each.
-    """
+    """Return translations, each held for some time, that leave no wire outside its travel, mm/s; one that is beyond it
+    already is not moved farther out, nor back. NaN stays NaN."""
     low, high = travel_mm
     back = np.minimum(-(inserted_length - low) / duration, 0.0)
     ahead = np.maximum((high - inserted_length) / duration, 0.0)
@@ -59,13 +49,7 @@ def within_travel(
 
 @settings
 class DriveLimits:
-    """What a drive must never exceed.
-
-    Attributes:
-        max_velocity_mm_s: fastest translation, either way, mm/s.
-        max_rotation_rad_s: fastest rotation, either way, rad/s.
-        travel_mm: least and largest inserted length, mm.
-    """
+    """What a drive must never exceed: translation and rotation either way, and least and largest inserted length."""
 
     max_velocity_mm_s: Positive
     max_rotation_rad_s: Positive
@@ -79,10 +63,7 @@ class DriveLimits:
 
     @staticmethod
     def of(device: Device, anatomy: Anatomy | None = None) -> DriveLimits:
-        """Return the limits of a device in a vessel: the drive's speed, the ostium and the far end (`far_end_mm`).
-
-        Without an anatomy the travel has no far end.
-        """
+        """Return a device's limits in a vessel: its drive's speed, ostium and far end (none without a vessel)."""
         return DriveLimits(
             max_velocity_mm_s=device.max_velocity_mm_s,
             max_rotation_rad_s=device.max_rotation_rad_s,
@@ -95,21 +76,13 @@ class DriveLimits:
         return np.array([self.max_velocity_mm_s, self.max_rotation_rad_s])
 
     def by_encoder(self, ostium_mm: float) -> DriveLimits:
-        """Return limits whose far end, by an encoder, is no deeper than where the device truly ends.
-
-        Args:
-            ostium_mm: the true inserted length is at most this much more than the encoder's, mm.
-        """
+        """Return limits whose far end, by an encoder, is no deeper than where the device truly ends; the true inserted
+        length is at most `ostium_mm` more than the encoder's."""
         low, high = self.travel_mm
         return replace(self, travel_mm=(low, high - max(ostium_mm, 0.0) - _HAIR_MM))
 
     def safe(self, translation: Any, rotation: Any) -> tuple[float, float]:
-        """Return one command that is finite and within the speed limits, whatever is asked; what is no number stops.
-
-        Args:
-            translation: mm/s.
-            rotation: rad/s.
-        """
+        """Return a finite command within the speed limits, mm/s and rad/s, whatever is asked; NaN stops."""
         try:
             asked = np.array([float(translation), float(rotation)])
         except (TypeError, ValueError, OverflowError):
@@ -122,15 +95,8 @@ class DriveLimits:
     def clip(
         self, control: Float[np.ndarray, "*n 2"], inserted_length: Numbers, duration: float
     ) -> Float[np.ndarray, "*n 2"]:
-        """Return what a drive can do of some controls, within its speed and its travel.
-
-        A control within the limits stays the same to the last bit.
-
-        Args:
-            control: mm/s and rad/s, each held for the whole time; NaN stays NaN.
-            inserted_length: Δ at the start, mm, one for each control or one for all.
-            duration: s.
-        """
+        """Return what a drive can do of controls (mm/s, rad/s), each held for the whole time, within speed and travel;
+        what is within stays to the last bit, NaN stays NaN. The inserted length is at the start."""
         made = np.clip(control, -self.fastest, self.fastest)
         made[..., 0] = within_travel(made[..., 0], inserted_length, duration, travel_mm=self.travel_mm)
         return made
@@ -138,13 +104,7 @@ class DriveLimits:
     def clip_sequence(
         self, control: Float[np.ndarray, "*n samples 2"], inserted_length: Numbers, duration: float
     ) -> Float[np.ndarray, "*n samples 2"]:
-        """Return what a drive can do of some sequences of controls, as `clip` one after the other.
-
-        Args:
-            control: mm/s and rad/s, each held for some time; NaN stays NaN, and so does all that follows it.
-            inserted_length: Δ before the first, mm, one for each sequence or one for all.
-            duration: of one control, s.
-        """
+        """Return `clip` of sequences of controls, one after the other; what follows a NaN is NaN."""
         made, inserted = np.array(control, dtype=float), np.asarray(inserted_length, dtype=float)
         for sample in range(made.shape[-2]):
             made[..., sample, :] = self.clip(made[..., sample, :], inserted, duration)

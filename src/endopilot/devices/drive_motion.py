@@ -1,8 +1,4 @@
-"""The motion of drives under velocity commands: `DriveMotion`, from a command to the proximal end of a device.
-
-Both the simulated robot and the drive process (`endopilot drive`) move by it; environments and data sets move many
-robots at once.
-"""
+"""The motion of drives under velocity commands, of many robots at once."""
 
 from __future__ import annotations
 
@@ -19,16 +15,8 @@ from endopilot.devices.robot import RobotConfig
 def through_play(
     ahead: Float[np.ndarray, "*n"], driven: Float[np.ndarray, "*n"], half_gap: Float[np.ndarray, "..."]
 ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
-    """Let motors go on, and return how far they are ahead of their devices then, and how far the devices went.
-
-    This is the play operator, p ← clip(p, e − half_gap, e + half_gap), of a motor at e and a device at p: the device
-    rests until the motor has gone through the gap, and then goes with it.
-
-    Args:
-        ahead: how far each motor is ahead of its device, e − p, mm or rad; no more than half a gap either way.
-        driven: how far it goes on without turning back, mm or rad.
-        half_gap: half of what is lost at a reversal, mm or rad.
-    """
+    """Let motors go on, and return how far they are `ahead` of their devices (e − p, at most half a gap) then, and how
+    far the devices went, mm or rad, by the play operator p ← clip(p, e − half_gap, e + half_gap)."""
     after = np.clip(ahead + driven, -half_gap, half_gap)
     return after, driven - (after - ahead)
 
@@ -37,16 +25,10 @@ _ROUNDING_S = 1e-12
 
 
 class DriveMotion:
-    """The motion of the drives of some robots, which do not depend on each other.
+    """The motion of the drives of some robots, which do not depend on each other: late, limited, with gain and play.
 
-    A drive follows a command late, no faster and no more suddenly than its limits. Gain and play lie between motor and
-    device: after a reversal the device rests until the motor has gone through the play.
-
-    Attributes:
-        velocity: of the motors, mm/s and rad/s.
-        motor: where the devices would be if gain were 1 and there were no play: what an encoder at the motor counts, mm
-            and rad.
-        position: of the devices' proximal ends: Δ, mm, and φ, rad. Set it where a device did not follow.
+    `motor` is where the devices would be without gain and play, what an encoder there counts; `position` is of their
+    proximal ends, to be set where a device did not follow (mm, rad).
     """
 
     def __init__(
@@ -57,14 +39,8 @@ class DriveMotion:
         *,
         seeds: Sequence[int | Sequence[int]] = (0,),
     ) -> None:
-        """Begin at rest, in the middle of the play, or somewhere in it if the encoders do not see it.
-
-        Args:
-            config: latency, jitter, accelerations, gains and plays, of all robots or of each.
-            limits: of the drives of each robot.
-            position: where the devices are, Δ, mm, and φ, rad.
-            seeds: of each robot's gains and jitter.
-        """
+        """Begin at rest at Δ, mm, and φ, rad, in the middle of the play, or somewhere in it if the encoders do not see
+        it; gains and jitter follow from each robot's seed."""
         robots, self._devices, _ = position.shape
         self._fastest = np.array([[each.fastest for each in of_robot] for of_robot in limits])
         self._travel = np.moveaxis(np.array([[each.travel_mm for each in of_robot] for of_robot in limits]), -1, 0)
@@ -128,10 +104,8 @@ class DriveMotion:
     def _grasp(
         self, robots: Sequence[int], seeds: Sequence[int | Sequence[int]], configs: Sequence[RobotConfig]
     ) -> None:
-        """Draw some robots: gains, half the plays, and how far the motors are ahead of the devices at the start.
-
-        That is nothing, in the middle of the play, or anywhere in it where encoders at the motors do not see it.
-        """
+        """Draw some robots: gains, half the plays, and how far the motors are ahead of the devices at the start: not at
+        all, or anywhere in the play where encoders at the motors do not see it."""
         devices = self._devices
         for robot, seed, config in zip(robots, seeds, configs, strict=True):
             self._random[robot] = random = np.random.default_rng(seed)
@@ -153,7 +127,6 @@ class DriveMotion:
             self._orders.popleft()
 
     def _next(self) -> Float[np.ndarray, "robots"]:
-        """Return when each robot's next order is due, s."""
         times = [np.where(due <= self._clock + _ROUNDING_S, np.inf, due) for due, _ in self._orders]
         return np.min(times, axis=0) if times else np.full_like(self._clock, np.inf)
 

@@ -21,12 +21,10 @@ from endopilot.devices.stack import Transmission
 from endopilot.files import write_yaml
 from endopilot.settings import NonNegative, Positive, Within, public, read_settings, settings
 
-ASSUMED, IDEAL = "assumed", "ideal"
-"""Names of the robot whose numbers are assumptions, which is the default, and of the one that does as commanded."""
+ASSUMED, IDEAL = "assumed", "ideal"  # the robot of assumed numbers, the default, and the one that does as commanded
 _SHIPPED = Path(__file__).parent / "robots"
 Kind = TypeVar("Kind", bound=Device)
-_MOST_SPREADS = 3.0
-"""A gain that is drawn lies no farther from its mean than this many standard deviations."""
+_MOST_SPREADS = 3.0  # a gain that is drawn lies no farther from its mean than this many standard deviations
 
 
 @settings
@@ -124,11 +122,7 @@ class RobotConfig:
         return self.of_drives(count, "play_mm", "play_rad") * np.maximum(1 + spread * drawn, 0.0)
 
     def run_out(self, velocity: Float[np.ndarray, "devices 2"]) -> Float[np.ndarray, "devices 2"]:
-        """Return how far motors go on before they obey a command to stop, mm and rad.
-
-        Args:
-            velocity: that they have, mm/s and rad/s.
-        """
+        """Return how far motors go on, from a velocity (mm/s, rad/s), before they obey a stop, mm and rad."""
         braking = self.of_drives(len(velocity), "max_acceleration_mm_s2", "max_acceleration_rad_s2")
         return velocity * self.latency_s + velocity * np.abs(velocity) / (2 * braking)
 
@@ -137,11 +131,7 @@ class RobotConfig:
         return replace(self, latency_s=self.latency_s * factor)
 
     def write(self, path: Path | str) -> None:
-        """Write the robot as a YAML file that `read_robot` reads, whole or not at all.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
+        """Write the robot as a YAML file for `read_robot`, whole or not at all; InputError if it cannot be written."""
         write_yaml(Path(path), asdict(self))
 
 
@@ -152,11 +142,7 @@ def list_robots() -> tuple[str, ...]:
 
 @public
 def read_robot(name_or_path: str | Path) -> RobotConfig:
-    """Read a robot by its name (`list_robots`), or from a YAML file.
-
-    Raises:
-        InputError: no such robot, or a file that is not one; the line names file, field, value and mend.
-    """
+    """Read a robot by its name, or from a YAML file; InputError names file, field, value and mend."""
     if str(name_or_path) == ASSUMED:
         return RobotConfig()
     path = named_file("robot", name_or_path, (_SHIPPED,), list_robots)

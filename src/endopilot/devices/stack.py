@@ -12,45 +12,33 @@ from jaxtyping import Float
 from endopilot.devices.catheter import Catheter, check_nested, read_catheter
 from endopilot.devices.device import Device, Wire, check_fits, read_wire
 from endopilot.errors import InputError
-from endopilot.lines import length_along
+from endopilot.lines import length_along, places_on
 from endopilot.settings import Within, settings
 from endopilot.types import Anatomy
 
 
 @settings
 class Transmission:
-    """How a drive's rotation reaches the ostium.
+    """How a drive's rotation reaches the ostium: the device between, of `length_mm` (0: none), twists under a Coulomb
+    friction torque a length, N·mm/mm.
 
-    The device behind the ostium twists under a Coulomb friction torque along it. docs/concepts/transmission.md derives
-    what that does: of a uniform device with the torsional stiffness GJ and free at the ostium, the rotation lags behind
-    the drive's by m L²/2GJ while it turns, and starts after a reversal when the drive has turned by twice that.
-
-    Attributes:
-        length_mm: length of the device between its drive and the ostium, mm; 0: the drive acts at the ostium.
-        twist_friction_n_mm_mm: friction torque a length, m, N·mm/mm.
+    docs/concepts/transmission.md derives it: of a uniform device with stiffness GJ, free at the ostium, the rotation
+    lags by m L²/2GJ while it turns, and starts after a reversal when the drive has turned by twice that.
     """
 
     length_mm: Annotated[float, Within(0, 3000, unit="mm", mistaken=(("m", 1000.0),))] = 0.0
     twist_friction_n_mm_mm: Annotated[float, Within(0, 1)] = 0.0
 
 
-SHOWN_BEHIND_MM = 20.0
-"""Length of devices that pictures show behind the ostium, in the guiding catheter, mm."""
-_APART_MM = 1e-6
-"""Nodes nearer to a tip than this are the tip, mm."""
-Proximals = tuple[tuple[float, float], ...]
-"""Of each of some devices' proximal ends a length and an angle, or their rates."""
+SHOWN_BEHIND_MM = 20.0  # length of devices that pictures show behind the ostium, in the guiding catheter, mm
+_APART_MM = 1e-6  # nodes nearer to a tip than this are the tip, mm
+Proximals = tuple[tuple[float, float], ...]  # of each device's proximal end a length and an angle, or rates
 
 
 @dataclass(frozen=True)
 class Stack:
-    """A wire, and the catheters around it from the inside out; a wire alone is a stack of one.
-
-    Attributes:
-        wire: the wire.
-        catheters: around it.
-        transmissions: what lies between drive and ostium, of each device; drives act at the ostium if not given.
-    """
+    """A wire, and the catheters around it from the inside out; a wire alone is a stack of one. `transmissions` are what
+    lies between drive and ostium, of each device; drives act at the ostium if not given."""
 
     wire: Wire
     catheters: tuple[Catheter, ...] = ()
@@ -66,15 +54,8 @@ class Stack:
 
     @staticmethod
     def of(device: Wire | Stack | str | Path, *catheters: Catheter | str | Path) -> Stack:
-        """Return the stack of a wire and catheters, each given itself, by its name or by its YAML file.
-
-        Args:
-            device: the wire, or a stack that the catheters are put around.
-            catheters: from the inside out; their drives act at the ostium.
-
-        Raises:
-            InputError: no such wire or catheter.
-        """
+        """Return the stack of a wire, or a stack, and catheters around it from the inside out, whose drives act at the
+        ostium; each is given itself, by its name or by its YAML file. Raises InputError for no such device."""
         around = tuple(each if isinstance(each, Catheter) else read_catheter(each) for each in catheters)
         if not isinstance(device, Stack):
             return Stack(device if isinstance(device, Wire) else read_wire(device), around)
@@ -127,11 +108,7 @@ class Stack:
         return self.wire.constants + tuple(each.constants for each in self.catheters) + behind
 
     def check(self, anatomy: Anatomy) -> None:
-        """Check that the devices fit into each other, and into an anatomy.
-
-        Raises:
-            InputError: one does not.
-        """
+        """Raise InputError unless the devices fit into each other, and into an anatomy."""
         check_nested(self.wire, self.catheters)
         for device in self.devices:
             check_fits(device, anatomy)
@@ -145,16 +122,11 @@ def column_prefixes(devices: int) -> tuple[str, ...]:
 def lines_from_tips(
     nodes: Float[np.ndarray, "n 3"], inserted_length_mm: Float[np.ndarray, "devices"]
 ) -> list[Float[np.ndarray, "_ 3"]]:
-    """Return the line that telescoping devices share, as each of them has it: from its own tip on.
-
-    Args:
-        nodes: of the line, from the foremost tip on, LPS mm.
-        inserted_length_mm: inserted length of each device; the foremost tip is that of the largest.
-    """
+    """Return the line that telescoping devices share (nodes, LPS mm) as each has it, from its own tip on."""
     behind = inserted_length_mm.max() - inserted_length_mm
     along = length_along(nodes)
     return [
-        nodes if at == 0 else np.vstack([_at(nodes, along, at), nodes[along > at + _APART_MM]])
+        nodes if at == 0 else np.vstack([places_on(nodes, along, np.array([at])), nodes[along > at + _APART_MM]])
         for at in behind.tolist()
     ]
 
@@ -162,16 +134,6 @@ def lines_from_tips(
 def shown_part(
     nodes: Float[np.ndarray, "n 3"], deepest_mm: float, behind_mm: float = SHOWN_BEHIND_MM
 ) -> Float[np.ndarray, "shown 3"]:
-    """Return what pictures show of a line: from its tip to a little behind the ostium, LPS mm.
-
-    Args:
-        nodes: of the line, from the foremost tip on, LPS mm; NaN beyond its end.
-        deepest_mm: inserted length of the device with that tip.
-        behind_mm: how much of it is shown behind the ostium, mm.
-    """
+    """Return what pictures show of a line, from its tip to `behind_mm` behind the ostium; NaN beyond its end."""
     nodes = nodes[np.isfinite(nodes).all(axis=1)]
     return nodes[length_along(nodes) <= deepest_mm + behind_mm]
-
-
-def _at(nodes: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n"], at_mm: float) -> Float[np.ndarray, "3"]:
-    return np.array([np.interp(at_mm, along, axis) for axis in nodes.T])

@@ -5,42 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import SimpleITK as sitk
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from scipy import ndimage
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.projection import project_tip
 from endopilot.anatomy.tree import SAMPLE_STEP_MM, sampled
-from endopilot.types import Anatomy, DistanceMap, LumenMask, VesselTree, Volume
+from endopilot.imaging.grid import interpolate_like
+from endopilot.types import Anatomy, LumenMask, VesselTree, Volume
 from endopilot.vessels.graph import groups
 
-SMALLEST_RADIUS_MM = 0.75
-"""Vessels thinner than this are not scored: two voxels of a coronary CTA across, CAT08 scores from 0.75 mm up too."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class AnatomyScore:
-    """Agreement of an extracted vessel with the true one, over true vessels of radius 0.75 mm or more.
-
-    Attributes:
-        dice: Dice coefficient of the lumen's voxels beyond the ostium.
-        cldice: centerline Dice (Shit et al., CVPR 2021), see `cl_dice`.
-        overlap: OV (Schaap et al., Med. Image Anal. 2009, "CAT08"), see `Agreement`.
-        inside_accuracy_mm: AI of the same, mm.
-        radius_mae_mm: mean absolute error of the radius where the centerlines overlap, mm.
-        ostium_error_mm: distance between the ostia, mm.
-        false_length_mm: length of the longest connected piece of extracted centerline that follows no true vessel of
-            any radius, mm.
-    """
-
-    dice: float
-    cldice: float
-    overlap: float
-    inside_accuracy_mm: float
-    radius_mae_mm: float
-    ostium_error_mm: float
-    false_length_mm: float
+SMALLEST_RADIUS_MM = 0.75  # thinner vessels are not scored: two voxels of a coronary CTA, as CAT08 does
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,29 +40,32 @@ class Agreement:
     false_length_mm: float
 
 
+@dataclass(frozen=True, kw_only=True)
+class AnatomyScore:
+    """Agreement of an extracted vessel with the true one, over true vessels of radius 0.75 mm or more: Dice of the
+    lumen's voxels beyond the ostium, `cl_dice`, and the measures of `Agreement`."""
+
+    dice: float
+    cldice: float
+    overlap: float
+    inside_accuracy_mm: float
+    radius_mae_mm: float
+    ostium_error_mm: float
+    false_length_mm: float
+
+
 def score_anatomy(mask: LumenMask, extracted: Anatomy, truth: Anatomy) -> AnatomyScore:
     """Compare a mask and the anatomy extracted from it with the anatomy that the volume was made of."""
-    agreement = compare_trees(extracted.tree, truth.tree)
     dice, cldice = _mask_scores(mask, truth)
-    return AnatomyScore(
-        dice=dice,
-        cldice=cldice,
-        overlap=agreement.overlap,
-        inside_accuracy_mm=agreement.inside_accuracy_mm,
-        radius_mae_mm=agreement.radius_mae_mm,
-        ostium_error_mm=float(np.linalg.norm(extracted.insertion.position - truth.insertion.position)),
-        false_length_mm=agreement.false_length_mm,
-    )
+    ostium_error_mm = float(np.linalg.norm(extracted.insertion.position - truth.insertion.position))
+    agreement = vars(compare_trees(extracted.tree, truth.tree))
+    return AnatomyScore(dice=dice, cldice=cldice, ostium_error_mm=ostium_error_mm, **agreement)
 
 
 def compare_trees(
     extracted: VesselTree, truth: VesselTree, *, smallest_radius_mm: float = SMALLEST_RADIUS_MM
 ) -> Agreement:
-    """Return how far an extracted centerline tree agrees with the true one.
-
-    Args:
-        smallest_radius_mm: true points of a smaller radius are not counted, mm.
-    """
+    """Return how a centerline tree agrees with the true one, without the true one's points of a smaller radius."""
     true_points, true_radius = sampled(truth)
     points, radius = sampled(extracted)
     distance, nearest = KDTree(true_points).query(points)
@@ -113,24 +91,21 @@ def cl_dice(
     mask_skeleton: Bool[np.ndarray, "nz ny nx"],
     truth_skeleton: Bool[np.ndarray, "nz ny nx"],
 ) -> float:
-    """Return the centerline Dice of two masks (Shit et al., "clDice", CVPR 2021).
-
-    With V the masks and S their skeletons: topology precision T_prec = |S_mask ∩ V_truth| / |S_mask|, topology
-    sensitivity T_sens = |S_truth ∩ V_mask| / |S_truth|, clDice = 2·T_prec·T_sens / (T_prec + T_sens).
-    """
+    """Return the centerline Dice of two masks V with skeletons S (Shit et al., "clDice", CVPR 2021): 2·T_prec·T_sens /
+    (T_prec + T_sens) of T_prec = |S_mask ∩ V_truth| / |S_mask| and T_sens = |S_truth ∩ V_mask| / |S_truth|."""
     precision = (mask_skeleton & truth).sum() / max(mask_skeleton.sum(), 1)
     sensitivity = (truth_skeleton & mask).sum() / max(truth_skeleton.sum(), 1)
     return float(2 * precision * sensitivity / max(precision + sensitivity, 1e-12))
 
 
 def _mask_scores(mask: LumenMask, truth: Anatomy) -> tuple[float, float]:
-    """Return Dice and clDice over voxels beyond the ostium whose nearest true vessel is large enough.
-
-    The true skeleton is the true centerline; the mask's is thinned out of it (Lee et al. 1994).
-    """
+    """Return Dice and clDice over voxels beyond the ostium whose nearest true vessel is large enough. The true skeleton
+    is the true centerline; the mask's is thinned out of it (Lee et al. 1994)."""
     from skimage.morphology import skeletonize
 
-    true = _resample(truth.distance_map, mask.volume) > 0
+    wall = truth.distance_map
+    whole = Volume(wall.values, np.full(3, wall.spacing_mm), wall.origin_mm, np.eye(3))
+    true = interpolate_like(whole, mask.volume, outside=-1.0) > 0
     box = ndimage.find_objects((mask.volume.voxels | true).astype(np.uint8))[0]
     ours, true = np.pad(mask.volume.voxels[box], 1), np.pad(true[box], 1)
     corner = np.array([part.start - 1 for part in box])
@@ -144,17 +119,3 @@ def _mask_scores(mask: LumenMask, truth: Anatomy) -> tuple[float, float]:
     line[tuple((np.rint(mask.volume.world_to_index(points)).astype(int)[:, ::-1] - corner).T)] = True
     dice = 2 * (true & ours & scored).sum() / max((true & scored).sum() + (ours & scored).sum(), 1)
     return float(dice), cl_dice(ours, true, skeletonize(ours) & scored, line & true & scored)
-
-
-def _resample(distance_map: DistanceMap, grid: Volume) -> Float[np.ndarray, "nz ny nx"]:
-    """Return the distance map at the voxel centres of `grid`, and a negative number outside the map, mm."""
-    image = sitk.GetImageFromArray(np.asarray(distance_map.values, dtype=np.float32))
-    image.SetSpacing([distance_map.spacing_mm] * 3)
-    image.SetOrigin(distance_map.origin_mm.tolist())
-    resample = sitk.ResampleImageFilter()
-    resample.SetSize(grid.voxels.shape[::-1])
-    resample.SetOutputSpacing(grid.spacing_mm.tolist())
-    resample.SetOutputOrigin(grid.origin_mm.tolist())
-    resample.SetOutputDirection(grid.direction.ravel().tolist())
-    resample.SetDefaultPixelValue(-1.0)
-    return sitk.GetArrayFromImage(resample.Execute(image))

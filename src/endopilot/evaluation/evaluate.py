@@ -61,13 +61,10 @@ def evaluate(
 ) -> dict[str, Any]:
     """Evaluate a run on navigations and on patients that it was not trained on.
 
-    Every navigation of a patient that the run was not trained on counts, whatever its split in the dataset; together
-    they are the split "test" of the result. Of patients that the run was trained on, the navigations outside the split
-    "train" count; they are the split "seen_test". The baseline "training mean" is taken over the split "train" of the
-    patients that the run was trained on, and left out where the dataset has none of them.
-
-    Writes `evaluation.npz` (the predictions) and `metrics.json` (every number, and how it was made), each whole or not
-    at all. `report.report_evaluation` makes figures and a page of them.
+    Every navigation of a new patient counts, as the split "test"; of patients that the run was trained on, those
+    outside the split "train", as "seen_test". The baseline "training mean" is over the split "train" of the latter, and
+    left out where there is none. Writes `evaluation.npz` (the predictions) and `metrics.json` (every number, and how it
+    was made), each whole or not at all, and returns the latter's content.
 
     Args:
         run: made by `endopilot train`, or "wires", the simulated wires.
@@ -76,13 +73,9 @@ def evaluate(
         dataset: folder of the dataset to evaluate on; the one that the run was trained on if not given.
         other_seeds: runs of the same training with other seeds, whose errors in P1 shall stand beside the run's.
 
-    Returns:
-        The content of `metrics.json`.
-
     Raises:
-        InputError: the run, its dataset or one of its anatomies is missing or damaged, nothing was held out, the
-            dataset was made with another wire, another seed was trained on other patients, there is no such robot, or
-            the output belongs to another run.
+        InputError: the run, its dataset or an anatomy is missing or damaged, nothing was held out, the dataset has
+            another wire, another seed other patients, there is no such robot, or the output belongs to another run.
     """
     with extra_named("evaluate"):
         from endopilot.evaluation.protocols import count_steps, run_protocols  # brings torch, slow to import
@@ -121,12 +114,7 @@ def evaluate(
         "training_mean": None
         if training is None
         else {"navigations": len(training), "patients": len(set(training.anatomy.tolist()))},
-        "manifest": manifest(
-            config=config,
-            seed=config.seed,
-            inputs=inputs,
-            wall_seconds=time.perf_counter() - start,
-        ),
+        "manifest": manifest(config=config, seed=config.seed, inputs=inputs, wall_seconds=time.perf_counter() - start),
     }
     for split, data in chosen.items() if others else ():
         episodes = Episodes.of_dataset(data)
@@ -150,7 +138,6 @@ def _parted(dataset: Dataset, known: Collection[str]) -> tuple[dict[str, Dataset
 
 
 def _chosen(data: Dataset, sequences: int | None) -> Dataset:
-    """Return at most `sequences` episodes, as evenly over the anatomies as they come."""
     if sequences is None or sequences >= len(data):
         return data
     rank = np.empty(len(data), dtype=int)
@@ -170,12 +157,8 @@ def _own_dataset(run: Path, record: Mapping[str, Any]) -> Path:
 
 
 def _metrics(results: Mapping[str, SplitResult], known: Collection[str], seed: int) -> dict[str, Any]:
-    """Return the content of metrics.json but for its manifest; `known` names the patients that were trained on."""
     splits = {
-        split: {
-            "title": SPLIT_TITLES[split],
-            "known_patients": len(set(result.anatomies) & set(known)),
-        }
+        split: {"title": SPLIT_TITLES[split], "known_patients": len(set(result.anatomies) & set(known))}
         | summarize(result, seed=seed)
         for split, result in results.items()
     }

@@ -1,8 +1,6 @@
-"""The numbers that say how good a prediction is. Pure numpy; NaN marks a sample that counts for nothing.
-
-Errors are `predicted − true`. A sample is left out only where the truth is not valid; a prediction that is not
-finite where the truth is counts as lost, and its sequence as diverged: both shares stand beside the errors.
-"""
+"""The numbers that say how good a prediction is. Errors are `predicted − true`; NaN marks a sample that counts for
+nothing, where the truth is not valid. A prediction that is not finite where the truth is counts as lost, its sequence
+as diverged."""
 
 from __future__ import annotations
 
@@ -23,15 +21,11 @@ PAPER_ERRORS: Mapping[str, Mapping[str, Mapping[str, float]]] = {
 }
 """Mean and SD of the absolute tip error, mm, as Kim et al. publish them (Hamlyn 2023, arXiv 2304.09286)."""
 
-DIVERGED_MM = 2.0
-"""A rollout whose absolute error of Δtip passes this, mm, once or more, has diverged."""
-
-OFF_WALL_MM = 0.1
-"""A tip with more than this between wire and wall, mm, is off the wall."""
+DIVERGED_MM = 2.0  # a rollout whose absolute error of Δtip passes this, mm, once or more, has diverged
+OFF_WALL_MM = 0.1  # a tip with more than this between wire and wall, mm, is off the wall
 
 
-DEPTHS_MM: tuple[float, ...] = (0.0, 30.0, 60.0, 90.0, math.inf)
-"""Edges of the parts of the vessel, by the true Δtip, over which errors are reported too, mm."""
+DEPTHS_MM: tuple[float, ...] = (0.0, 30.0, 60.0, 90.0, math.inf)  # edges of parts of the vessel, by true Δtip, mm
 
 _PUSHED_MM, _STUCK_SHARE = 0.5, 0.1
 _SLIP_MM = 1.0
@@ -45,16 +39,11 @@ def tip_events(
     abscissa: Float[np.ndarray, "episodes samples"],
     direction: Float[np.ndarray, "episodes samples 3"],
 ) -> dict[str, Bool[np.ndarray, "episodes later"]]:
-    """Return in which samples after the first the tip does not go with the drive.
+    """Return in which samples after the first the tip does not go with the drive (lengths in mm, angles in rad).
 
-    `stick`: the drive moves by more than 0.5 mm, and the tip by less than a tenth of that. `slip`: the tip moves by
-    1 mm more than the drive, or as much the other way. `whip`: the tip's direction turns by 0.5 rad more than the drive
+    `stick`: the drive moves by more than 0.5 mm, and the tip by less than a tenth of that. `slip`: the tip moves by 1
+    mm more than the drive, or as much the other way. `whip`: the tip's direction turns by 0.5 rad more than the drive
     and the bends that it passes (0.2 rad a mm, which few arteries exceed) explain.
-
-    Args:
-        inserted: Δ, mm.
-        rotation: φ, rad.
-        abscissa: Δtip, mm.
     """
     pushed, moved = np.diff(inserted.astype(float), axis=1), np.diff(abscissa.astype(float), axis=1)
     turned = np.abs(np.diff(rotation.astype(float), axis=1))
@@ -83,11 +72,8 @@ def span_name(span: tuple[float, float]) -> str:
 
 
 def span_slices(n_samples: int, sample_period_s: float) -> dict[str, slice]:
-    """Return the samples of each span that a prediction of `n_samples` reaches into.
-
-    Prediction k (from 0) is the state (k + 1) periods after the last given one, and belongs to the span with
-    start < time ≤ end.
-    """
+    """Return the samples of each span that a prediction of `n_samples` reaches into: prediction k (from 0) is the state
+    k + 1 periods after the last given one, and belongs to the span with start < time ≤ end."""
     slices = {}
     for span in SPANS_S:
         start, stop = (round(edge / sample_period_s) for edge in span)
@@ -97,12 +83,8 @@ def span_slices(n_samples: int, sample_period_s: float) -> dict[str, slice]:
 
 
 def error_statistics(error: Float[np.ndarray, "episodes samples"]) -> dict[str, float | int | None]:
-    """Return the statistics of the absolute error over all finite samples, in the unit of the error.
-
-    `mae` and `sd` are mean and standard deviation of the absolute error (what the paper publishes), `median` and
-    `p95` its quantiles, `rmse` the root of the mean squared error, `bias` the mean of the signed error, `count`
-    the number of samples. Without any finite sample all but `count` are None.
-    """
+    """Return the statistics of the absolute error over finite samples, in its unit (None without any): `mae` and `sd`
+    of it (what the paper publishes), `rmse`, quantiles, and `bias`, the mean of the signed error."""
     finite = error[np.isfinite(error)]
     if finite.size == 0:
         return dict.fromkeys(("mae", "sd", "median", "p95", "rmse", "bias"), None) | {"count": 0}
@@ -121,11 +103,8 @@ def error_statistics(error: Float[np.ndarray, "episodes samples"]) -> dict[str, 
 def skill(
     error: Float[np.ndarray, "episodes samples"], baseline: Float[np.ndarray, "episodes samples"]
 ) -> float | None:
-    """Return 1 − RMSE/RMSE of the baseline, over the samples where both are finite.
-
-    1 is a perfect prediction, 0 is no better than the baseline, and a negative value is worse. None where no
-    sample has both, or where the baseline is without error.
-    """
+    """Return 1 − RMSE/RMSE of the baseline, over the samples where both are finite: 1 is perfect, 0 no better than the
+    baseline. None where no sample has both, or where the baseline is without error."""
     both = np.isfinite(error) & np.isfinite(baseline)
     reference = float(np.sum(baseline[both] ** 2))
     if reference == 0.0:
@@ -136,12 +115,8 @@ def skill(
 def bootstrap_intervals(
     error: Float[np.ndarray, "episodes samples"], anatomy: Int[np.ndarray, "episodes"], *, seed: int, draws: int = 1000
 ) -> dict[str, tuple[float, float]] | None:
-    """Return the 95 % percentile intervals of mae, sd, rmse and p95 when anatomies are drawn with replacement.
-
-    Sequences of one patient are alike, so the patient is the unit that is drawn (cluster bootstrap: Davison &
-    Hinkley 1997, §3.8). None with fewer than two anatomies, where nothing can be said of other patients. Of p95 the
-    samples count as the next of 2000 evenly filled steps.
-    """
+    """Return the 95 % percentile intervals of mae, sd, rmse and p95 when anatomies are drawn with replacement (cluster
+    bootstrap: Davison & Hinkley 1997, §3.8); None with fewer than two. Of p95 the next of 2000 steps counts."""
     finite = np.isfinite(error)
     absolute = np.abs(error[finite])
     names, owner = np.unique(np.broadcast_to(anatomy[:, None], error.shape)[finite], return_inverse=True)
@@ -185,27 +160,24 @@ def quantiles_over_time(values: Float[np.ndarray, "episodes samples"]) -> dict[s
 
 def mean_over_time(error: Float[np.ndarray, "episodes samples"]) -> Float[np.ndarray, "samples"]:
     """Return the mean absolute error over the sequences at each time; NaN where no sequence has a value."""
-    finite = np.isfinite(error)
-    count = finite.sum(axis=0)
-    total = np.where(finite, np.abs(error), 0.0).sum(axis=0)
-    return np.divide(total, count, out=np.full(error.shape[1], np.nan), where=count > 0)
+    return _mean_of_finite(np.abs(error), axis=0)
 
 
 def rmse_of_sequences(error: Float[np.ndarray, "episodes samples"]) -> Float[np.ndarray, "episodes"]:
     """Return the RMSE of each sequence over its finite samples, in the unit of the error; NaN where it has none."""
-    finite = np.isfinite(error)
-    count = finite.sum(axis=1)
-    total = np.where(finite, error**2, 0.0).sum(axis=1)
-    return np.sqrt(np.divide(total, count, out=np.full(count.shape, np.nan), where=count > 0))
+    return np.sqrt(_mean_of_finite(error**2, axis=1))
+
+
+def _mean_of_finite(values: Float[np.ndarray, "episodes samples"], axis: int) -> Float[np.ndarray, "n"]:
+    finite = np.isfinite(values)
+    count, total = finite.sum(axis=axis), np.where(finite, values, 0.0).sum(axis=axis)
+    return np.divide(total, count, out=np.full(count.shape, np.nan), where=count > 0)
 
 
 def control_rmse(
     predicted: Float[np.ndarray, "episodes samples 2"], true: Float[np.ndarray, "episodes samples 2"]
 ) -> Float[np.ndarray, "episodes 2"]:
-    """Return the RMSE of the control of each sequence: translation in mm/s, rotation in deg/s.
-
-    NaN for a sequence without any sample in which both are finite.
-    """
+    """Return the RMSE of each sequence's control, mm/s and deg/s; NaN where no sample is finite in both."""
     error = (predicted - true) * np.array([1.0, np.rad2deg(1.0)])
     return np.stack([rmse_of_sequences(error[..., axis]) for axis in range(2)], axis=-1)
 
@@ -228,13 +200,8 @@ def tip_statistics(
     sample_period_s: float,
     seed: int,
 ) -> dict[str, dict]:
-    """Return, for each span and for "all" samples, the statistics of one tip coordinate's error.
-
-    Args:
-        error: predicted − true Δtip or γtip, mm; NaN where there is nothing to compare.
-        radius: lumen radius at the true tip, mm; `over_radius` holds the statistics of the error over the radius.
-        baselines: errors of the baselines on the same samples, mm, by name.
-    """
+    """Return for each span and for "all" samples the statistics of a tip coordinate's error, mm, and, as `over_radius`,
+    of that over the lumen radius at the true tip. `baselines` has errors on the same samples, mm, by name."""
     spans: dict[str, slice] = {**span_slices(error.shape[1], sample_period_s), "all": slice(None)}
     statistics = {}
     for name, samples in spans.items():

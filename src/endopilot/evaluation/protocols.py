@@ -28,13 +28,8 @@ Samples = Float[np.ndarray, "episodes samples"]
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """Recorded episodes, with the patients and the wire that they were recorded with.
-
-    Attributes:
-        anatomies: in the order of their names.
-        anatomy_of: index of each episode's anatomy.
-        robot: what controls pass before they move the wire; None where a drive does exactly what it can.
-    """
+    """Recorded episodes, with the anatomies (in the order of their names), the wire, and the robot, if any, that
+    controls pass."""
 
     data: Dataset
     names: tuple[str, ...]
@@ -45,21 +40,14 @@ class Recorded:
 
     @staticmethod
     def of(data: Dataset, robot: RobotConfig | None = None) -> Recorded:
-        """Read what the episodes of a dataset were recorded with.
-
-        Raises:
-            InputError: an anatomy is missing or damaged.
-        """
+        """Read what the episodes of a dataset were recorded with; InputError if an anatomy is missing or damaged."""
         names, anatomy_of = np.unique(data.anatomy, return_inverse=True)
         anatomies = tuple(read_anatomy(data.anatomy_folder(str(name))) for name in names)
         return Recorded(data, tuple(map(str, names)), anatomies, anatomy_of, data.stack.wire, robot)
 
     def drivable(self, control: Control) -> Control:
-        """Return what a drive makes of controls: no faster than it can, nor out of the catheter or beyond the vessel.
-
-        Controls that are not finite stay so. A robot's drives begin at rest, in the middle of their play, after the
-        given states; their mean over a sample moves the wire.
-        """
+        """Return what a drive makes of controls, within its speed and travel; NaN stays NaN. A robot's drives begin at
+        rest, in the middle of their play, after the given states."""
         driven, inserted = np.empty(control.shape), self.data.inserted_length[:, WINDOW - 1, 0].astype(float)
         for index, anatomy in enumerate(self.anatomies):
             mine, limits = self.anatomy_of == index, DriveLimits.of(self.device, anatomy)
@@ -87,17 +75,9 @@ class Recorded:
     def simulated(
         self, controls: Mapping[str, Control], advance: Advance | None = None
     ) -> Iterator[tuple[Int[np.ndarray, "chosen"], Trajectory]]:
-        """Drive episodes as they were driven while states are given, and the wire by each series of controls after.
-
-        Catheters go on as they were commanded.
-        Series of `REPLAYED` with another friction have it from the start.
-
-        Args:
-            controls: after the given states, by series, all of one length.
-
-        Yields:
-            The episodes of one anatomy, and their simulation: a world for each series and episode, series by series.
-        """
+        """Yield the episodes of one anatomy and their simulation, a world for each series and episode, series by
+        series: driven as they were while states are given, then the wire by each series, catheters as commanded. Series
+        of `REPLAYED` with another friction have it from the start."""
         for index, anatomy in enumerate(self.anatomies):
             mine = np.flatnonzero(self.anatomy_of == index)
             worlds = self.data[np.tile(mine, len(controls))]
@@ -113,9 +93,7 @@ class Recorded:
 @dataclass(frozen=True, eq=False)
 class Replay:
     """One series of controls, simulated: its tip, the drive's load, and the tip's distance from the recorded one, mm.
-
-    NaN from where the simulation fails, or the series holds no finite control.
-    """
+    NaN from where the simulation fails, or the series holds no finite control."""
 
     abscissa: Samples
     offset: Samples
@@ -131,10 +109,7 @@ class Replay:
 
 
 def replay(recorded: Recorded, controls: Mapping[str, Control], advance: Advance) -> dict[str, Replay]:
-    """Simulate every episode again with each series of controls (mm/s and rad/s) after the given states.
-
-    `advance` is called after each anatomy.
-    """
+    """Simulate every episode again with each series of controls (mm/s, rad/s) after the given states."""
     shape, signals = recorded.data.valid[:, WINDOW:].shape, [field.name for field in fields(Replay)]
     out = {name: Replay(*np.full((len(signals), *shape), np.nan)) for name in controls}
     for chosen, rollout in recorded.simulated(controls, advance):
@@ -151,8 +126,7 @@ def replay(recorded: Recorded, controls: Mapping[str, Control], advance: Advance
     return out
 
 
-EXPOSURE_PERIOD_S = 10.0
-"""Time between X-ray images after the given states, s."""
+EXPOSURE_PERIOD_S = 10.0  # time between X-ray images after the given states, s
 
 
 def exposures(data: Dataset) -> list[int]:
@@ -166,12 +140,9 @@ def replanned(
 ) -> Control:
     """Return controls (mm/s, rad/s) after the given states that are planned anew at each of `exposures`.
 
-    Each plan is driven in the simulator up to the next exposure. For the next one the predictor is given the motion of
-    the drive, the given tips, the observed tips, and in between the tips that it predicted itself; the desired tips
-    stay the same. Where the simulation fails, or no finite control is planned, controls are NaN from there on.
-
-    Args:
-        episodes: the same as the predictor is given them; their tips are the desired ones.
+    Each plan is driven in the simulator up to the next exposure, for which the predictor is given the motion of the
+    drive, the given and observed tips, and in between those it predicted; the desired tips stay. Where the simulation
+    fails, or no finite control is planned, controls are NaN from there on.
     """
     control, under_way, observed = first.control.copy(), _planned(episodes, first, WINDOW), given_states(episodes)
     for now in exposures(recorded.data):
@@ -190,11 +161,8 @@ def replanned(
 def _driven(
     recorded: Recorded, under_way: Episodes, commanded: Control, last: int
 ) -> tuple[Episodes, Bool[np.ndarray, "episodes"]]:
-    """Return episodes after the drive was commanded, and which of them a simulation lost.
-
-    Known are the motion of the drive and, at the end, the tip in an X-ray image. It was observed before at sample
-    `last`.
-    """
+    """Return episodes after the drive was commanded, and which of them a simulation lost. Known are the motion of the
+    drive and, at the end, the tip in an X-ray image, which was observed before at sample `last`."""
     now = WINDOW + commanded.shape[1] - 1
     names = ("control", "command", "proximal", "tip", "branch")
     made = {name: getattr(under_way, name).copy() for name in names}
@@ -213,7 +181,6 @@ def _driven(
 
 
 def _planned(under_way: Episodes, plan: OpenLoop, begin: int) -> Episodes:
-    """Return episodes with the tips from a sample on as a plan predicts them, where it does."""
     tip = under_way.tip.copy()
     finite = np.isfinite(plan.tip).all(axis=-1, keepdims=True)
     tip[:, begin:] = np.where(finite, plan.tip, tip[:, begin:])
@@ -221,7 +188,6 @@ def _planned(under_way: Episodes, plan: OpenLoop, begin: int) -> Episodes:
 
 
 def _desired(under_way: Episodes, desired: Episodes, begin: int) -> Episodes:
-    """Return episodes under way with everything from a sample on as it is desired."""
     names = ("control", "command", "proximal", "tip", "branch")
     parts = {name: (getattr(under_way, name)[:, :begin], getattr(desired, name)[:, begin:]) for name in names}
     return replace(under_way, **{name: np.concatenate(both, axis=1) for name, both in parts.items()})
@@ -255,16 +221,13 @@ def mean_control(train: Dataset, data: Dataset, given: int) -> Float[np.ndarray,
 
 
 def follow_slack(data: Dataset, given: int) -> Float[np.ndarray, "episodes samples 2"]:
-    """Return the control that moves the drive as far as the tip is to move, without rotation, (mm/s, rad/s).
-
-    With the slack of the last given state held this puts the tip where it is desired.
-    """
+    """Return the control that moves the drive as far as the tip is to move, without rotation (mm/s, rad/s): with the
+    slack of the last given state held, the tip is where it is desired."""
     travel = np.diff(data.tip_abscissa[:, given - 1 :, 0].astype(float), axis=1)
     return np.stack([travel / data.sample_period_s, np.zeros_like(travel)], axis=-1)
 
 
-PROTOCOLS = ("forward", "inverse", "dual")
-"""What a predictor does with the episodes of each patient."""
+PROTOCOLS = ("forward", "inverse", "dual")  # what a predictor does with the episodes of each patient
 
 
 def count_steps(data: Dataset) -> int:
@@ -273,25 +236,15 @@ def count_steps(data: Dataset) -> int:
 
 
 def run_protocols(
-    predictor: Predictor,
-    data: Dataset,
-    training: Dataset | None,
-    advance: Advance,
-    robot: RobotConfig | None = None,
+    predictor: Predictor, data: Dataset, training: Dataset | None, advance: Advance, robot: RobotConfig | None = None
 ) -> SplitResult:
     """Predict the samples after the 30 given states by every protocol, and simulate the controls that were chosen.
 
     P1 is the forward network under the true controls; P2 the inverse network with the true tip as desired; P3 the
-    paper's loop of both; P4 the controls of P3 simulated again from the start of the episode, in the anatomy and with
-    the device and friction that it was recorded with, within the limits of the drive. P4 is driven once more with plans
-    made anew at X-ray images (`replanned`).
-
-    Args:
-        training: the episodes that the run was trained on, over which the baselines that are means are taken; these
-            are left out if there are none.
-        advance: called after each protocol in each anatomy, with P1's error so far, each new plan and each anatomy's
-            simulation.
-        robot: what the controls of P4 pass before they move the wire; a drive does exactly what it can if not given.
+    paper's loop of both; P4 the controls of P3 simulated again from the episode's start, as it was recorded, within the
+    limits of the drive, or after `robot`, and once more with plans made anew at X-ray images (`replanned`). Baselines
+    that are means are over `training`, if any. `advance` is called with P1's error, each new plan and each anatomy's
+    simulation.
     """
     recorded, episodes = Recorded.of(data, robot), Episodes.of_dataset(data)
     predicted = _predicted(predictor, episodes, recorded.anatomy_of, advance)
@@ -341,10 +294,7 @@ def run_protocols(
 def _predicted(
     predictor: Predictor, episodes: Episodes, anatomy_of: Int[np.ndarray, "episodes"], advance: Advance
 ) -> dict[str, OpenLoop]:
-    """Return what a predictor makes of the episodes by each protocol.
-
-    One anatomy comes after the other, so that a slow model shows its first errors early.
-    """
+    """Return a predictor's answers by each protocol, an anatomy at a time: a slow model shows its errors early."""
     order = np.argsort(anatomy_of, kind="stable")
     parts = [
         episodes.select(chosen) for chosen in np.split(order, np.unique(anatomy_of[order], return_index=True)[1][1:])

@@ -30,8 +30,7 @@ from endopilot.files import reading, regular, writing
 METRICS_FILE, RESULTS_FILE, FIGURES_FOLDER, REPORT_FILE = "metrics.json", "evaluation.npz", "figures", "report.html"
 """What an evaluation writes into its folder."""
 
-SPLITS: tuple[str, ...] = ("seen_test", "test")
-"""Splits of a result: navigations of patients that the run was trained on, and of all other patients."""
+SPLITS: tuple[str, ...] = ("seen_test", "test")  # navigations of patients known to the run, and of all others
 
 SERIES_TITLES: Mapping[str, str] = {
     "P1": "Forward network, true controls (P1)",
@@ -69,13 +68,7 @@ CONTROL_BASELINES: tuple[str, ...] = ("hold_control", "training_mean", "follow_s
 
 @dataclass(frozen=True, eq=False)
 class TipSeries:
-    """Where the tip was predicted to be after the given states; NaN where the prediction failed.
-
-    Attributes:
-        abscissa: Δtip, mm.
-        offset: γtip, mm.
-        radius: lumen radius where the tip was predicted to be, mm.
-    """
+    """Where tips were predicted to be (Δtip, γtip and the lumen radius there, mm); NaN where that failed."""
 
     abscissa: Float[np.ndarray, "episodes samples"]
     offset: Float[np.ndarray, "episodes samples"]
@@ -92,13 +85,11 @@ class SplitResult:
     """Everything predicted on one split, over the samples after the given states.
 
     Attributes:
-        anatomy: index in `anatomies` of each episode.
-        sequence: index of each episode among those of its anatomy.
-        true_control: the recorded control, (mm/s, rad/s).
+        anatomy: index in `anatomies` of each episode; `sequence` among those of its anatomy.
+        true_control: the recorded control, (mm/s, rad/s); `controls` the predicted ones by series.
         tips: predicted tips by series (see `SERIES_TITLES`).
-        controls: predicted controls by series, (mm/s, rad/s).
-        base_force: axial force of the drive by simulated series, "true" being the recorded one, N.
-        base_torque: torque of the drive likewise, N·mm.
+        base_force: axial force of the drive by simulated series, "true" being the recorded one, N; `base_torque`
+            likewise, N·mm.
         tip_distance: distance between the simulated and the recorded tip in space, by simulated series, mm.
         events: where the recorded tip sticks, slips or whips (see `metrics.tip_events`).
     """
@@ -157,11 +148,7 @@ def write_results(results: Mapping[str, SplitResult], path: Path) -> None:
 
 
 def read_results(path: Path) -> dict[str, SplitResult]:
-    """Read what `write_results` wrote.
-
-    Raises:
-        InputError: the file is missing or damaged.
-    """
+    """Read what `write_results` wrote; InputError if it is missing or damaged."""
     path = regular(path)
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -258,7 +245,6 @@ def over_seeds(result: SplitResult, tips: Sequence[TipSeries]) -> dict[str, Any]
 
 
 def _control(result: SplitResult) -> dict[str, Any]:
-    """Return the errors of the controls that each series chose, over all samples and as RMSE of each sequence."""
     scale = np.array([1.0, np.rad2deg(1.0)])
     errors = {name: (control - result.true_control) * scale for name, control in result.controls.items()}
     out: dict[str, Any] = {}
@@ -298,11 +284,8 @@ def _drive(result: SplitResult, series: str) -> dict[str, Any]:
 
 
 def generalisation_gap(splits: Mapping[str, Any]) -> dict[str, Any]:
-    """Return how much larger the mean absolute errors are in new patients than in those that were trained on.
-
-    By series, coordinate and span: `difference` (mm) and `ratio`; None where an error is not known or is 0. Empty
-    unless there are both kinds of patients.
-    """
+    """Return how much larger mean absolute errors are in new patients than in those trained on: by series, coordinate
+    and span `difference` (mm) and `ratio`, None where unknown; empty without both kinds of patients."""
     if not {"seen_test", "test"} <= splits.keys():
         return {}
     known, new = splits["seen_test"], splits["test"]

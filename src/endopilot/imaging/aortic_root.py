@@ -1,7 +1,5 @@
-"""The aortic root of a cardiac CT angiogram, where vessels open into it, and where a coronary artery leaves it.
-
-The ascending aorta is the largest round bright disc that goes on slice by slice.
-"""
+"""The aortic root of a cardiac CT angiogram, the largest round bright disc, where vessels open into it, and their
+ostia."""
 
 from __future__ import annotations
 
@@ -17,52 +15,30 @@ from endopilot.imaging.grid import LEAST_BLOOD_HU, connected_components, distanc
 from endopilot.lines import length_along
 from endopilot.types import Insertion, Volume
 
-_LEVELS_HU = (180.0, 230.0, 290.0, 360.0)
-"""Thresholds tried one after another: at one of them the aorta stands apart from its neighbours."""
-_RADIUS_MM = (9.0, 24.0)
-"""Inner radii of ascending aortas, mm: normal 12-18 (Wolak 2008), with room for small women and aneurysms."""
-_ROUND_SHARE = 0.6
-"""Share of the directions in which the edge must lie near the circle; neighbours touch in the others."""
-_FEWEST_SLICES_MM = 10.0
-"""Length over which the disc must persist, mm."""
-_MOST_ROOTS = 3
-"""Chains of discs that are returned at most: the pulmonary trunk may be one, and the descending aorta."""
+_LEVELS_HU = (180.0, 230.0, 290.0, 360.0)  # thresholds tried one after another, until the aorta stands apart
+_RADIUS_MM = (9.0, 24.0)  # inner radii of ascending aortas, mm: normal 12-18 (Wolak 2008), and small or dilated ones
+_ROUND_SHARE = 0.6  # share of the directions in which the edge must lie near the circle; neighbours touch in the others
+_FEWEST_SLICES_MM = 10.0  # length over which the disc must persist, mm
+_MOST_ROOTS = 3  # chains of discs that are returned at most: the pulmonary trunk may be one, and the descending aorta
 _DIRECTIONS = 32
-_BRIGHTEST_HU = 600.0
-"""Undiluted contrast in the superior vena cava is brighter than this, and no more likely to be the aorta."""
-_BALL_MM = 7.0
-"""Ball that opens the aorta: its surface goes on under the artery's mouth."""
-_BOX_MM = 18.0
-"""Half the edge of the box around the artery's beginning that is looked at, mm."""
-_SECTIONS_MM = np.arange(1.0, 6.01, 0.5)
-"""Heights above the aortic wall at which the artery's middle is measured, mm."""
-_FITTED = 8
-"""So many of the lowest sections carry the parabola that goes on to the wall."""
-_NEAR_MM = 4.5
-"""Blood farther than this from the tracked path is not this artery's."""
-_MOUTH_MM = 3.0
-"""Nearer than this to the artery's axis, the opened aorta bulges into the mouth."""
-_WALL_MM = 3.0
-"""Width of the wall around the mouth from which the wall without the mouth is estimated, mm."""
-_FEWEST_OF_WALL = 100
-"""With fewer voxels of wall around the mouth, the wall is not estimated."""
-_DEEPEST_MM = 1.0
-"""A ball that opens the aorta bulges no deeper into a mouth: its cap of 3.5 mm radius is 0.9 mm high."""
-TO_WALL_MM = 3.5
-"""Vesselness fades where an artery opens into the aorta: a tree starts within this distance of the wall."""
-_OPENING_MM = 5.0
-"""Blood that joins a vessel to the aorta is looked for this far around the vessel's voxel nearest the wall."""
+_BRIGHTEST_HU = 600.0  # contrast in the superior vena cava is brighter, and no more likely to be the aorta
+_BALL_MM = 7.0  # ball that opens the aorta: its surface goes on under the artery's mouth
+_BOX_MM = 18.0  # half the edge of the box around the artery's beginning that is looked at, mm
+_SECTIONS_MM = np.arange(1.0, 6.01, 0.5)  # heights above the aortic wall at which the artery's middle is measured, mm
+_FITTED = 8  # so many of the lowest sections carry the parabola that goes on to the wall
+_NEAR_MM = 4.5  # blood farther than this from the tracked path is not this artery's
+_MOUTH_MM = 3.0  # nearer than this to the artery's axis, the opened aorta bulges into the mouth
+_WALL_MM = 3.0  # width of the wall around the mouth from which the wall without the mouth is estimated, mm
+_FEWEST_OF_WALL = 100  # with fewer voxels of wall around the mouth, the wall is not estimated
+_DEEPEST_MM = 1.0  # a ball that opens the aorta bulges no deeper into a mouth: its cap of 3.5 mm radius is 0.9 mm high
+TO_WALL_MM = 3.5  # a tree starts within this distance of the aorta's wall, where vesselness fades
+_OPENING_MM = 5.0  # blood that joins a vessel to the aorta is looked for this far around its voxel nearest the wall
 
 
 @dataclass(frozen=True, eq=False)
 class AorticRoot:
-    """The ascending aorta as discs, one an axial slice, from the lowest to the highest.
-
-    Attributes:
-        centres: LPS mm.
-        radius: mm.
-        blood_hu: median HU inside.
-    """
+    """The ascending aorta as discs (`centres` LPS mm, `radius` mm), one an axial slice from the lowest up; `blood_hu`
+    is their median."""
 
     centres: Float[np.ndarray, "n 3"]
     radius: Float[np.ndarray, "n"]
@@ -82,17 +58,8 @@ class _Disc:
 
 
 def find_aortic_roots(grid: Volume) -> list[AorticRoot]:
-    """Find what may be the ascending aorta, the likeliest first: a right heart as bright as the left is as likely.
-
-    Args:
-        grid: CT in HU along the LPS axes, isotropic, of about 1.5 mm: finer detail is of no use here.
-
-    Returns:
-        One to three, apart from each other.
-
-    Raises:
-        InputError: no contrast, or no such vessel in the volume.
-    """
+    """Return one to three places that may be the ascending aorta, the likeliest first, on a `grid` in HU, of about 1.5
+    mm. Raises InputError without contrast or such a vessel."""
     hu = np.asarray(ndimage.gaussian_filter(grid.voxels, 0.7))
     spacing = float(grid.spacing_mm[0])
     if (ndimage.minimum_filter(hu, round(9.0 / spacing)) > LEAST_BLOOD_HU).sum() == 0:
@@ -188,12 +155,7 @@ def _best_chain(slices: list[list[_Disc]]) -> list[_Disc]:
 
 @dataclass(frozen=True, eq=False)
 class Opening:
-    """Where a vessel comes to the aortic wall.
-
-    Attributes:
-        voxel: the vessel's voxel nearest the wall (k, j, i).
-        vessel: number of the connected vessel among all.
-    """
+    """Where a vessel comes to the aortic wall: its `voxel` (k, j, i) there, and its number among the connected ones."""
 
     voxel: Int[np.ndarray, "3"]
     vessel: int
@@ -251,18 +213,9 @@ def find_ostium(
     aorta: Bool[np.ndarray, "nz ny nx"],
     grid: Volume,
 ) -> tuple[Insertion, Float[np.ndarray, "m 3"]]:
-    """Return the ostium, and the path begun anew from there.
-
-    The artery's middle is the centroid of its blood at several heights above the aortic wall; a parabola through the
-    lowest of them is carried on to the wall. Where the artery leaves at a slant, the tracked path begins at its edge,
-    and the blood near the path is more of one side than of the other: a second round looks around the parabola.
-
-    Args:
-        path: LPS mm, the first point within a few mm of the aortic wall, or anywhere if no aorta is near.
-        blood: voxels above half the lumen's HU.
-        aorta: voxels of the aorta, roughly.
-        grid: the isotropic grid of both masks.
-    """
+    """Return the ostium, and the path (LPS mm) begun anew from there. A parabola through centroids of the artery's
+    blood at several heights is carried on to the wall; a second round looks around it, for the tracked path begins at
+    the mouth's edge. `blood` is above half the lumen's HU; `aorta` is rough; both lie on `grid`."""
     spacing = float(grid.spacing_mm[0])
     half = round(_BOX_MM / spacing)
     centre = np.round(grid.world_to_index(path[0])).astype(int)[::-1]
@@ -295,10 +248,8 @@ def find_ostium(
 def _height_of_wall(
     mouth: Float[np.ndarray, "3"], height: Float[np.ndarray, "nz ny nx"], corner: np.ndarray, grid: Volume
 ) -> float:
-    """Return where the aortic wall goes on under the artery's mouth, mm of height: below 0, as the ball bulges in.
-
-    A quadric through the wall around the mouth estimates it; outliers, such as another vessel's mouth, are left out.
-    """
+    """Return the aortic wall's height under the artery's mouth, mm, by a quadric through the wall around, less
+    outliers."""
     spacing = float(grid.spacing_mm[0])
     near = np.argwhere(np.abs(height) < 0.8 * spacing)
     offset = grid.index_to_world((near + corner)[:, ::-1].astype(float)) - mouth
@@ -352,7 +303,6 @@ def _middles(
 
 
 def _heading(path: np.ndarray) -> Float[np.ndarray, "3"]:
-    """Return the unit direction of the first millimetres of a path."""
     smooth = ndimage.gaussian_filter1d(path, 3.0, axis=0, mode="nearest")
     step = smooth[min(8, len(path) - 1)] - smooth[0]
     return step / max(float(np.linalg.norm(step)), 1e-9)

@@ -12,22 +12,14 @@ from scipy.spatial import KDTree
 from endopilot.imaging.grid import connected_components, dilated, distance_to_outside
 from endopilot.types import Volume
 
-_SMOOTHING_MM = 0.3
-"""Width of the Gaussian against noise, mm; about the scanner's own blur, so that little detail is lost."""
-_BLUR_MM = 0.4
-"""Width of that Gaussian and of a scanner's point-spread function (0.6 mm at half height) together, mm."""
-_SURROUNDINGS_MM = 1.2
-"""Width of the window in which the surroundings' HU are averaged, mm."""
-_WALL_HU = 0.0
-"""Even in fat and lung, the vessel's own wall lies next to the lumen: half a millimetre of soft tissue, blurred."""
-_BLOCK = 8
-"""Edge of the blocks in which voxels near the vessel are looked for, voxels."""
-CALCIUM = 1.5
-"""Times the lumen's HU; brighter voxels are calcium or metal."""
-_FEWEST_VOXELS = 5
-"""Smaller bright specks are noise."""
-_RIM_MM = 1.2
-"""Blur spreads calcium's brightness this far: at a distance of three of its widths nothing is left."""
+_SMOOTHING_MM = 0.3  # width of the Gaussian against noise, mm: about the scanner's own blur
+_BLUR_MM = 0.4  # width of that Gaussian and of a scanner's point-spread function (0.6 mm at half height) together, mm
+_SURROUNDINGS_MM = 1.2  # width of the window in which the surroundings' HU are averaged, mm
+_WALL_HU = 0.0  # even in fat and lung the vessel's wall lies next to the lumen: half a millimetre of tissue, blurred
+_BLOCK = 8  # edge of the blocks in which voxels near the vessel are looked for, voxels
+CALCIUM = 1.5  # times the lumen's HU; brighter voxels are calcium or metal
+_FEWEST_VOXELS = 5  # smaller bright specks are noise
+_RIM_MM = 1.2  # blur spreads calcium's brightness this far: at a distance of three of its widths nothing is left
 
 
 def lumen_at_half_height(
@@ -37,18 +29,8 @@ def lumen_at_half_height(
     lumen_hu: float,
     excluded: Bool[np.ndarray, "nz ny nx"],
 ) -> Bool[np.ndarray, "nz ny nx"]:
-    """Return the voxels of the lumen around a vessel's paths.
-
-    The surroundings differ from side to side (fat, muscle, lung), and the wall's level with them: a fixed threshold
-    would make a vessel too wide in muscle or too narrow in fat.
-
-    Args:
-        volume: CT in HU, cropped to the vessel.
-        points: dense points along the paths, LPS mm.
-        radius: rough lumen radius at each, mm.
-        lumen_hu: HU of the contrast-filled lumen.
-        excluded: voxels that belong to other blood pools.
-    """
+    """Return the voxels of the lumen around dense points of paths (LPS mm) with rough radii, mm: the wall's level
+    follows what is beside it (fat, muscle, lung). `excluded` voxels belong to other blood pools."""
     spacing = volume.spacing_mm[::-1]
     hu = ndimage.gaussian_filter(volume.voxels.astype(np.float32), _SMOOTHING_MM / spacing, truncate=3.0)
     distance, local_radius = _distance_to_paths(volume, points, radius, margin_mm=4.0)
@@ -85,7 +67,6 @@ def _drop_rims(inside: np.ndarray, calcium: np.ndarray, distance: np.ndarray, sp
 
 
 def _large_parts(mask: np.ndarray) -> Bool[np.ndarray, "nz ny nx"]:
-    """Return a mask without specks, which are noise."""
     if not mask.any():
         return mask
     label = connected_components(mask)

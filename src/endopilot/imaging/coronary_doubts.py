@@ -17,66 +17,39 @@ from endopilot.imaging.grid import connected_components, distance_to_outside
 from endopilot.lines import length_along
 from endopilot.types import Volume
 
-_BLOCK_MM = 1.5
-"""Slices are compared in blocks of this size, so that noise counts little."""
-_EDGES = 98.0
-"""Percentile of the change from slice to slice: that of the edges of heart and vessels."""
+_BLOCK_MM = 1.5  # slices are compared in blocks of this size, so that noise counts little
+_EDGES = 98.0  # percentile of the change from slice to slice: that of the edges of heart and vessels
 _STEEPEST, _OF_STEEPEST = 90.0, 60.0
 """Percentile of the gradient in the slice above which a block is an edge there, and that of the change of such edges. A
 flat surface between two slices changes much of the image, but not these."""
-_TISSUE_HU = (-100.0, 700.0)
-"""Ribs and lung do not jump with the heart: edges are those between fat, muscle and blood."""
-_STEP = 1.35
-"""Between slabs of two heart beats, both change by this factor more than from slice to slice around it."""
-_NEIGHBOURS = 9
-"""Slices around a pair that tell its usual change."""
+_TISSUE_HU = (-100.0, 700.0)  # ribs and lung do not jump with the heart: edges are those between fat, muscle and blood
+_STEP = 1.35  # between slabs of two heart beats, both change by this factor more than from slice to slice around it
+_NEIGHBOURS = 9  # slices around a pair that tell its usual change
 _LUNG_HU = -300.0
-_WIDE_END_MM = 1.5
-"""Distal ends of coronary arteries are thinner than this radius: a wider one is where the vessel was lost."""
-_END_MM = 4.0
-"""Length of a vessel's end whose radius counts."""
-_STUB_MM = 10.0
-"""Shorter paths are stubs and bumps, such as at the artery's mouth: their ends are wide, and nothing is lost."""
-_AHEAD_MM, _AHEAD_COSINE = 7.0, 0.8
-"""A vessel that begins this far beyond an end, and in its direction, is its continuation behind a gap."""
-_LEAST_CONTINUATION_MM = 8.0
-"""A continuation is at least so long."""
-_SHORTEST_MM = {"rca": 60.0, "lca": 60.0}
-"""Length of the shortest main vessels, mm: of a right artery that ends before the crux, of an LAD."""
-_SECOND_MM = 30.0
-"""A left tree has two vessels of at least this length, LAD and LCx."""
-_VEIN_SHARE, _VEIN_MM, _VEIN_RADIUS_MM = 0.8, 15.0, 1.0
-"""Blood is as bright everywhere in arteries: a vessel this wide that is dimmer over this length is a vein."""
-_GRAFT_MM = 12.0
-"""A vessel that leaves the aorta so far above the ostium is a bypass graft,"""
+_WIDE_END_MM = 1.5  # distal ends of coronary arteries are thinner: at a wider one the vessel was lost
+_END_MM = 4.0  # length of a vessel's end whose radius counts
+_STUB_MM = 10.0  # shorter paths are stubs and bumps, as at the artery's mouth: nothing is lost at their wide ends
+_AHEAD_MM, _AHEAD_COSINE = 7.0, 0.8  # a vessel so far beyond an end, and in its direction, continues it behind a gap
+_LEAST_CONTINUATION_MM = 8.0  # a continuation is at least so long
+_SHORTEST_MM = {"rca": 60.0, "lca": 60.0}  # shortest main vessels, mm: a right artery before the crux, an LAD
+_SECOND_MM = 30.0  # a left tree has two vessels of at least this length, LAD and LCx
+_VEIN_SHARE, _VEIN_MM, _VEIN_RADIUS_MM = 0.8, 15.0, 1.0  # a vessel this wide, dimmer over this length, is a vein
+_GRAFT_MM = 12.0  # a vessel that leaves the aorta so far above the ostium is a bypass graft,
 _LEFT_ABOVE_MM = 26.0
 """unless it may be the left artery: in seven patients' CT angiograms the left ostium lies 9 to 24 mm above the right
 one, on the other side of the aorta, since the aortic root is tilted."""
 _LEAST_GRAFT_MM3 = 100.0
-_METAL_HU = 2000.0
-"""Brighter than calcium: leads, stents, clips."""
-_METAL_MM3, _METAL_NEAR_MM = 4.0, 15.0
-"""Metal of this volume, so near to the tree, disturbs it."""
-_BEYOND_MM = 10.0
-"""The mask of a thin distal end may be this much shorter than its path."""
-_FILLED_MM = 2.0
-"""Calcium or metal so near to where the mask ends fills the vessel."""
-_WALL_HU = 50.0
-"""The aortic wall."""
+_METAL_HU = 2000.0  # brighter than calcium: leads, stents, clips
+_METAL_MM3, _METAL_NEAR_MM = 4.0, 15.0  # metal of this volume, so near to the tree, disturbs it
+_BEYOND_MM = 10.0  # the mask of a thin distal end may be this much shorter than its path
+_FILLED_MM = 2.0  # calcium or metal so near to where the mask ends fills the vessel
+_WALL_HU = 50.0  # the aortic wall
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """What is known of the scan on the grid of the vessels.
-
-    Attributes:
-        grid: CT in HU.
-        hu: the same, lightly smoothed.
-        lumen_hu: HU of contrast-filled lumen.
-        pools: aorta, chambers, great vessels.
-        vessels: voxels of thin vessels.
-        response: vesselness.
-    """
+    """A CT on the grid of the vessels: HU (`grid`, and `hu` lightly smoothed), HU of contrast-filled lumen, and voxels
+    of blood pools and thin vessels with their vesselness."""
 
     grid: Volume
     hu: Float[np.ndarray, "nz ny nx"]
@@ -93,17 +66,8 @@ class Scan:
 
 @dataclass(frozen=True, eq=False)
 class FoundTree(Scan):
-    """A coronary tree as it was found in a scan.
-
-    Attributes:
-        volume: CT in HU, as it was given.
-        aorta: voxels of the aorta on that grid; none if it is not in the volume.
-        tree: those of the scan's vessels that are the tree.
-        ostium: LPS mm.
-        paths: from the ostium to every distal end, each from where it leaves those before it, LPS mm.
-        radius: radius at the points of each path, mm.
-        lumen: the mask, on the voxels of `volume`.
-    """
+    """A coronary tree in a scan: paths (LPS mm, radii) from the ostium to every end, each from where it leaves those
+    before it; `aorta` and `lumen` lie on `volume`'s voxels."""
 
     volume: Volume
     aorta: Bool[np.ndarray, "nz ny nx"]
@@ -163,7 +127,6 @@ def _change_of_edges(blocks: Float[np.ndarray, "nz ny nx"]) -> Float[np.ndarray,
 
 
 def _over_usual(change: Float[np.ndarray, "_"]) -> Float[np.ndarray, "_"]:
-    """Return a change from slice to slice as a multiple of what is usual around it."""
     return change / np.maximum(ndimage.median_filter(change, _NEIGHBOURS, mode="nearest"), 1e-6)
 
 

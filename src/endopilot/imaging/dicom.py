@@ -1,9 +1,5 @@
-"""CT from DICOM: one series of axial-like slices, its geometry checked, its identifiers left behind.
-
-Headers are read with pydicom, restricted to the tags below, so that nothing that names a patient is ever asked for.
-Pixels are decoded by GDCM through SimpleITK, which reads more compressions than pydicom alone; but for RLE, where GDCM
-does not come back from some damaged files.
-"""
+"""CT from DICOM: one series of axial-like slices, its geometry checked, its identifiers left behind: only the tags
+below are read. GDCM decodes pixels, but for RLE, where it does not come back from some damaged files."""
 
 from __future__ import annotations
 
@@ -58,22 +54,13 @@ _PREAMBLE = 128
 _MOST_NAMED = 10
 _FEWEST_SLICES = 4
 _HU_TYPES = ("", "HU")
-_PERHAPS_HU_TYPES = ("US", "HU_MOD")
-"""RescaleType of HU that the scanner modified, and of converters that leave the type open (unspecified)."""
-_AIR_HU = -1024.0
-"""What pixels are given that lie outside the scanned circle (PixelPaddingValue)."""
+_PERHAPS_HU_TYPES = ("US", "HU_MOD")  # RescaleType of modified HU, and of converters that leave the type open
+_AIR_HU = -1024.0  # what pixels are given that lie outside the scanned circle (PixelPaddingValue)
 
 
 @dataclass(frozen=True, eq=False)
 class _Slice:
-    """What the header of one file says of its image, without identifiers.
-
-    Attributes:
-        path: the file.
-        transfer_syntax: UID of the encoding.
-        numbers: values of each of `_NUMBERS`; none where the header has none.
-        words: text of each of `_WORDS`, in capitals; empty where the header has none.
-    """
+    """What a file's header says of its image, without identifiers: `numbers` and `words`, in capitals."""
 
     path: Path
     transfer_syntax: str
@@ -110,16 +97,8 @@ class _Slice:
 
 
 def read_series(path: Path, series: str | None, phase: str | None = None) -> Volume:
-    """Read a CT series in HU.
-
-    Args:
-        path: a folder, its subfolders searched too, or one file of the series wanted.
-        series: number or SeriesInstanceUID of the series to take where the folder holds several.
-        phase: number of the cardiac phase to take where the series holds several.
-
-    Raises:
-        InputError: there is no image or more than one series, or the series is no plain CT volume.
-    """
+    """Read a CT series in HU from a folder with its subfolders, or by one of its files; `series` is a number or a UID,
+    `phase` a number. Raises InputError where there is no image, more than one series, or no plain CT volume."""
     folder = path if path.is_dir() else path.parent
     slices, left_out = _read_headers(_files(folder, deep=path == folder))
     if not slices:
@@ -164,11 +143,8 @@ def _files(folder: Path, *, deep: bool) -> list[Path]:
 
 
 def _read_headers(files: Sequence[Path]) -> tuple[list[_Slice], list[str]]:
-    """Return the headers of DICOM images, scout views left out, and what is to be noted of other files.
-
-    Among the other files may be slices whose content is lost: what is named as the slices are and is no text is
-    refused, and so is what says of itself that it is an image.
-    """
+    """Return the headers of DICOM images without scout views, and notes on other files. Raises InputError for a file
+    that may be a slice whose content is lost: named as the slices are and no text, or an image by its own word."""
     found, others = [], []
     # pydicom's warnings quote header values; none may reach a log.
     with progress("Reading DICOM headers", len(files)) as advance, warnings.catch_warnings():
@@ -228,7 +204,6 @@ def _slice(file: Path, header: Dataset) -> _Slice:
 
 
 def _choose(slices: Sequence[_Slice], series: str | None, folder: Path) -> list[_Slice]:
-    """Return the slices of the one series there is, or of the one asked for."""
     groups_by: defaultdict[str, list[_Slice]] = defaultdict(list)
     for slice_ in slices:
         groups_by[slice_.series[1]].append(slice_)
@@ -335,10 +310,7 @@ def _geometry(
 
 
 def _read_pixels(slices: Sequence[_Slice]) -> tuple[np.ndarray, list[str]]:
-    """Decode slices in the order given and return HU: int16 where all are whole numbers that fit, else float32.
-
-    Pixels that show nothing are given the HU of air, and that is noted.
-    """
+    """Return HU of slices in the order given, int16 if whole, else float32; pixels that show nothing become air."""
     padded = 0
     whole = all(number.is_integer() for slice_ in slices for number in slice_.rescale)
     voxels = np.empty((len(slices), *slices[0].size), dtype=np.float32)
@@ -380,7 +352,6 @@ def _pad(slice_: _Slice, plane: Float[np.ndarray, "ny nx"]) -> int:
 
 
 def _decoded(slice_: _Slice, reader: sitk.ImageFileReader) -> np.ndarray:
-    """Return the HU of one slice; any error means that its pixels are damaged."""
     if slice_.transfer_syntax in _ENCAPSULATED:
         content = slice_.path.read_bytes()
         begin = max(content.rfind(mark) for mark in _PIXELS_BEGIN)

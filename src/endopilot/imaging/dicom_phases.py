@@ -21,8 +21,7 @@ PHASE_TAGS = {
 }
 """Fields that may tell phases apart, the clearest first, and the unit of each."""
 
-_POSITION_MM = 1e-3
-"""Slices nearer to each other than this are at one position."""
+_POSITION_MM = 1e-3  # slices nearer to each other than this are at one position
 
 
 def choose_phase(
@@ -33,19 +32,9 @@ def choose_phase(
     *,
     named: int | None = None,
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the indices of the slices of the one phase there is, or of the one asked for, and what is to be noted.
-
-    Args:
-        values: of each field of `PHASE_TAGS`, for every slice; None where a header lacks it.
-        positions_mm: of the slices along their normal.
-        phase: number of the phase wanted, as the field gives it.
-        folder: for messages.
-        named: index of the slice whose file was given in place of the folder; its phase is taken if none is asked for.
-
-    Raises:
-        InputError: there are several phases and none was chosen, there is no such phase, or several images at one
-            position cannot be distinguished.
-    """
+    """Return the slices of the one phase there is, or was asked for, and notes. `values` has each of `PHASE_TAGS` for
+    every slice, None where it lacks; `named` is the slice given in place of the folder. Raises InputError for no single
+    phase."""
     everything = np.arange(len(positions_mm))
     if np.diff(np.sort(positions_mm)).min(initial=np.inf) >= _POSITION_MM:
         return everything, _single(values, phase, folder)
@@ -94,10 +83,8 @@ def _single(values: Mapping[str, Sequence[float | None]], phase: str | None, fol
 
 
 def _split(values: Sequence[float | None], positions_mm: np.ndarray) -> dict[float, np.ndarray]:
-    """Return the slices of each phase by its value; none where the values do not tell phases apart.
-
-    The time after the R wave may vary from beat to beat: then phases are distinguished by their order at each position.
-    """
+    """Return the slices of each phase by its value; none where the values do not tell phases apart. The time after the
+    R wave may vary from beat to beat: then phases are distinguished by their order at each position."""
     if any(value is None or not np.isfinite(value) for value in values):
         return {}
     known = np.array(values, dtype=float)

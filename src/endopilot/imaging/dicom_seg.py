@@ -1,8 +1,5 @@
-"""Masks as DICOM segmentation objects (DICOM-SEG, PS3.3 A.51), written with the optional package `highdicom`.
-
-The object carries its own geometry, on the grid of the mask, and no UID of the CT that it was made from: a study's UIDs
-lead to its patient.
-"""
+"""Masks as DICOM segmentation objects (DICOM-SEG, PS3.3 A.51), written with the optional package `highdicom`, without
+any UID of the CT, which would lead to its patient."""
 
 from __future__ import annotations
 
@@ -25,16 +22,11 @@ if TYPE_CHECKING:
     from pydicom.dataset import Dataset
 
 SUFFIX = ".dcm"
-_SAME_MM = 1e-3
-"""Frames nearer to each other than this are of one slice."""
+_SAME_MM = 1e-3  # frames nearer to each other than this are of one slice
 
 
 def need_highdicom(path: Path) -> Any:
-    """Return the package `highdicom`.
-
-    Raises:
-        InputError: it is not installed.
-    """
+    """Return the package `highdicom`, or raise InputError where it is not installed."""
     try:
         return importlib.import_module("highdicom")
     except ImportError as error:
@@ -44,11 +36,7 @@ def need_highdicom(path: Path) -> Any:
 
 
 def write_seg(mask: LumenMask, path: Path) -> None:
-    """Write a mask as a binary DICOM-SEG object with one segment, empty slices included.
-
-    Raises:
-        InputError: highdicom is absent, or the file cannot be written.
-    """
+    """Write a mask as a binary DICOM-SEG object with one segment, empty slices included."""
     hd = need_highdicom(path)
     from pydicom.sr.codedict import codes
 
@@ -93,17 +81,8 @@ def write_seg(mask: LumenMask, path: Path) -> None:
 
 
 def read_seg(path: Path, label: int | str | None = None) -> Volume:
-    """Read one segment of a DICOM-SEG object, whatever other segments overlap it, as a volume of booleans.
-
-    Of a fractional segment, voxels that it fills by half or more are taken, and a note says so.
-
-    Args:
-        path: the file.
-        label: number or SegmentLabel of the segment; None where there is but one.
-
-    Raises:
-        InputError: the file is damaged, no segmentation, or not on a regular grid, or the segment is not there.
-    """
+    """Read one segment of a DICOM-SEG object, by number or SegmentLabel, as booleans; of a fractional one, voxels that
+    it fills by half or more. Raises InputError for a damaged or another file, an irregular grid, or no such segment."""
     import pydicom  # comes with an extra
 
     try:
@@ -142,12 +121,9 @@ def read_seg(path: Path, label: int | str | None = None) -> Volume:
 
 
 def _frames(content: Dataset) -> tuple[list[int], np.ndarray, tuple[float, ...], tuple[float, ...], float]:
-    """Return the geometry of all frames; any error means that the object is none that can be read.
-
-    Returns:
-        Of each frame ReferencedSegmentNumber (0 in a label map) and ImagePositionPatient, LPS mm; of all
-        ImageOrientationPatient, PixelSpacing, and SpacingBetweenSlices (0 where it is absent), mm.
-    """
+    """Return each frame's ReferencedSegmentNumber (0 in a label map) and ImagePositionPatient; of all
+    ImageOrientationPatient, PixelSpacing and SpacingBetweenSlices (0 if absent), mm. Any error means an unreadable
+    object."""
     shared = content.SharedFunctionalGroupsSequence[0]
 
     def item(frame: Dataset, name: str) -> Dataset:

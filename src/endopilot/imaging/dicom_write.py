@@ -1,8 +1,5 @@
-"""CT to DICOM: one series of uncompressed slices that names no patient.
-
-The attributes are those that DICOM requires of a CT image (PS3.3 A.3.3); those of type 2 are present and empty.
-highdicom writes no CT images but needs the same header for a mask: pydicom makes it for both.
-"""
+"""CT to DICOM: one series of uncompressed slices that names no patient, with the attributes that DICOM requires of a CT
+image (PS3.3 A.3.3); highdicom writes no CT images but needs the same header for a mask."""
 
 from __future__ import annotations
 
@@ -28,17 +25,8 @@ _UNNAMED = (
 
 
 def write_series(volume: Volume, folder: Path) -> None:
-    """Write a CT volume as a DICOM series, one file a slice, without any patient's data.
-
-    HU are rounded to whole numbers. The same volume gives the same bytes.
-
-    Args:
-        volume: CT in HU.
-        folder: a new folder, or an empty one.
-
-    Raises:
-        InputError: the folder holds files already, or cannot be written.
-    """
+    """Write a CT volume in whole HU as a DICOM series without patient's data, a file a slice; the same volume gives the
+    same bytes. Raises InputError where the folder holds files already, or cannot be written."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: is there already; give a new folder for the DICOM series")
     voxels = np.clip(np.round(volume.voxels), -32768, 32767).astype("<i2")
@@ -51,11 +39,7 @@ def write_series(volume: Volume, folder: Path) -> None:
 
 
 def save(content: Dataset, path: Path) -> None:
-    """Write a DICOM file, and compare what has arrived byte by byte.
-
-    Raises:
-        InputError: other bytes have arrived.
-    """
+    """Write a DICOM file, and compare what has arrived byte by byte; raises InputError if it differs."""
     stream = io.BytesIO()
     content.save_as(stream, enforce_file_format=True)
     path.write_bytes(stream.getvalue())
@@ -64,10 +48,7 @@ def save(content: Dataset, path: Path) -> None:
 
 
 def slice_headers(volume: Volume) -> list[Dataset]:
-    """Return the header of every slice of a volume, pixels left out.
-
-    The UIDs are made from the volume's own content (PS3.5 B.2), so that nothing of another header is in them.
-    """
+    """Return each slice's header, pixels left out; UIDs follow from the volume's own content (PS3.5 B.2)."""
     content = hashlib.sha256(np.ascontiguousarray(volume.voxels).tobytes())
     for part in (volume.spacing_mm, volume.origin_mm, volume.direction):
         content.update(np.ascontiguousarray(part).tobytes())
@@ -87,7 +68,6 @@ def slice_headers(volume: Volume) -> list[Dataset]:
 
 
 def _slice_header(volume: Volume, k: int) -> Dataset:
-    """Return the header of slice `k` without its UIDs."""
     header = Dataset()
     header.file_meta = FileMetaDataset()
     header.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian

@@ -1,8 +1,7 @@
 """Where the voxels of an image lie: one rule on spacing, origin and axes for every file format.
 
-Spacings are finite and positive, axes are unit vectors at right angles. Axes that miss this by less than 1e-2 are
-those of a header with few digits: they are straightened, and the volume's notes say so. Beyond, the image is sheared
-(a gantry tilt, for instance), and is refused with the name of the header's field.
+Axes that miss right angles by less than 1e-2 are those of a header with few digits: they are straightened, and noted.
+Beyond, the image is sheared (a gantry tilt, for instance), and is refused with the name of the header's field.
 """
 
 from __future__ import annotations
@@ -18,12 +17,9 @@ from jaxtyping import Float, Int, Shaped
 from endopilot.errors import InputError
 from endopilot.types import Volume
 
-AXES_TOLERANCE = 1e-2
-"""Cosine between two axes, and share by which a unit vector's length may err, below which axes are straightened."""
-_PLACE_TOLERANCE = 0.05
-"""A slice may lie off its place by this share of the step: positions are written with few digits."""
-_ROUNDING = 1e-5
-"""What single precision and six decimals leave: it moves no voxel by more than some micrometres, and is not noted."""
+AXES_TOLERANCE = 1e-2  # cosine between axes, and error of a unit vector's length, below which they are straightened
+_PLACE_TOLERANCE = 0.05  # a slice may lie off its place by this share of the step: positions have few digits
+_ROUNDING = 1e-5  # what single precision and six decimals leave, some micrometres: it is not noted
 
 MM_PER_UNIT = {
     **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1.0),
@@ -34,8 +30,7 @@ MM_PER_UNIT = {
     **dict.fromkeys(("in", "inch", "inches"), 25.4),
 }
 """Millimetres in each unit of length that a header may name, in lower case."""
-_CONVERTED_MM = (1e-3, 20.0)
-"""Voxel sizes that a unit other than mm may lead to, mm: others show that the header names the wrong unit."""
+_CONVERTED_MM = (1e-3, 20.0)  # voxel sizes that a unit other than mm may lead to, mm: else the unit is wrong
 
 
 @dataclass(frozen=True)
@@ -49,14 +44,7 @@ class Fields:
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Where voxels lie, as `Volume` holds it, and what was done to the header's numbers.
-
-    Attributes:
-        spacing_mm: distance between neighbouring voxel centres along i, j and k, mm.
-        origin_mm: LPS position of the centre of voxel (0, 0, 0), mm.
-        direction: columns are the LPS unit vectors along which i, j and k grow.
-        notes: a sentence for each change.
-    """
+    """Where voxels lie, as in `Volume` (mm, LPS), and a sentence for each change made to the header's numbers."""
 
     spacing_mm: Float[np.ndarray, "3"]
     origin_mm: Float[np.ndarray, "3"]
@@ -77,19 +65,9 @@ def geometry(
     path: Path,
     fields: Fields,
 ) -> Geometry:
-    """Return the geometry of an image, its axes straightened to the nearest rotation about the volume's centre.
-
-    Args:
-        direction: columns are the LPS directions of i, j and k, of length 1.
-        spacing_mm: distance between voxel centres along i, j and k, mm.
-        origin_mm: centre of the first voxel, LPS mm.
-        size: number of voxels along i, j and k.
-        path: the file, for messages.
-        fields: what its format calls these, for messages.
-
-    Raises:
-        InputError: a number is not finite, a spacing is not positive, an axis is no unit vector, or axes are sheared.
-    """
+    """Return the geometry of an image of `size` (i, j, k), its axes (columns of `direction`) straightened to the
+    nearest rotation about its centre. Raises InputError, which names the header's `fields`, for what is no such
+    geometry."""
     for name, values in ((fields.spacing, spacing_mm), (fields.origin, origin_mm), (fields.direction, direction.T)):
         if not np.isfinite(values).all():
             raise InputError(f"{path}: {name} holds {_text(values)}, which is not finite; export it again")
@@ -126,10 +104,7 @@ def geometry(
 
 
 def parted(steps_mm: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """Return the directions and the lengths of steps from voxel to voxel, the columns of a header's matrix.
-
-    A step without length, or one that is not finite, is left as it is, for `geometry` to refuse.
-    """
+    """Return directions and lengths of a header's steps along i, j and k; `geometry` refuses one without length."""
     lengths = np.linalg.norm(steps_mm, axis=0)
     with np.errstate(invalid="ignore"):
         return steps_mm / np.where(lengths > 0, lengths, 1.0), lengths
@@ -145,16 +120,8 @@ def farthest_apart_mm(one: Geometry | Volume, other: Geometry | Volume, size: Se
 def plane(
     orientation: Sequence[float], spacing_mm: Sequence[float], *, path: Path
 ) -> tuple[Float[np.ndarray, "3 2"], Float[np.ndarray, "3"]]:
-    """Return the directions in which i and j grow in a DICOM slice, as its header gives them, and their unit normal.
-
-    Args:
-        orientation: ImageOrientationPatient, six numbers.
-        spacing_mm: PixelSpacing: between rows, between columns, mm.
-        path: the file, for messages.
-
-    Raises:
-        InputError: they are no unit vectors at right angles, or pixels have no size.
-    """
+    """Return the directions of i and j in a DICOM slice, from ImageOrientationPatient and PixelSpacing, and their unit
+    normal. Raises InputError for axes that are not at right angles, or pixels without size."""
     axes = np.array(orientation, dtype=float).reshape(2, 3).T
     normal = np.cross(axes[:, 0], axes[:, 1])
     length = float(np.linalg.norm(normal))
@@ -173,22 +140,9 @@ def slice_grid(
     *,
     path: Path,
 ) -> Geometry:
-    """Return where the voxels of parallel slices lie (DICOM PS3.3 C.7.6.2.1.1).
-
-    Not the step from slice to slice is bounded, whose errors add up, but how far each slice lies from its place in the
-    even grid from the first to the last, along the slice too.
-
-    Args:
-        positions: ImagePositionPatient of each slice, LPS mm.
-        slots: number of each slice, from 0; several images may be of one slice, and slices may be left out.
-        axes: directions of i and j.
-        spacing_mm: PixelSpacing: between rows, between columns, mm.
-        size: Rows, Columns.
-        path: the file or folder, for messages.
-
-    Raises:
-        InputError: a slice lies elsewhere than even steps put it, or slices are stacked along a slant.
-    """
+    """Return where the voxels of parallel slices of `size` (Rows, Columns) lie (DICOM PS3.3 C.7.6.2.1.1). Bounded is
+    how far each lies from its place in the even grid, not the step, whose errors add up; `slots` number the slices from
+    0. Raises InputError for uneven steps or a slant."""
     first, last = positions[slots.argmin()], positions[slots.argmax()]
     travel = (last - first) / slots.max()
     step = float(np.linalg.norm(travel))
@@ -210,17 +164,7 @@ def slice_grid(
 
 
 def converted(unit: str, sizes: Float[np.ndarray, "3"], *, path: Path, field: str) -> tuple[float, tuple[str, ...]]:
-    """Return the factor from a header's unit of length to mm, and the note that says so.
-
-    Args:
-        unit: as the header names it, in any case.
-        sizes: of the voxels in that unit.
-        path: the file, for messages.
-        field: of the header, for messages.
-
-    Raises:
-        InputError: the unit is unknown, or cannot be meant: voxels would be smaller than 1 µm or larger than 20 mm.
-    """
+    """Return the factor from a unit of length to mm, and its note; InputError if voxels are not of 1 µm to 20 mm."""
     factor = MM_PER_UNIT.get(unit.strip().lower())
     if factor is None:
         raise InputError(f"{path}: {field} {unit!r} is no unit of length that is known; export it in mm")

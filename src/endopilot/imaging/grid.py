@@ -1,6 +1,4 @@
-"""Volumes on other grids, the passage to SimpleITK's images and back, distances and components on a grid,
-and how far two masks of one vessel agree: `compare_masks`.
-"""
+"""Volumes on other grids and as SimpleITK's images, distances and components on a grid, and agreement of two masks."""
 
 from __future__ import annotations
 
@@ -16,8 +14,7 @@ from scipy import ndimage
 from endopilot.errors import InputError, Remark, box_text
 from endopilot.types import Anatomy, LumenMask, Volume
 
-LEAST_BLOOD_HU = 130.0
-"""Without contrast, blood measures 30-60 HU; below this value no method here can separate lumen from wall."""
+LEAST_BLOOD_HU = 130.0  # without contrast blood measures 30-60 HU; below this no method here separates lumen from wall
 
 
 def to_image(volume: Volume) -> sitk.Image:
@@ -41,11 +38,7 @@ def from_image(image: sitk.Image) -> Volume:
 
 
 def check_covers(ct: Volume, anatomy: Anatomy) -> None:
-    """Check that a CT shows a vessel; what lies beyond its edges is said in a `Remark`.
-
-    Raises:
-        InputError: more of the vessel lies outside the CT than in it.
-    """
+    """Raise InputError where a CT shows less than half of a vessel; a `Remark` says what else lies beyond its edges."""
     points = anatomy.tree.line.points
     shape = np.array(ct.voxels.shape[::-1])
     index = ct.world_to_index(points)
@@ -60,14 +53,8 @@ def check_covers(ct: Volume, anatomy: Anatomy) -> None:
 
 
 def resample(volume: Volume, spacing_mm: float) -> Volume:
-    """Return a volume on an isotropic grid, its axes in the order and sense nearest to LPS, as float32.
-
-    Axes that become coarser are smoothed first, so that fine structures are averaged and not skipped.
-
-    Args:
-        volume: the volume.
-        spacing_mm: the new distance between voxel centres, mm.
-    """
+    """Return a volume on an isotropic grid, its axes in the order and sense nearest to LPS, as float32. Axes that
+    become coarser are smoothed first, so that fine structures are averaged and not skipped."""
     oriented = from_image(sitk.DICOMOrient(to_image(volume), "LPS"))
     voxels = oriented.voxels.astype(np.float32)
     # A Gaussian of this width turns one sampling aperture (taken as Gaussian, σ half a voxel) into the other.
@@ -95,14 +82,7 @@ def interpolate_like(volume: Volume, like: Volume, outside: float) -> Float[np.n
 def distance_to_outside(
     mask: Bool[np.ndarray, "nz ny nx"], spacing_mm: float | tuple[float, float, float]
 ) -> Float[np.ndarray, "nz ny nx"]:
-    """Return, for every voxel inside a mask, the distance to the nearest voxel centre outside, mm; 0 outside.
-
-    ITK's transform (Maurer et al. 2003) gives what SciPy's gives in less than half the time, on all cores.
-
-    Args:
-        mask: the mask.
-        spacing_mm: distance between voxel centres along k, j and i, or the one for all.
-    """
+    """Return each voxel's distance to the nearest centre outside, mm; `spacing_mm` is along k, j, i, or one for all."""
     outside = sitk.GetImageFromArray((~mask).astype(np.uint8))
     outside.SetSpacing([float(step) for step in np.broadcast_to(spacing_mm, 3)[::-1]])
     signed = sitk.SignedMaurerDistanceMap(outside, insideIsPositive=False, squaredDistance=False, useImageSpacing=True)
@@ -118,15 +98,8 @@ def distance_and_nearest(
 
 
 def dilated(mask: Bool[np.ndarray, "nz ny nx"], reach: int | Sequence[int]) -> Bool[np.ndarray, "nz ny nx"]:
-    """Return the voxels whose box, so many voxels to either side, holds any of a mask.
-
-    It is SciPy's maximum filter of a mask, in a fourth of the time: a box that has grown to one size is shifted by that
-    size to make the next.
-
-    Args:
-        mask: the mask.
-        reach: voxels to either side, along k, j and i, or the one for all.
-    """
+    """Return the voxels whose box of `reach` voxels to either side (along k, j, i, or one for all) holds any of a mask:
+    a box grown to one size is shifted by that size, in a fourth of the time of SciPy's maximum filter."""
     grown = mask
     for axis, least in enumerate(np.broadcast_to(reach, 3).tolist()):
         held, done = np.moveaxis(grown, axis, 0), 0
@@ -143,26 +116,15 @@ def dilated(mask: Bool[np.ndarray, "nz ny nx"], reach: int | Sequence[int]) -> B
 
 
 def connected_components(mask: Bool[np.ndarray, "nz ny nx"], *, corners: bool = False) -> Int[np.ndarray, "nz ny nx"]:
-    """Return a number for each connected part of a mask, from 1; 0 outside.
-
-    Args:
-        mask: the mask.
-        corners: voxels that touch only at an edge or corner are connected too.
-    """
+    """Return numbers from 1 of a mask's connected parts, 0 outside; `corners` connects at edges and corners too."""
     structure = ndimage.generate_binary_structure(3, 3 if corners else 1)
     return ndimage.label(mask, structure)[0]  # pyright: ignore[reportIndexIssue]
 
 
 @dataclass(frozen=True)
 class MaskOverlap:
-    """Agreement of a mask with a reference, on the mask's grid.
-
-    Attributes:
-        dice: 2 |both| / (|mask| + |reference|).
-        share_inside_reference: share of the mask that lies in the reference.
-        cut_off_ml: volume of the reference that the mask lacks, ml.
-        beyond_ml: volume of the mask outside the reference, ml.
-    """
+    """Agreement of a mask with a reference on the mask's grid: Dice 2 |both| / (|mask| + |reference|), the mask's share
+    inside, and the volumes of either beyond the other, ml."""
 
     dice: float
     share_inside_reference: float
@@ -171,11 +133,7 @@ class MaskOverlap:
 
 
 def compare_masks(mask: LumenMask, reference: LumenMask) -> MaskOverlap:
-    """Return how far a mask agrees with a reference on any grid.
-
-    Raises:
-        InputError: the reference is empty, or lies wholly outside the mask's volume.
-    """
+    """Return how far a mask agrees with a reference on any grid; InputError if that is empty or outside the volume."""
     ours, theirs = mask.volume.voxels, mask_like(reference, mask.volume)
     if not theirs.any():
         raise InputError("reference: has no voxel set inside the volume; give a mask of the same scan")

@@ -1,7 +1,5 @@
-"""NIfTI-1 and NIfTI-2 files (https://nifti.nimh.nih.gov), read as their standard says.
-
-Where sform and qform place the voxels elsewhere, the one in the scanner's anatomical coordinates is taken.
-"""
+"""NIfTI-1 and NIfTI-2 files (https://nifti.nimh.nih.gov), read as their standard says, placed by anatomical
+coordinates."""
 
 from __future__ import annotations
 
@@ -22,18 +20,14 @@ from endopilot.imaging.geometry import Fields, Geometry, converted, farthest_apa
 from endopilot.imaging.segments import ImageFile, Segment
 from endopilot.imaging.voxels import Encoding, opened, read_voxels, rescaled
 
-_SPACING_TOLERANCE = 0.01
-"""Voxel sizes that a header gives twice may differ by this share: they are written with few digits."""
+_SPACING_TOLERANCE = 0.01  # voxel sizes given twice may differ by this share: they have few digits
 _RAS_TO_LPS = np.array([-1.0, -1.0, 1.0])
-_SCANNER = 1
-"""Code of a transform to the scanner's anatomical coordinates."""
+_SCANNER = 1  # code of a transform to the scanner's anatomical coordinates
 _LARGEST_OFFSET = 1 << 40
 _LONGEST_EXTENSION = 1 << 24
-_XML_EXTENSION = 30
-"""Code of an extension of Caret, whose XML may name labels (NIFTI_ECODE_CARET in nifti1_io.h)."""
+_XML_EXTENSION = 30  # code of an extension of Caret, whose XML may name labels (NIFTI_ECODE_CARET in nifti1_io.h)
 _UNITS = {0: "mm", 1: "m", 2: "mm", 3: "µm"}
-_INTENTS = (0, 1001, 1002, 1003)
-"""What a grey-level image or a mask may be meant as: nothing, an estimate, labels, or names of regions."""
+_INTENTS = (0, 1001, 1002, 1003)  # a grey-level image or a mask: nothing, an estimate, labels, names of regions
 
 _HEADERS = {
     348: {
@@ -67,27 +61,13 @@ _HEADERS = {
 }
 """Of each version, by the size of its header: field: (format, offset)."""
 
-_TYPES = {
-    2: "u1",
-    4: "i2",
-    8: "i4",
-    16: "f4",
-    64: "f8",
-    256: "i1",
-    512: "u2",
-    768: "u4",
-    1024: "i8",
-    1280: "u8",
-}
+_TYPES = {2: "u1", 4: "i2", 8: "i4", 16: "f4", 64: "f8", 256: "i1", 512: "u2", 768: "u4", 1024: "i8", 1280: "u8"}
 """Grey levels, by their code `datatype`."""
 
 
 def read_nifti(path: Path) -> ImageFile:
-    """Read a NIfTI file (.nii, .nii.gz), its voxels as the rescale makes them, and the names of its labels.
-
-    Raises:
-        InputError: the file is damaged, holds no three-dimensional grey levels, or does not say where they are.
-    """
+    """Read a NIfTI file (.nii, .nii.gz), its voxels rescaled, and its labels' names. Raises InputError for a damaged
+    file, one without three-dimensional grey levels, or one that does not say where they are."""
     stream = opened(path)
     try:
         with stream:
@@ -108,7 +88,6 @@ def read_nifti(path: Path) -> ImageFile:
 
 
 def _header(content: bytes, path: Path) -> dict[str, Any]:
-    """Return the fields of a header, its size and its byte order, after making sure that it is one of a single file."""
     for order, size in itertools.product("<>", _HEADERS):
         if content[:4] == struct.pack(f"{order}i", size):
             break
@@ -167,10 +146,7 @@ def _offset(header: dict[str, Any], path: Path) -> int:
 
 
 def _named_labels(content: bytes, order: str) -> tuple[Segment, ...]:
-    """Return the names in a header's extensions, as TotalSegmentator and Connectome Workbench write them.
-
-    An extension is its size, its kind and its content; names are XML: `<Label Key="52"><![CDATA[aorta]]></Label>`.
-    """
+    """Return names in a header's extensions, in XML as TotalSegmentator and Connectome Workbench write them."""
     at = 4 if content[:1] not in (b"", b"\0") else len(content)
     while at + 8 <= len(content):
         size, kind = struct.unpack_from(f"{order}2i", content, at)

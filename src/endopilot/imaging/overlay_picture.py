@@ -27,15 +27,8 @@ def draw_overlay(
     reference: LumenMask | None = None,
     through: Float[np.ndarray, "3"] | None = None,
 ) -> None:
-    """Write a PNG of an axial, a coronal and a sagittal slice, the mask outlined in green and a reference in red.
-
-    Args:
-        volume: CT in HU, its axes nearly along LPS.
-        mask: the segmentation, on any grid.
-        path: the PNG.
-        reference: another mask to compare with, on any grid.
-        through: LPS position that the slices pass, mm; by default each passes where the mask's section is largest.
-    """
+    """Write a PNG of three slices, the mask outlined in green and a reference in red, on any grids. They pass `through`
+    an LPS position, mm, or each where the mask's section is largest."""
     outlines = [(mask_like(mask, volume), "lime")]
     if reference is not None:
         outlines.append((mask_like(reference, volume), "red"))

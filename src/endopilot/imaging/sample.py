@@ -1,8 +1,5 @@
-"""A real CT angiogram to try: fetched once, checked, and kept in the user's cache.
-
-The volume is a test file of TotalSegmentator (https://github.com/wasserth/TotalSegmentator, Apache-2.0), which is in
-its source distribution on the Python package index.
-"""
+"""A real CT angiogram to try, fetched once into the user's cache: a test file in the source distribution of
+TotalSegmentator (https://github.com/wasserth/TotalSegmentator, Apache-2.0)."""
 
 from __future__ import annotations
 
@@ -44,16 +41,8 @@ _FILES = {
 
 
 def fetch_sample(name: str = "cta-thorax") -> Path:
-    """Return the path of a sample CT, fetched into the user's cache if it is not there.
-
-    Its masks lie beside it. Licence and source are printed on standard error.
-
-    Args:
-        name: `cta-thorax`.
-
-    Raises:
-        InputError: the sample is unknown, cannot be fetched, or is not what it should be.
-    """
+    """Return the path of a sample CT, masks beside it, fetched if needed, its licence and source on standard error.
+    Raises InputError if it is unknown, cannot be fetched, or is not what it should be."""
     import pooch
 
     if name != _NAME:

@@ -1,7 +1,4 @@
-"""Segmentation of one vessel's lumen: the entry function of the imaging stage, its settings and its methods.
-
-Before a method searches a CT, its histogram must show HU and, where a method needs a pool of blood, contrast.
-"""
+"""Segmentation of one vessel's lumen: the entry function of the imaging stage, settings, methods and first checks."""
 
 from __future__ import annotations
 
@@ -34,20 +31,13 @@ METHODS = Registry(
     group="endopilot.segmentation",
 )
 """Where the segmentation methods are. Each is a `SegmentationMethod`, or just its function `segment_lumen`."""
-_ROOT_MM = 5.0
-"""An ostium is on an aorta of 9 mm radius or more: where it is nearer to the volume's edge, the root is cut off."""
-_BLOCK_MM = 2.0
-"""Voxels are averaged to blocks of about this size: noise goes, pools of blood stay."""
-_CALM_HU = 25.0
-"""Tissue is homogeneous where its standard deviation over 3 × 3 × 3 blocks is smaller: blood is, bone is not."""
-_NOISE_FACTOR = 1.3
-"""In a noisy scan, the limit is this many times the lower quartile of that deviation in fat, muscle and blood."""
-_BRIGHTEST_HU = 900.0
-"""Metal and dense bone lie above this, no blood does."""
-_LEAST_POOL_ML = 4.0
-"""Less than the inside of any heart chamber; homogeneous bone of the thorax comes in smaller pieces."""
-_POOL_MM = 20.0
-"""Diameter of a ball of that volume: a field of view that is shorter holds only a slice of a pool."""
+_ROOT_MM = 5.0  # an ostium is on an aorta of 9 mm or more: nearer to the volume's edge, the root is cut off
+_BLOCK_MM = 2.0  # voxels are averaged to blocks of about this size: noise goes, pools of blood stay
+_CALM_HU = 25.0  # tissue with a smaller SD over 3 × 3 × 3 blocks is homogeneous: blood is, bone is not
+_NOISE_FACTOR = 1.3  # in a noisy scan, the limit in lower quartiles of that SD in fat, muscle and blood
+_BRIGHTEST_HU = 900.0  # metal and dense bone lie above this, no blood does
+_LEAST_POOL_ML = 4.0  # less than any heart chamber holds; homogeneous bone of the thorax is smaller
+_POOL_MM = 20.0  # diameter of a ball of that volume: a field of view that is shorter holds only a slice of a pool
 
 
 @settings
@@ -85,11 +75,9 @@ class SegmentationMethod:
     """A method that finds the lumen of a vessel in a CT angiogram.
 
     Attributes:
-        segment_lumen: takes the volume (HU) and the settings, and returns the mask of the lumen on the volume's grid,
-            with the ostium if it finds one.
-        options: the method's own settings with their defaults; `config.settings(options)` returns them as given.
-        blood_pools: whether the method needs an aorta or a heart chamber in the volume; contrast is then looked for
-            before it runs.
+        segment_lumen: from volume (HU) and settings to the lumen's mask on the volume's grid, with any ostium found.
+        options: its own settings with their defaults; `config.settings(options)` returns them as given.
+        blood_pools: whether it needs an aorta or a heart chamber; contrast is then looked for before it runs.
     """
 
     segment_lumen: Callable[[Volume, SegmentConfig], LumenMask]
@@ -190,18 +178,8 @@ def _refuse_cut_root(volume: Volume, ostium: Insertion) -> None:
 
 
 def refuse_other_units(volume: Volume, seeds: Sequence[Sequence[float]] = ()) -> None:
-    """Refuse a volume that cannot be in HU.
-
-    A CT that was cut off at 0, or stripped of all but the brain, holds nothing below 0 either. Seeds tell it from one
-    whose rescale is lost: at them it has the HU of blood with contrast.
-
-    Args:
-        volume: CT in HU.
-        seeds: places in the vessel, LPS mm.
-
-    Raises:
-        InputError: nothing is below 0, where fat, lung and air are, and no blood at seeds shows that it is CT.
-    """
+    """Raise InputError for a volume that cannot be in HU: nothing is below 0, where fat, lung and air are, and at the
+    seeds (LPS mm) it has not the HU of blood with contrast, as a CT that was cut off at 0 or stripped would."""
     low, high = float(volume.voxels.min()), float(volume.voxels.max())
     if low < 0:
         return
@@ -222,14 +200,8 @@ def refuse_other_units(volume: Volume, seeds: Sequence[Sequence[float]] = ()) ->
 
 
 def refuse_without_contrast(volume: Volume) -> None:
-    """Refuse a CT of the chest or abdomen whose blood holds no contrast.
-
-    The histogram is that of homogeneous tissue. Blood with contrast is the one tissue that fills millilitres there
-    above 130 HU; blood without measures 30 to 60 HU, like muscle. Of a field of view shorter than a pool, a
-    proportionally smaller pool is asked for.
-
-    Raises:
-        InputError: no connected 4 ml of homogeneous tissue are that bright.
+    """Raise InputError for a CT of chest or abdomen without 4 connected ml (fewer in a short field of view) of
+    homogeneous tissue above 130 HU: only blood with contrast fills millilitres there; without, it measures 30 to 60 HU.
     """
     extent_mm = float((volume.spacing_mm * volume.voxels.shape[::-1]).min())
     blocks, size_mm = _blocks(volume)

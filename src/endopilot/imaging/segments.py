@@ -20,13 +20,7 @@ _LIKE_NEIGHBOURS = 0.25
 
 @dataclass(frozen=True)
 class Segment:
-    """A segment as a file describes it.
-
-    Attributes:
-        name: empty where it has none.
-        layer: which of the file's label images it is in, from 0.
-        value: of its voxels there.
-    """
+    """A segment of a file: its name (or empty), the label image that it is in, from 0, and its value there."""
 
     name: str
     layer: int
@@ -35,13 +29,7 @@ class Segment:
 
 @dataclass(frozen=True, eq=False)
 class ImageFile:
-    """What an image file holds.
-
-    Attributes:
-        volume: the voxels, of the first layer where there are several.
-        layers: all voxels, layer first: one for a plain volume.
-        segments: those that its header names.
-    """
+    """An image file's content: the volume of its first layer, all layers, and the segments that its header names."""
 
     volume: Volume
     layers: Shaped[np.ndarray, "layers nz ny nx"]
@@ -51,20 +39,9 @@ class ImageFile:
 def inside_segment(
     image: ImageFile, label: int | str | None, threshold: float | None, path: Path
 ) -> tuple[Bool[np.ndarray, "nz ny nx"], tuple[str, ...]]:
-    """Return the voxels of the one segment that holds some, or of the one asked for, and what is to be noted.
-
-    A segment's number is its value; where segments of several layers share values, it is its place in the file, from 1.
-
-    Args:
-        image: label images, 0 outside, or grey levels.
-        label: number or name of a segment; None where there is but one.
-        threshold: of grey levels, between those inside and outside.
-        path: the file, for messages.
-
-    Raises:
-        InputError: a layer is neither a label image nor grey levels with a threshold, nothing is inside, or the label
-            is not there or not given.
-    """
+    """Return the voxels of the one segment that holds some, or was asked for, and notes. Its number is its value, or
+    its place in the file, from 1, where several layers share values; `threshold` divides grey levels. Raises InputError
+    where a layer is neither, nothing is inside, or the label is not there or not given."""
     layers = image.layers
     if threshold is not None:
         if label is not None or len(layers) > 1:
@@ -99,17 +76,7 @@ def _inside_threshold(
 def choose(
     numbered: Sequence[tuple[int, Segment]], label: int | str | None, path: Path, *, show_names: bool = True
 ) -> Segment:
-    """Return the one segment there is, or the one with a number or name.
-
-    Args:
-        numbered: segments that hold voxels, each with its number.
-        label: number or name of a segment; None where there is but one.
-        path: the file, for messages.
-        show_names: whether messages may hold the names.
-
-    Raises:
-        InputError: there are several, or none or several of that name.
-    """
+    """Return the only segment, or that of a number or name; InputError, which names them if `show_names`."""
     listed = ", ".join(_shown(number, s.name if show_names else "") for number, s in numbered[:_MOST_LISTED])
     listed += ", …" if len(numbered) > _MOST_LISTED else ""
     if label is None:
@@ -159,11 +126,8 @@ def _values(layer: Shaped[np.ndarray, "nz ny nx"], asked: bool, path: Path) -> l
 
 
 def _is_grey(layer: Shaped[np.ndarray, "nz ny nx"], usual: float) -> bool:
-    """Return whether whole numbers are grey levels: neighbours not both 0, nor of the usual value, are seldom alike.
-
-    Along some axis 0 to 24 % of them are in most vessels of 1 to 12 mm that were resampled to 2 to 255 greys, 29 %
-    or more in a label one voxel thick, and 60 % or more in all others that were tried.
-    """
+    """Return whether whole numbers are grey levels: few neighbours are alike, neither both 0 nor of the usual value:
+    along some axis at most 24 % in vessels of 1 to 12 mm in 2 to 255 greys, 29 % or more in thinnest labels."""
     for axis in range(3):
         one, other = (np.moveaxis(layer, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
         pairs = (one != 0) & (other != 0) & ((one != usual) | (other != usual))

@@ -1,11 +1,6 @@
-"""Images with a text header: NRRD (.nrrd, .nhdr), 3D Slicer's segmentations (.seg.nrrd), MetaImage (.mha, .mhd).
-
-NRRD: https://teem.sourceforge.net/nrrd/format.html. A segmentation of Slicer is one label image, or several in layers
-where segments overlap; its header names each segment's layer and value.
-
-MetaImage: https://itk.org/Wiki/MetaIO/Documentation. `AnatomicalOrientation` repeats in words what `TransformMatrix`
-says in numbers, in ITK's way: RAI are axes that run from right, anterior and inferior, which is LPS.
-"""
+"""Images with a text header: NRRD (.nrrd, .nhdr; https://teem.sourceforge.net/nrrd/format.html), Slicer's segmentations
+(.seg.nrrd), whose header names each segment's layer and value, and MetaImage (.mha, .mhd;
+https://itk.org/Wiki/MetaIO/Documentation), where RAI are axes from right, anterior and inferior, which is LPS."""
 
 from __future__ import annotations
 
@@ -36,8 +31,7 @@ _NRRD_TYPES = {
     **dict.fromkeys(("int", "signed int", "int32", "int32_t"), "i4"),
     **dict.fromkeys(("uint", "unsigned int", "uint32", "uint32_t"), "u4"),
     **dict.fromkeys(
-        ("longlong", "long long", "long long int", "signed long long", "signed long long int", "int64", "int64_t"),
-        "i8",
+        ("longlong", "long long", "long long int", "signed long long", "signed long long int", "int64", "int64_t"), "i8"
     ),
     **dict.fromkeys(("ulonglong", "unsigned long long", "unsigned long long int", "uint64", "uint64_t"), "u8"),
     "float": "f4",
@@ -74,16 +68,11 @@ _META_SYNONYMS = {
     "ElementByteOrderMSB": "BinaryDataByteOrderMSB",
 }
 _META_FIELDS = Fields("TransformMatrix", "ElementSpacing", "Offset")
-_FROM = ("RL", "AP", "IS")
-"""Letters of `AnatomicalOrientation` along x, y and z of LPS: where an axis along it begins, and one against it."""
+_FROM = ("RL", "AP", "IS")  # letters of `AnatomicalOrientation` where an axis along x, y, z begins, or one against it
 
 
 def read_nrrd(path: Path) -> ImageFile:
-    """Read an NRRD file.
-
-    Raises:
-        InputError: the file is damaged, holds no grey levels or labels, or does not say where they are.
-    """
+    """Read an NRRD file. Raises InputError if it is damaged, holds no grey levels or labels, or tells no place."""
     with path.open("rb") as stream:
         fields, keys = _nrrd_header(stream, path)
         sizes, vectors = _axes(fields, path)
@@ -127,8 +116,6 @@ def _nrrd_header(stream: BufferedIOBase, path: Path) -> tuple[dict[str, str], di
             raise InputError(f"{path}: its header is damaged ({text[:60]!r} is no field of its own); export it again")
         fields[name] = description.strip()
         if name == "data file" and fields[name].split()[:1] == ["LIST"]:
-            rest = stream.read(_LONGEST_HEADER).decode("utf-8", errors="replace").split("\n")
-            fields[name] += "\n" + "\n".join(part.strip() for part in rest if part.strip())
             return fields, keys
     if "data file" not in fields:
         raise InputError(f"{path}: truncated or damaged (its header does not end); copy or export it again")
@@ -185,7 +172,6 @@ def _nrrd_geometry(
 
 
 def _to_lps(space: str, path: Path) -> np.ndarray:
-    """Return the signs that take the file's world axes to LPS."""
     words = space.strip().lower().split("-")
     if len(words) == 1 and len(words[0]) == 3:
         words = [_LETTERS.get(letter, "") for letter in words[0]]
@@ -200,7 +186,6 @@ def _to_lps(space: str, path: Path) -> np.ndarray:
 def _values(
     fields: dict[str, str], sizes: list[int], stream: BufferedIOBase, path: Path
 ) -> tuple[Shaped[np.ndarray, "..."], tuple[Path, ...]]:
-    """Return the voxels, the slowest axis first, and the files that they are from."""
     kind, packing = fields.get("type", "").lower(), _PACKINGS.get(fields.get("encoding", "").lower())
     if kind not in _NRRD_TYPES:
         raise InputError(f"{path}: type {kind!r} holds no grey levels; export it as short or float")
@@ -236,11 +221,7 @@ def _segments(keys: dict[str, str], path: Path) -> tuple[Segment, ...]:
 
 
 def read_metaimage(path: Path) -> ImageFile:
-    """Read a MetaImage file.
-
-    Raises:
-        InputError: the file is damaged, holds no grey levels or labels, or does not say where they are.
-    """
+    """Read a MetaImage file. Raises InputError if it is damaged, holds no grey levels or labels, or tells no place."""
     with path.open("rb") as stream:
         fields = _meta_header(stream, path)
         size = _meta_size(fields, path)
@@ -269,9 +250,6 @@ def _meta_header(stream: BufferedIOBase, path: Path) -> dict[str, str]:
             raise InputError(f"{path}: its header is damaged ({name[:40]!r} is no field of its own); export it again")
         fields[name] = value.strip()
         if name == "ElementDataFile":
-            if fields[name].split()[:1] == ["LIST"]:
-                rest = stream.read().decode("utf-8", errors="replace").split("\n")
-                fields[name] = "LIST\n" + "\n".join(part.strip() for part in rest if part.strip())
             return fields
     raise InputError(f"{path}: truncated or damaged (its header does not end); copy or export it again")
 

@@ -14,12 +14,9 @@ from scipy.spatial import KDTree
 
 from endopilot.imaging.grid import distance_to_outside
 
-_SHORTEST_BRANCH_MM = 4.0
-"""Shorter side branches are bumps of the wall."""
-_COST_FLOOR = 0.05
-"""Added to the vesselness, so that a path through a gap has a finite cost."""
-_SMOOTHING_MM = 1.5
-"""Width of the Gaussian that takes the voxel steps out of a path, mm."""
+_SHORTEST_BRANCH_MM = 4.0  # shorter side branches are bumps of the wall
+_COST_FLOOR = 0.05  # added to the vesselness, so that a path through a gap has a finite cost
+_SMOOTHING_MM = 1.5  # width of the Gaussian that takes the voxel steps out of a path, mm
 
 
 def vesselness(
@@ -34,14 +31,8 @@ def vesselness(
 
     Of the Hessian's eigenvalues λ₁ ≤ λ₂ ≤ λ₃ at scale σ, a bright tube has λ₁ ≈ λ₂ ≪ 0; the surface of a chamber has
     only λ₁ ≪ 0. The response is therefore −σ²λ₂ (Sato et al. 1998), divided by e⁻¹ times the contrast, which is what a
-    straight tube of radius √2·σ gives: its profile 1 − exp(−r²/2σ²) has −σ²·d²/dx² = u·exp(−u) with u = r²/2σ².
-
-    Args:
-        hu: image on an isotropic grid.
-        where: where the response is wanted; it is 0 elsewhere. The voxels at the volume's border are left out.
-        spacing_mm: distance between voxel centres, mm.
-        sigmas_mm: widths of the Gaussians, mm; a tube of radius r answers most at r/√2.
-        contrast_hu: HU of the lumen above its surroundings.
+    straight tube of radius √2·σ gives: its profile 1 − exp(−r²/2σ²) has −σ²·d²/dx² = u·exp(−u) with u = r²/2σ². It is 0
+    but `where` it is wanted, and at the border; a tube of radius r answers most at σ = r/√2.
     """
     where = where.copy()
     for axis in range(3):
@@ -80,10 +71,7 @@ def _hessian(smooth: np.ndarray, k: np.ndarray, j: np.ndarray, i: np.ndarray) ->
 def _middle_eigenvalue(
     xx: np.ndarray, yy: np.ndarray, zz: np.ndarray, xy: np.ndarray, xz: np.ndarray, yz: np.ndarray
 ) -> np.ndarray:
-    """Return the middle eigenvalue of symmetric 3×3 matrices, by the trigonometric solution (Smith 1961).
-
-    `skimage.feature.hessian_matrix_eigvals` asks LAPACK matrix by matrix, which takes 25 times as long.
-    """
+    """Return symmetric 3×3 matrices' middle eigenvalue (Smith 1961), 25 times as fast as by LAPACK matrix by matrix."""
     mean = (xx + yy + zz) / 3
     a, b, c = xx - mean, yy - mean, zz - mean
     spread = np.sqrt(np.maximum((a * a + b * b + c * c + 2 * (xy * xy + xz * xz + yz * yz)) / 6, 1e-12))
@@ -99,21 +87,9 @@ def track_tree(
     ends: list[Int[np.ndarray, "3"]],
     spacing_mm: float,
 ) -> list[Float[np.ndarray, "_ 3"]]:
-    """Return the paths from `start` to every distal end of the tree, each from where it leaves those before it.
-
-    The farthest end is reached first; what its path covers is taken away, and so on until what is left is shorter than
-    a branch (after TEASAR, Sato et al. 2000). A path has the least cost; a strong response makes a step cheap.
-
-    Args:
-        response: vesselness.
-        passable: the tree's voxels; paths stay inside.
-        start: passable voxel (k, j, i) nearest the ostium.
-        ends: passable voxels that a path must reach, whatever its length.
-        spacing_mm: distance between voxel centres, mm.
-
-    Returns:
-        Continuous voxel indices (k, j, i), the longest path first.
-    """
+    """Return the paths (voxel indices k, j, i) from `start` to every distal end, farthest first, each from where it
+    leaves those before it, until what is left is shorter than a branch (after TEASAR, Sato et al. 2000). A strong
+    vesselness makes steps in `passable` voxels cheap; `ends` must be reached, whatever the length."""
     voxels = np.argwhere(passable)
     number = np.full(passable.shape, -1, dtype=np.int32)
     number[passable] = np.arange(len(voxels))
@@ -168,7 +144,6 @@ def _graphs(number: np.ndarray, voxels: np.ndarray, response: np.ndarray) -> tup
 
 
 def _trace(before: np.ndarray, tip: int, on_path: np.ndarray) -> Int[np.ndarray, "n"]:
-    """Return the voxels from the first one already on a path, or from the root, to the tip."""
     path = [tip]
     while before[path[-1]] >= 0 and not on_path[path[-1]]:
         path.append(int(before[path[-1]]))

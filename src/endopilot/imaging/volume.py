@@ -1,9 +1,5 @@
-"""Reading and writing volumes and masks, in LPS mm, whatever the file format.
-
-CT comes from a DICOM series or from NIfTI, NRRD or MHA; masks from the last three or DICOM-SEG. RAS files are turned
-into LPS and the rescale slope and intercept are applied, so that voxels are HU. A file is read right, or its volume's
-notes say what was changed, or it is refused in one line.
-"""
+"""Reading and writing volumes and masks, in LPS mm and HU, whatever the file format: a file is read right, or its
+volume's notes say what was changed, or it is refused in one line."""
 
 from __future__ import annotations
 
@@ -27,15 +23,11 @@ from endopilot.imaging.voxels import compact
 from endopilot.settings import public
 from endopilot.types import Insertion, LumenMask, Volume
 
-SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha")
-"""File formats that are read and written, by suffix."""
-
-MASK_SUFFIXES = (*SUFFIXES, dicom_seg.SUFFIX)
-"""File formats of masks, by suffix; the last is a DICOM-SEG object."""
+SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha")  # file formats that are read and written, by suffix
+MASK_SUFFIXES = (*SUFFIXES, dicom_seg.SUFFIX)  # file formats of masks, by suffix; the last is a DICOM-SEG object
 
 _READ_ONLY_SUFFIXES = (".mhd", ".nhdr")
-_SMALLEST_SIZE = 4
-"""Fewer voxels than this along an axis are no volume: a slice, or a scout view."""
+_SMALLEST_SIZE = 4  # fewer voxels than this along an axis are no volume: a slice, or a scout view
 
 
 @public
@@ -85,16 +77,8 @@ def _is_dicom(path: Path) -> bool:
 
 
 def check_output(path: str | Path, *, mask: bool = False) -> None:
-    """Refuse a name that nothing could be written under, before the work is done.
-
-    Args:
-        path: where a volume, or a mask, is to be written.
-        mask: it is a mask; a volume may go to a folder of DICOM slices too, a mask to a DICOM-SEG object.
-
-    Raises:
-        InputError: the suffix is unknown, the folder holds something, highdicom is absent, or the JSON file beside a
-            mask would replace one that is not this mask's.
-    """
+    """Raise InputError for a name that nothing could be written under, before the work is done: an unknown suffix, a
+    folder that holds something, DICOM-SEG without highdicom, or a JSON file beside a mask that is not this mask's."""
     path = Path(path)
     if mask and (sidecar := _sidecar(path)).exists() and _mask_of(sidecar).get("name") != path.name:
         raise InputError(
@@ -112,17 +96,8 @@ def check_output(path: str | Path, *, mask: bool = False) -> None:
 
 
 def write_volume(volume: Volume, path: str | Path) -> None:
-    """Write a volume; the suffix of `path` chooses the format, and a path without suffix makes a DICOM series.
-
-    Booleans are written as uint8; a DICOM series holds whole HU.
-
-    Args:
-        volume: the volume.
-        path: a file ending in .nii.gz, .nii, .nrrd or .mha, or a new folder for a DICOM series of CT images.
-
-    Raises:
-        InputError: the suffix is unknown, the folder holds something or cannot be written, or the disk is full.
-    """
+    """Write a volume; the suffix (.nii.gz, .nii, .nrrd, .mha) chooses the format, and a new folder makes a DICOM
+    series, of whole HU. Booleans become uint8. Raises InputError for a suffix or folder that does not do."""
     path = Path(path)
     check_output(path)
     if path.suffix == "":
@@ -135,11 +110,7 @@ def write_volume(volume: Volume, path: str | Path) -> None:
 
 
 def _write_file(volume: Volume, partial: Path) -> None:
-    """Write a volume to a temporary file, and read it again: ITK does not tell all that goes wrong.
-
-    Raises:
-        OSError: what the file holds is not the volume, as on a full disk.
-    """
+    """Write a volume to a temporary file, and read it again: ITK does not tell of a full disk (OSError)."""
     try:
         # Level 1 costs a few percent in size and saves most of the time.
         sitk.WriteImage(to_image(volume), partial, useCompression=partial.suffix != ".nii", compressionLevel=1)
@@ -157,12 +128,7 @@ def read_mask(path: str | Path, *, label: int | str | None = None, threshold: fl
     Args:
         path: a NIfTI, NRRD or MHA file of whole numbers, 0 outside, or of grey levels; or a DICOM-SEG object.
         label: number or name of the segment to take where the file holds several; segments may overlap.
-        threshold: of grey levels (probabilities, a resampled mask, a signed distance), the value at the wall; the
-            volume's border is outside.
-
-    Returns:
-        The mask; its ostium is None where no sidecar holds it. Its warnings are those of the sidecar, and what
-        reading it changed.
+        threshold: of grey levels, the value at the wall; the volume's border is outside.
 
     Raises:
         InputError: the file is missing, damaged or no mask, the label is not in it, or nothing is inside.
@@ -183,20 +149,9 @@ def read_mask(path: str | Path, *, label: int | str | None = None, threshold: fl
 
 
 def write_mask(mask: LumenMask, path: str | Path, *, manifest: Mapping[str, Any]) -> None:
-    """Write a mask, and beside it `<stem>.json` with its ostium, method and warnings and the manifest of the run.
-
-    The JSON file holds the mask's name and SHA-256, so that no other mask is taken for it. Either both are written or
-    none.
-
-    Args:
-        mask: the mask.
-        path: a file ending in .nii.gz, .nii, .nrrd, .mha, or .dcm for a DICOM-SEG object.
-        manifest: the record of the run, as `endopilot.files.manifest` makes it.
-
-    Raises:
-        InputError: the suffix is unknown, highdicom is absent, the folder cannot be written, the disk is full, or the
-            JSON file beside it is another's.
-    """
+    """Write a mask (.nii.gz, .nii, .nrrd, .mha, or .dcm for DICOM-SEG), and `<stem>.json` with its ostium, method,
+    warnings, the run's manifest, and the mask's SHA-256, by which it is of no other; or neither. Raises as
+    `check_output`."""
     path = Path(path)
     check_output(path, mask=True)
     ostium = mask.ostium
@@ -216,7 +171,6 @@ def write_mask(mask: LumenMask, path: str | Path, *, manifest: Mapping[str, Any]
 
 
 def _suffix(path: Path) -> str | None:
-    """Return the known suffix that the file's name ends in, or None."""
     name = path.name.lower()
     return next((suffix for suffix in (*SUFFIXES, *_READ_ONLY_SUFFIXES) if name.endswith(suffix)), None)
 
@@ -261,11 +215,8 @@ def _mask_of(sidecar: Path) -> dict[str, Any]:
 
 
 def _read_sidecar(mask: Path) -> tuple[Insertion | None, str, tuple[str, ...]]:
-    """Return ostium, method and warnings from the sidecar of a mask; JSON files that others put beside it have none.
-
-    An ostium in another vessel is plausible and wrong: where the sidecar is not of this very file, or does not say of
-    which, the ostium is not taken, and a warning gives it.
-    """
+    """Return ostium, method and warnings from the sidecar of a mask. An ostium in another vessel is plausible and
+    wrong: where the sidecar is not of this very file, the ostium is not taken, and a warning gives it."""
     path = _sidecar(mask)
     content = read_json(path) if path.exists() else None
     if not isinstance(content, dict) or "ostium" not in content:

@@ -1,8 +1,5 @@
-"""The voxels of image files: from bytes, packed or plain, to an array of HU or labels.
-
-Files are read here, and not by a library that looks for files of other names beside the one given. A file holds the
-voxels that its header describes, and not one byte less or more: otherwise its header or its voxels are damaged.
-"""
+"""The voxels of image files: from bytes, packed or plain, to an array, by no library that looks for files of other
+names beside the one given. A file holds exactly the bytes that its header describes, or it is damaged."""
 
 from __future__ import annotations
 
@@ -20,7 +17,6 @@ from jaxtyping import Shaped
 
 from endopilot.errors import InputError
 
-_MOST_FILES = 100_000
 _GZIP = b"\x1f\x8b"
 
 
@@ -36,7 +32,6 @@ class Encoding:
     """How a file stores voxels.
 
     Attributes:
-        dtype: type of a value, its byte order included.
         packing: raw, gzip, zlib, bzip2, or ascii: numbers with blanks between them.
         skipped_lines: before the voxels, to be left out.
         skipped_bytes: then, once unpacked, to be left out; −1 if raw voxels are the last bytes of the file.
@@ -51,17 +46,8 @@ class Encoding:
 def read_voxels(
     stream: BufferedIOBase, encoding: Encoding, shape: Sequence[int], *, path: Path
 ) -> Shaped[np.ndarray, "..."]:
-    """Return the array that a stream holds from here to its end.
-
-    Args:
-        stream: where the voxels begin, or what is to be left out before them.
-        encoding: how they are stored.
-        shape: of the array; the last axis is the fastest.
-        path: the file, for messages.
-
-    Raises:
-        InputError: there are fewer or more bytes than the shape needs, or they are damaged.
-    """
+    """Return the array of a shape, the last axis the fastest, that a stream (or bytes) holds from here to its end;
+    `path` is for messages. Raises InputError for fewer or more bytes, or damaged ones."""
     dtype, count = encoding.dtype, math.prod(int(extent) for extent in shape)
     size, skipped = count * dtype.itemsize, encoding.skipped_bytes
     try:
@@ -104,43 +90,17 @@ def _unpacked(stream: BufferedIOBase, packing: str, most: int) -> bytearray:
 def read_voxels_beside(
     spec: str | None, stream: BufferedIOBase, encoding: Encoding, shape: Sequence[int], *, header: Path
 ) -> tuple[Shaped[np.ndarray, "..."], tuple[Path, ...]]:
-    """Return the array of a text header, which follows there or is in files beside it, and all files.
-
-    Args:
-        spec: what NRRD and MetaImage write: a name; a pattern such as `slice%03d.raw 1 300 1`; or LIST and names, one
-            a line. Names are relative to the header; of several files each holds the same share of the array. None
-            where the array follows.
-        stream: of the header, at its end.
-        encoding: how each file stores its voxels.
-        shape: of the array; the last axis is the fastest.
-        header: the file that names them.
-
-    Raises:
-        InputError: a file is missing or damaged, or the number of files is wrong.
-    """
+    """Return the array (last axis fastest) of a text header, at its stream's end (`spec` None) or in the file beside
+    it that `spec` names, and all files. Raises InputError where that is missing or damaged."""
     if spec is None:
         return read_voxels(stream, encoding, shape, path=header), (header,)
-    first, *others = spec.split("\n")
-    words, names = first.split(), others
-    try:
-        if words[:1] != ["LIST"]:
-            low, high, step = (int(word) for word in words[1:4]) if "%" in first else (0, 0, 1)
-            numbers = range(low, high + 1, step)[:_MOST_FILES]
-            names = [words[0] % number for number in numbers] if "%" in first else [first]
-    except (TypeError, ValueError):
-        raise InputError(f"{header}: {first[:60]!r} names no files of voxels; export it as one file") from None
-    files, count = [header.parent / name for name in names], math.prod(int(extent) for extent in shape)
-    if not files or count % len(files):
-        shown = "×".join(map(str, shape[::-1]))
-        raise InputError(f"{header}: names {len(files)} files for {shown} voxels; export it again")
-    missing = next((file for file in files if not file.is_file()), None)
-    if missing is not None:
-        raise InputError(f"{header}: the file of voxels that it names is missing ({missing.name}); put it beside it")
-    parts = []
-    for file in files:
-        with file.open("rb") as content:
-            parts.append(read_voxels(content, encoding, (count // len(files),), path=file))
-    return np.concatenate(parts).reshape(tuple(shape)), (header, *files)
+    if "%" in spec or spec.split()[:1] == ["LIST"]:
+        raise InputError(f"{header}: its voxels are in several files; export it as one file")
+    file = header.parent / spec
+    if not file.is_file():
+        raise InputError(f"{header}: the file of voxels that it names is missing ({file.name}); put it beside it")
+    with file.open("rb") as content:
+        return read_voxels(content, encoding, shape, path=file), (header, file)
 
 
 def _numbers(content: bytes, dtype: np.dtype, count: int, path: Path) -> np.ndarray:

@@ -12,25 +12,18 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from endopilot.atlas import curves as shape
 from endopilot.atlas import heart_reference as reference
-from endopilot.atlas.heart_reference import HeartFit, ellipsoid, reference_courses, tube
+from endopilot.atlas.heart_reference import HeartFit, chamber, ellipsoid, reference_courses, tube
 from endopilot.lines import length_along
 from endopilot.types import Centerline, VesselTree
 
-_KNOTS = 16
-"""Points of each of the left reference courses."""
-_SLAB = 8
-"""Slices of the coarse grid whose depths are computed at once: they stay in the processor's cache."""
+_KNOTS = 16  # points of each of the left reference courses
+_SLAB = 8  # slices of the coarse grid whose depths are computed at once: they stay in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
 class Organ:
-    """One organ on the coarse grid.
-
-    Attributes:
-        name: of which tissue.
-        depth: signed distance to its surface, mm, positive inside, indexed [k, j, i].
-        clearance_mm: the organ keeps this distance from coronary lumens; None where it may touch them.
-    """
+    """One organ of a tissue on the coarse grid, by its `depth`, mm, positive inside, indexed [k, j, i]; it keeps
+    `clearance_mm` from coronary lumens, None where it may touch them."""
 
     name: str
     depth: Float[np.ndarray, "nz ny nx"]
@@ -46,10 +39,10 @@ def place(tree: VesselTree) -> HeartFit:
     """Fit the reference heart to the tree; without section labels it is a right one, its crux at 60 % of the path."""
     if is_left(tree):
         courses = reference_courses().copy()
-        # Onto the aorta's surface: the direction of its axis is nearly z there.
-        outward = courses[0] - np.array(reference.AORTA[2], dtype=float)
+        # Onto the aorta's surface, away from its axis, which passes here at the ostium's height and is nearly z.
+        outward = courses[0] - [14.5, 5.0, 0.0]
         outward[2] = 0.0
-        courses[0] += reference.aorta(courses[:1])[0] * outward / np.linalg.norm(outward)
+        courses[0] += chamber(courses[:1], "aorta")[0] * outward / np.linalg.norm(outward)
         lad, lcx = courses[:_KNOTS], courses[_KNOTS : 2 * _KNOTS]
         fork = int(np.linalg.norm(lad - lcx[0], axis=1).argmin())
         lcx = np.concatenate([lad[: fork + 1], lcx[1:]])
@@ -80,15 +73,9 @@ def organs(
     generator: np.random.Generator,
     appendage_mm: float = 0.0,
 ) -> tuple[Organ, ...]:
-    """Return the organs in painting order, from the chest wall to the blood pools.
-
-    Args:
-        heart: from `place`.
-        grid: the patient's positions of the coarse grid, mm.
-        around_vessels: signed distance to the surface of the fat that the coronaries need, mm.
-        generator: random stream of the surfaces' unevenness.
-        appendage_mm: the left atrial appendage is wider by this, mm, and touches the coronary walls; 0: it does not.
-    """
+    """Return the organs in painting order, their surfaces uneven at random. `around_vessels` is the signed distance to
+    the surface of the fat that the coronaries need; the left atrial appendage, wider by `appendage_mm` but at 0,
+    touches their walls."""
     slabs = [
         heart.to_reference(slab.reshape(-1, 3)).reshape(slab.shape).astype(np.float32)
         for slab in np.split(grid, range(_SLAB, len(grid), _SLAB))
@@ -103,13 +90,13 @@ def organs(
         return amplitude_mm * noise / noise.std()
 
     rough, wavy = uneven(0.7, 3.0), uneven(0.8, 10.0)
-    lv_wall, lv = shaped(reference.left_ventricle_wall) + wavy, shaped(reference.left_ventricle) + 1.3 * rough
-    rv, ra, la = shaped(reference.right_ventricle), shaped(reference.right_atrium), shaped(reference.left_atrium)
+    lv_wall, lv = shaped(chamber, "left_ventricle_wall") + wavy, shaped(chamber, "left_ventricle") + 1.3 * rough
+    rv, ra, la = shaped(chamber, "right_ventricle"), shaped(chamber, "right_atrium"), shaped(chamber, "left_atrium")
     rv_wall, rv, ra, la = rv + 3 + wavy, rv + wavy + rough, ra + 0.7 * rough, la + 0.5 * wavy
-    aorta, pulmonary = shaped(reference.aorta), shaped(reference.pulmonary_artery)
+    aorta, pulmonary = shaped(chamber, "aorta"), shaped(chamber, "pulmonary_artery")
     cava, lower_cava = shaped(tube, _UPPER_CAVA, (8, 8.5, 9)), shaped(tube, _LOWER_CAVA, (10, 11, 11))
     veins = np.max([shaped(tube, line, (6, 5, 3)) for line in _PULMONARY_VEINS], axis=0)
-    appendage = shaped(reference.left_appendage) + appendage_mm + 0.5 * wavy if appendage_mm > 0 else la
+    appendage = shaped(chamber, "left_appendage") + appendage_mm + 0.5 * wavy if appendage_mm > 0 else la
     epicardium = np.max([lv_wall, rv_wall, ra + 2, np.maximum(la, appendage) + 2], axis=0)
     large_vessels = np.max([aorta, pulmonary, cava, lower_cava], axis=0)
     pericardium = _close(np.max([epicardium + 2.5, large_vessels + 3, around_vessels], axis=0), 26.0, spacing_mm)
@@ -137,11 +124,8 @@ def organs(
 
 
 def other_coronary(heart: HeartFit, tree: VesselTree) -> tuple[Centerline, ...]:
-    """Return the first part of the other coronary artery, by the mean diameters of Dodge 1992.
-
-    Beside a right tree the left main (4.5 mm), LAD (3.7 mm) and LCx (3.4 mm); beside a left tree the right coronary
-    artery (4.0 mm) nearly to the acute margin.
-    """
+    """Return the first part of the other coronary artery, by mean diameters of Dodge 1992: left main (4.5 mm), LAD (3.7
+    mm) and LCx (3.4 mm), or the right one (4.0 mm) nearly to the acute margin."""
     lines = []
     for waypoints, begin, end in _RIGHT_CORONARY if is_left(tree) else _LEFT_CORONARY:
         points = heart.from_reference(shape.curve_through(np.array(waypoints, dtype=float)))
@@ -152,10 +136,7 @@ def other_coronary(heart: HeartFit, tree: VesselTree) -> tuple[Centerline, ...]:
 
 
 def cardiac_veins(heart: HeartFit, tree: VesselTree, *, touching: bool = False) -> tuple[Centerline, ...]:
-    """Return the small cardiac vein beside segments 2 and 3, a vein beside the distal artery, the coronary sinus.
-
-    Where they touch the artery, only its wall lies between.
-    """
+    """Return veins that touch the artery: beside segments 2 and 3, beside the distal artery, the coronary sinus."""
     line, crux = tree.longest_path(), _crux_abscissa(tree)
     lines = []
     if is_left(tree):
@@ -212,8 +193,7 @@ _PULMONARY_VEINS = [
     [(44, 46, -2), (62, 54, 4), (90, 50, 14)],
     [(44, 46, -16), (60, 58, -24), (88, 64, -36)],
 ]
-_TOUCHING_MM = 0.7
-"""Gap between the lumens of an artery and a vein that touches it, mm."""
+_TOUCHING_MM = 0.7  # gap between the lumens of an artery and a vein that touches it, mm
 _LEFT_GRAFT = [(9, -9, 22), (9, -20, 27), (16, -36, 21), (28, -44, 10), (44, -48, -6)]
 _RIGHT_GRAFT = [(2, -8, 20), (-6, -19, 20), (-26, -22, 6), (-38, -20, -14), (-41, -14, -36)]
 """From within the aorta's front wall over the pulmonary trunk, and beside the right atrium."""
@@ -236,13 +216,11 @@ def _close(depth: Float[np.ndarray, "nz ny nx"], width_mm: float, spacing_mm: fl
 
 
 def _chest(x: Float[np.ndarray, "nz ny nx 3"]) -> Float[np.ndarray, "nz ny nx"]:
-    """Signed distance to the inside of the chest: an elliptical cylinder."""
     across, deep = (x[..., 0] - 12) / 135, (x[..., 1] - 12) / 76
     return 76 * (1 - np.sqrt(across**2 + deep**2))
 
 
 def _bone(x: Float[np.ndarray, "nz ny nx 3"]) -> Float[np.ndarray, "nz ny nx"]:
-    """Signed distance to sternum, ribs and spine."""
     sternum = 4.5 - np.linalg.norm(
         np.stack([np.maximum(np.abs(x[..., 0] - 8) - 11, 0), x[..., 1] + 71 + 0.08 * x[..., 2]], axis=-1), axis=-1
     )

@@ -20,32 +20,19 @@ _LEADS = (
     [(-11, 18, 60), (-15, 21, -8), (-20, 14, -16), (-19, 2, 2), (-13, -5, 8)],
 )
 """From the upper vena cava to the right ventricle's apex, and to the right atrium's appendage (reference heart, mm)."""
-_LEAD_MM, _LEAD_HU = 0.9, 9000.0
-"""Radius of a lead, and the mean CT number of its conductors and insulation."""
-_STRUT_MM2, _STRUT_HU = 0.01, 25000.0
-"""Cross-section of a strut (0.1 mm by 0.1 mm), and its metal's CT number."""
-_CROWN_MM, _CROWNS = 1.4, 6
-"""A stent is a row of zigzag rings this long, each with so many peaks."""
-_WATER = 2e-5
-"""Attenuation of water divided by 1000: 1 HU along 1 mm adds this to the line integral."""
-_SATURATION = 4.0
-"""Line integral that a beam of many energies approaches behind ever more metal: the softer photons are gone."""
-_VIEWS = 120
-"""Views of half a turn."""
-_BIN_MM = 1.0
-"""Width of the detector's bins, and spacing of the grid on which streaks are reconstructed, mm."""
-_SWAY_MM = 1.5
-"""Metal in the heart moves this far while one slice is scanned, mm: the views disagree, and streaks result."""
+_LEAD_MM, _LEAD_HU = 0.9, 9000.0  # radius of a lead, and mean CT number of conductors and insulation
+_STRUT_MM2, _STRUT_HU = 0.01, 25000.0  # cross-section of a strut (0.1 mm by 0.1 mm), its metal's CT number
+_CROWN_MM, _CROWNS = 1.4, 6  # a stent is a row of zigzag rings this long, each with so many peaks
+_WATER = 2e-5  # attenuation of water divided by 1000: 1 HU along 1 mm adds this to the line integral
+_SATURATION = 4.0  # line integral that the beam approaches behind ever more metal: softer photons are gone
+_VIEWS = 120  # views of half a turn
+_BIN_MM = 1.0  # width of the detector's bins, and spacing of the grid on which streaks are reconstructed, mm
+_SWAY_MM = 1.5  # metal in the heart moves this far during a slice's scan, mm: views disagree, streaks result
 
 
 @dataclass(frozen=True, eq=False)
 class Metal:
-    """Metal as points of matter.
-
-    Attributes:
-        points: LPS mm.
-        mass: excess CT number times volume of each point, HU mm³.
-    """
+    """Metal as points of matter, LPS mm, and of each its excess CT number times volume, HU mm³."""
 
     points: Float[np.ndarray, "n 3"]
     mass: Float[np.ndarray, "n"]
@@ -99,17 +86,8 @@ def stents(lines: Sequence[Centerline], count: int, generator: np.random.Generat
 def add_metal(
     image: Float32[np.ndarray, "nz ny nx"], grid: Grid, metal: Sequence[Metal], generator: np.random.Generator
 ) -> None:
-    """Add metal and its streaks to the image, in place.
-
-    Streaks are what filtered back-projection makes of the error of the line integrals: behind metal the beam hardens,
-    and metal that moves is elsewhere from view to view.
-
-    Args:
-        image: HU.
-        grid: its voxels.
-        metal: leads and stents.
-        generator: random stream of the motion's directions.
-    """
+    """Add leads and stents, and their streaks, to an image in HU, in place: what filtered back-projection makes of the
+    errors of line integrals where the beam hardens, and where metal moves from view to view."""
     points = np.concatenate([part.points for part in metal])
     mass = np.concatenate([part.mass for part in metal])
     spacing = np.array([axis[1] - axis[0] for axis in (grid.z, grid.y, grid.x)])
@@ -133,7 +111,6 @@ def add_metal(
 
 
 def _deposit(image: np.ndarray, index: Float[np.ndarray, "n 3"], hu: Float[np.ndarray, "n"]) -> None:
-    """Share each point's HU among the eight voxels around it."""
     low = np.floor(index).astype(int)
     share = index - low
     for corner in np.ndindex(2, 2, 2):

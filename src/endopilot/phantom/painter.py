@@ -7,10 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-COARSE_MM = 2.0
-"""Spacing of the grid on which organs are computed, mm."""
-SLAB = 8
-"""Slices rendered at once: a slab stays in the processor's cache."""
+COARSE_MM = 2.0  # spacing of the grid on which organs are computed, mm
+SLAB = 8  # slices rendered at once: a slab stays in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,12 +22,9 @@ from endopilot.phantom.scanner import misregister, scan, smear
 from endopilot.settings import Ascending, NonNegative, Share, Within, public, settings
 from endopilot.types import Anatomy, Centerline, Volume
 
-_REACH_MM = 5.0
-"""Distances to small vessels are computed up to this far, mm."""
-_FAT_MM = 5.5
-"""Fat reaches at least this far from a coronary's axis, mm."""
-_WALL_MM = 0.5
-"""Thickness of a coronary wall, mm."""
+_REACH_MM = 5.0  # distances to small vessels are computed up to this far, mm
+_FAT_MM = 5.5  # fat reaches at least this far from a coronary's axis, mm
+_WALL_MM = 0.5  # thickness of a coronary wall, mm
 
 
 _Side = Annotated[int, Within(16, 2048)]
@@ -89,16 +86,8 @@ class _Plaque:
 
 @public
 def make_phantom(anatomy: Anatomy, *, config: PhantomConfig | None = None, seed: int = 0) -> Volume:
-    """Return a synthetic CT angiogram of a right or left coronary anatomy, in HU.
-
-    Args:
-        anatomy: its tree gives the lumen; a stenosis named in its provenance gets a soft plaque.
-        config: scanner, contrast, disease.
-        seed: seed of contrast, noise, plaques and the surroundings' shapes.
-
-    Returns:
-        int16 voxels along the LPS axes.
-    """
+    """Return a synthetic CT angiogram of a coronary anatomy: int16 HU along the LPS axes. A stenosis named in the
+    provenance gets a soft plaque; the seed draws contrast, noise, plaques and surroundings."""
     config = config or PhantomConfig()
     generator = np.random.Generator(np.random.Philox(key=np.array([seed, 0x7068616E], dtype=np.uint64)))
     heart = chest.place(anatomy.tree)
@@ -210,7 +199,6 @@ def _small_vessels(grid: Grid, lines: Sequence[Centerline]) -> Float32[np.ndarra
 
 
 def _plaques(grid: Grid, anatomy: Anatomy, generator: np.random.Generator, mean_count: float) -> list[_Plaque]:
-    """Return soft plaques around stenoses, and calcified ones in the wall."""
     paths = chest.main_paths(anatomy.tree)
     plaques = []
     for stenosis in anatomy.provenance.get("stenoses", ()):
@@ -237,16 +225,8 @@ def _plaque(
     place: tuple[float, float],
     semi_axes: tuple[float, float, float],
 ) -> _Plaque:
-    """Return an ellipsoid beside the line.
-
-    Args:
-        grid: the image's voxels.
-        tissue: what it consists of.
-        line: the vessel's centerline.
-        index: at which of its points.
-        place: how far from the line, mm, and at which angle from the line's normal, rad.
-        semi_axes: along the line, away from it and around it, mm.
-    """
+    """Return an ellipsoid beside a point of the line: how far from it (mm), at which angle from its normal (rad), and
+    the semi-axes along the line, away from it and around it, mm."""
     tangent = line.points[index + 1] - line.points[index - 1]
     tangent = tangent / np.linalg.norm(tangent)
     outward = np.cos(place[1]) * line.normals[index] + np.sin(place[1]) * np.cross(tangent, line.normals[index])
@@ -261,13 +241,8 @@ def _plaque(
 
 
 def _organs(
-    grid: Grid,
-    heart: HeartFit,
-    coronaries: Sequence[Centerline],
-    generator: np.random.Generator,
-    appendage_mm: float,
+    grid: Grid, heart: HeartFit, coronaries: Sequence[Centerline], generator: np.random.Generator, appendage_mm: float
 ) -> tuple[Grid, tuple[chest.Organ, ...]]:
-    """Return the coarse grid and the organs on it; fat wraps the coronaries too."""
     axes = (np.arange(axis[0] - COARSE_MM, axis[-1] + 2 * COARSE_MM, COARSE_MM) for axis in (grid.x, grid.y, grid.z))
     coarse = Grid(*axes)
     z, y, x = np.meshgrid(coarse.z, coarse.y, coarse.x, indexing="ij")

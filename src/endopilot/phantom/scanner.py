@@ -10,10 +10,8 @@ from scipy.ndimage import gaussian_filter1d, shift
 
 from endopilot.phantom.painter import SLAB, Painter
 
-_PHASES = 7
-"""Positions of a moving heart that are averaged."""
-_HELD_MM = 4.0
-"""The motion fades over this depth below the pericardium, mm."""
+_PHASES = 7  # positions of a moving heart that are averaged
+_HELD_MM = 4.0  # the motion fades over this depth below the pericardium, mm
 
 
 def smear(
@@ -24,18 +22,9 @@ def smear(
     motion_mm: float,
     generator: np.random.Generator,
 ) -> None:
-    """Average the heart over the path of its motion during the scan, in place; the chest stays.
-
-    The heart rests longest at the ends of the path, so that edges across it show a ghost. The anatomy is the middle.
-
-    Args:
-        image: HU.
-        painter: of this image.
-        heart: depth below the pericardium on the painter's coarse grid, mm.
-        spacing_mm: voxel size along k, j and i, mm.
-        motion_mm: length of the path, mm; its direction is random.
-        generator: random stream.
-    """
+    """Average the heart over the path of its motion during the scan, in a random direction about the anatomy, in place;
+    it rests longest at the ends. `heart` is the depth below the pericardium on the painter's coarse grid, mm; voxel
+    sizes are along k, j and i."""
     path = generator.normal(size=3)
     path *= motion_mm / (np.linalg.norm(path) * np.array(spacing_mm))
     still = image.copy()
@@ -56,19 +45,8 @@ def misregister(
     slab_mm: float,
     generator: np.random.Generator,
 ) -> None:
-    """Displace the heart from one slab of slices to the next, in place, as heart beats that differ do; the chest stays.
-
-    The heart lies in turn half a step to either side of its mean place, along one random direction.
-
-    Args:
-        image: HU.
-        painter: of this image.
-        heart: depth below the pericardium on the painter's coarse grid, mm.
-        spacing_mm: voxel size along k, j and i, mm.
-        step_mm: distance between the heart's places in neighbouring slabs, mm.
-        slab_mm: height of the slabs, mm; the first one's is random.
-        generator: random stream.
-    """
+    """Displace the heart from slab to slab, in place, as differing heart beats do: in turn half of `step_mm` to either
+    side of its mean along one random direction; the first slab's height is random. `heart` is as for `smear`."""
     path = generator.normal(size=3)
     path *= 0.5 * step_mm / (np.linalg.norm(path) * np.array(spacing_mm))
     still = image.copy()
@@ -99,18 +77,8 @@ def scan(
     grain_mm: float,
     generator: np.random.Generator,
 ) -> None:
-    """Add noise and blur, in place: the reconstruction kernel shapes the image and the noise's grain alike.
-
-    Iterative reconstruction leaves a coarser grain: it takes the noise's fine part away and the edges' not.
-
-    Args:
-        image: HU.
-        spacing_mm: voxel size along k, j and i, mm.
-        psf_mm: width of the point-spread function at half its height, mm.
-        noise_hu: standard deviation of the noise in the result, HU.
-        grain_mm: additional width of the noise's grain at half its height, mm.
-        generator: random stream.
-    """
+    """Add noise and blur, in place, both shaped by the reconstruction kernel; iterative reconstruction's grain is
+    coarser. `psf_mm` and the additional `grain_mm` are widths at half height; `noise_hu` is the result's SD."""
     sigmas = [psf_mm / np.sqrt(8 * np.log(2)) / step for step in spacing_mm]
     if grain_mm == 0:
         gain = _gain(sigmas)

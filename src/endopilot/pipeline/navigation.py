@@ -40,25 +40,9 @@ def navigate_into(
     catheter: Sequence[str] = (),
     config: NavigateConfig | None = None,
 ) -> dict[str, Any]:
-    """Drive a wire to a place in a patient's vessel, as `navigate` does, and write what happened into a folder.
-
-    A folder that was finished with the same arguments is left as it is.
-
-    Args:
-        anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
-        target: a section such as "4" or "LAD", or a point "X,Y,Z" in LPS mm, which is moved to the centerline.
-        output: folder of the results.
-        policy: name of what decides.
-        device: name of the wire, or its YAML file.
-        catheter: names of the catheters around it, from the inside out, or YAML files.
-        config: limits, X-ray, and how reality differs from what the policy is given.
-
-    Returns:
-        The outcome in one line, and figures.
-
-    Raises:
-        InputError: the navigation cannot be begun (see `navigate`), or the folder belongs to another run.
-    """
+    """Drive a wire to a place in a patient's vessel, as `navigate` does, and write what happened into a folder, unless
+    the same was finished there. `target` is a section such as "4" or "LAD", or a point "X,Y,Z" in LPS mm. Returns the
+    outcome in one line, and figures. Raises InputError where it cannot begin, or the folder is another run's."""
     stack = Stack.of(device, *catheter)
     set_up = set_up_navigation(anatomy, target, policy=policy, device=stack, config=config)
     _claim(Path(output), set_up)
@@ -68,21 +52,9 @@ def navigate_into(
 
 
 def write_navigation(driven: PatientNavigation, *, output: str | Path) -> dict[str, Any]:
-    """Write a navigation in a patient into a folder: page, picture, table, trajectory, episode and manifest.
-
-    The anatomy is written beside them if the navigation was given it in memory. A page of the documentation, Navigate
-    in a patient, describes the files.
-
-    Args:
-        driven: what `navigate` returned.
-        output: the folder.
-
-    Returns:
-        The outcome in one line, and figures.
-
-    Raises:
-        InputError: the folder belongs to another run.
-    """
+    """Write a navigation in a patient into a folder: page, picture, table, trajectory, episode and manifest, and an
+    anatomy in memory (docs: Navigate in a patient). Returns the outcome in one line, and figures; InputError if the
+    folder belongs to another run."""
     _claim(Path(output), driven.set_up)
     return _write(driven, Path(output), None)
 
@@ -105,13 +77,7 @@ def _claim(output: Path, set_up: SetUp) -> None:
 
 
 def _write(found: PatientNavigation, output: Path, asked: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Write all files that installed libraries make, the manifest last, and return the figures.
-
-    Args:
-        found: the navigation.
-        output: the folder.
-        asked: the names that `endopilot navigate` was given; None where it was not called.
-    """
+    """Write what installed libraries make, the manifest last; return the figures. `asked`: the names typed."""
     set_up, present = found.set_up, extras_present()
     driven_in, real = set_up.folder, set_up.true_anatomy
     if driven_in is None or real is not set_up.anatomy:  # the catheter lies otherwise: an anatomy of its own

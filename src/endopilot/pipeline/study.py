@@ -1,9 +1,6 @@
-"""All stages in a row: a CT angiogram goes in, a report comes out.
-
-`run_demo` makes its own patients first; `run_volume` takes one volume of yours, and drives a wire to a target in it if
-one is given. Both record the finished stages, so that an interrupted run goes on where it stopped, and both end with
-report.html, metrics.json and manifest.json.
-"""
+"""All stages in a row: a CT angiogram goes in, a report comes out. `run_demo` makes its own patients first;
+`run_volume` takes one volume of yours, with a target if given. Both record the finished stages, so that an interrupted
+run goes on, and end with report.html, metrics.json and manifest.json."""
 
 from __future__ import annotations
 
@@ -45,12 +42,9 @@ from endopilot.types import Volume
 from endopilot.vessels.read_source import read_source
 
 VOLUME_SUFFIX = ".nii.gz"
-EVALUATED = 16
-"""Navigations that are evaluated in each split; each takes some 13 s of a core, and the demo five minutes of two."""
-MISMATCH = (0.8, 1.2)
-"""Friction and tip stiffness of the navigations that simulated wires are evaluated on, over those they are given."""
-_EXTRAS = ("learn", "report")
-"""Extras that the stages need, the last one after minutes of work."""
+EVALUATED = 16  # navigations evaluated in each split; each takes some 13 s of a core
+MISMATCH = (0.8, 1.2)  # friction and tip stiffness of the navigations over those that simulated wires are given
+_EXTRAS = ("learn", "report")  # extras that the stages need, the last one after minutes of work
 DEMO_ORIGIN = (
     "The patients are synthetic: right coronary arteries drawn from published statistics, and a CT angiogram of each, "
     "made with noise, blur, calcium, chambers and veins. Everything after the CT is made from it alone."
@@ -63,11 +57,7 @@ RUN_ORIGIN = "One CT angiogram, given by the user; everything is made from it al
 
 
 class Stages:
-    """The finished stages of a run, their seconds and the rejected patients, kept in `stages.json`.
-
-    Args:
-        folder: the run's folder, which the run has claimed.
-    """
+    """A run's finished stages, their seconds and rejected patients, kept in `stages.json` of its folder."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / "stages.json"
@@ -135,20 +125,8 @@ class RunConfig(StudyConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class _Run:
-    """What the stages share.
-
-    Attributes:
-        output: folder of everything that is made.
-        config: device and size of the study.
-        segmentation: how to segment.
-        device: the wire.
-        stages: what is finished.
-        origin: where the patients come from, for the report.
-        command: what was typed, for the report.
-        inputs: SHA-256 of the input files, by name.
-        notes: what reading the volume changed.
-        navigation: folder of the agent's navigation; None where no target was given.
-    """
+    """What the stages share: settings and the wire, the record of finished stages, the input's SHA-256s and notes, and
+    for the report where the patients come from and what was typed."""
 
     output: Path
     config: StudyConfig
@@ -173,21 +151,9 @@ class _Run:
 
 
 def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
-    """Run all stages on synthetic patients and write `output`/report.html.
-
-    Everything after the CT volumes is made from them alone; the generator's truth only scores the result.
-
-    Args:
-        output: folder of everything the demo makes.
-        config: size of the demo.
-
-    Returns:
-        The report's path and the figures of its summary.
-
-    Raises:
-        InputError: a library of some stage is not installed, the folder belongs to another run, or too few patients
-            could be segmented.
-    """
+    """Run all stages on synthetic patients, from their CT volumes alone; write `output`/report.html, and return its
+    path and figures. Raises InputError where a stage's library is missing, the folder is another run's, or too few
+    patients could be segmented."""
     require_extras(*_EXTRAS)
     device = read_wire(config.device)
     claim(output, "endopilot demo", config=config, device=device, version=__version__)
@@ -221,26 +187,9 @@ def run_volume(
     phase: str | None = None,
     target: str | None = None,
 ) -> dict[str, Any]:
-    """Run all stages on one CT angiogram and write `output`/report.html.
-
-    With a target, the agent drives the wire there, and its page is in `output`/navigation. Another target may be given
-    to the same folder later.
-
-    Args:
-        volume: DICOM folder or file, NIfTI, NRRD or MHA, in HU.
-        output: folder of everything the run makes.
-        config: segmentation, device and size of the study.
-        series: number or instance UID of the series, where a DICOM folder holds several.
-        phase: cardiac phase, where a DICOM series holds several.
-        target: a section such as "4" or "LAD", or a point "X,Y,Z" in LPS mm, that the agent drives the wire to.
-
-    Returns:
-        As `run_demo` does; with a target, the figures of the navigation first.
-
-    Raises:
-        InputError: a library of some stage is not installed, the volume cannot be read or segmented, the vessel has no
-            such target, or the folder belongs to another run, such as that of another volume.
-    """
+    """Run all stages on one CT angiogram in HU, as `run_demo`. With a target (a section such as "4" or "LAD", or a
+    point "X,Y,Z" in LPS mm; another one later), the agent drives the wire there, into `output`/navigation. Raises
+    InputError as `read_volume`, `segment` and `navigate`, and where the folder belongs to another run."""
     require_extras(*_EXTRAS)
     content, device = read_volume(volume, series=series, phase=phase), read_wire(config.device)
     identity = {"volume_sha256": _digest(content), "method": METHODS.origin(config.segmentation.method)}
@@ -321,7 +270,6 @@ def _anatomies(run: _Run, volumes: Sequence[Path]) -> list[Path]:
 
 
 def _drive(run: _Run, anatomy: Path) -> None:
-    """Let the agent drive to the distal end of the longest path."""
     assert run.navigation is not None
     tree = read_anatomy(anatomy).tree
     longest = tree.longest_leaf()
@@ -405,7 +353,6 @@ def _report(run: _Run, names: Sequence[str]) -> None:
 
 
 def _scores(output: Path, names: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Return how well each synthetic patient's anatomy matches the truth that its volume was made from."""
     path = output / "scores.json"
     if path.exists():
         return read_json(path)
@@ -431,7 +378,6 @@ def _replay(output: Path) -> tuple[Path, Trajectory]:
 
 
 def _finish(run: _Run) -> dict[str, Any]:
-    """Write metrics.json and manifest.json unless they are there, and return what the command prints."""
     output, stages = run.output, run.stages
     metrics = read_json(output / "evaluation" / "metrics.json")
     wall_seconds = sum(stages.seconds.values())

@@ -1,7 +1,5 @@
-"""The figures of an evaluation and of a report, drawn with matplotlib: each function returns one and saves nothing.
-
-`titles` says what a reader calls each split.
-"""
+"""The figures of an evaluation and of a report: each function returns one; `titles` says what a reader calls each
+split."""
 
 from __future__ import annotations
 
@@ -14,28 +12,12 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Shaped
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from endopilot.evaluation.results import SERIES_TITLES
-from endopilot.plotting import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, STYLE, VERMILLION, YELLOW
+from endopilot.plotting import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, STYLE, VERMILLION
 from endopilot.report.tables import distinct, rows, values
 from endopilot.types import Anatomy, LumenMask, Volume
-
-SECTION_COLORS = (
-    BLUE,
-    ORANGE,
-    GREEN,
-    VERMILLION,
-    SKY,
-    PURPLE,
-    YELLOW,
-    "#7f5aa2",
-    "#6b4f2a",
-    "#44aa99",
-    "#882255",
-    GREY,
-)
 
 SERIES_STYLE: dict[str, dict] = {
     "true": {"color": BLACK, "label": "Recorded"},
@@ -52,11 +34,8 @@ SERIES_STYLE: dict[str, dict] = {
 }
 
 
-WINDOW_HU = (-150.0, 650.0)
-"""Grey window of CTA pictures, HU: from fat to well-filled lumen."""
-
-CROP_MARGIN_MM = 18.0
-"""What is shown of the volume around the vessel, mm."""
+WINDOW_HU = (-150.0, 650.0)  # grey window of CTA pictures, HU: from fat to well-filled lumen
+CROP_MARGIN_MM = 18.0  # what is shown of the volume around the vessel, mm
 
 
 def tip_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
@@ -79,10 +58,7 @@ def tip_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
 
 
 def safety_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
-    """Draw γ/(r − r_w), below it γ/r, against time: median, quartiles and 95 % quantile (`tables.safety_table`).
-
-    One column a split.
-    """
+    """Draw γ/(r − r_w), below it γ/r, against time, a column a split, with median, quartiles and 95 % quantile."""
     splits = distinct(table, "split")
     plate = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
     ratios = (("clearance", "γ / (r − r_w)", "the wire touches"), ("radius", "γ / r", "the wire's axis on the wall"))
@@ -124,20 +100,14 @@ def control_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figu
 
 
 def drive_difference_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
-    """Draw histograms of the RMSE of the drive's force and torque of each sequence where controls are simulated.
-
-    One row a split (`tables.drive_difference_table`).
-    """
+    """Draw histograms of RMSEs of the drive's force and torque where controls are simulated, a row a split."""
     panels = (("force_rmse_n", "Difference in proximal force (RMSE), N"),)
     return _histograms(table, titles, (*panels, ("torque_rmse_nmm", "Difference in proximal torque (RMSE), N mm")))
 
 
 def _histograms(table: pd.DataFrame, titles: Mapping[str, str], panels: Sequence[tuple[str, str]]) -> Figure:
-    """Draw histograms of columns with one value a sequence, one row a split; the series stand above one another.
-
-    Sequences beyond the 98 % quantile of the second-widest series are counted in the last bar; the tick below a
-    histogram marks its median. The highest bar of each histogram says how many sequences it holds.
-    """
+    """Draw histograms of columns with one value a sequence, a row a split, a series above another, medians as ticks,
+    with numbers; what lies beyond the second-widest series' 98 % quantile is in the last bar."""
     splits, series = distinct(table, "split"), distinct(table, "series")
     with matplotlib.rc_context(STYLE):
         figure, axes = _grid(len(splits), len(panels), height=0.9 + 0.55 * len(series))
@@ -161,7 +131,6 @@ def _histograms(table: pd.DataFrame, titles: Mapping[str, str], panels: Sequence
 
 
 def _histogram(ax: Axes, of: Float[np.ndarray, "n"], edges: Float[np.ndarray, "m"], bottom: float, color: str) -> None:
-    """Draw one histogram that stands on `bottom` and is 0.75 high, with its median and the size of its highest bar."""
     if not len(of):
         return
     counts, _ = np.histogram(np.clip(of, 0.0, edges[-1]), edges)
@@ -205,12 +174,8 @@ def stage_figure(table: pd.DataFrame) -> Figure:
 
 
 def volume_figure(volume: Volume, mask: LumenMask, anatomy: Anatomy | None = None) -> Figure:
-    """Draw the CTA with the segmented lumen's outline (axial and coronal) and, if given, the extracted tree.
-
-    The axial slice goes through the ostium; the coronal picture is the maximum over a slab as deep as the vessel,
-    so that the whole vessel shows. Both are cropped to the vessel and laid out as radiologists read them: the
-    patient's right on the left, the head on top. Volume and mask lie on the same grid.
-    """
+    """Draw the CTA with the outline of a mask on its grid and, if given, the extracted tree, cropped, as radiologists
+    read: axial through the ostium, coronal the maximum over a slab as deep as the vessel."""
     ostium = mask.ostium or (anatomy.insertion if anatomy is not None else None)
     voxels, lumen = _along_lps(volume, volume.voxels), _along_lps(volume, mask.volume.voxels).astype(bool)
     spacing = volume.spacing_mm[_lps_axes(volume)]  # along x, y and z
@@ -229,7 +194,7 @@ def volume_figure(volume: Volume, mask: LumenMask, anatomy: Anatomy | None = Non
         _picture(axes[1], slab, np.any(lumen, axis=1)[crop[0], crop[2]], spacing[[0, 2]], origin="lower")
         axes[1].set_title("Coronal maximum projection")
         if anatomy is not None:
-            draw_tree(axes[2], anatomy)
+            anatomy.plot(axes=axes[2], view="front")
             axes[2].set_title("Extracted centerline")
     return figure
 
@@ -238,34 +203,8 @@ def tree_figure(anatomy: Anatomy) -> Figure:
     """Draw the extracted tree alone, where there is no CT."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(6.0, 4.2), layout="constrained")
-        draw_tree(figure.subplots(), anatomy)
+        anatomy.plot(axes=figure.subplots(), view="front")
     return figure
-
-
-def draw_tree(ax: Axes, anatomy: Anatomy) -> None:
-    """Draw the centerline tree from the front, coloured by section, as thick as the lumen."""
-    tree = anatomy.tree
-    shown: set[int] = set()
-    for branch in tree.branches:
-        line = branch.centerline
-        points = line.points[:, [0, 2]]
-        segments = np.stack([points[:-1], points[1:]], axis=1)
-        sections = branch.section[1:]
-        colors = [section_color(int(section)) for section in sections]
-        ax.add_collection(LineCollection(list(segments), colors=colors, linewidths=1.6 * line.radius[1:], alpha=0.9))
-        shown |= {int(section) for section in sections}
-    for section in sorted(shown):
-        ax.plot([], [], color=section_color(section), lw=4, label=tree.section_names[section])
-    ax.plot(*anatomy.insertion.position[[0, 2]], marker="o", color=BLACK, ms=5, ls="none", label="ostium")
-    ax.set_aspect("equal")
-    ax.autoscale_view()
-    ax.set(xlabel="x (to the patient's left), mm", ylabel="z (to the head), mm")
-    ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.2)
-
-
-def section_color(section: int) -> str:
-    """Return the colour of a section, the same in all pictures."""
-    return SECTION_COLORS[section % len(SECTION_COLORS)]
 
 
 def _grid(rows: int, columns: int, *, height: float) -> tuple[Figure, Shaped[np.ndarray, "rows columns"]]:
@@ -311,7 +250,6 @@ def _lps_axes(volume: Volume) -> list[int]:
 
 
 def _level(volume: Volume, point: Float[np.ndarray, "3"], levels: int) -> int:
-    """Return the axial slice of `_along_lps` that a point lies in."""
     axis = _lps_axes(volume)[2]
     level = round(float(volume.world_to_index(point)[axis]))
     level = levels - 1 - level if volume.direction[2, axis] < 0 else level
@@ -326,7 +264,6 @@ def _picture(
     *,
     origin: Any,
 ) -> None:
-    """Show one grey picture with the lumen's outline; `spacing` is (columns, rows), mm."""
     rows, columns = picture.shape
     extent = (0.0, columns * spacing[0], rows * spacing[1], 0.0)
     if origin == "lower":

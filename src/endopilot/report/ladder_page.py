@@ -26,23 +26,15 @@ from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import Task, list_tasks
 
 PAGE_FILE = "index.html"
-SHOWN = 5
-"""Patients of each task that the pictures show."""
+SHOWN = 5  # patients of each task that the pictures show
 OUTCOMES = {"safe success": GREEN, "success, but too large a force": ORANGE, "not reached": VERMILLION}
 
-XRAY = {"color": BLACK, "marker": "o", "ms": 4.5, "mfc": "none", "mew": 0.8, "ls": "none"}
-"""How an exposure is drawn."""
+XRAY = {"color": BLACK, "marker": "o", "ms": 4.5, "mfc": "none", "mew": 0.8, "ls": "none"}  # how an exposure is drawn
 
 
 def write_page(output: Path) -> Path:
-    """Write the page of a folder that `climb` has filled, and the replays beside it.
-
-    Returns:
-        The page, `output`/index.html; it needs the files beside it.
-
-    Raises:
-        InputError: the folder holds no scores.
-    """
+    """Write index.html and replays into a folder that `climb` has filled, and return its path; InputError without
+    scores."""
     content = read_json(output / SCORES_FILE)
     terms = Terms(content["ladder"], request=content.get("request", ""), patients=content["patients"])
     tasks = [terms.task(row["task"]) for row in content["scores"] if row["level"] is not None]
@@ -85,7 +77,6 @@ def _section(output: Path, task: Task, patients: int) -> dict[str, Any]:
 
 
 def _replay_scene(task: Task, navigation: Navigation, result: dict[str, Any], path: Path) -> go.Figure:
-    """Return a navigation replayed in space, with its target, what X-ray showed, and what came of it."""
     course = result["course"]
     *_, recording = recorded_navigation(path, task.name, 0)
     record = begun(recording, navigation, seed=navigation_seed(task, 0)).run()
@@ -106,7 +97,6 @@ def _outcome(result: dict[str, Any]) -> str:
 
 
 def _courses(navigations: list[Navigation], results: list[dict[str, Any]]) -> Figure:
-    """Draw trees, viewed across their largest extent, with route, target and the tip's path."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(2.4 * SHOWN, 2.9), layout="constrained")
         for ax, navigation, result in zip(

@@ -1,8 +1,5 @@
-"""The page of a navigation in a patient: what came of it, its replay in space, its course in time, how to repeat it.
-
-`navigation_figure` draws that course: paths of the tips, Δtip with what was believed, safety ratio, forces, controls,
-X-ray.
-"""
+"""The page of a navigation in a patient: what came of it, its replay in space, its course in time
+(`navigation_figure`), how to repeat it."""
 
 from __future__ import annotations
 
@@ -35,11 +32,7 @@ from endopilot.tasks.targets import section_at
 def write_navigation_page(
     path: Path, found: PatientNavigation, *, picture: bytes, commands: Mapping[str, str], manifest: Mapping[str, Any]
 ) -> None:
-    """Write the page as one HTML file that needs nothing beside it.
-
-    Raises:
-        InputError: the page cannot be written.
-    """
+    """Write the page as one HTML file that needs nothing beside it; InputError if it cannot be written."""
     name = found.set_up.navigation.anatomy.name
     outcome = tell_outcome(found)
     page = render(
@@ -143,8 +136,7 @@ def _exposures(found: PatientNavigation) -> list[dict[str, str]]:
 
 
 _DEVICE_COLORS = (BLUE, *CATHETER_COLORS)
-_LABEL_SHARE = 0.06
-"""Labels of forks are this share of the axis apart, at least."""
+_LABEL_SHARE = 0.06  # labels of forks are this share of the axis apart, at least
 
 
 def navigation_figure(found: PatientNavigation) -> Figure:
@@ -171,7 +163,6 @@ def navigation_figure(found: PatientNavigation) -> Figure:
 
 
 def _mark_sections(axes: Axes, found: PatientNavigation) -> None:
-    """Write each section's name once, at the middle of its longest piece."""
     tree = found.set_up.navigation.anatomy.tree
     longest: dict[str, np.ndarray] = {}
     for branch in tree.branches:
@@ -243,7 +234,6 @@ def _draw_force(axes: Axes, found: PatientNavigation) -> None:
 
 
 def _draw_pushes(axes: Axes, found: PatientNavigation) -> None:
-    """Draw how hard each drive pushes, or pulls below zero."""
     rollout = found.record.trajectory
     time_s = DECISION_PERIOD_S * np.arange(1, rollout.drive_force.shape[1] + 1)
     pushes = rollout.drive_force[0].T

@@ -13,8 +13,7 @@ from endopilot.plotting import BLACK, GREY, ORANGE, STYLE, VERMILLION
 from endopilot.robot.replay import EpisodeReplay
 from endopilot.types import Anatomy
 
-MOST_SHOWN = 4
-"""Episodes that one picture shows, evenly chosen from all."""
+MOST_SHOWN = 4  # episodes that one picture shows, evenly chosen from all
 _SPARE_MM = 4.0
 
 

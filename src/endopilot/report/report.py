@@ -1,7 +1,4 @@
-"""The report: one HTML file that needs nothing beside it, for a surgeon or a reviewer to read.
-
-`report_evaluation` makes one, with the figures, of what `evaluate` left on disk.
-"""
+"""The report: one HTML file that needs nothing beside it; `report_evaluation` makes one of what `evaluate` left."""
 
 from __future__ import annotations
 
@@ -43,15 +40,8 @@ STILL_FILE = "scene.png"
 
 @dataclass(frozen=True, kw_only=True)
 class PatientContent:
-    """One patient of a report.
-
-    Attributes:
-        name: the patient's name in the study.
-        anatomy: folder of the extracted anatomy.
-        volume: the CT angiogram, if there is one.
-        mask: the segmented lumen on the same grid, if there is one.
-        scores: agreement with the truth by name, where a truth is known; names end in their unit.
-    """
+    """One patient of a report: the folder of the anatomy, the CT and the mask on its grid, if there are, and the
+    agreement with a known truth by names that end in their unit."""
 
     name: str
     anatomy: Path
@@ -66,11 +56,9 @@ class ReportContent:
 
     Attributes:
         origin: one sentence that says what the patients are: real, or synthetic and how made.
-        evaluation: folder made by `endopilot evaluate`.
-        run: folder made by `endopilot train`.
-        replay: navigations with `shape`, the first of which is shown in space.
-        replay_anatomy: folder of the anatomy that they are in.
-        navigation: folder made by `endopilot navigate`, beside or below the report; its page is linked.
+        evaluation: folder made by `endopilot evaluate`; `run` of `endopilot train`; `navigation` of `endopilot
+            navigate`, beside or below the report.
+        replay: navigations with `shape`, in `replay_anatomy`, the first of which is shown in space.
         manifest: how everything was made (`files.manifest`).
     """
 
@@ -88,14 +76,9 @@ class ReportContent:
 
 
 def write_report(output_html: Path, content: ReportContent) -> list[str]:
-    """Write the report as one self-contained HTML file, and the still picture `scene.png` beside it.
-
-    Returns:
-        Remarks for the user, such as which system library is missing for a picture that was left out.
-
-    Raises:
-        InputError: a file that the content names is missing or damaged, or the report cannot be written.
-    """
+    """Write the report as one HTML file, and the still picture `scene.png` beside it; return remarks, such as which
+    library a left-out picture needs. Raises InputError for a missing or damaged file, or a report that cannot be
+    written."""
     output_html = Path(output_html)
     remarks: list[str] = []
     metrics = read_json(content.evaluation / METRICS_FILE) if content.evaluation is not None else None
@@ -146,7 +129,6 @@ def _patient(patient: PatientContent) -> dict[str, Any]:
 
 
 def _driven(navigation: Path | None, beside: Path) -> dict[str, Any] | None:
-    """Return what the agent did: one line, the picture, and where its page is, seen from the report."""
     if navigation is None:
         return None
     figures = read_json(navigation / "manifest.json")["figures"]
@@ -160,7 +142,6 @@ def _driven(navigation: Path | None, beside: Path) -> dict[str, Any] | None:
 
 
 def _scene(content: ReportContent, still: Path, remarks: list[str]) -> dict[str, Any] | None:
-    """Return the plotly scene, its library, and the still picture that is printed in its place."""
     folder = content.replay_anatomy or (content.patients[0].anatomy if content.patients else None)
     if folder is None:
         return None
@@ -226,14 +207,8 @@ def image(png: bytes, description: str) -> Markup:
 
 
 def report_evaluation(folder: Path) -> Path:
-    """Write the PNG and the CSV of each figure into `figures/`, and then `report.html`, one page that stands alone.
-
-    Returns:
-        The page's path.
-
-    Raises:
-        InputError: the folder holds no evaluation, or a damaged one.
-    """
+    """Write the PNG and the CSV of each figure into `figures/`, and then `report.html`, one page that stands alone;
+    return its path. Raises InputError where the folder holds no evaluation, or a damaged one."""
     metrics = read_json(folder / METRICS_FILE)
     titles = {split: of["title"] for split, of in metrics["splits"].items()}
     _write_figures(read_results(folder / RESULTS_FILE), titles, folder / FIGURES_FOLDER)

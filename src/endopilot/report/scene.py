@@ -8,12 +8,12 @@ import numpy as np
 import plotly.graph_objects as go
 from jaxtyping import Float
 from markupsafe import Markup
+from matplotlib.colors import to_hex
 
+from endopilot.anatomy.wall_mesh import wall_mesh
 from endopilot.devices.device import Device
 from endopilot.devices.stack import lines_from_tips, shown_part
-from endopilot.plotting import CATHETER_COLORS
-from endopilot.report.figures import section_color
-from endopilot.report.wall_mesh import wall_mesh
+from endopilot.plotting import CATHETER_COLORS, section_colors
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import Anatomy
 
@@ -21,17 +21,10 @@ BACKGROUND, INK, FAINT = "#0d1424", "#dfe6f2", "#31405c"
 WALL, WIRE, TIP, BELIEVED = "#d98a8a", "#f6f7fb", "#ffd34d", "#5fb8ff"
 Wires = Float[np.ndarray, "wires nodes 3"]
 
-_WIRE_WIDTH = 7.0
-"""Width of the wire's line, pixels; a catheter's is as much wider as its diameter."""
-
-TRAIL_S = 20.0
-"""How long the path of the tip stays in the picture, s."""
-
-_VIEWED = 1.3
-"""Length, in units of the cube root of its box's volume, that the camera sees of a vessel from its usual place."""
-
-FRAME_MS = 90
-"""Time between two samples when the navigation is played, ms."""
+_WIRE_WIDTH = 7.0  # width of the wire's line, pixels; a catheter's is as much wider as its diameter
+TRAIL_S = 20.0  # how long the path of the tip stays in the picture, s
+_VIEWED = 1.3  # length that the camera sees of a vessel, in cube roots of its box's volume
+FRAME_MS = 90  # time between two samples when the navigation is played, ms
 
 
 def navigation_scene(
@@ -41,14 +34,8 @@ def navigation_scene(
     devices: Sequence[Device] = (),
     believed: Sequence[Wires] | None = None,
 ) -> go.Figure:
-    """Return a plotly figure of the wall, the centerline by section, and the first world of a rollout replayed.
-
-    Args:
-        rollout: navigations with `shape`; without one the vessel is shown alone.
-        devices: the wire and the catheters of the rollout, whose names and diameters are shown; a wire alone is drawn
-            without.
-        believed: wires that a policy holds possible at each sample, nodes from the tip on, LPS mm.
-    """
+    """Return a plotly figure of the wall, the centerline by section, and a rollout's first world (with `shape`)
+    replayed; `believed` are wires that a policy holds possible at each sample, nodes from the tip on, LPS mm."""
     wall = _wall(anatomy)
     figure = go.Figure([wall, *_centerlines(anatomy)])
     figure.update_layout(_layout(np.ptp([np.asarray(axis) for axis in (wall.x, wall.y, wall.z)], axis=1)))
@@ -70,12 +57,7 @@ def mark_target(
     observed: Float[np.ndarray, "exposures 3"],
     seconds: Float[np.ndarray, "exposures"],
 ) -> None:
-    """Add the target to a scene, and where the tip was when X-ray was on.
-
-    Args:
-        target: LPS mm.
-        observed: places of the tip, LPS mm.
-    """
+    """Add the target to a scene, and where the tip was when X-ray was on, LPS mm."""
     for points, name, marker, labels in (
         (target[None], "Target", {"symbol": "diamond", "size": 6}, ["target"]),
         (observed, "Tip under X-ray", {"symbol": "circle-open", "size": 7}, [f"X-ray at {t:g} s" for t in seconds]),
@@ -87,11 +69,7 @@ def mark_target(
 
 
 def visible_devices(rollout: Trajectory, world: int, sample: int) -> list[Float[np.ndarray, "_ 3"]]:
-    """Return the nodes of the wire, then of each catheter, from its tip to a little behind the ostium, LPS mm.
-
-    Raises:
-        ValueError: the rollout was made without `record_shape`.
-    """
+    """Return nodes of the wire and catheters from the tip to a little behind the ostium; ValueError without shape."""
     if rollout.shape is None:
         raise ValueError("the rollout holds no wire shapes; simulate with record_shape=True")
     inserted = rollout.inserted_length[world, sample]
@@ -121,7 +99,6 @@ def _wall(anatomy: Anatomy) -> go.Mesh3d:
 
 
 def _centerlines(anatomy: Anatomy) -> list[go.Scatter3d]:
-    """Return one line a section; pieces of a section are joined by gaps."""
     tree = anatomy.tree
     pieces: dict[int, list[np.ndarray]] = {}
     for branch in tree.branches:
@@ -131,8 +108,8 @@ def _centerlines(anatomy: Anatomy) -> list[go.Scatter3d]:
             # One point before the section joins it to the one that it leaves.
             chosen = points[max(at[0] - 1, 0) : at[-1] + 1]
             pieces.setdefault(int(section), []).extend([chosen, np.full((1, 3), np.nan)])
-    lines = []
-    for section, parts in sorted(pieces.items()):
+    lines, palette = [], section_colors(len(pieces))
+    for number, (section, parts) in enumerate(sorted(pieces.items())):
         x, y, z = np.concatenate(parts).astype(np.float32).T
         lines.append(
             go.Scatter3d(
@@ -140,7 +117,7 @@ def _centerlines(anatomy: Anatomy) -> list[go.Scatter3d]:
                 y=y,
                 z=z,
                 mode="lines",
-                line={"color": section_color(section), "width": 5},
+                line={"color": to_hex(palette(number)), "width": 5},
                 name=f"Section {tree.section_names[section]}",
                 hovertemplate=f"section {tree.section_names[section]}<extra></extra>",
             )
@@ -266,7 +243,6 @@ def _uncovered(rollout: Trajectory, sample: int) -> list[Float[np.ndarray, "_ 3"
 
 
 def _catheter_state(rollout: Trajectory, sample: int, k: int) -> str:
-    """Return how far device k is inserted and turned, and how its drive pushes it."""
     return (
         f"Δ = {rollout.inserted_length[0, sample, k]:.1f} mm<br>"
         f"φ = {np.rad2deg(rollout.rotation[0, sample, k]):.0f}°<br>"
@@ -288,7 +264,6 @@ def _possible(wires: Wires, deepest_mm: float) -> go.Scatter3d:
 
 
 def _layout(size_mm: Float[np.ndarray, "3"]) -> dict:
-    """Return axes, camera and colours for a vessel of some size along x, y and z, mm."""
     # plotly's box keeps its volume, so that of a tall vessel is longer than the usual view is high
     farther = max(1.0, float(size_mm.max() / size_mm.prod() ** (1 / 3)) / _VIEWED)
     eye = {name: farther * at for name, at in zip("xyz", (0.4, -2.0, 0.5), strict=True)}
@@ -305,11 +280,7 @@ def _layout(size_mm: Float[np.ndarray, "3"]) -> dict:
     axes = {f"{name}axis": axis | {"title": {"text": title}} for name, title in zip("xyz", titles, strict=True)}
     return {
         # View from the front, as a surgeon stands before the patient: the patient's left is on the right.
-        "scene": {
-            "aspectmode": "data",
-            **axes,
-            "camera": {"eye": eye, "center": {"x": 0, "y": 0, "z": -0.12}},
-        },
+        "scene": {"aspectmode": "data", **axes, "camera": {"eye": eye, "center": {"x": 0, "y": 0, "z": -0.12}}},
         "paper_bgcolor": BACKGROUND,
         "font": {"color": INK, "family": "system-ui, sans-serif"},
         "legend": {"font": {"size": 11}, "x": 0.99, "xanchor": "right", "y": 0.93, "bgcolor": BACKGROUND},

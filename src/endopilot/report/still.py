@@ -1,8 +1,5 @@
-"""A still picture of the vessel, wire and catheters in it, rendered by VTK without a screen in a process of its own.
-
-VTK aborts its process where it finds no graphics library, so it must not run in ours: `render_still` writes what is to
-be seen to a file and starts `still_process` as a program, whose failure is then one clear line.
-"""
+"""A still picture of the vessel, wire and catheters in it, by VTK in a process of its own, `still_process`: VTK aborts
+where it finds no graphics library, and its failure is then one clear line."""
 
 from __future__ import annotations
 
@@ -16,11 +13,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from endopilot.anatomy.wall_mesh import wall_mesh
 from endopilot.devices.device import Device
 from endopilot.files import writing
 from endopilot.plotting import CATHETER_COLORS
 from endopilot.report import still_process
-from endopilot.report.wall_mesh import wall_mesh
 from endopilot.types import Anatomy
 
 LIBRARIES_MISSING = (
@@ -33,15 +30,8 @@ TIMEOUT_S = 180
 def render_still(
     anatomy: Anatomy, lines: Sequence[Float[np.ndarray, "_ 3"]], path: Path, *, devices: Sequence[Device] = ()
 ) -> str | None:
-    """Render the vessel's translucent wall, its centerline, the wire and translucent catheters to a PNG.
-
-    Args:
-        lines: nodes of the wire, then of each catheter, from its tip backwards, LPS mm; none to show the vessel alone.
-        devices: wire and catheters, which are drawn as wide as each other's diameters; needed with catheters.
-
-    Returns:
-        None when the picture is there; otherwise one line that says what to install.
-    """
+    """Render the vessel's wall, its centerline, and `lines` (nodes of the wire, then of each catheter, from the tip,
+    LPS mm) to a PNG; return None, or a line that says what to install."""
     surface = wall_mesh(anatomy.distance_map, max_triangles=400_000)
     centerlines = [branch.centerline.points for branch in anatomy.tree.branches]
     widths = [device.diameter_mm / devices[0].diameter_mm for device in devices] or [1.0] * len(lines)

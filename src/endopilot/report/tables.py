@@ -9,12 +9,7 @@ import numpy as np
 import pandas as pd
 
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.evaluation.metrics import (
-    control_rmse,
-    mean_over_time,
-    quantiles_over_time,
-    rmse_of_sequences,
-)
+from endopilot.evaluation.metrics import control_rmse, mean_over_time, quantiles_over_time, rmse_of_sequences
 from endopilot.evaluation.results import CONTROL_BASELINES, TIP_BASELINES, SplitResult
 
 SAFETY_SERIES = ("true", "P3", "P4")
@@ -60,10 +55,7 @@ def control_error_table(results: Mapping[str, SplitResult]) -> pd.DataFrame:
 
 
 def drive_difference_table(results: Mapping[str, SplitResult]) -> pd.DataFrame:
-    """Return the RMSE of each sequence's drive force (N) and torque (N·mm) where controls were simulated.
-
-    It is the difference from the recorded ones, for each split and each series of `DRIVEN_SERIES`.
-    """
+    """Return RMSEs of drive force (N) and torque (N·mm) of each split and series of `DRIVEN_SERIES`."""
     pieces = []
     for split, result in results.items():
         for series in _ordered(result.base_force, DRIVEN_SERIES):

@@ -13,16 +13,11 @@ from endopilot.errors import InputError
 from endopilot.simulation.config import FREE_BEHIND_MM, Actuation
 from endopilot.types import Anatomy
 
-ROUNDING_MM = 1e-2
-"""An inserted length may be rounded this far below 0, mm."""
+ROUNDING_MM = 1e-2  # an inserted length may be rounded this far below 0, mm
 
 
 def check_distance_map(anatomy: Anatomy) -> None:
-    """Check insertion and distance map: the map is finite, and positive around the ostium along the catheter's axis.
-
-    Raises:
-        InputError: it is not.
-    """
+    """Raise InputError unless the distance map is finite, and positive around the ostium along the catheter's axis."""
     field, insertion = anatomy.distance_map, anatomy.insertion
     if not np.isfinite(field.values).all():
         raise InputError(f"{anatomy.name}: the distance map has values that are not finite; extract it again")
@@ -55,37 +50,21 @@ def check_distance_map(anatomy: Anatomy) -> None:
 
 
 def check_memory(needed: int, what: str, mend: str) -> None:
-    """Check that `needed` bytes are at most 0.8 of the machine's memory.
-
-    Raises:
-        InputError: they are more; it begins with `what` needs them and ends with the mend.
-    """
+    """Raise InputError, which begins with `what` needs it, for more bytes than 0.8 of the machine's memory."""
     available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > 0.8 * available:
         raise InputError(f"{what} need {needed / 2**30:.1f} GiB of {available / 2**30:.1f}; {mend}")
 
 
 def check_shape_memory(worlds: int, samples: int, nodes: int) -> None:
-    """Check that the positions of all nodes, 24 bytes each, fit into 0.8 of the machine's memory.
-
-    Raises:
-        InputError: they do not.
-    """
+    """Raise InputError unless the positions of all nodes, 24 bytes each, fit into 0.8 of the machine's memory."""
     what = f"shapes of {worlds} worlds of {samples} samples"
     check_memory(24 * worlds * samples * nodes, what, "simulate fewer at once")
 
 
 def with_device_axis(name: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return an array with its axis of devices, which may be left out where a wire is alone.
-
-    Args:
-        name: of the array, as a message begins.
-        array: as it was given.
-        shape: that it must have; the axis of devices is the second where there are two, else the last but one.
-
-    Raises:
-        InputError: it has another shape.
-    """
+    """Return an array with its axis of devices (the second of a shape of two, else the last but one), which a wire
+    alone may leave out. Raises InputError, which begins with `name`, for another shape."""
     axis = 1 if len(shape) == 2 else len(shape) - 2
     without = shape[:axis] + shape[axis + 1 :]
     if shape[axis] == 1 and array.shape == without:
@@ -101,17 +80,7 @@ def check_control(
     stacks: Sequence[Stack],
     actuation: Actuation,
 ) -> None:
-    """Check that controls are finite, and no faster than their drives.
-
-    Args:
-        control: mm/s and rad/s, or N and N·mm.
-        largest: magnitude that no control may exceed.
-        stacks: the devices of each world.
-        actuation: what controls are.
-
-    Raises:
-        InputError: one is not.
-    """
+    """Raise InputError unless controls are finite (mm/s and rad/s, or N and N·mm) and within their drives' limits."""
     if (np.abs(control) <= largest[:, None]).all():
         return
     names = ("force in N", "torque in N·mm") if actuation == "force" else ("translation in mm/s", "rotation in rad/s")
@@ -128,15 +97,7 @@ def check_control(
 
 
 def check_travel(deepest_mm: Float[np.ndarray, "worlds devices"], longest_mm: Float[np.ndarray, "worlds"]) -> None:
-    """Check that no device is driven beyond its end.
-
-    Args:
-        deepest_mm: inserted lengths that may come of the controls, mm.
-        longest_mm: those that the devices are laid out for, mm.
-
-    Raises:
-        InputError: one is.
-    """
+    """Raise InputError where a device may be driven deeper than it is laid out for, mm."""
     deepest_mm = deepest_mm.max(axis=1)
     if (deepest_mm > longest_mm).any():
         world = int(np.argmax(deepest_mm - longest_mm))

@@ -24,16 +24,11 @@ if TYPE_CHECKING:
 else:  # each build of the core has classes of its own
     CoreMotion = CoreTransmission = Lumen = Options = RodModel = Simulation = Tubes = Any
 
-Processor = Literal["cpu", "cuda"]
-"""Where worlds are stepped: the processor's threads, or a CUDA GPU."""
+Processor = Literal["cpu", "cuda"]  # where worlds are stepped: the processor's threads, or a CUDA GPU
 
 
 def core_for(processor: Processor) -> Any:
-    """Return the core's module that steps worlds there; it has the same names as `endopilot._core`.
-
-    Raises:
-        InputError: a GPU is asked for, and this installation or this machine has none.
-    """
+    """Return the module that steps worlds there, with the names of `endopilot._core`; InputError without a GPU."""
     if processor == "cpu":
         return _core
     try:
@@ -51,11 +46,7 @@ def core_for(processor: Processor) -> Any:
 
 @contextmanager
 def gpu_errors(processor: Processor) -> Iterator[None]:
-    """Turn what a GPU reports, such as too little memory, into an error for people.
-
-    Raises:
-        InputError: the GPU failed.
-    """
+    """Turn what a GPU reports, such as too little memory, into an InputError."""
     try:
         yield
     except RuntimeError as error:
@@ -64,28 +55,20 @@ def gpu_errors(processor: Processor) -> Iterator[None]:
         raise InputError(f"processor: 'cuda': {error}; simulate fewer worlds at once, or give 'cpu'") from None
 
 
-FREE_BEHIND_MM = 3.0
-"""Nodes farther behind the ostium than this follow the drive exactly, mm."""
-LANES = _core.LANES
-"""Worlds that one thread steps side by side."""
-_DENT_MM = 0.015
-"""Depth to which a node that bears all that the drives can push with dents a wall of no given stiffness, mm."""
-_HARD_PUSH_N = 2.0
-"""Push that stands for the limit of a drive that has none, N."""
-_RIGID_REACH_MM, _COMPLIANT_REACH_MM = 0.5, 2.4
-"""How far outside the wall a wire may lie, mm; distance maps reach 2.5 mm."""
-_SOFTEST_N_MM2 = 0.01
-"""A softer wall would yield farther than distance maps reach, N/mm²."""
-_ARTERY_MM = 4.0
-"""Width of the artery that displaces the muscle around it, mm."""
+FREE_BEHIND_MM = 3.0  # nodes farther behind the ostium than this follow the drive exactly, mm
+LANES = _core.LANES  # worlds that one thread steps side by side
+_DENT_MM = 0.015  # depth to which a node that bears all that drives can push dents a wall of no stiffness, mm
+_HARD_PUSH_N = 2.0  # push that stands for the limit of a drive that has none, N
+_RIGID_REACH_MM, _COMPLIANT_REACH_MM = 0.5, 2.4  # how far outside the wall a wire may lie; maps reach 2.5 mm
+_SOFTEST_N_MM2 = 0.01  # a softer wall would yield farther than distance maps reach, N/mm²
+_ARTERY_MM = 4.0  # width of the artery that displaces the muscle around it, mm
 COMPLIANT_WALL_STIFFENING_MM2 = 8.023 / _ARTERY_MM**2
 """A compliant wall yields by d to K d exp(s d²), s in 1/mm²: muscle in simple shear by γ = d/4 mm bears γ exp(8.023 γ²)
 times its modulus (Holzapfel and Ogden, Phil Trans R Soc A 2009, isotropic part, from shear tests of porcine muscle)."""
 COMPLIANT_WALL_AT_TIP_MM = 6.4
 """The tip bears on a point, and takes along as much wall as this length has, mm: a rigid disc as wide as the artery, on
 the muscle of docs/concepts/wall.md, is held by E B/(1 - ν²) = 0.064 N/mm (Boussinesq), and K is 0.01 N/mm²."""
-Actuation = Literal["velocity", "force"]
-"""What a control is: translation (mm/s) and rotation (rad/s), or the drive's axial force (N) and torque (N·mm)."""
+Actuation = Literal["velocity", "force"]  # mm/s and rad/s, or the drive's axial force (N) and torque (N·mm)
 
 
 @settings
@@ -162,8 +145,7 @@ class SimulatorConfig:
         return min(self.threads or CORES, -(-worlds // lanes))
 
 
-Preset = Literal["default", "fast", "accurate"]
-"""Names of `PRESETS`."""
+Preset = Literal["default", "fast", "accurate"]  # names of `PRESETS`
 PRESETS: Mapping[Preset, SimulatorConfig] = MappingProxyType(
     {
         "default": SimulatorConfig(),

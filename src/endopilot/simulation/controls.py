@@ -28,8 +28,7 @@ PERIODS_S = (1e-3, 4.0)
 """How long a control of a file may hold, s: drives take a command a millisecond at best, and nobody drives blindly for
 longer."""
 _KINDS = ("insertion", "retraction", "spin", "pause")
-_DRIVE = 2**32
-"""From the key of a navigation's wire to that of its catheter; no study has that many navigations."""
+_DRIVE = 2**32  # from the key of a navigation's wire to that of its catheter; no study has that many navigations
 
 
 @settings
@@ -77,23 +76,9 @@ def random_controls(
     first: int = 0,
     devices: int = 1,
 ) -> tuple[Float[np.ndarray, "n devices 2"], Float[np.ndarray, "n samples devices 2"]]:
-    """Draw random navigations; sequence i is the same whatever `n_sequences`.
-
-    Args:
-        config: their distribution.
-        n_sequences: number of navigations.
-        n_samples: number of sample periods of each.
-        seed: key of the random streams.
-        max_inserted_length_mm: largest inserted length that a navigation reaches, mm; the smallest is 0.
-        first: index of the first of them.
-        devices: number of devices; each is driven independently of the others, with the same distribution.
-
-    Returns:
-        Initial (Δ mm, φ rad), and controls (mm/s, rad/s), of each device.
-
-    Raises:
-        InputError: a number that is not positive, or a negative seed.
-    """
+    """Draw random navigations, each the same whatever `n_sequences`, from number `first`; return their start (Δ mm, φ
+    rad) and controls (mm/s, rad/s) of each device, driven independently. Inserted lengths lie between 0 and
+    `max_inserted_length_mm`. Raises InputError for a number that is not positive."""
     if n_sequences < 1 or n_samples < 1:
         raise InputError(f"random controls: {n_sequences} sequences of {n_samples} samples; give at least 1 of 1")
     if not 0 <= seed < 2**64:
@@ -123,18 +108,8 @@ def random_controls(
 def free_wire_load(
     velocity: Float[np.ndarray, "*n 2"], *, radius_mm: float, friction_n: float, drag_n_s_mm: float, stick_mm_s: float
 ) -> Float[np.ndarray, "*n 2"]:
-    """Return the drive's force (N) and torque (N·mm) that move a wire through the introducer alone at some velocity.
-
-    The wire's surface moves by v = (Δ̇, r φ̇) past the valve, whose smoothed Coulomb friction F and drag c oppose it with
-    F v / √(v² + ε²) + c v, as the rod core has it.
-
-    Args:
-        velocity: Δ̇ (mm/s) and φ̇ (rad/s).
-        radius_mm: of the wire, r.
-        friction_n: F.
-        drag_n_s_mm: c.
-        stick_mm_s: ε, velocity below which friction falls off.
-    """
+    """Return the drive's force (N) and torque (N·mm) that move a wire through the introducer alone at (Δ̇ mm/s, φ̇
+    rad/s): its surface's v = (Δ̇, r φ̇) is opposed by F v / √(v² + ε²) + c v, as in the rod core."""
     surface = velocity * np.array([1.0, radius_mm])
     size = np.sqrt((surface**2).sum(axis=-1, keepdims=True) + stick_mm_s**2)
     return (friction_n / size + drag_n_s_mm) * surface * np.array([1.0, radius_mm])
@@ -168,13 +143,7 @@ def _manoeuvre(config: ControlConfig, generator: np.random.Generator) -> Float[n
 
 @dataclass(frozen=True, eq=False)
 class ScriptedControls:
-    """Controls from a file.
-
-    Attributes:
-        initial: (Δ mm, φ rad) of each world and device before the first period.
-        control: mm/s and rad/s, likewise.
-        period_s: time that each control holds, s.
-    """
+    """A file's controls: start (Δ mm, φ rad) and velocities (mm/s, rad/s) of each world and device, `period_s` each."""
 
     initial: Float[np.ndarray, "worlds devices 2"]
     control: Float[np.ndarray, "worlds samples devices 2"]
@@ -182,20 +151,12 @@ class ScriptedControls:
 
 
 def read_controls_csv(path: Path, *, devices: int = 1) -> ScriptedControls:
-    """Read scripted controls.
+    """Read scripted controls of so many devices; a rollout that was written as CSV can be simulated again.
 
-    The columns are `time_s` (end of each period, all of one length: 0.5, 1.0, ... or 0.05, 0.1, ...),
-    `translation_mm_s` and `rotation_rad_s`; optional are `world` (several navigations in one file, by whole numbers),
-    and `inserted_length_mm` with `rotation_rad` (state at the end of each period, from which the initial one follows;
-    0 if they are not there). So a rollout that was written as CSV can be simulated again. Columns of catheters begin
-    with `catheter_1_` and `catheter_2_`. `csv_file` says which ways of writing a CSV are read.
-
-    Args:
-        path: the file.
-        devices: how many devices it drives.
-
-    Raises:
-        InputError: not such a table; the line names file, column, row and mend.
+    The columns are `time_s` (end of each period, all of one length), `translation_mm_s` and `rotation_rad_s`; optional
+    are `world` (several navigations in one file), and `inserted_length_mm` with `rotation_rad` (state at the end of
+    each period, from which the initial one follows; else 0). Columns of catheters begin with `catheter_1_` and
+    `catheter_2_`. Raises InputError for another table (`csv_file`).
     """
     prefixes = column_prefixes(devices)
     driven = [prefix + name for prefix in prefixes for name in _COLUMNS[1:]]
@@ -219,7 +180,6 @@ def read_controls_csv(path: Path, *, devices: int = 1) -> ScriptedControls:
 
 
 def _rows_of_worlds(table: Columns) -> Int[np.ndarray, "worlds samples"]:
-    """Return the rows of each world, in the order of their numbers; all rows where the file knows no worlds."""
     if "world" not in table.values:
         return np.arange(len(table.lines))[None]
     world = table.values["world"]

@@ -30,10 +30,8 @@ from endopilot.simulation.rod import RodLayout
 from endopilot.simulation.tubes import TransmissionLayout, TubeLayout
 from endopilot.types import SAMPLE_PERIOD_S, DistanceMap, Insertion
 
-_LARGEST_NEWTON_STEP = 0.3
-"""Displacement of a node (mm) that one Newton step is clamped to; larger ones can tangle the wire for good."""
-_MAX_ITERATIONS = 400
-"""Newton iterations after which a time step is halved, down to 1/64; a wire that snaps over needs some hundred."""
+_LARGEST_NEWTON_STEP = 0.3  # a node's displacement (mm) in a Newton step at most; larger ones tangle the wire
+_MAX_ITERATIONS = 400  # then a time step is halved, down to 1/64; a wire that snaps over needs some hundred
 _OF_DEVICES = frozenset(name for name, of, *_ in _core.OUTPUTS if of == "device")
 
 
@@ -59,35 +57,17 @@ def run_core(
     tubes: TubeLayout | None = None,
     transmission: TransmissionLayout | None = None,
 ) -> dict[str, np.ndarray]:
-    """Run the C++ core on rods and walls of one's own making, as the verification does.
-
-    Devices count from the inside out, with two numbers each where the arrays below have numbers.
+    """Run the C++ core on rods and walls of one's own making; arguments are those of `make_simulation`.
 
     Args:
-        rod: nodes and stiffnesses; with tubes, the nodes alone count, and the drag.
-        lumen: the wall, or None for a rod in the open.
-        insertion: the point and the direction along which the base slides.
-        config: settings.
         initial: inserted length (mm) and rotation (rad) of each device before the first period.
-        control: mm/s and rad/s, or N and N·mm.
-        friction: Coulomb coefficients.
-        actuation: what the controls are.
-        loads: dead loads and springs.
-        record_shape: record node positions, mm.
-        record_attitude: record element orientations, quaternions w x y z.
+        control: mm/s and rad/s, or N and N·mm, as `actuation` says.
         lanes: worlds stepped side by side by one thread: 1, 4 or 8.
-        approach: bring the wire to its first inserted length from the ostium; else it starts there, straight.
-        free_behind_mm: nodes farther behind the insertion point follow the drive, mm.
-        push_limit_n: force at which the drive slips, N; of the device, where there is one.
-        pull_limit_n: the same where it pulls, N.
-        torque_limit_n_mm: torque at which it slips, N·mm.
-        tubes: telescoping tubes, which have limits of their own.
-        transmission: how the drives act on the devices; at the ostium if not given.
+        push_limit_n: force at which the drive slips, N; where it pulls `pull_limit_n`, turns `torque_limit_n_mm`.
 
     Returns:
-        The arrays that `_core.OUTPUTS` lists, with an axis of devices where they are of devices; `reason`: 0 fine,
-        1 not finite, 2 not converged; `contacts`: the force of the wall at each node and on the element behind it at
-        the end, N.
+        The arrays of `_core.OUTPUTS`, with an axis of devices where they are of devices; `reason`: 0 fine, 1 not
+        finite, 2 not converged; `contacts`: the wall's force at each node and on the element behind it, N.
     """
     limits = np.array([[push_limit_n, pull_limit_n, torque_limit_n_mm]]) if tubes is None else tubes.limits
     worlds, samples, devices = len(control), control.shape[1], len(limits)
@@ -148,15 +128,9 @@ def make_simulation(
 
     Args:
         rod: nodes and stiffnesses; with tubes, the nodes alone count, and the drag.
-        lumen: the wall, or None for a rod in the open.
         insertion: the point and the direction along which the base slides.
         limits: where each drive slips: push (N), pull (N) and torque (N·mm).
         push_limit_n: what all drives together can push with, N; it sizes the wall's stiffness.
-        worlds: their number.
-        config: settings.
-        tubes: of a wire in catheters.
-        motion: of the vessel and the insertion.
-        transmission: how the drives act on the devices; at the ostium if not given.
         loads: dead loads and springs.
         approach: bring devices to their first inserted length from the ostium; else they start there, straight.
         free_behind_mm: nodes farther behind the insertion point follow the drive, mm.
@@ -184,18 +158,11 @@ def of_device(result: Mapping[str, np.ndarray], device: int) -> dict[str, np.nda
 
 def insertion_arguments(insertion: Insertion) -> dict[str, np.ndarray]:
     """Return an insertion as the core wants it: `origin`, mm, and `orientation`, a quaternion w x y z."""
-    return {
-        "origin": np.asarray(insertion.position, dtype=float),
-        "orientation": _base_orientation(insertion),
-    }
+    return {"origin": np.asarray(insertion.position, dtype=float), "orientation": _base_orientation(insertion)}
 
 
 def core_options(
-    config: SimulatorConfig,
-    *,
-    push_limit_n: float,
-    free_behind_mm: float,
-    approach: bool = True,
+    config: SimulatorConfig, *, push_limit_n: float, free_behind_mm: float, approach: bool = True
 ) -> Options:
     """Return the settings as the core wants them; what all drives can push with, N, sizes the wall's stiffness."""
     options = core_for(config.processor).Options()
@@ -225,16 +192,8 @@ def make_lumen(
     finer: int = 1,
     spheres: Float[np.ndarray, "lines 8"] | None = None,
 ) -> Lumen:
-    """Return the wall as the core wants it, a quadratic B-spline through the map.
-
-    Args:
-        distance_map: of the vessel.
-        radius_mm: of the wire.
-        processor: where it is used.
-        far_mm: a wire farther outside the wall than this has left the map.
-        finer: the spline's grid is this many times finer than the map.
-        spheres: on such a grid, spheres inside the lumen make it sharp: the ends (LPS, mm) of lines of centres, and
-            the radii at these ends, mm.
+    """Return the wall for a wire of some radius, a quadratic B-spline through the map, which ends `far_mm` outside. On
+    a grid `finer` by a whole number, `spheres` (ends of their centres' lines, LPS, and radii there, mm) make it sharp.
     """
     spacing = float(distance_map.spacing_mm)
     return core_for(processor).make_lumen(
@@ -249,10 +208,8 @@ def make_lumen(
 
 
 def _base_orientation(insertion: Insertion) -> Float[np.ndarray, "4"]:
-    """Return the quaternion (w x y z) of the axes of a wire at φ = 0: the third along it, the second against its bend.
-
-    Where φ's zero is that of the world's axes, it is the shortest turn that takes the third axis to the direction.
-    """
+    """Return the quaternion (w x y z) of a wire's axes at φ = 0: the third along it, the second against its bend. Where
+    φ's zero is that of the world's axes, it is the shortest turn that takes the third axis to the direction."""
     direction, zero = np.asarray(insertion.direction, dtype=float), insertion.rotation_zero
     if isinstance(zero, np.ndarray):
         axes = np.column_stack([np.cross(direction, zero), -zero, direction])

@@ -1,7 +1,5 @@
-"""Where the numbers stand of which a state of the core is made: `World` in src/core/world.hpp.
-
-Through them friction varies along the vessel: `run_along` prepares each step, as the core has one coefficient a device.
-"""
+"""Where the numbers of a core's state stand (`World` in src/core/world.hpp), through which friction varies along a
+vessel."""
 
 from __future__ import annotations
 
@@ -13,19 +11,14 @@ from jaxtyping import Float
 from endopilot.progress import Advance
 from endopilot.simulation.groups import Group, factor_at
 
-SCALARS, DEVICE, NODE = 10, 27, 35
-"""Numbers of a world, then of each device, then of each node."""
-INSERTED, ACTIVE, REASON, TIME = 0, 5, 6, 9
-"""Of a world: inserted length, mm, number of nodes ahead of the catheter, why it is invalid, and time, s."""
+SCALARS, DEVICE, NODE = 10, 27, 35  # numbers of a world, then of each device, then of each node
+INSERTED, ACTIVE, REASON, TIME = 0, 5, 6, 9  # of a world: length, mm, nodes ahead of the catheter, reason, s
 LENGTH, ROTATION, FRICTION, LOADS = SCALARS, SCALARS + 1, SCALARS + 5, slice(SCALARS + 7, SCALARS + 11)
 """Of the wire: inserted length, mm, rotation, rad, coefficient of friction, and force and torque at the base, then of
 the drive, N and N·mm."""
-DRIVE_ROTATIONS = slice(SCALARS + 18, SCALARS + DEVICE)
-"""Of the wire: rotations of the drive and between it and the ostium, rad."""
-POSITION, ATTITUDE = slice(0, 3), slice(3, 7)
-"""Of a node: where it lies, mm, and the quaternion of the element behind it."""
-CONTACTS = (13, 24)
-"""Of a node: where the numbers of its two contact points begin, at the node and at the middle of the element."""
+DRIVE_ROTATIONS = slice(SCALARS + 18, SCALARS + DEVICE)  # the drive's, and between it and the ostium, rad
+POSITION, ATTITUDE = slice(0, 3), slice(3, 7)  # of a node, mm, and the quaternion of the element behind it
+CONTACTS = (13, 24)  # where a node's two contact points begin, at the node and at its element's middle
 LIMIT, NORMAL_FORCE, OFFSET = 0, 7, slice(8, 11)
 """Of a contact point: limit of friction in the coming step, N, the wall's force, N, and how far the wire's curve lies
 beside the polygon there, mm."""
@@ -58,18 +51,8 @@ def run_along(
     run: Callable[..., dict[str, np.ndarray]],
     advance: Advance | None = None,
 ) -> dict[str, np.ndarray]:
-    """Run worlds step by step, and before each multiply the friction of every contact by the factor where it lies.
-
-    A step that the core shortens, as in a snap, ends with the friction that the devices have by themselves.
-
-    Args:
-        group: the worlds.
-        control: of each sample.
-        steps: of a sample.
-        factors: as in `factor_at`.
-        run: runs the worlds, as the core's `run` does.
-        advance: called with the number of samples of all worlds that were simulated since the last call.
-    """
+    """Run worlds step by step with the core's `run`, and before each multiply every contact's friction by the factor
+    (`factor_at`) where it lies. A step that the core shortens ends with the devices' own friction."""
     samples = []
     for sample in range(control.shape[1]):
         now, results = np.ascontiguousarray(control[:, sample : sample + 1]), []

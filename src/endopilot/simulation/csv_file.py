@@ -1,8 +1,6 @@
-"""Tables that people write: columns of numbers, read from a CSV file whichever way a spreadsheet saved it.
-
-Commas, semicolons, tabs and bars separate; decimal commas are read where commas do not separate; names of columns may
-be in capitals. Whatever was not read as it stands is said in a `Remark`; a cell that is no finite number is refused.
-"""
+"""Tables that people write: columns of numbers, read from a CSV file whichever way a spreadsheet saved it: with commas,
+semicolons, tabs or bars, decimal commas, capitals. What was not read as it stands is said in a `Remark`; a cell that is
+no finite number is refused."""
 
 from __future__ import annotations
 
@@ -21,8 +19,7 @@ from jaxtyping import Float, Int
 from endopilot.errors import InputError, Remark
 from endopilot.files import read_text
 
-_LARGEST, _MOST_ROWS = 2**28, 5_000_000
-"""Bytes and rows of a table; a rollout of 10 000 navigations of a minute has 1.2 million rows."""
+_LARGEST, _MOST_ROWS = 2**28, 5_000_000  # bytes and rows of a table; 10 000 minutes have 1.2 million rows
 _SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars"}
 _NUMBER = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
 _LONGEST_CELL = 40
@@ -30,14 +27,7 @@ _LONGEST_CELL = 40
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Columns of numbers from a file.
-
-    Attributes:
-        path: the file.
-        values: the numbers of each column that is there, by name.
-        lines: the line of the file that each row ends on.
-        header: the names of all columns of the file, in small letters.
-    """
+    """Columns of numbers by name, the file's line that each row ends on, and all columns' names in small letters."""
 
     path: Path
     values: dict[str, Float[np.ndarray, "rows"]]
@@ -52,17 +42,8 @@ class Columns:
 def read_columns(
     path: Path, needed: Sequence[str], optional: Sequence[str] = (), *, sparse: Sequence[str] = ()
 ) -> Columns:
-    """Read columns of finite numbers from a CSV file.
-
-    Args:
-        path: the file.
-        needed: names of the columns that must be there.
-        optional: names of others to read where they are there; all else in the file is left out.
-        sparse: likewise; cells of these may be empty, and are NaN.
-
-    Raises:
-        InputError: not such a table; the line names file, row, column and mend.
-    """
+    """Read columns of finite numbers from a CSV file: needed ones, optional ones, and sparse ones, whose cells may be
+    empty (NaN). Raises InputError for another table; the line names file, row, column and mend."""
     text = read_text(path, what="CSV file", largest=_LARGEST)
     marked = re.match(r"sep=(.)\r?\n", text, flags=re.IGNORECASE)  # by which Excel finds the separator
     skipped = 1 if marked else 0

@@ -1,9 +1,6 @@
-"""A simulator whose one wire another engine moves, MuJoCo: rigid links with sprung joints, and contacts of its own.
-
-The rod core shares nothing with it but the wire's stiffnesses, the lumen's surface and the coefficient of friction. Its
-joints get an inertia and a damping of their own by which all come to rest alike, in some hundredths of a second: a wire
-moves as slowly as if it had neither.
-"""
+"""A simulator whose one wire another engine moves, MuJoCo: rigid links with sprung joints, and contacts of its own. It
+shares with the rod core the stiffnesses, the lumen's surface and the friction. Joints get an inertia and a damping by
+which all come to rest in some hundredths of a second: a wire moves as slowly as without."""
 
 from __future__ import annotations
 
@@ -29,44 +26,24 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState, Step
 from endopilot.types import Anatomy, DistanceMap, Insertion
 
-STEP_S = 0.002
-"""Time step of MuJoCo, s."""
+STEP_S = 0.002  # time step of MuJoCo, s
 SETTLE_S = 0.06
 """Time in which the joints come to rest, s. Velocities are taken away after each step, so that an inertia of stiffness
 times this and the step damps a joint, in the equations that contacts solve too, and nothing swings."""
-SHELL_MM = 0.4
-"""Thickness of the wall's triangles, mm: they lie so far outside the lumen. A thinner wall lets a node through."""
-MESH_MM = 0.4
-"""Spacing of the grid that the wall's triangles are found on, mm."""
-BEHIND_MM = 3.0
-"""Joints farther behind the ostium are held straight, mm; no wall is needed there."""
-LEAP_MM = 0.1
-"""A node that would move farther in a step is damped more, as where the wire snaps over, mm."""
+SHELL_MM = 0.4  # the wall's triangles lie so far outside the lumen, mm; a thinner one lets nodes through
+MESH_MM = 0.4  # spacing of the grid that the wall's triangles are found on, mm
+BEHIND_MM = 3.0  # joints farther behind the ostium are held straight, mm; no wall is needed there
+LEAP_MM = 0.1  # a node that would move farther in a step is damped more, as where the wire snaps over, mm
 _SLOWEST = 256
-_HELD = 1e3
-"""Inertia of a joint that is held, N·mm·s²."""
-_BASE_INERTIA = 1e6
-"""Of the base, which follows the drive, N·s²/mm and N·mm·s²."""
+_HELD = 1e3  # inertia of a joint that is held, N·mm·s²
+_BASE_INERTIA = 1e6  # of the base, which follows the drive, N·s²/mm and N·mm·s²
 
 
 class EngineWire:
-    """One wire in MuJoCo, from a base that follows a drive to its tip.
-
-    Attributes:
-        inserted_mm: length ahead of the ostium, mm.
-        rotation_rad: of the base, rad.
-    """
+    """One wire in MuJoCo, from a base that follows a drive: inserted length ahead of the ostium, and rotation."""
 
     def __init__(self, anatomy: Anatomy, rod: RodLayout) -> None:
-        """Lay the wire out straight on the guiding catheter's axis, its tip at the ostium.
-
-        Args:
-            anatomy: the vessel.
-            rod: nodes and stiffnesses.
-
-        Raises:
-            ModuleNotFoundError: MuJoCo is not installed; the message says how it is.
-        """
+        """Lay the wire out straight on the catheter's axis, tip at the ostium; ModuleNotFoundError without MuJoCo."""
         with extra_named("engine: mujoco"):
             self._mujoco: Any = importlib.import_module("mujoco")
         wall = wall_triangles(anatomy.distance_map, anatomy.insertion, 2 * anatomy.catheter_radius_mm)
@@ -147,13 +124,8 @@ class EngineWire:
 def wall_triangles(
     field: DistanceMap, insertion: Insertion, clear_mm: float
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]:
-    """Return the surface `SHELL_MM` outside a lumen, LPS mm, without the guiding catheter behind the ostium.
-
-    Args:
-        field: of the vessel with its catheter.
-        insertion: the ostium.
-        clear_mm: no triangle stays this near to the catheter's axis.
-    """
+    """Return the surface `SHELL_MM` outside a lumen, LPS mm, without the guiding catheter behind the ostium; no
+    triangle stays within `clear_mm` of the catheter's axis."""
     from skimage.measure import marching_cubes
 
     extent = (np.array(field.values.shape[::-1]) - 1) * field.spacing_mm
@@ -215,30 +187,17 @@ def _text(values: np.ndarray) -> str:
     return " ".join(f"{value:.5g}" if isinstance(value, float) else str(value) for value in values.ravel().tolist())
 
 
-_RESULTANT_MM = 2.0
-"""Length of wire whose forces of the wall are added up, mm, as the core does."""
-_THROUGH_WALL = 3
-"""Reason of a world whose wire has left the vessel."""
+_RESULTANT_MM = 2.0  # length of wire whose forces of the wall are added up, mm, as the core does
+_THROUGH_WALL = 3  # reason of a world whose wire has left the vessel
 
 
 class EngineSimulator(Simulator):
-    """One wire in one vessel that lies still, moved by MuJoCo; all else is read as of any simulator.
-
-    The drive makes every motion that it is asked for, whatever force it takes.
-    """
+    """One wire in one vessel that lies still, moved by MuJoCo; all else is read as of any simulator. The drive makes
+    every motion that it is asked for, whatever force it takes."""
 
     def __init__(self, anatomy: Anatomy, device: Stack, *, config: SimulatorConfig) -> None:
-        """Lay the wire out.
-
-        Args:
-            anatomy: the vessel.
-            device: the wire.
-            config: settings; of the rod core those of its elements and its introducer count.
-
-        Raises:
-            InputError: there are catheters, or the wall yields, or friction differs along the vessel.
-            ModuleNotFoundError: MuJoCo is not installed.
-        """
+        """Lay the wire out by the rod core's elements and introducer. Raises InputError where there are catheters, the
+        wall yields, or friction differs along the vessel; ModuleNotFoundError without MuJoCo."""
         if device.catheters or config.compliant_wall_n_mm2 is not None or config.friction_along:
             raise InputError(
                 "engine: mujoco; it has a wire alone in a rigid wall of one friction; leave the others out"
@@ -247,11 +206,7 @@ class EngineSimulator(Simulator):
         super().__init__(anatomy, device, config=config)
 
     def set_state(self, state: SimulatorState) -> None:
-        """Refuse another state: only the core's can be restored.
-
-        Raises:
-            InputError: always.
-        """
+        """Raise InputError: only the core's state can be restored."""
         raise InputError("state: another engine's state is not restored; drive it again from its start")
 
     def _run(
@@ -261,12 +216,11 @@ class EngineSimulator(Simulator):
         time_step: float,
         steps: int,
         *,
-        by_force: bool,
         shape: bool = False,
         advance: Advance | None = None,
     ) -> dict[str, np.ndarray]:
         if not control.shape[1]:
-            begun = super()._run(group, control, time_step, steps, by_force=by_force, shape=shape, advance=advance)
+            begun = super()._run(group, control, time_step, steps, shape=shape, advance=advance)
             self._begin(group)
             return begun
         rows = []
@@ -278,7 +232,6 @@ class EngineSimulator(Simulator):
         return result | ({"shape": np.stack([row["shape"] for row in rows])[None]} if shape else {})
 
     def _begin(self, group: Group) -> None:
-        """Push the wire from the ostium to where the core has brought its own."""
         values = group.simulation.state()
         length, rotation, friction = (float(values[0, k]) for k in (at.LENGTH, at.ROTATION, at.FRICTION))
         if length <= 0:
@@ -292,7 +245,6 @@ class EngineSimulator(Simulator):
         self._write(group, self._wire, (0.0, 0.0), 0.0)
 
     def _driven(self, group: Group, velocity: tuple[float, float], seconds: float) -> dict[str, np.ndarray]:
-        """Drive the wire for some time, and return what the core would record at its end."""
         wire = self._wire
         assert wire is not None  # a wire that was not begun is at the ostium, where nothing is driven from
         if self.valid[0]:

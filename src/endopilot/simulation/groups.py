@@ -1,7 +1,4 @@
-"""Worlds in groups: those with an equal anatomy and equal devices are stepped by one simulation of the core.
-
-`make_wall` brings their anatomy to the core: the distance map, on a finer grid where it is too coarse for catheters.
-"""
+"""Worlds in groups: those with an equal anatomy and equal devices are stepped by one simulation of the core."""
 
 from __future__ import annotations
 
@@ -26,26 +23,15 @@ from endopilot.simulation.rod import LONGEST_ELEMENTS, RodLayout, lay_out
 from endopilot.simulation.tubes import lay_out_transmission, lay_out_tubes
 from endopilot.types import Anatomy, DistanceMap, VesselTree
 
-FINE_MM = 0.2
-"""Spacing of a finer grid, mm, at most: a tube's axis then reads at most 0.1 mm too near to the wall."""
+FINE_MM = 0.2  # spacing of a finer grid, mm, at most: a tube's axis then reads at most 0.1 mm too near to the wall
 
-_APART_MM = 0.1
-"""Distance between the points of the guiding catheter's axis that are looked at, mm."""
+_APART_MM = 0.1  # distance between the points of the guiding catheter's axis that are looked at, mm
 
 
 def make_wall(anatomy: Anatomy, stack: Stack, config: SimulatorConfig) -> Lumen:
-    """Return an anatomy's wall as the core wants it.
-
-    A spline rounds the ridge off that the distance to the wall has on a vessel's axis, by up to half the map's spacing.
-    To a catheter hardly narrower than the vessel or the guiding catheter, the wall then seems to leave no room where
-    there is some. For those the spline's grid is finer, and the inscribed spheres of the centerline and the guiding
-    catheter make it sharp.
-
-    Args:
-        anatomy: the vessel.
-        stack: the wire, and the catheters around it.
-        config: settings of the rod core.
-    """
+    """Return an anatomy's wall as the core wants it for a stack. A spline rounds the distance's ridge on the axis by up
+    to half the map's spacing; for catheters hardly narrower than the vessel its grid is finer, and the inscribed
+    spheres make it sharp."""
     radius_mm = stack.outer_radius_mm
     field = _stiffened(anatomy, radius_mm, config.wall_along) if config.wall_along else anatomy.distance_map
     wall = make_lumen(field, radius_mm, config.processor, far_mm=config.wall_reach_mm)
@@ -64,24 +50,15 @@ def make_wall(anatomy: Anatomy, stack: Stack, config: SimulatorConfig) -> Lumen:
 def factor_at(
     abscissa_mm: Float[np.ndarray, "*n"], tree: VesselTree, factors: Sequence[float]
 ) -> Float[np.ndarray, "*n"]:
-    """Return a factor that varies along a vessel.
-
-    Args:
-        abscissa_mm: where, along the path from the ostium; behind it, in the guiding catheter, the first counts.
-        tree: centerlines.
-        factors: at even distances from the ostium to the end of the longest path, linear between.
-    """
+    """Return a factor at abscissae, mm; `factors` are at even distances from behind the ostium to the longest end."""
     ends = np.linspace(0.0, float(tree.longest_path().abscissa[-1]), len(factors)) if len(factors) > 1 else [0.0]
     return np.interp(abscissa_mm, ends, factors)
 
 
 def _stiffened(anatomy: Anatomy, radius_mm: float, factors: Sequence[float]) -> DistanceMap:
-    """Return a map by which the wall is softer than where it is stiffest, as `factor_at` has it.
-
-    A spring K d²/2 of depth d is c² times as stiff where the map gives c d: distances from where a device touches the
-    wall are multiplied by the root of the factor over the largest one. So none grows, for the core takes a wall to be
-    as far as the map says; the largest factor is the core's own stiffness (`core_options`).
-    """
+    """Return a map by which the wall is softer than where it is stiffest, as `factor_at` has it: a spring K d²/2 is c²
+    times as stiff where the map gives c d. So none grows, for the core takes a wall to be as far as the map says; the
+    largest factor is the core's own stiffness (`core_options`)."""
     field, tree = anatomy.distance_map, anatomy.tree
     lines = [branch.centerline for branch in tree.branches]
     nearest = KDTree(np.concatenate([line.points for line in lines]))
@@ -103,10 +80,8 @@ def _leaves_room(wall: Lumen, anatomy: Anatomy, radius_mm: float) -> bool:
 
 
 def _inscribed_spheres(wall: Lumen, anatomy: Anatomy) -> Float[np.ndarray, "lines 8"]:
-    """Return the inscribed spheres along the centerlines and the guiding catheter's axis, as `make_lumen` takes them.
-
-    None is wider than the wall, rounded off as it may be, allows.
-    """
+    """Return the inscribed spheres along the centerlines and the guiding catheter's axis, as `make_lumen` takes them,
+    none wider than the rounded wall allows."""
     rounded_off = 0.5 * anatomy.distance_map.spacing_mm
     lines = []
     for branch in anatomy.tree.branches:
@@ -118,30 +93,20 @@ def _inscribed_spheres(wall: Lumen, anatomy: Anatomy) -> Float[np.ndarray, "line
     return np.concatenate([*lines, [guiding]])
 
 
-GroupKey = tuple[str, tuple[Any, ...]]
-"""Identity of an anatomy, and constants of its devices."""
-_KEPT = 4
-"""Walls that are kept for the next simulator; each takes 4 bytes a point of the distance map."""
-_walls: dict[tuple[Any, ...], Lumen] = {}
-"""The last walls that were made, the latest last."""
+GroupKey = tuple[str, tuple[Any, ...]]  # identity of an anatomy, and constants of its devices
+_KEPT = 4  # walls that are kept for the next simulator; each takes 4 bytes a point of the distance map
+_walls: dict[tuple[Any, ...], Lumen] = {}  # the last walls that were made, the latest last
 
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """The worlds with an equal anatomy and equal devices.
+    """The worlds with an equal anatomy and equal devices; `anatomy` and `stack` are those of the first.
 
     Attributes:
-        anatomy: the vessel, as the first of them has it.
-        stack: the wire and its catheters, as the first of them has it.
-        rod: its nodes and stiffnesses.
-        lumen: the wall, as the core has it.
-        wall: how far outside the wall it goes, mm, and how the stiffness of the wall varies along the vessel.
-        motion: of the vessel, as the core has it; None if it lies still.
-        simulation: the worlds, as the core has them.
-        index: their numbers, ascending.
-        path_mm: length of the vessel's longest path.
-        longest_mm: inserted length that the wire is laid out for.
-        project: projection to the vessel's centerline.
+        wall: how far outside the wall the lumen goes, mm, and how its stiffness varies along the vessel.
+        motion: of the vessel, None if it lies still; as the core has it, as are `lumen` and `simulation`.
+        index: the worlds' numbers, ascending.
+        path_mm: length of the vessel's longest path; `longest_mm`: inserted length that the wire is laid out for.
     """
 
     anatomy: Anatomy
@@ -187,19 +152,8 @@ def make_groups(
     sharing: Sequence[Group],
     reach_mm: float,
 ) -> list[Group]:
-    """Return the groups of worlds, with their wires laid out and at the ostium.
-
-    Args:
-        anatomies: of each world.
-        stacks: wire and catheters of each world.
-        motion: of every vessel about its ostium; None if they lie still.
-        config: settings of the rod core.
-        sharing: groups whose lumens and projections are taken rather than prepared again.
-        reach_mm: inserted length that devices are laid out for, mm; the far end of each vessel if that is more.
-
-    Raises:
-        InputError: a device that does not fit its anatomy or the catheter around it; a distance map that is not finite,
-            or negative at the ostium; more worlds than the memory holds.
+    """Return the groups of worlds, with wires laid out (`reach_mm`, or to the vessel's far end if deeper) at the
+    ostium, about which vessels move by `motion`; `sharing`'s lumens are taken over. Raises InputError as `Simulator`.
     """
     core, wall = core_for(config.processor), (config.wall_reach_mm, config.wall_along)
     prepared = [group for group in sharing if isinstance(group.lumen, core.Lumen) and group.wall == wall]

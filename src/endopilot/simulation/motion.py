@@ -1,9 +1,8 @@
 """The patient's motion: heartbeat and breathing move the vessel and with it the guiding catheter.
 
-A point X of the vessel, as CT shows it, lies at x = o + u + R (1 + E) (X - o) in the laboratory, with o the ostium.
-The shift u, the rotation R and the symmetric strain E are smooth and periodic in time. Breathing shifts and turns; the
-heartbeat shifts, turns and contracts. CT shows the vessel at mid-diastole and at the end of expiration; there every
-motion begins.
+A point X of the vessel, as CT shows it, lies at x = o + u + R (1 + E) (X - o), with o the ostium. The shift u, the
+rotation R and the symmetric strain E (of the heartbeat alone) are smooth and periodic in time. CT shows the vessel at
+mid-diastole and at the end of expiration; there every motion begins.
 """
 
 from __future__ import annotations
@@ -20,8 +19,7 @@ from endopilot.atlas.heart_reference import LEFT_VENTRICLE_AXIS
 from endopilot.settings import Finite, Within, settings
 from endopilot.simulation.config import CoreMotion, Processor, core_for
 
-MotionName = Literal["still", "breathing", "heartbeat", "both"]
-"""Names of motions: see `motion_named`."""
+MotionName = Literal["still", "breathing", "heartbeat", "both"]  # names of motions: see `motion_named`
 Axis = Float[np.ndarray, "3"]
 
 AMPLITUDES = {
@@ -34,20 +32,16 @@ AMPLITUDES = {
 }
 """Amplitudes in which patients differ: published mean, standard deviation, least and most; `Motion` has the sources."""
 
-_LONG_AXIS = np.array(LEFT_VENTRICLE_AXIS) / np.linalg.norm(LEFT_VENTRICLE_AXIS)
-"""From the base of the heart to its apex, LPS."""
-_LONG_AXIS_MM = 94.0
-"""Length of the left ventricle's outside along it, mm, as in the atlas."""
-_KNOTS = 64
-"""Knots of the spline through a period."""
+_LONG_AXIS = np.array(LEFT_VENTRICLE_AXIS) / np.linalg.norm(LEFT_VENTRICLE_AXIS)  # from the heart's base to its apex
+_LONG_AXIS_MM = 94.0  # length of the left ventricle's outside along it, mm, as in the atlas
+_KNOTS = 64  # knots of the spline through a period
 _PHASES, _CONTRACTED = (0.03, 0.34, 0.54, 0.74), (0.0, 1.0, 0.42, 0.22)
 """Shares of the contraction that are done at phases of the heartbeat, as shares of its period: where systole begins
 and ends, where the rapid filling ends and where the filling by the atria begins. Shortening is greatest at 0.34 (4D CT
 of 25 normal hearts; McVeigh et al., J Cardiovasc Comput Tomogr 2018). The others are such that the proximal and middle
 right coronary artery stays within 1 mm for about as long as published (Shechter et al., Med Phys 2005): 94 ms at
 end-systole, for 76 ± 34 ms, and 88 ms in mid-diastole, for 65 ± 42 ms."""
-_MID_DIASTOLE = 0.68
-"""Phase at which CT shows the vessel."""
+_MID_DIASTOLE = 0.68  # phase at which CT shows the vessel
 
 
 @settings
@@ -117,13 +111,8 @@ def contracted_share(phase: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
 
 
 def motion_named(name: MotionName, seed: int | None = None) -> Motion | None:
-    """Return a motion by its name; None for a vessel that lies still.
-
-    Args:
-        name: "still", "breathing", "heartbeat" or "both".
-        seed: draws the amplitudes of one patient from the published distributions, within the published ranges; the
-            published means if None.
-    """
+    """Return a motion by its name; None for "still". The seed draws one patient's amplitudes from the published
+    distributions, within the published ranges; without it they are the published means."""
     if name == "still":
         return None
     motion = Motion() if seed is None else draw_motion(seed)
@@ -141,11 +130,7 @@ def motion_named(name: MotionName, seed: int | None = None) -> Motion | None:
 
 
 def published_mean(motion: Motion) -> Motion | None:
-    """Return what is published of a patient's motion: the mean amplitudes of what moves, with the patient's periods.
-
-    Args:
-        motion: the patient's own; None is returned where nothing of it moves.
-    """
+    """Return published mean amplitudes of what moves in a patient's motion, with the patient's periods, or None."""
     beats = bool(motion.annulus_mm or motion.heart_volume_share or motion.heart_rotation_deg)
     shifts = motion.breathing_caudal_mm or motion.breathing_anterior_mm
     breathes = bool(shifts or motion.breathing_dorsal_deg or motion.breathing_dextral_deg)

@@ -1,7 +1,4 @@
-"""Robots in front of a simulator's devices: drives, grips, encoders and load cells; one robot a world.
-
-`endopilot.robot.robot.SimulatedRobot` is one of them behind a robot's interface; data sets and environments drive many.
-"""
+"""Robots in front of a simulator's devices: drives, grips, encoders and load cells; one robot a world."""
 
 from __future__ import annotations
 
@@ -23,21 +20,10 @@ from endopilot.simulation.trajectory import Trajectory
 
 
 class Recorder:
-    """Drives a simulator step by step and keeps what it does.
-
-    Attributes:
-        simulator: what is driven.
-        period_s: duration of a step, s.
-    """
+    """Drives a simulator in steps of `period_s` and keeps what it does."""
 
     def __init__(self, simulator: Simulator, period_s: float, *, record_shape: bool = False) -> None:
-        """Begin where the worlds are now.
-
-        Args:
-            simulator: what is driven.
-            period_s: duration of a step, s.
-            record_shape: record the positions of all nodes too.
-        """
+        """Begin where the worlds are now; `record_shape` records the positions of all nodes too."""
         self.simulator, self.period_s = simulator, period_s
         self._set_up, self._start, self._began_s = simulator.set_up, simulator.proximal, simulator.time
         self._commands: list[np.ndarray] = []
@@ -61,11 +47,7 @@ class Recorder:
         return step
 
     def trajectory(self) -> Trajectory:
-        """Return all steps so far.
-
-        Raises:
-            ValueError: there is none yet.
-        """
+        """Return all steps so far; ValueError if there is none."""
         if self._step is None:
             raise ValueError("nothing was driven yet")
         rows, recorded, at = np.stack(self._rows, axis=1), {}, 0
@@ -81,20 +63,12 @@ class Recorder:
         )
 
 
-Seed = Sequence[int]
-"""Seed of one robot: of its gains, its jitter and its noise."""
+Seed = Sequence[int]  # seed of one robot: of its gains, its jitter and its noise
 
 
 def in_grip(stack: Stack, robot: RobotConfig, core: SimulatorConfig) -> tuple[Stack, SimulatorConfig]:
-    """Return devices as a robot holds them, and settings by which the wall is as hard as before.
-
-    They slip where its grip yields, and lie behind the ostium as its drives say, or else as the stack says.
-
-    Args:
-        stack: the devices.
-        robot: what holds them.
-        core: settings of the rod core, whose wall is as hard as the devices' push limits say if nothing else is given.
-    """
+    """Return devices as a robot holds them, slipping where its grip yields, behind the ostium as its drives say, or
+    else the stack; and settings by which the wall is as hard as before."""
     drives = robot.drives(len(stack))
     wire, *around = drives
     catheters = tuple(drive.gripped(each) for drive, each in zip(around, stack.catheters, strict=True))
@@ -109,16 +83,10 @@ def in_grip(stack: Stack, robot: RobotConfig, core: SimulatorConfig) -> tuple[St
 
 
 class Robots:
-    """What moves the devices of some worlds, and what is measured of them. No world depends on another.
+    """What moves the devices of some worlds, and what is measured of them; worlds are independent.
 
-    Encoders count from the assumed position of the ostium. On the devices they measure what play and a slipping drive
-    leave of a command; at the motors they see neither. The load holds what the introducer's valve takes: its friction,
-    with the sign of the motion.
-
-    Attributes:
-        motion: of the drives.
-        ostium_mm: the true inserted lengths are this much more than the encoders', mm; less where the guiding catheter
-            backs out.
+    Encoders count from the assumed ostium: true inserted lengths are `ostium_mm` more. On the devices they measure what
+    play and slip leave of a command; at the motors they see neither. The load holds what the introducer's valve takes.
     """
 
     def __init__(
@@ -130,15 +98,7 @@ class Robots:
         seeds: Sequence[Seed],
         ostium_mm: float | Float[np.ndarray, "worlds"] = 0.0,
     ) -> None:
-        """Grasp the devices where they are.
-
-        Args:
-            simulator: whose devices they are.
-            config: latency, gains, plays, encoders and noise, of all robots or of each world's.
-            limits: of the drives of each world, by the encoders.
-            seeds: of each world's robot.
-            ostium_mm: the true inserted lengths are this much more than the encoders', mm, in all worlds or in each.
-        """
+        """Grasp the devices where they are, with one config, or one each, and limits of the drives by the encoders."""
         worlds, devices = len(limits), len(limits[0])
         configs = [config] * worlds if isinstance(config, RobotConfig) else list(config)
         self.ostium_mm = np.broadcast_to(ostium_mm, worlds).astype(float)
@@ -164,14 +124,7 @@ class Robots:
         seeds: Sequence[Seed],
         configs: Sequence[RobotConfig] | None = None,
     ) -> None:
-        """Let other robots grasp the devices of some worlds, at rest.
-
-        Args:
-            simulator: whose devices they are.
-            worlds: their numbers.
-            seeds: of their robots.
-            configs: of these; as before if not given.
-        """
+        """Let other robots, with configs as before if not given, grasp the devices of some worlds, at rest."""
         for world, config in [] if configs is None else zip(worlds, configs, strict=True):
             self._configs[world] = config
         self._grasp(worlds, seeds)
@@ -185,13 +138,8 @@ class Robots:
         worlds: Sequence[int] | None = None,
         encoder_noise: np.random.Generator | None = None,
     ) -> Float[np.ndarray, "chosen devices 4"]:
-        """Return a reading of the encoders, mm and rad, and of the drives' loads, N and N·mm.
-
-        Args:
-            simulator: whose devices are read.
-            worlds: those that are read; all if not given.
-            encoder_noise: of the encoders' noise, where there is one world; the robots' own streams if not given.
-        """
+        """Return a reading of the encoders, mm and rad, and of the drives' loads, N and N·mm, of some worlds or all.
+        The robots' own streams draw the noise if the encoders' is not given."""
         chosen = list(range(len(self._random)) if worlds is None else worlds)
         places = self.counted(simulator)[chosen]
         own, shape = [self._random[world] for world in chosen], places.shape[1:]
@@ -206,7 +154,6 @@ class Robots:
         return np.where(self._at_motor, self.motion.motor, self._counted(simulator))
 
     def _grasp(self, worlds: Sequence[int], seeds: Sequence[Seed]) -> None:
-        """Take what the robots of some worlds measure, and how noisily."""
         devices = self._noise.shape[1]
         for world, seed in zip(worlds, seeds, strict=True):
             config, self._random[world] = self._configs[world], np.random.default_rng([*seed, 8])

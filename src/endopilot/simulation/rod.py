@@ -12,20 +12,16 @@ from scipy.optimize import brentq
 from endopilot.devices.device import Wire
 from endopilot.simulation.config import Processor, RodModel, core_for
 
-POISSON_RATIO = 0.3
-"""Of steel and nitinol; it ties shear to bending stiffness."""
-SHEAR_CORRECTION = 6 * (1 + POISSON_RATIO) / (7 + 6 * POISSON_RATIO)
-"""Cowper's shear coefficient of a round section (J. Appl. Mech. 33, 1966)."""
+POISSON_RATIO = 0.3  # of steel and nitinol; it ties shear to bending stiffness
+SHEAR_CORRECTION = 6 * (1 + POISSON_RATIO) / (7 + 6 * POISSON_RATIO)  # round section (Cowper, J. Appl. Mech. 33)
 _DRAG_N_S_MM2, _SOFT_N_MM2 = 5e-6, 0.1
 """Drag on one mm of wire, N·s/mm²; far below friction. On a wire softer than the latter anywhere, N·mm², it falls with
 the square of that: it would fold as it is pushed."""
 _LEAST_N_S_MM2 = 1e-10
 """Drag is no less than this, N·s/mm². That of blood would be more, 2πη / ln(length / diameter) = 1e-8 with η = 0.0035
 Pa·s, and fold a wire of less than some 0.005 N·mm² as it is pushed; no blood is modelled."""
-_GROWTH_MM = 40.0
-"""Distance from the tip at which elements are twice as long as there; they grow in proportion to it, mm."""
-LONGEST_ELEMENTS = 5.0
-"""Longest elements, as a multiple of those at the tip: the shaft is stiffer and bends less sharply."""
+_GROWTH_MM = 40.0  # elements so far from the tip are twice as long as there, mm; they grow in proportion
+LONGEST_ELEMENTS = 5.0  # in elements at the tip: the shaft is stiffer and bends less sharply
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,14 +30,11 @@ class RodLayout:
 
     Attributes:
         abscissa_mm: distance of the nodes from the tip, mm.
-        shear_n: shear stiffness κGA of the elements, N.
-        stretch_n: axial stiffness EA of the elements, N.
-        bend_n_mm2: EI at the nodes, N·mm².
-        twist_n_mm2: GJ at the nodes, N·mm².
+        shear_n: shear stiffness κGA of the elements, N; `stretch_n` is EA, N.
+        bend_n_mm2: EI at the nodes, N·mm²; `twist_n_mm2` is GJ.
         rest_curvature: curvature and twist of the unloaded rod at the nodes, in the elements' axes, rad/mm.
         radius_mm: outer radius at the nodes, mm.
-        drag_n_s_mm: viscous drag of the nodes, N·s/mm.
-        spin_drag_n_mm_s: viscous drag of the elements' rotation, N·mm·s.
+        drag_n_s_mm: viscous drag of the nodes, N·s/mm; `spin_drag_n_mm_s` of the elements' rotation, N·mm·s.
     """
 
     abscissa_mm: Float[np.ndarray, "n"]
@@ -70,17 +63,9 @@ class RodLayout:
 
 
 def lay_out(device: Wire, *, element_mm: float, length_mm: float) -> RodLayout:
-    """Lay a device out as a rod, with shorter elements near the tip.
-
-    The nodes depend on the device and on `element_mm` alone; a longer `length_mm` only adds nodes at the base. So
-    worlds do not notice what other worlds need.
-
-    Args:
-        device: the wire.
-        element_mm: length of the elements at the tip, mm. It is taken somewhat shorter, so that the middle of an
-            element lies where the bend of the tip ends: half a joint's bend would act at the wrong place.
-        length_mm: length that the rod must have at least, mm; two more elements are added behind it.
-    """
+    """Lay a device out as a rod of at least `length_mm` and two elements behind it. Nodes depend on the device and
+    `element_mm` alone, a longer rod only adds some at the base; those at the tip are shorter, so that the middle of one
+    lies where its bend ends."""
     abscissa = _nodes(element_mm, length_mm, device.tip_bend_length_mm)
     length = np.append(np.diff(abscissa), np.diff(abscissa)[-1])
     middle = abscissa + 0.5 * length

@@ -1,9 +1,6 @@
-"""The signals of a trajectory, each declared once: `Outputs`, what the core records, and `SIGNALS`, all of them.
-
-The core's table `_core.OUTPUTS` says name, shape, unit and meaning of what it records. A new output needs one more line
-here, its field in `Outputs`: `Step`, `Trajectory`, data sets, files, tables and the documentation follow. A signal that
-comes from elsewhere, such as what a robot measures, is one row of `_FURTHER`, and an array in `Trajectory.columns`.
-"""
+"""The signals of a trajectory, each declared once: `Outputs`, what the core records, and `SIGNALS`, all of them. A new
+output of `_core.OUTPUTS` needs one more line here, its field in `Outputs`; one from elsewhere a row of `_FURTHER`, and
+an array in `Trajectory.columns`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -22,14 +19,8 @@ _TIP = ("tip_abscissa_mm", "tip_offset_mm")
 
 
 class Signal(NamedTuple):
-    """An array of a trajectory's file.
-
-    Attributes:
-        axes: of the array, apart by spaces; numbers are sizes.
-        unit: of its numbers.
-        meaning: what it is.
-        columns: its columns in a table, one for each number of a sample; none if it has no place there.
-    """
+    """An array of a trajectory's file: its axes (apart by spaces; numbers are sizes), unit and meaning, and its columns
+    in a table, one for each number of a sample; none if it has no place there."""
 
     axes: str
     unit: str
@@ -89,7 +80,6 @@ _FURTHER = {
 
 
 def _columns(name: str, of: str, numbers: int, unit: str) -> tuple[str, ...]:
-    """Return the columns of an output: its name and unit, and those of a vector with its axes."""
     if of not in ("device", "sample"):
         return ()
     name = {"tip_position": "tip", "iterations": "newton_iterations"}.get(name, name)
@@ -151,14 +141,7 @@ class SolvedOutputs(Outputs):
 
 
 def table_columns(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return signals as columns of a table: those of the wire, those of each catheter, and those of all together.
-
-    Args:
-        values: signals by name; the first axis is that of the table's rows, the second that of devices if there is one.
-
-    Returns:
-        By the columns' names; those of catheters begin with `catheter_1_` and `catheter_2_`.
-    """
+    """Return signals as table columns by name, of catheters with their prefix; axes are rows, then devices."""
     of_devices = {name: each for name, each in values.items() if SIGNALS[name].of_devices}
     devices = next((each.shape[1] for each in of_devices.values()), 0)
     parts = [

@@ -30,19 +30,12 @@ blunt tip of a 7 French catheter (pigs; Shah et al., Europace 2011). No such fig
 or cerebral artery."""
 
 
-LONGEST_MM = 5000.0
-"""No wire or catheter is longer, mm: exchange wires have up to 4.5 m."""
+LONGEST_MM = 5000.0  # no wire or catheter is longer, mm: exchange wires have up to 4.5 m
 
 
 @dataclass(frozen=True)
 class WallForceEvent:
-    """A world whose wire presses the wall harder than `WALL_FORCE_LIMIT_N`.
-
-    Attributes:
-        world: its number.
-        time_s: end of the first sample in which it does, s.
-        force_n: largest force in any of its samples, N.
-    """
+    """A world that presses the wall beyond `WALL_FORCE_LIMIT_N`, the end of its first such sample, s, and its peak."""
 
     world: int
     time_s: float
@@ -122,17 +115,7 @@ def run_set_up(
     period_s: float,
     record_shape: bool,
 ) -> Trajectory:
-    """Drive worlds from their start with a sequence of commands each, as long as it may take.
-
-    Args:
-        set_up: what is simulated.
-        command: mm/s and rad/s, or N and N·mm, of each world, sample and device.
-        period_s: time that each holds, s.
-        record_shape: record the positions of all nodes too.
-
-    Raises:
-        InputError: as `simulate` has it.
-    """
+    """Drive worlds from their start with a sequence of commands each (mm/s and rad/s, or N and N·mm)."""
     worlds, samples = command.shape[:2]
     check_memory(8 * worlds * samples * 20, f"control: {worlds} worlds of {samples} samples", "simulate fewer at once")
     if not 0 < period_s < np.inf:
@@ -165,10 +148,7 @@ def run_set_up(
 
 
 def wall_force_events(trajectory: Trajectory) -> tuple[WallForceEvent, ...]:
-    """Return the worlds whose wire presses the wall harder than it should, in the order of their numbers.
-
-    Forces are those at the ends of samples, of valid worlds.
-    """
+    """Return by their numbers the valid worlds whose wire presses the wall harder than it should."""
     force = np.where(trajectory.valid, trajectory.wall_force, 0.0)
     above = force > WALL_FORCE_LIMIT_N
     return tuple(

@@ -1,8 +1,5 @@
-"""Many worlds, driven step by step: for controllers, planners and learning environments.
-
-`Simulator` keeps the state of its worlds between calls; `simulate` runs whole control sequences at once. Both drive the
-same C++ core and give the same answer to the last bit.
-"""
+"""Many worlds, driven step by step: for controllers, planners and learning environments; `simulate` runs whole
+sequences. Both drive the same C++ core, to the same bits."""
 
 from __future__ import annotations
 
@@ -33,10 +30,8 @@ from endopilot.simulation.state import SimulationSetUp, SimulatorState, Step, Su
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
-_DEEPEST_START = 0.8
-"""Share of the longest path that a random start may lie at."""
-_LEAST_BYTES = 4000
-"""No world takes less memory, bytes; a number of worlds that needs more is refused before they are listed."""
+_DEEPEST_START = 0.8  # share of the longest path that a random start may lie at
+_LEAST_BYTES = 4000  # no world takes less memory; too many are refused before they are listed
 
 
 class Simulator(Readout):
@@ -183,7 +178,7 @@ class Simulator(Readout):
                 sample_period=SAMPLE_PERIOD_S,
             )
             no_control = np.zeros((len(group.index), 0, self._devices, 2))
-            self._run(group, no_control, self.config.time_step_s, self.config.steps_per_sample, by_force=False)
+            self._run(group, no_control, self.config.time_step_s, self.config.steps_per_sample)
         resets = np.isin(np.arange(self.worlds), chosen)
         self._set_up = replace(
             self._set_up,
@@ -262,16 +257,7 @@ class Simulator(Readout):
         began_s: Float[np.ndarray, "worlds"],
         result: Mapping[str, np.ndarray],
     ) -> Trajectory:
-        """Return what was recorded of these worlds as a trajectory; `run` and `Recorder` do.
-
-        Args:
-            set_up: what they were simulated with.
-            start: Δ (mm) and φ (rad) before the first sample.
-            command: of each sample.
-            period_s: time between samples, s.
-            began_s: `time` before the first sample, s.
-            result: the arrays of `Step`, with an axis of samples, and of `shape` if it was recorded.
-        """
+        """Return what was recorded as a trajectory: worlds' starts, `time`, commands and the arrays of `Step`."""
         recorded: dict[str, Any] = {name: result[name] for name in Step.__dataclass_fields__}
         times = began_s[:, None] + period_s * np.arange(1, command.shape[1] + 1)
         return Trajectory(
@@ -288,26 +274,20 @@ class Simulator(Readout):
 
     @property
     def state(self) -> SimulatorState:
-        """The worlds' state, to be kept and given to `set_state`.
-
-        Example:
-            >>> kept = simulator.state  # kept.write(path) writes it to a file
-        """
+        """The worlds' state, to be kept and given to `set_state`; `simulator.state.write(path)` writes it to a file."""
         return SimulatorState(tuple(group.simulation.state() for group in self._groups), self._fingerprint)
 
     def set_state(self, state: SimulatorState) -> None:
-        """Restore all worlds, bit by bit.
-
-        Raises:
-            InputError: the state is that of other anatomies, devices or settings, of another number of worlds, or of
-                another version of endopilot.
+        """Restore all worlds, bit by bit; InputError for the state of other anatomies, devices, settings or versions.
 
         Example:
-            >>> kept, control = simulator.state, np.tile([5.0, 0.5], (4, 1))
+            >>> kept, control = simulator.state, np.tile([5.0, simulator.config.element_mm], (4, 1))
             >>> once = simulator.step(control, 0.1)
             >>> simulator.set_state(kept)
             >>> np.array_equal(simulator.step(control, 0.1).tip_position, once.tip_position)
             True
+            >>> simulator.set_up.initial.shape
+            (4, 1, 2)
         """
         state.check_version()
         if state.fingerprint != self._fingerprint:
@@ -321,13 +301,8 @@ class Simulator(Readout):
     def copy_worlds(self, source: ArrayLike, *, of: Simulator | None = None) -> None:
         """Put every world where another one, of the same anatomy and device, is now; friction goes with it.
 
-        Args:
-            source: for each world, the number of the one that it becomes a copy of; its own to stay as it is.
-            of: the simulator that the numbers belong to, made with equal anatomies, devices and settings but
-                maybe another number of worlds; this one if not given.
-
-        Raises:
-            InputError: not one number for each world, or a world of another anatomy or device, or other settings.
+        `source` has, for each world, the number of the one that it becomes a copy of, among those `of` another
+        simulator of equal anatomies, devices and settings if given. Raises InputError for other numbers or worlds.
 
         Example:
             >>> simulator.copy_worlds([0, 0, 2, 2])
@@ -360,22 +335,12 @@ class Simulator(Readout):
 
     @property
     def set_up(self) -> SimulationSetUp:
-        """What the worlds are simulated with, and where they started.
-
-        Example:
-            >>> simulator.set_up.initial.shape
-            (4, 1, 2)
-        """
+        """What the worlds are simulated with, and where they started."""
         return self._set_up
 
     @property
     def config(self) -> SimulatorConfig:
-        """Settings of the rod core.
-
-        Example:
-            >>> simulator.config.element_mm
-            0.75
-        """
+        """Settings of the rod core."""
         return self._set_up.config
 
     def _random_start(self, seed: int | None) -> tuple[np.ndarray, np.ndarray]:
@@ -389,7 +354,6 @@ class Simulator(Readout):
     def _checked(
         self, control: ArrayLike | SupportsDLPack, period_s: float, *, sequence: bool
     ) -> Float[np.ndarray, "worlds samples devices 2"]:
-        """Return controls with all their axes, once they are checked."""
         array: Any = control
         if not isinstance(array, np.ndarray) and hasattr(array, "__dlpack__"):
             array = np.from_dlpack(array)
@@ -415,11 +379,8 @@ class Simulator(Readout):
         advance: Advance | None = None,
     ) -> dict[str, np.ndarray]:
         """Step all worlds; from now on they are on their way."""
-        by_force = self._set_up.actuation == "force"
         results = [
-            self._run(
-                group, control[group.index], time_step, steps, by_force=by_force, shape=record_shape, advance=advance
-            )
+            self._run(group, control[group.index], time_step, steps, shape=record_shape, advance=advance)
             for group in self._groups
         ]
         if control.size and not np.isnan(self._set_up.initial).all():
@@ -461,13 +422,12 @@ class Simulator(Readout):
         time_step: float,
         steps: int,
         *,
-        by_force: bool,
         shape: bool = False,
         advance: Advance | None = None,
     ) -> dict[str, np.ndarray]:
         run = partial(
             group.simulation.run,
-            force_driven=by_force,
+            force_driven=self._set_up.actuation == "force",
             time_step=time_step,
             record_shape=shape,
             record_attitude=False,
@@ -492,7 +452,6 @@ class Simulator(Readout):
 
     @cached_property
     def _fingerprint(self) -> str:
-        """Hash of all that a state belongs to."""
         groups = [(group.index.tolist(), group_key(group.anatomy, group.stack)) for group in self._groups]
         return hashlib.sha256(repr((self._settings, groups)).encode()).hexdigest()
 

@@ -19,8 +19,7 @@ from endopilot.simulation.motion import Motion
 from endopilot.simulation.signals import SolvedOutputs, described
 from endopilot.types import Anatomy
 
-FORMAT_VERSION = 4
-"""Of `SimulatorState`: raised when its values or its fingerprint come to mean something else."""
+FORMAT_VERSION = 4  # of `SimulatorState`: raised when its values or its fingerprint come to mean something else
 
 
 @runtime_checkable
@@ -33,17 +32,15 @@ class SupportsDLPack(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SimulationSetUp:
-    """What worlds are simulated with. A `Simulator` made of it and the same commands give the same bits.
+    """What worlds are simulated with: a `Simulator` made of it and the same commands give the same bits.
 
     Attributes:
-        anatomies: the vessel of each world.
-        stacks: the devices of each world.
+        anatomies: the vessel of each world; `stacks` its devices.
         initial: Δ (mm) and φ (rad) that the devices are brought to before the first command; NaN in a world that was
             on its way already.
         friction: Coulomb coefficient of each device on the wall.
         actuation: what commands are: "velocity" (mm/s, rad/s) or "force" (N, N·mm).
         motion: how every vessel moves with time; None where they lie still.
-        config: settings of the rod core.
     """
 
     anatomies: Sequence[Anatomy]
@@ -69,12 +66,8 @@ class Step(SolvedOutputs):
 
 @dataclass(frozen=True, eq=False)
 class SimulatorState:
-    """All that the worlds' future depends on. Restored, also in another process, they go on with the same bits.
-
-    Attributes:
-        values: one array of float64 for each pair of anatomy and device, a row a world.
-        fingerprint: hash of the anatomies, devices and settings that the state belongs to.
-        format_version: of the meaning of both.
+    """All that the worlds' future depends on: restored, also in another process, they go on with the same bits.
+    `values` is an array for each pair of anatomy and device, a row a world; `fingerprint` a hash of what it belongs to.
     """
 
     values: tuple[Float[np.ndarray, "_ _"], ...]
@@ -82,14 +75,7 @@ class SimulatorState:
     format_version: int = FORMAT_VERSION
 
     def check_version(self, where: str = "state") -> None:
-        """Check that this version of endopilot can read the values.
-
-        Args:
-            where: what a person would look for: a file, or "state".
-
-        Raises:
-            InputError: the state has another format version.
-        """
+        """Raise InputError, which names `where` it is from, unless this version of endopilot can read the values."""
         if self.format_version != FORMAT_VERSION:
             raise InputError(
                 f"{where}: format version {self.format_version}, not {FORMAT_VERSION}; make the state again"
@@ -104,11 +90,7 @@ class SimulatorState:
 
     @staticmethod
     def read(path: Path | str) -> SimulatorState:
-        """Read a state.
-
-        Raises:
-            InputError: the file is missing, is no saved state, or is one of another format version.
-        """
+        """Read a state; InputError if the file is missing, is no saved state, or is one of another format version."""
         try:
             with np.load(regular(path), allow_pickle=False) as stored:
                 fingerprint = str(stored["fingerprint"])

@@ -1,15 +1,9 @@
 """The tip-load test: a device's tip pushed against a plate until it buckles, as catalogues state it in gram-force.
 
-Makers publish no common protocol, and no standard fixes one. The usual description is followed here: the wire is held
-10 mm behind its tip, its tip is set upright on the plate of a balance, and the holder is lowered until the tip buckles;
-the tip load is what the balance then shows. The tip is straight, as it leaves its packing, for a shaped tip bends from
-the first touch; the plate is smooth, so that the tip slides. A uniform tip then buckles as a clamped-free column at
-
-    F = π² EI / (4 L²)
-
-(S. P. Timoshenko and J. M. Gere, Theory of Elastic Stability, 1961, §2.1), the formula that the shipped devices' EI at
-the tip is computed from. The simulated test takes the device's whole stiffness profile, so a device whose taper begins
-ahead of 10 mm is held to its catalogue too.
+There is no common protocol; as usually described, the wire is held 10 mm behind its tip, upright on a balance's smooth
+plate, and lowered until the straight tip buckles as a clamped-free column at F = π² EI / (4 L²) (S. P. Timoshenko and
+J. M. Gere, Theory of Elastic Stability, 1961, §2.1), the formula that the shipped devices' EI at the tip is computed
+from. The test takes the whole stiffness profile, so a taper that begins ahead of 10 mm is held to its catalogue too.
 """
 
 from __future__ import annotations
@@ -28,33 +22,21 @@ from endopilot.simulation.core import run_core
 from endopilot.simulation.rod import POISSON_RATIO, SHEAR_CORRECTION, RodLayout
 from endopilot.types import Insertion
 
-HELD_MM = 10.0
-"""Distance from the tip at which the test holds the wire, mm."""
-TOLERANCE = 0.05
-"""Relative error of the simulated tip load against the catalogue's that passes."""
+HELD_MM = 10.0  # distance from the tip at which the test holds the wire, mm
+TOLERANCE = 0.05  # relative error of the simulated tip load against the catalogue's that passes
 _ELEMENTS = 40
-_PLATE_N_MM = 100.0
-"""Stiffness of the plate, N/mm: a tip load moves it by some µm."""
-_PUSH_SHARE = 0.02
-"""The holder is lowered by this share of the length. A buckled column's load grows by half of it, 1 %."""
+_PLATE_N_MM = 100.0  # stiffness of the plate, N/mm: a tip load moves it by some µm
+_PUSH_SHARE = 0.02  # of the length, lowered; a buckled column's load grows by half of it, 1 %
 _SAMPLES = 20
-_IMPERFECTION = 1e-3
-"""Sideways load on the tip as a share of the load at which a uniform tip buckles: no real tip is perfectly straight."""
-_STATIC = SimulatorConfig(time_step_s=0.5, tolerance_mm=1e-7, threads=1)
-"""One step a sample and next to no drag: each sample is an equilibrium."""
+_IMPERFECTION = 1e-3  # sideways load as a share of the buckling load: no real tip is perfectly straight
+_STATIC = SimulatorConfig(time_step_s=0.5, tolerance_mm=1e-7, threads=1)  # each sample is an equilibrium
 _DRAG = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class TipLoadTest:
-    """A simulated tip-load test.
-
-    Attributes:
-        pushed_mm: how far the holder was lowered, mm.
-        force_n: force on the plate, N.
-        shape_mm: nodes of the wire at the end, from tip to holder, mm; the wire stands along x on a plate at x = 10.
-        load_n: the tip load, the largest force on the plate, N.
-    """
+    """A simulated tip-load test: how far the holder was lowered, mm, the force on the plate, N, the wire's nodes at the
+    end, from tip to holder along x on a plate at x = 10, mm, and the tip load, the largest force, N."""
 
     pushed_mm: Float[np.ndarray, "samples"]
     force_n: Float[np.ndarray, "samples"]
@@ -63,14 +45,8 @@ class TipLoadTest:
 
 
 def simulate_tip_load(wire: Wire | str | Path) -> TipLoadTest:
-    """Push the distal 10 mm of a wire, straight, against a smooth plate until it buckles.
-
-    Args:
-        wire: the wire, its name or its YAML file; its tip shape is left out.
-
-    Raises:
-        RuntimeError: the rod core did not converge.
-    """
+    """Push the distal 10 mm of a wire (or its name, or its YAML file), straight, against a smooth plate until it
+    buckles; RuntimeError if the rod core did not converge."""
     wire = wire if isinstance(wire, Wire) else read_wire(wire)
     rod = _distal_rod(wire)
     nodes = len(rod.abscissa_mm)
@@ -108,12 +84,8 @@ def simulate_tip_load(wire: Wire | str | Path) -> TipLoadTest:
 
 
 def tip_load_row(device: Wire) -> dict[str, Any]:
-    """Return what `endopilot devices --tip-load` shows of a device.
-
-    The keys: `name`, `ei_tip_n_mm2`, the catalogue's `tip_load_n` and `tip_load_gf`, the simulated test's
-    `tested_tip_load_n` and `tested_tip_load_gf`, and against the catalogue's load the relative `error`, its `bar` and
-    whether it `passed`; None where the catalogue states no load.
-    """
+    """Return what `endopilot devices --tip-load` shows of a device: the catalogue's tip load, the simulated test's, the
+    relative `error`, its `bar` and whether it `passed`; None where the catalogue states no load."""
     load, stated = simulate_tip_load(device).load_n, device.tip_load_n
     error = None if stated is None else load / stated - 1
     shown = device.summary()
@@ -128,7 +100,6 @@ def tip_load_row(device: Wire) -> dict[str, Any]:
 
 
 def _distal_rod(device: Wire) -> RodLayout:
-    """Return the distal 10 mm, straight and in elements of one length, with the held nodes behind."""
     size = HELD_MM / (_ELEMENTS - 0.5)  # the clamped element fixes a direction over its length: half of it is held
     abscissa = size * np.arange(_ELEMENTS + 1)
     stretch = 16.0 * device.bend_stiffness(abscissa + 0.5 * size) / device.diameter_mm**2  # a round section, as in rod

@@ -40,13 +40,10 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure  # slow to import
 
-TRAJECTORY = "trajectory.npz"
-"""Name of the file in a folder that holds one navigation or plan."""
-FORMAT_VERSION = 1
-"""Of the .npz file: raised when an array comes to mean something else."""
+TRAJECTORY = "trajectory.npz"  # name of the file in a folder that holds one navigation or plan
+FORMAT_VERSION = 1  # of the .npz file: raised when an array comes to mean something else
 _FORMAT = "endopilot trajectory"
-_REASONS = {1: "left the finite numbers", 2: "did not converge", 3: "went through the wall"}
-"""Meaning of `Trajectory.reason` for an invalid world."""
+_REASONS = {1: "left the finite numbers", 2: "did not converge", 3: "went through the wall"}  # of an invalid world
 
 
 @described
@@ -109,14 +106,8 @@ class Trajectory(SolvedOutputs):
 
     def replay(self, *, record_shape: bool | None = None, **changed: Any) -> Trajectory:
         """Simulate the same commands again from the same start; what nothing changes comes out the same to the bit.
-
-        Args:
-            record_shape: record the positions of all nodes too; if not given, where they were recorded before.
-            changed: attributes of `SimulationSetUp` that are to be others, such as `config`, `motion` or `friction`.
-
-        Raises:
-            InputError: a world was on its way already when the recording began, or its vessel is not given.
-        """
+        `changed` are attributes of `SimulationSetUp`. Raises InputError where a world was on its way already when the
+        recording began, or its vessel is not given."""
         from endopilot.simulation.simulate import run_set_up  # which returns trajectories
 
         set_up = replace(self.set_up, **changed)
@@ -153,11 +144,8 @@ class Trajectory(SolvedOutputs):
         return figure
 
     def write(self, path: Path | str) -> None:
-        """Write it as .npz, which `read_trajectory` reads back to the bit, or as a table, .csv or .parquet.
-
-        Raises:
-            InputError: another suffix, or shapes for a table.
-            ModuleNotFoundError: .parquet without the extra `learn`.
+        """Write it as .npz, which `read_trajectory` reads back to the bit, or as a table, .csv or .parquet. Raises
+        InputError for another suffix or shapes in a table, ModuleNotFoundError for .parquet without the extra `learn`.
         """
         path = Path(path)
         if path.suffix not in (".parquet", ".csv", ".npz"):
@@ -223,10 +211,7 @@ def trajectory_signals(trajectory: Trajectory) -> dict[str, np.ndarray]:
 
 
 def trajectory_table(trajectory: Trajectory) -> pd.DataFrame:
-    """Return one row for each world and sample; column names end in their units where they have one.
-
-    Columns of the wire have plain names; those of catheters begin with `catheter_1_` and `catheter_2_`.
-    """
+    """Return one row for each world and sample, as `table_columns` names them."""
     import pandas as pd
 
     worlds, samples = trajectory.valid.shape
@@ -247,15 +232,8 @@ def trajectory_table(trajectory: Trajectory) -> pd.DataFrame:
 
 @public
 def read_trajectory(path: str | Path, *, anatomy: Anatomy | Sequence[Anatomy] | None = None) -> Trajectory:
-    """Read a trajectory from an .npz file.
-
-    Args:
-        path: the file.
-        anatomy: the vessel of all worlds, or one for each; without it the trajectory is not replayed or plotted.
-
-    Raises:
-        InputError: no such file, or one that is no trajectory, of another version, or of another vessel.
-    """
+    """Read a trajectory from an .npz file; without its anatomy (of all worlds, or one for each) it is not replayed or
+    plotted. Raises InputError for another file, version or vessel."""
     try:
         with np.load(regular(path), allow_pickle=False) as stored:
             about = json.loads(str(stored["about"]))
@@ -295,7 +273,6 @@ def _arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
 
 
 def _about(trajectory: Trajectory, arrays: Mapping[str, np.ndarray]) -> str:
-    """Return what the arrays mean and what they were simulated with, as JSON."""
     set_up = trajectory.set_up
     meaning = {name: SIGNALS.get(name.removeprefix("column.")) for name in arrays}
     stacks = list({id(stack): stack for stack in set_up.stacks}.values())

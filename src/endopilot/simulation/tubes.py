@@ -11,24 +11,18 @@ from endopilot.devices.stack import Stack
 from endopilot.simulation.config import CoreTransmission, Processor, Tubes, core_for
 from endopilot.simulation.rod import POISSON_RATIO, SHEAR_CORRECTION
 
-_SPACING_MM, _BEHIND_SPACING_MM = 0.25, 1.0
-"""Distance between the points of a profile, mm; of those behind the ostium."""
+_SPACING_MM, _BEHIND_SPACING_MM = 0.25, 1.0  # between a profile's points, mm; of those behind the ostium
 
 
 @dataclass(frozen=True, eq=False)
 class TubeLayout:
     """Two or three telescoping tubes; row k of each array belongs to tube k, the innermost first.
 
-    A profile has a value for each of the equal stretches that follow each other from the tube's tip; the last value
-    goes on beyond them.
+    A profile has a value for each of the equal stretches (`spacing_mm`) that follow each other from the tube's tip; the
+    last value goes on beyond them. EI and GJ are in N·mm², EA in N.
 
     Attributes:
-        spacing_mm: length of a stretch, mm.
-        bend_n_mm2: EI, N·mm².
-        twist_n_mm2: GJ, N·mm².
-        stretch_n: EA, N.
         rest_curvature: curvature of the unloaded tube about its first director, 1/mm.
-        radius_mm: outer radius, mm.
         bore_friction: Coulomb coefficient between a tube and the next one in it; that of the innermost is not used.
         limits: force (N) at which its drive slips where it pushes, where it pulls, and torque (N·mm) at which it slips.
         shear_share: κGA / EA of all tubes.
@@ -63,12 +57,7 @@ class TubeLayout:
 
 
 def lay_out_tubes(stack: Stack, *, length_mm: float) -> TubeLayout | None:
-    """Return the tubes of a stack; None for a wire alone.
-
-    Args:
-        stack: wire and catheters.
-        length_mm: length that the profiles must cover.
-    """
+    """Return the tubes of a stack, their profiles covering `length_mm`; None for a wire alone."""
     if not stack.catheters:
         return None
     wire, catheters, devices = stack.wire, stack.catheters, stack.devices
@@ -94,14 +83,8 @@ def lay_out_tubes(stack: Stack, *, length_mm: float) -> TubeLayout | None:
 
 @dataclass(frozen=True, eq=False)
 class TransmissionLayout:
-    """Devices behind the ostium; entry or row k belongs to device k, the innermost first.
-
-    Attributes:
-        spacing_mm: length of the equal stretches that follow each other from a device's tip, mm.
-        length_mm: length between drive and ostium, mm; 0: the drive acts at the ostium.
-        friction_n_mm_mm: friction torque a length, N·mm/mm.
-        twist_n_mm2: GJ of the stretches, N·mm²; the last value goes on beyond them.
-    """
+    """Devices behind the ostium, the innermost first: length between drive and ostium (0: the drive acts there),
+    friction torque a length, and GJ of equal stretches from the tip, as in `TubeLayout`."""
 
     spacing_mm: float
     length_mm: Float[np.ndarray, "devices"]
@@ -120,12 +103,7 @@ class TransmissionLayout:
 
 
 def lay_out_transmission(stack: Stack, *, longest_mm: float) -> TransmissionLayout | None:
-    """Return how the drives of a stack act on it; None where they act at the ostium.
-
-    Args:
-        stack: wire and catheters.
-        longest_mm: length of them that may lie ahead of the catheter.
-    """
+    """Return how a stack's drives, of which `longest_mm` may lie ahead of the catheter, act; None if at the ostium."""
     each = stack.transmissions
     if not any(one.length_mm > 0 for one in each):
         return None

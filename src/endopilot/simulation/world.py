@@ -38,8 +38,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion, MotionName, motion_named
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
-NOMINAL = "nominal"
-"""Name of the world that is as it is given."""
+NOMINAL = "nominal"  # name of the world that is as it is given
 QUANTITIES = ("friction", "stiffness", "latency", "ostium")
 """What `World.share` makes differ: friction coefficient, stiffness of the tip, the robot's latency, and the position of
 the ostium along the catheter's axis, the last in units of the lumen's diameter there."""
@@ -147,12 +146,7 @@ class World:
         return self
 
     def drawn(self, anatomy: Anatomy, seed: int) -> World:
-        """Return the world with what is drawn by chance: `share`'s sides, and the side to which the catheter leans.
-
-        Args:
-            anatomy: the vessel as given.
-            seed: of the navigation.
-        """
+        """Return the world with what a navigation's seed draws: the sides, also of the catheter's lean."""
         change = drawn_sides(self.share, np.random.default_rng([seed, 3]))
         world = replace(_differing(change, anatomy, self), share=0.0) if self.share else self
         return world.leaning(seed)
@@ -192,11 +186,8 @@ class World:
         return turned_axis(given.insertion.direction, self.axis_deg, self.axis_side_deg or 0.0)
 
     def anatomy(self, given: Anatomy) -> Anatomy:
-        """Return the vessel with its guiding catheter as it is in reality; its branches are those that are given.
-
-        Raises:
-            InputError: it has no such section.
-        """
+        """Return the vessel with its guiding catheter as it is in reality, its branches as given; InputError for a
+        section it lacks."""
         as_given = (self.lumen_factor, self.lumen_mm, self.occluded, self.stenosis) == (1.0, 0.0, (), None)
         real = given if as_given else _with_lumen(given, self.lumen_factor, self.lumen_mm, self.occluded, self.stenosis)
         return real if self.axis_deg == 0 else with_axis(real, self.axis(given))
@@ -209,14 +200,7 @@ class World:
         return replace(given, **changed) if changed else given
 
     def check_engine(self, what: str) -> None:
-        """Check that the rod core moves the wire.
-
-        Args:
-            what: what it has to move in, as the message names it.
-
-        Raises:
-            InputError: another engine does.
-        """
+        """Raise InputError, which names `what` the wire is to move in, unless the rod core moves it."""
         if self.engine != "rod":
             raise InputError(f"world: engine = {self.engine}; {what} are of the rod core alone: leave it out")
 
@@ -225,11 +209,7 @@ class World:
         return (self.robot or given).delayed(self.latency_factor)
 
     def write(self, path: Path | str) -> None:
-        """Write what differs as a YAML file that `read_world` reads, whole or not at all.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
+        """Write what differs as a YAML file for `read_world`, whole or not at all; InputError if that fails."""
         write_yaml(Path(path), self.differences())
 
     def differences(self) -> dict[str, Any]:
@@ -248,11 +228,7 @@ def list_worlds() -> tuple[str, ...]:
 
 
 def read_world(name_or_path: str | Path) -> World:
-    """Read a world by its name (`list_worlds`), or from a YAML file.
-
-    Raises:
-        InputError: no such world, or a file that is not one; the line names file, field, value and mend.
-    """
+    """Read a world by its name, or from a YAML file; InputError names file, field, value and mend."""
     if str(name_or_path) == NOMINAL:
         return World()
     path = named_file("world", name_or_path, (_SHIPPED,), list_worlds)
@@ -265,12 +241,7 @@ def drawn_sides(share: float, random: np.random.Generator) -> dict[str, float]:
 
 
 def world_by(change: Mapping[str, float], anatomy: Anatomy) -> World:
-    """Return the world in which some of `QUANTITIES` differ by a share.
-
-    Args:
-        change: share by quantity; what is not there does not differ.
-        anatomy: the vessel, whose lumen at the ostium is the unit of the ostium's place.
-    """
+    """Return the world whose `QUANTITIES` differ by a share; the unit of its place is the ostium's lumen."""
     return _differing(change, anatomy, World())
 
 
@@ -318,7 +289,6 @@ def _with_lumen(
 
 
 def _place(anatomy: Anatomy, stenosis: Stenosis) -> tuple[int, float]:
-    """Return the branch that a stenosis lies in or leads to, and its abscissa, mm."""
     tree = anatomy.tree
     if stenosis.section is None:
         leaf = tree.longest_leaf()

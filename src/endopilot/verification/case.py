@@ -17,10 +17,8 @@ from endopilot.simulation.rod import RodLayout
 from endopilot.simulation.tubes import TubeLayout
 from endopilot.types import Insertion
 
-X_AXIS = Insertion(position=np.zeros(3), direction=np.array([1.0, 0.0, 0.0]))
-"""Free rods are clamped at the origin and point along x."""
-STATIC = SimulatorConfig(time_step_s=0.5, tolerance_mm=1e-8, largest_jump=1e6, threads=1)
-"""One time step a sample: with drag of next to nothing, each sample is a static equilibrium."""
+X_AXIS = Insertion(position=np.zeros(3), direction=np.array([1.0, 0.0, 0.0]))  # free rods point along x from 0
+STATIC = SimulatorConfig(time_step_s=0.5, tolerance_mm=1e-8, largest_jump=1e6, threads=1)  # samples are equilibria
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,14 +44,7 @@ class Picture:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One comparison.
-
-    Attributes:
-        reference: value of the closed form, or of the other engine.
-        error: relative error, or absolute where the reference is 0.
-        picture: the case's figure.
-        skipped: why the comparison could not be made; empty if it was.
-    """
+    """A comparison with a reference: its error is relative, or absolute if that is 0; `skipped` says why not made."""
 
     case: str
     reference: float
@@ -105,20 +96,11 @@ def straight_rod(
     drag: float = 1e-12,
     clamp: int = 3,
 ) -> RodLayout:
-    """Return a uniform straight rod whose free length begins in the middle of its first free element.
+    """Return a uniform straight rod whose free length begins in the middle of its first free element (a clamped one
+    fixes a direction, and the joint behind it stands for half of it): (elements - 1/2) element lengths.
 
-    A clamped element fixes a direction over its whole length, and the joint behind it stands for half of it: so a rod
-    clamped at a wall has its wall in the middle of the clamped element. The free length is (elements - 1/2) element
-    lengths.
-
-    Args:
-        elements: number of elements, the half clamped one included.
-        bend: EI, N·mm².
-        twist: GJ, N·mm².
-        shear: κGA, N; very stiff if not given.
-        stretch: EA, N; very stiff if not given.
-        drag: drag of a node, N·s/mm.
-        clamp: nodes behind the wall that the drive holds.
+    EI and GJ are in N·mm², κGA and EA in N (very stiff if not given), a node's drag in N·s/mm; the drive holds `clamp`
+    nodes behind the wall.
     """
     stiff = 1e5 * bend / length_mm**2
     return uniform_rod(
@@ -203,14 +185,7 @@ def equilibrium(
     free_behind_mm: float = 0.0,
 ) -> dict[str, np.ndarray]:
     """Bring one clamped rod to rest and return the core's arrays, shape and attitude included, without the world axis.
-
-    Args:
-        rod: the rod; all nodes but the last three are free.
-        control: motion of the clamp, mm/s and rad/s.
-        insertion: where the wall of the clamp is, and the rod's direction.
-        inserted_length_mm: free length; the rod's own if not given.
-        free_behind_mm: the rod is held this far behind the wall of the clamp.
-    """
+    All nodes but the last three are free; `control` moves the clamp, mm/s and rad/s."""
     if inserted_length_mm is None:
         inserted_length_mm = (len(rod.abscissa_mm) - 3 - 0.5) * float(rod.abscissa_mm[1])
     return driven(
@@ -241,22 +216,9 @@ def driven(
     free_behind_mm: float = 0.0,
     push_limit_n: float = np.inf,
 ) -> dict[str, np.ndarray]:
-    """Drive one rod, or tubes in each other, and return the core's arrays, without the axis of worlds.
-
-    The axis of devices is there with tubes alone.
-
-    Args:
-        control: mm/s and rad/s, of each tube if there are some.
-        initial: inserted length (mm) and rotation (rad) at the start.
-        tubes: from the inside out, in place of the rod's stiffnesses.
-        insertion: where and in which direction the base slides.
-        approach: bring the rod to its first inserted length from the ostium; else it starts there, straight.
-        free_behind_mm: nodes farther behind the insertion follow the drive, mm.
-        push_limit_n: force at which the drive slips, N.
-
-    Raises:
-        RuntimeError: the core did not converge.
-    """
+    """Drive one rod, or tubes in each other, and return the core's arrays, without the axis of worlds; only tubes have
+    one of devices. Controls (mm/s, rad/s) and the start (mm, rad) have a row for each of `tubes`; all else is as of
+    `run_core`. Raises RuntimeError where the core did not converge."""
     result = run_core(
         rod,
         lumen,

@@ -68,10 +68,8 @@ def elastica_curve(alpha: float) -> Float[np.ndarray, "2 n"]:
 
 
 def elastica() -> list[Case]:
-    """Compare a cantilever under a dead tip load, α = F L²/EI, with Mattiasson's elliptic integrals.
-
-    K. Mattiasson, Int. J. Numer. Meth. Eng. 17 (1981) 145-153; loads that he has not: `elastica_closed_form`.
-    """
+    """Compare a cantilever under a dead tip load, α = F L²/EI, with the elliptic integrals of K. Mattiasson, Int. J.
+    Numer. Meth. Eng. 17 (1981) 145-153; loads that he has not: `elastica_closed_form`."""
     table = {
         1.0: (0.301721, 0.056433),
         2.0: (0.493457, 0.160642),
@@ -95,11 +93,8 @@ def elastica() -> list[Case]:
 
 
 def roll_up() -> list[Case]:
-    """Roll a rod into a circle: under an end moment M = 2π EI/L its ends meet.
-
-    Drag makes it roll up slowly, for the moment's potential holds for small rotations in a time step; at rest the drag
-    is gone.
-    """
+    """Roll a rod into a circle: under an end moment M = 2π EI/L its ends meet. Drag makes it roll up slowly, for the
+    moment's potential holds for small rotations in a time step; at rest the drag is gone."""
     rod = straight_rod(elements=ELEMENTS, length_mm=1.0, bend=1.0, twist=1.0, drag=ROLL_UP_DRAG)
     loading = Loading.none(len(rod.abscissa_mm))
     length = (ELEMENTS - 1) * rod.abscissa_mm[1]  # from the wall, in the middle of an element, to the tip element's
@@ -128,10 +123,8 @@ def timoshenko() -> list[Case]:
 
 
 def euler_column() -> list[Case]:
-    """Compare the load under which a clamped-free column loses its sideways stiffness with π² EI/(2L)².
-
-    A small sideways load f moves the tip by δ; f/δ falls to zero about linearly towards the critical load.
-    """
+    """Compare the load under which a clamped-free column loses its sideways stiffness with π² EI/(2L)²: the ratio of a
+    small sideways load and the tip's motion falls to zero about linearly towards it."""
     critical = np.pi**2 / 4
     loads = critical * np.array([0.9, 0.94, 0.98])
     stiffness = []
@@ -194,10 +187,8 @@ def bend_of_45_degrees() -> list[Case]:
 
 
 def rod_energy(rod: RodLayout, shape: Float[np.ndarray, "n 3"], attitude: Float[np.ndarray, "n 4"]) -> float:
-    """Return the elastic energy of a rod, N·mm, written independently of the core.
-
-    The half of the clamped joint's stretch that lies behind the wall is counted too.
-    """
+    """Return the elastic energy of a rod, N·mm, written independently of the core; the half of the clamped joint's
+    stretch that lies behind the wall is counted too."""
     turn = Rotation.from_quat(attitude, scalar_first=True)
     length = np.diff(rod.abscissa_mm)
     strain = turn[:-1].inv().apply((shape[:-1] - shape[1:]) / length[:, None]) - [0.0, 0.0, 1.0]
@@ -227,17 +218,13 @@ def objectivity() -> list[Case]:
         change = float(np.abs(energy[3:]).max() if load == 0 else abs(energy[-1] - energy[2])) / reference
         turned = np.cumsum(control[:, 1]) * 0.5
         start = np.full(2, energy[2])
-        curves = (
-            Curve("energy before the turn", turned[[0, -1]], start, "reference"),
-            Curve("core", turned, energy),
-        )
+        curves = (Curve("energy before the turn", turned[[0, -1]], start, "reference"), Curve("core", turned, energy))
         picture = Picture("turned, rad", "elastic energy, N mm", curves)
         cases.append(Case(f"energy, {name}", 0.0, change, change, 1e-10, picture))
     return cases
 
 
 def _ahead(shape: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 m"]:
-    """Return x and y of the nodes in front of the wall."""
     return shape[:ELEMENTS, :2].T
 
 

@@ -28,17 +28,10 @@ from endopilot.vessels.sources import check_unit
 from endopilot.vessels.surface import Surface, filled_box, surface_from_mask
 from endopilot.vessels.surface_distance import distance_map_from_surface
 
-CERTAIN = 0.8
-"""An ostium less probable than this is asked for."""
-
-PRESENT = 0.5
-"""The other artery is in the lumen if it begins in another piece with at least this probability."""
-
-SHORTEST_MM = 15.0
-"""A lumen whose branches together are shorter than this is no artery but a crumb."""
-
-GRID_MM = 0.5
-"""Grid spacing at which the arteries are compared, mm."""
+CERTAIN = 0.8  # an ostium less probable than this is asked for
+PRESENT = 0.5  # the other artery is in the lumen if it begins in another piece with at least this probability
+SHORTEST_MM = 15.0  # a lumen whose branches together are shorter than this is no artery but a crumb
+GRID_MM = 0.5  # grid spacing at which the arteries are compared, mm
 
 _NAMES = {"rca": "right coronary artery", "lca": "left coronary artery"}
 _NAMED, _WORTH_NAMING = 4, 0.02
@@ -49,16 +42,8 @@ _EVERY = 4  # of the skeleton's points, some 0.6 mm apart, are enough to find ve
 
 @dataclass(frozen=True, eq=False)
 class CoronaryInlet:
-    """Where a coronary artery begins.
-
-    Attributes:
-        position: tip of the open end, LPS mm.
-        confidence: probability that the artery begins there, 0 to 1.
-        runner_up: the next best place, if any.
-        crux: where the arteries meet the crux of the heart, if both are in the lumen and one reaches it.
-        other: where the other coronary artery begins, LPS mm, if it is in the lumen too, as another piece.
-        notes: remarks on what speaks against it.
-    """
+    """Where a coronary artery begins (LPS mm), with which probability, and the next best place; the `crux` if it is
+    known, and where the `other` artery begins, LPS mm, if it is in the lumen as another piece."""
 
     position: Float[np.ndarray, "3"]
     confidence: float
@@ -80,13 +65,8 @@ class CoronaryInlet:
 def coronary_inlet(
     content: LumenMask | Surface, side: Side, label: str, coordinates: str | None = None
 ) -> CoronaryInlet | None:
-    """Return where an artery begins, or None where the lumen holds a piece of the aorta, which shows it.
-
-    `coordinates` are the axes that the user gave for a file that does not state its own; None where the file does.
-
-    Raises:
-        InputError: the artery is not there, the file is in other axes, or it is not certain where the artery begins;
-            the message names what to give.
+    """Return where an artery begins, or None where a piece of the aorta in the lumen shows it; `coordinates` are axes
+    that the user gave. Raises InputError, which names what to give, for an absent or uncertain artery, or other axes.
     """
     pieces: list[list[OpenEnd]] = []
     skeletons: list[Skeleton] = []

@@ -22,8 +22,7 @@ from endopilot.vessels.ends import OpenEnd
 
 Side = Literal["rca", "lca"]
 
-SAME_MM = 8.0
-"""Ends of one lumen nearer each other than this are ends of one stub: corners of one cut, or a branch at the ostium."""
+SAME_MM = 8.0  # ends of one lumen nearer than this are of one stub: corners of a cut, or a branch at the ostium
 
 LEFT_FROM_RIGHT = np.array([0.40, 0.79, 0.46])
 """Direction of the left ostium as seen from the right one, LPS: the right sinus of Valsalva faces forwards and lies
@@ -31,21 +30,15 @@ lower. In seven real patients within 13° of this."""
 
 LEFT_FROM_RIGHT_SD_DEG = 14.0
 
-BETWEEN_MM, BETWEEN_SD = 35.6, 0.12
-"""Distance of the two ostia, mm, and the SD of its logarithm; 31 to 39 mm in seven real patients."""
-
-AORTA_UP = np.array([-0.40, -0.30, 0.87])
-"""Axis of the aortic root, LPS: up, to the right, and forwards."""
+BETWEEN_MM, BETWEEN_SD = 35.6, 0.12  # distance of the ostia, mm, and its logarithm's SD; 31 to 39 in seven patients
+AORTA_UP = np.array([-0.40, -0.30, 0.87])  # axis of the aortic root, LPS: up, to the right, and forwards
 
 AORTA_BEHIND_MM = 7.0
 """The aorta's axis passes this far behind and to the right of the middle between the ostia, which lie some 125° apart
 on its wall."""
 
-AORTA_MM, AORTA_SD_MM = 15.0, 3.0
-"""No coronary artery comes nearer to the aorta's axis than this, mm; 15.8 to 19.4 mm in seven real patients."""
-
-AORTA_REACH_MM = (-5.0, 40.0)
-"""The stretch of the aorta's axis, from the level between the ostia, that is looked at, mm."""
+AORTA_MM, AORTA_SD_MM = 15.0, 3.0  # no artery comes nearer to the aorta's axis; 15.8 to 19.4 mm in seven patients
+AORTA_REACH_MM = (-5.0, 40.0)  # stretch of the aorta's axis, from the level between the ostia, looked at
 
 HEADING = {"rca": np.array([-0.78, -0.5, 0.37]), "lca": np.array([0.96, -0.12, 0.24])}
 """First heading: the right artery leaves to the right and forwards, the left main to the left."""
@@ -57,26 +50,16 @@ CALIBRE, CALIBRE_SD = 1.0, 0.25
 TAPER, TAPER_SD = 0.6, 0.2
 WIDENING_SD = 0.15
 HEADING_SD_DEG, COURSE_SD_DEG = 40.0, 35.0
-OPENING_DEG, OPENING_SD_DEG = 105.0, 20.0
-"""Branches leave forwards: a fork whose branches open farther than this is entered from the side."""
+OPENING_DEG, OPENING_SD_DEG = 105.0, 20.0  # branches leave forwards: a wider fork is entered from the side
 
 WEIGHT = {"calibre": 0.6, "taper": 0.4, "widening": 0.4, "opening": 0.6, "heading": 2.0, "course": 1.2}
 """What each likelihood counts: those of the lumen's width say in part the same."""
 
-ABSENT = -14.0
-"""Score of an artery that the lumen does not hold: below that of any ostium that looks like one."""
-
-ASKED = 1.0
-"""Logarithm of how much likelier the artery asked for is in the lumen than not, before it is looked at."""
-
-NEITHER = -14.0
-"""Score below which two arteries are rather something else. Both of a patient score −1 to −6."""
-
-ALONE = -9.0
-"""The same for a single artery, which scores 0 to −5."""
-
-TOUCHING = -8.0
-"""What it costs to take one lumen for both arteries, which touch or run together with their veins."""
+ABSENT = -14.0  # score of an artery that the lumen does not hold: below that of any ostium that looks like one
+ASKED = 1.0  # logarithm of how much likelier the artery asked for is in the lumen than not, before it is looked at
+NEITHER = -14.0  # score below which two arteries are rather something else. Both of a patient score −1 to −6
+ALONE = -9.0  # the same for a single artery, which scores 0 to −5
+TOUCHING = -8.0  # what it costs to take one lumen for both arteries, which touch or run together with their veins
 
 OTHER_AXES: dict[str, tuple[Float[np.ndarray, "3"], float]] = {
     "ras": (np.array([-1.0, -1.0, 1.0]), -2.5),
@@ -89,8 +72,7 @@ OTHER_AXES: dict[str, tuple[Float[np.ndarray, "3"], float]] = {
 }
 """Axes that a file may be in instead of LPS: the signs that turn it over, and the logarithm of how likely that is."""
 
-UNSTATED = 1.5
-"""What is added for RAS axes where the file does not state its own."""
+UNSTATED = 1.5  # what is added for RAS axes where the file does not state its own
 
 _FREEDOM = 3.0
 
@@ -99,19 +81,12 @@ Dominance = Literal["right", "balanced", "left"]
 CRUX_FROM_OSTIUM_MM = np.array([12.0, 43.0, -44.0])
 """The crux as seen from the right ostium, LPS mm: behind and below it. In six real patients within 13 mm of this."""
 
-REACHED_MM = 20.0
-"""An artery that comes this near to the crux reaches it; in seven real patients the other one stays 34 mm away."""
+REACHED_MM = 20.0  # an artery so near to the crux reaches it; in seven patients the other stays 34 mm away
 
 
 @dataclass(frozen=True, eq=False)
 class OstiumCandidate:
-    """A place where an artery may begin.
-
-    Attributes:
-        position: mean of the ends of one stub, by their probability, LPS mm.
-        piece: which of the separate lumens it belongs to.
-        probability: share of the hypotheses that put the ostium here.
-    """
+    """A place (LPS mm, mean of one stub's ends) where an artery may begin, its piece of lumen, and its probability."""
 
     position: Float[np.ndarray, "3"]
     piece: int
@@ -120,13 +95,8 @@ class OstiumCandidate:
 
 @dataclass(frozen=True, eq=False)
 class OstiumRanking:
-    """How the hypotheses about a lumen's arteries share the probability of 1.
-
-    Attributes:
-        candidates: places where the artery asked for may begin, most probable first.
-        absent: probability that the artery is absent.
-        touching: where the artery would begin if one lumen held both, with that probability.
-        axes: the axes, of `OTHER_AXES`, that explain the lumen best, and with which probability.
+    """How the hypotheses about a lumen's arteries share the probability of 1: `touching` is where the artery would
+    begin if one lumen held both, `axes` those of `OTHER_AXES` that explain the lumen best, each with its probability.
     """
 
     candidates: list[OstiumCandidate]
@@ -138,15 +108,9 @@ class OstiumRanking:
 def rank_ostia(
     pieces: Sequence[Sequence[OpenEnd]], vessels: Float[np.ndarray, "n 3"] | None = None, *, stated: bool = True
 ) -> dict[Side, OstiumRanking]:
-    """Return where each artery may begin if it is asked for, and what else the lumen may hold.
-
-    What is missing to 1 is the probability that nothing in the lumen is as coronary arteries are.
-
-    Args:
-        pieces: the open ends of every lumen that may be a coronary artery.
-        vessels: points along all vessels, LPS mm: none of them may lie in the aorta.
-        stated: whether the file states its axes.
-    """
+    """Return where each artery asked for may begin, and what else the lumen may hold. `pieces` are open ends of every
+    lumen that may be an artery; no point of `vessels` (LPS mm) may lie in the aorta; `stated`: are the file's axes?
+    What is missing to 1 is the probability of no coronary arteries."""
     ends = [end for own in pieces for end in own]
     owner = np.array([piece for piece, own in enumerate(pieces) for _ in own])
     place = np.array([end.position for end in ends])
@@ -205,7 +169,6 @@ def _scores(
 def _merged(
     place: Float[np.ndarray, "n 3"], owner: Int[np.ndarray, "n"], share: Float[np.ndarray, "n"]
 ) -> list[OstiumCandidate]:
-    """Return the ends' shares with those of one stub added up, most probable first."""
     found, left = [], share.copy()
     while left.max(initial=0.0) > 0.0:
         best = int(left.argmax())
@@ -217,13 +180,7 @@ def _merged(
 
 
 def end_score(end: OpenEnd, side: Side, flip: Float[np.ndarray, "3"] | float = 1.0) -> float:
-    """Return the logarithmic likelihood, up to a constant, that the right or left artery begins at an end.
-
-    Args:
-        end: the end.
-        side: which artery.
-        flip: signs that turn the end's axes into LPS.
-    """
+    """Return the log-likelihood, up to a constant, that an artery begins at an end; `flip` turns its axes to LPS."""
     heading = WEIGHT["heading"] * _log_t((_angle_deg(flip * end.heading, HEADING[side]) / HEADING_SD_DEG) ** 2)
     course = WEIGHT["course"] * _log_t((_angle_deg(flip * end.course, COURSE[side]) / COURSE_SD_DEG) ** 2)
     return shape_score(end) + float(heading + course)
@@ -275,7 +232,6 @@ def _aorta_clearance(
 
 
 def _log_t(square: Float[np.ndarray, "..."] | float) -> Float[np.ndarray, "..."] | np.float64:
-    """Return the logarithm of Student's t at a squared deviation, as a share of its peak."""
     return -0.5 * (_FREEDOM + 1) * np.log1p(square / _FREEDOM)
 
 
@@ -286,12 +242,7 @@ def _angle_deg(one: Float[np.ndarray, "... 3"], two: Float[np.ndarray, "3"]) -> 
 
 @dataclass(frozen=True, eq=False)
 class Crux:
-    """Where the posterior interventricular groove meets the atrioventricular one.
-
-    Attributes:
-        position: LPS mm, within some 15 mm.
-        dominance: which artery reaches it.
-    """
+    """Where the grooves between ventricles and to the atria meet, LPS mm within 15 mm, and which artery reaches it."""
 
     position: Float[np.ndarray, "3"]
     dominance: Dominance
@@ -305,10 +256,7 @@ class Crux:
 def find_crux(
     right_ostium: Float[np.ndarray, "3"], right: Float[np.ndarray, "n 3"], left: Float[np.ndarray, "m 3"]
 ) -> Crux | None:
-    """Return the crux of a patient, or None where neither artery reaches it: then the ends are cut off.
-
-    It follows from the right artery's ostium and points along both trees, LPS mm.
-    """
+    """Return the crux from the right ostium and points of both trees (LPS mm); None where they end before it."""
     position = right_ostium + CRUX_FROM_OSTIUM_MM
     reached = [bool(np.linalg.norm(tree - position, axis=1).min() < REACHED_MM) for tree in (right, left)]
     if not any(reached):

@@ -1,8 +1,5 @@
 """Nothing of a lumen is lost unsaid: what is too thin to follow is widened, and what the tree does not reach is stated.
-
-The yardstick is the middle of the mask (`traced_lines`), which has every branch of one voxel. Its length is the sum of
-what the tree reaches, of what it reaches because it was widened, and of what is left out with its length and place.
-"""
+The yardstick is the middle of the mask (`traced_lines`), which has every branch of one voxel."""
 
 from __future__ import annotations
 
@@ -20,8 +17,7 @@ from endopilot.vessels.repair import NOTED_MM
 from endopilot.vessels.surface import MAXIMUM_GRID_POINTS, Surface, blur_voxels, smooth_level
 from endopilot.vessels.topology import MOST_LISTED
 
-_REACH_VOXELS = 1.5
-"""The tree reaches what lies within its radius and this many voxels of its axis: the mask's middle is not smooth."""
+_REACH_VOXELS = 1.5  # the tree reaches so many voxels beyond its radius: the mask's middle is not smooth
 
 _NARROWEST, _NARROWEST_STEPS = 0.75, 1.2
 """A stretch is widened to a radius of this many widths of the wall's blur, and grid steps: such a tube has no gap.
@@ -33,20 +29,13 @@ _MOST_VOXELS, _MOST_INSIDE = 10_000_000, 300_000
 """A wall becomes at most as many voxels, and as many inside it: their middle is found in 4 s. Thin vessels stay whole
 in coarser voxels, since all that the wall touches are kept."""
 
-_DIAGONAL = 0.87
-"""A ball of this many grid steps in radius holds a grid point wherever it lies (√3/2)."""
+_DIAGONAL = 0.87  # a ball of this many grid steps in radius holds a grid point wherever it lies (√3/2)
 
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """A connected part of a mask's middle.
-
-    Attributes:
-        nodes: which points of the middle these are.
-        length_mm: their length.
-        beyond_mm: length of what lies beyond them as seen from the widest place.
-        place: where they begin, LPS mm.
-    """
+    """A connected part of a mask's middle: its nodes and length, and the length of what lies beyond as seen from the
+    widest place, mm. It begins at `place`, LPS mm."""
 
     nodes: Int[np.ndarray, "_"]
     length_mm: float
@@ -55,12 +44,7 @@ class Stretch:
 
 
 def voxelised(surface: Surface, step_mm: float) -> Volume:
-    """Return the mask of all voxels that a closed wall holds or touches, so that its thinnest neck stays connected.
-
-    Args:
-        surface: the wall.
-        step_mm: edge of the voxels, mm; larger where there would be too many.
-    """
+    """Return all voxels (edge `step_mm`, or larger) that a closed wall holds or touches: no thin neck is lost."""
     extent = np.ptp(surface.vertices, axis=0)
     most = max(float(np.prod(extent + 4 * step_mm)) / _MOST_VOXELS, abs(surface.volume) / _MOST_INSIDE)
     step = max(step_mm, most ** (1 / 3))
@@ -75,13 +59,8 @@ def voxelised(surface: Surface, step_mm: float) -> Volume:
 
 
 def widened(mask: Volume, lines: MedialLines, minimum_mm: float) -> tuple[Volume, Float[np.ndarray, "n 3"], list[str]]:
-    """Return the mask with a tube wherever it is too thin for the wall and the grid to carry it on, where, and remarks.
-
-    Args:
-        mask: one connected lumen.
-        lines: its middle.
-        minimum_mm: a thin stretch with less than this on it and beyond it stays as it is.
-    """
+    """Return a connected mask with a tube wherever it is too thin for the wall and the grid to carry it on, where, and
+    remarks. A thin stretch with less than `minimum_mm` on it and beyond it stays as it is."""
     edges = mask.spacing_mm
     extent = np.array(mask.voxels.shape[::-1]) * edges
     step = max(0.5 * float(edges.min()), float(np.prod(extent + 2) / MAXIMUM_GRID_POINTS) ** (1 / 3))
@@ -118,10 +97,7 @@ def unreached(
 def stretches(
     lines: MedialLines, chosen: Bool[np.ndarray, "n"], order: Float[np.ndarray, "n"] | None = None
 ) -> list[Stretch]:
-    """Return the connected parts of chosen points of a mask's middle, longest first.
-
-    A part begins at its point of the lowest `order`; by default at that nearest to the widest place.
-    """
+    """Return connected parts of chosen middle points, longest first, from the lowest `order` or the widest place on."""
     length, behind = lines.tree.length, lines.behind_mm
     order = length if order is None else order
     found = []
@@ -133,10 +109,7 @@ def stretches(
 
 
 def left_out_text(left: list[Stretch], ostium: Float[np.ndarray, "3"], reach_mm: float) -> list[str]:
-    """Return what is said of the parts that a tree does not reach: one remark a part, and one for all crumbs.
-
-    A part that begins within `reach_mm` of the ostium lies behind it.
-    """
+    """Return remarks on parts that a tree does not reach, one for all crumbs; up to `reach_mm` they lie behind it."""
     left = sorted(left, key=lambda stretch: -stretch.length_mm)
     long = [s for s in left if s.length_mm >= NOTED_MM]
     remarks = []
@@ -175,7 +148,6 @@ def record(lines: MedialLines, wide: Float[np.ndarray, "m 3"], left: list[Stretc
 def _draw_balls(
     voxels: Bool[np.ndarray, "nz ny nx"], centres: Int[np.ndarray, "n 3"], reach: Float[np.ndarray, "3"]
 ) -> None:
-    """Fill a ball around each voxel, with a radius of `reach` voxels along each axis."""
     span = np.ceil(reach).astype(int)
     ball = np.array(list(np.ndindex(*(2 * span + 1)))) - span
     ball = ball[(((ball / reach) ** 2).sum(axis=1)) <= 1.0]
@@ -185,10 +157,8 @@ def _draw_balls(
 
 
 def _thin(mask: Volume, lines: MedialLines, enough: float) -> Bool[np.ndarray, "n"]:
-    """Return which points of a mask's middle the smooth wall does not carry on: it is too near, or closed in between.
-
-    Voxel centres lie up to half a diagonal off the axis, so that the deepest one around a point stands for it.
-    """
+    """Return which points of a mask's middle the smooth wall does not carry on. Voxel centres lie up to half a diagonal
+    off the axis, so that the deepest one around a point stands for it."""
     level, corner = smooth_level(mask)
     core = connected_components(level > enough, corners=True)
     around = (lines.index[:, None, :] - corner - 1 + np.array(list(np.ndindex(3, 3, 3)))).reshape(-1, 3)

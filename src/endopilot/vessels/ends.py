@@ -16,47 +16,27 @@ from endopilot.lines import length_along
 from endopilot.vessels.graph import RootedGraph, VesselGraph, lumen_graph
 from endopilot.vessels.surface import Surface
 
-STUB_COVERAGE, STUB_SLENDERNESS, STUB_MM = 1.2, 1.0, 1.0
-"""How little of a branch counts as an end: a left main may be as short as it is wide."""
-
-_NEAR_MM = (1.5, 8.0)
-"""The calibre of an end is that of the lumen between these distances from it."""
-
-_HEADING_MM = (8.0, 16.0)
-"""An artery's first heading is that from its end to where it is between these distances."""
+STUB_COVERAGE, STUB_SLENDERNESS, STUB_MM = 1.2, 1.0, 1.0  # a left main may be as short as it is wide
+_NEAR_MM = (1.5, 8.0)  # the calibre of an end is that of the lumen between these distances from it
+_HEADING_MM = (8.0, 16.0)  # an artery's first heading is that from its end to where it is between these distances
 
 _SMOOTH_MM = 1.5
-_BEGUN_RADII = 2.0
-"""Beyond this many of its radii from an end, a lumen's width is no longer that of its cap."""
-
-_MAJOR_MM = 15.0
-"""A branch with at least this much length behind it counts at the first fork."""
-
-
-_BLIND = 0.6
-"""An end whose cap is as round as a sphere counts this share of one that is cut flat."""
-
-_ROUND_CAP, _FLAT_CAP = 0.3, 0.7
-"""Flat part of a cap over the section: at 0.4 mm voxels domes of 2 to 6 mm have 0.2 to 0.5, cuts 0.6 to 0.9."""
-
-_NECK, _DOME = 1.3, 4.0
-"""An end this many times as wide as its neck, which lies no more of its radii behind than the second, is a dome."""
+_BEGUN_RADII = 2.0  # beyond this many of its radii from an end, a lumen's width is no longer that of its cap
+_MAJOR_MM = 15.0  # a branch with at least this much length behind it counts at the first fork
+_BLIND = 0.6  # an end whose cap is as round as a sphere counts this share of one that is cut flat
+_ROUND_CAP, _FLAT_CAP = 0.3, 0.7  # flat share of a section's cap: domes have 0.2 to 0.5, cuts 0.6 to 0.9
+_NECK, _DOME = 1.3, 4.0  # an end this much wider than its neck, at most the second of its radii behind, is a dome
 
 _LINE_ENDS, _NO_LINE = 0.5, 0.1
 """Lines run from the inlet, as VMTK writes them: one that ends at a place says this share of what one that begins there
 says for it; a place where no line begins or ends is as little likely as the second."""
 
-_RIVAL = 0.55
-"""Ends that look this much like the inlet as the best one are named."""
+_RIVAL = 0.55  # ends that look this much like the inlet as the best one are named
 
 
 @dataclass(frozen=True, eq=False)
 class Skeleton(VesselGraph):
-    """The middle of one connected lumen; its radius is the mean over the neighbourhood, its costs are lengths, mm.
-
-    Attributes:
-        tips: indices of the ends, stubs included.
-    """
+    """The middle of one connected lumen with its `tips`; radii are means of the neighbourhood, costs lengths, mm."""
 
     tips: Int[np.ndarray, "t"]
 
@@ -73,7 +53,7 @@ class OpenEnd:
         widening: mean over the tree of ln(r / narrowest radius on the path from the end); 0 where no path widens.
         heading: unit vector from the end to where the vessel is 8 to 16 mm on.
         course: unit vector from the end to the tree's centre.
-        opening_deg: angle between the two main branches at the first fork, degrees; 0 where nothing forks near.
+        opening_deg: angle between the main branches at the first fork, degrees; 0 where nothing forks near.
         longest_mm: longest path from the end, mm.
     """
 
@@ -172,14 +152,7 @@ def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
 
 @dataclass(frozen=True, eq=False)
 class InletEnd:
-    """An end of a tree that a device may enter at.
-
-    Attributes:
-        node: index of its tip.
-        position: middle of the end, mm.
-        radius: of the vessel there, mm.
-        score: how much it looks like the inlet, mm: its radius, less where something speaks against it.
-    """
+    """An end that a device may enter at: tip, middle, radius, mm, and score, the radius less what speaks against it."""
 
     node: int
     position: Float[np.ndarray, "3"]
@@ -205,17 +178,10 @@ def likely_inlets(
     wall: Surface | None = None,
     lines: Sequence[Float[np.ndarray, "2 3"]] = (),
 ) -> list[InletEnd]:
-    """Return the ends of a tree, the one that looks most like its inlet first.
+    """Return the ends of a tree, likeliest inlet first: wide, the tree narrows from it, cut flat, lines begin there.
 
-    The inlet is wide, the tree narrows from it, it is cut flat, and lines begin there. An end that bulges behind a neck
-    is an aneurysm's dome: it counts as its neck does, less by how much it bulges. A cut that bulges is none: the root
-    of the aorta does.
-
-    Args:
-        tree: the vessel, rooted at one end.
-        paths: of its nodes, the first from one end to another, each other one from an earlier one to an end.
-        wall: the wall, which shows where a vessel is cut; None for lines.
-        lines: first and last point of each line of a file of lines.
+    An aneurysm's dome, an end that bulges behind a neck, counts as its neck does, less by how much it bulges; a cut
+    that bulges is none. `paths` are those of `RootedGraph.traced`, `lines` first and last points of a file's lines.
     """
     middle = np.concatenate(paths)
     widths = tree.radius[middle]
@@ -264,13 +230,9 @@ def _bulge(points: Float[np.ndarray, "n 3"], clearance: Float[np.ndarray, "n"], 
 def _flatness(
     points: Float[np.ndarray, "n 3"], place: int, width: float, triangles: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> float:
-    """Return the area of the flattest part of the wall that closes an end, over that of the vessel's section.
-
-    A vessel cut straight or aslant has 1 or more, a dome 0.12 (what lies within 20° of one direction on a sphere).
-
-    The points, mm, are the way inwards from the tip, at `place` of which the vessel has its whole width, a radius, mm;
-    the triangles are the wall's centres, normals and areas.
-    """
+    """Return the area of the flattest part of the wall that closes an end, over that of the vessel's section: 1 or more
+    for a vessel cut straight or aslant, 0.12 for a dome. The points, mm, lead inwards from the tip, to the whole width
+    at `place`, radius mm; the triangles are the wall's centres, normals and areas."""
     centres, normals, areas = triangles
     back = int(np.searchsorted(length_along(points[place:]), 1.5 * width))
     axis = points[place] - points[min(place + max(back, 1), len(points) - 1)]

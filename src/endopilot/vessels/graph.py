@@ -20,14 +20,9 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import KDTree
 
-COVERAGE = 1.6
-"""A path covers what lies within this many inscribed radii (and two grid steps) of it."""
-
-SLENDERNESS = 2.2
-"""A side branch is kept if it reaches this many times its own radius out of its parent's inscribed sphere."""
-
-TOGETHER = 0.5
-"""Lines nearer each other than this share of the local radius run together and become one."""
+COVERAGE = 1.6  # a path covers what lies within this many inscribed radii (and two grid steps) of it
+SLENDERNESS = 2.2  # a kept side branch reaches this many of its radii out of its parent's inscribed sphere
+TOGETHER = 0.5  # lines nearer each other than this share of the local radius run together and become one
 
 _FINE_STEPS = 10.0
 """A part of the lumen is as wide as this many grid steps where every second one of them is enough: five steps a radius
@@ -43,14 +38,8 @@ Graph = TypeVar("Graph", bound="VesselGraph")
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """A line of a tree before it is cut at its branching points.
-
-    Attributes:
-        points: positions, LPS mm; the first one is the parent's point `place`.
-        radius: inscribed-sphere radii, mm.
-        parent: index of the line that it leaves, -1 for the first.
-        place: index of the point of the parent that it leaves from.
-    """
+    """A line of a tree before it is cut at its branching points: points (LPS mm; the first is the parent's point
+    `place`) and inscribed-sphere radii, mm. `parent` is the line that it leaves, -1 for the first."""
 
     points: Float[np.ndarray, "n 3"]
     radius: Float[np.ndarray, "n"]
@@ -64,7 +53,6 @@ class VesselGraph:
 
     Attributes:
         columns: names of the attributes that hold one row a point.
-        points: positions, mm.
         radius: distance to the wall at each, mm.
         costs: sparse matrix of what the way between neighbours costs; each pair stands in it once.
         step_mm: distance of neighbours along an axis of the grid, or along a line, mm.
@@ -132,12 +120,7 @@ class VesselGraph:
 
 @dataclass(frozen=True, eq=False)
 class RootedGraph(VesselGraph):
-    """A graph with a way from every point to a root.
-
-    Attributes:
-        before: the next point on the way to the root, -1 at the root itself.
-        length: of the way to the root, mm.
-    """
+    """A graph with the shortest way of `length`, mm, from each point to a root by the next one, `before` (-1 there)."""
 
     before: Int[np.ndarray, "n"]
     length: Float[np.ndarray, "n"]
@@ -164,24 +147,14 @@ class RootedGraph(VesselGraph):
         return max(int(clear[-1]) + 2 if len(clear) else 0, min(4, len(nodes)))
 
     def traced(
-        self,
-        minimum_mm: float,
-        *,
-        coverage: float = COVERAGE,
-        slenderness: float = SLENDERNESS,
-        together: bool = False,
+        self, minimum_mm: float, *, coverage: float = COVERAGE, slenderness: float = SLENDERNESS, together: bool = False
     ) -> list[Int[np.ndarray, "_"]]:
         """Return the tree as paths of points: the first from the root, each other one from a point of an earlier path.
 
-        The farthest uncovered point is traced back to the tree, and its path covers its surroundings. What is not
-        longer than it is wide, or than the local radius, is a bump and is dropped.
-
-        Args:
-            minimum_mm: a branch reaches at least this far out of its parent, mm.
-            coverage: a path covers what lies within this many inscribed radii (and two steps) of it.
-            slenderness: a branch reaches at least this many times its own radius out of its parent.
-            together: whether points are those of lines that may repeat each other: a path ends where it comes within
-                `TOGETHER` radii of an earlier one, or two steps.
+        The farthest uncovered point is traced back to the tree; its path covers what is within `coverage` radii and two
+        steps. What reaches less than `minimum_mm`, `slenderness` times its radius or the local radius out of its parent
+        is a bump. Points `together` are of lines that may repeat each other: a path ends within `TOGETHER` radii, or
+        two steps, of an earlier one.
         """
         reach = coverage * self.radius + 2 * self.step_mm
         if together:
@@ -239,14 +212,8 @@ def lumen_graph(
     spacing_mm: float | Float[np.ndarray, "3"],
     root: int | None = None,
 ) -> RootedGraph:
-    """Return the graph of grid points inside one lumen, with the ways to a root.
-
-    Args:
-        points: grid points along the axes of the coordinates, mm.
-        clearance: their distance to the wall, mm.
-        spacing_mm: spacing of the grid, one or along each axis, mm; the graph keeps the largest.
-        root: index of the point that all ways lead to; the one farthest from the widest place if None.
-    """
+    """Return the grid points in one lumen (of several spacings the largest), their clearance, mm, and the ways to a
+    root, by default the point farthest from the widest place."""
     if root is None:
         graph = lumen_graph(points, clearance, spacing_mm, int(clearance.argmax()))
         return graph.rooted(int(graph.length.argmax()))
@@ -289,11 +256,8 @@ def lumen_graph(
 def _levels(
     index: Int[np.ndarray, "n 3"], clearance: Float[np.ndarray, "n"], edges: Float[np.ndarray, "3"], root: int
 ) -> Int[np.ndarray, "n"]:
-    """Return how coarse the grid may be at each point: every 2 to this power-th point is enough.
-
-    A part of the lumen that spheres of `_FINE_STEPS` times so many steps fill is as well resolved by it, away from
-    narrower parts and from the root.
-    """
+    """Return how coarse the grid may be at each point: every 2 to this power-th is enough where spheres of
+    `_FINE_STEPS` such steps fill the lumen, away from narrower parts and from the root."""
     from endopilot.imaging.grid import dilated  # brings SimpleITK, which simulating does without
 
     level = np.zeros(len(index), dtype=int)
@@ -313,7 +277,6 @@ def _levels(
 
 
 def _length_to_root(points: Float[np.ndarray, "n 3"], before: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Sum the steps of every path to the root at once, by pointer doubling."""
     jump = np.where(before >= 0, before, np.arange(len(points)))
     length = np.linalg.norm(points - points[jump], axis=1)
     while True:

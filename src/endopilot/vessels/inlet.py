@@ -19,33 +19,15 @@ from endopilot.vessels.surface_distance import distance_map_from_surface
 
 Vessel = Literal["rca", "lca", "generic"]
 
-PARENT_RATIO = 2.5
-"""A lumen this many times wider than the tree's median, at its inlet, is the parent vessel."""
-
-PARENT_RADIUS_MM = (3.5, 6.0)
-"""The aorta's root is never narrower than the first, a coronary artery never wider than the second (an aneurysm is)."""
-
-AORTA_RADIUS_MM = 7.0
-"""A lumen with a coronary artery that is as wide as this somewhere holds the aorta itself."""
-
-GRID_MM = 0.6
-"""Grid spacing at which the parent vessel is looked for, mm."""
-
-COMPARABLE = 0.25
-"""A piece with at least this share of the largest one's size may be the other coronary artery."""
-
-
-ENTRANCE_RADII = 3.0
-"""An ostium given nearer than this many radii to an end of the vessel enters at that end."""
-
-SNAP_MM, SNAP_SD_MM = 10.0, 4.0
-"""A given ostium enters at an open end at most the first away; its likely error is the second."""
-
-PLAUSIBLE = -5.0
-"""An end that scores less than this does not look like an inlet: the tip of a side branch."""
-
-LIKENESS_SD = 0.25
-"""Spread of the logarithm of how much an end looks like the inlet: half the likeness is worth as much as 9 mm."""
+PARENT_RATIO = 2.5  # a lumen this many times wider than the tree's median, at its inlet, is the parent vessel
+PARENT_RADIUS_MM = (3.5, 6.0)  # no aortic root is narrower, no coronary artery wider (an aneurysm is)
+AORTA_RADIUS_MM = 7.0  # a lumen with a coronary artery that is as wide as this somewhere holds the aorta itself
+GRID_MM = 0.6  # grid spacing at which the parent vessel is looked for, mm
+COMPARABLE = 0.25  # a piece with at least this share of the largest one's size may be the other coronary artery
+ENTRANCE_RADII = 3.0  # an ostium given nearer than this many radii to an end of the vessel enters at that end
+SNAP_MM, SNAP_SD_MM = 10.0, 4.0  # a given ostium enters at an end so near at most; its likely error
+PLAUSIBLE = -5.0  # an end that scores less than this does not look like an inlet: the tip of a side branch
+LIKENESS_SD = 0.25  # spread of the logarithm of likeness to an inlet: half of it is worth as much as 9 mm
 
 _BRANCH_MM = 4.0
 
@@ -53,13 +35,8 @@ _BRANCH_MM = 4.0
 def piece_on_side(
     sizes: Float[np.ndarray, "n"], centres: Float[np.ndarray, "n 3"], vessel: Vessel
 ) -> tuple[int, list[int]]:
-    """Return which of several separate lumens is the vessel, and which others are nearly as large.
-
-    The right coronary artery lies to the patient's right of the left one (smaller x in LPS), so among pieces of
-    comparable size the side decides; for other vessels it is the largest.
-
-    Sizes are volumes, or anything that grows with them; centres are in LPS mm.
-    """
+    """Return which of several lumens (of sizes in any unit of volume) is the vessel, and which others are nearly as
+    large. Among such the side decides: the right coronary artery has the smaller x in LPS; else the largest is it."""
     large = np.flatnonzero(sizes >= COMPARABLE * sizes.max())
     if vessel == "generic":
         chosen = int(sizes.argmax())
@@ -94,17 +71,8 @@ def beyond_parent(
     side: Side,
     inlet: Float[np.ndarray, "3"] | None,
 ) -> tuple[Insertion | None, Bool[np.ndarray, "nz ny nx"]]:
-    """Return the ostium and the lumen beyond it where the lumen holds a piece of the aorta; else None and the lumen.
-
-    The aorta is looked for on a coarser grid: on that of the coronary artery it has millions of points.
-
-    Args:
-        surface: the wall.
-        distance_map: distance to it.
-        inside: which of its grid points belong to the lumen.
-        side: which coronary artery is wanted.
-        inlet: where the artery begins, LPS mm, if the lumen holds no aorta; a stub of the aorta may bulge there.
-    """
+    """Return the ostium and the lumen beyond it where the lumen holds a piece of the aorta (looked for on a coarser
+    grid); else None and the lumen. `inlet` is where the artery begins (LPS mm) otherwise; a stub may bulge there."""
     if distance_map.values[inside].max(initial=0.0) < PARENT_RADIUS_MM[0]:
         return None, inside
     coarse = distance_map
@@ -147,19 +115,9 @@ def entrance(
     side: Side | None,
     surface: Surface | None = None,
 ) -> Insertion:
-    """Return where the device enters if a place some millimetres off is given: at an end near it, or in mid-vessel.
-
-    An end that an artery may begin at, no farther than `SNAP_MM`, is the ostium; it gets no direction, since the
-    centerline gives it better. In mid-vessel the direction is away from the vessel's inlet.
-
-    Args:
-        distance_map: the wall.
-        points: grid points in the lumen, LPS mm.
-        clearance: their distance to the wall, mm.
-        given: the place, without a direction.
-        side: which coronary artery this is, None for any other vessel.
-        surface: the wall as triangles, which shows where a vessel is cut.
-    """
+    """Return where the device enters if a place some millimetres off is given: at an end within `SNAP_MM`, without a
+    direction, which the centerline gives better; or in mid-vessel, away from the inlet. `clearance` is the grid points'
+    distance to the wall, mm."""
     spacing = distance_map.spacing_mm
     ends: Sequence[InletEnd | OpenEnd]
     if side is None:
@@ -219,11 +177,8 @@ def inlets(
 def _parent_region(
     distance_map: DistanceMap, inside: Bool[np.ndarray, "nz ny nx"], graph: RootedGraph, usual_mm: float
 ) -> Bool[np.ndarray, "nz ny nx"] | None:
-    """Return the grid points of the parent vessel that the graph's root lies in, or None where it lies in none.
-
-    The parent is what spheres of `PARENT_RATIO` times the usual radius reach, connected and around the root; a bulge
-    farther along is an aneurysm and stays.
-    """
+    """Return the parent vessel's grid points around the graph's root, reached by spheres of `PARENT_RATIO` times the
+    usual radius; None if none. A bulge farther along is an aneurysm and stays."""
     spacing = distance_map.spacing_mm
     wide = float(np.clip(PARENT_RATIO * usual_mm, *PARENT_RADIUS_MM))
     core = inside & (distance_map.values > wide)

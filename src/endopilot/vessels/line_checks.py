@@ -13,22 +13,14 @@ from endopilot.types import VesselTree
 from endopilot.vessels.graph import RootedGraph, groups, pieces
 from endopilot.vessels.line_graph import STEP_MM, FoundLines, LineGraph
 
-_SHORTEST_MM = 2.0
-"""Shorter stretches are left out together in one note, mm."""
-
-_MOST_NOTES = 12
-"""As many stretches or loops are noted one by one."""
-
-_OPEN_MM = 0.2
-"""A loop has a hole where the spheres on its two sides are this far apart, mm."""
+_SHORTEST_MM = 2.0  # shorter stretches are left out together in one note, mm
+_MOST_NOTES = 12  # as many stretches or loops are noted one by one
+_OPEN_MM = 0.2  # a loop has a hole where the spheres on its two sides are this far apart, mm
 
 
 def left_out(found: FoundLines, tree: VesselTree) -> tuple[list[str], dict[str, float]]:
-    """Return a note on each stretch of line outside the tree's spheres, and the balance of all.
-
-    The balance: `length_mm` of the lines, of them `reached_mm` by the tree's spheres and `left_out_mm` (these two add
-    up to the first), and `bridged_mm` of gaps between them.
-    """
+    """Return a note on each stretch of line outside the tree's spheres, and the balance, mm: `length_mm` of the lines
+    is `reached_mm` by the spheres and `left_out_mm`; `bridged_mm` of gaps lie between them."""
     nodes, piece = found.whole, found.piece
     whole = tree.line
     gap, nearest = KDTree(whole.points).query(nodes.points)
@@ -79,10 +71,7 @@ def _length_once(nodes: LineGraph, part: Int[np.ndarray, "p"]) -> float:
 
 
 def closures(tree: VesselTree) -> list[str]:
-    """Return a note on each place where vessels meet again, so that their lumens close a loop that a tree cannot hold.
-
-    Spheres of two places meet there, while on the way from one to the other along the tree some do not.
-    """
+    """Return a note on each loop that a tree cannot hold: spheres meet while some on the way between do not."""
     whole = tree.line
     points, radius, abscissa = whole.points, whole.radius, whole.abscissa
     branch = np.repeat(np.arange(len(tree.branches)), [len(own.section) for own in tree.branches])
@@ -126,7 +115,6 @@ def closures(tree: VesselTree) -> list[str]:
 
 
 def _graph_of(tree: VesselTree, branch: Int[np.ndarray, "n"]) -> RootedGraph:
-    """Return a tree's points as a graph, the first of each branch joined to the nearest one of its parent."""
     line, before = tree.line, np.arange(len(branch)) - 1
     for start, own in zip(np.flatnonzero(np.diff(branch, prepend=-1)), tree.branches, strict=True):
         if own.parent >= 0:

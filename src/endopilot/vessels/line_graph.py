@@ -1,8 +1,5 @@
 """Centerlines as a vessel graph, and the lines of one tree in it: joined along lines, where they meet, over small gaps.
-
-Lines may overlap, as VMTK writes them, or meet end to end, as Slicer writes them. The tree is traced as in a lumen:
-farthest end first, each further line from where it leaves what is there.
-"""
+Lines may overlap, as VMTK writes them, or meet end to end, as Slicer does; the tree is traced as in a lumen."""
 
 from __future__ import annotations
 
@@ -23,46 +20,24 @@ from endopilot.vessels.ends import likely_inlets
 from endopilot.vessels.graph import Line, RootedGraph, VesselGraph
 from endopilot.vessels.sources import Polylines
 
-STEP_MM = 0.5
-"""Distance between the points of the tree, mm."""
-
-LONGEST_BRIDGE = 4.0
-"""Lines that end within this many radii of another are joined to it; the gap is noted."""
-
-PARENT_VESSEL_RATIO = 2.5
-"""Where lines start in spheres this many times wider than their own median, they start in a parent vessel."""
-
-_OPPOSITE = -0.5
-"""Cosine of the angle between two directions from which on a vessel passes a place rather than forks there."""
-
-_OWN_MM = 2.0
-"""A line's points that coincide and lie farther than this apart along it are a place that it comes back to, mm."""
+STEP_MM = 0.5  # distance between the points of the tree, mm
+LONGEST_BRIDGE = 4.0  # lines that end within this many radii of another are joined to it; the gap is noted
+PARENT_VESSEL_RATIO = 2.5  # lines that start in spheres so much wider than their median start in a parent vessel
+_OPPOSITE = -0.5  # cosine of two directions from which on a vessel passes a place rather than forks there
+_OWN_MM = 2.0  # a line comes back to a place where coinciding points lie farther apart along it than this, mm
 
 _SHORTEST_MM = 2.0
 
-_RIVAL = 0.4
-"""A coronary artery's lines that are not connected to a piece this share as long are those of another artery."""
-
-_NEIGHBOURS = 6
-"""Points of a line are compared with this many nearest ones."""
-
-_DISORDER = 2.0
-"""A line this many times as long as the shortest tree through its points is in no order."""
-
-_JUMP_STEPS, _JUMP_RADII = 8.0, 5.0
-"""A step of more than this many usual ones, and of both radii this many times, leads to another vessel."""
+_RIVAL = 0.4  # lines that are not connected to a piece this share as long are another artery's
+_NEIGHBOURS = 6  # points of a line are compared with this many nearest ones
+_DISORDER = 2.0  # a line this many times as long as the shortest tree through its points is in no order
+_JUMP_STEPS, _JUMP_RADII = 8.0, 5.0  # a step of more usual ones, and radii, leads to another vessel
 
 
 @dataclass(frozen=True, eq=False)
 class LineGraph(VesselGraph):
-    """Points of all lines, twice as dense as the tree's; what a way costs is its length, more where it changes lines.
-
-    Attributes:
-        owner: index of the line of each point.
-        along: distance from the start of its line, mm.
-        ends: which are the first or last of their line.
-        share: length of line that each stands for, mm.
-    """
+    """Points of all lines, twice as dense as the tree's; a way costs its length, more where it changes lines. Points
+    have an `owner` line, `along` mm from its start, and stand for a `share` of it, mm."""
 
     columns = ("points", "radius", "owner", "along", "ends", "share")
     owner: Int[np.ndarray, "n"]
@@ -77,10 +52,7 @@ class LineGraph(VesselGraph):
         return replace(part, ends=np.concatenate([[True], cut]) | np.concatenate([cut, [True]]))
 
     def free_ends(self) -> Int[np.ndarray, "e"]:
-        """Return the ends that no vessel passes, or all ends if there is no such.
-
-        Seen from a free end, what lies about one and a half radii away lies in one direction, or forks there.
-        """
+        """Return the ends that no vessel passes (all near lies on one side), or all if there is no such."""
         tree, free = KDTree(self.points), []
         for end in np.flatnonzero(self.ends):
             reach = max(1.5 * float(self.radius[end]), 4 * STEP_MM)
@@ -117,9 +89,7 @@ class FoundLines:
     """The lines of one tree in centerlines, and what became of the others.
 
     Attributes:
-        lines: of the tree.
-        rule: by which its root was chosen.
-        notes: what was done, a sentence each.
+        rule: by which the root was chosen.
         rivals: a note on other ends that may be the inlet.
         whole: all lines as given.
         piece: connected piece of each point of `whole`, -1 in the parent vessel that the lines start in.
@@ -138,21 +108,9 @@ class FoundLines:
 
 
 def found_lines(source: Polylines, given: Insertion | None, label: str, vessel: str = "generic") -> FoundLines:
-    """Return the lines of one tree in centerlines.
-
-    Where the lines start in a parent vessel (VMTK's coronary centerlines start in the aorta), they are cut at the
-    ostium: where they leave the parent's spheres.
-
-    Args:
-        source: centerlines with radii, LPS mm.
-        given: the ostium, if it is known.
-        label: name of the source, for messages.
-        vessel: "rca", "lca" or "generic".
-
-    Raises:
-        InputError: the points of a line are in no order, no line is near the given ostium, or a coronary artery is
-            asked for and the lines are those of two.
-    """
+    """Return the lines of one tree in centerlines with radii, LPS mm, cut where they leave a parent vessel that they
+    start in (VMTK's: the aorta). Raises InputError where a line's points are in no order, no line is near the given
+    ostium, or a coronary artery is asked for and the lines are those of two."""
     source, notes = in_order(source, label)
     whole = line_graph(source)
     keep, cut_at = _outside_parent_vessel(whole)
@@ -186,7 +144,6 @@ def found_lines(source: Polylines, given: Insertion | None, label: str, vessel: 
 
 
 def _rooted(graph: LineGraph, root: int) -> RootedGraph:
-    """Return the graph with the cheapest ways to a root, a way's length being what it costs."""
     length, before = dijkstra(graph.costs, directed=False, indices=root, return_predecessors=True)
     return RootedGraph(graph.points, graph.radius, graph.costs, graph.step_mm, before, length)
 
@@ -222,10 +179,7 @@ def _meeting(graph: LineGraph) -> LineGraph:
 
 
 def _bridges(graph: LineGraph) -> Int[np.ndarray, "m 2"]:
-    """Return the shortest gaps, from line ends, that join pieces which lie within `LONGEST_BRIDGE` radii of each other.
-
-    Each joins two pieces that nothing shorter joins.
-    """
+    """Return the shortest gaps between ends of pieces within `LONGEST_BRIDGE` radii that are not joined yet."""
     piece, found = graph.pieces, list[tuple[float, int, int]]()
     for end, near, gap in graph.around_ends(LONGEST_BRIDGE) if piece.max() > 0 else ():
         for other in np.setdiff1d(piece[near], piece[end]):
@@ -238,10 +192,7 @@ def _bridges(graph: LineGraph) -> Int[np.ndarray, "m 2"]:
 
 
 def _outside_parent_vessel(graph: LineGraph) -> tuple[Bool[np.ndarray, "n"], Float[np.ndarray, "3"] | None]:
-    """Return which points lie outside the parent vessel that the lines start in, and where they leave it.
-
-    The parent's spheres are those at the lines' common start that are several times wider than the lines' median.
-    """
+    """Return which points lie outside the parent that the lines start in, by its far wider spheres there, and where."""
     points, radius, owner = graph.points, graph.radius, graph.owner
     everywhere = np.ones(len(points), dtype=bool)
     starts = np.flatnonzero(np.diff(owner, prepend=-1))
@@ -322,15 +273,9 @@ def _resampled(
 
 
 def in_order(source: Polylines, label: str) -> tuple[Polylines, list[str]]:
-    """Return lines that follow their vessels, and what was done, a sentence each.
-
-    Points that repeat are dropped. Points in another order than along the vessel are sorted where only one order is the
-    shortest. Where neighbouring spheres do not touch, a line is joined by a straight piece, or cut if it jumps to
-    another vessel.
-
-    Raises:
-        InputError: the points of a line are in no order.
-    """
+    """Return lines that follow their vessels, and what was done: repeated points dropped, points sorted where only one
+    order is the shortest, gaps closed by straight pieces, jumps to another vessel cut. Raises InputError for points in
+    no order."""
     points, radii, notes = [], [], []
     for number, (line, size) in enumerate(zip(source.points, source.radius, strict=True)):
         name = source.name(number)
@@ -372,10 +317,7 @@ def in_order(source: Polylines, label: str) -> tuple[Polylines, list[str]]:
 
 
 def _order(line: Float[np.ndarray, "n 3"], label: str) -> Int[np.ndarray, "n"] | None:
-    """Return the order of points along the vessel where it is another than they are in, or None where it is not.
-
-    The shortest tree through the points, where it has no fork, is the order along a vessel.
-    """
+    """Return points' order along the vessel if it is another: the shortest tree through them, if it has no fork."""
     count = len(line)
     if count < 4:
         return None
@@ -404,6 +346,5 @@ def _order(line: Float[np.ndarray, "n 3"], label: str) -> Int[np.ndarray, "n"] |
 
 
 def _turns(line: Float[np.ndarray, "n 3"]) -> int:
-    """Return at how many points a line turns by more than 90°."""
     step = np.diff(line, axis=0)
     return int((np.einsum("ij,ij->i", step[1:], step[:-1]) < 0).sum())

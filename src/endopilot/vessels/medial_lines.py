@@ -1,8 +1,5 @@
-"""The middle of a mask as a graph of single voxels, which keeps every thin branch and every tunnel of the mask.
-
-It does not depend on the smooth wall or on the grid that the centerlines come from, so it is the yardstick for both:
-where it is thinner than they can show, the mask is widened; what the final tree does not reach of it is stated.
-"""
+"""The middle of a mask as a graph of single voxels, with every thin branch and tunnel: independent of the smooth wall
+and the centerlines' grid, it is the yardstick of what these show and reach."""
 
 from __future__ import annotations
 
@@ -21,26 +18,20 @@ from endopilot.imaging.grid import connected_components
 from endopilot.types import Volume
 from endopilot.vessels.graph import RootedGraph, VesselGraph, lumen_graph
 
-SMALLEST_PIECE = 12
-"""A piece of fewer voxels is noise."""
-
-_NEIGHBOURS_APART = 1.8
-"""Voxels that share a corner lie this near each other, in voxels."""
+SMALLEST_PIECE = 12  # a piece of fewer voxels is noise
+_NEIGHBOURS_APART = 1.8  # voxels that share a corner lie this near each other, in voxels
 
 _NEAR_VOXELS, _MOSTLY_DEEP = 5.0, 0.5
 """A search for the nearest border takes long from voxels deeper than this. Where this share of them is, as in an aorta
 of fine voxels (33 against 3 s), distances are swept over the whole box instead."""
 
-_STUB_VOXELS, _SLENDER = 4.0, 1.5
-"""A side branch of the middle reaches this far out of its parent: in voxels, and in its own radii."""
+_STUB_VOXELS, _SLENDER = 4.0, 1.5  # a side branch reaches so far out of its parent, in voxels and own radii
 
 
 @dataclass(frozen=True, eq=False)
 class MedialLines(VesselGraph):
-    """The middle of a mask: a forest whose ways are as wide as they can be.
-
-    Its radius is the distance to the mask's border, half a voxel where the mask is one or two voxels thick; its costs
-    are lengths, mm.
+    """The middle of a mask: a forest of widest ways, whose radius is the distance to the mask's border, costs lengths,
+    mm.
 
     Attributes:
         index: voxel indices (z, y, x).
@@ -181,7 +172,6 @@ def _traced_piece(
 def _clearance(
     voxels: Bool[np.ndarray, "nz ny nx"], index: Int[np.ndarray, "n 3"], edges_mm: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "n"]:
-    """Return the distance from voxels of a mask to its border, mm: half a voxel on the border itself."""
     border, edges = _border(voxels), edges_mm[::-1]
     tree, places = KDTree(np.argwhere(border) * edges), index * edges
     gap = np.asarray(tree.query(places, distance_upper_bound=_NEAR_VOXELS * float(edges.max()))[0])
@@ -194,7 +184,6 @@ def _clearance(
 
 
 def _border(voxels: Bool[np.ndarray, "nz ny nx"]) -> Bool[np.ndarray, "nz ny nx"]:
-    """Return the voxels of a mask with a face outside."""
     inner = np.zeros_like(voxels)
     core = voxels[1:-1, 1:-1, 1:-1].copy()
     for axis in range(3):

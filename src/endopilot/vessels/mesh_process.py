@@ -1,10 +1,6 @@
-"""Reads one mesh file with VTK and writes its arrays to standard output; `polydata.py` runs it as a process.
-
-VTK's readers crash on some damaged files, and print what they complain of. Here neither reaches the caller. The process
-imports nothing of endopilot, and writes an npz archive: `points`; `corners` of triangles; `line_points` and, where each
-line begins in it, `line_offsets`; arrays of numbers as `point:NAME` and `cell:NAME`; the texts `kind`, `fields` and
-`complaint`.
-"""
+"""Reads one mesh file with VTK, in a process of its own as VTK may crash and print, and writes an npz archive to
+standard output: `points`; `corners` of triangles; `line_points` and `line_offsets`, where each line begins; arrays of
+numbers as `point:NAME` and `cell:NAME`; the texts `kind`, `fields` and `complaint`. It imports nothing of endopilot."""
 
 from __future__ import annotations
 
@@ -17,10 +13,7 @@ import numpy as np
 
 
 def read(path: str) -> dict[str, np.ndarray]:
-    """Return the arrays of a mesh file by name, with VTK's complaints instead of on the screen.
-
-    Called outside a process of its own, it serves files that are known to be whole.
-    """
+    """Return a mesh file's arrays by name, with VTK's complaints; outside its own process, of whole files alone."""
     from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkStringOutputWindow
 
     window, before, level = (
@@ -96,7 +89,6 @@ def _cells(cells: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _fields(field_data: Any) -> str:
-    """Return the texts in field data as statements NAME=text."""
     texts = []
     for i in range(field_data.GetNumberOfArrays()):
         array = field_data.GetAbstractArray(i)

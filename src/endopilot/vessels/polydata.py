@@ -1,8 +1,6 @@
-"""Surfaces and centerlines from STL, OBJ, PLY, VTP, VTU and VTK, with the axes and the unit that their headers state.
-
-3D Slicer writes its axes as `SPACE=LPS` or `SPACE=RAS`: in the header of an STL, in a comment of a PLY or OBJ, in the
-title of a VTK file, and in the field data of a VTP.
-"""
+"""Surfaces and centerlines from STL, OBJ, PLY, VTP, VTU and VTK, with the axes and the unit that their headers state:
+3D Slicer writes `SPACE=LPS` or `SPACE=RAS` in an STL's header, a PLY's or OBJ's comment, a VTK file's title, a VTP's
+fields."""
 
 from __future__ import annotations
 
@@ -32,11 +30,8 @@ from endopilot.vessels.sources import (
 )
 from endopilot.vessels.surface import Surface
 
-_HEADER_BYTES = 65536
-"""Statements of axes and unit stand in the first bytes of a file."""
-
-_LONGEST_S, _BYTES_A_SECOND = 30.0, 1e6
-"""A file that takes longer to read than this, and than its size at this speed, is damaged."""
+_HEADER_BYTES = 65536  # statements of axes and unit stand in the first bytes of a file
+_LONGEST_S, _BYTES_A_SECOND = 30.0, 1e6  # a file that takes longer than this, and at this speed, is damaged
 
 _SIMVASCULAR = {"ModelFaceID", "BranchId", "CenterlineSectionArea", "GlobalNodeID"}
 """Arrays that SimVascular writes into models, centerlines and meshes, all in cm."""
@@ -44,8 +39,7 @@ _SIMVASCULAR = {"ModelFaceID", "BranchId", "CenterlineSectionArea", "GlobalNodeI
 _SPACE = re.compile(r"\bSPACE\s*[=:]\s*[\"']?([A-Za-z][A-Za-z-]*)", re.IGNORECASE)
 _UNIT = re.compile(r"\bUNITS?\s*[=:]\s*[\"']?([A-Za-zµμ]+)", re.IGNORECASE)
 
-_FEWEST_BYTES = 16
-"""No format holds a vessel in fewer bytes."""
+_FEWEST_BYTES = 16  # no format holds a vessel in fewer bytes
 
 _PLY_KINDS = {"char": "i1", "uchar": "u1", "int8": "i1", "uint8": "u1", "short": "i2", "ushort": "u2", "int16": "i2",
               "uint16": "u2", "int": "i4", "uint": "u4", "int32": "i4", "uint32": "u4", "float": "f4", "float32": "f4",
@@ -55,12 +49,8 @@ _PLY_COUNTS = {name: kind for name, kind in _PLY_KINDS.items() if not kind.start
 
 
 def read_polydata(path: Path) -> AnatomySource:
-    """Read a surface, or centerlines with radii, in LPS mm where the header states axes and unit.
-
-    Raises:
-        InputError: the file is empty, damaged or truncated, is neither a surface nor a centerline, is a centerline
-            without radii, or states axes other than LPS and RAS.
-    """
+    """Read a surface, or centerlines with radii, in LPS mm where the header states axes and unit. Raises InputError for
+    a damaged file, one that is neither, centerlines without radii, or axes other than LPS and RAS."""
     _check_size(path)
     data = arrays(path)
     notes: list[str] = []
@@ -87,11 +77,7 @@ def read_polydata(path: Path) -> AnatomySource:
 
 
 def arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return what `mesh_process` reads from a file, in a process of its own, which may crash or hang.
-
-    Raises:
-        InputError: the file cannot be read, or holds neither triangles nor lines.
-    """
+    """Return what `mesh_process`, which may crash or hang, reads; InputError for neither triangles nor lines."""
     limit_s = _LONGEST_S + path.stat().st_size / _BYTES_A_SECOND
     command = [sys.executable, "-P", mesh_process.__file__, str(path.resolve())]
     try:
@@ -119,7 +105,6 @@ def _damaged(path: Path, complaint: str) -> InputError:
 
 
 def _header(path: Path) -> str:
-    """Return the part of a file that may state axes and unit: header, title or comments."""
     with path.open("rb") as stream:
         text = stream.read(_HEADER_BYTES).decode("latin-1")
     kind = path.suffix.lower()
@@ -163,7 +148,6 @@ def _factor(statement: str, data: dict[str, np.ndarray], notes: list[str]) -> tu
 
 
 def _surface(points: np.ndarray, corners: np.ndarray, path: Path) -> Surface:
-    """Return the triangles, points that coincide made one and triangles without an area left out."""
     vertices, index = np.unique(points, axis=0, return_inverse=True)
     faces = index.reshape(-1)[corners]
     first, second, third = faces.T
@@ -200,11 +184,7 @@ def _radius_array(data: dict[str, np.ndarray], path: Path) -> np.ndarray:
 
 
 def _check_size(path: Path) -> None:
-    """Refuse a mesh file that is empty, or shorter than its header promises.
-
-    Raises:
-        InputError: it is; or the header of a PLY file cannot be understood.
-    """
+    """Raise InputError for a mesh file that is empty, shorter than its header promises, or no proper PLY."""
     size = path.stat().st_size
     if size < _FEWEST_BYTES:
         raise InputError(f"{path}: is empty or truncated; export it again")
@@ -224,10 +204,7 @@ def _check_size(path: Path) -> None:
 
 
 def _is_ascii_stl(text: str) -> bool:
-    """Return whether the first bytes of an STL file are those of the text format.
-
-    A binary header may begin with "solid" too, but no facet follows it.
-    """
+    """Return whether an STL file is text: binary ones may begin with "solid" too, but no facet follows."""
     return text.lstrip().lower().startswith("solid") and ("facet" in text.lower() or "endsolid" in text.lower())
 
 

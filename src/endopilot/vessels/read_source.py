@@ -37,8 +37,7 @@ _CONVERT = {
 """How a file that is not read becomes one that is, by its suffix."""
 
 
-_NUMBERED_AXES = {"0": "ras", "1": "lps"}
-"""Axes by the numbers of Slicer's older files."""
+_NUMBERED_AXES = {"0": "ras", "1": "lps"}  # axes by the numbers of Slicer's older files
 
 _NO_CENTERLINE = {
     "fiducial": "its points are in no order; convert it to a curve in Slicer's Markups module",
@@ -87,7 +86,6 @@ def read_source(path: str | Path, *, label: int | str | None = None, threshold: 
 
 
 def _read_curves(folder: Path) -> AnatomySource:
-    """Return all markups curves of a folder as the lines of one tree."""
     entries = sorted(folder.iterdir())
     curves = [path for path in entries if path.name.lower().endswith(".mrk.json")]
     if (folder / "anatomy.json").exists():
@@ -144,7 +142,6 @@ def _read_markups(path: Path) -> AnatomySource:
 
 
 def _no_centerline(kind: Any, control: list[Any]) -> str | None:
-    """Return why a markup is no centerline, or None if it is one."""
     lower = str(kind or "Curve").lower()
     if lower not in ("curve", "line"):
         return _NO_CENTERLINE.get(lower, "only open curves and lines are (type Curve or Line)")

@@ -1,7 +1,4 @@
-"""Repairs of the flaws that masks from elsewhere have: blobs, gaps, cavities. `repair_surface` is that of surfaces.
-
-Every repair returns remarks, which `extract_anatomy` writes into the provenance.
-"""
+"""Repairs of flaws of masks from elsewhere: blobs, gaps, cavities; their remarks go into the provenance."""
 
 from __future__ import annotations
 
@@ -22,37 +19,25 @@ from endopilot.vessels.medial_lines import MedialLines, piece_labels
 from endopilot.vessels.surface import filled_box
 from endopilot.vessels.topology import MOST_LISTED, SMALLEST_PIECE, Touch, parted, touch_remarks
 
-NEAR_OSTIUM_MM = 5.0
-"""A lumen farther than this from a given ostium does not belong to it."""
+NEAR_OSTIUM_MM = 5.0  # a lumen farther than this from a given ostium does not belong to it
+LARGEST_GAP_VOXELS = 4.0  # pieces of a mask that are this near each other are taken for one interrupted vessel
 
-LARGEST_GAP_VOXELS = 4.0
-"""Pieces of a mask that are this near each other are taken for one interrupted vessel."""
+_DIRECTION_VOXELS = 12.0  # a piece's direction at its end is that of its voxels within this distance
+_ONWARDS = 0.5  # cosine of the largest angle between a piece and the gap that it is joined across
 
-_DIRECTION_VOXELS = 12.0
-"""A piece's direction at its end is that of its voxels within this distance."""
+NOTED_MM = 5.0  # what is left out or widened gets a remark of its own from this length; shorter pieces are summed up
 
-_ONWARDS = 0.5
-"""Cosine of the largest angle between a piece and the gap that it is joined across."""
-
-NOTED_MM = 5.0
-"""What is left out or widened gets a remark of its own from this length; shorter pieces are summed up."""
-
-_MOST_JOINED = 200
-"""At most this many pieces of a mask are looked at as vessels or parts of them."""
+_MOST_JOINED = 200  # at most this many pieces of a mask are looked at as vessels or parts of them
 
 OTHER_SIDE = {"rca": "left coronary artery", "lca": "right coronary artery"}
 
 
 @dataclass(frozen=True, eq=False)
 class Lumen:
-    """One lumen of a mask, ready for its wall.
+    """One lumen of a mask, ready for its wall, with its middle and remarks on what was joined, parted and left out.
 
-    Attributes:
-        mask: its voxels.
-        lines: their middle.
-        before: middle of all that the file connects with it: what the tree should reach.
-        told: which points of `before` lie in another vessel that was parted from this one, and that a remark names.
-        notes: remarks on what was joined, parted and left out.
+    `before` is the middle of all that the file connects with it, which the tree should reach; `told` those points of it
+    that lie in another vessel, parted from this one with a remark.
     """
 
     mask: Volume
@@ -64,16 +49,8 @@ class Lumen:
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """The pieces of a mask.
-
-    Attributes:
-        joined: voxels as they were read, and over gaps of a few voxels to what carries on.
-        gaps: a voxel at each gap, and whether what lies beyond was joined or runs alongside.
-        parted: the joined voxels, parted where they touch.
-        touches: what touches.
-        before: middle of the joined voxels.
-        lines: middle of the parted ones.
-    """
+    """The pieces of a mask: `joined` over gaps of a few voxels to what carries on, with its middle `before`, and
+    `parted` where they touch, with its middle `lines`; `gaps` has a voxel at each, and whether it was joined."""
 
     joined: Volume
     gaps: list[tuple[Int[np.ndarray, "3"], bool]]
@@ -103,17 +80,8 @@ def connected_mask(
     """Return the one lumen at the ostium, or the largest: gaps of a few voxels bridged, cavities filled, blobs removed.
 
     Places where it touches itself are parted (`topology.parted`). Where a mask holds both coronary arteries and no
-    ostium is given, `vessel` decides by the patient's side.
-
-    Args:
-        mask: one or several lumens, and specks.
-        given: the ostium, if it is known.
-        label: name of the source, for messages.
-        vessel: which vessel is wanted.
-        other_ostium: ostium of the other coronary artery, LPS mm, if it is known.
-
-    Raises:
-        InputError: the mask is empty, full, a solid block, noise, or touches nothing near the given ostium.
+    ostium is given, `vessel` decides by the patient's side. Ostia are in LPS mm. Raises InputError for a mask that is
+    empty, full, a solid block or noise, or that touches nothing near the given ostium.
     """
     if not mask.voxels.any():
         raise InputError(f"{label}: the mask is empty; check the label or segment again")
@@ -156,7 +124,6 @@ def connected_mask(
 
 
 def _holds(mask: Volume, voxels: Bool[np.ndarray, "nz ny nx"], place: Float[np.ndarray, "3"]) -> bool:
-    """Return whether some voxels lie at a place, LPS mm, or next to it."""
     at = np.rint(mask.world_to_index(place)).astype(int)[::-1]
     return bool(voxels[tuple(slice(max(0, i - 2), i + 3) for i in at)].any())
 
@@ -182,9 +149,7 @@ def chosen_piece(
     pieces: list[Float[np.ndarray, "_ 3"]], sizes: Shaped[np.ndarray, "p"], given: Insertion | None, vessel: Vessel
 ) -> tuple[int, float, Float[np.ndarray, "3"], list[int]]:
     """Return the piece at the ostium, how far away it is, mm, and where; and which other pieces are nearly as large.
-
-    Without an ostium it is that on the vessel's side (`piece_on_side`). A speck of noise is no piece.
-    """
+    Without an ostium it is that on the vessel's side (`piece_on_side`). A speck of noise is no piece."""
     if given is None:
         main, others = piece_on_side(sizes.astype(float), np.array([piece.mean(axis=0) for piece in pieces]), vessel)
         return main, 0.0, pieces[main][0], others
@@ -206,17 +171,8 @@ def pieces_left_out(
     other_ostium: Float[np.ndarray, "3"] | None,
     counted: str,
 ) -> list[str]:
-    """Say which pieces were left out and where they lie, since a real vessel may be lost with them.
-
-    Args:
-        pieces: points of each piece, LPS mm.
-        taken: numbers of those that the lumen is made of.
-        severed: of those that touched it and were parted from it.
-        others: of those nearly as large.
-        vessel: which vessel is wanted.
-        other_ostium: of the other coronary artery, LPS mm, if it is known.
-        counted: what the points are.
-    """
+    """Say which pieces (points, LPS mm, of `counted`) were left out and where they lie: a real vessel may be lost with
+    them. The lumen is made of `taken`; `severed` touched it and were parted from it; `others` are nearly as large."""
     remarks, foreign = list[str](), -1
     lost = [number for number in range(len(pieces)) if number not in taken]
     if lost and other_ostium is not None:
@@ -263,11 +219,8 @@ def pieces_left_out(
 def _joined(
     voxels: Bool[np.ndarray, "nz ny nx"],
 ) -> tuple[Bool[np.ndarray, "nz ny nx"], list[tuple[Int[np.ndarray, "3"], bool]]]:
-    """Join pieces that lie within the largest gap by tubes as wide as the vessels at both ends.
-
-    Two vessels that pass each other are not one: a piece that runs alongside another is not joined to it. Returns the
-    voxels, and for each gap a voxel at it and whether it was bridged.
-    """
+    """Join pieces within the largest gap by tubes as wide as the vessels, unless one runs alongside the other; return
+    the voxels, and for each gap a voxel at it and whether it was bridged."""
     labels, index = connected_components(voxels, corners=True), np.argwhere(voxels)
     members = split(index, labels[tuple(index.T)] - 1)
     large = sorted(range(len(members)), key=lambda piece: -len(members[piece]))[:_MOST_JOINED]

@@ -1,9 +1,5 @@
-"""Repairs of the flaws that surfaces from elsewhere have: separate pieces, holes, inverted normals, walls for lumens.
-
-A printed phantom's shell or a vessel wall's mask is given for a lumen: the lumen is what the wall encloses.
-
-Every repair returns remarks, which `extract_anatomy` writes into the provenance.
-"""
+"""Repairs of flaws of surfaces from elsewhere: separate pieces, holes, inverted normals, walls (a phantom's shell) for
+lumens, which they enclose; their remarks go into the provenance."""
 
 from __future__ import annotations
 
@@ -24,38 +20,25 @@ from endopilot.vessels.inlet import Vessel
 from endopilot.vessels.repair import NEAR_OSTIUM_MM, chosen_piece, pieces_left_out
 from endopilot.vessels.surface import Surface, filled_box, surface_from_mask
 
-MOST_PIECES = 12
-"""At most this many pieces of a surface are looked at as coronary arteries or parts of them."""
+MOST_PIECES = 12  # at most this many pieces of a surface are looked at as coronary arteries or parts of them
 
-_ACROSS = 120.0
-"""A surface is looked at in voxels of this share of its box's mean edge: 2 million."""
-
-_FACING = 0.12
-"""Of a wall of 1 to 3 mm round lumens of 2 to 6 mm 0.15 to 0.5 of the surface faces itself on both sides."""
-
-_HOLDS = 0.08
-"""A shell of voxels holds at least this share of its own number: half a sixth."""
-
-_OVERLAP = 20
-"""Surfaces that have no more voxels than this in common touch."""
-
-
-_MOST_VOXELS = 2_000_000
-"""A mask of more is looked at in blocks: 0.5 s."""
+_ACROSS = 120.0  # a surface is looked at in voxels of this share of its box's mean edge: 2 million
+_FACING = 0.12  # of a wall of 1 to 3 mm round lumens of 2 to 6 mm 0.15 to 0.5 of the surface faces itself on both sides
+_HOLDS = 0.08  # a shell of voxels holds at least this share of its own number: half a sixth
+_OVERLAP = 20  # surfaces that have no more voxels than this in common touch
+_MOST_VOXELS = 2_000_000  # a mask of more is looked at in blocks: 0.5 s
 
 _ENCLOSED = 16
 """A void is enclosed where the wall is met in this many of the 26 directions: 16 in the plane of a tube's open end,
 13 or fewer between two branches."""
 
-_REACH = 5
-"""The wall is looked for within 2 to the power of this many voxels."""
+_REACH = 5  # the wall is looked for within 2 to the power of this many voxels
 
 _UNIFORM, _LINING = 0.4, 0.9
 """A wall's thickness varies by at most this share of it (SD), and this share of it lines the lumen: not so a vessel
 with a catheter or an island in it."""
 
-_THICKEST = 4.0
-"""A wall is at most this many times as thick as its lumen's radius."""
+_THICKEST = 4.0  # a wall is at most this many times as thick as its lumen's radius
 
 
 def closed_surface(
@@ -65,13 +48,8 @@ def closed_surface(
     vessel: Vessel = "generic",
     other_ostium: Float[np.ndarray, "3"] | None = None,
 ) -> tuple[Surface, list[str]]:
-    """Return one closed wall with outward normals: largest piece (or the one at the ostium), holes capped.
-
-    Arguments are those of `repair.connected_mask`, with a surface for the mask.
-
-    Raises:
-        InputError: the holes cannot be closed, or the surface is nowhere near the given ostium.
-    """
+    """Return one closed wall with outward normals: largest piece (or that at the ostium), holes capped; arguments as of
+    `connected_mask`. Raises InputError for holes that cannot be closed, or a surface nowhere near the ostium."""
     mesh: Any = _without_duplicates(_polydata(surface.vertices, surface.faces).clean().triangulate())
     mesh, remarks = _lumen_of(mesh)
     regions = mesh.connectivity(extraction_mode="all")
@@ -110,10 +88,7 @@ def closed_surface(
 
 
 def _lumen_of(mesh: Any) -> tuple[Any, list[str]]:
-    """Return the inner faces of a wall that has a thickness, with a remark; any other mesh as it is.
-
-    From a wall, unlike from a vessel, many lines along the normals meet the surface again on both sides.
-    """
+    """Return a thick wall's inner faces, with a remark, or the mesh: a normal meets a wall again on both sides."""
     if min(_met_again(mesh, sign) for sign in (1.0, -1.0)) < _FACING:
         return mesh, []
     closed = _surface(_capped(mesh))
@@ -195,7 +170,6 @@ def region_places(surface: Surface) -> list[Float[np.ndarray, "3"]]:
 
 
 def _without_duplicates(mesh):
-    """Drop triangles that occur twice, as where a surface was exported together with its own copy."""
     faces = np.asarray(mesh.faces.reshape(-1, 4)[:, 1:])
     _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     if len(first) == len(faces):
@@ -280,7 +254,6 @@ def without_wall(mask: Volume) -> tuple[Volume, list[str]]:
 
 
 def _wall_text(thickness_mm: float) -> str:
-    """Return the remark on a wall that was given for a lumen."""
     return f"what is given is a wall of {thickness_mm:.1f} mm: the lumen inside it is taken"
 
 

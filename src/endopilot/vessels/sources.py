@@ -22,11 +22,8 @@ AXES = {"LPS": "lps", "LEFT-POSTERIOR-SUPERIOR": "lps", "RAS": "ras", "RIGHT-ANT
 
 RAS_TO_LPS = np.array([-1.0, -1.0, 1.0])
 
-SMALLEST_RADIUS_MM = 0.25
-"""Vessels that a guidewire enters have mean radii from this on."""
-
-LARGEST_EXTENT_MM = 2500.0
-"""No vessel of the body reaches farther."""
+SMALLEST_RADIUS_MM = 0.25  # vessels that a guidewire enters have mean radii from this on
+LARGEST_EXTENT_MM = 2500.0  # no vessel of the body reaches farther
 
 _KINDS = {
     "coronary": (1.2, 0.35, 120.0),
@@ -41,12 +38,10 @@ _KINDS = {
 published statistics (rca 1.2 and 123, lca 1.0 and 147, cerebral 1.5 and 140, portal 3.3 and 177, arch 8 and 304), and
 of public patients. Calibres of small vessels spread more: some files hold their thinnest branches, others do not."""
 
-_LONGER_SD, _SHORTER_SD = 0.3, 0.9
-"""Spread of ln(extent) about a kind's own; a file may hold a piece of the vessel, so that shorter costs less."""
+_LONGER_SD, _SHORTER_SD = 0.3, 0.9  # spread of ln(extent) of a kind; a file may hold a piece: shorter costs less
 
 _UNITS = {"mm": 1.0, "cm": 10.0, "inches": 25.4, "dm": 100.0, "m": 1000.0, "tenths of mm": 0.1, "µm": 0.001}
-_RARE = {"tenths of mm": 0.02, "µm": 0.02}
-"""How likely a unit is against cm, before the sizes are looked at."""
+_RARE = {"tenths of mm": 0.02, "µm": 0.02}  # how likely a unit is against cm, before the sizes are looked at
 
 ASSUMED, BY_ARRAYS, STATED, ANSWERED = 4.0, 100.0, 1e4, 1e6
 """How much likelier a file's unit is what it was taken for than any other: by default, since arrays of a program that
@@ -55,22 +50,14 @@ has a usual unit are in it, since the file states the unit, and since the user d
 _CERTAIN, _FITS = 0.9, 0.05
 """A unit less probable than the first is asked for; the message names what has this share of the best one's chances."""
 
-_NONE = 1e-6
-"""Likelihood of sizes that are no vessel's; those of a kind's medians have 1."""
-
-_NAMES = {**MM_PER_UNIT, "[in_i]": 25.4}
-"""mm in each unit of length, by its names; `[in_i]` is the inch of UCUM, which Slicer writes."""
+_NONE = 1e-6  # likelihood of sizes that are no vessel's; those of a kind's medians have 1
+_NAMES = {**MM_PER_UNIT, "[in_i]": 25.4}  # mm in each unit, by its names; `[in_i]` is UCUM's inch, which Slicer writes
 
 
 @dataclass(frozen=True, eq=False)
 class Polylines:
-    """Centerlines as a file holds them: any number of lines, in any order and direction, possibly overlapping.
-
-    Attributes:
-        points: positions of each line, mm.
-        radius: inscribed-sphere radii of each line, mm.
-        names: what messages call each line; its number if none are given.
-    """
+    """Centerlines as a file holds them: positions and inscribed-sphere radii, mm, of any number of lines, in any order
+    and direction, possibly overlapping. Messages call lines by their names, or by their numbers."""
 
     points: tuple[Float[np.ndarray, "_ 3"], ...]
     radius: tuple[Float[np.ndarray, "_"], ...]
@@ -105,16 +92,8 @@ class AnatomySource:
 
 
 def transformed(source: AnatomySource, *, scale: float | None, coordinates: str | None) -> AnatomySource:
-    """Return a source in LPS mm, with a note where nothing states the axes.
-
-    Args:
-        source: as read.
-        scale: factor that turns its unit into mm, if the user states it.
-        coordinates: "lps" or "ras" where the user states the axes, otherwise None.
-
-    Raises:
-        InputError: the user states other axes or another unit than the file.
-    """
+    """Return a source in LPS mm, with a note where nothing states the axes. `scale` (mm in its unit) and `coordinates`
+    ("lps", "ras") are the user's; InputError where the file states others."""
     label, notes = source.file or "the source", source.notes
     if coordinates is not None and source.coordinates is not None and coordinates != source.coordinates:
         stated = (
@@ -155,13 +134,8 @@ def in_mm(content: Any, factor: float, turn: Float[np.ndarray, "3"]) -> Any:
 
 
 def checked_lines(lines: Polylines, path: Path, notes: list[str]) -> Polylines:
-    """Return centerlines whose positions are finite and whose radii are positive.
-
-    Where the radius is no number or zero only at the end of a line, it becomes that of the point before, with a note.
-
-    Raises:
-        InputError: there is no line, or a position or radius is none.
-    """
+    """Return centerlines whose positions are finite and whose radii are positive; InputError where they are not. Where
+    the radius is no number or zero only at the end of a line, it becomes that of the point before, with a note."""
     if not lines.points:
         raise InputError(f"{path}: holds no line of at least two points; export the centerline again")
     if all((radius == 0).all() for radius in lines.radius):
@@ -207,21 +181,11 @@ def check_unit(
     factor: float = 1.0,
     odds: float = STATED,
 ) -> None:
-    """Refuse a vessel that has another size than vessels have, and ask where its size fits in several units.
+    """Refuse a vessel (points on it, or its box's corners, in mm by `factor`) of another size than vessels have, and
+    ask with the `--scale`s where several units fit.
 
-    Radius and extent together tell the unit: no tree of the body is as long as a coronary artery's in mm and as wide as
-    an aorta's in cm. Each unit is weighed by how usual it makes the two, against the nearest kind of vessel.
-
-    Args:
-        points: places on the vessel or its wall, or the corners of its box, in mm as taken.
-        radius_mm: mean radius, if it is known.
-        vessel: which vessel it is to be.
-        label: name of the source, for the message.
-        factor: mm in the unit that the file was taken to be in.
-        odds: how much likelier that unit is than another: `ASSUMED`, `BY_ARRAYS`, `STATED` or `ANSWERED`.
-
-    Raises:
-        InputError: the size is no vessel's, or one in several units; the message names each size and its `--scale`.
+    Radius and extent together tell the unit, each weighed by how usual it makes the two against the nearest kind of
+    vessel; `odds` (`ASSUMED`, `BY_ARRAYS`, `STATED`, `ANSWERED`) favour the one it was taken in.
     """
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     units = {factor: unit_name(factor)} | {one: name for name, one in _UNITS.items()}

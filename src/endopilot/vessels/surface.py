@@ -13,40 +13,27 @@ from scipy.spatial import KDTree
 from endopilot.errors import InputError
 from endopilot.types import Volume
 
-SMOOTHING_VOXELS = 1.75
-"""Standard deviation, in longest edges, of the Gaussian under which the surface must look like the mask."""
+SMOOTHING_VOXELS = 1.75  # SD, in longest edges, of the Gaussian under which the surface looks like the mask
 
 ACROSS_EDGES = 0.75
 """It is wider in voxels along shorter edges, by this power of the edges' ratio: at 0, a wall nearly in the plane of
 thick slices keeps their steps, which are long in the plane; at 1, the crotch of two lumens at 30° fills."""
 
 _FIT_ITERATIONS = 8
-_BLOCK = 24
-"""Edge in voxels of the blocks that a mask is smoothed in."""
-
-BAND_MM = 2.5
-"""How far outside the wall the distance map reaches, mm; beyond, it holds the constant −`BAND_MM`."""
-
-MAXIMUM_GRID_POINTS = 20_000_000
-"""A distance map holds at most this many grid points (80 MB of float32); the spacing grows until it fits."""
+_BLOCK = 24  # edge in voxels of the blocks that a mask is smoothed in
+BAND_MM = 2.5  # how far outside the wall the distance map reaches, mm; beyond, it holds the constant −`BAND_MM`
+MAXIMUM_GRID_POINTS = 20_000_000  # of a distance map (80 MB of float32); the spacing grows until it fits
 
 _NEAREST_TRIANGLES = 4
-_WORTH_THREADS = 20_000
-"""With fewer points than this, starting threads takes longer than they save."""
+_WORTH_THREADS = 20_000  # with fewer points than this, starting threads takes longer than they save
 
 
-_SLICES = 16
-"""A wall's inside is found this many slices at a time: of 170 000 triangles in 0.15 s, in 1.2 s all at once."""
+_SLICES = 16  # a wall's inside is found so many slices at a time: 170 000 triangles in 0.15 s, all at once 1.2 s
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A triangulated wall.
-
-    Attributes:
-        vertices: positions, LPS mm.
-        faces: three vertex indices a triangle.
-    """
+    """A triangulated wall: positions, LPS mm, and three vertex indices a triangle."""
 
     vertices: Float[np.ndarray, "n 3"]
     faces: Int[np.ndarray, "m 3"]
@@ -87,12 +74,8 @@ class Surface:
         return 2.0 * self.volume / float(self.triangles()[2].sum())
 
     def distance(self, points: Float[np.ndarray, "n 3"], *, limit_mm: float = np.inf) -> Float[np.ndarray, "n"]:
-        """Return the unsigned distance in mm from points to the wall, `limit_mm` where it is at least that.
-
-        The triangles are found by their centroids: the nearest four for points close to the wall, the nearest one
-        alone for points so far that its neighbours cannot matter. They must therefore be about as small as the
-        details that matter (see `refined`).
-        """
+        """Return unsigned distances, mm, to the wall, at most `limit_mm`, by the nearest four centroids, or one where
+        far: triangles must be about as small as the details that matter (`refined`)."""
         result = np.full(len(points), limit_mm)
         reach, count = limit_mm + self.longest_edge, min(_NEAREST_TRIANGLES, len(self.faces))
         for start in range(0, len(points), 200_000):
@@ -132,10 +115,8 @@ class Surface:
     def inside(
         self, shape: tuple[int, int, int], origin: Float[np.ndarray, "3"], spacing_mm: float
     ) -> Bool[np.ndarray, "nz ny nx"]:
-        """Return which points of a grid along the LPS axes lie inside a closed wall.
-
-        VTK looks at every triangle for every slice, so that it is given a few slices at a time, and what crosses them.
-        """
+        """Return which points of a grid along the LPS axes lie inside a closed wall, a few slices at a time, for VTK
+        looks at every triangle for every slice."""
         from vtkmodules.util.numpy_support import vtk_to_numpy
         from vtkmodules.vtkImagingStencil import vtkImageStencilToImage, vtkPolyDataToImageStencil
 
@@ -187,11 +168,8 @@ def polydata_of(
 
 
 def surface_from_mask(mask: Volume) -> Surface:
-    """Return the smooth wall whose blurred inside equals the blurred mask: the zero level of `level_function`.
-
-    Raises:
-        InputError: the mask is nowhere thick enough to hold a lumen.
-    """
+    """Return the smooth wall whose blurred inside equals the blurred mask: the zero level of `level_function`. Raises
+    InputError where the mask is nowhere thick enough to hold a lumen."""
     from skimage.measure import marching_cubes
 
     level, corner = smooth_level(mask)
@@ -237,10 +215,8 @@ def blur_voxels(edges_mm: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
 
 @lru_cache(maxsize=1)
 def smooth_level(mask: Volume) -> tuple[Float[np.ndarray, "nz ny nx"], Int[np.ndarray, "3"]]:
-    """Return the `level_function` of a mask on its filled box and a margin, and the voxel (z, y, x) it begins at.
-
-    The last mask's is kept: what it is too thin to show is looked for before the wall is made of it.
-    """
+    """Return the `level_function` of a mask on its filled box and a margin, and the voxel (z, y, x) it begins at. The
+    last mask's is kept: what it is too thin to show is looked for before the wall is made of it."""
     margin, box = 4, filled_box(mask.voxels)
     inside = np.pad(np.asarray(mask.voxels[box], dtype=bool), margin)
     return level_function(inside, mask.spacing_mm[::-1]), np.array([part.start for part in box]) - margin
@@ -254,13 +230,8 @@ def level_function(
     A Gaussian of one voxel takes the staircase out of the mask, but also shrinks round vessels (by about σ²/2R).
     Therefore the level function d is not the blurred mask itself: it starts from σ·Φ⁻¹(G∗mask), which is exact for a
     plane, and is corrected by σ√2π·(G∗mask − G∗H(d)) until its own blurred inside agrees. H(d) is the share of a voxel
-    that lies inside. The zero level keeps the mask's local volume, so radii are unbiased down to about one voxel.
-
-    A vessel fills little of its box, so the box is worked through in blocks, and only in those that hold some wall.
-
-    Args:
-        inside: the mask.
-        edges_mm: edges of its voxels along its axes, mm.
+    that lies inside. The zero level keeps the mask's local volume, so radii are unbiased down to about one voxel. A
+    vessel fills little of its box, so the box is worked through in blocks, and only in those that hold some wall.
     """
     from scipy.special import ndtri
 
@@ -312,7 +283,6 @@ def _blurred(
 
 
 def _finer(values: Float[np.ndarray, "a b c"], axis: int, factor: int) -> Float[np.ndarray, "d e f"]:
-    """Return values on a grid `factor` times finer along one axis, by a cubic spline from end to end."""
     from scipy.interpolate import CubicSpline
 
     size = values.shape[axis]
@@ -323,7 +293,6 @@ def _finer(values: Float[np.ndarray, "a b c"], axis: int, factor: int) -> Float[
 def _halved(
     faces: Int[np.ndarray, "m 3"], longest: Int[np.ndarray, "m"], vertices: Float[np.ndarray, "n 3"]
 ) -> tuple[Int[np.ndarray, "halves 3"], Float[np.ndarray, "edges 3"]]:
-    """Return triangles split at the middles of their longest edges, and these middles, which follow the vertices."""
     rows = np.arange(len(faces))
     one, two, opposite = faces[rows, longest], faces[rows, (longest + 1) % 3], faces[rows, (longest + 2) % 3]
     edges, inverse = np.unique(np.sort(np.stack([one, two], axis=1), axis=1), axis=0, return_inverse=True)

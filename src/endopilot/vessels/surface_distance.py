@@ -11,18 +11,11 @@ from endopilot.imaging.grid import dilated
 from endopilot.types import DistanceMap
 from endopilot.vessels.surface import BAND_MM, Surface, grid_of
 
-_NEAR_WALL = (2, 5)
-"""This many grid steps outside and inside the wall are computed exactly, the rest on every second grid point."""
+_NEAR_WALL = (2, 5)  # grid steps outside and inside the wall that are exact, the rest at every second point
 
 
 def distance_map_from_surface(surface: Surface, *, spacing_mm: float, band_mm: float = BAND_MM) -> DistanceMap:
-    """Return the signed distance to a closed triangulated wall.
-
-    Args:
-        surface: closed wall, LPS mm.
-        spacing_mm: grid spacing, mm.
-        band_mm: how far outside the wall distances are kept, mm.
-    """
+    """Return the signed distance to a closed triangulated wall (LPS mm), kept up to `band_mm` outside it."""
     lower = surface.vertices.min(axis=0) - band_mm
     shape, origin = grid_of(lower, surface.vertices.max(axis=0) + band_mm, spacing_mm)
     inside = surface.inside(shape, origin, spacing_mm)
@@ -46,10 +39,7 @@ def _far_field(
     spacing: float,
     band: float,
 ) -> Float[np.ndarray, "nz ny nx"]:
-    """Return signed distances from every second grid point, linear between them; far inside, from every fourth.
-
-    At a distance ρ from the medial axis this errs by at most h²/2ρ, so it serves away from the wall.
-    """
+    """Return signed distances from every second (far inside, fourth) point, linear between: errs by h²/2ρ at most."""
     half = np.full(tuple((np.array(inside.shape) + 1) // 2 + 1), -band, dtype=np.float32)
     second, asked = inside[::2, ::2, ::2], wanted[::2, ::2, ::2]
     if (deep := second & ~dilated(~second, _NEAR_WALL[1])).any():

@@ -30,21 +30,15 @@ from endopilot.vessels.graph import pieces
 from endopilot.vessels.inlet import AORTA_RADIUS_MM
 from endopilot.vessels.medial_lines import SMALLEST_PIECE, MedialLines, piece_labels, thinned_lines, traced_lines
 
-CONTACT = 0.6
-"""A place whose clearance is less than this share of the vessels' on both sides is a contact, not a stenosis."""
+CONTACT = 0.6  # a place with less clearance than this share of both sides' is a contact, not a stenosis
 
 SHORTEST_LOOP_MM = 20.0
 """Loops from this length are cut. In shorter ones two branches touch again just behind their fork, or a wall has a
 hole: which way a line takes hardly matters."""
 
-SHORTEST_TUNNEL_MM = 6.0
-"""Tunnels shorter than this, or no longer than round the vessel itself, are rough voxels."""
-
-MOST_LISTED = 8
-"""As many places or pieces are listed one by one."""
-
-_SLIT_VOXELS = 3.0
-"""So are those whose opposite sides come as near each other as this, in voxels."""
+SHORTEST_TUNNEL_MM = 6.0  # tunnels shorter than this, or no longer than round the vessel itself, are rough voxels
+MOST_LISTED = 8  # as many places or pieces are listed one by one
+_SLIT_VOXELS = 3.0  # so are those whose opposite sides come as near each other as this, in voxels
 
 _APART, _STRAIGHT = (0.35, 0.5, 0.8), (0.6, 0.8)
 """Axes that stay apart by these shares of both radii together: of one vessel that touches itself, of two that perhaps
@@ -93,12 +87,11 @@ _LEFT: dict[Kind, Kind | None] = {
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """A place where a mask touches itself or closes a loop, and what was made of it.
+    """A place (LPS mm) where a mask touches itself or closes a loop, and what was made of it.
 
     Attributes:
-        kind: parted: the vessel touches itself, a loop is narrowest, distant parts lie side by side, two vessels
-            touch; left: two vessels perhaps touch, a flap has an opening, a tunnel is small, or there are many rings.
-        place: where, LPS mm.
+        kind: parted: the vessel touches itself, a loop is narrowest, distant parts lie side by side, two vessels touch;
+            left: two vessels perhaps touch, a flap has an opening, a tunnel is small, or there are many rings.
         size_mm: length of the vessel between the two sides, or of the contact.
     """
 
@@ -142,11 +135,8 @@ class _Ring:
 
 
 def parted(mask: Volume) -> tuple[Volume, list[Touch], MedialLines, MedialLines]:
-    """Return the mask parted where it touches itself, all places where it touches or closes a loop, and its middle.
-
-    No part of a lumen loses its way to the rest, except one of two vessels that certainly only touch. The middle is
-    that of the mask as it was, and as it is.
-    """
+    """Return the mask parted where it touches itself, all its contacts and loops, and its middle before and after. No
+    part loses its way to the rest, except one of two vessels that certainly only touch."""
     parting, before = _Parting(mask), traced_lines(mask)
     for _ in range(_ROUNDS):
         thin = thinned_lines(parting.result)  # has all loops, but not all ends
@@ -172,7 +162,6 @@ def parted(mask: Volume) -> tuple[Volume, list[Touch], MedialLines, MedialLines]
 
 
 def _porous(mask: Volume, thin: MedialLines, rings: list[_Ring]) -> list[Touch]:
-    """Return the places of a mask's rings, the longest first."""
     parting = _Parting(mask)
     for ring in sorted(rings, key=lambda ring: -ring.around_mm):
         parting.say("porous", thin.local[ring.nodes[0]], ring.around_mm)
@@ -180,10 +169,7 @@ def _porous(mask: Volume, thin: MedialLines, rings: list[_Ring]) -> list[Touch]:
 
 
 def touch_remarks(found: list[Touch], *, parted: bool = True) -> list[str]:
-    """Return what is said of places where a lumen touches itself: one remark for each kind, the largest place first.
-
-    Where the lumen, a surface's, is not parted there, the words are others.
-    """
+    """Return remarks on where a lumen touches itself: one a kind, the largest first, other words if not parted."""
     kinds = [touch.kind if parted else _LEFT.get(touch.kind, touch.kind) for touch in found]
     remarks = []
     for kind, (text, size) in _SAID.items():
@@ -263,10 +249,8 @@ class _Parting:
     def _neck(
         self, place: Float[np.ndarray, "3"], reach_mm: float, across: Float[np.ndarray, "n 3"]
     ) -> tuple[float, bool]:
-        """Return the least clearance at places across a neck, mm, and whether a flap is at its middle.
-
-        With its wall filled in, the vessel then is wider there than any lumen within reach.
-        """
+        """Return the least clearance at places across a neck, mm, and whether a flap is at its middle: with its wall
+        filled in, the vessel is wider there than any lumen within reach."""
         reach, at = np.ceil(reach_mm / self.edges).astype(int), np.rint(place / self.edges).astype(int)
         window = tuple(slice(max(0, c - 2 * r), c + 2 * r + 1) for c, r in zip(at, reach, strict=True))
         own = np.pad(self.result.voxels[window], 1)
@@ -287,7 +271,6 @@ def _count(mask: Volume) -> int:
 
 
 def _rings(lines: MedialLines, mask: Volume) -> list[_Ring]:
-    """Return the loops of a mask's middle that are not rough voxels, one for each edge that closes one."""
     rings = []
     for start, end in lines.closing:
         nodes = np.array(lines.tree.way(int(end), int(start)))
@@ -353,7 +336,6 @@ def _segments(lines: MedialLines, rings: list[_Ring]) -> list[list[int]]:
 
 
 def _is_stub(lines: MedialLines, path: list[int]) -> bool:
-    """Return whether a segment that ends is no longer than the middle is wide where it begins."""
     length = float(length_along(lines.local[path])[-1])
     around = np.linalg.norm(lines.local - lines.local[path[0]], axis=1) <= length
     return length < max(2.0 * float(lines.radius[around].max()), _SLIT_VOXELS * float(lines.edges_mm.max()))
@@ -468,11 +450,8 @@ def _sever(voxels: Bool[np.ndarray, "nz ny nx"], lines: MedialLines, ends: tuple
 
 
 def _without_sides(mask: Volume, lines: MedialLines) -> tuple[Volume, Touch] | None:
-    """Return the mask with parts that lie far from each other along the vessel parted where they touch over a length.
-
-    Each voxel belongs to the nearest point of the middle; neighbours that belong to distant points are emptied, unless
-    the lumen falls apart that way. None if there are none.
-    """
+    """Return the mask with distant parts parted where they touch over a length, between voxels whose nearest middle
+    points are distant; None if there are none, or the lumen fell apart."""
     if lines.radius.max(initial=0.0) > AORTA_RADIUS_MM:  # a branch's first part lies inside the aorta's own middle
         return None
     voxel = float(mask.spacing_mm.max())

@@ -33,32 +33,19 @@ from endopilot.imaging.segment import SegmentConfig
 from endopilot.progress import progress
 from endopilot.types import Insertion, LumenMask, Volume
 
-_GRID_MM = 1.5
-"""Working voxel: a tenth of the aorta's radius, and the walls between it and its neighbours still show."""
-_WALL_HU = 50.0
-"""Soft tissue around the lumen: vessel wall and muscle without contrast."""
-_PATH_LEVELS = (0.6, 0.5, 0.4)
-"""Shares of the blood's HU that the path stays above; a lower one is tried where the seeds are not connected."""
-_REACH_MM = 30.0
-"""Bright voxels farther from the path are not the aorta: half of 60 mm, a large aneurysm."""
-_CORE = 0.6
-"""Share of the inscribed radius around the path that is aorta without question."""
-_WIDEST_MM = 18.0
-"""With one seed the far end is free; a wider inscribed sphere than this means that a heart chamber was entered."""
-_THINNEST_MM = 3.0
-"""Radius of the opening: branches and leaks thinner than this go."""
-_SEED_MM = 6.0
-"""A seed is moved to the middle of the lumen within this distance."""
+_GRID_MM = 1.5  # working voxel: a tenth of the aorta's radius, and the walls between it and its neighbours still show
+_WALL_HU = 50.0  # soft tissue around the lumen: vessel wall and muscle without contrast
+_PATH_LEVELS = (0.6, 0.5, 0.4)  # shares of the blood's HU that the path stays above; lower ones where seeds are apart
+_REACH_MM = 30.0  # bright voxels farther from the path are not the aorta: half of 60 mm, a large aneurysm
+_CORE = 0.6  # share of the inscribed radius around the path that is aorta without question
+_WIDEST_MM = 18.0  # with one seed the far end is free: a wider inscribed sphere is in a heart chamber
+_THINNEST_MM = 3.0  # radius of the opening: branches and leaks thinner than this go
+_SEED_MM = 6.0  # a seed is moved to the middle of the lumen within this distance
 
 
 def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
-    """Segment the aortic lumen from the first seed, where the device enters, to the last.
-
-    Further seeds in between guide the path. With one seed, the lumen is followed to its far end.
-
-    Raises:
-        InputError: there is no seed, no contrast at a seed, or no contrast-filled path between seeds.
-    """
+    """Segment the aortic lumen from the first seed, where the device enters, by those between to the last, or to its
+    far end. Raises InputError without a seed, contrast at a seed, or a contrast-filled path."""
     if not config.seeds:
         raise InputError("seeds: the aorta method needs one or two points in the lumen, LPS mm; give --seeds x y z")
     with progress("Segmenting the aorta", 4) as advance:

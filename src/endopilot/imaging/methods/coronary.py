@@ -44,60 +44,36 @@ from endopilot.types import Insertion, LumenMask, Volume
 
 _ROOT_GRID_MM = 1.5
 _BODY_GRID_MM = 1.0
-_GRID_MM = 0.5
-"""Grids on which the aorta, the large blood pools and the vessels are sought."""
-_MUSCLE_HU = 100.0
-"""Myocardium in the arterial phase."""
-_FAT_HU = -90.0
-"""Epicardial fat."""
-_LOW_SHARE = 0.25
-"""A vessel's voxels rise by this share of the step from what surrounds them to lumen; the blur dims small vessels."""
-_POOL_RADIUS_MM = 3.5
-"""A ball of this radius fits in chambers and great vessels, and in no coronary artery but a dilated one."""
+_GRID_MM = 0.5  # grids on which the aorta, the large blood pools and the vessels are sought
+_MUSCLE_HU = 100.0  # myocardium in the arterial phase
+_FAT_HU = -90.0  # epicardial fat
+_LOW_SHARE = 0.25  # a vessel's voxels rise by this share of the step to lumen; the blur dims small vessels
+_POOL_RADIUS_MM = 3.5  # such a ball fits in chambers, great vessels, and no coronary artery but a dilated one
 _CORE_RADIUS_MM = 5.5
-_NEAR_CORE_MM = 4.0
-"""A ball of this radius fits in no dilated artery either: what is wide so near to where it fits is a pool."""
+_NEAR_CORE_MM = 4.0  # such a ball fits in no dilated artery either: what is wide so near to it is a pool
 _CORE_MEDIAN = 3
 """Edge of the median filter against noise where the large balls are sought, voxels of the body's grid. A Gaussian would
 close the fat between an artery and a pool."""
-_RESPONSE = 0.15
-"""Vesselness of a vessel's voxels."""
-_SCALES_MM = (0.6, 0.9, 1.3, 1.9, 2.8)
-"""Scales of the vesselness: they answer most to radii of 0.8 to 4 mm."""
-_GAP_MM = 1.0
-"""Voxels between vessels this close together are bridged, if they are bright."""
-_SEED_MM = 5.0
-"""A seed belongs to the vessel within this distance."""
-_LEAST_TREE_MM3 = 250.0
-"""A smaller connected vessel is no coronary tree: 50 mm of 2.5 mm width hold as much."""
-_RIVAL_SHARE = 0.85
-"""What is dimmer than this share of the aorta's blood is no second candidate for it."""
-COARSEST_MM = 1.25
-"""Longest edge of voxels in which a coronary artery of 2 mm still shows."""
-
-_MOUTH_MM = 4.0
-"""Length of the artery's beginning where the aorta's blood hides its radius, mm."""
-_WIDEST_MM = 5.0
-"""Largest radius expected of a coronary artery, mm."""
-_MARGIN_MM = 8.0
-"""Width of surroundings kept around the tree for the contour, mm."""
-_OSTIUM_REACH_MM = 8.0
-"""Around the ostium, the plane across the vessel cuts, and nothing else."""
+_RESPONSE = 0.15  # vesselness of a vessel's voxels
+_SCALES_MM = (0.6, 0.9, 1.3, 1.9, 2.8)  # scales of the vesselness: they answer most to radii of 0.8 to 4 mm
+_GAP_MM = 1.0  # voxels between vessels this close together are bridged, if they are bright
+_SEED_MM = 5.0  # a seed belongs to the vessel within this distance
+_LEAST_TREE_MM3 = 250.0  # a smaller connected vessel is no coronary tree: 50 mm of 2.5 mm width hold as much
+_RIVAL_SHARE = 0.85  # what is dimmer than this share of the aorta's blood is no second candidate for it
+COARSEST_MM = 1.25  # longest edge of voxels in which a coronary artery of 2 mm still shows
+_MOUTH_MM = 4.0  # length of the artery's beginning where the aorta's blood hides its radius, mm
+_WIDEST_MM = 5.0  # largest radius expected of a coronary artery, mm
+_MARGIN_MM = 8.0  # width of surroundings kept around the tree for the contour, mm
+_OSTIUM_REACH_MM = 8.0  # around the ostium, the plane across the vessel cuts, and nothing else
 _SIDE = {"rca": (-0.64, -0.77), "lca": (0.77, 0.64)}
 """Direction (x, y) from the aorta's axis to each ostium: the right one lies to the front and right, the left one to the
 left and back."""
 
 
 def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
-    """Segment the right or left coronary tree.
-
-    Without seeds everything is found automatically. The first seed overrides where the tree begins, the others add
-    distal ends that must be reached.
-
-    Raises:
-        InputError: the voxels are too coarse, there is no contrast, no aorta, no such vessel at its wall, or no vessel
-            at a seed.
-    """
+    """Segment a coronary tree, without seeds automatically; the first sets where it begins, others add ends to be
+    reached. Raises InputError where voxels are too coarse, or contrast, aorta, or a vessel at its wall or a seed is
+    missing."""
     coarsest = float(volume.spacing_mm.max())
     if coarsest > COARSEST_MM:
         raise InputError(
@@ -144,7 +120,6 @@ def _find_roots(grid: Volume, config: SegmentConfig) -> list[AorticRoot]:
 
 
 def _hu_at(volume: Volume, seed: tuple[float, float, float]) -> float:
-    """Return the brightest smoothed HU within 2 mm of a seed."""
     index = volume.world_to_index(np.array(seed, dtype=float))[::-1]
     box = box_around(index[None], 2.0 / volume.spacing_mm[::-1], volume.voxels.shape)
     found = float(np.max(ndimage.gaussian_filter(volume.voxels[box].astype(np.float32), 0.7)))
@@ -157,7 +132,6 @@ def _hu_at(volume: Volume, seed: tuple[float, float, float]) -> float:
 
 
 def _find_vessels(grid: Volume, lumen_hu: float) -> Scan:
-    """Tell blood pools and thin vessels apart."""
     hu = np.asarray(ndimage.gaussian_filter(grid.voxels, 0.35 / _GRID_MM, truncate=3.0))
     body = resample(grid, _BODY_GRID_MM)
     above_muscle = _MUSCLE_HU + _LOW_SHARE * (lumen_hu - _MUSCLE_HU)

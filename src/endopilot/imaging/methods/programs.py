@@ -1,9 +1,8 @@
 """Segmentation by another program, run as a subprocess with the weights and the licence that its user has.
 
-The program gets the CT in a temporary folder, as a file with no header but its geometry, and writes its labels there.
-TotalSegmentator (https://github.com/wasserth/TotalSegmentator): its task `coronary_arteries` needs a licence of the
-user's own; `--options task=total structure=aorta` does not. nnU-Net v2 (https://github.com/MIC-DKFZ/nnUNet): the user's
-own trained model.
+The program gets the CT in a temporary folder, with no header but its geometry, and writes its labels there. Of
+TotalSegmentator (https://github.com/wasserth/TotalSegmentator) `coronary_arteries` needs a licence of the user's own,
+`--options task=total structure=aorta` none; nnU-Net v2 (https://github.com/MIC-DKFZ/nnUNet) the user's own model.
 """
 
 from __future__ import annotations
@@ -27,10 +26,8 @@ from endopilot.imaging.volume import SUFFIXES, read_volume, write_volume
 from endopilot.progress import progress
 from endopilot.types import Insertion, LumenMask, Volume
 
-_SEED_MM = 5.0
-"""A seed belongs to the lumen within this distance."""
-_MOUTH_MM = 8.0
-"""The vessel's direction at the first seed is that to the middle of the lumen within this distance."""
+_SEED_MM = 5.0  # a seed belongs to the lumen within this distance
+_MOUTH_MM = 8.0  # the vessel's direction at the first seed is that to the middle of the lumen within this distance
 _LONGEST_MESSAGE = 200
 _TOTALSEGMENTATOR = {"task": "coronary_arteries", "structure": "", "device": ""}
 """Task (`-ta`); structure whose mask is taken, by default the task's name; device (`-d`): gpu, cpu, gpu:1."""
@@ -39,11 +36,8 @@ _NNUNET = {"model": "", "device": "", "label": ""}
 
 
 def by_totalsegmentator(volume: Volume, config: SegmentConfig) -> LumenMask:
-    """Return the mask of one structure as TotalSegmentator finds it; the first seed, if any, is the ostium.
-
-    Raises:
-        InputError: TotalSegmentator is missing, fails, or writes no or an empty mask.
-    """
+    """Return the mask of one structure as TotalSegmentator finds it; the first seed, if any, is the ostium. Raises
+    InputError if it is missing, fails, or writes no or an empty mask."""
     settings = config.settings(_TOTALSEGMENTATOR)
     task = settings["task"]
     structure = settings["structure"] or task
@@ -66,11 +60,8 @@ def by_totalsegmentator(volume: Volume, config: SegmentConfig) -> LumenMask:
 
 
 def by_nnunet(volume: Volume, config: SegmentConfig) -> LumenMask:
-    """Return the lumen as a trained nnU-Net finds it, all folds of it together; the first seed, if any, is the ostium.
-
-    Raises:
-        InputError: no or an unfit model is given, nnU-Net is missing, fails, or writes no or an empty mask.
-    """
+    """Return the lumen as all folds of a trained nnU-Net find it together; the first seed, if any, is the ostium.
+    Raises InputError for an unfit model, a missing or failing nnU-Net, or an empty mask."""
     settings = config.settings(_NNUNET)
     model, label = Path(settings["model"]), settings["label"]
     folds = sorted(folder.name.removeprefix("fold_") for folder in model.glob("fold_*")) if settings["model"] else []
@@ -112,21 +103,9 @@ def segment_by_program(
     label: int | None = None,
     mend: str,
 ) -> LumenMask:
-    """Return the lumen that a program finds in a volume; the ostium is at the first seed.
-
-    Args:
-        volume: CT in HU.
-        seeds: points in the lumen, LPS mm; none where the ostium is not known.
-        arguments: program and arguments, from the folder that holds the CT and the folder for its answer.
-        given: name of the CT's file.
-        answer: name of the file that the program is to write.
-        label: value of the lumen where the answer holds several.
-        mend: what to do where the program is missing or fails.
-
-    Raises:
-        InputError: the program is not there, fails, writes no such file, or marks nothing in the CT; or a seed lies
-            farther than 5 mm from the lumen.
-    """
+    """Return the lumen that a program finds, with the ostium at the first of `seeds` (LPS mm). `arguments` makes the
+    command from the folder of the CT, there named `given`, and that of the `answer`; `label` is the lumen's value.
+    Raises InputError, with `mend`, if it fails, marks nothing, or a seed lies farther than 5 mm from the lumen."""
     with tempfile.TemporaryDirectory(prefix="endopilot-") as temporary:
         source, target = Path(temporary) / "ct", Path(temporary) / "answer"
         target.mkdir()
@@ -155,7 +134,6 @@ def segment_by_program(
 
 
 def _ostium_at_seeds(lumen: Volume, seeds: Sequence[tuple[float, float, float]]) -> Insertion:
-    """Return the ostium at the first seed, with the direction into the lumen."""
     points = lumen.index_to_world(np.argwhere(lumen.voxels)[:, ::-1].astype(float))
     for seed in seeds:
         gap = float(np.linalg.norm(points - np.array(seed), axis=1).min())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
@@ -11,29 +11,19 @@ from skimage.measure import marching_cubes
 
 from endopilot.types import DistanceMap
 
-MAX_TRIANGLES = 45_000
-"""Triangles of a wall at most: some 1.5 MB in a page."""
+MAX_TRIANGLES = 45_000  # triangles of a wall at most: some 1.5 MB in a page
 
 
-@dataclass(frozen=True, eq=False)
-class WallMesh:
-    """A triangle mesh.
-
-    Attributes:
-        vertices: positions, LPS mm.
-        triangles: indices of the corners of each triangle.
-    """
+class WallMesh(NamedTuple):
+    """Vertices, LPS mm, and the indices of the corners of each triangle."""
 
     vertices: Float[np.ndarray, "vertices 3"]
     triangles: Int[np.ndarray, "triangles 3"]
 
 
 def wall_mesh(distance_map: DistanceMap, *, max_triangles: int = MAX_TRIANGLES) -> WallMesh:
-    """Return the surface where the distance to the wall is zero (marching cubes).
-
-    Where it would have more than `max_triangles`, the distance map is resampled on a coarser grid first: it is
-    smooth, so this keeps the wall's shape better than removing triangles.
-    """
+    """Return the surface where the distance to the wall is zero. Above `max_triangles`, the smooth distance map is
+    first resampled on a coarser grid, which keeps the shape better than removing triangles."""
     values, origin = _cropped(distance_map)
     spacing = np.full(3, distance_map.spacing_mm)
     vertices, triangles = _march(values, spacing)
@@ -55,7 +45,6 @@ def _march(
 
 
 def _cropped(distance_map: DistanceMap) -> tuple[Float32[np.ndarray, "nz ny nx"], Float[np.ndarray, "3"]]:
-    """Return the part of the map around the lumen with one layer of outside about it, and its origin, LPS mm."""
     inside = np.asarray(distance_map.values) > 0
     found = [np.flatnonzero(inside.any(axis=others)) for others in ((1, 2), (0, 2), (0, 1))]
     start = np.array([max(index[0] - 2, 0) for index in found])
