@@ -253,7 +253,7 @@ class Trials:
         return step
 
     def _spend(self, step: Step) -> None:
-        """Take a step off the budget. Packs of `LANES` worlds may not be full; a node of a pair costs twice a wire's."""
+        """Take a step off the budget. Packs of `LANES` worlds may not be full; a pair's node costs twice a wire's."""
         packed = -(-self.count // LANES) * LANES / self.count
         self._budget.spend(self.devices * packed * float(step.node_iterations.sum()) + _CALL)
 
