@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endopilot.belief.adviser import AdviserConfig, Predicted, XrayAdviser, count_events, near_exposures
+from endopilot.belief.adviser import AdviserConfig, Predicted, XrayAdviser, astray_mm, count_events, near_exposures
 from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of, surely_missed
 from endopilot.errors import InputError
 
@@ -43,13 +43,26 @@ def test_bands_hold_over_whole_intervals_of_new_patients(unlike) -> None:
     assert np.mean(samplewise) < 0.5  # bands made sample by sample hold too few whole intervals
 
 
-def test_an_event_is_where_a_state_begins_and_an_exposure_beside_it_shows_it() -> None:
+def test_an_event_is_where_a_state_begins_and_an_exposure_then_or_soon_after_shows_it() -> None:
     state = np.array([[1, 1, 0, 1, 1, 0, 0, 1, 0, 1], [0, 0, 0, 0, 1, 0, 0, 0, 0, 0]], dtype=bool)
     exposed = np.zeros((2, 10), dtype=bool)
     assert count_events(state, near_exposures(exposed)) == (3, 3)  # not what was so at first, nor the last sample
     exposed[0, [2, 9]] = True  # one period before the first; two after the second
     exposed[1, 5] = True
-    assert count_events(state, near_exposures(exposed)) == (3, 1)
+    assert count_events(state, near_exposures(exposed)) == (3, 2)
+    assert count_events(state, near_exposures(exposed, before=True)) == (3, 1)  # as the ladder's second version has it
+
+
+def test_a_tip_in_another_branch_is_astray_by_way_of_the_fork(fork) -> None:
+    """The branches leave at 20 mm, where the lumen's radius is a mouth in which a tip counts as in both."""
+    tree = fork.tree
+    leaves = float(tree.departures(1)[2])
+    line = tree.path(1)
+    mouth = leaves + float(np.interp(leaves, line.abscissa, line.radius))
+    one, at = np.array([1, 1, 1, -1, 0]), np.array([mouth + 3.0, mouth + 3.0, mouth - 0.5, 9.0, 5.0])
+    other, there = np.array([1, 2, 2, 2, 2]), np.array([mouth + 5.0, mouth + 2.0, mouth - 0.2, 7.0, leaves + 4.0])
+    found = astray_mm(tree, (one, at), (other, there))
+    np.testing.assert_allclose(found, [2.0, 5.0, 0.3, 2.0, leaves - 1.0])
 
 
 def test_too_few_patients_are_refused() -> None:

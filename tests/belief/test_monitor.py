@@ -22,7 +22,7 @@ from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation, Target
 
 HALF_MM = np.array([0.8, 0.2])
-NOTHING = Identified(interval={}, compliant=None, explains=True)
+NOTHING = Identified(interval={}, wall="unknown", explains=True, words="")
 
 
 class ToAndFro:

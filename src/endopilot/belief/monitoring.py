@@ -298,7 +298,6 @@ def follow_policy(monitored: Monitored, policy: ExposurePolicy, config: AdviserC
             seen = episodes.tip[on, sample], episodes.branch[on, sample], episodes.tip_sd[on, sample]
             model.observe(on, sample, *seen)
     near = near_exposures(exposed & monitored.found)
-    near[:, WINDOW] |= monitored.found[:, WINDOW - 1]  # X-ray was on until the sample before
     wall = monitored.ratio >= config.wall_ratio
     astray = np.abs(model.tip[..., 0] - truth[..., 0]) >= config.abscissa_mm
     astray[:, WINDOW - 1] = False

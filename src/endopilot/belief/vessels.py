@@ -13,7 +13,7 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.world import World
 from endopilot.types import Anatomy
 
-_OF_VESSEL = "lumen_factor", "lumen_mm", "occluded", "stenosis", "axis_deg", "axis_side_deg"
+_OF_VESSEL = "lumen_factor", "lumen_mm", "occluded", "stenosis", "axis_deg", "axis_side_deg", "ostium_aside_mm"
 """What of a `World` makes another vessel."""
 
 
@@ -42,6 +42,13 @@ class SharedVessels:
         if not key <= self._kept:
             self._kept |= key
             self.simulators.append(simulator)
+
+    def forget(self) -> None:
+        """Keep none but the given vessel: maps of others take memory."""
+        given = self._made[World()]
+        self._made = {World(): given}
+        self.simulators = [each for each in self.simulators if set(map(id, each.set_up.anatomies)) == {id(given)}]
+        self._kept = {(id(given), each.config.wall_reach_mm) for each in self.simulators}
 
     def kinds(
         self, given: Stack, members: Sequence[World]

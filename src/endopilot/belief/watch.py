@@ -30,9 +30,10 @@ _FAR, _RECENT = 2.0, 6
 this many times its bound over √n. Bounds are those of bands as calibrated."""
 _OUTSIDE, _OF = 1.5, 3
 """Two of so many innovations this many times their bounds are enough too. Bounds are those of widened bands."""
-_PROOF, _WIDER = 3, 1.5
-"""Images in a row that lie within the bands of a belief that was identified before it is trusted; and how much wider
-its bands begin: members that a few images chose are more alike than they are right."""
+_PROOF, _WIDER, _UNKNOWN = 3, 1.5, 2.5
+"""Images in a row that lie within the bands of a belief that was identified before it is trusted; how much wider its
+bands begin: members that a few images chose are more alike than they are right; and where no hypothesis explains the
+images: an assumption, until innovations tell."""
 
 
 class Innovations:
@@ -52,11 +53,12 @@ class Innovations:
         self.factor, self.alarm = np.ones(2), False
         self._excess, self._weight = np.full(2, _PRIOR), np.full(2, _PRIOR)
 
-    def renew(self) -> None:
-        """Take another belief, which has yet to prove itself."""
-        self.factor, self._shares, self._off = np.full(2, _WIDER), [], []
+    def renew(self, *, unknown: bool = False) -> None:
+        """Take another belief, which has yet to prove itself, or explains nothing: what is wrong is unknown."""
+        wider = _UNKNOWN if unknown else _WIDER
+        self.factor, self._shares, self._off = np.full(2, wider), [], []
         self.alarm, self._inside, self._needed = True, 0, _PROOF
-        self._excess, self._weight = np.full(2, _WIDER**2 * _PRIOR), np.full(2, _PRIOR)
+        self._excess, self._weight = np.full(2, wider**2 * _PRIOR), np.full(2, _PRIOR)
 
     @property
     def outside(self) -> bool:
@@ -94,9 +96,9 @@ class Innovations:
             self._inside, self._needed = 0, 2
 
 
-_LUMEN_SHARE, _LUMEN_MM = 0.12, 0.3
-"""The lumen's radius may be off by this share, and no more than this, mm: CT shows it to a tenth or a voxel, an
-assumption."""
+_LUMEN_SHARE, _LUMEN_MM = 0.16, 0.4
+"""The lumen's radius may be off by this share, and no more than this, mm: CT shows it to a tenth or a voxel and blooms,
+an assumption."""
 _FREE_MM, _HELD_SHARE = 5.0, np.array([0.3, 0.05])
 """A wire that is moved by more than this while its tip rests buckles: standard deviations of (Δtip, γtip) that this
 adds, as shares of what goes beyond, mm; found in coronary arteries with compliant walls, on patients to improve agents
