@@ -54,7 +54,8 @@ def _ostium_aside(random: np.random.Generator) -> dict[str, Any]:
 def _wall(random: np.random.Generator) -> dict[str, Any]:
     found = _factors(compliant_wall_n_mm2=(0.01, 0.04))(random)
     if random.random() < 0.5:
-        found["wall_along"] = tuple(np.exp(random.uniform(np.log(0.3), np.log(3.0), 3)).tolist())
+        along = np.exp(random.uniform(np.log(0.3), np.log(3.0), 3))
+        found["wall_along"] = tuple((along / min(along.min(), 1.0)).tolist())  # nowhere softer than a wall can be
     return found
 
 

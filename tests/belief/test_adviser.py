@@ -196,8 +196,16 @@ def test_what_a_play_adds_widens_both_bands_at_once() -> None:
 def test_exposures_keep_their_distance() -> None:
     offset = [0.3, 0.58, 0.62, 0.66, 0.66, 0.3, 0.3, 0.9, 0.3, 0.9, 0.3, 0.9, 0.9]
     due = advices(offset, [10.0] * len(offset), config=AdviserConfig(wall_ratio=0.6), abscissa=0.0, offset=0.01)
-    assert np.diff(due).min() >= 3
-    assert due[0] in (2, 3)
+    assert np.diff(due).min() == 2
+    assert due[0] == 2
+    adviser = adviser_at(predicted(), abscissa=0.0, offset=0.0)
+    assert [adviser.advise(predicted(), always=True) for _ in range(6)] == [False, False, True] * 2
+
+
+def test_an_exposure_is_due_where_the_wall_begins_to_press() -> None:
+    adviser = adviser_at(predicted(), abscissa=0.0, offset=0.0)
+    due = [adviser.advise(predicted(), presses=each) for each in (False, False, True, True, False)]
+    assert due == [False, False, True, False, False]
 
 
 def test_refuses_bad_settings() -> None:
@@ -216,7 +224,7 @@ def test_an_exposure_follows_another_as_long_as_that_showed_the_tip_on_the_other
 
     assert not any(due(6))  # predicted at the wall since the start
     adviser.exposed(0.5, 1.2)
-    assert due(6) == [False, False, True, False, False, True]
+    assert due(6) == [False, True, False, True, False, True]
     adviser.exposed(0.8, 1.2)
     assert not any(due(6))
 
@@ -224,7 +232,7 @@ def test_an_exposure_follows_another_as_long_as_that_showed_the_tip_on_the_other
 def test_a_model_that_erred_is_looked_at_as_long_as_its_band_lies_across_the_wall() -> None:
     """The band of γtip is ±0.05 mm, and τ is 0.6; that of Δtip grows by 0.2 mm a sample up to 0.6 δ, or δ."""
     inserted = [2.0 * abs(6 - i) for i in range(12)]
-    for erred, across, along in ((False, [3], [5, 10]), (True, [3, 6, 9], [3, 6, 9])):
+    for erred, across, along in ((False, [2], [5, 10]), (True, [2, 4, 6, 8, 10], [3, 6, 9])):
         found = []
         for offset, moved, config in (
             (0.58, [10.0] * 12, AdviserConfig(wall_ratio=0.6)),

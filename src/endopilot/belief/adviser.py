@@ -136,6 +136,7 @@ class XrayAdviser:
         always: bool = False,
         erred: bool = False,
         wall_mm: float = 0.0,
+        presses: bool = False,
     ) -> bool:
         """Return whether X-ray is due now, a period after the last call.
 
@@ -147,6 +148,7 @@ class XrayAdviser:
             erred: whether the model has erred by more than its calibration knows.
             wall_mm: by which the lumen's radius may be another than it is given, mm, which the calibration does not
                 know: a tip on the wall is then off by as much, and the edges of that band count too.
+            presses: whether the wall begins to press with more than it may.
         """
         inserted_mm, offset_mm = float(at.proximal[0]), float(at.tip[1])
         self._periods, self._travel_mm = self._periods + 1, self._travel_mm + abs(inserted_mm - self._inserted_mm)
@@ -160,7 +162,7 @@ class XrayAdviser:
         disagrees = self._shown is not None and bool(beyond[1]) != self._shown
         self.wide = bool(half[0] >= self._config.abscissa_mm * (_ERRED_SHARE if erred else 1.0))
         self.late = self._periods * DECISION_PERIOD_S >= self._calibration.longest_s
-        due = crossed or disagrees or self.wide or (across and erred) or self.late
+        due = crossed or disagrees or self.wide or (across and erred) or self.late or presses
         due = (due and self._periods >= _SPACING) or (always and self._periods >= _ALWAYS)
         if due or not crossed:
             self._beyond = beyond

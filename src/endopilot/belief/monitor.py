@@ -196,7 +196,8 @@ class Monitor:
             watch.exposed(float((at.tip + self.seen.less(at.tip))[1]), at)
         motion = _MOTION_SD_MM * (self.belief.motion is not None)
         changed = self.identified is not None or self.moves is not None or self.belief.drives.unknown
-        due = watch.advise(at, self.belief.play_spread() ** 2 + motion**2, changed=changed)
+        pressed = self.load_ratio * float(self.belief.force[self.belief.best]) / self._navigation.force_limit_n
+        due = watch.advise(at, self.belief.play_spread() ** 2 + motion**2, changed=changed, pressed=pressed)
         return self._believed(watch, at.tip, due)
 
     def _see(self, exposure: TipMeasurement, period: int, at: Predicted) -> None:

@@ -376,6 +376,12 @@ def periodic_policy(monitored: Monitored, period: int) -> ExposurePolicy:
     return taken_again(monitored, lambda sample, tip, spread: (sample + phase) % period == 0)
 
 
+def measure_metronome(monitored: Monitored, per_minute: float, config: AdviserConfig) -> dict[str, float]:
+    """Return what periodic imaging with about as many exposures a minute misses: see `measure_policy`."""
+    period = max(1, round(60 / SAMPLE_PERIOD_S / max(per_minute, 1e-9)))
+    return measure_policy(monitored, periodic_policy(monitored, min(period, monitored.truth.shape[1])), config)
+
+
 def oracle_policy(monitored: Monitored, config: AdviserConfig) -> ExposurePolicy:
     """Return a policy that knows the truth, and exposes where an event begins."""
     wall = monitored.ratio >= config.wall_ratio

@@ -150,6 +150,9 @@ class Allowance:
         return np.hypot(_HELD_SHARE * max(self.held_mm - free_mm, 0.0), _TIP_MM) * self._alone
 
 
+_PRESSES = 0.8
+"""Share of the largest force that the wall may press with, by simulated wires and the drive's load, from which it is
+looked at: they err by a fifth, as wires do."""
 MISMATCH = "model mismatch"
 """Why X-ray is asked for while the model is taken to be wrong."""
 
@@ -172,7 +175,7 @@ class Watch:
         self.innovations = Innovations()
         self._adviser = XrayAdviser(calibration, config, tip_radius_mm, at)
         self._allowance = Allowance(at.proximal[0], at.tip[0], alone=alone)
-        self._half = self.half_width
+        self._half, self._presses = self.half_width, False
 
     def move(self, at: Predicted) -> None:
         """Take what is predicted a period later."""
@@ -188,7 +191,12 @@ class Watch:
         self._allowance.exposed()
 
     def advise(
-        self, at: Predicted, variance_mm2: Float[np.ndarray, "2"] | float = 0.0, *, changed: bool = False
+        self,
+        at: Predicted,
+        variance_mm2: Float[np.ndarray, "2"] | float = 0.0,
+        *,
+        changed: bool = False,
+        pressed: float = 0.0,
     ) -> bool:
         """Return whether an exposure is due, once a period.
 
@@ -196,7 +204,9 @@ class Watch:
             at: what is predicted for now, after the exposure if there was one.
             variance_mm2: of (Δtip, γtip), which the calibration does not know of, mm².
             changed: whether the model is another than the given one, which erred.
+            pressed: force of the wall as a share of what it may be.
         """
+        self._presses, pressed_before = pressed >= _PRESSES, self._presses
         due = self._adviser.advise(
             at,
             np.sqrt(variance_mm2 + self._allowance.sd_mm**2),
@@ -204,6 +214,7 @@ class Watch:
             always=self.innovations.alarm,
             erred=changed or bool((self.innovations.factor > 1).any()),
             wall_mm=self._allowance.wall_mm(at.radius_mm),
+            presses=self._presses and not pressed_before,
         )
         self._half = self.half_width / self.innovations.factor
         return due
@@ -217,7 +228,7 @@ class Watch:
             return "the last exposure is long ago"
         if self._adviser.wide:
             return f"Δtip is known to ±{self.half_width[0]:.1f} mm only"
-        return "the tip may be reaching the wall"
+        return "the wall presses hard" if self._presses else "the tip may be reaching the wall"
 
     @property
     def half_width(self) -> Float[np.ndarray, "2"]:

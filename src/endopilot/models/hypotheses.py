@@ -57,11 +57,8 @@ class Hypothesis(ABC):
         of_vessel: whether each value needs another map of the vessel.
     """
 
-    of_kind = True
-    of_vessel = False
-
-    def __init__(self, name: str, *parameters: Parameter) -> None:
-        self.name, self.parameters = name, parameters
+    def __init__(self, name: str, *parameters: Parameter, of_kind: bool = True, of_vessel: bool = False) -> None:
+        self.name, self.parameters, self.of_kind, self.of_vessel = name, parameters, of_kind, of_vessel
 
     @abstractmethod
     def world(self, world: World, values: Mapping[str, float]) -> World:
@@ -76,18 +73,6 @@ class Differs(Hypothesis):
         return replace(world, **{each.name: values[each.name] for each in self.parameters})
 
 
-class DiffersBeside(Differs):
-    """The same of fields that members of one kind differ in."""
-
-    of_kind = False
-
-
-class OtherLumen(Differs):
-    """The lumen is wider or narrower."""
-
-    of_vessel = True
-
-
 class CompliantWall(Hypothesis):
     """The wall yields; 0 is rigid."""
 
@@ -100,12 +85,10 @@ class CompliantWall(Hypothesis):
 class Displaced(Hypothesis):
     """X-ray shows the wire beside where it lies: a field of a world that is a vector has these components, LPS."""
 
-    of_kind = False
-
     def __init__(self, name: str, field: str, usual: float, other: float, most: float, words: str) -> None:
         axes = ((side, f"{words} {{:.1f}} to {{:.1f}} towards {side}") for side in ("left", "back", "head"))
         parameters = [Parameter(f"{field} {side}", usual, other, -most, most, what, False) for side, what in axes]
-        super().__init__(name, *parameters)
+        super().__init__(name, *parameters, of_kind=False)
         self._field = field
 
     def world(self, world: World, values: Mapping[str, float]) -> World:
@@ -143,14 +126,19 @@ HYPOTHESES: tuple[Hypothesis, ...] = (
         Parameter("tip_stiffness_factor", 0.12, 0.4, 0.4, 2.5, "tip stiffness ×{:.2f} to {:.2f}"),
         Parameter("shaft_stiffness_factor", 0.05, 0.4, 0.4, 2.5, "shaft stiffness ×{:.2f} to {:.2f}"),
     ),
-    OtherLumen("another lumen", Parameter("lumen_factor", 0.03, 0.1, 0.75, 1.3, "lumen ×{:.2f} to {:.2f}")),
+    Differs(
+        "another lumen", Parameter("lumen_factor", 0.03, 0.1, 0.75, 1.3, "lumen ×{:.2f} to {:.2f}"), of_vessel=True
+    ),
     CompliantWall("a wall that yields", Parameter("compliance", 0.01, 0.7, 0.0, 1.0, "", factor=False)),
-    DiffersBeside("another friction", Parameter("friction_factor", 0.15, 0.6, 0.3, 3.0, "friction ×{:.2f} to {:.2f}")),
-    DiffersBeside(
+    Differs(
+        "another friction",
+        Parameter("friction_factor", 0.15, 0.6, 0.3, 3.0, "friction ×{:.2f} to {:.2f}"),
+        of_kind=False,
+    ),
+    Differs(
         "another ostium",
-        Parameter(
-            "ostium_mm", 0.3, 2.0, -6.0, 6.0, "wire {:.1f} to {:.1f} mm deeper than by its encoder", factor=False
-        ),
+        Parameter("ostium_mm", 0.3, 2.0, -6.0, 6.0, "wire {:.1f} to {:.1f} mm deeper than by its encoder", False),
+        of_kind=False,
     ),
     Displaced("another registration", "registration_mm", 0.1, 1.0, 5.0, "registered beside by, mm,"),
     Displaced("a patient who drifts", "drift_mm_min", 0.05, 1.5, 8.0, "drifts by, mm a minute,"),
