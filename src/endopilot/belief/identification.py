@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from endopilot.belief.belief import Belief, Past
 from endopilot.errors import InputError
-from endopilot.models.hypotheses import HYPOTHESES, Family, Posterior
+from endopilot.models.hypotheses import HEART, HYPOTHESES, LUMEN, Family, Posterior
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S
 
@@ -59,8 +59,7 @@ def identify(belief: Belief, past: Past, *, seed: int = 0) -> tuple[Belief, Iden
         The belief that takes its place, at the same moment, and what was found.
     """
     lumens = len(past.exposures) > 1 and belief.navigation.anatomy.distance_map.values.size <= _LARGEST_MAP
-    names = [each for each in HYPOTHESES if lumens or not each.of_vessel]
-    family = Family([each for each in names if each.parameters[0].name != "annulus_factor"])
+    family = Family([each for each in HYPOTHESES if each.name != HEART and (lumens or each.name != LUMEN)])
     shown = np.array([belief.unmoved(each, period) for period, each in past.exposures.items()])
     found, spread = family.as_given(), np.ones(len(family.parameters))
     for generation in range(_GENERATIONS):

@@ -111,12 +111,14 @@ def _drift_gain(
 ) -> float:
     """Return the logarithm of how much likelier a wrong registration that drifts makes the images than none."""
     field = np.concatenate([across, across * (times_s / 60)[:, None, None]], axis=-1)
-    precision, left = np.diag(np.repeat(_DRIFT_SD, 3) ** -2.0), error
-    for _ in range(2):
+    precision = np.diag(np.repeat(_DRIFT_SD, 3) ** -2.0)
+
+    def fitted(left: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         weight = 1 / (1 + (left**2).sum(axis=1) / _HEAVY)
         normal, right = np.einsum("n,nik,nil->kl", weight, field, field), np.einsum("n,nik,ni->k", weight, field, error)
-        found = np.linalg.solve(normal + precision, right)
-        left = error - field @ found
+        return np.linalg.solve(normal + precision, right), normal, right
+
+    found, normal, right = fitted(error - field @ fitted(error)[0])
     occam = np.linalg.slogdet(normal + precision)[1] - np.linalg.slogdet(precision)[1]
     return float(0.5 * (found @ right - occam))
 

@@ -13,14 +13,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.devices.stack import Stack
-from endopilot.models.hypotheses import HYPOTHESES, MEDIAN_SQUARE, Displaced, Family, likelihoods, log_likelihood
+from endopilot.models.hypotheses import HYPOTHESES, LUMEN, MEDIAN_SQUARE, Displaced, Family, likelihoods, log_likelihood
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulate import run_set_up
 from endopilot.simulation.state import SimulationSetUp
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
-FAMILY = Family([each for each in HYPOTHESES if not each.of_vessel and not isinstance(each, Displaced)])
+FAMILY = Family([each for each in HYPOTHESES if each.name != LUMEN and not isinstance(each, Displaced)])
 """What members differ in; a lumen of their own would need a map of the vessel each, and tips along a vessel show no
 registration."""
 SCALES_MM = np.array([0.05, 0.025])

@@ -54,11 +54,11 @@ class Hypothesis(ABC):
         name: in words.
         parameters: that it leaves open.
         of_kind: whether worlds that differ in it are of other wires or vessels; others are simulated side by side.
-        of_vessel: whether each value needs another map of the vessel.
+        costly: whether each value needs a simulator of its own, so that few are tried.
     """
 
-    def __init__(self, name: str, *parameters: Parameter, of_kind: bool = True, of_vessel: bool = False) -> None:
-        self.name, self.parameters, self.of_kind, self.of_vessel = name, parameters, of_kind, of_vessel
+    def __init__(self, name: str, *parameters: Parameter, of_kind: bool = True, costly: bool = False) -> None:
+        self.name, self.parameters, self.of_kind, self.costly = name, parameters, of_kind, costly
 
     @abstractmethod
     def world(self, world: World, values: Mapping[str, float]) -> World:
@@ -115,6 +115,7 @@ def _of_patients(amplitude: str, name: str) -> Parameter:
     return Parameter(name, sd / mean, sd / mean, 0.1, 2.5, name.replace("_", " ") + " {:.2f} to {:.2f}")
 
 
+LUMEN, HEART = "another lumen", "another heartbeat"
 HYPOTHESES: tuple[Hypothesis, ...] = (
     Differs(
         "another tip",
@@ -126,10 +127,8 @@ HYPOTHESES: tuple[Hypothesis, ...] = (
         Parameter("tip_stiffness_factor", 0.12, 0.4, 0.4, 2.5, "tip stiffness ×{:.2f} to {:.2f}"),
         Parameter("shaft_stiffness_factor", 0.05, 0.4, 0.4, 2.5, "shaft stiffness ×{:.2f} to {:.2f}"),
     ),
-    Differs(
-        "another lumen", Parameter("lumen_factor", 0.03, 0.1, 0.75, 1.3, "lumen ×{:.2f} to {:.2f}"), of_vessel=True
-    ),
-    CompliantWall("a wall that yields", Parameter("compliance", 0.01, 0.7, 0.0, 1.0, "", factor=False)),
+    Differs("another lumen", Parameter("lumen_factor", 0.03, 0.1, 0.75, 1.3, "lumen ×{:.2f} to {:.2f}"), costly=True),
+    CompliantWall("a wall that yields", Parameter("compliance", 0.01, 0.7, 0.0, 1.0, "", factor=False), costly=True),
     Differs(
         "another friction",
         Parameter("friction_factor", 0.15, 0.6, 0.3, 3.0, "friction ×{:.2f} to {:.2f}"),
@@ -143,9 +142,10 @@ HYPOTHESES: tuple[Hypothesis, ...] = (
     Displaced("another registration", "registration_mm", 0.1, 1.0, 5.0, "registered beside by, mm,"),
     Displaced("a patient who drifts", "drift_mm_min", 0.05, 1.5, 8.0, "drifts by, mm a minute,"),
     OtherHeart(
-        "another heartbeat",
+        HEART,
         _of_patients("annulus_mm", "annulus_factor"),
         _of_patients("heart_volume_share", "heart_volume_factor"),
+        costly=True,
     ),
 )
 """What may be other. Usual deviations are those of the ladder's patients (±20 %, 0.3 mm), those of other hypotheses
@@ -212,7 +212,7 @@ class Family:
         owner = [k for k, hypothesis in enumerate(hypotheses) for _ in hypothesis.parameters]
         self._owner = np.array(owner)
         self._of_kind = np.array([hypotheses[k].of_kind for k in owner])
-        self._of_vessel = np.array([hypotheses[k].of_vessel for k in owner])
+        self._costly = np.array([hypotheses[k].costly for k in owner])
         ends = np.array([[self._number(each, end) for end in (each.low, each.high)] for each in self.parameters])
         self._low, self._high = ends.T
 
@@ -235,13 +235,13 @@ class Family:
         vessels: int = 4,
         seed: int = 0,
     ) -> Float[np.ndarray, "members p"]:
-        """Return members evenly around a center, in a normal distribution: some of each kind, in few vessels.
+        """Return members evenly around a center, in a normal distribution: some of each kind, in few simulators.
 
         Args:
             factor: the covariance is this times its transpose.
             kinds: wires in vessels that differ.
             each: members of a kind, which differ in what needs no other wire or vessel.
-            vessels: that differ.
+            vessels: how many values of what is costly are tried, no more than kinds.
             seed: of the Sobol sequence.
         """
         from scipy.stats import qmc  # slow to import
@@ -255,10 +255,9 @@ class Family:
         unit = normal(kinds * each, 0)
         unit[:, self._of_kind] = np.repeat(normal(kinds, 1), each, axis=0)[:, self._of_kind]
         found = center + unit @ factor.T
-        of_vessel = found[: vessels * each : each, self._of_vessel]
-        found[:, self._of_vessel] = of_vessel[np.arange(kinds * each) // each % min(vessels, kinds)]
-        lead = np.arange(kinds * each) // each * each
-        found[:, self._of_kind] = found[lead][:, self._of_kind]
+        kind = np.arange(kinds * each) // each
+        found[:, self._of_kind] = found[kind * each][:, self._of_kind]
+        found[:, self._costly] = found[kind % vessels * each][:, self._costly]
         return np.clip(found, self._low, self._high)
 
     def values(self, unit: Float[np.ndarray, "p"]) -> dict[str, float]:
