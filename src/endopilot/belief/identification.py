@@ -30,7 +30,10 @@ _UNSURE = 0.5
 """A parameter is unknown where its hypothesis is less likely, or its interval wider than this share of what was likely
 before; and so is what explains the images where none of the hypotheses is likelier."""
 _GENERATIONS, _KINDS, _EACH, _VESSELS = 2, 16, 4, 3
-"""Generations of members; kinds of wires in vessels in each, so many of each, and lumens among them."""
+"""Generations of members; kinds of wires in vessels in each, so many of each, and lumens and walls among them, which
+stay the same: making a lumen takes a second."""
+_SAME_LUMEN = 0.02
+"""A lumen that differs by less is taken as given."""
 _NARROWEST = 0.1
 """Members of a generation are spread over this share of what is other at least."""
 
@@ -52,7 +55,7 @@ class Identified:
     words: str
 
 
-def identify(belief: Belief, past: Past, *, seed: int = 0) -> tuple[Belief, Identified]:
+def identify(belief: Belief, past: Past) -> tuple[Belief, Identified]:
     """Find what explains the exposures of a navigation so far.
 
     Returns:
@@ -61,15 +64,18 @@ def identify(belief: Belief, past: Past, *, seed: int = 0) -> tuple[Belief, Iden
     lumens = len(past.exposures) > 1 and belief.navigation.anatomy.distance_map.values.size <= _LARGEST_MAP
     family = Family([each for each in HYPOTHESES if each.name != HEART and (lumens or each.name != LUMEN)])
     shown = np.array([belief.unmoved(each, period) for period, each in past.exposures.items()])
-    found, spread = family.as_given(), np.ones(len(family.parameters))
+    found = family.as_given()
+    drawn = first = family.drawn(found.mean, np.eye(len(found.mean)), _KINDS, _EACH, vessels=_VESSELS)
     for generation in range(_GENERATIONS):
-        drawn = family.drawn(found.mean, np.diag(spread), _KINDS, _EACH, vessels=_VESSELS, seed=10 * seed + generation)
-        tips, scale = _replayed(belief, past, [family.world(each) for each in drawn])
+        if generation:
+            spread = np.diag(np.clip(2 * found.sd, _NARROWEST, 1.0))
+            drawn = family.drawn(found.mean, spread, _KINDS, _EACH, vessels=_VESSELS, seed=generation)
+            drawn[:, family.costly] = first[:, family.costly]
+        worlds = [family.world(each) for each in drawn]
+        tips, scale = _replayed(belief, past, worlds)
         found = family.update(drawn, tips, shown, scale)
-        spread = np.clip(2 * found.sd, _NARROWEST, 1.0)
-    chosen = _members(family, found, belief)
-    belief.vessels.forget()
-    made = belief.like(chosen)
+    belief.vessels.keep(worlds)
+    made = belief.like(_members(family, found, belief))
     made.replay(past)
     return made, _stated(family, found)
 
@@ -106,6 +112,8 @@ def _members(family: Family, found: Posterior, belief: Belief) -> list[World]:
     drawn = family.drawn(found.center, found.factor, kinds, -(-count // kinds), vessels=1)[:count]
     drawn[0] = found.center
     best = family.world(found.center)
+    if abs(best.lumen_factor - 1) < _SAME_LUMEN:
+        best = replace(best, lumen_factor=1.0)
     alike = "lumen_factor", "compliant_wall_n_mm2", "registration_mm", "drift_mm_min"
     shared = {name: getattr(best, name) for name in alike}
     return [replace(family.world(each), **shared) for each in drawn]

@@ -250,7 +250,7 @@ class Monitor:
 
     def _identify(self) -> None:
         """Change the belief to what explains all exposures."""
-        found, identified = identify(self.belief, self.past, seed=self.changes_left)
+        found, identified = identify(self.belief, self.past)
         self.changes_left -= 1
         if len(self.past.proximal) == 1:
             self._given = found.members

@@ -43,12 +43,12 @@ class SharedVessels:
             self._kept |= key
             self.simulators.append(simulator)
 
-    def forget(self) -> None:
-        """Keep none but the given vessel: maps of others take memory."""
-        given = self._made[World()]
-        self._made = {World(): given}
-        self.simulators = [each for each in self.simulators if set(map(id, each.set_up.anatomies)) == {id(given)}]
-        self._kept = {(id(given), each.config.wall_reach_mm) for each in self.simulators}
+    def keep(self, members: Sequence[World]) -> None:
+        """Forget all vessels but the given one and those of some members: maps take memory."""
+        kept = {id(self.of(each)) for each in (World(), *members)}
+        self._made = {alone: vessel for alone, vessel in self._made.items() if id(vessel) in kept}
+        self.simulators = [each for each in self.simulators if {*map(id, each.set_up.anatomies)} <= kept]
+        self._kept = {key for key in self._kept if key[0] in kept}
 
     def kinds(
         self, given: Stack, members: Sequence[World]

@@ -203,6 +203,7 @@ class Family:
     Attributes:
         parameters: of all, one after the other.
         usual: their standard deviations where nothing is other, as shares of those where it is.
+        costly: whether each is costly to try.
     """
 
     def __init__(self, hypotheses: Sequence[Hypothesis]) -> None:
@@ -212,7 +213,7 @@ class Family:
         owner = [k for k, hypothesis in enumerate(hypotheses) for _ in hypothesis.parameters]
         self._owner = np.array(owner)
         self._of_kind = np.array([hypotheses[k].of_kind for k in owner])
-        self._costly = np.array([hypotheses[k].costly for k in owner])
+        self.costly = np.array([hypotheses[k].costly for k in owner])
         ends = np.array([[self._number(each, end) for end in (each.low, each.high)] for each in self.parameters])
         self._low, self._high = ends.T
 
@@ -257,7 +258,7 @@ class Family:
         found = center + unit @ factor.T
         kind = np.arange(kinds * each) // each
         found[:, self._of_kind] = found[kind * each][:, self._of_kind]
-        found[:, self._costly] = found[kind % vessels * each][:, self._costly]
+        found[:, self.costly] = found[kind % vessels * each][:, self.costly]
         return np.clip(found, self._low, self._high)
 
     def values(self, unit: Float[np.ndarray, "p"]) -> dict[str, float]:

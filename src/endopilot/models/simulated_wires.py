@@ -41,7 +41,7 @@ from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 GENERATIONS = 2
 """Times that wires are tried through what was seen; those of the next are drawn around the best of the last."""
-TRIED, FOLLOWED = (16, 2), (4, 2)
+TRIED, FOLLOWED = (8, 4), (2, 4)
 """Kinds of wires in a generation, and how many of each; and of those that follow the commands to the end, around the
 best one."""
 TRANSLATIONS_MM_S = (-5.0, -1.5, 0.0, 1.5, 5.0)
