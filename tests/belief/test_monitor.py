@@ -96,6 +96,17 @@ def test_a_deeper_ostium_is_noticed_and_identified(along_the_fork) -> None:
     assert np.mean(held) > 0.75
 
 
+def test_a_wrong_registration_is_noticed_and_taken_off_what_x_ray_shows(along_the_fork) -> None:
+    shown = (0.4, 1.1, -0.9)
+    for policy, _ in driven(replace(along_the_fork, seconds=10.0), World(registration_mm=shown), kind=Rocks):
+        belief = policy.monitor.belief
+    assert policy.monitor.identified is not None and "registered beside" in policy.last.found
+    np.testing.assert_allclose(belief.members[0].registered_mm(10.0)[1:], shown[1:], atol=0.5)  # x lies along the vessel
+    seen = policy.monitor.past.exposures[0]
+    off = belief.in_vessel(seen, 0).position - seen.position
+    np.testing.assert_allclose(off, -np.array(belief.members[0].registration_mm))
+
+
 def test_nothing_is_noticed_where_nothing_is_wrong(along_the_fork) -> None:
     for policy, _ in driven(along_the_fork, World()):
         assert not policy.monitor.alarm and policy.monitor.identified is None
