@@ -101,7 +101,8 @@ def test_a_wrong_registration_is_noticed_and_taken_off_what_x_ray_shows(along_th
     for policy, _ in driven(replace(along_the_fork, seconds=10.0), World(registration_mm=shown), kind=Rocks):
         belief = policy.monitor.belief
     assert policy.monitor.identified is not None and "registered beside" in policy.last.found
-    np.testing.assert_allclose(belief.members[0].registered_mm(10.0)[1:], shown[1:], atol=0.5)  # x lies along the vessel
+    found = belief.members[0].registered_mm(10.0)
+    np.testing.assert_allclose(found[1:], shown[1:], atol=0.5)  # x lies along the vessel
     seen = policy.monitor.past.exposures[0]
     off = belief.in_vessel(seen, 0).position - seen.position
     np.testing.assert_allclose(off, -np.array(belief.members[0].registration_mm))

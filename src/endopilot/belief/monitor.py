@@ -1,7 +1,7 @@
 """A wire that is followed by its encoders under a belief: `Monitor`, which whoever drives may ask for X-ray.
 
 An exposure is compared with what was predicted before it weighs the belief (`Innovations`). Where several disagree the
-model is wrong, not the prediction unlucky: the bands widen, and X-ray is due every 1.5 s, or 1 s at the wall, until two images lie in them.
+model is wrong, not the prediction unlucky: the bands widen, and X-ray is due every 1.5 s until two images lie in them.
 """
 
 from __future__ import annotations
