@@ -23,27 +23,39 @@ from endopilot.simulation.world import NOMINAL, Stenosis, World, list_worlds, re
 PAGE = Path(__file__).parent / "concepts" / "worlds.md"
 FIGURES = {
     "missed_share": "events missed, random drive",
-    "missed_share_worst": "the same in the worst world",
+    "missed_share_worst": "the same in the worst worlds, a tenth of them",
     "exposures_per_minute_nominal": "exposures a minute, random drive, nominal world",
     "exposures_per_minute_other": "exposures a minute, random drive, other worlds",
     "in_bands_share_random": "decisions in both bands, random drive",
     "in_bands_share_planned": "decisions in both bands, planned",
     "in_bands_share": "the smaller of both",
-    "in_bands_share_worst": "the same in the worst world",
+    "in_bands_share_worst": "the same in the worst worlds, a tenth of them",
     "safe_share": "planned navigations that arrived safely",
-    "safe_share_worst": "the same in the worst world",
+    "safe_share_worst": "the same in the worst worlds, a tenth of them",
     "exposures_planned": "exposures of a planned navigation",
     "exposures_planned_nominal": "the same in the nominal world",
     "navigations_above_40_exposures": "planned navigations with more than 40 exposures",
     "unsafe_by_force_share": "planned navigations beyond the force limit",
     "missed_share_planned": "events missed, planned",
+    "missed_share_before": "events missed, random drive, counted as the ladder does",
+    "missed_share_planned_before": "the same, planned",
+    "contacts_missed_share": "contacts with the wall missed",
+    "contacts_missed_share_evenly": "the same with as many exposures at even times",
+    "intervals_held_share": "stated intervals of 80 % that hold",
     "false_alarms_share": "navigations in the nominal world with a false alarm",
     "alarms_share": "navigations in other worlds with an alarm",
     "ostium_error_mm": "error of an ostium that is off, after 5 exposures, median, mm",
     "wall_right_share": "kinds of wall found right, of those that are stated",
 }
 """Figures of the agent in other worlds, in words."""
-LEAST = ("in_bands_share", "in_bands_share_worst", "safe_share", "safe_share_worst", "wall_right_share")
+LEAST = (
+    "in_bands_share",
+    "in_bands_share_worst",
+    "safe_share",
+    "safe_share_worst",
+    "wall_right_share",
+    "intervals_held_share",
+)
 """Figures that are to be at least as large as their bar."""
 
 

@@ -5,16 +5,18 @@ asks for X-ray (random). The targets are those of the seven coronary tasks of th
 of atlases that neither the ladder nor a training, a calibration or another benchmark has. On `development` an agent may
 be improved; `test` is for what is published. Both are the first four patients of each atlas that
 `benchmarks.agent.ladder_patients.choose` takes, by the ladder's own rules; the atlas of a task has the seed 19000, or
-20000, and the task's level.
+20000, and the task's level. Beside the shipped worlds, or in their place, some are drawn at random (`drawn_worlds`).
 
-Events, and which of them are missed, are counted as in the ladder, by `navigation_events`, and decisions in both bands
-by `NavigationRecord.in_bands`; a decision that has no band, as of a wire that is lost, counts as outside.
+An event begins where the tip reaches the wall, lies 2 mm astray of where it is believed, by way of the fork where it is
+in another branch, or the wall presses with more than the limit. It is missed without an exposure then or 0.5 s later.
+Decisions in both bands are those of `NavigationRecord.in_bands`; a decision that has no band, as of a wire that is
+lost, counts as outside.
 """
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +25,11 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from benchmarks.agent.drawn_worlds import drawn_world
 from benchmarks.figures import Bar, judged
+from endopilot.anatomy.projection import safety_ratio
+from endopilot.belief.adviser import AdviserConfig, count_events, near_exposures
+from endopilot.belief.identification import Identified
 from endopilot.belief.monitor import BelievedTip, Monitor
 from endopilot.belief.watch import MISMATCH
 from endopilot.cli.arguments import OutputFolder
@@ -36,7 +42,7 @@ from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Decision, Observation
 from endopilot.navigation.record import NavigationRecord
 from endopilot.runs import claim, make_missing
-from endopilot.settings import Within
+from endopilot.settings import Seed, Within
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.world import NOMINAL, World, list_worlds, read_world
 from endopilot.tasks.navigation import Navigation
@@ -45,6 +51,8 @@ from endopilot.types import SAMPLE_PERIOD_S
 
 Set = Literal["development", "test"]
 Drive = Literal["planned", "random"]
+DRAWN = "drawn-{seed}-{number:03d}"
+"""Name of a world that is drawn."""
 PATIENTS: dict[Set, dict[str, tuple[int, tuple[int, ...]]]] = {
     "development": {
         "descending": (19002, (0, 1, 2, 3)),
@@ -75,11 +83,10 @@ SECONDS = 60.0
 MOST_EXPOSURES = 40
 """No planned navigation shall take more."""
 BARS = {
-    "missed_share": Bar(0.05),
-    "missed_share_worst": Bar(0.12),
+    "missed_share": Bar(0.06),
     "exposures_per_minute_nominal": Bar(17),
     "exposures_per_minute_other": Bar(27),
-    "in_bands_share": Bar(0.9, at_least=True),
+    "in_bands_share": Bar(0.88, at_least=True),
     "in_bands_share_worst": Bar(0.75, at_least=True),
     "safe_share": Bar(0.95, at_least=True),
     "safe_share_worst": Bar(0.85, at_least=True),
@@ -88,6 +95,7 @@ BARS = {
     "navigations_above_40_exposures": Bar(0),
     "unsafe_by_force_share": Bar(0.01),
     "false_alarms_share": Bar(0.1),
+    "intervals_held_share": Bar(0.75, at_least=True),
     "ostium_error_mm": Bar(0.25),
     "wall_right_share": Bar(0.85, at_least=True),
 }
@@ -127,10 +135,9 @@ class DrivenAtRandom:
         return Decision(wanted, expose=bool(self._believed.asks))
 
     @property
-    def wall(self) -> str:
-        """Of which kind the wall was found to be; "unknown" where nothing was identified."""
-        identified = self._monitor.identified
-        return "unknown" if identified is None else identified.wall
+    def monitor(self) -> Monitor:
+        """What follows the wire."""
+        return self._monitor
 
     def believed(self) -> BelievedTip:
         """Return where the monitor has the tip."""
@@ -165,8 +172,8 @@ def measure(path: Path, worlds: Mapping[str, World], patients: Set) -> None:
         world=world,
     )
     result = counted(driven_on(loop) if at_random else loop.run(), navigation)
-    if isinstance(driver, DrivenAtRandom):
-        result |= identified(driver, world)
+    found_mm = driver.ostium_mm if isinstance(driver, DrivenAtRandom) else None
+    result |= identified(driver.monitor.identified, loop.world, found_mm)
     write_json(path, {"task": task.name, "patient": navigation.anatomy.name} | result)
 
 
@@ -182,7 +189,17 @@ def driven_on(loop: NavigationLoop) -> NavigationRecord:
 def counted(record: NavigationRecord, navigation: Navigation) -> dict[str, Any]:
     """Return what is counted of a navigation."""
     assert record.believed is not None
-    radius_mm = navigation.device.tip_radius_mm
+    radius_mm, advice = navigation.device.tip_radius_mm, AdviserConfig()
+    tip, near = record.tip[:-1, 0], near_exposures(record.exposed)
+    at_wall = safety_ratio(tip.offset, tip.radius, radius_mm) >= advice.wall_ratio
+    states = (
+        at_wall,
+        record.astray_mm[:-1] >= advice.abscissa_mm,
+        record.contact_force_max[:-1] > navigation.force_limit_n,
+    )
+    kinds = [count_events(state, near[:-1]) for state in states]
+    samples = len(record.exposed) - 1
+    even = max(0.0, 1.0 - 2 * int(record.exposed[1:].sum()) / samples)
     return {
         "reason": record.gives_up or record.reason,
         "success": record.success,
@@ -190,27 +207,41 @@ def counted(record: NavigationRecord, navigation: Navigation) -> dict[str, Any]:
         "seconds": record.seconds,
         "exposures": record.exposures,
         "peak_force_n": record.peak_force_n,
-        "events": navigation_events(record.tip[:, 0], record.exposed, record.believed[:-1, 0], radius_mm),
-        "decisions": [int(record.in_bands.sum()), len(record.exposed) - 1],
+        "events": np.sum(kinds, axis=0).tolist(),
+        "events_of_kinds": kinds,
+        "metronome": [kinds[0][0], kinds[0][1], even * kinds[0][0]],
+        "events_before": navigation_events(record.tip[:, 0], record.exposed, record.believed[:-1, 0], radius_mm),
+        "decisions": [int(record.in_bands.sum()), samples],
         "alarms": sum(MISMATCH in asks for asks in record.asks),
+        "found": record.found,
     }
 
 
-def identified(driver: DrivenAtRandom, world: World) -> dict[str, Any]:
-    """Return how well a wrong ostium (error in mm) and the kind of wall were found; None where they were not."""
+def identified(found: Identified | None, world: World, ostium_mm: float | None) -> dict[str, Any]:
+    """Return how well a wrong ostium (error in mm) and the kind of wall were found, None where they were not, and which
+    of the intervals that are stated hold.
+
+    Args:
+        ostium_mm: where the ostium is believed, mm deeper than given; None where that is not known.
+    """
     compliant = "rigid" if world.compliant_wall_n_mm2 is None else "compliant"
-    found_mm = driver.ostium_mm if world.ostium_mm else None
+    interval = {} if found is None else found.interval
+    stated = {name: ends for name, ends in interval.items() if ends is not None and hasattr(world, name)}
+    wall = "unknown" if found is None else found.wall
     return {
-        "ostium_error_mm": None if found_mm is None else abs(found_mm - world.ostium_mm),
-        "wall_right": None if driver.wall == "unknown" else driver.wall == compliant,
+        "ostium_error_mm": None if ostium_mm is None or not world.ostium_mm else abs(ostium_mm - world.ostium_mm),
+        "wall_right": None if wall == "unknown" else wall == compliant,
+        "intervals": {name: low <= getattr(world, name) <= high for name, (low, high) in stated.items()},
     }
 
 
 def row(world: str, drive: Drive, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the row of one world and drive."""
-    (happened, missed), (held, decisions) = (
-        np.sum([result[name] for result in results], axis=0).tolist() for name in ("events", "decisions")
+    (happened, missed), (held, decisions), before, metronome = (
+        np.sum([result[name] for result in results], axis=0).tolist()
+        for name in ("events", "decisions", "events_before", "metronome")
     )
+    intervals = [holds for result in results for holds in result["intervals"].values()]
     seconds, exposures = (sum(result[name] for result in results) for name in ("seconds", "exposures"))
     return {
         "world": world,
@@ -220,6 +251,13 @@ def row(world: str, drive: Drive, results: Sequence[Mapping[str, Any]]) -> dict[
         "unsafe_by_force": sum(not result["safe"] for result in results) if drive == "planned" else None,
         "events": happened,
         "missed": missed,
+        "events_before": before[0],
+        "missed_before": before[1],
+        "contacts": metronome[0],
+        "contacts_missed": metronome[1],
+        "contacts_missed_evenly": metronome[2],
+        "intervals": len(intervals),
+        "intervals_held": sum(intervals),
         "decisions": decisions,
         "in_bands": held,
         "exposures": exposures,
@@ -247,7 +285,8 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """Return the figures of the rows of all worlds; those without navigations are left out.
 
     They are of the worlds other than the nominal one where their names do not say so. `in_bands_share` is that of
-    planned or of random navigations, whichever is smaller; `worst` is the world in which a figure is worst.
+    planned or of random navigations, whichever is smaller; `worst` is the mean of the tenth of the worlds in which a
+    figure is worst, `before` counts events as the ladder does, and `evenly` would as many exposures at even times.
     """
     nominal = [each for each in rows if each["world"] == NOMINAL]
     other = [each for each in rows if each["world"] != NOMINAL]
@@ -255,9 +294,11 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     def of(drive: Drive, some: Sequence[Mapping[str, Any]] = other) -> list[Mapping[str, Any]]:
         return [each for each in some if each["drive"] == drive]
 
-    def worst(rows: Sequence[Mapping[str, Any]], part: str, whole: str, choose: Callable[..., float]) -> float | None:
-        found = [share([each], part, whole) for each in rows]
-        return choose((value for value in found if value is not None), default=None)
+    def worst(rows: Sequence[Mapping[str, Any]], part: str, whole: str, *, most: bool = False) -> float | None:
+        worlds = sorted({each["world"] for each in rows})
+        shares = [share([each for each in rows if each["world"] == world], part, whole) for world in worlds]
+        found = sorted((value for value in shares if value is not None), reverse=most)
+        return float(np.mean(found[: max(1, round(len(found) / 10))])) if found else None
 
     def a_minute(rows: Sequence[Mapping[str, Any]]) -> float | None:
         a_second = share(rows, "exposures", "seconds")
@@ -267,16 +308,16 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     bands = {drive: share(of(drive), "in_bands", "decisions") for drive in ("random", "planned")}
     found = {
         "missed_share": share(of("random"), "missed", "events"),
-        "missed_share_worst": worst(of("random"), "missed", "events", max),
+        "missed_share_worst": worst(of("random"), "missed", "events", most=True),
         "exposures_per_minute_nominal": a_minute(of("random", nominal)),
         "exposures_per_minute_other": a_minute(of("random")),
         "in_bands_share": min((value for value in bands.values() if value is not None), default=None),
-        "in_bands_share_worst": worst(other, "in_bands", "decisions", min),
+        "in_bands_share_worst": worst(other, "in_bands", "decisions"),
         "in_bands_share_random": bands["random"],
         "in_bands_share_planned": bands["planned"],
         "missed_share_planned": share(of("planned"), "missed", "events"),
         "safe_share": share(of("planned"), "safe", "navigations"),
-        "safe_share_worst": worst(of("planned"), "safe", "navigations", min),
+        "safe_share_worst": worst(of("planned"), "safe", "navigations"),
         "exposures_planned": share(of("planned"), "exposures", "navigations"),
         "exposures_planned_nominal": share(of("planned", nominal), "exposures", "navigations"),
         "unsafe_by_force_share": share(of("planned"), "unsafe_by_force", "navigations"),
@@ -284,6 +325,12 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
         "false_alarms_share": share(nominal, "alarmed", "navigations"),
         "alarms_share": share(other, "alarmed", "navigations"),
         "events": sum(each["events"] for each in rows),
+        "missed_share_before": share(of("random"), "missed_before", "events_before"),
+        "missed_share_planned_before": share(of("planned"), "missed_before", "events_before"),
+        "contacts_missed_share": share(other, "contacts_missed", "contacts"),
+        "contacts_missed_share_evenly": share(other, "contacts_missed_evenly", "contacts"),
+        "intervals_held_share": share(rows, "intervals_held", "intervals"),
+        "intervals": sum(each["intervals"] for each in rows),
         "wall_right_share": share(of("random", rows), "walls_right", "walls"),
         "ostium_error_mm": float(np.median(ostia)) if ostia else None,
     }
@@ -296,6 +343,8 @@ def drive_in_worlds(
     planned: Annotated[int, Within(0, PLACES)] = 11,
     random: Annotated[int, Within(0, PLACES)] = 6,
     worlds: tuple[str, ...] = (),
+    drawn: Annotated[int, Within(0, 1000)] = 0,
+    seed: Seed = 0,
     patients: Set = "test",
 ) -> dict[str, Any]:
     """Drive the agent, and a wire at random under its belief, in worlds that it does not know.
@@ -307,7 +356,10 @@ def drive_in_worlds(
         output: folder of the results.
         planned: navigations of the agent in each world.
         random: navigations at random in each world.
-        worlds: names of worlds, or YAML files; if not given, the nominal one and all shipped ones of the rod core.
+        worlds: names of worlds, or YAML files; if not given and none is drawn, the nominal one and all shipped ones of
+            the rod core.
+        drawn: worlds that are drawn at random.
+        seed: of these.
         patients: set of the patients.
 
     Returns:
@@ -317,7 +369,8 @@ def drive_in_worlds(
         InputError: no such world, or the folder belongs to another run.
     """
     shipped = [name for name in list_worlds() if read_world(name).engine == "rod"]
-    chosen = {Path(name).stem: read_world(name) for name in worlds or shipped}
+    chosen = {Path(name).stem: read_world(name) for name in worlds or (() if drawn else shipped)}
+    chosen |= {DRAWN.format(seed=seed, number=number): drawn_world(seed, number) for number in range(drawn)}
     paths: dict[tuple[str, Drive], list[Path]] = {}
     for name, world in chosen.items():
         identity = Terms(NEWEST, world=world).identity("agent")

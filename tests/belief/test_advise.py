@@ -92,11 +92,12 @@ def test_encoders_and_exposures_err_as_the_world_of_the_dataset_says(split, fold
 
 
 def test_imaging_often_enough_shows_every_event_and_none_shows_no_event(split) -> None:
-    often = monitoring.measure_policy(split, monitoring.periodic_policy(split, 3), EVENTS)
+    often = monitoring.measure_policy(split, monitoring.periodic_policy(split, 2), EVENTS)
     never = monitoring.measure_policy(split, lambda sample, tip, spread: np.zeros(len(tip), dtype=bool), EVENTS)
     knowing = monitoring.measure_policy(split, monitoring.oracle_policy(split, EVENTS), EVENTS)
-    assert often["missed_share"] == 0.0 and often["exposures_per_minute"] == pytest.approx(40.0, rel=0.02)
-    assert 0.7 < never["missed_share"] < 1.0  # X-ray was on until the first sample
+    assert often["missed_share"] == 0.0 and often["exposures_per_minute"] == pytest.approx(60.0, rel=0.02)
+    assert monitoring.measure_metronome(split, often["exposures_per_minute"], EVENTS) == often
+    assert never["missed_share"] == 1.0  # X-ray was on until the first sample, before all of them
     assert never["exposures_per_minute"] == 0.0
     assert never["events_per_minute"] > 1.0 and never["fewer_frames_than_fluoroscopy"] == 1.0
     assert knowing["missed_share"] == 0.0
@@ -308,7 +309,6 @@ def test_the_calibration_of_simulated_wires_goes_to_the_output(
     monkeypatch.setattr(monitoring, "monitor", lambda *_, **__: split)
     monkeypatch.setattr(advise_module, "PERIODS", (1, 90))
     monkeypatch.setattr(advise_module, "SHARES", ())
-    monkeypatch.setattr(advise_module, "THRESHOLDS", ())
     found = advise(Path("wires"), folder / "dataset", tmp_path / "out", AdviseConfig())
     assert Calibration.read(tmp_path / "out") == found["calibration"]
     assert not Path("wires").exists()
@@ -336,7 +336,6 @@ def test_the_same_calibration_is_measured_on_navigations_made_otherwise(
     make_toy_dataset(tmp_path / "all", **shape, anatomy_shares=(0.0, 0.0, 1.0))
     monkeypatch.setattr(advise_module, "PERIODS", (1, 90))
     monkeypatch.setattr(advise_module, "SHARES", ())
-    monkeypatch.setattr(advise_module, "THRESHOLDS", ())
     run, dataset, output = folder / "run", folder / "dataset", tmp_path / "out"
     found = advise(run, dataset, output, AdviseConfig(), also_test=[dataset, tmp_path / "other"])
     same, other = found["made_otherwise"]
@@ -345,6 +344,8 @@ def test_the_same_calibration_is_measured_on_navigations_made_otherwise(
         name: value for name, value in found["adviser"].items() if name != "offset_share"
     }
     assert other["coverage"]["patients"] == 1
+    dose, even = (other[name]["exposures_per_minute"] for name in ("adviser", "metronome"))
+    assert even == pytest.approx(dose, rel=0.3)
     with pytest.raises(InputError, match="which the bands are fitted to"):
         advise(run, dataset, tmp_path / "no", AdviseConfig(), also_test=[tmp_path / "all"])
     assert not (tmp_path / "no").exists()

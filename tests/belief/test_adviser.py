@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endopilot.belief.adviser import AdviserConfig, Predicted, XrayAdviser, count_events, near_exposures
+from endopilot.belief.adviser import AdviserConfig, Predicted, XrayAdviser, astray_mm, count_events, near_exposures
 from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of, surely_missed
 from endopilot.errors import InputError
 
@@ -43,13 +43,26 @@ def test_bands_hold_over_whole_intervals_of_new_patients(unlike) -> None:
     assert np.mean(samplewise) < 0.5  # bands made sample by sample hold too few whole intervals
 
 
-def test_an_event_is_where_a_state_begins_and_an_exposure_beside_it_shows_it() -> None:
+def test_an_event_is_where_a_state_begins_and_an_exposure_then_or_soon_after_shows_it() -> None:
     state = np.array([[1, 1, 0, 1, 1, 0, 0, 1, 0, 1], [0, 0, 0, 0, 1, 0, 0, 0, 0, 0]], dtype=bool)
     exposed = np.zeros((2, 10), dtype=bool)
     assert count_events(state, near_exposures(exposed)) == (3, 3)  # not what was so at first, nor the last sample
     exposed[0, [2, 9]] = True  # one period before the first; two after the second
     exposed[1, 5] = True
-    assert count_events(state, near_exposures(exposed)) == (3, 1)
+    assert count_events(state, near_exposures(exposed)) == (3, 2)
+    assert count_events(state, near_exposures(exposed, before=True)) == (3, 1)  # as the ladder's second version has it
+
+
+def test_a_tip_in_another_branch_is_astray_by_way_of_the_fork(fork) -> None:
+    """The branches leave at 20 mm, where the lumen's radius is a mouth in which a tip counts as in both."""
+    tree = fork.tree
+    leaves = float(tree.departures(1)[2])
+    line = tree.path(1)
+    mouth = leaves + float(np.interp(leaves, line.abscissa, line.radius))
+    one, at = np.array([1, 1, 1, -1, 0]), np.array([mouth + 3.0, mouth + 3.0, mouth - 0.5, 9.0, 5.0])
+    other, there = np.array([1, 2, 2, 2, 2]), np.array([mouth + 5.0, mouth + 2.0, mouth - 0.2, 7.0, leaves + 4.0])
+    found = astray_mm(tree, (one, at), (other, there))
+    np.testing.assert_allclose(found, [2.0, 5.0, 0.3, 2.0, leaves - 1.0])
 
 
 def test_too_few_patients_are_refused() -> None:
@@ -183,8 +196,16 @@ def test_what_a_play_adds_widens_both_bands_at_once() -> None:
 def test_exposures_keep_their_distance() -> None:
     offset = [0.3, 0.58, 0.62, 0.66, 0.66, 0.3, 0.3, 0.9, 0.3, 0.9, 0.3, 0.9, 0.9]
     due = advices(offset, [10.0] * len(offset), config=AdviserConfig(wall_ratio=0.6), abscissa=0.0, offset=0.01)
-    assert np.diff(due).min() >= 3
-    assert due[0] in (2, 3)
+    assert np.diff(due).min() == 2
+    assert due[0] == 2
+    adviser = adviser_at(predicted(), abscissa=0.0, offset=0.0)
+    assert [adviser.advise(predicted(), always=True) for _ in range(6)] == [False, False, True] * 2
+
+
+def test_an_exposure_is_due_where_the_wall_begins_to_press() -> None:
+    adviser = adviser_at(predicted(), abscissa=0.0, offset=0.0)
+    due = [adviser.advise(predicted(), presses=each) for each in (False, False, True, True, False)]
+    assert due == [False, False, True, False, False]
 
 
 def test_refuses_bad_settings() -> None:
@@ -203,7 +224,7 @@ def test_an_exposure_follows_another_as_long_as_that_showed_the_tip_on_the_other
 
     assert not any(due(6))  # predicted at the wall since the start
     adviser.exposed(0.5, 1.2)
-    assert due(6) == [False, False, True, False, False, True]
+    assert due(6) == [False, True, False, True, False, True]
     adviser.exposed(0.8, 1.2)
     assert not any(due(6))
 
@@ -211,7 +232,7 @@ def test_an_exposure_follows_another_as_long_as_that_showed_the_tip_on_the_other
 def test_a_model_that_erred_is_looked_at_as_long_as_its_band_lies_across_the_wall() -> None:
     """The band of γtip is ±0.05 mm, and τ is 0.6; that of Δtip grows by 0.2 mm a sample up to 0.6 δ, or δ."""
     inserted = [2.0 * abs(6 - i) for i in range(12)]
-    for erred, across, along in ((False, [3], [5, 10]), (True, [3, 6, 9], [3, 6, 9])):
+    for erred, across, along in ((False, [2], [5, 10]), (True, [2, 4, 6, 8, 10], [3, 6, 9])):
         found = []
         for offset, moved, config in (
             (0.58, [10.0] * 12, AdviserConfig(wall_ratio=0.6)),

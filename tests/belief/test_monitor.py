@@ -22,7 +22,7 @@ from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation, Target
 
 HALF_MM = np.array([0.8, 0.2])
-NOTHING = Identified(interval={}, compliant=None, explains=True)
+NOTHING = Identified(interval={}, wall="unknown", explains=True, words="")
 
 
 class ToAndFro:
@@ -94,6 +94,18 @@ def test_a_deeper_ostium_is_noticed_and_identified(along_the_fork) -> None:
             held.append(bool(np.less_equal(off, np.add(believed.half_width, 4.0 * 0.5)).all()))
     assert found == pytest.approx(2.5, abs=0.5)
     assert np.mean(held) > 0.75
+
+
+def test_a_wrong_registration_is_noticed_and_taken_off_what_x_ray_shows(along_the_fork) -> None:
+    shown = (0.4, 1.1, -0.9)
+    for policy, _ in driven(replace(along_the_fork, seconds=10.0), World(registration_mm=shown), kind=Rocks):
+        belief = policy.monitor.belief
+    assert policy.monitor.identified is not None and "registered beside" in policy.last.found
+    found = belief.members[0].registered_mm(10.0)
+    np.testing.assert_allclose(found[1:], shown[1:], atol=0.5)  # x lies along the vessel
+    seen = policy.monitor.past.exposures[0]
+    off = belief.in_vessel(seen, 0).position - seen.position
+    np.testing.assert_allclose(off, -np.array(belief.members[0].registration_mm))
 
 
 def test_nothing_is_noticed_where_nothing_is_wrong(along_the_fork) -> None:

@@ -49,6 +49,18 @@ def test_errors_along_the_wire_and_of_another_place_are_no_motion() -> None:
         assert find_motion(tip, direction, tip + off + noise, TIMES_S, OSTIUM).gain < 6.0
 
 
+def test_a_registration_that_errs_and_drifts_is_no_motion() -> None:
+    """3 mm a minute, over 40 s: without the drift's own evidence a heart that beats gains 10 and more."""
+    times_s = np.linspace(0.0, 40.0, 16)
+    for seed in range(4):
+        random = np.random.default_rng(seed)
+        tip, side = random.uniform(-40, 40, (16, 3)) + OSTIUM, random.standard_normal((17, 3))
+        side /= np.linalg.norm(side, axis=1, keepdims=True)
+        off = np.array([1.0, 0.3, -0.5]) + 3.0 * side[16] * times_s[:, None] / 60
+        seen = tip + off + 0.3 * random.standard_normal((16, 3))
+        assert find_motion(tip, side[:16], seen, times_s, OSTIUM).gain < 0.0
+
+
 def test_amplitudes_are_found_around_a_known_motion_and_only_where_they_differ() -> None:
     """A seventh image of another amplitude is enough, since the periods are known; with those that are known the
     motion gains nothing."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from benchmarks.agent import worlds
+from benchmarks.agent.drawn_worlds import KINDS, drawn_world
 from benchmarks.agent.worlds import DrivenAtRandom, counted, drive_in_worlds, driven_on, figures, identified, row
 from endopilot.belief.identification import Identified
 from endopilot.errors import InputError
@@ -22,7 +22,8 @@ from endopilot.tasks.task import list_tasks
 
 CORE = SimulatorConfig(element_mm=1.5, time_step_s=0.05, threads=1)
 GOOD = {"reason": "reached", "success": True, "safe": True, "seconds": 30.0, "exposures": 4, "peak_force_n": 0.1}
-GOOD |= {"events": [4, 1], "decisions": [18, 20], "alarms": 0}
+GOOD |= {"events": [4, 1], "decisions": [18, 20], "alarms": 0, "events_before": [4, 0], "metronome": [3, 1, 2.0]}
+GOOD |= {"intervals": {"lumen_factor": True}}
 
 
 @pytest.fixture(scope="module")
@@ -83,10 +84,12 @@ def test_figures_are_those_of_other_worlds_and_of_the_worst():
     assert found["missed_share"] == 0.2 and found["missed_share_worst"] == 0.4
     assert found["exposures_per_minute_nominal"] == 8 and found["exposures_per_minute_other"] == 14
     assert found["safe_share"] == 0.5 and found["unsafe_by_force_share"] == 0.25
+    assert found["missed_share_before"] == 0 and found["intervals_held_share"] == 1 and found["intervals"] == 9
+    assert found["contacts_missed_share"] < found["contacts_missed_share_evenly"] == pytest.approx(2 / 3, abs=1e-4)
     assert found["exposures_planned"] == 15.5 and found["exposures_planned_nominal"] == 4
     assert found["navigations_above_40_exposures"] == 1
     assert found["in_bands_share_random"] == 0.9 and found["in_bands_share_planned"] == 0.675
-    assert found["in_bands_share"] == 0.675 and found["in_bands_share_worst"] == 0.45
+    assert found["in_bands_share"] == 0.675 and found["in_bands_share_worst"] == 0.6
     assert found["false_alarms_share"] == pytest.approx(1 / 3, abs=1e-4) and found["alarms_share"] == 0
     assert "exposures_planned" not in figures([each for each in rows if each["drive"] == "random"])
 
@@ -99,13 +102,28 @@ def test_an_ostium_that_is_off_and_stated_walls_are_compared_with_the_truth():
         row("deeper", "planned", [GOOD]),
     ]
     assert figures(rows)["ostium_error_mm"] == 0.35 and figures(rows)["wall_right_share"] == 0.5
-    driver = DrivenAtRandom()
-    driver._monitor = SimpleNamespace(identified=Identified({}, 0.9, True))  # pyright: ignore[reportAttributeAccessIssue]
-    driver.ostium_mm = 1.7
-    assert identified(driver, World(ostium_mm=2.0)) == {"ostium_error_mm": pytest.approx(0.3), "wall_right": False}
-    assert identified(driver, World(compliant_wall_n_mm2=0.01)) == {"ostium_error_mm": None, "wall_right": True}
-    driver._monitor = SimpleNamespace(identified=Identified({}, 0.5, True))  # pyright: ignore[reportAttributeAccessIssue]
-    assert identified(driver, World())["wall_right"] is None
+    stated = {
+        "lumen_factor": (1.0, 1.2),
+        "friction_factor": (0.5, 0.8),
+        "tip_bend_factor": None,
+        "drift_mm_min left": (0, 1),
+    }
+    said = Identified(stated, "compliant", explains=True, words="")
+    wide = identified(said, World(ostium_mm=2.0, lumen_factor=1.1), 1.7)
+    assert wide["ostium_error_mm"] == pytest.approx(0.3) and wide["wall_right"] is False
+    assert wide["intervals"] == {"lumen_factor": True, "friction_factor": False}
+    soft = identified(said, World(compliant_wall_n_mm2=0.01), 1.7)
+    assert soft["ostium_error_mm"] is None and soft["wall_right"] is True
+    nothing = identified(None, World(), None)
+    assert nothing == {"ostium_error_mm": None, "wall_right": None, "intervals": {}}
+
+
+def test_drawn_worlds_are_those_of_their_seed_and_have_every_kind_alone_and_with_another():
+    drawn = [drawn_world(3, number) for number in range(2 * len(KINDS))]
+    assert drawn == [drawn_world(3, number) for number in range(2 * len(KINDS))] != [drawn_world(4, 0), *drawn[1:]]
+    alone, both = ([each.about for each in drawn if (" and " in each.about) is two] for two in (False, True))
+    assert set(alone) == set(KINDS) and len(both) == len(KINDS)
+    assert all(each.differences().keys() > {"about"} for each in drawn)
 
 
 def test_patients_are_those_of_no_task_and_of_one_set():

@@ -15,8 +15,9 @@ from endopilot.dataset.loader import read_dataset
 from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
 from endopilot.models.checkpoint import load_model
-from endopilot.models.ensemble import NOMINAL, SPREADS, drawn, posterior, weigh, weights
+from endopilot.models.ensemble import weigh, weights
 from endopilot.models.episodes import Episodes
+from endopilot.models.hypotheses import HYPOTHESES, Family
 from endopilot.models.simulated_wires import SimulatedWires
 
 GIVEN, LATER = np.arange(45) < 30, slice(30, None)
@@ -122,18 +123,39 @@ def test_under_way_they_drive_on_from_what_was_driven(episodes):
     np.testing.assert_allclose(led.proximal[:, 0], start + 0.5 * led.control[:, 0], atol=1e-9)
 
 
-def test_a_posterior_finds_what_a_line_explains_and_no_more():
-    """Friction moves the tip, nothing else does; every tenth measurement is wrong by millimetres."""
-    random = np.random.default_rng(0)
-    members = drawn(NOMINAL[None], SPREADS[None], 16, moves=True)[:, 0]
-    slope = np.outer(random.uniform(1, 3, 30), [1.0, 0.1])
-    paths = (members[:, 0] - 1)[:, None, None] * slope
-    tip = 0.15 * slope + random.normal(0, 0.01, slope.shape)
-    tip[::10] += 3.0
-    mean, sd = posterior(members, paths, tip, np.zeros_like(tip), np.ones(30, dtype=bool))
-    assert mean[0] == pytest.approx(1.15, abs=0.01) and sd[0] < 0.1 * SPREADS[0]
-    np.testing.assert_allclose(mean[1:], NOMINAL[1:], atol=1e-4)
-    np.testing.assert_allclose(sd[1:], SPREADS[1:], rtol=1e-3)
+@pytest.fixture(scope="module")
+def moved_tips():
+    """Return members of two hypotheses, what they show in 20 exposures, and what is shown if the first one is made."""
+    friction, ostium = (each for each in HYPOTHESES if each.name in ("another friction", "another ostium"))
+    family, random = Family([friction, ostium]), np.random.default_rng(0)
+    members = family.drawn(np.zeros(2), np.eye(2), 16, 4)
+    slope = random.uniform(0.5, 1.5, (2, 20, 3)) * np.array([[1.0, 0.3, 0.0], [0.0, 0.2, 1.0]])[:, None]
+    shown = 1.5 * slope[0] + random.normal(0, 0.1, slope[0].shape)
+    shown[::10] += 3.0  # a measurement that went wrong
+    return family, members, np.einsum("mp,pna->mna", members, slope), shown, np.full(shown.shape, 0.1)
+
+
+def test_the_hypothesis_that_explains_the_images_is_the_likeliest_and_its_parameter_is_known(moved_tips):
+    family, members, tips, shown, scale = moved_tips
+    found = family.update(members, tips, shown, scale)
+    assert found.probability[0] > 0.9 and found.probability[1] < 0.5 and found.none < 0.05
+    assert found.mean[0] == pytest.approx(1.5, abs=0.1) and found.center[1] == pytest.approx(0.0, abs=0.1)
+    low, high = family.interval(found, "friction_factor", 1.28)
+    assert low < np.exp(1.5 * 0.6) < high and high / low < 1.2
+
+
+def test_none_of_the_hypotheses_wins_where_none_explains_the_images(moved_tips):
+    family, members, tips, shown, scale = moved_tips
+    elsewhere = np.random.default_rng(1).normal(0, 0.6, shown.shape)
+    assert family.update(members, tips, elsewhere, scale).none > 0.9
+    assert family.update(members, np.full_like(tips, np.nan), shown, scale).none == 1.0
+
+
+def test_nothing_is_believed_where_nothing_was_seen(moved_tips):
+    family, members, tips, shown, scale = moved_tips
+    found = family.update(members, tips[:, :0], shown[:0], scale[:0])
+    assert not found.center.any() and not found.probability.any()
+    np.testing.assert_array_equal(np.diag(found.factor), family.usual)
 
 
 def test_a_wire_is_as_likely_as_it_retraces_what_was_seen():

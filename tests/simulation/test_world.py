@@ -195,6 +195,15 @@ def test_xray_shows_the_wire_beside_where_it_lies(straight):
     np.testing.assert_allclose(off[1:].mean(axis=0), [0.0, 0.0, 0.7], atol=0.1)
 
 
+def test_a_registration_drifts_and_an_ostium_lies_aside(fork):
+    world = World(registration_mm=(0.5, 0.0, -1.0), drift_mm_min=(0.0, 2.0, 1.0), ostium_aside_mm=(0.3, -0.4))
+    assert world.registered_mm(0.0) == (0.5, 0.0, -1.0) and world.registered_mm(30.0) == (0.5, 1.0, -0.5)
+    given, real = fork.insertion, world.anatomy(fork).insertion
+    off = real.position - given.position
+    assert np.linalg.norm(off) == pytest.approx(0.5) and abs(off @ given.direction) < 1e-9
+    np.testing.assert_allclose(real.direction, given.direction)
+
+
 def test_the_vessel_moves(straight):
     world = World(motion="both")
     assert world.motion == Motion()

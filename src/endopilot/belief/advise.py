@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from endopilot import __version__
 from endopilot.belief import monitoring
-from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import CALIBRATION_FILE, Calibration, check_enough
 from endopilot.belief.monitoring import AdviseConfig, Monitored
 from endopilot.dataset.loader import Dataset, read_dataset
@@ -29,8 +28,6 @@ PERIODS = (1, 2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 45, 90)
 """Samples between two exposures of periodic imaging."""
 SHARES = (0.0, 0.1, 0.25, 0.5, 0.75, 1.0, 1.5, 2.5)
 """Shares of γtip's band that the adviser uses, for its curve; the calibrated one is measured too."""
-THRESHOLDS = tuple((ratio, mm) for ratio in (0.6, 0.7, 0.8, 0.9) for mm in (1.0, 2.0))
-"""Other values of τ and of δ, mm, that the adviser is measured with."""
 
 
 def advise(
@@ -74,10 +71,10 @@ def advise(
     check_enough(len(set(own.episodes.anatomy)), config.adviser.level)
     calibration = monitoring.calibrate(fitted, own, config.adviser)
     shares = sorted({*SHARES, calibration.offset_share})
-    with progress("Advising", len(PERIODS) + len(shares) + len(THRESHOLDS) + 1) as advance:
+    with progress("Advising", len(PERIODS) + len(shares) + 1) as advance:
 
-        def measured(policy: monitoring.ExposurePolicy, events: AdviserConfig = config.adviser) -> dict[str, float]:
-            point = monitoring.measure_policy(test, policy, events)
+        def measured(policy: monitoring.ExposurePolicy) -> dict[str, float]:
+            point = monitoring.measure_policy(test, policy, config.adviser)
             advance()
             return point
 
@@ -86,12 +83,6 @@ def advise(
         curves["adviser"] = [
             {"offset_share": share} | measured(monitoring.adviser_policy(test, each, config.adviser))
             for share, each in bands.items()
-        ]
-        events = [replace(config.adviser, wall_ratio=ratio, abscissa_mm=mm) for ratio, mm in THRESHOLDS]
-        thresholds = [
-            {"wall_ratio": each.wall_ratio, "abscissa_mm": each.abscissa_mm}
-            | measured(monitoring.adviser_policy(test, calibration, each), each)
-            for each in events
         ]
         curves["oracle"] = [measured(monitoring.oracle_policy(test, config.adviser))]
     otherwise = [
@@ -105,10 +96,10 @@ def advise(
         "coverage": monitoring.coverage(test, calibration),
         "coverage_of_calibration_patients": monitoring.coverage(own, calibration),
         "adviser": at,
+        "metronome": monitoring.measure_metronome(test, at["exposures_per_minute"], config.adviser),
         "periodic_exposures_per_minute_with_the_same_missed_share": equal,
         "share_of_the_exposures_of_periodic_imaging": at["exposures_per_minute"] / equal,
         "curves": curves,
-        "other_thresholds": thresholds,
         "made_otherwise": otherwise,
         "patients_not_registered": [*fitted.unregistered, *own.unregistered, *test.unregistered],
         "images_without_a_wire_share": float(1 - test.found.mean()),
@@ -159,12 +150,15 @@ def _measure_otherwise(
     """Return what the calibrated adviser misses and costs on navigations that were made otherwise, and how."""
     theirs, ours = (_leaves(data.manifest["config"]) for data in (made, calibrated))
     cover = monitoring.coverage(test, calibration)
-    policy = monitoring.adviser_policy(test, calibration, config.adviser)
+    adviser = monitoring.measure_policy(
+        test, monitoring.adviser_policy(test, calibration, config.adviser), config.adviser
+    )
     return {
         "dataset": str(made.folder),
         "differs": {name: value for name, value in theirs.items() if value != ours.get(name)},
         "coverage": cover,
-        "adviser": monitoring.measure_policy(test, policy, config.adviser),
+        "adviser": adviser,
+        "metronome": monitoring.measure_metronome(test, adviser["exposures_per_minute"], config.adviser),
     }
 
 

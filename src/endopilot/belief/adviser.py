@@ -12,9 +12,11 @@ from endopilot.anatomy.projection import safety_ratio
 from endopilot.belief.bands import Calibration
 from endopilot.settings import OpenShare, Positive, settings
 from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM
+from endopilot.types import VesselTree
 
-_SPACING = 3
-"""Periods from one exposure to the next, at least."""
+_SPACING, _ALWAYS = 2, 3
+"""Periods from one exposure to the next, at least: one shows what began within a period before it. And where a model is
+taken to be wrong, and each image is to test it."""
 _ERRED_SHARE = 0.6
 """Share of δ at which Δtip's band asks for X-ray once the model has erred, found on patients to improve agents on."""
 
@@ -33,12 +35,37 @@ class AdviserConfig:
     """Share of the events that may be missed: the calibration finds how much of γtip's band the adviser must use."""
 
 
-def near_exposures(exposed: Bool[np.ndarray, "*n samples"]) -> Bool[np.ndarray, "*n samples"]:
-    """Return which samples have an exposure within 0.5 s, a sample, given which were exposed."""
+def near_exposures(exposed: Bool[np.ndarray, "*n samples"], *, before: bool = False) -> Bool[np.ndarray, "*n samples"]:
+    """Return which samples have an exposure then or 0.5 s, a sample, later, given which were exposed.
+
+    Args:
+        before: whether one that comes a sample earlier counts too, as in version 2 of the ladder.
+    """
     near = exposed.copy()
-    near[..., 1:] |= exposed[..., :-1]
     near[..., :-1] |= exposed[..., 1:]
+    if before:
+        near[..., 1:] |= exposed[..., :-1]
     return near
+
+
+def astray_mm(
+    tree: VesselTree, believed: tuple[np.ndarray, np.ndarray], true: tuple[np.ndarray, np.ndarray]
+) -> Float[np.ndarray, "n"]:
+    """Return how far tips lie from where they are believed, along the vessel, mm: by way of the fork between the two.
+
+    Within the mouth of a branch, as far from the fork as the lumen there is wide, a tip counts as in both.
+
+    Args:
+        believed: branch and Δtip, mm, of each.
+        true: the same.
+    """
+    fork = np.full(len(true[0]), np.inf)
+    for k, (one, other) in enumerate(zip(believed[0].tolist(), true[0].tolist(), strict=True)):
+        if one >= 0 and np.isfinite(leaves := tree.departures(one)[other]):
+            line = tree.path(one)
+            fork[k] = leaves + np.interp(leaves, line.abscissa, line.radius)
+    at, there = believed[1], true[1]
+    return at + there - 2 * np.minimum(fork, np.minimum(at, there))  # the nearer of two on one route is their fork
 
 
 def count_events(state: Bool[np.ndarray, "*n samples"], near: Bool[np.ndarray, "*n samples"]) -> tuple[int, int]:
@@ -76,8 +103,8 @@ class XrayAdviser:
     it, or across it. Below, nothing threatens; above, the tip is known to be at the wall; across, either may be. An
     exposure is due where the band reaches τ, where the predicted tip crosses it, and where the band has left it below;
     as long as the last exposure showed the tip on the other side of τ than it is predicted; and after an interval as
-    long as any that was calibrated on. It shows what is within 0.5 s of it, so none follows another sooner than after
-    1.5 s.
+    long as any that was calibrated on. It shows what began within the last 0.5 s, so none follows another sooner than
+    after 1 s.
 
     A model that has erred is trusted less: an exposure is due as long as the band lies across τ, and where the band of
     Δtip is 0.6 δ wide.
@@ -109,6 +136,7 @@ class XrayAdviser:
         always: bool = False,
         erred: bool = False,
         wall_mm: float = 0.0,
+        presses: bool = False,
     ) -> bool:
         """Return whether X-ray is due now, a period after the last call.
 
@@ -120,6 +148,7 @@ class XrayAdviser:
             erred: whether the model has erred by more than its calibration knows.
             wall_mm: by which the lumen's radius may be another than it is given, mm, which the calibration does not
                 know: a tip on the wall is then off by as much, and the edges of that band count too.
+            presses: whether the wall begins to press with more than it may.
         """
         inserted_mm, offset_mm = float(at.proximal[0]), float(at.tip[1])
         self._periods, self._travel_mm = self._periods + 1, self._travel_mm + abs(inserted_mm - self._inserted_mm)
@@ -133,8 +162,8 @@ class XrayAdviser:
         disagrees = self._shown is not None and bool(beyond[1]) != self._shown
         self.wide = bool(half[0] >= self._config.abscissa_mm * (_ERRED_SHARE if erred else 1.0))
         self.late = self._periods * DECISION_PERIOD_S >= self._calibration.longest_s
-        due = crossed or disagrees or self.wide or (across and erred) or self.late or always
-        due = due and self._periods >= _SPACING
+        due = crossed or disagrees or self.wide or (across and erred) or self.late or presses
+        due = (due and self._periods >= _SPACING) or (always and self._periods >= _ALWAYS)
         if due or not crossed:
             self._beyond = beyond
         if due:

@@ -26,7 +26,7 @@ from endopilot.belief.vessels import SharedVessels
 from endopilot.devices.device import lateral_reach
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Proximals
-from endopilot.models.ensemble import likelihoods
+from endopilot.models.hypotheses import likelihoods
 from endopilot.settings import NonNegative, Positive, ShareBelowOne, Within, settings
 from endopilot.simulation.config import PRESETS, SimulatorConfig
 from endopilot.simulation.motion import Motion
@@ -132,7 +132,7 @@ class Belief:
     Each member is a `World` of its own: wire, friction, lumen, wall and ostium as they may truly be.
 
     Attributes:
-        members: what each takes reality to be.
+        members: what each takes reality to be; all have the same wall and registration.
         kinds: vessel and devices, those that differ; members share them.
         kind: the place among these of each member.
         ostium_mm: how much deeper each member's devices lie than the encoders say, mm.
@@ -231,18 +231,26 @@ class Belief:
         return np.maximum(given_mm + self.ostium_mm.reshape(-1, *[1] * (given_mm.ndim - 1)), 0.0)
 
     def in_vessel(self, measured: TipMeasurement, period: int) -> TipMeasurement:
-        """Return a measurement less the motion that was found, in place of the one that is known.
+        """Return a measurement less the motion that was found, in place of the known one, and less the registration's
+        error.
 
         Args:
             measured: as the C-arm has it, less the known motion.
         """
-        if self.motion is None:
+        beside_mm = self.members[0].registered_mm(period * DECISION_PERIOD_S)
+        if self.motion is None and not any(beside_mm):
             return measured
-        placed = self._placed(self.motion, period)
-        position = np.linalg.solve(placed[:, :3], self.in_laboratory(measured, period) - placed[:, 3])
+        position = self.unmoved(measured, period) - beside_mm
         tip = self._projector(position[None])
         at = {"abscissa": float(tip.abscissa[0]), "offset": float(tip.offset[0]), "branch": int(tip.branch[0])}
         return replace(measured, position=position, **at)
+
+    def unmoved(self, measured: TipMeasurement, period: int) -> Float[np.ndarray, "3"]:
+        """Return where a measurement shows a tip less the motion that was found, LPS mm."""
+        if self.motion is None:
+            return measured.position
+        placed = self._placed(self.motion, period)
+        return np.linalg.solve(placed[:, :3], self.in_laboratory(measured, period) - placed[:, 3])
 
     def in_laboratory(self, measured: TipMeasurement, period: int) -> Float[np.ndarray, "3"]:
         """Return where a tip was seen, LPS mm: the C-arm has taken the known motion off."""
@@ -340,14 +348,14 @@ class Belief:
         friction. Its scales are no smaller than the measurement's own standard deviations.
         """
         if self.drives.lose:
-            self._weigh(measured, measured.position - self._relocate(measured), None)
+            self._weigh(measured.position - self._relocate(measured), measured, None)
         else:
-            self._weigh(measured, measured.position, self.weight)
+            self._weigh(measured.position, measured, self.weight)
         if self.drives.lose and self.navigation.known_motion is None:  # else the next period takes them there
             self._move(self.drives.proximal)
 
     def _weigh(
-        self, measured: TipMeasurement, position: Float[np.ndarray, "3"], weight: Float[np.ndarray, "members"] | None
+        self, position: Float[np.ndarray, "3"], measured: TipMeasurement, weight: Float[np.ndarray, "members"] | None
     ) -> None:
         """Weigh the members; with their weights before, the measurement counts as evidence."""
         self.error, axes = self.errors(position)
@@ -358,23 +366,16 @@ class Belief:
             self.evidence += float(np.log(np.nan_to_num(weight * density).sum() + 1e-9))
         self._score = self._score + np.log(density)
 
-    def replay(self, past: Past) -> Float[np.ndarray, "members exposures 3"]:
-        """Drive the members, at the start of the navigation, as the devices went so far, and weigh them alike.
-
-        Returns:
-            The errors at each exposure along and across each member's wire, and of its γtip, mm.
-        """
-        errors = []
+    def replay(self, past: Past) -> None:
+        """Drive the members, at the start of the navigation, as the devices went so far, and weigh them alike."""
         for period, proximal in enumerate(past.proximal):
             if period:
                 self._move(proximal)
             if period in past.exposures:
-                measured = self.in_vessel(past.exposures[period], period)
                 self.shown.append((self.simulator.tip_position[:, 0].copy(), self.simulator.tip_direction[:, 0].copy()))
-                self._weigh(measured, measured.position, self.weight)
-                tip = np.column_stack([self.tip.abscissa, self.tip.offset])
-                errors.append(np.column_stack([self.error, np.abs(measured.less(tip)[:, 1])]))
-        return np.stack(errors, axis=1)
+                self._weigh(
+                    self.in_vessel(past.exposures[period], period).position, past.exposures[period], self.weight
+                )
 
     def rerun(self, past: Past) -> list[Float[np.ndarray, "devices 2"]]:
         """Follow a navigation so far from its start, with drives of its own.

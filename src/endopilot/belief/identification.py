@@ -1,76 +1,41 @@
-"""Which wire, lumen, wall and ostium explain what X-ray showed: `identify`.
+"""Which hypotheses explain what X-ray showed: `identify`.
 
-Members that differ in all of these replay the way of the devices so far, and are weighed by all exposures. Those of
-the next generation are drawn around the likeliest. In a generation, members of one *kind*, of a wire in a vessel, are
-simulated side by side; they differ in friction and ostium.
+Members that differ in the parameters of all hypotheses replay the way of the devices so far. What they show at each
+exposure is compared with what X-ray did (`models.hypotheses`). Members of the next generation are drawn around what is
+then believed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import ndtr, ndtri
 
-from endopilot.belief.belief import Belief, BeliefConfig, Past
+from endopilot.belief.belief import Belief, Past
 from endopilot.errors import InputError
-from endopilot.models.ensemble import likelihoods
+from endopilot.models.hypotheses import HEART, HYPOTHESES, LUMEN, Family, Posterior
 from endopilot.simulation.world import World
+from endopilot.tasks.navigation import DECISION_PERIOD_S
 
-RANGES: Mapping[str, tuple[float, float]] = {
-    "tip_bend_factor": (0.6, 1.5),
-    "tip_bend_length_factor": (0.7, 1.4),
-    "tip_stiffness_factor": (0.5, 2.0),
-    "lumen_factor": (0.85, 1.15),
-    "friction_factor": (0.4, 2.5),
-    "ostium_mm": (-4.0, 4.0),
-}
-"""Parameters that are identified, and their ranges; factors are drawn by their logarithms."""
-_NAMES: Mapping[str, str] = {
-    "tip_bend_factor": "tip bend ×{:.2f} to {:.2f}",
-    "tip_bend_length_factor": "bent length ×{:.2f} to {:.2f}",
-    "tip_stiffness_factor": "tip stiffness ×{:.2f} to {:.2f}",
-    "lumen_factor": "lumen ×{:.2f} to {:.2f}",
-    "friction_factor": "friction ×{:.2f} to {:.2f}",
-    "ostium_mm": "wire {:.1f} to {:.1f} mm deeper than by its encoder",
-}
-_OF_KIND = 4
-"""The first of them are those of a kind."""
-_LUMENS = 0.9, 1.0, 1.1
-"""Lumens that are tried: each is prepared by itself."""
 _LARGEST_MAP = 50_000_000
 """Points of a distance map beyond which no other lumen is tried: it would take gigabytes."""
-_COMPLIANT_N_MM2 = 0.01
-"""Stiffness of a wall that is compliant: that of an artery in the heart's muscle, docs/concepts/wall.md."""
-_SCALES_MM = (0.5, 0.3, 0.3)
-"""Scales of a good member's errors along and across its wire, and of its γtip, mm."""
-_USUAL_SD: Mapping[str, float] = {
-    "tip_bend_factor": 0.2,
-    "tip_bend_length_factor": 0.15,
-    "tip_stiffness_factor": 0.3,
-    "lumen_factor": 0.08,
-    "friction_factor": 0.5,
-}
-"""Standard deviations of the factors' logarithms before anything was seen: an assumption."""
-_COMPLIANT_SHARE = 0.3
-"""How much likelier a rigid wall is before: an assumption."""
-_UNSURE = 0.15
-"""The kind of wall is unknown where either is at least this likely."""
-_KNOWN_SHARE = 0.5
-"""A parameter is unknown where its interval is wider than this share of what was likely before."""
-_OSTIUM_SD_MM = 0.4
-"""Standard deviation of the ostium that the first exposure shows, at least, mm."""
-_SHRINKS, _NARROWEST, _LEAST_OF_A_WALL = 0.7, 0.04, 2
-"""Members are drawn around their parents, moved towards the mean; no closer than this share of a parameter's range; and
-so many kinds have each kind of wall at least."""
-_UNEXPLAINED = 3.0
-"""A member that errs by this many of the scales at every exposure is as likely as none of all."""
-_KINDS, _EACH, _GENERATIONS = 8, 8, 2
-"""Wires in vessels that are tried in a generation, a third of the first ones in a compliant vessel; frictions and ostia
-that are tried with each; and generations."""
+_MODEL_MM = np.array([0.5, 0.3])
+"""Standard deviations of a good member's errors along and across its wire, mm."""
+_DEVIATIONS = 1.28
+"""Half of an interval that holds with 80 %, in standard deviations."""
+_UNSURE = 0.5
+"""A parameter is unknown where its hypothesis is less likely, or its interval wider than this share of what was likely
+before; and so is what explains the images where none of the hypotheses is likelier."""
+_GENERATIONS, _KINDS, _EACH, _VESSELS = 2, 16, 4, 3
+"""Generations of members; kinds of wires in vessels in each, so many of each, and lumens and walls among them, which
+stay the same: making a lumen takes a second."""
+_SAME_LUMEN = 0.02
+"""A lumen that differs by less is taken as given."""
+_NARROWEST = 0.1
+"""Members of a generation are spread over this share of what is other at least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,228 +43,96 @@ class Identified:
     """What explains the exposures.
 
     Attributes:
-        interval: of each parameter of `RANGES`, the range that holds 80 % of the likelihood; None where the exposures
-            hardly tell it.
-        compliant: how likely the wall is compliant; None where nothing tells it.
-        explains: whether the likeliest explains the exposures better than no member does.
+        interval: of each parameter, the range in which it is with 80 %; None where the exposures hardly tell it.
+        wall: of which kind the wall is.
+        explains: whether a hypothesis does; none of them is likelier if not.
+        words: what was found, in words.
     """
 
     interval: Mapping[str, tuple[float, float] | None]
-    compliant: float | None
+    wall: Literal["compliant", "rigid", "unknown"]
     explains: bool
-
-    @property
-    def wall(self) -> Literal["compliant", "rigid", "unknown"]:
-        """Of which kind the wall is."""
-        if self.compliant is None or _UNSURE <= self.compliant <= 1 - _UNSURE:
-            return "unknown"
-        return "compliant" if self.compliant > 0.5 else "rigid"
-
-    @property
-    def words(self) -> str:
-        """What was found, in words."""
-        known = [_NAMES[name].format(*ends) for name, ends in self.interval.items() if ends is not None]
-        found = ", ".join([*known, f"{self.wall} wall"])
-        return found if self.explains else f"nothing explains the images well; likeliest {found}"
+    words: str
 
 
-def identify(belief: Belief, past: Past, *, seed: int = 0) -> tuple[Belief, Identified]:
+def identify(belief: Belief, past: Past) -> tuple[Belief, Identified]:
     """Find what explains the exposures of a navigation so far.
 
     Returns:
         The belief that takes its place, at the same moment, and what was found.
     """
-    random = np.random.default_rng([seed, len(past.proximal), 0x1DE])
-    ostium = _ostium(belief, past)
-    if len(past.proximal) == 1:  # nothing but the ostium shows before the wire moves
-        return _deeper(belief, past, *ostium)
-    theta, walls = _first(ostium, random)
-    lumens = _LUMENS if belief.navigation.anatomy.distance_map.values.size <= _LARGEST_MAP else (1.0,)
-    members, score, weight, explains = _weighed(belief, past, theta, walls, lumens)
-    for _ in range(_GENERATIONS - 1):
-        theta, walls = _redrawn(theta, walls, weight, random)
-        members, score, weight, explains = _weighed(belief, past, theta, walls, lumens)
-    flat = theta.reshape(-1, len(RANGES))
-    interval = {name: _interval(name, flat[:, k], weight) for k, name in enumerate(RANGES)}
-    compliant = float(weight[np.repeat(walls, _EACH)].sum())
-    found = belief.like(_chosen(members, score, weight, _EACH, belief.config))
-    found.replay(past)
-    return found, Identified(interval, compliant, explains)
+    lumens = len(past.exposures) > 1 and belief.navigation.anatomy.distance_map.values.size <= _LARGEST_MAP
+    family = Family([each for each in HYPOTHESES if each.name != HEART and (lumens or each.name != LUMEN)])
+    shown = np.array([belief.unmoved(each, period) for period, each in past.exposures.items()])
+    found = family.as_given()
+    drawn = first = family.drawn(found.mean, np.eye(len(found.mean)), _KINDS, _EACH, vessels=_VESSELS)
+    for generation in range(_GENERATIONS):
+        if generation:
+            spread = np.diag(np.clip(2 * found.sd, _NARROWEST, 1.0))
+            drawn = family.drawn(found.mean, spread, _KINDS, _EACH, vessels=_VESSELS, seed=generation)
+            drawn[:, family.costly] = first[:, family.costly]
+        worlds = [family.world(each) for each in drawn]
+        tips, scale = _replayed(belief, past, worlds)
+        found = family.update(drawn, tips, shown, scale)
+    belief.vessels.keep(worlds)
+    made = belief.like(_members(family, found, belief))
+    made.replay(past)
+    return made, _stated(family, found)
 
 
-def _weighed(
-    belief: Belief, past: Past, theta: Theta, walls: np.ndarray, lumens: Sequence[float]
-) -> tuple[list[World], np.ndarray, np.ndarray, bool]:
-    """Return members of parameters, their logarithmic likelihoods, weights by a part of these, and whether the best
-    explains more than none does."""
-    members = _members(theta, walls, lumens)
-    score, explains = _scores(belief, past, members)
-    score = score + _prior(members)
-    return members, score, _tempered(score, len(members) / 8), explains
-
-
-def _ostium(belief: Belief, past: Past) -> tuple[float, float]:
-    """Return how much deeper the wire was at the start than the encoder says, by the first exposure, and the standard
-    deviation of that, mm."""
-    low, high = RANGES["ostium_mm"]
-    tried = np.arange(low, high + 0.1, 0.5)
-    if 0 not in past.exposures:
-        return 0.0, high / 2
-    first = Past(past.proximal[:1], {0: past.exposures[0]})
-    score, _ = _scores(belief, first, [World(ostium_mm=float(each)) for each in tried])
-    weight = likelihoods(score)
-    mean = float(weight @ tried)
-    return mean, max(float(np.sqrt(weight @ (tried - mean) ** 2)), _OSTIUM_SD_MM)
-
-
-def _deeper(belief: Belief, past: Past, ostium_mm: float, sd_mm: float) -> tuple[Belief, Identified]:
-    """Return the same members with their ostia where the first exposure has them."""
-    off = np.array([each.ostium_mm for each in belief.members])
-    wider = sd_mm / max(float(off.std()), 1e-3)
-    members = zip(belief.members, (ostium_mm + wider * (off - off.mean())).tolist(), strict=True)
-    found = belief.like([replace(each, ostium_mm=deeper) for each, deeper in members])
-    found.replay(past)
-    interval = dict.fromkeys(RANGES) | {"ostium_mm": (ostium_mm - sd_mm, ostium_mm + sd_mm)}
-    return found, Identified(interval, None, explains=True)
-
-
-Theta = Float[np.ndarray, "kinds each parameters"]
-
-
-def _first(ostium: tuple[float, float], random: np.random.Generator) -> tuple[Theta, np.ndarray]:
-    """Return evenly spread parameters: the first kind is as given, and ostia are about where the first image has it."""
-    from scipy.stats import qmc  # slow to import
-
-    kinds, each = _KINDS, _EACH
-    of_kind = qmc.Sobol(_OF_KIND, rng=random).random(kinds)
-    of_kind[0] = [_to_unit(name, 1.0) for name in list(RANGES)[:_OF_KIND]]
-    rest = qmc.Sobol(len(RANGES) - _OF_KIND, rng=random).random(kinds * each).reshape(kinds, each, -1)
-    off = ndtri(np.clip(rest[..., -1], 1e-3, 1 - 1e-3)) * ostium[1]
-    rest[..., -1] = np.clip(_to_unit("ostium_mm", ostium[0] + off), 0.0, 1.0)
-    unit = np.concatenate([np.repeat(of_kind[:, None], each, axis=1), rest], axis=-1)
-    unit[:, 0, list(RANGES).index("friction_factor")] = _to_unit("friction_factor", 1.0)
-    walls = np.arange(kinds) % 3 == 1
-    return unit, walls
-
-
-def _bounds(name: str) -> tuple[float, float]:
-    low, high = RANGES[name]
-    return (np.log(low), np.log(high)) if name.endswith("factor") else (low, high)
-
-
-def _to_unit(name: str, value: Any) -> Any:
-    low, high = _bounds(name)
-    return ((np.log(value) if name.endswith("factor") else value) - low) / (high - low)
-
-
-def _from_unit(name: str, unit: float) -> float:
-    low, high = _bounds(name)
-    value = low + unit * (high - low)
-    return float(np.exp(value)) if name.endswith("factor") else float(value)
-
-
-def _members(theta: Theta, walls: np.ndarray, lumens: Sequence[float]) -> list[World]:
-    """Return members of parameters; each has the nearest of the lumens that are tried, in a compliant vessel the given
-    one."""
-    made = []
-    for of_kind, wall in zip(theta, walls, strict=True):
-        for unit in of_kind:
-            values: dict[str, Any] = {name: _from_unit(name, float(u)) for name, u in zip(RANGES, unit, strict=True)}
-            wanted = 1.0 if wall else values["lumen_factor"]
-            values["lumen_factor"] = min(lumens, key=lambda factor: abs(factor - wanted))
-            made.append(World(**values, compliant_wall_n_mm2=_COMPLIANT_N_MM2 if wall else None))
-    return made
-
-
-def _prior(members: Sequence[World]) -> Float[np.ndarray, "members"]:
-    """Return how likely members are before anything was seen, as logarithms: near to what is given, most likely."""
-    off = [[np.log(getattr(each, name)) / sd for name, sd in _USUAL_SD.items()] for each in members]
-    compliant = [each.compliant_wall_n_mm2 is not None for each in members]
-    return -0.5 * np.square(off).sum(axis=1) + np.where(compliant, np.log(_COMPLIANT_SHARE), 0.0)
-
-
-def _scores(belief: Belief, past: Past, members: Sequence[World]) -> tuple[Float[np.ndarray, "members"], bool]:
-    """Return the logarithmic likelihoods of members, and whether the best explains more than none does."""
-    score = np.full(len(members), -1e6)
-    wall = np.array([each.compliant_wall_n_mm2 is not None for each in members])
-    count = len(past.exposures)
-    for kind in (False, True):
-        chosen = np.flatnonzero(wall == kind)
-        if not len(chosen):
-            continue
+def _replayed(
+    belief: Belief, past: Past, members: list[World]
+) -> tuple[Float[np.ndarray, "members exposures 3"], Float[np.ndarray, "exposures 3"]]:
+    """Return where members show their tips at each exposure, LPS mm; and how well these are known, beside the image."""
+    tips = np.full((len(members), len(past.exposures), 3), np.nan)
+    directions = tips.copy()
+    walls = [each.compliant_wall_n_mm2 for each in members]
+    for wall in dict.fromkeys(walls):
+        rows = np.array([k for k, each in enumerate(walls) if each == wall])
         try:
-            tried = belief.like([members[k] for k in chosen.tolist()])
+            tried = belief.like([members[k] for k in rows])
         except InputError:  # the wire does not fit
             continue
-        error = tried.replay(past)
-        scaled = error / np.maximum(_SCALES_MM, [(0.0, *seen.tip_sd_mm) for seen in past.exposures.values()])
-        found = -np.log1p((scaled**2).sum(axis=-1)).sum(axis=1)
-        score[chosen] = np.where(tried.simulator.valid, np.nan_to_num(found, nan=-1e6), -1e6)
-    return score, bool(score.max() > -count * np.log1p(_UNEXPLAINED**2))
+        tried.replay(past)
+        position, direction = (np.stack(each, axis=1) for each in zip(*tried.shown, strict=True))
+        times_s = DECISION_PERIOD_S * np.array(list(past.exposures))
+        beside = np.array([[members[k].registered_mm(time_s) for time_s in times_s.tolist()] for k in rows])
+        tips[rows] = np.where(tried.simulator.valid[:, None, None], position + beside, np.nan)
+        directions[rows] = direction
+    along = np.nanmedian(directions, axis=0)
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    measured = np.array([np.diag(each.covariance) for each in past.exposures.values()])
+    own = _MODEL_MM[1] ** 2 + (_MODEL_MM[0] ** 2 - _MODEL_MM[1] ** 2) * along**2
+    return tips, np.sqrt(measured + own)
 
 
-def _tempered(score: Float[np.ndarray, "n"], least: float) -> Float[np.ndarray, "n"]:
-    """Return weights by as much of the likelihood as leaves some number of members effective."""
-    low, high = 0.0, 1.0
-    for _ in range(30):
-        power = high if high == 1.0 else 0.5 * (low + high)
-        if 1 / (likelihoods(power * score) ** 2).sum() >= least:
-            low = power
-            if power == 1.0:
-                break
-        else:
-            high = power if power < 1.0 else 1.0 - 1e-9
-    return likelihoods(low * score)
+def _members(family: Family, found: Posterior, belief: Belief) -> list[World]:
+    """Return members around the likeliest explanation, in its lumen, with its wall and registration."""
+    kinds, count = belief.config.stiffness_levels, belief.config.members
+    drawn = family.drawn(found.center, found.factor, kinds, -(-count // kinds), vessels=1)[:count]
+    drawn[0] = found.center
+    best = family.world(found.center)
+    if abs(best.lumen_factor - 1) < _SAME_LUMEN:
+        best = replace(best, lumen_factor=1.0)
+    alike = "lumen_factor", "compliant_wall_n_mm2", "registration_mm", "drift_mm_min"
+    shared = {name: getattr(best, name) for name in alike}
+    return [replace(family.world(each), **shared) for each in drawn]
 
 
-def _redrawn(
-    theta: Theta, walls: np.ndarray, weight: np.ndarray, random: np.random.Generator
-) -> tuple[Theta, np.ndarray]:
-    """Draw the next generation around the likeliest members, as kernels that keep mean and variance (Liu and West)."""
-    kinds, each, count = theta.shape
-    flat, wall = theta.reshape(-1, count), np.repeat(walls, each)
-    at = (np.arange(kinds) + random.random()) / kinds
-    parents = np.searchsorted(np.cumsum(weight), at).clip(0, len(weight) - 1)
-    parents[0] = int(np.argmax(weight))
-    for kind in (False, True):  # neither kind of wall is given up
-        lacking = max(_LEAST_OF_A_WALL - int((wall[parents] == kind).sum()), 0)
-        others = np.flatnonzero(wall == kind)
-        if lacking and len(others):
-            parents[kinds - lacking :] = others[np.argsort(-weight[others])[:lacking]]
-    mean = weight @ flat
-    sd = np.sqrt(weight @ (flat - mean) ** 2)
-    center = _SHRINKS * flat[parents] + (1 - _SHRINKS) * mean
-    width = np.maximum(np.sqrt(1 - _SHRINKS**2) * sd, _NARROWEST)
-    center = np.repeat(center[:, None], each, axis=1)
-    drawn = _truncated(center, width, random)
-    drawn[:, :, :_OF_KIND] = drawn[:, :1, :_OF_KIND]
-    drawn[0, :, :_OF_KIND], drawn[:, 0, _OF_KIND:] = flat[parents[0], :_OF_KIND], flat[parents, _OF_KIND:]
-    return drawn, wall[parents]
-
-
-def _truncated(center: np.ndarray, sd: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Return normal deviates between 0 and 1."""
-    low, high = ndtr((0.0 - center) / sd), ndtr((1.0 - center) / sd)
-    return np.clip(center + sd * ndtri(low + (high - low) * random.random(center.shape)), 0.0, 1.0)
-
-
-def _interval(name: str, unit: np.ndarray, weight: np.ndarray) -> tuple[float, float] | None:
-    """Return the range of a parameter that holds 80 % of the weight; None where it is hardly narrower than before."""
-    order = np.argsort(unit)
-    share = np.cumsum(weight[order])
-    ends = (unit[order][min(int(np.searchsorted(share, at)), len(unit) - 1)] for at in (0.1, 0.9))
-    low, high = (_from_unit(name, float(end)) for end in ends)
-    before = 2 * 1.28 * _USUAL_SD[name] if name in _USUAL_SD else RANGES[name][1]
-    after = np.log(high / low) if name in _USUAL_SD else high - low
-    return (low, high) if after <= _KNOWN_SHARE * before else None
-
-
-def _chosen(
-    members: Sequence[World], score: Float[np.ndarray, "members"], weight: np.ndarray, each: int, config: BeliefConfig
-) -> tuple[World, ...]:
-    """Return the likeliest members, of the likelier kind of wall: some of each of the likeliest kinds."""
-    compliant = np.array([member.compliant_wall_n_mm2 is not None for member in members])
-    rows = np.where(compliant == (weight[compliant].sum() > 0.5), score, -np.inf).reshape(-1, each)
-    kinds = np.argsort(-rows.max(axis=1))[: config.stiffness_levels]
-    most = config.members // len(kinds)
-    return tuple(members[kind * each + lane] for kind in kinds for lane in np.argsort(-rows[kind])[:most])
+def _stated(family: Family, found: Posterior) -> Identified:
+    """Return what is stated of what was found."""
+    interval = dict[str, tuple[float, float] | None]()
+    for k, each in enumerate(family.parameters):
+        known = found.sd[k] <= _UNSURE
+        interval[each.name] = family.interval(found, each.name, _DEVIATIONS) if known else None
+    ends, explains = interval.pop("compliance"), found.none < _UNSURE
+    wall = "unknown"
+    if ends is not None and (ends[1] < _UNSURE or ends[0] > 0.1):
+        wall = "compliant" if ends[0] > 0.1 else "rigid"
+    likely = [
+        hypothesis for hypothesis, share in zip(family.hypotheses, found.probability, strict=True) if share > _UNSURE
+    ]
+    open_to = [each for hypothesis in likely for each in hypothesis.parameters]
+    stated = [each.words.format(*ends) for each in open_to if (ends := interval.get(each.name)) is not None]
+    words = ", ".join([*(stated or [each.name for each in likely] or ["as given"]), f"{wall} wall"])
+    return Identified(interval, wall, explains, words if explains else f"unknown; likeliest {words}")

@@ -87,6 +87,7 @@ class BelievedTip:
             X-ray showed, NaN without bands.
         asks: why X-ray is asked for at the next decision; empty if it is not.
         found: what was identified since the model was taken to be wrong, in words; empty if nothing was.
+        branch: of the vessel, in which it is believed; -1 where that is not told.
     """
 
     abscissa: float
@@ -94,6 +95,7 @@ class BelievedTip:
     half_width: tuple[float, float] = (np.nan, np.nan)
     asks: str = ""
     found: str = ""
+    branch: int = -1
 
 
 class Monitor:
@@ -189,12 +191,13 @@ class Monitor:
         event = Event.UNEXPLAINED if not explained else Event.DOUBTED if self.alarm else Event.TRUSTED
         self.states.take(event if exposure is not None or back else None)
         if watch is None:
-            return BelievedTip(float(at.tip[0]), float(at.tip[1]))
+            return BelievedTip(float(at.tip[0]), float(at.tip[1]), branch=int(self.belief.tip.branch[self.belief.best]))
         if self.seen is not None:
             watch.exposed(float((at.tip + self.seen.less(at.tip))[1]), at)
         motion = _MOTION_SD_MM * (self.belief.motion is not None)
         changed = self.identified is not None or self.moves is not None or self.belief.drives.unknown
-        due = watch.advise(at, self.belief.play_spread() ** 2 + motion**2, changed=changed)
+        pressed = self.load_ratio * float(self.belief.force[self.belief.best]) / self._navigation.force_limit_n
+        due = watch.advise(at, self.belief.play_spread() ** 2 + motion**2, changed=changed, pressed=pressed)
         return self._believed(watch, at.tip, due)
 
     def _see(self, exposure: TipMeasurement, period: int, at: Predicted) -> None:
@@ -247,7 +250,7 @@ class Monitor:
 
     def _identify(self) -> None:
         """Change the belief to what explains all exposures."""
-        found, identified = identify(self.belief, self.past, seed=self.changes_left)
+        found, identified = identify(self.belief, self.past)
         self.changes_left -= 1
         if len(self.past.proximal) == 1:
             self._given = found.members
@@ -262,7 +265,7 @@ class Monitor:
     def _renew(self) -> None:
         """Begin with another belief."""
         self._since, self._loads = 0, LoadRatio()
-        self._innovations.renew()
+        self._innovations.renew(unknown=self.identified is not None and not self.identified.explains)
         period = len(self.past.proximal) - 1
         self.seen = self.belief.in_vessel(self.past.exposures[period], period)
 
@@ -312,13 +315,13 @@ class Monitor:
     def _believed(self, watch: Watch, tip: np.ndarray, due: bool) -> BelievedTip:
         abscissa, offset = tip.tolist()
         words = [each.words for each in (self.moves, self.belief.drives, self.identified) if each is not None]
-        found = "; ".join(each for each in words if each)
+        found, branch = "; ".join(each for each in words if each), int(self.belief.tip.branch[self.belief.best])
         if self.lost:
             asks = "no simulated wire explains the last image" if due or not self._tests else ""
-            return BelievedTip(abscissa, offset, (np.inf, np.inf), asks, found)
+            return BelievedTip(abscissa, offset, (np.inf, np.inf), asks, found, branch)
         along, across = watch.half_width.tolist()
         asks = watch.reason if due else ""
-        return BelievedTip(abscissa, offset, (along, across), asks, found)
+        return BelievedTip(abscissa, offset, (along, across), asks, found, branch)
 
 
 def predicted_tip(belief: Belief) -> Predicted:

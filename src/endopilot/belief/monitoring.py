@@ -29,7 +29,6 @@ FLUOROSCOPY_HZ = 7.5
 """Frame rate of the fluoroscopy that advice is compared with."""
 OFFSET_SHARES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.0)
 """Shares of γtip's band that are tried when an adviser is calibrated."""
-_GRID_MM = 0.25
 ExposurePolicy = Callable[[int, Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]], Bool[np.ndarray, "n"]]
 """From sample, predicted tip and its spread (mm), which navigations are exposed."""
 
@@ -91,26 +90,20 @@ class Lumen:
     """The lumen's radius at a predicted tip: on the path through the branch that it was last observed in."""
 
     def __init__(self, trees: Sequence[VesselTree], owner: Int[np.ndarray, "episodes"]) -> None:
-        """Tabulate the radii.
+        """Take the lines.
 
         Args:
             owner: of each episode, the index of its patient.
         """
-        lines = [[_onwards(tree, branch) for branch in range(len(tree.branches))] for tree in trees]
-        longest = max(line[0][-1] for branches in lines for line in branches)
-        grid = np.arange(0.0, longest + _GRID_MM, _GRID_MM)
-        self._table = np.zeros((len(trees), max(len(branches) for branches in lines), len(grid)))
-        for index, branches in enumerate(lines):
-            for branch, (abscissa, radius) in enumerate(branches):
-                self._table[index, branch] = np.interp(grid, abscissa, radius)
+        self._lines = [[_onwards(tree, branch) for branch in range(len(tree.branches))] for tree in trees]
         self._owner = owner
 
     def radius(
         self, branch: Int[np.ndarray, "episodes"], abscissa_mm: Float[np.ndarray, "episodes"]
     ) -> Float[np.ndarray, "episodes"]:
         """Return the radius, mm, at a Δtip, mm, on the path through a branch."""
-        place = np.clip(np.rint(np.nan_to_num(abscissa_mm) / _GRID_MM).astype(int), 0, self._table.shape[2] - 1)
-        return self._table[self._owner, branch, place]
+        lines = [self._lines[k][along] for k, along in zip(self._owner.tolist(), branch.tolist(), strict=True)]
+        return np.array([np.interp(at, *line) for at, line in zip(np.nan_to_num(abscissa_mm), lines, strict=True)])
 
 
 def _onwards(tree: VesselTree, branch: int) -> tuple[np.ndarray, np.ndarray]:
@@ -298,7 +291,6 @@ def follow_policy(monitored: Monitored, policy: ExposurePolicy, config: AdviserC
             seen = episodes.tip[on, sample], episodes.branch[on, sample], episodes.tip_sd[on, sample]
             model.observe(on, sample, *seen)
     near = near_exposures(exposed & monitored.found)
-    near[:, WINDOW] |= monitored.found[:, WINDOW - 1]  # X-ray was on until the sample before
     wall = monitored.ratio >= config.wall_ratio
     astray = np.abs(model.tip[..., 0] - truth[..., 0]) >= config.abscissa_mm
     astray[:, WINDOW - 1] = False
@@ -375,6 +367,12 @@ def periodic_policy(monitored: Monitored, period: int) -> ExposurePolicy:
     """Return periodic imaging, each navigation with a phase of its own; `period` counts samples."""
     phase = np.arange(len(monitored.truth))
     return taken_again(monitored, lambda sample, tip, spread: (sample + phase) % period == 0)
+
+
+def measure_metronome(monitored: Monitored, per_minute: float, config: AdviserConfig) -> dict[str, float]:
+    """Return what periodic imaging with about as many exposures a minute misses: see `measure_policy`."""
+    period = max(1, round(60 / SAMPLE_PERIOD_S / max(per_minute, 1e-9)))
+    return measure_policy(monitored, periodic_policy(monitored, min(period, monitored.truth.shape[1])), config)
 
 
 def oracle_policy(monitored: Monitored, config: AdviserConfig) -> ExposurePolicy:

@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from endopilot.models.hypotheses import HYPOTHESES, Displaced
 from endopilot.simulation.motion import AMPLITUDES, Motion, contracted_share, place
 
 _HEART = {
@@ -39,6 +40,8 @@ _USUAL_HZ = (1.17, 0.2), (0.25, 0.06)
 _PHASE, _FINE = 0.08, np.arange(-8, 9) / 8
 """Frequencies that are tried differ by this share of a period over the whole time; and finer ones near the best, in
 shares of that."""
+_DRIFT_SD = np.array([each.parameters[0].other for each in HYPOTHESES if isinstance(each, Displaced)])
+"""Standard deviations of a registration that errs, mm, and of its drift, mm a minute."""
 _ALONG_MM, _ACROSS_MM, _HEAVY = 3.0, 0.6, 12.0
 """Standard deviations of a predicted tip's error along and across the wire, mm: the motion also drives the wire to and
 fro in its vessel; and the squares of errors, in these, beyond which a tip counts for less."""
@@ -51,7 +54,7 @@ class FoundMotion:
     Attributes:
         motion: with the likeliest periods and amplitudes.
         gain: logarithm of how much likelier it makes what X-ray showed than the known motion, or a vessel that lies
-            still.
+            still, with a registration that errs and drifts as is likeliest.
         misfit: mean square of the errors that are left, in standard deviations; near 1 where the motion explains them.
     """
 
@@ -99,7 +102,25 @@ def find_motion(
     _, _, left = max((fit.best(times_s, weight) for fit in fits), key=lambda each: each[0])
     gain, motion, left = max((fit.best(times_s, 1 / (1 + left / _HEAVY)) for fit in fits), key=lambda each: each[0])
     weight = 1 / (1 + left / _HEAVY)
+    gain -= max(_drift_gain(across, error, times_s), 0.0)
     return FoundMotion(motion, gain, float((weight * left).sum() / (3 * weight.sum())))
+
+
+def _drift_gain(
+    across: Float[np.ndarray, "n 3 3"], error: Float[np.ndarray, "n 3"], times_s: Float[np.ndarray, "n"]
+) -> float:
+    """Return the logarithm of how much likelier a wrong registration that drifts makes the images than none."""
+    field = np.concatenate([across, across * (times_s / 60)[:, None, None]], axis=-1)
+    precision = np.diag(np.repeat(_DRIFT_SD, 3) ** -2.0)
+
+    def fitted(left: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        weight = 1 / (1 + (left**2).sum(axis=1) / _HEAVY)
+        normal, right = np.einsum("n,nik,nil->kl", weight, field, field), np.einsum("n,nik,ni->k", weight, field, error)
+        return np.linalg.solve(normal + precision, right), normal, right
+
+    found, normal, right = fitted(error - field @ fitted(error)[0])
+    occam = np.linalg.slogdet(normal + precision)[1] - np.linalg.slogdet(precision)[1]
+    return float(0.5 * (found @ right - occam))
 
 
 def _fields(

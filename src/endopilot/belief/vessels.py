@@ -13,7 +13,7 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.world import World
 from endopilot.types import Anatomy
 
-_OF_VESSEL = "lumen_factor", "lumen_mm", "occluded", "stenosis", "axis_deg", "axis_side_deg"
+_OF_VESSEL = "lumen_factor", "lumen_mm", "occluded", "stenosis", "axis_deg", "axis_side_deg", "ostium_aside_mm"
 """What of a `World` makes another vessel."""
 
 
@@ -42,6 +42,13 @@ class SharedVessels:
         if not key <= self._kept:
             self._kept |= key
             self.simulators.append(simulator)
+
+    def keep(self, members: Sequence[World]) -> None:
+        """Forget all vessels but the given one and those of some members: maps take memory."""
+        kept = {id(self.of(each)) for each in (World(), *members)}
+        self._made = {alone: vessel for alone, vessel in self._made.items() if id(vessel) in kept}
+        self.simulators = [each for each in self.simulators if {*map(id, each.set_up.anatomies)} <= kept]
+        self._kept = {key for key in self._kept if key[0] in kept}
 
     def kinds(
         self, given: Stack, members: Sequence[World]

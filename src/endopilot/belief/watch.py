@@ -30,9 +30,10 @@ _FAR, _RECENT = 2.0, 6
 this many times its bound over √n. Bounds are those of bands as calibrated."""
 _OUTSIDE, _OF = 1.5, 3
 """Two of so many innovations this many times their bounds are enough too. Bounds are those of widened bands."""
-_PROOF, _WIDER = 3, 1.5
-"""Images in a row that lie within the bands of a belief that was identified before it is trusted; and how much wider
-its bands begin: members that a few images chose are more alike than they are right."""
+_PROOF, _WIDER, _UNKNOWN = 3, 1.5, 2.5
+"""Images in a row that lie within the bands of a belief that was identified before it is trusted; how much wider its
+bands begin: members that a few images chose are more alike than they are right; and where no hypothesis explains the
+images: an assumption, until innovations tell."""
 
 
 class Innovations:
@@ -52,11 +53,12 @@ class Innovations:
         self.factor, self.alarm = np.ones(2), False
         self._excess, self._weight = np.full(2, _PRIOR), np.full(2, _PRIOR)
 
-    def renew(self) -> None:
-        """Take another belief, which has yet to prove itself."""
-        self.factor, self._shares, self._off = np.full(2, _WIDER), [], []
+    def renew(self, *, unknown: bool = False) -> None:
+        """Take another belief, which has yet to prove itself, or explains nothing: what is wrong is unknown."""
+        wider = _UNKNOWN if unknown else _WIDER
+        self.factor, self._shares, self._off = np.full(2, wider), [], []
         self.alarm, self._inside, self._needed = True, 0, _PROOF
-        self._excess, self._weight = np.full(2, _WIDER**2 * _PRIOR), np.full(2, _PRIOR)
+        self._excess, self._weight = np.full(2, wider**2 * _PRIOR), np.full(2, _PRIOR)
 
     @property
     def outside(self) -> bool:
@@ -94,9 +96,9 @@ class Innovations:
             self._inside, self._needed = 0, 2
 
 
-_LUMEN_SHARE, _LUMEN_MM = 0.12, 0.3
-"""The lumen's radius may be off by this share, and no more than this, mm: CT shows it to a tenth or a voxel, an
-assumption."""
+_LUMEN_SHARE, _LUMEN_MM = 0.16, 0.4
+"""The lumen's radius may be off by this share, and no more than this, mm: CT shows it to a tenth or a voxel and blooms,
+an assumption."""
 _FREE_MM, _HELD_SHARE = 5.0, np.array([0.3, 0.05])
 """A wire that is moved by more than this while its tip rests buckles: standard deviations of (Δtip, γtip) that this
 adds, as shares of what goes beyond, mm; found in coronary arteries with compliant walls, on patients to improve agents
@@ -148,6 +150,9 @@ class Allowance:
         return np.hypot(_HELD_SHARE * max(self.held_mm - free_mm, 0.0), _TIP_MM) * self._alone
 
 
+_PRESSES = 0.8
+"""Share of the largest force that the wall may press with, by simulated wires and the drive's load, from which it is
+looked at: they err by a fifth, as wires do."""
 MISMATCH = "model mismatch"
 """Why X-ray is asked for while the model is taken to be wrong."""
 
@@ -170,7 +175,7 @@ class Watch:
         self.innovations = Innovations()
         self._adviser = XrayAdviser(calibration, config, tip_radius_mm, at)
         self._allowance = Allowance(at.proximal[0], at.tip[0], alone=alone)
-        self._half = self.half_width
+        self._half, self._presses = self.half_width, False
 
     def move(self, at: Predicted) -> None:
         """Take what is predicted a period later."""
@@ -186,7 +191,12 @@ class Watch:
         self._allowance.exposed()
 
     def advise(
-        self, at: Predicted, variance_mm2: Float[np.ndarray, "2"] | float = 0.0, *, changed: bool = False
+        self,
+        at: Predicted,
+        variance_mm2: Float[np.ndarray, "2"] | float = 0.0,
+        *,
+        changed: bool = False,
+        pressed: float = 0.0,
     ) -> bool:
         """Return whether an exposure is due, once a period.
 
@@ -194,7 +204,9 @@ class Watch:
             at: what is predicted for now, after the exposure if there was one.
             variance_mm2: of (Δtip, γtip), which the calibration does not know of, mm².
             changed: whether the model is another than the given one, which erred.
+            pressed: force of the wall as a share of what it may be.
         """
+        self._presses, pressed_before = pressed >= _PRESSES, self._presses
         due = self._adviser.advise(
             at,
             np.sqrt(variance_mm2 + self._allowance.sd_mm**2),
@@ -202,6 +214,7 @@ class Watch:
             always=self.innovations.alarm,
             erred=changed or bool((self.innovations.factor > 1).any()),
             wall_mm=self._allowance.wall_mm(at.radius_mm),
+            presses=self._presses and not pressed_before,
         )
         self._half = self.half_width / self.innovations.factor
         return due
@@ -215,7 +228,7 @@ class Watch:
             return "the last exposure is long ago"
         if self._adviser.wide:
             return f"Δtip is known to ±{self.half_width[0]:.1f} mm only"
-        return "the tip may be reaching the wall"
+        return "the wall presses hard" if self._presses else "the tip may be reaching the wall"
 
     @property
     def half_width(self) -> Float[np.ndarray, "2"]:

@@ -220,7 +220,7 @@ def navigation_events(
     count, advice = len(believed_mm), AdviserConfig()
     at_wall = safety_ratio(tip.offset, tip.radius, wire_radius_mm)[:count] >= advice.wall_ratio
     errs = np.abs(believed_mm - tip.abscissa[:count]) >= advice.abscissa_mm
-    found = np.array([count_events(state, near_exposures(exposed[:count])) for state in (at_wall, errs)])
+    found = np.array([count_events(state, near_exposures(exposed[:count], before=True)) for state in (at_wall, errs)])
     return int(found[:, 0].sum()), int(found[:, 1].sum())
 
 

@@ -20,7 +20,7 @@ from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Stack
 from endopilot.models import ensemble
 from endopilot.models.config import WINDOW
-from endopilot.models.ensemble import NARROWEST, NOMINAL, SPREADS, Members, Paths
+from endopilot.models.ensemble import FAMILY, NARROWEST, SCALES_MM, Members, Paths
 from endopilot.models.episodes import (
     EachObserved,
     Episodes,
@@ -33,6 +33,7 @@ from endopilot.models.episodes import (
     given_states,
     jumps,
 )
+from endopilot.models.hypotheses import Posterior
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
@@ -40,14 +41,13 @@ from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 GENERATIONS = 2
 """Times that wires are tried through what was seen; those of the next are drawn around the best of the last."""
-TRIED, FOLLOWED = 16, 8
-"""Wires of a generation; wires that follow the commands to the end, around the best one."""
+TRIED, FOLLOWED = (8, 4), (2, 4)
+"""Kinds of wires in a generation, and how many of each; and of those that follow the commands to the end, around the
+best one."""
 TRANSLATIONS_MM_S = (-5.0, -1.5, 0.0, 1.5, 5.0)
 """Speeds that are tried, beyond the one that would move a tip without slack to where it is desired."""
 ROTATIONS_RAD_S = (-2.0, 0.0, 2.0)
 """Rotations that are tried with each."""
-Parameters = tuple[Float[np.ndarray, "episodes 5"], Float[np.ndarray, "episodes 5"]]
-"""Mean and standard deviation of each episode's `ensemble.NAMES`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +55,12 @@ class SimulatedWires:
     """The rod core as a predictor of whatever devices episodes have.
 
     Attributes:
-        identified: mean and standard deviation of the parameters after what was seen of given states, by setup and by
-            a digest of patient, commands and tips; all protocols and later plans share them.
+        identified: what is believed after what was seen of given states, by setup and by a digest of patient, commands
+            and tips; all protocols and later plans share it.
         tracked: controls that lead the tip along the desired one from the given states on; P2 and P3 share them.
     """
 
-    identified: WeakKeyDictionary[EpisodeSetUp, dict[bytes, Parameters]] = field(
+    identified: WeakKeyDictionary[EpisodeSetUp, dict[bytes, Posterior]] = field(
         default_factory=WeakKeyDictionary, repr=False
     )
     tracked: WeakKeyDictionary[Episodes, OpenLoop] = field(default_factory=WeakKeyDictionary, repr=False)
@@ -84,13 +84,12 @@ class SimulatedWires:
 
         `ensemble.weigh` makes a prediction of them, and again, without another simulation, when more tips are seen.
         """
-        found = np.full((1 + FOLLOWED, *episodes.tip.shape), np.nan)
+        found = np.full((1 + np.prod(FOLLOWED), *episodes.tip.shape), np.nan)
         for anatomy, chosen in _by_anatomy(episodes):
             data = episodes.select(chosen)
-            mean, sd = self._identified(anatomy, data, seen[chosen])
-            sd = np.clip(sd, NARROWEST * SPREADS, SPREADS)
-            around = ensemble.drawn(mean, sd, FOLLOWED, moves=_moves(data, anatomy))
-            members = np.concatenate([ensemble.rounded(mean)[None], around])
+            believed, least = self._identified(anatomy, data, seen[chosen]), np.diag(NARROWEST * FAMILY.usual)
+            around = [FAMILY.drawn(each.center, each.factor + least, *FOLLOWED) for each in believed]
+            members = np.stack([np.concatenate([e.center[None], m]) for e, m in zip(believed, around, strict=True)], 1)
             found[:, chosen] = _replayed(anatomy, data, members, data.samples)
         return found
 
@@ -123,14 +122,13 @@ class SimulatedWires:
         tip, control = np.empty(desired.shape), np.empty(desired.shape)
         for anatomy, chosen in _by_anatomy(episodes):
             data = episodes.select(chosen)
-            mean, _ = self._identified(anatomy, data, np.broadcast_to(observed, data.branch.shape))
-            best, stack = ensemble.rounded(mean), Stack.of(data.setup.device)
-            stacks = ensemble.with_stiffnesses(stack, best[:, 1])
+            believed = self._identified(anatomy, data, np.broadcast_to(observed, data.branch.shape))
+            best, stack = [FAMILY.world(each.center) for each in believed], Stack.of(data.setup.device)
             tip[chosen], control[chosen] = track(
                 anatomy,
-                [stacks[factor] for factor in best[:, 1]],
-                friction=ensemble.frictions(stack, best[:, 0]),
-                start=ensemble.as_deep(data.start, best[:, 2]),
+                [each.stack(stack) for each in best],
+                friction=ensemble.frictions(stack, np.array([each.friction_factor for each in best])),
+                start=ensemble.as_deep(data.start, np.array([each.ostium_mm for each in best])),
                 command=data.command,
                 desired=desired[chosen],
                 config=data.setup.simulator,
@@ -139,16 +137,15 @@ class SimulatedWires:
         start = episodes.proximal[:, begin - 1 : begin].astype(float)
         return OpenLoop(tip=tip, proximal=start + SAMPLE_PERIOD_S * np.cumsum(control, axis=1), control=control)
 
-    def _identified(self, anatomy: Anatomy, data: Episodes, seen: EachObserved) -> Parameters:
-        """Return the parameters of episodes of one anatomy after what was seen of the given states."""
+    def _identified(self, anatomy: Anatomy, data: Episodes, seen: EachObserved) -> list[Posterior]:
+        """Return what is believed of episodes of one anatomy after what was seen of the given states."""
         known, seen = self.identified.setdefault(data.setup, {}), seen[:, :WINDOW]
         digests = [_digest(data, i, seen[i]) for i in range(len(data))]
         new = np.array([i for i, digest in enumerate(digests) if digest not in known], dtype=int)
         if len(new):
-            for i, *found in zip(new, *_identify(anatomy, data.select(new), seen[new]), strict=True):
-                known[digests[i]] = found[0], found[1]
-        mean, sd = zip(*(known[digest] for digest in digests), strict=True)
-        return np.array(mean), np.array(sd)
+            for i, found in zip(new, _identify(anatomy, data.select(new), seen[new]), strict=True):
+                known[digests[i]] = found
+        return [known[digest] for digest in digests]
 
 
 def _digest(data: Episodes, i: int, seen: Observed) -> bytes:
@@ -164,17 +161,23 @@ def _digest(data: Episodes, i: int, seen: Observed) -> bytes:
     return hashlib.sha256(b"\0".join([str(data.anatomy[i]).encode(), *(part.tobytes() for part in signals)])).digest()
 
 
-def _identify(anatomy: Anatomy, data: Episodes, seen: EachObserved) -> Parameters:
-    mean, sd = np.tile(NOMINAL, (len(data), 1)), np.tile(SPREADS, (len(data), 1))
-    spread, samples = sd, int(np.nonzero(seen)[1].max(initial=-1)) + 1
-    tips, sd_mm = (signal[:, :samples].astype(float) for signal in (data.tip, data.tip_sd))
-    for _ in range(GENERATIONS if samples else 0):
-        members = ensemble.drawn(mean, spread, TRIED, moves=_moves(data, anatomy))
+def _identify(anatomy: Anatomy, data: Episodes, seen: EachObserved) -> list[Posterior]:
+    count, size = len(data), len(FAMILY.parameters)
+    found = [FAMILY.as_given()] * count
+    samples = int(np.nonzero(seen)[1].max(initial=-1)) + 1
+    tips, scale = data.tip[:, :samples].astype(float), np.maximum(SCALES_MM, data.tip_sd[:, :samples].astype(float))
+    center, spread = np.zeros((count, size)), np.ones((count, size))
+    for generation in range(GENERATIONS if samples else 0):
+        each = zip(center, spread, strict=True)
+        members = np.stack([FAMILY.drawn(c, np.diag(s), *TRIED, seed=generation) for c, s in each], axis=1)
         paths = _replayed(anatomy, data, members, samples)
-        each = zip(np.moveaxis(members, 1, 0), np.moveaxis(paths, 1, 0), tips, sd_mm, seen[:, :samples], strict=True)
-        mean, sd = (np.array(part) for part in zip(*(ensemble.posterior(*one) for one in each), strict=True))
-        spread = np.clip(2 * sd, NARROWEST * SPREADS, SPREADS)
-    return mean, sd
+        found = [
+            FAMILY.update(members[:, k], paths[:, k, at], tips[k, at], scale[k, at], noisy=True)
+            for k, at in enumerate(seen[:, :samples])
+        ]
+        center = np.array([each.mean for each in found])
+        spread = np.clip([2 * each.sd for each in found], NARROWEST, 1.0)
+    return found
 
 
 def _replayed(anatomy: Anatomy, data: Episodes, members: Members, samples: int) -> Paths:
@@ -245,10 +248,6 @@ def track(
         control[:, k] = moved[best, 0] - slip / SAMPLE_PERIOD_S
         simulator.copy_worlds(np.repeat(best, each))
     return tip, control
-
-
-def _moves(episodes: Episodes, anatomy: Anatomy) -> bool:
-    return episodes.setup.known_motions.get(anatomy.name) is not None
 
 
 def _by_anatomy(episodes: Episodes) -> Iterator[tuple[Anatomy, Int[np.ndarray, "chosen"]]]:

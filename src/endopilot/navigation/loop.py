@@ -229,6 +229,7 @@ class NavigationLoop:
         state, tip = self.robot.proximal_state(), None
         if self._expose:
             inserted, _ = state.devices[0]
+            self.c_arm.registration_mm = self.world.registered_mm(self.time_s)
             tip = self.c_arm.expose(self.simulator, inserted, self._random, time_s=self.time_s)
         self._exposed = self._expose
         self.observation, self.believed = Observation(self.time_s, state.devices, tip, state.load), None

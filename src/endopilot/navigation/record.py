@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.anatomy.projection import project_tip
+from endopilot.belief.adviser import astray_mm
 from endopilot.navigation.policy import BelievedTip, Observation, Proximals
 from endopilot.robot.robot import SimulatedRobot
 from endopilot.simulation.simulator import Simulator
@@ -41,6 +42,7 @@ class NavigationRecord:
         measured: what X-ray showed at this moment; None where it was off, or no wire was found in the images.
         believed: where the policy believed the tip to be when it decided; NaN at the end, and None for a policy that
             does not tell: (Δtip, γtip), mm.
+        astray_mm: how far along the vessel the tip lay from there, by way of the fork where it lay in another branch.
         half_width: of the adviser's bands around it, mm, likewise; NaN where there is none, infinite where the policy
             could not explain what X-ray showed.
         asks: why the policy asked at this moment for X-ray at the next one; empty where it did not, or does not tell.
@@ -76,6 +78,7 @@ class NavigationRecord:
     control: Float[np.ndarray, "samples devices 2"]
     measured: tuple[TipMeasurement | None, ...]
     believed: Float[np.ndarray, "samples 2"] | None
+    astray_mm: Float[np.ndarray, "samples"]
     half_width: Float[np.ndarray, "samples 2"] | None
     asks: tuple[str, ...]
     found: str
@@ -106,9 +109,9 @@ class NavigationRecord:
         """Whether the adviser's bands held Δtip and γtip, at each decision with bands; infinite ones hold nothing."""
         if self.believed is None or self.half_width is None:
             return np.zeros(0, dtype=bool)
-        true = np.stack([self.tip.abscissa[:, 0], self.tip.offset[:, 0]], axis=-1)
+        off = np.stack([self.astray_mm, np.abs(self.tip.offset[:, 0] - self.believed[:, 1])], axis=-1)
         half = self.half_width
-        held = (np.less_equal(np.abs(true - self.believed), half) & np.isfinite(half)).all(axis=1)
+        held = (np.less_equal(off, half) & np.isfinite(half)).all(axis=1)
         return np.asarray(held)[~np.isnan(half).any(axis=1)]
 
 
@@ -187,7 +190,8 @@ class Track:
         tells = any(tip is not None for tip in self._believed)
         found = believed[-2].found if periods else ""
         where = np.array([(tip.abscissa, tip.offset) for tip in believed])
-        half_width = np.array([tip.half_width for tip in believed])
+        half_width, branch = np.array([tip.half_width for tip in believed]), np.array([tip.branch for tip in believed])
+        tip = project_tip(tree, anatomy.insertion, position)
         tips = [None if seen is None else seen.tip for seen in self._seen[:periods]]
         nothing = ((np.nan, np.nan),) * devices
         encoders, load = (
@@ -216,13 +220,14 @@ class Track:
             encoders=encoders,
             load=load,
             tip_position=position,
-            tip=project_tip(tree, anatomy.insertion, position),
+            tip=tip,
             shape=np.array(self._shape),
             contact_force_max=force,
             exposed=exposures > 0,
             control=np.array([*self._control[:periods], np.zeros((devices, 2))]),
             measured=(*tips, None),
             believed=where if tells else None,
+            astray_mm=astray_mm(tree, (branch, where[:, 0]), (tip.branch[:, 0], tip.abscissa[:, 0])),
             half_width=half_width if tells else None,
             asks=tuple(tip.asks for tip in believed),
             found=found,

@@ -15,6 +15,7 @@ from pydantic_core import PydanticCustomError
 
 from endopilot.anatomy.catheter_axis import turned_axis, with_axis
 from endopilot.anatomy.other_lumen import with_radii
+from endopilot.anatomy.tree import cross_axes
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire
 from endopilot.devices.device_files import named_file
@@ -109,6 +110,9 @@ class World:
     """The guiding catheter leans by this angle off its given axis, degrees."""
     axis_side_deg: Finite | None = None
     """To which side it leans, degrees around the given axis; drawn with the seed if not given."""
+    ostium_aside_mm: tuple[Finite, Finite] = (0.0, 0.0)
+    """The ostium, and the guiding catheter with it, lies this far beside its given place, mm, along the two axes across
+    the given one that `axis_side_deg` counts from."""
     backs_out_mm: Annotated[float, Within(0, 50)] = 0.0
     """The guiding catheter backs out of the ostium by this, mm, at 5 mm/s, and takes all devices back; their encoders
     do not see it, and no device is taken back behind the ostium."""
@@ -129,6 +133,8 @@ class World:
     """How heart and breath truly move the vessel: breathing, heartbeat, both, or amplitudes; as given if not here."""
     registration_mm: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
     """X-ray shows the wire displaced by this, mm LPS: the vessel is registered so far beside where it lies."""
+    drift_mm_min: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
+    """So much farther it shows displaced with every minute, mm LPS: the patient moves on the table."""
     share: ShareBelowOne = 0.0
     """Friction, tip stiffness, latency and ostium differ by this share, each up or down as drawn with the seed; the
     ostium by this share of the lumen's diameter there. What differs already is not drawn."""
@@ -190,7 +196,16 @@ class World:
         section it lacks."""
         as_given = (self.lumen_factor, self.lumen_mm, self.occluded, self.stenosis) == (1.0, 0.0, (), None)
         real = given if as_given else _with_lumen(given, self.lumen_factor, self.lumen_mm, self.occluded, self.stenosis)
-        return real if self.axis_deg == 0 else with_axis(real, self.axis(given))
+        if self.axis_deg == 0 and not any(self.ostium_aside_mm):
+            return real
+        across = np.concatenate(cross_axes(given.insertion.direction[None]))
+        moved = replace(real.insertion, position=real.insertion.position + self.ostium_aside_mm @ across)
+        return with_axis(replace(real, insertion=moved), self.axis(given))
+
+    def registered_mm(self, time_s: float) -> tuple[float, float, float]:
+        """Return by how much X-ray shows the wire displaced at a time, s, mm LPS."""
+        x, y, z = (at + time_s / 60 * rate for at, rate in zip(self.registration_mm, self.drift_mm_min, strict=True))
+        return x, y, z
 
     def core(self, given: SimulatorConfig) -> SimulatorConfig:
         """Return the settings of the rod core that plays reality."""
