@@ -86,8 +86,8 @@ def navigation_seed(task: Task, place: int) -> int:
 def attempt(policy: str, navigation: Navigation, *, seed: int, terms: Terms | None = None) -> dict[str, Any]:
     """Let a policy drive a navigation, and return its figures, its course and its recording.
 
-    Where the policy searches, `planning_s` is the processor time that its searches took, s. It is no figure: it differs
-    from run to run.
+    `decision_s` is the wall time that each decision took, s, and `planning_s`, where the policy searches, the processor
+    time of its searches. They are no figures: they differ from run to run.
 
     Args:
         seed: of encoder noise, detection errors and the policy.
@@ -98,8 +98,10 @@ def attempt(policy: str, navigation: Navigation, *, seed: int, terms: Terms | No
     """
     terms = terms or Terms()
     with Apart(policy) if terms.request else nullcontext(make_policy(policy)) as driver:
-        record = NavigationLoop(navigation, driver, config=terms.loop, seed=seed, world=terms.world).run()
-    result = {"seed": seed} | scored(navigation, record, tells=isinstance(driver, AgentPolicy))
+        loop = NavigationLoop(navigation, driver, config=terms.loop, seed=seed, world=terms.world)
+        record = loop.run()
+    result: dict[str, Any] = {"seed": seed, "decision_s": np.round(loop.decision_s, 5).tolist()}
+    result |= scored(navigation, record, tells=isinstance(driver, AgentPolicy))
     planning_s = getattr(driver, "planning_s", None)
     return result if planning_s is None else result | {"planning_s": round(planning_s, 2)}
 

@@ -117,7 +117,7 @@ def climb(*, output: str | Path, config: LadderConfig | None = None) -> list[dic
     terms = terms_of(config)
     claim(output, "endopilot ladder", **terms.identity(config.policy))
     paths = config.paths(output)
-    make_missing(f"Ladder, {config.policy}", paths, partial(_navigate, policy=config.policy, terms=terms))
+    make_missing(f"Ladder, {config.policy}", paths, partial(drive_one, policy=config.policy, terms=terms))
     tasks = config.chosen
     results = {task.name: [read_json(path) for path in paths if path.parent.name == task.name] for task in tasks}
     rows = score(tasks, results)
@@ -130,7 +130,8 @@ def climb(*, output: str | Path, config: LadderConfig | None = None) -> list[dic
     return rows
 
 
-def _navigate(path: Path, *, policy: str, terms: Terms) -> None:
+def drive_one(path: Path, *, policy: str, terms: Terms) -> None:
+    """Let a policy do the navigation of a result file, TASK/PLACE.json, and write the file."""
     task, place = terms.task(path.parent.name), int(path.stem)
     navigation = task.ladder_navigation(place)
     result = attempt(policy, navigation, seed=navigation_seed(task, place), terms=terms)

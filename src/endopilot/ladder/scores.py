@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest
 
 from endopilot.tasks.task import Task
 
@@ -69,10 +70,8 @@ def score_navigations(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def interval(reached: int, count: int) -> tuple[float, float]:
     """Return Wilson's 95 % interval of a share (J. Am. Stat. Assoc. 22, 209, 1927)."""
-    z, share = 1.959964, reached / count
-    middle, width = share + z * z / (2 * count), z * ((share * (1 - share) + z * z / (4 * count)) / count) ** 0.5
-    low, high = (max(0.0, (middle + sign * width) / (1 + z * z / count)) for sign in (-1, 1))
-    return low, high
+    found = binomtest(reached, count).proportion_ci(method="wilson")
+    return float(found.low), float(found.high)
 
 
 def submitted(scores: Mapping[str, Any]) -> dict[str, Any]:

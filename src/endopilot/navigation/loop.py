@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import field, replace
 from typing import Annotated, Any
 
@@ -103,6 +104,7 @@ class NavigationLoop:
         reason: why the navigation is over, as in `NavigationRecord`; None while it goes on.
         gives_up: where and why the policy gave up at the last decision, in words; empty if it goes on. Somebody else
             may go on then.
+        decision_s: wall time that each decision took, s.
     """
 
     def __init__(
@@ -160,6 +162,7 @@ class NavigationLoop:
         self.believed: BelievedTip | None = None
         self.reason: str | None = None
         self.gives_up = ""
+        self.decision_s: list[float] = []
         self.policy.start(navigation, seed)
 
     @property
@@ -240,13 +243,14 @@ class NavigationLoop:
         Raises:
             InputError: it is no decision.
         """
-        driver = self._driver or self.policy
+        driver, began = self._driver or self.policy, time.perf_counter()
         if driver is not self.policy:
             if isinstance(self.policy, Led):
                 self.policy.watch(observation)
             else:
                 self.policy.decide(observation)  # what it answers is not done
         decision = _checked(driver.decide(observation), type(driver).__name__)
+        self.decision_s.append(time.perf_counter() - began)
         self.believed = self.policy.believed() if isinstance(self.policy, Believer) else None
         return decision
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from pydantic import InstanceOf, model_validator
+from pydantic import InstanceOf, field_validator, model_validator
 
 from endopilot.devices.catheter import Catheter, check_nested
 from endopilot.devices.device import Device, Wire
@@ -78,7 +78,7 @@ class Navigation:
         catheters: around it, from the inside out.
         arrives: whose tip is to go to the target: "wire", or "catheter", the one next to the wire. The wire's tip may
             then not be pulled back into the catheter.
-        target: where the tip is to go.
+        target: where the tip is to go: what `Anatomy.target` takes, such as a section or a point.
         start_inserted_length_mm: inserted length Δ at the start, mm.
         start_rotation_rad: rotation φ at the start, rad.
         start_catheter_mm: inserted length of the catheters at the start, mm; their rotations are 0.
@@ -104,6 +104,12 @@ class Navigation:
     known_motion: Motion | None = None
     xray: XrayKind = "assumed"
     robot: RobotConfig | None = None
+
+    @field_validator("target", mode="before")
+    @classmethod
+    def _placed(cls, place: Any, info: Any) -> Any:
+        anatomy = info.data.get("anatomy")
+        return anatomy.target(place) if anatomy is not None and not isinstance(place, dict | Target) else place
 
     @model_validator(mode="after")
     def _consistent(self) -> Navigation:

@@ -42,7 +42,8 @@ def find_target(tree: VesselTree, place: Place, *, depth_mm: float | None = None
             raise InputError(str(error)) from None
         return place
     if not isinstance(place, str):
-        return _nearest(tree, place, ",".join(f"{number:g}" for number in place))
+        numbers = np.ravel(np.array(place, dtype=object)).tolist()
+        return _nearest(tree, numbers, ",".join(map(str, numbers)))
     if not place.strip():
         raise InputError("target: is empty; give a section such as 4, or a point X,Y,Z in LPS mm")
     place = place.strip(" ()[]")
@@ -111,11 +112,11 @@ def turn_rad(tree: VesselTree, branch: int) -> float:
     return float(np.arccos(np.clip(into @ onto / (np.linalg.norm(into) * np.linalg.norm(onto)), -1.0, 1.0)))
 
 
-def _nearest(tree: VesselTree, numbers: Sequence[str] | Sequence[float] | np.ndarray, text: str) -> Target:
+def _nearest(tree: VesselTree, numbers: Sequence[str] | Sequence[float], text: str) -> Target:
     """Return the place of the centerline that is nearest to a point, LPS mm."""
     try:
         point = np.array([float(number) for number in numbers])
-    except ValueError:
+    except (TypeError, ValueError):
         point = np.full(3, np.nan)
     if point.shape != (3,) or not np.isfinite(point).all():
         raise InputError(f"target: {text}; not three finite numbers; give a point as X,Y,Z in LPS mm")
