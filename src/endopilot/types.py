@@ -299,12 +299,12 @@ class Anatomy:
         return f"Anatomy(name={self.name!r}, branches={branches}, longest_path_mm={length:.1f}, sections={sections!r})"
 
     def target(self, place: Place, *, depth_mm: float | None = None) -> Target:
-        """Return the target that is meant, as `Navigation`, the environments and the commands understand it.
+        """Return the target that is meant, as navigations, environments and commands understand it.
 
         Args:
-            place: a section such as "4" or "LAD", whose middle is meant; a point X, Y, Z in LPS mm, from which the
-                nearest place of the centerline is taken; or a target, which is checked.
-            depth_mm: of a section, the place so far beyond its begin is meant, mm.
+            place: a section such as "4" or "LAD", whose middle is meant; a point X, Y, Z in LPS mm, which is moved to
+                the centerline; or a target, which is checked.
+            depth_mm: the place so far beyond the section's begin is meant, mm.
 
         Raises:
             InputError: nothing is named, or what does not lie in the vessel.

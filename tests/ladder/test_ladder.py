@@ -216,7 +216,7 @@ def test_tasks_of_ones_own_are_climbed_scored_by_a_second_rule_and_checked(tmp_p
     assert "<th>Near, %</th>" in page and "a point for each patient" in page
     own_tasks(tmp_path / "mine", seconds=5.0, targets_mm=[[0, 0, 21], [0, 0, 30]])
     list_tasks.cache_clear()
-    with pytest.raises(InputError, match=r"task 'along' of .*mine is another than the file was made with"):
+    with pytest.raises(InputError, match=r"task 'along' of ladder .*mine is not the one here"):
         check_submission(tmp_path / "run" / "submission.json")
 
 

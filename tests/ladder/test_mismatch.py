@@ -53,7 +53,6 @@ def test_a_row_a_case_and_a_deeper_wire_arrives_sooner(measured):
     assert [row["case"] for row in rows] == ["matched", "ostium-more", "all"]
     assert all(row["navigations"] == 1 and row["safe_success"] == 1.0 for row in rows)
     assert rows[1]["seconds"] < rows[0]["seconds"]
-    assert rows[0]["exposures_per_minute"] == pytest.approx(60 / rows[0]["seconds"], abs=0.1)
     content = json.loads((folder / "mismatch.json").read_text(encoding="utf-8"))
     assert content["cases"] == rows and content["mismatch"] == 0.2
 

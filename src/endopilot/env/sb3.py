@@ -18,6 +18,9 @@ with extra_named("endopilot.env.sb3"):
 def make_vec(name: str, num_envs: int = 1, **given: Any) -> VecEnv:
     """Return the worlds that `gymnasium.make_vec` makes, as Stable-Baselines3 takes them.
 
+    A step's infos are empty but for worlds whose episode ends: they hold all that `NavigateVectorEnv` tells, and what
+    Stable-Baselines3 looks for: `terminal_observation`, `TimeLimit.truncated`, and `is_success`, a safe success::
+
         model = PPO("MlpPolicy", make_vec("endopilot/Crux-v2", num_envs=64, patients=16))
 
     Args:
@@ -28,57 +31,46 @@ def make_vec(name: str, num_envs: int = 1, **given: Any) -> VecEnv:
     Raises:
         InputError: as for `NavigateVectorEnv`.
     """
-    return Worlds(gymnasium.make_vec(name, num_envs=num_envs, autoreset_mode="SameStep", **given))
+    return _Worlds(gymnasium.make_vec(name, num_envs=num_envs, autoreset_mode="SameStep", **given))
 
 
-class Worlds(VecEnv):
-    """A `NavigateVectorEnv`, with `autoreset_mode="SameStep"`, as a `VecEnv`, whose worlds end in the same way.
-
-    A step's infos are empty but for worlds whose episode ends: they hold all that `NavigateVectorEnv` tells, and what
-    Stable-Baselines3 looks for: `terminal_observation`, `TimeLimit.truncated`, and `is_success`, a safe success.
-    """
+class _Worlds(VecEnv):
+    """An environment with `autoreset_mode="SameStep"`, whose worlds end as those of Stable-Baselines3."""
 
     def __init__(self, worlds: VectorEnv) -> None:
         self.worlds = worlds
         super().__init__(worlds.num_envs, worlds.single_observation_space, worlds.single_action_space)
 
     def reset(self) -> Any:
-        """Start an episode in every world, with the seeds of `seed` where it was called since."""
-        observations, _ = self.worlds.reset(seed=self._seeds)
+        observations, _ = self.worlds.reset(seed=self._seeds)  # which `seed` has set, or are none
         self._reset_seeds()
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take what `step_wait` is to do."""
         self._actions = actions
 
     def step_wait(self) -> Any:
-        """Step all worlds."""
         observations, rewards, terminations, truncations, info = self.worlds.step(self._actions)
         ended, infos = terminations | truncations, list[dict[str, Any]]({} for _ in rewards)
         for world in np.flatnonzero(ended).tolist():
             final = {name: of[world].item() for name, of in info["final_info"].items() if not name.startswith("_")}
-            final |= {
+            infos[world] = final | {
                 "terminal_observation": info["final_obs"][world],
+                "TimeLimit.truncated": bool(truncations[world]),
                 "is_success": final["success"] and final["safe"],
             }
-            infos[world] = final | {"TimeLimit.truncated": bool(truncations[world])}
         return observations, rewards.astype(np.float32), ended, infos
 
     def close(self) -> None:
-        """End the worlds."""
         self.worlds.close()
 
     def get_images(self) -> Sequence[Any]:
-        """Return a picture of each world."""
         return self.worlds.render() or ()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute of all worlds, once for each that is asked for."""
         return [getattr(self.worlds, attr_name) for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Return that no world is."""
         return [False for _ in self._get_indices(indices)]
 
     def _refused(self, name: str, *_: Any, **__: Any) -> Any:

@@ -51,11 +51,7 @@ _PIXELS = (64, 128)
 
 
 def refuse_options(options: dict[str, Any] | None, *known: str) -> None:
-    """Refuse what `reset` does not understand.
-
-    Raises:
-        InputError: there is such an option.
-    """
+    """Raise `InputError` for an option that `reset` does not understand."""
     for name in set(options or {}) - set(known):
         raise InputError(f"options: {name!r}; reset takes {' and '.join(known) or 'none'}, all else is given to make")
 
@@ -217,14 +213,11 @@ class NavigateVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode in every world, or in those of `options["reset_mask"]`.
+        """Start an episode in every world, or in those of `options["reset_mask"]`, a boolean for each.
 
         Args:
             seed: world i draws from seed + i, or from its own; without one the generators go on.
-            options: `reset_mask`, a boolean for each world.
-
-        Returns:
-            Observations and info of all worlds.
+            options: `reset_mask` or none.
 
         Raises:
             InputError: another option, or a mask of another shape.
@@ -251,13 +244,7 @@ class NavigateVectorEnv(VectorEnv):
         Bool[np.ndarray, "worlds"],
         dict[str, Any],
     ]:
-        """Drive every world for a control period.
-
-        Args:
-            actions: a row a world.
-
-        Returns:
-            Observations, rewards, terminations, truncations and info, as the class says.
+        """Drive every world for a control period, by a row of actions each.
 
         Raises:
             ResetNeeded: a world has not been reset, or its episode has ended and nothing resets it by itself.

@@ -30,13 +30,8 @@ def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[d
 
     Each navigation leaves one file, `output`/CASE/TASK/PATIENT.json; an interrupted run goes on with the others.
 
-    Args:
-        output: folder of the results; `mismatch.json` in it holds the scores.
-        share: by which each of `QUANTITIES` differs, up and down, between 0 and 1.
-
-    Returns:
-        A row for each of `CASES`: `case`, and over all navigations what `endopilot.ladder.scores.score` gives, with
-        `exposures_per_minute`.
+    Each of `QUANTITIES` differs by `share`, up and down, between 0 and 1. A row for each of `CASES` is returned, and
+    stands in `output`/mismatch.json: over all navigations what `endopilot.ladder.scores.score_navigations` gives.
 
     Raises:
         InputError: `share` is out of its range, the folder belongs to another run, or a navigation cannot be begun.
@@ -56,18 +51,10 @@ def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[d
     rows = []
     for case, of_case in paths.items():
         results = [read_json(path) for path in of_case]
-        exposures, seconds = (sum(result[name] for result in results) for name in ("exposures", "seconds"))
-        row = {"case": case, "navigations": len(results)} | score_navigations(results)
-        rows.append(row | {"exposures_per_minute": round(exposures / (seconds / 60), 1)})
-    content = {
-        "policy": config.policy,
-        "ladder": config.version,
-        "robot": config.robot,
-        "mismatch": share,
-        "tasks": [task.name for task in tasks],
-    }
-    most = max(len(task.ladder.numbers[: config.patients]) for task in tasks)
-    write_json(output / MISMATCH_FILE, content | {"patients": most, "cases": rows})
+        rows.append({"case": case, "navigations": len(results)} | score_navigations(results))
+    content = {"policy": config.policy, "ladder": config.version, "robot": config.robot, "mismatch": share}
+    content |= {"tasks": [task.name for task in tasks], "patients": config.patients_done, "cases": rows}
+    write_json(output / MISMATCH_FILE, content)
     return rows
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,8 @@ from endopilot.tasks.navigation import DECISION_PERIOD_S
 
 TITLES = {2: "Version 2", "coaxial": "Wire and catheter", 1: "Version 1"}
 """Of the shipped versions of the ladder."""
-_Run = tuple[Mapping[str, Any], str, str, Mapping[str, Sequence[Mapping[str, Any]]]]
+_Run = tuple[Mapping[str, Any], str, str, Mapping[str, list[dict[str, Any]]]]
+"""Terms, policy, source, and of each task the results of its navigations."""
 
 
 def tabulate(folder: Path) -> list[dict[str, Any]]:
@@ -48,7 +48,6 @@ def tabulate(folder: Path) -> list[dict[str, Any]]:
 
 
 def _runs(folder: Path) -> Iterator[_Run]:
-    """Yield terms, policy, source, and of each task the results of its navigations."""
     for path in sorted(folder.rglob(SCORES_FILE)):
         content = read_json(path)
         if "key" not in content:
@@ -60,10 +59,7 @@ def _runs(folder: Path) -> Iterator[_Run]:
         content = read_json(path)
         if isinstance(content, dict) and "navigations" in content and not path.with_name(SCORES_FILE).exists():
             read = read_submission(path)
-            navigations = {
-                name: [{key: value for key, value in asdict(one).items() if value is not None} for one in done]
-                for name, done in read.navigations.items()
-            }
+            navigations = {name: [one.figures() for one in done] for name, done in read.navigations.items()}
             yield read.terms.key(), read.policy, "file", navigations
 
 

@@ -146,11 +146,7 @@ class Navigation:
         return int(np.ceil(self.seconds / period_s - 1e-9))
 
     def reached(self, tip: TipProjection) -> Bool[np.ndarray, "..."]:
-        """Return which worlds have reached the target, see `reached`.
-
-        Args:
-            tip: of all devices, along the last axis.
-        """
+        """Return which worlds have reached the target, see `reached`; tips of all devices lie along the last axis."""
         return self.target.reached(tip[..., : self.arriving + 1])
 
 
@@ -163,14 +159,9 @@ def reached(
     """Return which worlds have reached their targets.
 
     The tip that is to arrive lies in the target's branch, within `SUCCESS_MM` of it along the centerline, and the
-    wire's tip lies no more than that behind it. Where a straight distance is given, the tip lies within that too, as
-    far as its distances along the centerline and from it say.
-
-    Args:
-        tip: of the wires, and if a catheter's are to arrive, those last, along the last axis.
-        branch: of the target of all, or of each.
-        abscissa: of the target of all, or of each, mm.
-        near_mm: straight distance from the target of all, or of each, mm.
+    wire's tip lies no more than that behind it. Where a straight distance `near_mm` is given, the tip lies within that
+    too, as far as its distances along the centerline and from it say. Along the last axis lie the tips of the wires,
+    and if a catheter's are to arrive, those last. Targets are one for all worlds, or one each.
     """
     wire, arriving = tip[..., 0], tip[..., -1]
     along_mm = np.abs(arriving.abscissa - abscissa)
