@@ -44,15 +44,15 @@ def mark(path: Path, submission: Submission) -> str:
     return "run by us" if path.parent == BY_US else "decided again" if at_hand else "replayed"
 
 
-def checked(path: Path) -> tuple[bool, str]:
+def checked(path: Path, by_us: Path = BY_US) -> tuple[bool, str]:
     """Drive a file again; return whether it may have its mark, and what came of it."""
     submission, policy = read_submission(path), ""
-    if path.parent == BY_US and submission.policy not in POLICIES.shipped:
+    if path.parent == by_us and ":" in submission.policy:
         module, _, thing = submission.policy.partition(":")
-        policy = LadderConfig(policy=f"{BY_US}/{module}.py:{thing}").policy
+        policy = LadderConfig(policy=f"{by_us}/{module}.py:{thing}").policy
     found = check_submission(path, policy=policy)
     remarks = "; ".join(filter(None, [found.difference, *found.remarks]))
-    if path.parent == BY_US and (submission.drawn is None or found.verdict != "decided again"):
+    if path.parent == by_us and (submission.drawn is None or found.verdict != "decided again"):
         return False, f"not run by us: drawn {submission.drawn}, {found.verdict}; {remarks}"
     return found.confirmed, f"{found.verdict}; {remarks}"
 

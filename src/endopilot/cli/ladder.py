@@ -8,6 +8,7 @@ from typing import Any
 
 from endopilot.cli.arguments import Answer, Existing, OutputFolder
 from endopilot.errors import InputError
+from endopilot.extras import extras_present, require_extras
 from endopilot.ladder.ladder import LadderConfig, climb
 
 
@@ -47,9 +48,10 @@ def command(
         return _tabulated(output or Path("runs"))
     if check is not None:
         return _confirmed(check, dataset, config.policy)
+    if dataset is not None:
+        require_extras("learn")  # before hours of work
     from endopilot.ladder.mismatch import MISMATCH_FILE, measure_mismatch
     from endopilot.ladder.submission import SUBMISSION_FILE
-    from endopilot.report.ladder_page import write_page
 
     name = config.policy.replace(":", ".")
     folder = output or Path("runs") / ("ladder-mismatch" if mismatch else "ladder") / name
@@ -59,8 +61,16 @@ def command(
     if mismatch:
         made = {"scores": folder / MISMATCH_FILE}
     else:
-        made = ({"page": write_page(folder)} if page else {}) | {"submission": folder / SUBMISSION_FILE}
+        made = (_page(folder) if page else {}) | {"submission": folder / SUBMISSION_FILE}
     return Answer(rows, [rows, made])
+
+
+def _page(folder: Path) -> dict[str, Any]:
+    if not extras_present()["report"]:
+        return {"left_out": "the page, which needs: pip install 'endopilot[report]'"}
+    from endopilot.report.ladder_page import write_page
+
+    return {"page": write_page(folder)}
 
 
 def _tabulated(folder: Path) -> Answer:

@@ -361,9 +361,10 @@ def _repeat(path: Path, *, terms: Terms, policy: str | None) -> None:
     task, place = terms.task(path.parent.name), int(path.stem)
     navigation, seed = task.ladder_navigation(place), navigation_seed(task, place)
     recording = Recording.unpacked(read_json(path), len(navigation.devices), terms)
-    figures = repeat(recording, navigation, seed=seed)
-    decided = policy is not None and attempt(policy, navigation, seed=seed, terms=terms)["sha256"] == figures["sha256"]
-    write_json(path, {"patient": navigation.anatomy.name} | figures | {"decided": decided})
+    figures = {"patient": navigation.anatomy.name} | repeat(recording, navigation, seed=seed)
+    if policy is not None:
+        figures["decided"] = attempt(policy, navigation, seed=seed, terms=terms)["sha256"] == figures["sha256"]
+    write_json(path, figures)
 
 
 def _difference(given: Mapping[str, Any], again: Mapping[str, Any]) -> str | None:
