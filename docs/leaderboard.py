@@ -74,9 +74,10 @@ def _tables() -> Iterator[str]:
         place = known.index(submission.version) if submission.version in known else len(known)
         row = _row(path, submission, links[path.stem])
         tables.setdefault((place, json_text(key)), []).append((key, row))
-    for _, rows in sorted(tables.items(), key=lambda item: (item[0][0], len(item[0][1]))):
+    for _, rows in sorted(tables.items(), key=lambda item: (item[0][0], '"drawn"' in item[0][1], len(item[0][1]))):
         key = rows[0][0]
-        yield from (f"### {TITLES.get(key['ladder'], key['ladder'])}", "", f"Key: {terms_in_words(key)}.", "")
+        drawn = ", drawn patients" * (key["patients"] == "drawn")
+        yield from (f"### {TITLES.get(key['ladder'], key['ladder'])}{drawn}", "", f"Key: {terms_in_words(key)}.", "")
         yield from (_line(*HEAD), "|" + "---|" * len(HEAD))
         yield from (line for _, line in sorted((row for _, row in rows), reverse=True))
         yield ""

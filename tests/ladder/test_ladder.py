@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from dataclasses import replace
 from html import unescape
 
@@ -218,6 +219,15 @@ def test_tasks_of_ones_own_are_climbed_scored_by_a_second_rule_and_checked(tmp_p
     list_tasks.cache_clear()
     with pytest.raises(InputError, match=r"task 'along' of ladder .*mine is not the one here"):
         check_submission(tmp_path / "run" / "submission.json")
+
+
+def test_without_the_libraries_of_its_page_a_ladder_says_what_is_left_out(climbed, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "plotly", None)  # as if it were not installed
+    with pytest.raises(SystemExit) as left:
+        main(["ladder", "--policy", "forward", "--tasks", "straight", "--patients", "1", "-o", str(climbed[0])])
+    printed = capsys.readouterr().out
+    assert left.value.code == 0 and "submission" in printed
+    assert "left_out    the page, which needs: pip install 'endopilot[report]'" in printed
 
 
 def test_the_table_is_made_of_what_was_driven_and_says_what_only_a_file_says(climbed, tmp_path, capsys):

@@ -26,10 +26,7 @@ def make_vec(name: str, num_envs: int = 1, **given: Any) -> VecEnv:
     Args:
         name: of an environment.
         num_envs: number of worlds.
-        given: what else `NavigateVectorEnv` takes.
-
-    Raises:
-        InputError: as for `NavigateVectorEnv`.
+        given: what else `NavigateVectorEnv` takes, and refuses by `InputError`.
     """
     return _Worlds(gymnasium.make_vec(name, num_envs=num_envs, autoreset_mode="SameStep", **given))
 

@@ -41,10 +41,8 @@ class NavigateEnv(gymnasium.Env):
             anatomy: a vessel of your own, or its folder.
             target: where the tip is to go in it: a section such as "LAD", or a point.
             render_mode: "rgb_array" lets `render` return pictures.
-            given: what else `NavigateVectorEnv` takes; of several navigations or patients the first is done.
-
-        Raises:
-            InputError: as for `NavigateVectorEnv`.
+            given: what else `NavigateVectorEnv` takes, and refuses by `InputError`; of several navigations or patients
+                the first is done.
         """
         given |= {"render_mode": render_mode, "autoreset_mode": AutoresetMode.DISABLED}
         self._worlds = NavigateVectorEnv(1, anatomy, target, **given)

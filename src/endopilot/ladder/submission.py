@@ -157,10 +157,7 @@ class SubmissionCheck:
 
 
 def blas_kernel() -> str | None:
-    """Return which kernel of linear algebra numpy and SciPy run here, such as openblas Haswell; None if it is not told.
-
-    Vessels differ by it in their last bits, and so does what is driven in them.
-    """
+    """Return which kernel of linear algebra numpy and SciPy run here, such as openblas Haswell; None if not told."""
     loaded = [each for each in threadpool_info() if each["user_api"] == "blas"]
     kernels = {f"{each['internal_api']} {each.get('architecture', '')}".strip() for each in loaded}
     return ", ".join(sorted(kernels)) or None
