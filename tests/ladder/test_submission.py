@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import runpy
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -293,6 +294,13 @@ def test_exposures_that_nobody_decided_again_are_not_confirmed(looking, tmp_path
     found = check_submission(path)
     assert found.verdict == "replayed"
     assert "exposures" not in found.scores[0] and found.scores[0]["exposures_as_recorded"] == 1.0
+
+
+def test_the_folder_alone_makes_nothing_run_by_us(written, tmp_path):
+    path = tmp_path / "submission.json"
+    path.write_text(json.dumps(written), encoding="utf-8")
+    leaderboard = runpy.run_path(str(Path(__file__).parents[2] / "docs" / "leaderboard.py"))
+    assert leaderboard["checked"](path, tmp_path) == (False, "not run by us: drawn None, decided again; ")
 
 
 def test_a_kernel_that_this_machine_lacks_is_not_judged(looking, tmp_path, monkeypatch):
