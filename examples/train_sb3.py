@@ -4,8 +4,8 @@
     python examples/train_sb3.py --minutes 5 --picture train_sb3.png
     python examples/train_sb3.py --minutes 30 --xray                # where seeing costs
 
-64 environments are stepped together; `WireVecEnv` is all that Stable-Baselines3 needs to see them as its own. The
-figure shows return and success of the episodes against time; the run ends with an error if nothing was learned.
+64 environments are stepped together, as `endopilot.env.sb3.make_vec` gives them to Stable-Baselines3. The figure shows
+return and success of the episodes against time; the run ends with an error if nothing was learned.
 """
 
 from __future__ import annotations
@@ -19,49 +19,14 @@ import torch
 from matplotlib.figure import Figure
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import VecMonitor
 
 import endopilot
+from endopilot.env.sb3 import make_vec
 
 ENVIRONMENTS, STEPS = 64, 64
 MOST_MM_S = 12.0
 """Of an action of 1."""
-
-
-class WireVecEnv(VecEnv):
-    """A `NavigateVectorEnv` as Stable-Baselines3 wants it: both reset a world that has ended in the same step."""
-
-    def __init__(self, count: int, observation: str) -> None:
-        self.worlds = endopilot.NavigateVectorEnv(count, observation=observation, autoreset_mode="SameStep")
-        super().__init__(count, self.worlds.single_observation_space, self.worlds.single_action_space)
-
-    def reset(self):
-        return self.worlds.reset(seed=self._seeds[0])[0]
-
-    def step_async(self, actions):
-        self.actions = actions
-
-    def step_wait(self):
-        observations, rewards, terminations, truncations, info = self.worlds.step(self.actions)
-        infos: list[dict] = [{} for _ in rewards]
-        for world in np.flatnonzero(terminations | truncations):
-            infos[world] = {
-                "terminal_observation": info["final_obs"][world],
-                "TimeLimit.truncated": bool(truncations[world]),
-                "success": bool(info["final_info"]["success"][world] and info["final_info"]["safe"][world]),
-            }
-        return observations, rewards.astype(np.float32), terminations | truncations, infos
-
-    def close(self):
-        self.worlds.close()
-
-    def get_attr(self, attr_name, indices=None):
-        return [getattr(self.worlds, attr_name, None)] * self.num_envs
-
-    def env_is_wrapped(self, wrapper_class, indices=None):
-        return [False] * self.num_envs
-
-    set_attr = env_method = None  # the worlds are stepped together
 
 
 class Clock(BaseCallback):
@@ -77,7 +42,7 @@ class Clock(BaseCallback):
     def _on_step(self) -> bool:
         now = time.monotonic() - self.began
         infos = [info for info in self.locals["infos"] if "episode" in info]
-        self.episodes += [(now, info["episode"]["r"], info["success"]) for info in infos]
+        self.episodes += [(now, info["episode"]["r"], info["is_success"]) for info in infos]
         return now < self.seconds
 
 
@@ -104,7 +69,7 @@ def main() -> None:
     asked = parser.parse_args()
     print(f"pushing alone: safe success {100 * pushing():.0f} %")
     torch.set_num_threads(1)
-    env = VecMonitor(WireVecEnv(ENVIRONMENTS, "xray" if asked.xray else "state"))
+    env = VecMonitor(make_vec(f"endopilot/Navigate{'Xray' if asked.xray else ''}-v0", num_envs=ENVIRONMENTS))
     env.seed(asked.seed)
     model = PPO(
         "MlpPolicy",

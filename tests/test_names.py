@@ -18,14 +18,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import endopilot
+from endopilot.tasks.targets import Place
 
 ROOT = Path(__file__).parents[1]
 LARGE = {
     "SimpleITK", "gymnasium", "jinja2", "matplotlib", "numpy", "pandas", "plotly", "pyarrow", "pydantic", "pydicom",
     "pyvista", "scipy", "skimage", "torch", "tyro", "vtk", "vtkmodules", "yaml",
 }  # fmt: skip
-SLOW = {"Axes": Axes, "Figure": Figure}
-"""Of other libraries, which a module imports only to be type-checked."""
+SLOW = {"Axes": Axes, "Figure": Figure, "Place": Place, "Target": endopilot.Target}
+"""What a module imports only to be type-checked."""
 ASKED = {
     "Anatomy", "read_anatomy", "extract_anatomy", "segment", "Wire", "read_wire", "Simulator", "simulate", "plan",
     "make_atlas", "generate_dataset", "train", "load_model", "navigate", "evaluate", "InputError", "read_volume",

@@ -19,7 +19,6 @@ from statistics import median
 sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
 
 from benchmarks.figures import DOCS, fill, markdown_table
-from endopilot.ladder.mismatch import title_of
 from endopilot.tasks.task import NEWEST, LadderVersion, find_task, list_tasks
 
 ROOT = Path(__file__).parents[2]
@@ -99,6 +98,13 @@ def _rows(mark: str) -> list[tuple[str, ...]]:
     text = (DOCS / PAGE).read_text(encoding="utf-8").split(f"<!-- {mark}:begin -->")[1].split(f"<!-- {mark}:end -->")[0]
     rows = [tuple(cell.strip() for cell in line.strip("|").split("|")) for line in text.splitlines() if line[:1] == "|"]
     return [row for row in rows if set(row[0]) != {"-"}]
+
+
+def title_of(case: str, share: float) -> str:
+    """Return a case of model mismatch in words."""
+    name, _, side = case.partition("-")
+    sign = {"more": " +", "less": " −"}.get(side, ", ±")
+    return case if case == "matched" else f"{name}{sign}{100 * share:g} %"
 
 
 def mismatch(folder: Path) -> list[str]:

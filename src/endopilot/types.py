@@ -24,6 +24,7 @@ import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -35,6 +36,9 @@ from endopilot.errors import InputError
 if TYPE_CHECKING:  # slow to import
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from endopilot.tasks.navigation import Target
+    from endopilot.tasks.targets import Place
 
 SAMPLE_PERIOD_S = 0.5  # time between two recorded samples, s: the paper records at 2 Hz
 
@@ -284,6 +288,20 @@ class Anatomy:
         branches, length = len(self.tree.branches), float(self.tree.longest_path().abscissa[-1])
         sections = ", ".join(self.tree.sections_present)
         return f"Anatomy(name={self.name!r}, branches={branches}, longest_path_mm={length:.1f}, sections={sections!r})"
+
+    def target(self, place: Place, *, depth_mm: float | None = None) -> Target:
+        """Return the target that is meant, as navigations, environments and commands understand it.
+
+        Args:
+            place: a section such as "4" or "LAD", whose middle is meant; a point X, Y, Z in LPS mm, which is moved to
+                the centerline; or a target, which is checked.
+            depth_mm: the place so far beyond the section's begin is meant, mm.
+
+        Raises:
+            InputError: nothing is named, or what does not lie in the vessel.
+        """
+        find_target = import_module("endopilot.tasks.targets").find_target  # by name: this module imports no room
+        return find_target(self.tree, place, depth_mm=depth_mm)
 
     def plot(
         self,

@@ -196,6 +196,13 @@ def test_the_same_seed_and_actions_give_the_same_bits(either):
     assert not np.array_equal(start, first.reset(seed=5)[0])
 
 
+def test_a_world_that_is_given_no_seed_goes_on_with_its_generator(near):
+    one, other = NavigateVectorEnv(2, navigations=near), NavigateVectorEnv(2, navigations=near)
+    for env in (one, other):
+        env.reset(seed=4)
+    assert np.array_equal(one.reset(seed=[None, None])[0], other.reset()[0])
+
+
 def test_a_single_environment_is_one_world_of_the_vector_environment(either):
     actions = _actions(either, steps=22)  # of 23
     many = NavigateVectorEnv(WORLDS, navigations=either, autoreset_mode=AutoresetMode.DISABLED)

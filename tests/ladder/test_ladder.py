@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import sys
 from dataclasses import replace
 from html import unescape
 
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 
 from endopilot import __version__, runs
+from endopilot.cli import main
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.ladder import attempt as attempts
@@ -18,6 +21,7 @@ from endopilot.ladder.attempt import attempt
 from endopilot.ladder.ladder import LadderConfig, climb
 from endopilot.ladder.scores import score
 from endopilot.ladder.submission import check_submission
+from endopilot.ladder.table import tabulate
 from endopilot.report.ladder_page import write_page
 from endopilot.tasks.task import find_task, list_tasks
 from endopilot.types import TipProjection
@@ -213,5 +217,40 @@ def test_tasks_of_ones_own_are_climbed_scored_by_a_second_rule_and_checked(tmp_p
     assert "<th>Near, %</th>" in page and "a point for each patient" in page
     own_tasks(tmp_path / "mine", seconds=5.0, targets_mm=[[0, 0, 21], [0, 0, 30]])
     list_tasks.cache_clear()
-    with pytest.raises(InputError, match=r"task 'along' of .*mine is another than the file was made with"):
+    with pytest.raises(InputError, match=r"task 'along' of ladder .*mine is not the one here"):
         check_submission(tmp_path / "run" / "submission.json")
+
+
+def test_without_the_libraries_of_its_page_a_ladder_says_what_is_left_out(climbed, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "plotly", None)  # as if it were not installed
+    with pytest.raises(SystemExit) as left:
+        main(["ladder", "--policy", "forward", "--tasks", "straight", "--patients", "1", "-o", str(climbed[0])])
+    printed = capsys.readouterr().out
+    assert left.value.code == 0 and "submission" in printed
+    assert "left_out    the page, which needs: pip install 'endopilot[report]'" in printed
+
+
+def test_the_table_is_made_of_what_was_driven_and_says_what_only_a_file_says(climbed, tmp_path, capsys):
+    folder, (scores,) = climbed
+    (row,) = tabulate(folder.parent)
+    assert {name: row[name] for name in scores if name != "level"} == {k: v for k, v in scores.items() if k != "level"}
+    assert (row["source"], row["navigations"], row["late"]) == ("run", 1, 0.0) and 0 < row["decision_ms"] <= row[
+        "p99_ms"
+    ]
+    shutil.copytree(folder, tmp_path / "run")
+    content = json.loads((tmp_path / "run" / "ladder.json").read_text(encoding="utf-8"))
+    content["scores"][0]["safe_success"] = 0.5  # what is written by hand does not count
+    (tmp_path / "run" / "ladder.json").write_text(json.dumps(content), encoding="utf-8")
+    shutil.copy(folder / "submission.json", tmp_path / "mine.json")
+    with pytest.raises(SystemExit) as left:
+        main(["ladder", "--table", "--json", "-o", str(tmp_path)])
+    file, run = sorted(json.loads(capsys.readouterr().out), key=lambda each: each["source"])
+    assert left.value.code == 0 and run["safe_success"] == file["safe_success"] == 1.0
+    assert (file["source"], file["decision_ms"], file["terms"]) == ("file", None, run["terms"])
+    with pytest.raises(SystemExit) as left:
+        main(["ladder", "--table", "-o", str(tmp_path)])
+    printed = capsys.readouterr().out
+    assert left.value.code == 0 and "\nas submissions say\n" in printed
+    assert max(map(len, printed.splitlines())) <= 80
+    with pytest.raises(InputError, match="holds no run of `endopilot ladder` and no submission"):
+        tabulate(tmp_path / "run" / "straight")

@@ -11,7 +11,7 @@ from endopilot import runs
 from endopilot.errors import InputError
 from endopilot.ladder import mismatch as mismatches
 from endopilot.ladder.ladder import LadderConfig
-from endopilot.ladder.mismatch import CASES, measure_mismatch, title_of, world_of
+from endopilot.ladder.mismatch import CASES, measure_mismatch, world_of
 from endopilot.simulation.world import World
 from endopilot.tasks.task import find_task
 
@@ -53,10 +53,8 @@ def test_a_row_a_case_and_a_deeper_wire_arrives_sooner(measured):
     assert [row["case"] for row in rows] == ["matched", "ostium-more", "all"]
     assert all(row["navigations"] == 1 and row["safe_success"] == 1.0 for row in rows)
     assert rows[1]["seconds"] < rows[0]["seconds"]
-    assert rows[0]["exposures_per_minute"] == pytest.approx(60 / rows[0]["seconds"], abs=0.1)
     content = json.loads((folder / "mismatch.json").read_text(encoding="utf-8"))
     assert content["cases"] == rows and content["mismatch"] == 0.2
-    assert (folder / "mismatch.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_an_interrupted_run_goes_on_and_another_share_needs_another_folder(measured, monkeypatch):
@@ -75,9 +73,3 @@ def test_a_share_beyond_its_range_is_refused(tmp_path):
     with pytest.raises(InputError, match="world: rough; mismatch makes worlds of its own"):
         measure_mismatch(tmp_path / "new", replace(ONE, world="rough"), 0.2)
     assert not (tmp_path / "new").exists()
-
-
-def test_cases_in_words():
-    assert [title_of(case, 0.2) for case in ("matched", "friction-less", "all")] == [
-        "matched", "friction −20 %", "all, ±20 %",
-    ]  # fmt: skip

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import runpy
+import shutil
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -16,6 +19,7 @@ from endopilot.ladder.terms import Terms
 from endopilot.navigation.policy import Observation
 from endopilot.tasks.task import find_task
 
+LEADERBOARD = Path(__file__).parents[2] / "docs" / "leaderboard.py"
 _POLICY = """
 import gc
 from endopilot.navigation.policy import Decision
@@ -71,7 +75,15 @@ def test_a_policy_from_a_file_is_run_in_patients_that_its_request_draws(spies, t
     assert [entry["seed"] for entry in done] == [drawn.seed, drawn.seed + 1] and drawn.seed != usual.seed
     assert len({entry["patient"] for entry in done}) == 2
     found = check_submission(tmp_path / "run" / "submission.json")
-    assert found.confirmed and found.key["patients"] == "drawn" and found.key != Terms().key()
+    assert found.verdict == "replayed" and found.key["patients"] == "drawn" and found.key != Terms().key()
+    checked = runpy.run_path(str(LEADERBOARD))["checked"]
+    by_us = shutil.copy(tmp_path / "run" / "submission.json", spies.parent)
+    assert checked(Path(by_us), spies.parent) == (True, "decided again; ")  # by the file that lies beside it
+    spies.write_text(_POLICY.replace("6.0, 0.1", "6.0, 0.2"))
+    assert checked(Path(by_us), spies.parent)[1].startswith("not run by us: drawn commit 1f3a, failed; task straight")
+    Path(by_us).write_text(json.dumps(content | {"policy": "unknown"}), encoding="utf-8")
+    with pytest.raises(InputError, match="task straight, patient 0: seed"):  # whoever is asked for draws the patients
+        checked(Path(by_us), spies.parent)
     for change in ({"drawn": "commit 2"}, {"drawn": None}):
         (tmp_path / "changed.json").write_text(json.dumps(content | change), encoding="utf-8")
         with pytest.raises(InputError, match="task straight, patient 0: seed"):

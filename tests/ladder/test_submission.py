@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import runpy
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -104,7 +105,7 @@ def test_a_file_of_version_1_is_driven_again_in_the_textbook_s_patients(tmp_path
     path.write_text(json.dumps(content), encoding="utf-8")
     assert check_submission(path).difference is None
     path.write_text(json.dumps(content | {"ladder": 2}), encoding="utf-8")
-    with pytest.raises(InputError, match="task 'straight' is not the one of endopilot"):
+    with pytest.raises(InputError, match="task 'straight' of ladder 2 is not the one here"):
         check_submission(path)
 
 
@@ -165,7 +166,7 @@ def test_a_changed_score_is_named(changed):
     ("change", "message"),
     [
         (lambda c: _first(c).update(seed=101), "task straight, patient 0: seed 101; the ladder's is 100"),
-        (lambda c: c["tasks"].update(straight="0" * 64), "task 'straight' is not the one of endopilot"),
+        (lambda c: c["tasks"].update(straight="0" * 64), "task 'straight' of ladder 2 is not the one here"),
         (lambda c: c["tasks"].pop("straight"), "tasks and navigations name different tasks"),
         (lambda c: c["navigations"]["straight"].append(_first(c)), "needs the same first 1 to 20 patients"),
         (lambda c: c.update(format=2), "format: 2; choose from 1, or give a submission.json"),
@@ -261,6 +262,7 @@ def looking(tmp_path_factory) -> dict:
         (lambda c: c.update(blas=None), "blas: none; "),
         (_of_another_kernel, None),  # or this machine lacks the kernel
         (_without_exposures, "retract-rotate decides otherwise"),
+        (_of_another_version, "retract-rotate decides otherwise"),
         (_of_a_better_hand, "retract-rotate decides otherwise"),
         (_in_another_patient, "task straight, patient 0: "),
         (lambda c: c["scores"][0].update(safe_success=0.999), "scores, straight: safe_success is 0.999 in the file"),
@@ -287,13 +289,18 @@ def test_a_forgery_is_never_confirmed(looking, tmp_path, forge, said):
 
 def test_exposures_that_nobody_decided_again_are_not_confirmed(looking, tmp_path):
     content, path = json.loads(json.dumps(looking)), tmp_path / "submission.json"
-    _of_another_version(content)
-    path.write_text(json.dumps(content), encoding="utf-8")
+    _without_exposures(content)
+    path.write_text(json.dumps(content | {"policy": "of-mine"}), encoding="utf-8")
     found = check_submission(path)
-    assert found.verdict == "replayed" and found.remarks[-1] == (
-        "retract-rotate decides otherwise here in 1 of 2 navigations"
-    )
+    assert found.verdict == "replayed"
     assert "exposures" not in found.scores[0] and found.scores[0]["exposures_as_recorded"] == 1.0
+
+
+def test_the_folder_alone_makes_nothing_run_by_us(written, tmp_path):
+    path = tmp_path / "submission.json"
+    path.write_text(json.dumps(written), encoding="utf-8")
+    leaderboard = runpy.run_path(str(Path(__file__).parents[2] / "docs" / "leaderboard.py"))
+    assert leaderboard["checked"](path, tmp_path) == (False, "not run by us: drawn None, decided again; ")
 
 
 def test_a_kernel_that_this_machine_lacks_is_not_judged(looking, tmp_path, monkeypatch):

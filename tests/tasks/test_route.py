@@ -11,7 +11,7 @@ import pytest
 from benchmarks.anatomy.analytic_lumens import tree_of
 from endopilot.anatomy.projection import project_tip
 from endopilot.errors import InputError
-from endopilot.tasks.navigation import Target
+from endopilot.tasks.navigation import Navigation, Target
 from endopilot.tasks.route import Route, check_passable
 from endopilot.tasks.targets import find_target
 from endopilot.types import Branch, VesselTree
@@ -121,7 +121,7 @@ def test_targets_by_name_and_by_place(fork):
     point = find_target(anatomy.tree, "0.3, 0, 31.9")
     assert point.branch == 1 and point.abscissa == pytest.approx(32.0, abs=0.3)
     assert find_target(anatomy.tree, [0.3, 0.0, 31.9]) == find_target(anatomy.tree, point) == point
-    beyond = find_target(anatomy.tree, "PDA", depth_mm=4.0)
+    beyond = anatomy.target("PDA", depth_mm=4.0)
     assert (beyond.branch, beyond.abscissa) == (2, pytest.approx(24.0))
 
 
@@ -132,13 +132,24 @@ def test_targets_by_name_and_by_place(fork):
         ("50,0,0", "nearest centerline"),
         ("1,nan,2", "finite"),
         ("1,x,2", "finite"),
+        ((1.0, 2.0), "1.0,2.0; not three"),
         (Target(branch=3, abscissa=1.0), "branches 0 to 2"),
         (Target(branch=2, abscissa=1.0), "runs from 20.0"),
     ],
 )
-def test_targets_outside_the_tree_are_refused(fork, text, part):
+def test_targets_outside_the_tree_are_refused(fork, wire, text, part):
     with pytest.raises(InputError, match=part):
         find_target(named(fork).tree, text)
+    with pytest.raises(InputError, match=part):
+        Navigation(anatomy=named(fork), device=wire, target=text)
+
+
+@pytest.mark.parametrize("place", ["4", [0.3, 0.0, 31.9], "0.3,0,31.9"])
+def test_a_navigation_takes_a_target_by_name_and_by_place(fork, wire, place):
+    anatomy = named(fork)
+    navigation = Navigation(anatomy=anatomy, device=wire, target=place)
+    assert navigation.target == find_target(anatomy.tree, place)
+    assert replace(navigation, target="3").target == anatomy.target("3")
 
 
 def test_a_lumen_narrower_than_the_wire_hides_what_lies_behind_it(fork, wire):

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from endopilot.cli.arguments import Answer, Existing, OutputFolder
 from endopilot.errors import InputError
+from endopilot.extras import extras_present, require_extras
 from endopilot.ladder.ladder import LadderConfig, climb
 
 
@@ -16,6 +18,7 @@ def command(
     mismatch: float = 0.0,
     check: Existing | None = None,
     dataset: Path | None = None,
+    table: bool = False,
     page: bool = True,
     config: LadderConfig = LadderConfig(),
 ) -> Answer:
@@ -34,15 +37,20 @@ def command(
             judged here. No policy climbs then.
         dataset: folder of a LeRobot data set of the navigations, with X-ray images, their recordings being driven again
             (docs/concepts/dataset.md).
+        table: print what lies on disk, and let no policy climb: a row for each task and policy of the runs in and below
+            the output folder, or runs if not given, and of the submissions in it, with the time that decisions took.
         page: write index.html with pictures and replays; --no-page leaves it out.
     """
     if dataset is not None and mismatch:
         raise InputError("dataset: with --mismatch, which writes no submission; leave one of them out")
+    if table:
+        return _tabulated(output or Path("runs"))
     if check is not None:
         return _confirmed(check, dataset, config.policy)
-    from endopilot.ladder.mismatch import PICTURE_FILE, measure_mismatch
+    if dataset is not None:
+        require_extras("learn")  # before hours of work
+    from endopilot.ladder.mismatch import MISMATCH_FILE, measure_mismatch
     from endopilot.ladder.submission import SUBMISSION_FILE
-    from endopilot.report.ladder_page import write_page
 
     name = config.policy.replace(":", ".")
     folder = output or Path("runs") / ("ladder-mismatch" if mismatch else "ladder") / name
@@ -50,10 +58,28 @@ def command(
     if dataset is not None:
         _write_dataset(folder / SUBMISSION_FILE, dataset)
     if mismatch:
-        made = {"picture": folder / PICTURE_FILE}
+        made = {"scores": folder / MISMATCH_FILE}
     else:
-        made = ({"page": write_page(folder)} if page else {}) | {"submission": folder / SUBMISSION_FILE}
+        made = (_page(folder) if page else {}) | {"submission": folder / SUBMISSION_FILE}
     return Answer(rows, [rows, made])
+
+
+def _page(folder: Path) -> dict[str, Any]:
+    if not extras_present()["report"]:
+        return {"left_out": "the page, which needs: pip install 'endopilot[report]'"}
+    from endopilot.report.ladder_page import write_page
+
+    return {"page": write_page(folder)}
+
+
+def _tabulated(folder: Path) -> Answer:
+    from endopilot.ladder.table import shown_row, tabulate, terms_in_words
+
+    rows, shown = tabulate(folder), dict[str, list[dict[str, Any]]]()
+    for row in rows:
+        title = terms_in_words(row["terms"]) + ("\nas submissions say" if row["source"] == "file" else "")
+        shown.setdefault(title, []).append(shown_row(row))
+    return Answer(rows, [part for title, some in shown.items() for part in (title, some, "")])
 
 
 def _confirmed(file: Path, dataset: Path | None, policy: str) -> Answer:

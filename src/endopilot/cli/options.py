@@ -44,7 +44,7 @@ LISTED: Mapping[str, str] = MappingProxyType(
         "train": "output epochs batch_size learning_rate max_seconds seed processor precision json",
         "plan": "target output device catheter model method seconds force_limit_n xray json",
         "navigate": "target output policy device catheter world robot xray seed json",
-        "ladder": "output policy tasks patients version robot world mismatch check json",
+        "ladder": "output policy tasks patients version robot world table check json",
         "xray": "output show view_deg zoom device inserted_length_mm catheter catheter_inserted_length_mm ct json",
         "locate": "camera output picture page device landmark_mm landmark_px registration_sd_mm travel_mm json",
         "angiograms": "output device catheter cines seconds seed drive motion dose json",

@@ -1,10 +1,7 @@
 """Navigation as environments for learning.
 
-`import endopilot` has Gymnasium know `endopilot/Navigate-v0`, `endopilot/NavigateXray-v0`,
-`endopilot/NavigateCoaxial-v0` and an environment for each task of the ladder, once Gymnasium is imported, before or
-after: `gymnasium.make("endopilot/Crux-v2")`. In a program that imports neither, the package stands before the name:
-`gymnasium.make("endopilot.env:endopilot/Crux-v2")`. A task of the ladder's version 1 ends in `-v0`, one of its version
-2 or of wire and catheter in `-v2`.
+`import endopilot` has Gymnasium know them, imported before or after: `gymnasium.make("endopilot/Crux-v2")`. A program
+that does not import it writes `endopilot.env:` before the name. A task of the ladder's version 1 ends in `-v0`.
 """
 
 from __future__ import annotations

@@ -29,8 +29,7 @@ class NavigationState:
 
     Attributes:
         simulator: the worlds.
-        kept: all else, as it is kept within the environment: how far the episodes are, the random generators, robots
-            and what else differs from episode to episode, and the last exposures.
+        kept: all else: how far the episodes are, random generators, robots and what else is drawn, the last exposures.
     """
 
     simulator: SimulatorState

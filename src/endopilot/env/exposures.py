@@ -35,14 +35,8 @@ _TARGET = np.arange(-1, 2)
 class Exposed:
     """The last exposure of each world; a row a world.
 
-    Attributes:
-        count: exposures since the start of the episode.
-        time_s: when the last was taken, since that start.
-        encoders: Δ, mm, and φ, rad, of the wire at that moment, as they were measured.
-        position: where the wire's tip was found, LPS mm.
-        tip: projection of that to the centerline.
-        image: the images, a view each; without rows where exposures are no images.
-        random: where errors and noise are drawn from.
+    `count` and `time_s` count from the episode's start. `encoders` are Δ, mm, and φ, rad, of the wire as measured then;
+    `position` is where its tip was found, LPS mm, `tip` the projection of that. Without images `image` has no rows.
     """
 
     count: Int[np.ndarray, "worlds"]
@@ -55,11 +49,7 @@ class Exposed:
 
 
 class CArms:
-    """A C-arm around each patient of an environment.
-
-    Attributes:
-        exposed: what they showed last.
-    """
+    """A C-arm around each patient of an environment; `exposed` is what they showed last."""
 
     def __init__(
         self,
@@ -69,11 +59,7 @@ class CArms:
         config: FluoroscopeConfig,
         pixels: int,
     ) -> None:
-        """Bring the middle of each vessel to the isocenter.
-
-        Args:
-            pixels: columns and rows of an image; 0 for exposures that say where the tip is.
-        """
+        """Bring each vessel's middle to the isocenter; without `pixels` of a row, exposures say where the tip is."""
         count, own = len(navigations), list(dict.fromkeys(navigations))
         self._pixels, motions = pixels, [(each.known_motion, each.anatomy.insertion.position) for each in navigations]
         self._known = [motion and motion.core(np.asarray(ostium)) for motion, ostium in motions]
@@ -116,12 +102,7 @@ class CArms:
         registration_mm: Float[np.ndarray, "worlds 3"],
         time_s: Float[np.ndarray, "worlds"],
     ) -> None:
-        """Take an exposure of every view in the worlds of a mask.
-
-        Args:
-            encoders: Δ, mm, and φ, rad, of the devices as they are measured.
-            registration_mm: the wires show displaced by this, mm LPS.
-        """
+        """Take an exposure of every view in the worlds of a mask; wires show displaced by `registration_mm`."""
         chosen = np.flatnonzero(mask & simulator.valid)
         if not len(chosen):
             return
@@ -159,7 +140,7 @@ def _noise() -> Float32[np.ndarray, "n"]:
 
 
 class Views:
-    """The views of one navigation: what stays the same, and the roadmap with the target that lies under every image."""
+    """The views of one navigation: what all its images have in common, such as the roadmap with the target."""
 
     def __init__(self, navigation: Navigation, real: Anatomy, config: FluoroscopeConfig, pixels: int) -> None:
         geometry = replace(config.geometry, pixel_mm=config.geometry.pixel_mm * _FULL_PIXELS / pixels)

@@ -29,14 +29,9 @@ class RouteTables:
     """The route of each world, from the ostium to the end of the target's branch.
 
     Attributes:
-        places: of each route, a row for each place, every `STEP_MM` along it, LPS mm: the place; the route's tangent
-            there and two normals that are carried along without twist; the lumen's radius; the places `AHEAD_MM`
-            farther on, in that frame and in units of that distance; half the radii at these. A shorter route is padded
-            with its last place.
-        leave: of each route, for each branch of the tree, the abscissa where the path into it leaves the route, mm;
-            infinite for the branches of the route and for those that the tree does not have.
-        route: which of these routes each world has.
-        target: abscissa of each world's target, mm.
+        places: a row every `STEP_MM`: the place, LPS mm; tangent and two normals that are carried along without twist;
+            radius; the places `AHEAD_MM` farther on, in that frame and in units of that distance; half the radii there.
+        leave: for each branch of the tree, where the path into it leaves the route, mm; infinite for those on it.
     """
 
     places: Float[np.ndarray, "routes places columns"]
@@ -75,8 +70,7 @@ class RouteTables:
     ) -> Float[np.ndarray, "worlds columns"]:
         """Return what is observed at the place of each world's route that is nearest to its wire's tip along the tree.
 
-        The columns are the wire's direction in the route's frame, if it is given; the tip's distances along both
-        normals, in radii of the lumen; the places ahead and half the radii there.
+        The wire's direction in the route's frame leads, if it is given, then the tip's offsets along both normals.
         """
         along = np.rint(np.minimum(self.leave[self.route, tip.branch], tip.abscissa) / STEP_MM).astype(np.int64)
         row = self.places[self.route, np.minimum(np.maximum(along, 0), self.places.shape[1] - 1)]
@@ -121,16 +115,8 @@ def space(observed: Observed, catheters: int, images: tuple[int, int, int]) -> S
 class Measured:
     """The worlds at one moment; row i belongs to world i.
 
-    Attributes:
-        tip: projections of the devices' tips to the centerline.
-        position: of the tips, LPS mm.
-        direction: unit vectors along the devices at their tips.
-        contact_force: largest force of the wall on one node, N.
-        inserted_length: Δ of the devices, mm.
-        rotation: φ, rad.
-        encoders: both as they are measured: by a robot's encoders where there is a robot.
-        valid: false for a world that has failed.
-        distance_mm: path length from every tip to its target, mm.
+    `tip` are projections of the tips, `position` and `direction` their places, LPS mm, and headings; `contact_force` is
+    the largest on one node, N; `encoders` are Δ, mm, and φ, rad, as measured, `distance_mm` path lengths to the target.
     """
 
     tip: TipProjection
@@ -192,12 +178,7 @@ def observe_exposed(
     time_s: Float[np.ndarray, "worlds"],
     time_share: Float[np.ndarray, "worlds"],
 ) -> Float[np.ndarray, "worlds features"]:
-    """Return what is measured, as the specification has it.
-
-    Args:
-        proximal: Δ, mm, φ, rad, and the drives' force and torque, N and N·mm, as they are measured.
-        routes: the paths to the targets; not given where exposures are images.
-    """
+    """Return what is measured, as the specification has it; without routes, where exposures are images."""
     wire, *catheters = (
         [inserted / 100.0, np.cos(turned), np.sin(turned), force / 0.5, torque / 0.5]
         for inserted, turned, force, torque in proximal.transpose(1, 2, 0)

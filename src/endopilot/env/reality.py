@@ -60,12 +60,8 @@ def draw_robot(random: np.random.Generator) -> RobotConfig:
 class Drawn:
     """What episodes begin with and go on with; a row a world.
 
-    Attributes:
-        ostium_mm: the true inserted lengths are this much more than the encoders', mm.
-        registration_mm: X-ray shows the wire displaced by this, mm LPS.
-        backs_out_mm: the guiding catheter has yet to back out by this, mm.
-        robots: what drives; None where the devices do as commanded.
-        readings: what the robots measured last: Δ, mm, φ, rad, N and N·mm; None likewise.
+    True inserted lengths are `ostium_mm` more than the encoders', and the guiding catheter has yet to back out by
+    `backs_out_mm`. `readings` are what `robots` measured last; both are None where the devices do as commanded.
     """
 
     ostium_mm: Float[np.ndarray, "worlds"]
@@ -76,11 +72,7 @@ class Drawn:
 
 
 class Reality:
-    """The worlds of an environment as they truly are.
-
-    Attributes:
-        drawn: what differs from episode to episode.
-    """
+    """The worlds of an environment as they truly are; `drawn` is what differs from episode to episode."""
 
     def __init__(
         self,
@@ -91,14 +83,7 @@ class Reality:
         motion: Motion | None,
         config: SimulatorConfig,
     ) -> None:
-        """Lay the devices out, each world as it is.
-
-        Args:
-            navigations: of each world, as they are given.
-            world: what differs: of all worlds, or of world i number i modulo their number; "random" draws some.
-            robot: what drives, likewise; the devices do as commanded if not given.
-            motion: of all vessels, where worlds have none.
-            config: of the rod core, where worlds have none.
+        """Lay the devices out, each world as it is; the arguments are those of `NavigateVectorEnv`.
 
         Raises:
             InputError: no such world or robot; worlds that differ in what all must have in common.
@@ -196,12 +181,7 @@ class Reality:
     def drive(
         self, control: Float[np.ndarray, "worlds devices 2"], period_s: float, time_s: Float[np.ndarray, "worlds"]
     ) -> Step:
-        """Move the devices for a while, by robots if there are some.
-
-        Args:
-            control: what drives are commanded, mm/s and rad/s.
-            time_s: since each episode's start, s.
-        """
+        """Move the devices for a while, by robots if there are some; `time_s` counts from each episode's start."""
         simulator, drawn = self.simulator, self.drawn
         back = np.zeros(len(time_s))  # by how much each guiding catheter backs out
         if drawn.backs_out_mm.any():

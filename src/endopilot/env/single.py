@@ -41,10 +41,8 @@ class NavigateEnv(gymnasium.Env):
             anatomy: a vessel of your own, or its folder.
             target: where the tip is to go in it: a section such as "LAD", or a point.
             render_mode: "rgb_array" lets `render` return pictures.
-            given: what else `NavigateVectorEnv` takes; of several navigations or patients the first is done.
-
-        Raises:
-            InputError: as for `NavigateVectorEnv`.
+            given: what else `NavigateVectorEnv` takes, and refuses by `InputError`; of several navigations or patients
+                the first is done.
         """
         given |= {"render_mode": render_mode, "autoreset_mode": AutoresetMode.DISABLED}
         self._worlds = NavigateVectorEnv(1, anatomy, target, **given)
@@ -55,11 +53,7 @@ class NavigateEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode.
-
-        Raises:
-            InputError: there are options, of which it knows none.
-        """
+        """Start an episode; it knows no options, and refuses them by `InputError`."""
         refuse_options(options)
         super().reset(seed=seed)
         self._worlds.draw_from(self.np_random)
@@ -67,11 +61,7 @@ class NavigateEnv(gymnasium.Env):
         return of_world(observations, 0), _first(infos)
 
     def step(self, action: ArrayLike) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
-        """Drive the wire for a control period.
-
-        Raises:
-            ResetNeeded: it has not been reset, or its episode has ended.
-        """
+        """Drive the wire for a control period; `ResetNeeded` is raised before `reset` and after an episode's end."""
         row = np.asarray(action, dtype=float)[None]
         observations, rewards, terminations, truncations, infos = self._worlds.step(row)
         ended = bool(terminations[0]), bool(truncations[0])

@@ -15,11 +15,9 @@ class TipFinder:
     """C-arms around some patients, of which each world has one; world by world with the same results."""
 
     def __init__(self, arms: Sequence[Fluoroscope], arm: Int[np.ndarray, "worlds"]) -> None:
-        """Lay out the lines of all patients in tables, a row an arm; a shorter one ends in vertices of no branch.
+        """Lay out the lines of all patients, of `arms` of one configuration, in tables, a row an arm.
 
-        Args:
-            arms: of one configuration.
-            arm: number of each world's.
+        A shorter one ends in vertices of no branch. `arm` is the number of each world's.
         """
         self._arm, self._config, views = arm, arms[0]._config, [each._views for each in arms]
         lengths = [[len(line) for line in each._points] for each in arms]
@@ -54,12 +52,8 @@ class TipFinder:
     ) -> Float[np.ndarray, "n 3"]:
         """Take an exposure of every view in some worlds and return where the tips are found to be, LPS mm.
 
-        Args:
-            worlds: their numbers.
-            tip: where the tips truly are, LPS mm.
-            heading: unit vectors along the wires there.
-            inserted: Δ by the encoders, mm.
-            noise: standard normal; along and across the wire.
+        `tip` is where they truly are, `heading` along the wires there, and `inserted` is Δ by the encoders, mm; `noise`
+        is standard normal, along and across the wire.
         """
         arm, config = self._arm[worlds], self._config
         pixel, slope = self._seen(arm, tip)

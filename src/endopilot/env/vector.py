@@ -32,7 +32,7 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation
-from endopilot.tasks.targets import Place, find_target
+from endopilot.tasks.targets import Place
 from endopilot.tasks.task import CORE, LadderVersion, in_catheter, reference_navigation, training_navigations
 from endopilot.types import Anatomy
 from endopilot.xray.fluoroscope import FluoroscopeConfig
@@ -51,11 +51,7 @@ _PIXELS = (64, 128)
 
 
 def refuse_options(options: dict[str, Any] | None, *known: str) -> None:
-    """Refuse what `reset` does not understand.
-
-    Raises:
-        InputError: there is such an option.
-    """
+    """Raise `InputError` for an option that `reset` does not understand."""
     for name in set(options or {}) - set(known):
         raise InputError(f"options: {name!r}; reset takes {' and '.join(known) or 'none'}, all else is given to make")
 
@@ -108,7 +104,7 @@ class NavigateVectorEnv(VectorEnv):
         Args:
             num_envs: number of worlds.
             anatomy: a vessel of your own, or its folder, for the wire `workhorse-014`.
-            target: where the tip is to go in it, as `find_target` understands it: a section such as "LAD", or a point.
+            target: where the tip is to go in it, as `Anatomy.target` does: a section such as "LAD", or a point.
             navigations: in place of these, one for all worlds, or several, of which world i has number i modulo their
                 number.
             task: in place of them, the name of a task of the ladder.
@@ -153,8 +149,7 @@ class NavigateVectorEnv(VectorEnv):
             raise InputError("anatomy, target: give both, such as NavigateEnv(anatomy, target='LAD'), or neither")
         if anatomy is not None and target is not None:
             vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
-            there = find_target(vessel.tree, target)
-            navigations = [Navigation(anatomy=vessel, device=read_wire("workhorse-014"), target=there)]
+            navigations = [Navigation(anatomy=vessel, device=read_wire("workhorse-014"), target=vessel.target(target))]
             navigations = in_catheter(navigations, catheter) if catheter else navigations
         elif navigations is None:
             ours = task or version != 1
@@ -218,14 +213,11 @@ class NavigateVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode in every world, or in those of `options["reset_mask"]`.
+        """Start an episode in every world, or in those of `options["reset_mask"]`, a boolean for each.
 
         Args:
             seed: world i draws from seed + i, or from its own; without one the generators go on.
-            options: `reset_mask`, a boolean for each world.
-
-        Returns:
-            Observations and info of all worlds.
+            options: `reset_mask` or none.
 
         Raises:
             InputError: another option, or a mask of another shape.
@@ -237,7 +229,8 @@ class NavigateVectorEnv(VectorEnv):
         if seed is not None:
             seeds = [seed + world for world in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
             for world in np.flatnonzero(mask).tolist():
-                self._generators[world] = seeding.np_random(seeds[world])[0]
+                if seeds[world] is not None:
+                    self._generators[world] = seeding.np_random(seeds[world])[0]
         self._begin(mask)
         now = self._now()
         return self._observe(now), self._infos(now, mask)
@@ -251,13 +244,7 @@ class NavigateVectorEnv(VectorEnv):
         Bool[np.ndarray, "worlds"],
         dict[str, Any],
     ]:
-        """Drive every world for a control period.
-
-        Args:
-            actions: a row a world.
-
-        Returns:
-            Observations, rewards, terminations, truncations and info, as the class says.
+        """Drive every world for a control period, by a row of actions each.
 
         Raises:
             ResetNeeded: a world has not been reset, or its episode has ended and nothing resets it by itself.

@@ -38,8 +38,7 @@ class Recording:
     Attributes:
         control: velocities of each device at each decision, within the robot's limits, mm/s and rad/s.
         exposed: whether X-ray was on at each decision.
-        believed_mm: where the agent believed the tip to be (Δtip) at each decision, mm; None for other policies.
-        gave_up: whether the policy ended the navigation with its last decision.
+        believed_mm: Δtip as the agent believed it at each decision, mm; None for other policies.
         terms: on which it was driven; not part of the text.
     """
 
@@ -61,11 +60,7 @@ class Recording:
 
     @staticmethod
     def unpacked(text: dict[str, Any], devices: int = 1, terms: Terms | None = None) -> Recording:
-        """Return the recording that `packed` made a text of.
-
-        Raises:
-            InputError: an array cannot be read, is not finite, or has another length than the others.
-        """
+        """Return the recording that `packed` made a text of, or raise `InputError` where that is none."""
         control, exposed = _unpack(text, "control", "<f8"), _unpack(text, "exposed", "|u1") != 0
         believed = None if text["believed_mm"] is None else _unpack(text, "believed_mm", "<f8")
         count, sizes = len(exposed), {"control": len(control) / (2 * devices)}
@@ -86,8 +81,8 @@ def navigation_seed(task: Task, place: int) -> int:
 def attempt(policy: str, navigation: Navigation, *, seed: int, terms: Terms | None = None) -> dict[str, Any]:
     """Let a policy drive a navigation, and return its figures, its course and its recording.
 
-    Where the policy searches, `planning_s` is the processor time that its searches took, s. It is no figure: it differs
-    from run to run.
+    `decision_s` is the wall time that each decision took, s, and `planning_s`, where the policy searches, the processor
+    time of its searches. They are no figures: they differ from run to run.
 
     Args:
         seed: of encoder noise, detection errors and the policy.
@@ -98,18 +93,16 @@ def attempt(policy: str, navigation: Navigation, *, seed: int, terms: Terms | No
     """
     terms = terms or Terms()
     with Apart(policy) if terms.request else nullcontext(make_policy(policy)) as driver:
-        record = NavigationLoop(navigation, driver, config=terms.loop, seed=seed, world=terms.world).run()
-    result = {"seed": seed} | scored(navigation, record, tells=isinstance(driver, AgentPolicy))
+        loop = NavigationLoop(navigation, driver, config=terms.loop, seed=seed, world=terms.world)
+        record = loop.run()
+    result: dict[str, Any] = {"seed": seed, "decision_s": np.round(loop.decision_s, 5).tolist()}
+    result |= scored(navigation, record, tells=isinstance(driver, AgentPolicy))
     planning_s = getattr(driver, "planning_s", None)
     return result if planning_s is None else result | {"planning_s": round(planning_s, 2)}
 
 
 def scored(navigation: Navigation, record: NavigationRecord, *, tells: bool = False) -> dict[str, Any]:
-    """Return the figures of a navigation, whoever drove it, its course and its recording.
-
-    Args:
-        tells: whether events count that who drove did not believe.
-    """
+    """Return the figures of a navigation, its course and its recording; if who drove `tells` a belief, also events."""
     believed = record.believed[:-1, 0] if tells and record.believed is not None else None
     recording = Recording(record.control[:-1], record.exposed[:-1], believed, record.reason == "gave up")
     course = {
@@ -126,10 +119,7 @@ def scored(navigation: Navigation, record: NavigationRecord, *, tells: bool = Fa
 
 
 def repeat(recording: Recording, navigation: Navigation, *, seed: int) -> dict[str, Any]:
-    """Drive the recorded velocities through the same robot and simulator, without the policy.
-
-    Returns:
-        The figures, as `attempt` returned them if the recording is that of this navigation.
+    """Drive the recorded velocities through the same robot and simulator, and return the figures, as `attempt` did.
 
     Raises:
         InputError: the recording is longer or shorter than the navigation.
@@ -142,10 +132,7 @@ def repeat(recording: Recording, navigation: Navigation, *, seed: int) -> dict[s
 
 
 def begun(recording: Recording, navigation: Navigation, *, seed: int) -> NavigationLoop:
-    """Return the loop that drives a navigation as it was recorded, at its start; its `run` is as recorded, to the bit.
-
-    `run` raises `InputError` where the recording is shorter than the navigation.
-    """
+    """Return the loop that drives a navigation as it was recorded, to the bit; too short a recording is refused."""
     terms = recording.terms
     return NavigationLoop(navigation, Repeated(recording), config=terms.loop, seed=seed, world=terms.world)
 
@@ -165,11 +152,7 @@ class Repeated:
         self._at = 0
 
     def decide(self, observation: Observation) -> Decision:
-        """Return the next decision.
-
-        Raises:
-            InputError: there is none.
-        """
+        """Return the next decision, or raise `InputError` where there is none."""
         if self._at == len(self._decisions):
             raise InputError(f"control: holds {self._at} decisions, and the navigation goes on")
         self._at += 1
@@ -212,10 +195,7 @@ def navigation_events(
 ) -> tuple[int, int]:
     """Return how many events a navigation had, as `AdviserConfig` defines them, and how many X-ray did not show.
 
-    Args:
-        tip: as it truly was, at the start and after each decision period.
-        exposed: whether X-ray was on, at the same moments.
-        believed_mm: Δtip as the policy believed it at each decision, mm.
+    `tip` is as it truly was at the start and after each decision period, `believed_mm` Δtip as the policy believed it.
     """
     count, advice = len(believed_mm), AdviserConfig()
     at_wall = safety_ratio(tip.offset, tip.radius, wire_radius_mm)[:count] >= advice.wall_ratio

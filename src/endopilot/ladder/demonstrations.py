@@ -35,18 +35,7 @@ _CHANNELS = 3
 def write_demonstrations(submission: str | Path, *, output: str | Path) -> dict[str, Any]:
     """Drive the navigations of a submission again, and write what was seen and decided as a LeRobot v3 data set.
 
-    An episode is a navigation, a sample a decision, two a second. The columns are
-
-    - `observation.state`: of each device Δ, mm, and φ, rad, by the robot's encoders, force, N, and torque, N·mm, of its
-      drive; and the age of the last exposure, s;
-    - `observation.images.view_1` and `view_2`: the X-ray images of that exposure, with vessel and target, as the
-      environments show them;
-    - `action`: what was decided then: velocities of each device, mm/s and rad/s, and 1 where the next sample was to be
-      an exposure;
-    - `exposed`: whether the images are of this moment;
-    - `contact_force_max_n`: largest wall force on a node over the period that follows;
-    - `next.done`: 1 at the last decision; `next.success`: 1 there if it leads to the target, and `next.reward`: 1 if
-      it does, and no force of the navigation was beyond the limit.
+    An episode is a navigation, a sample a decision, two a second; docs/concepts/dataset.md describes the columns.
 
     Returns:
         `dataset` (the folder), `episodes`, `samples` and `exposures`.

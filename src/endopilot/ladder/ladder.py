@@ -73,6 +73,11 @@ class LadderConfig:
         """The tasks named, or all."""
         return [task for task in list_tasks(self.version) if not self.tasks or task.name in self.tasks]
 
+    @property
+    def patients_done(self) -> int:
+        """Most patients that are done of a task."""
+        return self.patients or max(len(task.ladder.numbers) for task in self.chosen)
+
     def paths(self, folder: Path) -> list[Path]:
         """Return the result files of the navigations in a folder, TASK/PLACE.json."""
         return [
@@ -83,16 +88,11 @@ class LadderConfig:
 
 
 def terms_of(config: LadderConfig) -> Terms:
-    """Return on what terms a policy climbs.
-
-    Raises:
-        InputError: no such robot or world.
-    """
+    """Return on what terms a policy climbs, or raise `InputError` where there is no such robot or world."""
     terms = Terms(config.version, read_robot(config.robot), read_world(config.world))
     if config.drawn is None:
         return terms
-    patients = config.patients or max(len(task.ladder.numbers) for task in config.chosen)
-    return terms.drawn(config.policy, POLICIES.origin(config.policy), config.drawn, patients)
+    return terms.drawn(config.policy, POLICIES.origin(config.policy), config.drawn, config.patients_done)
 
 
 def climb(*, output: str | Path, config: LadderConfig | None = None) -> list[dict[str, Any]]:
@@ -117,20 +117,21 @@ def climb(*, output: str | Path, config: LadderConfig | None = None) -> list[dic
     terms = terms_of(config)
     claim(output, "endopilot ladder", **terms.identity(config.policy))
     paths = config.paths(output)
-    make_missing(f"Ladder, {config.policy}", paths, partial(_navigate, policy=config.policy, terms=terms))
+    make_missing(f"Ladder, {config.policy}", paths, partial(drive_one, policy=config.policy, terms=terms))
     tasks = config.chosen
     results = {task.name: [read_json(path) for path in paths if path.parent.name == task.name] for task in tasks}
     rows = score(tasks, results)
-    most = max(map(len, results.values()))
-    content = {"policy": config.policy, "ladder": config.version, "robot": config.robot, "patients": most}
-    content |= {"world": {"name": config.world, **terms.world.differences()}, "key": terms.key(), "scores": rows}
+    content = {"policy": config.policy, "ladder": config.version, "robot": config.robot, "key": terms.key()}
+    content |= {"world": {"name": config.world, **terms.world.differences()}, "patients": config.patients_done}
+    content |= {"scores": rows}
     content |= {"request": terms.request} if terms.request else {}
     write_json(output / SCORES_FILE, content)
     write_submission(output / SUBMISSION_FILE, config.policy, terms, results, rows, drawn=config.drawn)
     return rows
 
 
-def _navigate(path: Path, *, policy: str, terms: Terms) -> None:
+def drive_one(path: Path, *, policy: str, terms: Terms) -> None:
+    """Let a policy do the navigation of a result file, TASK/PLACE.json, and write the file."""
     task, place = terms.task(path.parent.name), int(path.stem)
     navigation = task.ladder_navigation(place)
     result = attempt(policy, navigation, seed=navigation_seed(task, place), terms=terms)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest
 
 from endopilot.tasks.task import Task
 
@@ -16,18 +17,14 @@ COAXIAL = range(13, 17)
 
 
 def score(tasks: Sequence[Task], results: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
-    """Return the scores of tasks, and over the lower four, the upper eight, all twelve, and all coaxial ones.
+    """Return the scores of tasks, and where all were done, over the lower four, upper eight, twelve, and coaxial ones.
 
-    Several tasks are scored together where all of them were done.
-
-    Each row has `level`; `task`; `safe_success`, the share of navigations that reached the target with a wall force
-    that never exceeded the task's limit; `safe_from` and `safe_to`, its 95 % interval over patients; `success`, the
-    share that reached it; of those that did, the medians of `seconds` and `path_ratio` (length of the tip's path over
-    that of the centerline); and of all the median of `peak_force_n` (N) and the mean of `exposures`. Rows of `agent`
-    have `missed_events`, the share of the events of all their navigations that X-ray did not show
-    (docs/concepts/advice.md). Rows of tasks with `near_mm` have `near`, the share of navigations in which the tip came
-    so near to the target, whatever the force. Rows of policies that search have `planning_s`, the mean processor time
-    of a navigation's searches, s; `submitted` leaves it and the interval out."""
+    `safe_success` is the share of navigations that reached the target with no wall force beyond the task's limit, from
+    `safe_from` to `safe_to` its 95 % interval over patients. `seconds` and `path_ratio` (the tip's path over the
+    centerline) are medians of those that arrived, `peak_force_n` (N) that of all, `exposures` the mean. Rows of `agent`
+    have `missed_events`, the share of events that X-ray did not show, of tasks with `near_mm` `near`, the share that
+    came so near, and of policies that search `planning_s`, the mean processor time of a navigation's searches, s.
+    """
     rows = [{"level": task.level, "task": task.name} | score_navigations(results[task.name]) for task in tasks]
     levels = {task.level: task.name for task in tasks}
     groups = {"lower four": range(1, 5), "upper eight": UPPER, "all twelve": range(1, 13), "all coaxial": COAXIAL}
@@ -69,10 +66,8 @@ def score_navigations(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def interval(reached: int, count: int) -> tuple[float, float]:
     """Return Wilson's 95 % interval of a share (J. Am. Stat. Assoc. 22, 209, 1927)."""
-    z, share = 1.959964, reached / count
-    middle, width = share + z * z / (2 * count), z * ((share * (1 - share) + z * z / (4 * count)) / count) ** 0.5
-    low, high = (max(0.0, (middle + sign * width) / (1 + z * z / count)) for sign in (-1, 1))
-    return low, high
+    found = binomtest(reached, count).proportion_ci(method="wilson")
+    return float(found.low), float(found.high)
 
 
 def submitted(scores: Mapping[str, Any]) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 from threadpoolctl import threadpool_info
 
-from endopilot import __version__, _core
+from endopilot import _core
 from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, write_json
@@ -81,16 +81,12 @@ class Submission:
     """What a policy did on the ladder, and how that can be done again.
 
     Attributes:
-        ladder: version of the ladder; a file without it is one of version 1.
-        origin: package and version that it comes from, or its file and the SHA-256 of that.
-        versions: of endopilot, Python and libraries.
+        ladder: its version; a file without it is one of version 1.
+        origin: package and version that the policy comes from, or its file and the SHA-256 of that.
         core: processor level that the rod core was built for.
-        blas: kernel of linear algebra of numpy and SciPy, such as openblas Haswell; none in older files.
+        blas: kernel of linear algebra of numpy and SciPy, such as openblas Haswell.
         tasks: name of each task and the SHA-256 of its definition with its device.
         navigations: by the task's name, in the order of the task's patients.
-        scores: what `endopilot.ladder.scores.score` makes of them.
-        robot: what drove; a file without it has the default one.
-        world: what reality was; a file without it has the nominal one.
         drawn: the word with which patients were drawn, where they were (`Terms.drawn`).
     """
 
@@ -123,8 +119,8 @@ class Submission:
 
 
 Verdict = Literal["decided again", "replayed", "failed", "not judged"]
-"""What came of a check: all figures are confirmed, and a shipped policy took the same decisions again; all figures but
-the exposures are; something is not as the file says; or this machine cannot tell."""
+"""What came of a check: all figures are confirmed, and the policy took the same decisions again; all figures but the
+exposures are; something is not as the file says; or this machine cannot tell."""
 
 
 @dataclass(frozen=True)
@@ -161,10 +157,7 @@ class SubmissionCheck:
 
 
 def blas_kernel() -> str | None:
-    """Return which kernel of linear algebra numpy and SciPy run here, such as openblas Haswell; None if it is not told.
-
-    Vessels differ by it in their last bits, and so does what is driven in them.
-    """
+    """Return which kernel of linear algebra numpy and SciPy run here, such as openblas Haswell; None if not told."""
     loaded = [each for each in threadpool_info() if each["user_api"] == "blas"]
     kernels = {f"{each['internal_api']} {each.get('architecture', '')}".strip() for each in loaded}
     return ", ".join(sorted(kernels)) or None
@@ -179,12 +172,7 @@ def write_submission(
     *,
     drawn: str | None = None,
 ) -> None:
-    """Write the submission file of a policy.
-
-    Args:
-        results: by the task's name, the results of its navigations (`attempt`) in the order of the task's patients.
-        drawn: the word that the patients were drawn with, if they were.
-    """
+    """Write the submission file of a policy; `results` are those of `attempt`, in the order of each task's patients."""
     known = {each.name for each in fields(NavigationEntry)}
     submission = Submission(
         ladder=terms.version,
@@ -228,14 +216,10 @@ def read_submission(path: str | Path) -> Submission:
         raise InputError(f"{path}: navigations: {counts}; each task needs the same first 1 to {known} patients")
     for name, entries in submission.navigations.items():
         if submission.tasks[name] != task_digest(find_task(name, version=submission.version)):
-            if isinstance(submission.version, str) and Path(submission.version).is_dir():
-                raise InputError(
-                    f"{path}: task {name!r} of {submission.version} is another than the file was made with: its "
-                    "definition, a device or an anatomy has changed; check it with the folder as it was"
-                )
             raise InputError(
-                f"{path}: task {name!r} is not the one of endopilot {__version__}; the file was made with endopilot "
-                f"{submission.versions.get('endopilot')}, check it with that"
+                f"{path}: task {name!r} of ladder {submission.version} is not the one here: its definition, a device "
+                "or an anatomy is another; check it with the folder as it was, or with endopilot "
+                f"{submission.versions.get('endopilot')}"
             )
         for place, entry in enumerate(entries):
             if entry.seed != (seed := navigation_seed(tasks[name], place)):
@@ -247,7 +231,7 @@ def check_submission(path: str | Path, *, policy: str = "") -> SubmissionCheck:
     """Drive all recordings of a submission file again, and compare every figure to the bit; nothing else is believed.
 
     They are driven with the file's kernel of linear algebra, one of `KERNELS`. A policy that is at hand also decides
-    again: its exposures are counted then. Where it decides otherwise, the file fails, unless it is of another version.
+    again: its exposures are counted then. Where it decides otherwise, the file fails, whatever version it names.
 
     Args:
         path: the file.
@@ -316,15 +300,13 @@ def _driven_again(submission: Submission, folder: Path, pool: Workers | None, at
     work = partial(_repeat, terms=terms, policy=policy if at_hand else None)
     bad = each(f"Checking {policy}", list(entries), work, pool)
     again = {path: {} if path in bad else read_json(path) for path in entries}
-    otherwise = [path for path, figures in again.items() if not figures.pop("decided", False)]
-    if at_hand and otherwise:
-        remarks.append(f"{policy} decides otherwise here in {len(otherwise)} of {len(entries)} navigations")
-    forged = otherwise if at_hand and submission.origin == POLICIES.origin(policy) else []
+    otherwise = {path for path, figures in again.items() if not figures.pop("decided", False)} if at_hand else ()
     found = {
-        path: str(bad[path]) if path in bad else _difference(entry.figures(), again[path])
+        path: str(bad[path])
+        if path in bad
+        else _difference(entry.figures(), again[path]) or (f"{policy} decides otherwise" if path in otherwise else None)
         for path, entry in entries.items()
     }
-    found |= {path: f"{policy} decides otherwise" for path in forged if found[path] is None}
     differing = [f"task {path.parent.name}, patient {int(path.stem)}: {said}" for path, said in found.items() if said]
     rows = []
     if differing:
@@ -335,12 +317,11 @@ def _driven_again(submission: Submission, folder: Path, pool: Workers | None, at
         pairs = zip_longest(submission.scores, rows, fillvalue={})
         said = [(row.get("task") or given.get("task"), _difference(given, submitted(row))) for given, row in pairs]
         differing = [f"scores, {task}: {remark}" for task, remark in said if remark]
-    decided = at_hand and not otherwise
-    if not decided:
+    if not at_hand:
         claimed = {name: f"{name}_as_recorded" for name in ("exposures", "missed_events")}
         rows = [{claimed.get(name, name): value for name, value in row.items()} for row in rows]
     return {
-        "verdict": "failed" if differing else "decided again" if decided else "replayed",
+        "verdict": "failed" if differing else "decided again" if at_hand else "replayed",
         "difference": differing[0] if differing else None,
         "scores": () if differing else rows,
         "remarks": tuple(remarks),
@@ -348,14 +329,10 @@ def _driven_again(submission: Submission, folder: Path, pool: Workers | None, at
 
 
 def recorded_navigation(path: Path, name: str | None, place: int) -> tuple[Task, int, Recording]:
-    """Return what was recorded of one navigation, from a submission or from a result file of a ladder's folder.
+    """Return the task, the patient's place in its list, and the recording of one navigation.
 
     Args:
-        path: a submission.json or TASK/NUMBER.json.
-        place: of the patient in the task's list, likewise.
-
-    Returns:
-        The task, the patient's place in its list, and the recording.
+        path: a submission.json, or TASK/NUMBER.json of a ladder's folder, which tells task and place by itself.
 
     Raises:
         InputError: the file is none of the ladder, or has no such navigation.
@@ -381,9 +358,10 @@ def _repeat(path: Path, *, terms: Terms, policy: str | None) -> None:
     task, place = terms.task(path.parent.name), int(path.stem)
     navigation, seed = task.ladder_navigation(place), navigation_seed(task, place)
     recording = Recording.unpacked(read_json(path), len(navigation.devices), terms)
-    figures = repeat(recording, navigation, seed=seed)
-    decided = policy is not None and attempt(policy, navigation, seed=seed, terms=terms)["sha256"] == figures["sha256"]
-    write_json(path, {"patient": navigation.anatomy.name} | figures | {"decided": decided})
+    figures = {"patient": navigation.anatomy.name} | repeat(recording, navigation, seed=seed)
+    if policy is not None:
+        figures["decided"] = attempt(policy, navigation, seed=seed, terms=terms)["sha256"] == figures["sha256"]
+    write_json(path, figures)
 
 
 def _difference(given: Mapping[str, Any], again: Mapping[str, Any]) -> str | None:

@@ -33,12 +33,7 @@ DRAWN = 1 << 62
 class Terms:
     """On what terms a policy climbs; nothing else than these, the policy and the kernel of linear algebra counts.
 
-    Attributes:
-        version: of the ladder.
-        robot: what drives.
-        world: what reality is.
-        request: SHA-256 that the patients are drawn from; empty where the tasks' own ones are done.
-        patients: of each task that are drawn.
+    `request` is the SHA-256 that so many `patients` of each task are drawn from; empty where the tasks' own are done.
     """
 
     version: LadderVersion = NEWEST
@@ -48,11 +43,7 @@ class Terms:
     patients: int = 0
 
     def task(self, name: str) -> Task:
-        """Return a task by its name, with the patients that are done.
-
-        Raises:
-            InputError: there is no such task or version, or no patients can be drawn for it.
-        """
+        """Return a task by its name with the patients that are done, or raise `InputError` where there is none."""
         task = find_task(name, version=self.version)
         return _drawn(task, self.request, self.patients) if self.request else task
 
@@ -62,13 +53,9 @@ class Terms:
         return LoopConfig(robot=self.robot, simulator=replace(CORE, threads=1))
 
     def drawn(self, policy: str, origin: str, word: str, patients: int) -> Terms:
-        """Return the terms with patients that are drawn from the hash of a request to run a policy.
+        """Return the terms with patients that are drawn from the hash of a request to run a policy of some origin.
 
-        Args:
-            policy: its name.
-            origin: package and version that it comes from, or its file and the SHA-256 of that.
-            word: of whoever runs it, so that nobody tries policies until the patients are easy.
-            patients: of each task.
+        `word` is that of whoever runs it, so that nobody tries policies until the patients are easy.
         """
         asked = {"policy": policy, "origin": origin, "key": self.key(), "word": word, "patients": patients}
         return replace(self, request=_digest(asked), patients=patients)
@@ -80,11 +67,7 @@ class Terms:
 
     @staticmethod
     def of(content: Mapping[str, Any]) -> Terms:
-        """Return the terms that the content of a file names; what it leaves out is as it was in older files.
-
-        Raises:
-            InputError: they are none.
-        """
+        """Return the terms that the content of a file names; what it leaves out is as it was in older files."""
         robot = from_record(RobotConfig, content["robot"]) if "robot" in content else RobotConfig()
         world = from_record(World, content["world"]) if "world" in content else World()
         return Terms(content.get("ladder") or 1, robot, world, content.get("request", ""), content.get("drawn", 0))

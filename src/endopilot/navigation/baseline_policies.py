@@ -105,11 +105,7 @@ class CatheterAlone:
     """Pushes the catheter at a constant velocity, with the wire's tip at its end; the wire never leads."""
 
     def start(self, navigation: Navigation, seed: int) -> None:
-        """Take the target's depth.
-
-        Raises:
-            InputError: there is no catheter.
-        """
+        """Take the target's depth, or raise `InputError` where there is no catheter."""
         check_catheter(navigation)
         self._deepest = navigation.target.abscissa + _SLACK_MM
 
@@ -120,17 +116,12 @@ class CatheterAlone:
         return Decision((push if wire <= catheter else _STAND, push))
 
 
-class InTurn:
+class InTurn(CatheterAlone):
     """Advances wire and catheter in turn, without X-ray: the wire leads by `LEAD_MM`, then the catheter follows."""
 
     def start(self, navigation: Navigation, seed: int) -> None:
-        """Take the target's depth.
-
-        Raises:
-            InputError: there is no catheter.
-        """
-        check_catheter(navigation)
-        self._deepest = navigation.target.abscissa + _SLACK_MM
+        """Take the target's depth, and whose tip is to arrive."""
+        super().start(navigation, seed)
         self._behind = BEHIND_MM if navigation.arrives == "wire" else 0.0
         self._follows = False
 
@@ -145,10 +136,6 @@ class InTurn:
 
 
 def check_catheter(navigation: Navigation) -> None:
-    """Check that a navigation has a catheter, for policies that drive one.
-
-    Raises:
-        InputError: it has none.
-    """
+    """Raise `InputError` where a navigation has no catheter, for policies that drive one."""
     if not navigation.catheters:
         raise InputError("policy: drives a catheter too, and there is none; give a catheter, or another policy")

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import field, replace
 from typing import Annotated, Any
 
@@ -70,15 +71,12 @@ class NavigationLoop:
 
     Every `DECISION_PERIOD_S` the policy is given the encoders' readings and, where its last decision asked for it, what
     X-ray shows; at the first decision X-ray is always on. The navigation ends when the target is reached at the end of
-    a period, when the time is over, or when the simulation fails.
-
-    `run` drives to the end, and records what truly happens::
+    a period, when the time is over, or when the simulation fails. `run` drives to the end, and records what happens::
 
         record = NavigationLoop(navigation, "agent", seed=1).run()
 
-    `navigate`, the ladder and the cockpit are plain loops over `step`; a program that shows the navigation starts,
-    pauses and ends it by calling `step` or not. Somebody else may drive, such as a `Hand`: the policy watches then, and
-    goes on with X-ray on once it is handed back to::
+    `navigate`, the ladder and the cockpit are plain loops over `step`. Somebody else may drive, such as a `Hand`: the
+    policy watches then, and goes on with X-ray on once it is handed back to::
 
         loop = NavigationLoop(navigation, "agent", seed=1)
         while loop.reason is None:
@@ -92,7 +90,6 @@ class NavigationLoop:
 
     Attributes:
         navigation: what is to be done, as the policy is given it; `aim` gives it another target.
-        config: robot, C-arm and rod core.
         world: what reality is, with what a seed draws.
         policy: what decides, or watches while somebody else does.
         simulator: the world as it truly is; its one wire is the real one.
@@ -101,8 +98,8 @@ class NavigationLoop:
         observation: what was observed last; None before the first decision.
         believed: what the policy believed at the last decision; None for a policy that does not tell.
         reason: why the navigation is over, as in `NavigationRecord`; None while it goes on.
-        gives_up: where and why the policy gave up at the last decision, in words; empty if it goes on. Somebody else
-            may go on then.
+        gives_up: where and why the policy gave up at the last decision, in words; empty if it goes on.
+        decision_s: wall time that each decision took, s.
     """
 
     def __init__(
@@ -160,6 +157,7 @@ class NavigationLoop:
         self.believed: BelievedTip | None = None
         self.reason: str | None = None
         self.gives_up = ""
+        self.decision_s: list[float] = []
         self.policy.start(navigation, seed)
 
     @property
@@ -189,11 +187,7 @@ class NavigationLoop:
         self._driver, self._expose = to, to is None
 
     def aim(self, target: Target) -> None:
-        """Let the navigation go to another target; a policy that has begun does not learn of it.
-
-        Raises:
-            InputError: the vessel has no such place.
-        """
+        """Let the navigation go to another target, of which a policy that has begun does not learn."""
         self.navigation = replace(self.navigation, target=target)
 
     def run(self) -> NavigationRecord:
@@ -211,11 +205,7 @@ class NavigationLoop:
         return decision
 
     def begin(self) -> Decision:
-        """Begin a period: observe, decide and command the robot. `advance` lets it move.
-
-        Raises:
-            ValueError: as `observe`.
-        """
+        """Begin a period: observe, decide and command the robot. `advance` lets it move."""
         return self.take(self.decide(self.observe()))
 
     def observe(self) -> Observation:
@@ -236,27 +226,20 @@ class NavigationLoop:
         return self.observation
 
     def decide(self, observation: Observation) -> Decision:
-        """Return what who drives decides; the policy watches where that is somebody else.
-
-        Raises:
-            InputError: it is no decision.
-        """
-        driver = self._driver or self.policy
+        """Return what who drives decides, or raise `InputError`; the policy watches where that is somebody else."""
+        driver, began = self._driver or self.policy, time.perf_counter()
         if driver is not self.policy:
             if isinstance(self.policy, Led):
                 self.policy.watch(observation)
             else:
                 self.policy.decide(observation)  # what it answers is not done
         decision = _checked(driver.decide(observation), type(driver).__name__)
+        self.decision_s.append(time.perf_counter() - began)
         self.believed = self.policy.believed() if isinstance(self.policy, Believer) else None
         return decision
 
     def take(self, decision: Decision) -> Decision:
-        """Command the robot for a period.
-
-        Returns:
-            The decision as the robot has taken it: within its limits, and with the velocities of all devices.
-        """
+        """Command the robot for a period; return the decision within its limits, with velocities of all devices."""
         taken = self.robot.command(decision.devices)
         seen = self.observation
         tip = None if seen is None else seen.tip
@@ -273,13 +256,9 @@ class NavigationLoop:
         self._track.exposed()
 
     def advance(self, seconds: float) -> float:
-        """Let robot and wire move, no farther than to the end of the period.
+        """Let robot and wire move for a multiple of the drives' cycle, no farther than to the end of the period.
 
-        Args:
-            seconds: a multiple of the drives' cycle.
-
-        Returns:
-            The largest wall force on a node, N.
+        The largest wall force on a node, N, is returned.
         """
         cycle_s = self.config.cycle_s
         cycles, peak_n = min(round(seconds / cycle_s), self._cycles_left), 0.0
@@ -324,12 +303,7 @@ def start_world(
 ) -> Simulator:
     """Return the world as it truly is, with the wire and its catheters at the start of the navigation.
 
-    Args:
-        navigation: as a policy is given it.
-        world: what reality is.
-        config: settings of the rod core, where the world has none.
-        robot: in whose grip the devices slip; at their own limits if not given.
-        motion: of the vessel; it lies still if not given.
+    Devices slip in the grip of `robot`, or at their own limits; the vessel lies still without `motion`.
 
     Raises:
         InputError: the wire does not fit the vessel, or starts deeper than it is long.

@@ -30,9 +30,8 @@ class NavigationRecord:
         time_s: s.
         inserted_length: Δ of each device, mm.
         rotation: φ of each device, rad.
-        encoders: Δ, mm, and φ, rad, of each device as the policy was given them at this moment; NaN at the end, and
-            where nobody asked.
-        load: axial force, N, and torque, N·mm, of each drive as the policy was given them, likewise.
+        encoders: Δ, mm, and φ, rad, of each device as the policy was given them; NaN at the end and where nobody asked.
+        load: axial force, N, and torque, N·mm, of each drive, likewise.
         tip_position: LPS mm.
         tip: Δtip, γtip, branch and lumen radius, with a row a sample and a column a device.
         shape: nodes of the line that the devices share, from the foremost tip on, LPS mm.
@@ -49,10 +48,8 @@ class NavigationRecord:
         found: what was identified once the model was taken to be wrong, in words; empty if nothing was.
         cycles: what the drives asked for in each of their cycles and what the devices truly did, without shapes;
             replayed it gives the same navigation to the bit. Its columns `encoders` and `load` are what the robot
-            measured at the end of each cycle (`SimulatedRobot.measured`); others repeat over a period's cycles what was
-            `decided`, and what X-ray `measured`, what was `believed` and the `half_width` at its begin, NaN where that
-            is nothing. `about` has the target, why it ended, when X-ray was on, s, why it was asked for, and what was
-            found. None where no period is over.
+            measured at the end of each cycle; others repeat over a period's cycles what was `decided`, `measured` and
+            `believed`, and the `half_width`. `about` tells target, end and exposures. None where no period is over.
         success: the tip reached the target in time, at the end of a period.
         safe: the wall force never exceeded the navigation's limit.
         seconds: how long it took, s.
@@ -120,14 +117,9 @@ class Track:
 
     def __init__(self) -> None:
         """Begin with nothing."""
-        self._proximal: list[Float[np.ndarray, "devices 2"]] = []
-        self._position: list[Float[np.ndarray, "devices 3"]] = []
-        self._shape: list[Float[np.ndarray, "nodes 3"]] = []
-        self._force: list[float] = []
-        self._control: list[Proximals] = []
-        self._seen: list[Observation | None] = []
+        self._moved: list[tuple[np.ndarray, np.ndarray, np.ndarray, float]] = []
+        self._decided: list[tuple[Proximals, Observation | None, BelievedTip | None]] = []
         self._exposures: list[int] = []
-        self._believed: list[BelievedTip | None] = []
         self._faults, self._before = 0, 0
 
     def decided(
@@ -140,10 +132,8 @@ class Track:
         fault: bool,
     ) -> None:
         """Take what was decided, what was observed then, whether X-ray was on, and what the policy believed."""
-        self._control.append(control)
+        self._decided.append((control, seen, believed))
         self._exposures.append(exposed + self._before)
-        self._seen.append(seen)
-        self._believed.append(believed)
         self._faults, self._before = self._faults + fault, 0
 
     def exposed(self) -> None:
@@ -155,10 +145,7 @@ class Track:
 
     def moved(self, simulator: Simulator, proximal: Float[np.ndarray, "devices 2"], peak_n: float) -> None:
         """Take where the devices are at the end of a period, and the largest wall force in it, N."""
-        self._proximal.append(proximal)
-        self._position.append(simulator.tip_position[0])
-        self._shape.append(simulator.position[0])
-        self._force.append(peak_n)
+        self._moved.append((proximal, simulator.tip_position[0], simulator.position[0], peak_n))
 
     def record(
         self,
@@ -169,37 +156,28 @@ class Track:
         reason: str,
         gives_up: str,
     ) -> NavigationRecord:
-        """Return the record of what was gathered up to the end of the last period.
-
-        Args:
-            navigation: what was to be done.
-            world: what reality was.
-            simulator: in which it took place; the radii at the tips are those of its vessel.
-            robot: what drove.
-            reason: why it ended.
-            gives_up: where and why the policy gave up, in words.
-        """
-        anatomy, force = navigation.anatomy, np.array(self._force)
-        tree = simulator.set_up.anatomies[0].tree
-        proximal, position = np.array(self._proximal), np.array(self._position)
+        """Return the record of what was gathered up to the end of the last period."""
+        tree = simulator.set_up.anatomies[0].tree  # the radii at the tips are those of the true vessel
+        proximal, position, shape, force = map(np.array, zip(*self._moved, strict=True))
         samples, devices, _ = proximal.shape
         periods = samples - 1  # a decision whose period is not over does not count
         cycles = periods * round(DECISION_PERIOD_S / robot.recorder.period_s)
         exposures = np.array([*self._exposures[:periods], 0])
-        believed = [_NOTHING if tip is None else tip for tip in self._believed[:periods]] + [_NOTHING]
-        tells = any(tip is not None for tip in self._believed)
+        control, seen, told = zip(*self._decided[:periods], strict=True) if periods else ((), (), ())
+        believed = [_NOTHING if tip is None else tip for tip in told] + [_NOTHING]
+        tells = any(tip is not None for *_, tip in self._decided)
         found = believed[-2].found if periods else ""
         where = np.array([(tip.abscissa, tip.offset) for tip in believed])
         half_width, branch = np.array([tip.half_width for tip in believed]), np.array([tip.branch for tip in believed])
-        tip = project_tip(tree, anatomy.insertion, position)
-        tips = [None if seen is None else seen.tip for seen in self._seen[:periods]]
+        tip = project_tip(tree, navigation.anatomy.insertion, position)
+        tips = [None if each is None else each.tip for each in seen]
         nothing = ((np.nan, np.nan),) * devices
         encoders, load = (
-            np.array([*(nothing if seen is None else getattr(seen, name) for seen in self._seen[:periods]), nothing])
+            np.array([*(nothing if each is None else getattr(each, name) for each in seen), nothing])
             for name in ("devices", "load")
         )
         decisions = {
-            "decided": np.array(self._control[:periods]),
+            "decided": np.array(control),
             "measured": np.array([(np.nan, np.nan) if tip is None else (tip.abscissa, tip.offset) for tip in tips]),
             "believed": where[:-1],
             "half_width": half_width[:-1],
@@ -221,10 +199,10 @@ class Track:
             load=load,
             tip_position=position,
             tip=tip,
-            shape=np.array(self._shape),
+            shape=shape,
             contact_force_max=force,
             exposed=exposures > 0,
-            control=np.array([*self._control[:periods], np.zeros((devices, 2))]),
+            control=np.array([*control, np.zeros((devices, 2))]),
             measured=(*tips, None),
             believed=where if tells else None,
             astray_mm=astray_mm(tree, (branch, where[:, 0]), (tip.branch[:, 0], tip.abscissa[:, 0])),

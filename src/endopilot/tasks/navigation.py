@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from pydantic import InstanceOf, model_validator
+from pydantic import InstanceOf, field_validator, model_validator
 
 from endopilot.devices.catheter import Catheter, check_nested
 from endopilot.devices.device import Device, Wire
@@ -78,7 +78,7 @@ class Navigation:
         catheters: around it, from the inside out.
         arrives: whose tip is to go to the target: "wire", or "catheter", the one next to the wire. The wire's tip may
             then not be pulled back into the catheter.
-        target: where the tip is to go.
+        target: where the tip is to go: what `Anatomy.target` takes, such as a section or a point.
         start_inserted_length_mm: inserted length Δ at the start, mm.
         start_rotation_rad: rotation φ at the start, rad.
         start_catheter_mm: inserted length of the catheters at the start, mm; their rotations are 0.
@@ -104,6 +104,12 @@ class Navigation:
     known_motion: Motion | None = None
     xray: XrayKind = "assumed"
     robot: RobotConfig | None = None
+
+    @field_validator("target", mode="before")
+    @classmethod
+    def _placed(cls, place: Any, info: Any) -> Any:
+        anatomy = info.data.get("anatomy")
+        return anatomy.target(place) if anatomy is not None and not isinstance(place, dict | Target) else place
 
     @model_validator(mode="after")
     def _consistent(self) -> Navigation:
@@ -140,11 +146,7 @@ class Navigation:
         return int(np.ceil(self.seconds / period_s - 1e-9))
 
     def reached(self, tip: TipProjection) -> Bool[np.ndarray, "..."]:
-        """Return which worlds have reached the target, see `reached`.
-
-        Args:
-            tip: of all devices, along the last axis.
-        """
+        """Return which worlds have reached the target, see `reached`; tips of all devices lie along the last axis."""
         return self.target.reached(tip[..., : self.arriving + 1])
 
 
@@ -157,14 +159,9 @@ def reached(
     """Return which worlds have reached their targets.
 
     The tip that is to arrive lies in the target's branch, within `SUCCESS_MM` of it along the centerline, and the
-    wire's tip lies no more than that behind it. Where a straight distance is given, the tip lies within that too, as
-    far as its distances along the centerline and from it say.
-
-    Args:
-        tip: of the wires, and if a catheter's are to arrive, those last, along the last axis.
-        branch: of the target of all, or of each.
-        abscissa: of the target of all, or of each, mm.
-        near_mm: straight distance from the target of all, or of each, mm.
+    wire's tip lies no more than that behind it. Where a straight distance `near_mm` is given, the tip lies within that
+    too, as far as its distances along the centerline and from it say. Along the last axis lie the tips of the wires,
+    and if a catheter's are to arrive, those last. Targets are one for all worlds, or one each.
     """
     wire, arriving = tip[..., 0], tip[..., -1]
     along_mm = np.abs(arriving.abscissa - abscissa)

@@ -159,11 +159,7 @@ def _gap_beside(tree: VesselTree, branch: int) -> Float[np.ndarray, "points"]:
 
 
 def check_passable(route: Route, device: Device) -> None:
-    """Check that the wire fits through the lumen everywhere up to the target.
-
-    Raises:
-        InputError: the lumen is narrower than the wire somewhere on the route; the line says where.
-    """
+    """Raise `InputError` where the lumen is somewhere narrower than the wire up to the target; the line says where."""
     before = route.line.abscissa <= route.target.abscissa
     abscissa, radius = route.line.abscissa[before], route.line.radius[before]
     narrow = radius <= device.tip_radius_mm

@@ -21,15 +21,10 @@ _ALIASES = {"pda": ("4", "15"), "lad": ("7",), "lcx": ("13", "11"), "rca": ("3",
 
 
 def find_target(tree: VesselTree, place: Place, *, depth_mm: float | None = None) -> Target:
-    """Return the target that is meant.
+    """Return the target that is meant, as `Anatomy.target` says.
 
-    Args:
-        tree: centerlines of the vessel.
-        place: a section, whose middle is meant, on the branch that holds most of it; a point, from which the nearest
-            place of the centerline is taken; or a target, which is checked.
-        depth_mm: of a section, the place that lies so far beyond its begin is meant, in the branch where it begins,
-            mm. Where several branches begin the section, it is the one that begins nearest to the ostium. If the
-            section goes on in several branches, the target lies in the straightest one.
+    The middle of a section lies on the branch that holds most of it. `depth_mm` counts in the branch where the section
+    begins, of several in the one that begins nearest to the ostium, and goes on in the straightest one.
 
     Raises:
         InputError: nothing is named, no such section, a section that ends before the depth, a point that is not three
@@ -42,7 +37,8 @@ def find_target(tree: VesselTree, place: Place, *, depth_mm: float | None = None
             raise InputError(str(error)) from None
         return place
     if not isinstance(place, str):
-        return _nearest(tree, place, ",".join(f"{number:g}" for number in place))
+        numbers = np.ravel(np.array(place, dtype=object)).tolist()
+        return _nearest(tree, numbers, ",".join(map(str, numbers)))
     if not place.strip():
         raise InputError("target: is empty; give a section such as 4, or a point X,Y,Z in LPS mm")
     place = place.strip(" ()[]")
@@ -65,13 +61,7 @@ def find_target(tree: VesselTree, place: Place, *, depth_mm: float | None = None
 
 
 def section_at(tree: VesselTree, branch: int, abscissa: float) -> str:
-    """Return the name of the section that a place of the tree lies in.
-
-    Args:
-        tree: centerlines.
-        branch: index of the branch.
-        abscissa: of the place, mm.
-    """
+    """Return the name of the section that a place of the tree lies in."""
     line = tree.branches[branch].centerline
     at = int(np.argmin(np.abs(line.abscissa - abscissa)))
     return tree.section_names[int(tree.branches[branch].section[at])]
@@ -111,11 +101,11 @@ def turn_rad(tree: VesselTree, branch: int) -> float:
     return float(np.arccos(np.clip(into @ onto / (np.linalg.norm(into) * np.linalg.norm(onto)), -1.0, 1.0)))
 
 
-def _nearest(tree: VesselTree, numbers: Sequence[str] | Sequence[float] | np.ndarray, text: str) -> Target:
+def _nearest(tree: VesselTree, numbers: Sequence[str] | Sequence[float], text: str) -> Target:
     """Return the place of the centerline that is nearest to a point, LPS mm."""
     try:
         point = np.array([float(number) for number in numbers])
-    except ValueError:
+    except (TypeError, ValueError):
         point = np.full(3, np.nan)
     if point.shape != (3,) or not np.isfinite(point).all():
         raise InputError(f"target: {text}; not three finite numbers; give a point as X,Y,Z in LPS mm")

@@ -162,11 +162,7 @@ class Task:
         return self.navigation(self.patient(self.ladder, place), start_rotation_rad=turn, target_mm=point)
 
     def target(self, tree: VesselTree) -> Target:
-        """Return the target in its section of a tree.
-
-        Raises:
-            InputError: the tree lacks the section, or it is too short.
-        """
+        """Return the target in its section of a tree, or raise `InputError` where the tree has no such place."""
         return find_target(tree, self.section or "", depth_mm=self.depth_mm)
 
     def navigation(
@@ -231,20 +227,12 @@ def _read_task(path: Path) -> Task:
 
 
 def find_task(name: str, *, version: LadderVersion = NEWEST) -> Task:
-    """Return a task of a version of the ladder by its name.
-
-    Raises:
-        InputError: the ladder has no such task, or there is no such version or folder.
-    """
+    """Return a task of a version of the ladder by its name, or raise `InputError` where there is none."""
     return _named(name, list_tasks(version))
 
 
 def task_by_hand(name: str) -> Task:
-    """Return a task by its name, of the newest version of the ladder or of wire and catheter.
-
-    Raises:
-        InputError: there is no such task.
-    """
+    """Return a task of the newest version of the ladder or of wire and catheter, or raise `InputError`."""
     return _named(name, list_tasks(NEWEST) + list_tasks("coaxial"))
 
 
@@ -258,13 +246,8 @@ def _named(name: str, tasks: Sequence[Task]) -> Task:
 def training_navigations(name: str | None, first: int, count: int, version: LadderVersion) -> list[Navigation]:
     """Return a task of the ladder in `count` of its training patients, from number `first` on.
 
-    A task of one's own that has no such patients is returned in those that it is scored on.
-
-    Args:
-        name: of the task; all tasks of the version, one after another, if not given.
-        first: number of the first patient.
-        count: of patients of each task.
-        version: of the ladder, or a folder of one's own tasks.
+    Without a name, all tasks of the version, one after another. A task of one's own that has no such patients is
+    returned in those that it is scored on.
 
     Raises:
         InputError: the ladder has no such task, or the task fewer patients.
@@ -278,11 +261,7 @@ def training_navigations(name: str | None, first: int, count: int, version: Ladd
 
 
 def in_catheter(navigations: Sequence[Navigation], name: str) -> list[Navigation]:
-    """Return navigations to the same targets, with a catheter around each wire, whose tip is to arrive.
-
-    Args:
-        navigations: of wires alone.
-        name: of the catheter, or its YAML file.
+    """Return navigations of wires alone with a catheter, named or in a YAML file, around each, whose tip is to arrive.
 
     Raises:
         InputError: there is no such catheter, or a wire does not fit into it.
