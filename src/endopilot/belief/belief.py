@@ -22,6 +22,7 @@ from jaxtyping import Float, Int
 from endopilot.anatomy.projection import TipProjector
 from endopilot.belief.drives import Drives
 from endopilot.belief.moved_copies import Fans, MovedCopies, shifted, turned
+from endopilot.belief.thought import Budget
 from endopilot.belief.vessels import SharedVessels
 from endopilot.devices.device import lateral_reach
 from endopilot.devices.drive_limits import DriveLimits
@@ -103,6 +104,10 @@ class Past:
     exposures: dict[int, TipMeasurement] = field(default_factory=dict)
     measured: list[tuple[Proximals, Proximals, Proximals]] = field(default_factory=list)
 
+    def copy(self) -> Past:
+        """Return what became of it so far, to which nothing is added."""
+        return Past(list(self.proximal), dict(self.exposures), list(self.measured))
+
     def by_encoders(self) -> Past:
         """Return the same with the proximal ends where the encoders read them."""
         return replace(self, proximal=[np.array(encoders, dtype=float) for encoders, _, _ in self.measured])
@@ -157,6 +162,7 @@ class Belief:
         drives: Drives | None = None,
         vessels: SharedVessels | None = None,
         motion: Motion | None = None,
+        budget: Budget | None = None,
     ) -> None:
         """Bring every member's wire to the start of the navigation.
 
@@ -164,7 +170,7 @@ class Belief:
             members: what each takes reality to be; all have the same kind of wall.
             drives: of another belief about the same devices; at rest at the start if not given.
         """
-        self.motion, self._given = motion, navigation
+        self.motion, self._given, self.budget = motion, navigation, budget
         self.navigation = navigation if motion is None else replace(navigation, known_motion=motion)
         self.members, self.config = tuple(members), config
         self._accuracy_mm = config.along_sd_mm, config.across_sd_mm
@@ -189,7 +195,7 @@ class Belief:
         Args:
             changed: `drives` and `motion`, where they are not to be those of this belief.
         """
-        kept = {"drives": self.drives, "vessels": self.vessels, "motion": self.motion}
+        kept = {"drives": self.drives, "vessels": self.vessels, "motion": self.motion, "budget": self.budget}
         return Belief(self._given, members, self.config, **kept | changed)
 
     @staticmethod
@@ -321,7 +327,10 @@ class Belief:
             control[:, k] = self._limits[k].clip(motion / DECISION_PERIOD_S, now[:, k, 0], DECISION_PERIOD_S)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a member that fails has no weight
-            self.force = simulator.step(control, DECISION_PERIOD_S).contact_force_max
+            step = simulator.step(control, DECISION_PERIOD_S)
+        self.force = step.contact_force_max
+        if self.budget is not None:
+            self.budget.simulated(step, -(-simulator.worlds // len(self.kinds)))
         self.tip = simulator.project()[:, 0]
 
     def errors(
@@ -366,9 +375,9 @@ class Belief:
             self.evidence += float(np.log(np.nan_to_num(weight * density).sum() + 1e-9))
         self._score = self._score + np.log(density)
 
-    def replay(self, past: Past) -> None:
-        """Drive the members, at the start of the navigation, as the devices went so far, and weigh them alike."""
-        for period, proximal in enumerate(past.proximal):
+    def replay(self, past: Past, begun: int = 0) -> None:
+        """Drive the members as the devices went so far, from the start or a later period, and weigh them alike."""
+        for period, proximal in enumerate(past.proximal[begun:], begun):
             if period:
                 self._move(proximal)
             if period in past.exposures:
@@ -377,14 +386,14 @@ class Belief:
                     self.in_vessel(past.exposures[period], period).position, past.exposures[period], self.weight
                 )
 
-    def rerun(self, past: Past) -> list[Float[np.ndarray, "devices 2"]]:
-        """Follow a navigation so far from its start, with drives of its own.
+    def rerun(self, past: Past, begun: int = 0) -> list[Float[np.ndarray, "devices 2"]]:
+        """Follow a navigation so far from its start, or a later period, with drives of its own.
 
         Returns:
             Where the proximal ends of the devices were believed at each decision, mm and rad.
         """
         proximal = []
-        for period, (encoders, load, commanded) in enumerate(past.measured):
+        for period, (encoders, load, commanded) in enumerate(past.measured[begun:], begun):
             self.drives.sent(commanded)
             if period:
                 self.follow(encoders, load)

@@ -6,6 +6,7 @@ model is wrong, not the prediction unlucky: the bands widen, and X-ray is due ev
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -14,13 +15,14 @@ import numpy as np
 from endopilot.belief.adviser import AdviserConfig, Predicted
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig, Past
-from endopilot.belief.drives import UNKNOWN
-from endopilot.belief.identification import Identified, identify
-from endopilot.belief.patient_motion import FoundMotion, find_motion
+from endopilot.belief.explanation import BETTER, Explanation, explain
+from endopilot.belief.identification import Identified
+from endopilot.belief.patient_motion import FoundMotion
 from endopilot.belief.states import SEEKS, Event, States
+from endopilot.belief.thought import Budget, Pace, Thought
 from endopilot.belief.watch import Innovations, Watch
 from endopilot.devices.stack import Proximals
-from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.navigation import Navigation
 from endopilot.xray.fluoroscope import TipMeasurement
 
 _FORGETS, _PRIOR_N = 0.9, 0.1
@@ -68,12 +70,8 @@ _MOST, _EVERY = 6, 3
 _LEAST_EXPOSURES, _OUTSIDE_MM = 3, 0.8
 """A motion of the vessel is looked for in as many exposures at least. Where none is known, one must have shown the tip
 so far outside the lumen."""
-_LEAST_GAIN, _MOST_MISFIT = 6.0, 0.8
-"""A motion is believed that makes the exposures likelier by this logarithm, and leaves no larger misfit."""
 _MOTION_SD_MM = np.array([0.6, 0.1])
 """Standard deviations of (Δtip, γtip) that a motion adds which was found, mm: measured in moving vessels."""
-_BETTER = 3.0
-"""What is found must explain all exposures better by this logarithm."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +121,7 @@ class Monitor:
         config: BeliefConfig | None = None,
         advice: AdviserConfig | None = None,
         members: Sequence[World] | None = None,
+        pace: Pace | None = None,
     ) -> None:
         """Lay out the simulated wires at the start of a navigation.
 
@@ -130,6 +129,7 @@ class Monitor:
             calibration: of the bands around what the simulated wires predict; None for a monitor that never doubts: it
                 neither asks for X-ray nor changes its belief.
             members: what the simulated wires take reality to be; around what is given if not given.
+            pace: what each step grants the search for what explains the exposures; if not given, one waits for it all.
         """
         self._navigation, self._config = navigation, config or BeliefConfig()
         self._given = Belief.around(self._config) if members is None else tuple(members)
@@ -140,6 +140,7 @@ class Monitor:
         self.seen: TipMeasurement | None = None
         self._tests, self._loads = calibration is not None and not navigation.catheters, LoadRatio()
         self.changes_left, self._since, self._returned = _MOST, 0, False
+        self._pace, self._thought = pace or Pace(), None
         self._watch, self._innovations = None, Innovations()
         if calibration is not None:
             tip_radius_mm, at = navigation.device.tip_radius_mm, predicted_tip(self.belief)
@@ -150,6 +151,11 @@ class Monitor:
     def lost(self) -> bool:
         """Whether no wire explains what X-ray showed last."""
         return self.states.lost
+
+    @property
+    def thinks(self) -> bool:
+        """Whether it seeks what explains the exposures: the devices rest as long, without X-ray."""
+        return self._thought is not None
 
     @property
     def alarm(self) -> bool:
@@ -186,10 +192,14 @@ class Monitor:
         back = self.belief.drives.proximal[0, 0] <= self._navigation.start_inserted_length_mm
         if exposure is not None:
             self._see(exposure, period, at)
+        told = exposure is not None or self.thinks
+        if self._thought is not None:
+            self._think(self._thought)
+        if told:
             at = predicted_tip(self.belief)
-        explained = self.belief.explains if exposure is not None else True
+        explained = self.belief.explains if told else True
         event = Event.UNEXPLAINED if not explained else Event.DOUBTED if self.alarm else Event.TRUSTED
-        self.states.take(event if exposure is not None or back else None)
+        self.states.take(event if (told or back) and not self.thinks else None)
         if watch is None:
             return BelievedTip(float(at.tip[0]), float(at.tip[1]), branch=int(self.belief.tip.branch[self.belief.best]))
         if self.seen is not None:
@@ -197,7 +207,9 @@ class Monitor:
         motion = _MOTION_SD_MM * (self.belief.motion is not None)
         changed = self.identified is not None or self.moves is not None or self.belief.drives.unknown
         pressed = self.load_ratio * float(self.belief.force[self.belief.best]) / self._navigation.force_limit_n
-        due = watch.advise(at, self.belief.play_spread() ** 2 + motion**2, changed=changed, pressed=pressed)
+        due = not self.thinks and watch.advise(
+            at, self.belief.play_spread() ** 2 + motion**2, changed=changed, pressed=pressed
+        )
         return self._believed(watch, at.tip, due)
 
     def _see(self, exposure: TipMeasurement, period: int, at: Predicted) -> None:
@@ -210,10 +222,38 @@ class Monitor:
         self.sought = not self.belief.explains and self.belief.seek(seen)
         self._innovations.alarm |= self._tests and not self.belief.explains
         self._since += 1
-        if self.alarm and self._finds_motion():
-            self._renew()
-        elif self._is_to_change():
-            self._identify()
+        seeks_motion, changes = self._may_move(), self._is_to_change()
+        if self._thought is None and (seeks_motion or changes):
+            self._thought = self._explaining(seeks_motion=seeks_motion, changes=changes)
+
+    def _explaining(self, *, seeks_motion: bool, changes: bool) -> Thought[Explanation | None]:
+        """Begin to seek what explains the exposures, which may take longer than a decision."""
+        belief, past, budget = copy.copy(self.belief), self.past.copy(), Budget()
+        navigation, given, moves, belief.budget = self._navigation, self._given, self.moves, budget
+
+        def work(_: object) -> Explanation | None:  # holds no monitor, which holds the thought
+            return explain(belief, past, navigation, given, moves=moves, seeks_motion=seeks_motion, changes=changes)
+
+        return Thought(work, budget, self._pace)
+
+    def _think(self, thought: Thought[Explanation | None]) -> None:
+        """Let the search for what explains the exposures go on, and believe that once it is found."""
+        thought.wait()
+        if thought.busy:
+            return
+        self._thought, found = None, thought.found
+        if found is None:
+            return
+        found.belief.budget = None
+        found.go_on(self.past)
+        if found.moves is not self.moves:
+            found.belief.drives.begin(self.past.measured[-1][0])
+        else:
+            self.changes_left -= 1
+            if len(found.past.proximal) == 1:
+                self._given = found.belief.members
+        self.belief, self.identified, self.moves = found.belief, found.identified, found.moves
+        self._renew()
 
     @property
     def may_return(self) -> bool:
@@ -234,7 +274,7 @@ class Monitor:
             for each in tried:
                 each.replay(self.past)
             still, found = tried[0], tried[-1]
-            if found.evidence < still.evidence + _BETTER:
+            if found.evidence < still.evidence + BETTER:
                 found, self.moves = still, None
             self.belief, self._returned = found, True
             period = len(self.past.proximal) - 1
@@ -248,61 +288,20 @@ class Monitor:
         first = self.identified is None and self.moves is None and not self.belief.drives.unknown
         return first or (self._since >= _EVERY and (not self.belief.explains or self._innovations.outside))
 
-    def _identify(self) -> None:
-        """Change the belief to what explains all exposures."""
-        found, identified = identify(self.belief, self.past)
-        self.changes_left -= 1
-        if len(self.past.proximal) == 1:
-            self._given = found.members
-        elif not self.belief.drives.lose:
-            other = self.belief.like(self._given, drives=self.belief.drives.of_robot(UNKNOWN))
-            proximal = other.rerun(self.past)
-            if other.evidence > found.evidence:
-                found, identified, self.past.proximal = other, None, proximal
-        self.belief, self.identified = found, identified
-        self._renew()
-
     def _renew(self) -> None:
         """Begin with another belief."""
         self._since, self._loads = 0, LoadRatio()
         self._innovations.renew(unknown=self.identified is not None and not self.identified.explains)
-        period = len(self.past.proximal) - 1
-        self.seen = self.belief.in_vessel(self.past.exposures[period], period)
+        period, seen = list(self.past.exposures.items())[-1]
+        self.seen = self.belief.in_vessel(seen, period)
 
-    def _finds_motion(self) -> bool:
-        """Return whether a motion of the vessel explains the exposures, and take it into the belief then."""
-        given, drives = self._navigation, self.belief.drives
-        if not self._tests or len(self.past.exposures) < _LEAST_EXPOSURES:
-            return False
-        members, past = self.belief.members, self.past
-        if self.moves is None and given.known_motion is None and self._farthest_outside_mm() < _OUTSIDE_MM:
-            return False
-        wrong = not self.belief.explains or self._innovations.outside
-        if self.moves is not None and not wrong and self._since < _EVERY:
+    def _may_move(self) -> bool:
+        """Return whether a motion of the vessel may explain the exposures."""
+        if not (self.alarm and self._tests) or len(self.past.exposures) < _LEAST_EXPOSURES:
             return False
         if self.moves is None:
-            members = self._given
-            if drives.unknown:  # its encoder may be right, and the image was wrong
-                drives, past = drives.of_robot(given.robot), self.past.by_encoders()
-        tried = self.belief.like(members, drives=drives)
-        tried.replay(past)
-        found = self.moves
-        for _ in range(2):  # the wire as it lies in a vessel that lies still, and in one that moves
-            best = tried.best
-            tip, direction = (np.array([each[best] for each in some]) for some in zip(*tried.shown, strict=True))
-            seen = np.array([self.belief.in_laboratory(each, period) for period, each in past.exposures.items()])
-            times_s = DECISION_PERIOD_S * np.array(list(past.exposures))
-            ostium = np.asarray(given.anatomy.insertion.position)
-            found = find_motion(tip, direction, seen, times_s, ostium, known=given.known_motion)
-            if found.gain < _LEAST_GAIN or found.misfit > _MOST_MISFIT:
-                return False
-            tried = self.belief.like(members, motion=found.motion, drives=drives)
-            tried.replay(past)
-        if tried.evidence < self.belief.evidence + _BETTER:
-            return False
-        self.belief, self.moves, self.identified, self.past = tried, found, None, past
-        drives.begin(past.measured[-1][0])
-        return True
+            return self._navigation.known_motion is not None or self._farthest_outside_mm() >= _OUTSIDE_MM
+        return not self.belief.explains or self._innovations.outside or self._since >= _EVERY
 
     def _farthest_outside_mm(self) -> float:
         """Return how far outside the lumen an exposure showed the tip at most, mm."""

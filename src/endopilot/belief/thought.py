@@ -6,11 +6,28 @@ import threading
 import time
 import weakref
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
+from endopilot.simulation.config import LANES
+from endopilot.simulation.state import Step
+
 Found = TypeVar("Found")
+_CALL = 4000
+"""Evaluations of nodes that take as long as what a call of the core takes besides, about 0.5 ms."""
+
+
+class Pace(NamedTuple):
+    """What a decision grants work that takes longer than a decision may.
+
+    Attributes:
+        evaluations: of nodes (Newton's iterations times active nodes) that it waits for.
+        seconds: that it waits instead, s; the work then goes on without it, and its bits do not repeat.
+    """
+
+    evaluations: float | int = np.inf
+    seconds: float | None = None
 
 
 class OutOfBudgetError(Exception):
@@ -65,6 +82,14 @@ class Budget:
             if self._cancelled:
                 raise CancelledError
 
+    def simulated(self, step: Step, alike: int) -> None:
+        """Take a step of the rod core off, of so many worlds of each vessel and stack.
+
+        Packs of `LANES` worlds may not be full; a node of a pair costs twice a wire's.
+        """
+        packed, devices = -(-alike // LANES) * LANES / alike, step.inserted_length.shape[1]
+        self.spend(devices * packed * float(step.node_iterations.sum()) + _CALL)
+
     def grant(self, evaluations: float | int, seconds: float | None) -> None:
         """Let the work in another thread spend more, and wait until it has, or has ended, or some time is over, s."""
         with self._turn:
@@ -99,19 +124,16 @@ class Thought(Generic[Found]):
         self,
         work: Callable[[Callable[[Found], None]], Found],
         budget: Budget,
-        *,
-        evaluations: float | int,
-        seconds: float | None,
+        pace: Pace,
     ) -> None:
         """Begin.
 
         Args:
             work: what is worked out; it is given what to call with the answer as far as it is known.
-            budget: that the work takes off, of which each decision grants some.
-            evaluations: of nodes that each decision grants.
-            seconds: that each decision waits at most, s: the work goes on without it then, and needs no grants.
+            budget: that the work takes off.
+            pace: what each decision grants of it.
         """
-        self.busy, self._granted, self._seconds = True, evaluations if seconds is None else np.inf, seconds
+        self.busy, self._granted, self._seconds = True, pace.evaluations, pace.seconds
         budget.begin(granted=0.0)
         self._budget, self._thread = budget, _Thread(work, budget)
         self._thread.start()
@@ -129,7 +151,7 @@ class Thought(Generic[Found]):
 
     def wait(self) -> None:
         """Let it go on for a decision; what fails in it is raised here."""
-        self._budget.grant(self._granted, self._seconds)
+        self._budget.grant(self._granted if self._seconds is None else np.inf, self._seconds)
         self.busy = not self._thread.ended
         if self._thread.error is not None:
             raise self._thread.error

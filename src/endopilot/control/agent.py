@@ -90,11 +90,14 @@ class _PlanningPolicy:
         """Follow the course, search another one, or pull back, as the module describes."""
         self._observe(observation)
         self._shows, lost = False, self.monitor.lost
-        wanted = self._pull_back() if lost else self._go_on(observation)
+        if self.monitor.thinks:
+            wanted = self._follower.move([0.0 for _ in self.navigation.devices])
+        else:
+            wanted = self._pull_back() if lost else self._go_on(observation)
         self.belief.drives.sent(wanted)
         ends = self._failed >= self.config.tries and self._follower.course is None and not lost
         ends = ends and not self.monitor.may_return
-        expose = self._back_far_enough() if lost else self.wants_xray()
+        expose = not self.monitor.thinks and (self._back_far_enough() if lost else self.wants_xray())
         return Decision(wanted, expose=expose, gives_up=self.halt if ends else "")
 
     def watch(self, observation: Observation) -> None:
@@ -152,7 +155,7 @@ class _PlanningPolicy:
             self.belief = monitor.belief
             self._begin_anew()
         self._limit_load()
-        if monitor.sought or (monitor.seen is not None and (before or monitor.lost)):
+        if monitor.thinks or monitor.sought or (monitor.seen is not None and (before or monitor.lost)):
             self._forget()  # they lie otherwise than the course was searched for
         if monitor.seen is not None:
             self._back_mm = self.belief.drives.proximal[0, 0] - self._way_back(monitor.seen)
@@ -252,8 +255,7 @@ class _PlanningPolicy:
             return
         self._crept, self.plans = 0, self.plans + 1
         self._search.set_out(self.belief, seconds=seconds, horizon_mm=self.config.horizon_mm or np.inf)
-        evaluations, seconds = self.config.decision_evaluations, self.config.decision_s
-        self._thought = Thought(self._search.go_on, self._search.budget, evaluations=evaluations, seconds=seconds)
+        self._thought = Thought(self._search.go_on, self._search.budget, self.config.pace)
 
     def _think(self, thought: Thought[Course]) -> None:
         """Let the search go on for a decision, and follow what it has found."""
@@ -299,7 +301,7 @@ class OraclePolicy(_PlanningPolicy):
 
     def _monitored(self) -> Monitor:
         members = [World(ostium_mm=self._world.ostium_mm)]
-        return Monitor(self.navigation, None, config=self.config.belief, members=members)
+        return Monitor(self.navigation, None, config=self.config.belief, members=members, pace=self.config.pace)
 
     def wants_xray(self) -> bool:
         """X-ray is always on."""
@@ -343,7 +345,8 @@ class AgentPolicy(_PlanningPolicy):
         navigation = self.navigation
         self._calibration = self._given or read_agent_calibration(navigation.xray, len(navigation.devices))
         self._exposures = 1  # a navigation begins with one
-        return Monitor(navigation, self._calibration, config=self.config.belief, advice=self._advice)
+        config = self.config
+        return Monitor(navigation, self._calibration, config=config.belief, advice=self._advice, pace=config.pace)
 
     def decide(self, observation: Observation) -> Decision:
         """Follow the course as the module describes; end where belief after belief was lost."""

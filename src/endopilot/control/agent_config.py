@@ -8,6 +8,7 @@ from typing import Annotated
 
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import BeliefConfig
+from endopilot.belief.thought import Pace
 from endopilot.control.search_config import SearchConfig
 from endopilot.errors import InputError
 from endopilot.settings import Positive, Within, settings
@@ -52,6 +53,11 @@ class AgentConfig:
     """Processor time after which a search ends likewise, s: then its bits hang on the machine's speed."""
     most_exposures: Annotated[int, Within(1, 10**6)] = 40
     """Exposures that an agent which looks when its adviser asks may take; it gives up where it needs more."""
+
+    @property
+    def pace(self) -> Pace:
+        """What a decision waits for."""
+        return Pace(self.decision_evaluations, self.decision_s)
 
     @staticmethod
     def of(navigation: Navigation) -> AgentConfig:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,6 @@ from endopilot.belief.thought import Budget
 from endopilot.control.course import Course
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Stack
-from endopilot.simulation.config import LANES
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState, Step
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
@@ -27,8 +27,6 @@ _SHORT_MM = 1.0
 _LOOKS = 5
 """Times in a period at which forces are read: a tip that is caught presses harder until it snaps, within some tenths
 of a second."""
-_CALL = 4000
-"""Evaluations of nodes that take as long as what a call of the core takes besides, about 0.5 ms."""
 _TIP = tuple(TipProjection.__dataclass_fields__)
 
 
@@ -246,16 +244,13 @@ class Trials:
         Raises:
             OutOfBudgetError: the search has spent its budget.
         """
-        step = drive_period(self.simulator, np.tile(control, (self.wires, 1, 1)), self._spend)
+        step = drive_period(
+            self.simulator, np.tile(control, (self.wires, 1, 1)), partial(self._budget.simulated, alike=self.count)
+        )
         self._seen = None
         proximal, tips = self._see()
         self.rows.append(Period(control, proximal, tips[:, WIRE], step.contact_force_max))
         return step
-
-    def _spend(self, step: Step) -> None:
-        """Take a step off the budget. Packs of `LANES` worlds may not be full; a pair's node costs twice a wire's."""
-        packed = -(-self.count // LANES) * LANES / self.count
-        self._budget.spend(self.devices * packed * float(step.node_iterations.sum()) + _CALL)
 
     def kept(self) -> Kept:
         """Return where they are."""
