@@ -27,15 +27,14 @@ from endopilot.xray.line_observations import (
     Line,
     Observations,
     SeenLine,
-    VesselGrid,
     joined,
     line_observations,
-    make_grid,
     see,
     shown_by,
     tip_observations,
 )
 from endopilot.xray.tip_posterior import Status, around_mode
+from endopilot.xray.vessel_grid import VesselGrid, make_grid
 
 _STEP_MM = 1.0
 """Distance of the grid's places, mm."""
@@ -161,9 +160,10 @@ class TipFilter:
         """Take the vessel and what sees it; `config` says what is known before the first frame."""
         self.config = config or LocateConfig()
         self._tree, self._cameras = tree, tuple(cameras)
-        self.grid: VesselGrid = make_grid(tree, step_mm=_STEP_MM, stiff_mm=self.config.stiff_mm)
+        self.grid: VesselGrid = make_grid(tree, step_mm=_STEP_MM)
+        self._way = self.grid.straightened(self.config.stiff_mm)
         count = len(self.grid.middle)
-        self._centre = self.grid.way.mean(axis=0)
+        self._centre = self._way.mean(axis=0)
         self._aside = _ASIDE_SD_MM + _ASIDE_RADII * self.grid.radius
         turn = np.deg2rad(self.config.turn_sd_deg)
         spread = np.array([*[self.config.registration_sd_mm] * 3, *[turn] * 3])
@@ -244,7 +244,7 @@ class TipFilter:
 
     def _moved(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "n 3"]:
         matrix = Rotation.from_rotvec(pose[3:6]).as_matrix()
-        return (self.grid.way - self._centre) @ matrix.T + self._centre + pose[:3]
+        return (self._way - self._centre) @ matrix.T + self._centre + pose[:3]
 
     def _compare(
         self, seen: Sequence[SeenLine], places: Int[np.ndarray, "m"], base: Float[np.ndarray, "6"]
@@ -327,7 +327,7 @@ class TipFilter:
         section = here.section[np.abs(here.centerline.abscissa - grid.abscissa[place]).argmin()]
         left = np.abs(rows.value - np.einsum("mri,mri->mr", rows.towards, fit.moved))[best]
         of_line = rows.used[best] & (rows.place[best] != places[best])
-        moved = self._moved(base)[places[best]] - grid.way[places[best]] + fit.moved[best, 0]
+        moved = self._moved(base)[places[best]] - self._way[places[best]] + fit.moved[best, 0]
         return TipLocation(
             frame=frame,
             status="found" if share >= _SURE else "ambiguous",
