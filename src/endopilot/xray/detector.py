@@ -156,8 +156,6 @@ CATHETER_MM = 8.0
 _MOST_PLACES = 20000
 _SLACK_MM = 0.3
 """How far outside the lumen the wire's axis may seem to lie, mm."""
-_WORTH, _STAYS_MM = 0.0, 0.5
-"""A wire is also followed in a displaced vessel where that is likelier by this logarithm, and by more than this, mm."""
 _BELIEVABLE = 3.0
 """An end farther than this many standard deviations from the followed wire's is another line's."""
 
@@ -256,22 +254,18 @@ class TipDetector:
         covariance = config.displaced_mm**2 * np.eye(3) if displaced is None else displaced
         ends = end_log(self.grid.abscissa, inserted_length) + (0.0 if expected is None else expected)
         moved = displacements(self.grid, self._room_mm, views, evidence, covariance, ends)
-        log_share = float(np.log(config.displaced / (1 - config.displaced)))
-        found = here
-        if moved.log_odds + log_share > _WORTH and np.linalg.norm(moved.shift) > _STAYS_MM:
-            views = [replace(view, source=view.source - moved.shift) for view in views]
-            there = follow(views)
-            # Laplace's evidence: of all shifts that were possible, one as narrow as what the images leave.
-            fits = -0.5 * float(moved.shift @ np.linalg.solve(covariance, moved.shift))
-            fits += 0.5 * float(np.linalg.slogdet(moved.covariance)[1] - np.linalg.slogdet(covariance)[1])
-            # A vessel that lies farther back shows more of the same wire in its catheter.
-            behind = here if moved.shift @ self._anatomy.insertion.direction > 0 else there
-            in_catheter = behind.ends[self.grid.abscissa < 0][-1] / CATHETER_MM
-            fits += float(in_catheter * (moved.shift @ self._anatomy.insertion.direction))
-            odds = there.log_odds - here.log_odds + log_share + fits
-            found = _either(here, replace(there, shift=moved.shift, shift_covariance=moved.covariance), odds)
-            if found.shift is here.shift:
-                views = [replace(view, source=view.source + moved.shift) for view in views]
+        shifted = [replace(view, source=view.source - moved.shift) for view in views]
+        there = follow(shifted)
+        # Laplace's evidence: of all shifts that were possible, one as narrow as what the images leave.
+        odds = there.log_odds - here.log_odds + float(np.log(config.displaced / (1 - config.displaced)))
+        odds -= 0.5 * float(moved.shift @ np.linalg.solve(covariance, moved.shift))
+        odds += 0.5 * float(np.linalg.slogdet(moved.covariance)[1] - np.linalg.slogdet(covariance)[1])
+        # A vessel that lies farther back shows more of the same wire in its catheter.
+        behind = here if moved.shift @ self._anatomy.insertion.direction > 0 else there
+        in_catheter = behind.ends[self.grid.abscissa < 0][-1] / CATHETER_MM
+        odds += float(in_catheter * (moved.shift @ self._anatomy.insertion.direction))
+        found = _either(here, replace(there, shift=moved.shift, shift_covariance=moved.covariance), odds)
+        views = views if found.shift is here.shift else shifted
         found = _refined(found, views, plain, self._radius_mm)
         hidden = any(_lies_on(line, view, found.position) for line, view in zip(lines, views, strict=False))
         return self._judged(found, hidden=hidden)

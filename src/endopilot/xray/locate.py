@@ -45,4 +45,5 @@ def locate(
         for frame in frames:
             found.append(follow.update(frame.number, frame.lines))
             advance()
-    return tuple(found)
+    smoothed = follow.smooth()
+    return tuple(smoothed.get(one.frame, one) for one in found)

@@ -171,6 +171,7 @@ class TipFilter:
         self._mean = np.zeros((count, 6))
         self._covariance = np.tile(np.diag(spread**2), (count, 1, 1))
         self._begun = False
+        self._seen = []
 
     def update(self, frame: int, lines: Sequence[Line | None]) -> TipLocation:
         """Return where the tip is, by this frame and those before.
@@ -204,10 +205,25 @@ class TipFilter:
             return TipLocation.nowhere(frame)
         log = self._log[places] + odds + (_BEYOND - _STRAY) * beyond
         evidence = np.logaddexp.reduce(log)
+        self.evidence = getattr(self, 'evidence', 0.0) + float(np.logaddexp.reduce(self._log[places] + odds))
         self._log = np.full_like(self._log, -np.inf)
         self._log[places] = log - evidence
         self._mean[places], self._covariance[places] = fit.mean, fit.covariance
-        return self._answer(frame, places, fit, rows, base)
+        self._seen.append((frame, places, odds + (_BEYOND - _STRAY) * beyond, fit, rows, base, log - evidence))
+        return self._answer(frame, places, fit, rows, base, log - evidence)
+
+    def smooth(self):
+        later, found, last = np.zeros(len(self.grid.middle)), {}, None
+        for frame, places, odds, fit, rows, base, log in reversed(self._seen):
+            if last is not None:
+                flow = goes(self.grid, self.config, float(last - frame))
+                later = np.log(flow @ np.exp(later - later.max()) + 1e-300)
+            whole = log + later[places]
+            found[frame] = self._answer(frame, places, fit, rows, base, whole - np.logaddexp.reduce(whole))
+            seen = np.full_like(later, odds.min())
+            seen[places] = odds
+            later, last = later + seen, frame
+        return found
 
     def _begin(self, lines: Sequence[Line | None]) -> bool:
         """Register the patient by the landmark, if there is one; return whether it was seen or is not needed."""
@@ -312,10 +328,11 @@ class TipFilter:
         )
 
     def _answer(
-        self, frame: int, places: Int[np.ndarray, "m"], fit: _Fit, rows: Observations, base: Float[np.ndarray, "6"]
+        self, frame: int, places: Int[np.ndarray, "m"], fit: _Fit, rows: Observations, base: Float[np.ndarray, "6"],
+        log: Float[np.ndarray, "m"]
     ) -> TipLocation:
         """Return mean and covariance around the mode of the posterior."""
-        grid, weight = self.grid, np.exp(self._log[places])
+        grid, weight = self.grid, np.exp(log)
         best = int(weight.argmax())
         near = np.linalg.norm(grid.middle[places] - grid.middle[places[best]], axis=1) <= _NEAR_MM
         close, tips = places[near], grid.middle[places] + fit.aside
