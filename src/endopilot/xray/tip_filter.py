@@ -11,7 +11,7 @@ of pose, of breathing, and of how far the device lies off its way.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -46,13 +46,15 @@ _ASIDE_SD_MM, _ASIDE_RADII, _ASIDE_MM = 1.5, 0.1, 20.0
 """How far the device lies off its way: this, and this share of the lumen's radius, mm; and over which length alike."""
 _DRIFT_MM, _DRIFT_RAD = 0.5, np.deg2rad(0.2)
 """Standard deviations of how the pose drifts from frame to frame."""
-_LANDMARK_SD_MM, _TIP_SD_MM = 6.0, 2.0
-"""Of the shift that a landmark shows, since the vessel breathes; and of a tip that is a landmark, along the vessel."""
+_LANDMARK_SD_MM, _DEPTH_SD_MM, _TIP_SD_MM = 6.0, 12.0, 2.0
+"""Of the shift that a landmark shows, since the vessel breathes; more along the beam, since a C-arm's distances are
+known to some 1.5 % of 800 mm, and depth and scale look alike; and of a tip that is a landmark, along the vessel."""
 _STRAY, _BEYOND = np.log(1 / 200), -2.5
 """Logarithm of the density, 1/mm, of a point that is not of the device, evenly in 200 mm; and of one in the catheter or
 vessel before the root, where the way is not known."""
 _LEAST_ODDS = 20.0
 """A line is the device's where it is likelier so, by this logarithm, than if its points were strays."""
+_LEAST = 1e-300
 _ROUNDS = 3
 _PRUNE, _MOST = 18.0, 600
 """Places whose tip alone is less likely than the best one's by this logarithm are not compared further, nor more than
@@ -149,6 +151,35 @@ def goes(grid: VesselGrid, config: LocateConfig, frames: float) -> Float[np.ndar
     return (1 - rare) * stay / stay.sum(axis=1, keepdims=True) + rare / len(stay)
 
 
+def told_by_later(
+    seen: Sequence[Float[np.ndarray, "_"]], going: Callable[[int], Float[np.ndarray, "_ _"]]
+) -> list[Float[np.ndarray, "_"]]:
+    """Return what all later frames say of the tip's place in each, a logarithm.
+
+    Args:
+        seen: what each frame says of some places by itself, a logarithm.
+        going: how likely the tip goes from each place of a frame to each of the next one, given the frame's index.
+    """
+    told = [np.zeros(len(seen[-1]))] if len(seen) else []
+    for k in range(len(seen) - 1, 0, -1):
+        log = seen[k] + told[-1]
+        told.append(np.log(going(k - 1) @ np.exp(log - log.max()) + _LEAST))
+    return told[::-1]
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What a frame says: of some places the observations, what they depend on, and the posterior up to the frame."""
+
+    frame: int
+    places: Int[np.ndarray, "m"]
+    odds: Float[np.ndarray, "m"]
+    fit: _Fit
+    rows: Observations
+    base: Float[np.ndarray, "6"]
+    log: Float[np.ndarray, "m"]
+
+
 class TipFilter:
     """Follows the tip of one device through the frames of a sequence.
 
@@ -170,8 +201,8 @@ class TipFilter:
         self._log = np.full(count, -np.log(count))
         self._mean = np.zeros((count, 6))
         self._covariance = np.tile(np.diag(spread**2), (count, 1, 1))
-        self._begun = False
-        self._seen = []
+        self._begun, self._registers_itself = False, self.config.landmark_mm is None and len(self._cameras) == 1
+        self._seen: list[_Seen] = []
 
     def update(self, frame: int, lines: Sequence[Line | None]) -> TipLocation:
         """Return where the tip is, by this frame and those before.
@@ -203,26 +234,32 @@ class TipFilter:
         whole = rows.value.shape[1] > 2 * len(seen)
         if np.logaddexp.reduce(self._log[places] + odds) < (_LEAST_ODDS if whole else 0.0):
             return TipLocation.nowhere(frame)
-        log = self._log[places] + odds + (_BEYOND - _STRAY) * beyond
-        evidence = np.logaddexp.reduce(log)
-        self.evidence = getattr(self, 'evidence', 0.0) + float(np.logaddexp.reduce(self._log[places] + odds))
+        odds = odds + (_BEYOND - _STRAY) * beyond
+        log = self._log[places] + odds
+        log -= np.logaddexp.reduce(log)
         self._log = np.full_like(self._log, -np.inf)
-        self._log[places] = log - evidence
+        self._log[places] = log
         self._mean[places], self._covariance[places] = fit.mean, fit.covariance
-        self._seen.append((frame, places, odds + (_BEYOND - _STRAY) * beyond, fit, rows, base, log - evidence))
-        return self._answer(frame, places, fit, rows, base, log - evidence)
+        self._seen.append(_Seen(frame, places, odds, fit, rows, base, log))
+        return self._answer(self._seen[-1], log)
 
-    def smooth(self):
-        later, found, last = np.zeros(len(self.grid.middle)), {}, None
-        for frame, places, odds, fit, rows, base, log in reversed(self._seen):
-            if last is not None:
-                flow = goes(self.grid, self.config, float(last - frame))
-                later = np.log(flow @ np.exp(later - later.max()) + 1e-300)
-            whole = log + later[places]
-            found[frame] = self._answer(frame, places, fit, rows, base, whole - np.logaddexp.reduce(whole))
-            seen = np.full_like(later, odds.min())
-            seen[places] = odds
-            later, last = later + seen, frame
+    def smooth(self) -> dict[int, TipLocation]:
+        """Return where the tip is in each frame that shows it, by all frames, those after too.
+
+        One view of a patient whom the device alone registers shows travel and shift alike: what later frames say of the
+        tip's place is what they say of the pose, and tells nothing more. None is returned then.
+        """
+        if self._registers_itself:
+            return {}
+        found, all_seen = {}, self._seen
+        frames = np.diff([one.frame for one in all_seen])
+        def going(k: int) -> Float[np.ndarray, "_ _"]:
+            flow = goes(self.grid, self.config, float(frames[k]))
+            return flow[np.ix_(all_seen[k].places, all_seen[k + 1].places)]
+
+        for one, later in zip(all_seen, told_by_later([one.odds for one in all_seen], going), strict=True):
+            log = one.log + later
+            found[one.frame] = self._answer(one, log - np.logaddexp.reduce(log))
         return found
 
     def _begin(self, lines: Sequence[Line | None]) -> bool:
@@ -243,7 +280,8 @@ class TipFilter:
             shown, slope = shown_by(self._cameras[0], point[None] + shift)
             shift = shift + np.linalg.pinv(slope[0]) @ (np.array(pixel) - shown[0])
         self._mean[:, :3] = shift
-        self._covariance[:, :3, :3] = _LANDMARK_SD_MM**2 * np.eye(3)
+        beam = np.linalg.svd(shown_by(self._cameras[0], point[None] + shift)[1][0])[2][2]
+        self._covariance[:, :3, :3] = _LANDMARK_SD_MM**2 * np.eye(3) + _DEPTH_SD_MM**2 * np.outer(beam, beam)
         return True
 
     def _predict(self, frames: int) -> None:
@@ -251,12 +289,12 @@ class TipFilter:
         flow = goes(self.grid, self.config, float(frames)) * np.exp(self._log)[:, None]
         total = flow.sum(axis=0)
         flow /= total
+        drift = np.diag(np.array([*[_DRIFT_MM] * 3, *[_DRIFT_RAD] * 3]) ** 2)
         square = self._covariance + self._mean[:, :, None] * self._mean[:, None]
         mean = flow.T @ self._mean
         square = (flow.T @ square.reshape(len(total), -1)).reshape(square.shape)
-        drift = np.array([*[_DRIFT_MM] * 3, *[_DRIFT_RAD] * 3])
         self._log, self._mean = np.log(total), mean
-        self._covariance = square - mean[:, :, None] * mean[:, None] + frames * np.diag(drift**2)
+        self._covariance = square - mean[:, :, None] * mean[:, None] + frames * drift
 
     def _moved(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "n 3"]:
         matrix = Rotation.from_rotvec(pose[3:6]).as_matrix()
@@ -327,12 +365,10 @@ class TipFilter:
             aside_covariance=aside[:, :1, :1] * np.eye(3) - own.swapaxes(1, 2) @ solved[..., 7:],
         )
 
-    def _answer(
-        self, frame: int, places: Int[np.ndarray, "m"], fit: _Fit, rows: Observations, base: Float[np.ndarray, "6"],
-        log: Float[np.ndarray, "m"]
-    ) -> TipLocation:
+    def _answer(self, seen: _Seen, log: Float[np.ndarray, "m"]) -> TipLocation:
         """Return mean and covariance around the mode of the posterior."""
-        grid, weight = self.grid, np.exp(log)
+        grid, places, fit, rows = self.grid, seen.places, seen.fit, seen.rows
+        weight = np.exp(log)
         best = int(weight.argmax())
         near = np.linalg.norm(grid.middle[places] - grid.middle[places[best]], axis=1) <= _NEAR_MM
         close, tips = places[near], grid.middle[places] + fit.aside
@@ -344,9 +380,9 @@ class TipFilter:
         section = here.section[np.abs(here.centerline.abscissa - grid.abscissa[place]).argmin()]
         left = np.abs(rows.value - np.einsum("mri,mri->mr", rows.towards, fit.moved))[best]
         of_line = rows.used[best] & (rows.place[best] != places[best])
-        moved = self._moved(base)[places[best]] - self._way[places[best]] + fit.moved[best, 0]
+        moved = self._moved(seen.base)[places[best]] - self._way[places[best]] + fit.moved[best, 0]
         return TipLocation(
-            frame=frame,
+            frame=seen.frame,
             status="found" if share >= _SURE else "ambiguous",
             position=mean,
             covariance=covariance,

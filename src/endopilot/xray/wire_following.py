@@ -173,27 +173,26 @@ class Follower:
 
         Each is the likeliest, given the one after; `most` is the number of the last places that are wanted.
         """
-        each, index = range(len(self.shown)), leg.alpha[at].argmax(axis=1)
-        places, found = [int(leg.places[at])], [index]
-        while len(found) != most and (at > 0 or leg.before is not None):
-            last = places[-1]
-            if at > 0:
-                at -= 1
-                low = np.clip(index - _REACH, 0, len(self.aside) - len(_TURNS))
-                near = np.stack([leg.alpha[at, k, low[k] : low[k] + len(_TURNS)] for k in each])
-                index = low + (near * self._turn[index[:, None], low[:, None] + np.arange(len(_TURNS))]).argmax(axis=1)
-            else:
-                assert leg.before is not None
-                leg, at = leg.before
-                expected = [
-                    float(self.shown[k].from_before(last, int(leg.places[at]), self.aside[index[k : k + 1]])[0])
-                    for k in each
-                ]
-                away = np.exp(-0.5 * (self.aside - np.array(expected)[:, None]) ** 2) + 1e-9
-                index = (leg.alpha[at] * away).argmax(axis=1)
-            places.append(int(leg.places[at]))
-            found.append(index)
-        return np.array(places[::-1]), self.aside[np.array(found[::-1])]
+        index, places, found = leg.alpha[at].argmax(axis=1).tolist(), [], []
+        while True:
+            low = 0 if most is None else max(at + 1 + sum(map(len, places)) - most, 0)
+            part = np.empty((at + 1 - low, len(index)), dtype=np.int64)
+            for k, j in enumerate(index):
+                part[-1, k] = j
+                for back, share in enumerate(leg.alpha[low:at, k][::-1], start=2):
+                    left, right = max(j - _REACH, 0), j + _REACH + 1
+                    j = left + int((share[left:right] * self._turn[j, left:right]).argmax())
+                    part[-back, k] = j
+            places.append(leg.places[low : at + 1][::-1])
+            found.append(part[::-1])
+            if low > 0 or leg.before is None or sum(map(len, places)) == most:
+                break
+            last, (leg, at) = int(leg.places[0]), leg.before
+            for k, one in enumerate(self.shown):
+                expected = one.from_before(last, int(leg.places[at]), self.aside[part[0, k] : part[0, k] + 1])
+                away = np.exp(-0.5 * (self.aside - expected) ** 2) + 1e-9
+                index[k] = int((leg.alpha[at, k] * away).argmax())
+        return np.concatenate(places)[::-1], self.aside[np.concatenate(found)[::-1]]
 
     def in_space(
         self,
