@@ -158,7 +158,7 @@ def test_a_wire_that_folds_back_ends_behind_its_fold(imager, planes, fork, back_
         error = max(
             np.linalg.norm(planes[i].view.project(found.position) - planes[i].view.project(nodes[0])) for i in shown
         )
-        assert error < 3.0  # pixels
+        assert error < 5.0  # pixels: half of what counts as missed, 1 mm
 
 
 def test_lines_that_were_there_before_are_none_of_the_wire(imager, planes, fork):

@@ -154,6 +154,7 @@ _HIDDEN_MM = 1.5
 CATHETER_MM = 8.0
 """Length of the catheter behind the ostium in which a wire is followed, mm."""
 _MOST_PLACES = 20000
+"""Places of a tree of 5 m: no coronary artery has more."""
 _SLACK_MM = 0.3
 """How far outside the lumen the wire's axis may seem to lie, mm."""
 _BELIEVABLE = 3.0
@@ -253,18 +254,18 @@ class TipDetector:
         here = follow(views)
         covariance = config.displaced_mm**2 * np.eye(3) if displaced is None else displaced
         ends = end_log(self.grid.abscissa, inserted_length) + (0.0 if expected is None else expected)
-        moved = displacements(self.grid, self._room_mm, views, evidence, covariance, ends)
-        shifted = [replace(view, source=view.source - moved.shift) for view in views]
+        shift, left = displacements(self.grid, self._room_mm, views, evidence, covariance, ends)
+        shifted = [replace(view, source=view.source - shift) for view in views]
         there = follow(shifted)
         # Laplace's evidence: of all shifts that were possible, one as narrow as what the images leave.
         odds = there.log_odds - here.log_odds + float(np.log(config.displaced / (1 - config.displaced)))
-        odds -= 0.5 * float(moved.shift @ np.linalg.solve(covariance, moved.shift))
-        odds += 0.5 * float(np.linalg.slogdet(moved.covariance)[1] - np.linalg.slogdet(covariance)[1])
+        odds -= 0.5 * float(shift @ np.linalg.solve(covariance, shift))
+        odds += 0.5 * float(np.linalg.slogdet(left)[1] - np.linalg.slogdet(covariance)[1])
         # A vessel that lies farther back shows more of the same wire in its catheter.
-        behind = here if moved.shift @ self._anatomy.insertion.direction > 0 else there
+        behind = here if shift @ self._anatomy.insertion.direction > 0 else there
         in_catheter = behind.ends[self.grid.abscissa < 0][-1] / CATHETER_MM
-        odds += float(in_catheter * (moved.shift @ self._anatomy.insertion.direction))
-        found = _either(here, replace(there, shift=moved.shift, shift_covariance=moved.covariance), odds)
+        odds += float(in_catheter * (shift @ self._anatomy.insertion.direction))
+        found = _either(here, replace(there, shift=shift, shift_covariance=left), odds)
         views = views if found.shift is here.shift else shifted
         found = _refined(found, views, plain, self._radius_mm)
         hidden = any(_lies_on(line, view, found.position) for line, view in zip(lines, views, strict=False))

@@ -2,14 +2,13 @@
 
 A wire lies in the lumen. For each shift of the vessel, the evidence of a wire is summed along every way from the
 catheter, at each place the best within the lumen; with how far ways are likely to go, that is how likely the images
-make the shift. The vessel either lies where it is registered, but for what the lumen's room hides, or elsewhere by a
-normal distribution: two hypotheses, whose wires are then followed.
+make the shift. The vessel lies where it is registered, or so shifted: two hypotheses, whose wires are both followed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
@@ -31,25 +30,8 @@ _ROOMS_PX = (1, 3, 5, 8)
 """Half widths of lumina that are told apart, pixels."""
 _INDEPENDENT = 0.25
 """Weight of the sums: places in a lumen choose the best pixel of many, and neighbours share theirs."""
-
-
 _DRIFTS_MM = 0.3
 """A vessel that lies shifted drifts by this from exposure to exposure, mm: an assumption."""
-
-
-@dataclass(frozen=True, eq=False)
-class Displacement:
-    """A shift of the vessel.
-
-    Attributes:
-        shift: LPS mm.
-        covariance: mm².
-        log_odds: logarithm of how likely it is against a vessel that lies where it is registered.
-    """
-
-    shift: Float[np.ndarray, "3"]
-    covariance: Float[np.ndarray, "3 3"]
-    log_odds: float
 
 
 class Displaced:
@@ -89,8 +71,8 @@ def displacements(
     evidence: Sequence[Evidence],
     covariance: Float[np.ndarray, "3 3"],
     ends: Float[np.ndarray, "n"],
-) -> Displacement:
-    """Return the likeliest shift of the vessel.
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """Return the vessel's shift, LPS mm, and its covariance, mm², by the images.
 
     Args:
         grid: of the vessel, its catheter before it.
@@ -124,17 +106,11 @@ def displacements(
         total = before + np.cumsum(score[low : low + len(run)], axis=0) * (_INDEPENDENT * _EVERY)
         sums[int(whole[-1])], low = total[-1], low + len(run)
         best = np.logaddexp(best, np.logaddexp.reduce(total + ends[run, None], axis=0))
-    here = int((tried**2).sum(axis=1).argmin())
-    log = best + prior
-    share = np.exp(log - np.logaddexp.reduce(log))
+    share = np.exp(best + prior - np.logaddexp.reduce(best + prior))
     mean = share @ tried
     off = tried - mean
     left = covariance - seen.T @ (seen @ covariance @ seen.T) @ seen
-    return Displacement(
-        shift=mean,
-        covariance=(share[:, None] * off).T @ off + _STEP_MM**2 / 12 * np.eye(3) + left,
-        log_odds=float(np.logaddexp.reduce(log) - np.logaddexp.reduce(prior) - best[here]),
-    )
+    return mean, (share[:, None] * off).T @ off + _STEP_MM**2 / 12 * np.eye(3) + left
 
 
 def _read(

@@ -253,6 +253,7 @@ class TipFilter:
             return {}
         found, all_seen = {}, self._seen
         frames = np.diff([one.frame for one in all_seen])
+
         def going(k: int) -> Float[np.ndarray, "_ _"]:
             flow = goes(self.grid, self.config, float(frames[k]))
             return flow[np.ix_(all_seen[k].places, all_seen[k + 1].places)]

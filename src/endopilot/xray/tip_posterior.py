@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from endopilot.xray.wire_following import Follower, Leg
 
@@ -113,7 +113,9 @@ def estimate_tip(
 
     anywhere = np.logaddexp.reduce(end_log(grid.abscissa, inserted_length) + by_time)
     scores = [leg.log_scale + before(leg) - anywhere + np.log(1 - _FOLDED_SHARE) for leg in legs]
-    folds = _folds(follower, legs, np.inf if inserted_length is None else inserted_length + 2 * _spread(inserted_length)[1])
+    folds = _folds(
+        follower, legs, np.inf if inserted_length is None else inserted_length + 2 * _spread(inserted_length)[1]
+    )
     back = [follower.backwards(leg, at, longest_mm(inserted_length)) for leg, at in folds]
     if back:
         anywhere = np.logaddexp.reduce(np.concatenate([before(leg) for leg in back]))

@@ -207,9 +207,7 @@ class Follower:
         tangent = self._tangent[places]
         prior = np.eye(3) - tangent[:, :, None] * tangent[:, None]
         prior *= (self._room_mm[places] ** 2 / 4)[:, None, None]
-        rows = np.stack(
-            [np.einsum("ki,kij->kj", one.across[places], one.slope[places]) for one in self.shown], axis=1
-        )
+        rows = np.stack([np.einsum("ki,kij->kj", one.across[places], one.slope[places]) for one in self.shown], axis=1)
         gain = np.linalg.solve(
             rows @ prior @ rows.swapaxes(1, 2) + variance[:, :, None] * np.eye(len(self.shown)), rows @ prior
         ).swapaxes(1, 2)
@@ -267,9 +265,7 @@ class Follower:
             if lost := bool(log_scale < likeliest - _LOST * len(self.shown)):
                 count = high
                 break
-        return Leg(
-            places[:count], alpha[:count], scales[:count], lengths[:count], before, likeliest, lost, free
-        )
+        return Leg(places[:count], alpha[:count], scales[:count], lengths[:count], before, likeliest, lost, free)
 
     def _gain(
         self, places: Int[np.ndarray, "k"], open_: np.ndarray, free: Sequence[Evidence]
