@@ -169,15 +169,27 @@ def told_by_later(
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What a frame says: of some places the observations, what they depend on, and the posterior up to the frame."""
+    """What a frame says of some places of the tip.
+
+    Attributes:
+        frame: its number.
+        places: of the grid.
+        odds: of its line, a logarithm.
+        log: posterior by this frame and those before.
+        tips: where the tip is if it is at that place, LPS mm.
+        covariance: of that, mm².
+        moved: how far the vessel lies there from where the cameras have the CT, LPS mm.
+        residual_mm: mean distance of the line from the moved way; NaN without a line.
+    """
 
     frame: int
     places: Int[np.ndarray, "m"]
     odds: Float[np.ndarray, "m"]
-    fit: _Fit
-    rows: Observations
-    base: Float[np.ndarray, "6"]
     log: Float[np.ndarray, "m"]
+    tips: Float[np.ndarray, "m 3"]
+    covariance: Float[np.ndarray, "m 3 3"]
+    moved: Float[np.ndarray, "m 3"]
+    residual_mm: Float[np.ndarray, "m"]
 
 
 class TipFilter:
@@ -240,7 +252,20 @@ class TipFilter:
         self._log = np.full_like(self._log, -np.inf)
         self._log[places] = log
         self._mean[places], self._covariance[places] = fit.mean, fit.covariance
-        self._seen.append(_Seen(frame, places, odds, fit, rows, base, log))
+        left = np.abs(rows.value - np.einsum("mri,mri->mr", rows.towards, fit.moved))
+        of_line = rows.used & (rows.place != places[:, None])
+        self._seen.append(
+            _Seen(
+                frame=frame,
+                places=places,
+                odds=odds,
+                log=log,
+                tips=self.grid.middle[places] + fit.aside,
+                covariance=fit.aside_covariance,
+                moved=(self._moved(base) - self._way)[places] + fit.moved[:, 0],
+                residual_mm=np.where(of_line, left, 0.0).sum(axis=1) / np.where(of_line.any(1), of_line.sum(1), np.nan),
+            )
+        )
         return self._answer(self._seen[-1], log)
 
     def smooth(self) -> dict[int, TipLocation]:
@@ -368,20 +393,16 @@ class TipFilter:
 
     def _answer(self, seen: _Seen, log: Float[np.ndarray, "m"]) -> TipLocation:
         """Return mean and covariance around the mode of the posterior."""
-        grid, places, fit, rows = self.grid, seen.places, seen.fit, seen.rows
-        weight = np.exp(log)
+        grid, places, weight = self.grid, seen.places, np.exp(log)
         best = int(weight.argmax())
         near = np.linalg.norm(grid.middle[places] - grid.middle[places[best]], axis=1) <= _NEAR_MM
-        close, tips = places[near], grid.middle[places] + fit.aside
-        share, mean, covariance = around_mode(tips, weight, near, grid.step_mm)
+        close = places[near]
+        share, mean, covariance = around_mode(seen.tips, weight, near, grid.step_mm)
         weight = weight[near] / share
-        covariance = covariance + np.einsum("m,mij->ij", weight, fit.aside_covariance[near])
+        covariance = covariance + np.einsum("m,mij->ij", weight, seen.covariance[near])
         place = int(close[np.linalg.norm(grid.middle[close] - weight @ grid.middle[close], axis=1).argmin()])
         here = self._tree.branches[grid.branch[place]]
         section = here.section[np.abs(here.centerline.abscissa - grid.abscissa[place]).argmin()]
-        left = np.abs(rows.value - np.einsum("mri,mri->mr", rows.towards, fit.moved))[best]
-        of_line = rows.used[best] & (rows.place[best] != places[best])
-        moved = self._moved(seen.base)[places[best]] - self._way[places[best]] + fit.moved[best, 0]
         return TipLocation(
             frame=seen.frame,
             status="found" if share >= _SURE else "ambiguous",
@@ -391,8 +412,8 @@ class TipFilter:
             abscissa=float(grid.abscissa[place]),
             branch=int(grid.branch[place]),
             section=self._tree.section_names[section],
-            moved_mm=moved,
-            residual_mm=float(left[of_line].mean()) if of_line.any() else np.nan,
+            moved_mm=seen.moved[best],
+            residual_mm=float(seen.residual_mm[best]),
         )
 
 

@@ -259,9 +259,8 @@ class Follower:
                 alpha[low + number] = state
             scales[low:high] = log_scale + np.cumsum((np.log(gained) + peak).sum(axis=1))
             log_scale, likeliest = float(scales[high - 1]), max(likeliest, float(scales[low:high].max()))
-            if high - low == _CHUNK or high == count:
-                done = self.way(leg, high - 1, _CHUNK + _GAP)
-                self._darken(free, done[0][:-_GAP], done[1][:-_GAP])
+            done = self.way(leg, high - 1, _CHUNK + _GAP)
+            self._darken(free, done[0][:-_GAP], done[1][:-_GAP])
             if lost := bool(log_scale < likeliest - _LOST * len(self.shown)):
                 count = high
                 break
