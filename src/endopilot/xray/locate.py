@@ -46,4 +46,4 @@ def locate(
             found.append(follow.update(frame.number, frame.lines))
             advance()
     smooth = follow.smooth()
-    return tuple(smooth.get(one.frame, one) for one in found)
+    return tuple(smooth[one.frame] if one.frame in smooth else one for one in found)

@@ -58,7 +58,7 @@ class Shown:
         reach = round(_AROUND_MM / grid.step_mm)
         ahead = np.zeros_like(self._pixel)
         for run in grid.runs():
-            line = self._pixel[np.concatenate([[max(grid.parent[run[0]], 0)], run])]
+            line = self._pixel[np.append(max(int(grid.parent[run[0]]), 0), run)]
             index = np.arange(1, len(line))
             ahead[run] = line[np.minimum(index + reach, len(line) - 1)] - line[np.maximum(index - reach, 0)]
         ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
