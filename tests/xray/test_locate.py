@@ -116,7 +116,7 @@ def test_a_landmark_registers_the_first_frame(anatomy) -> None:
 
 
 def test_later_frames_tell_of_earlier_ones(anatomy) -> None:
-    """A slow tip in one view, where a landmark registers: the frames after take away half of what breathing makes of its travel."""
+    """A tip that stays, in one view, where a landmark registers: breathing looks like travel by half as much."""
     devices, moved = course(anatomy, anatomy.tree.leaves()[0], frames=24)
     still = [devices[12]] * 12
     frames = frames_of(still, moved[:12], CAMERAS[:1])

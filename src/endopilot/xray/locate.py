@@ -45,5 +45,4 @@ def locate(
         for frame in frames:
             found.append(follow.update(frame.number, frame.lines))
             advance()
-    smooth = follow.smooth()
-    return tuple(smooth[one.frame] if one.frame in smooth else one for one in found)
+    return tuple(({one.frame: one for one in found} | follow.smooth()).values())
