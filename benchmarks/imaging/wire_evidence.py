@@ -14,8 +14,7 @@ from scipy.optimize import minimize
 
 from benchmarks.imaging.scenes import Scene, SceneConfig, draw_scenes
 from endopilot.files import write_json
-from endopilot.xray.absorbers import in_catheter
-from endopilot.xray.corridor import make_corridor
+from endopilot.xray.absorbers import in_catheter, lumen_points
 from endopilot.xray.detector import PARAMETERS, RidgeEvidence, TipDetector, features, products
 
 SCENES = SceneConfig(patients=8, seed=9001)
@@ -28,8 +27,7 @@ RIDGE = 1e-4
 def samples(scene: Scene, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return the features of pixels on wires, and of pixels in the vessel off them."""
     detector = TipDetector(scene.anatomy, scene.device, evidence=RidgeEvidence(np.zeros(1), 0.0))
-    corridor = make_corridor(scene.anatomy, scene.device.tip_radius_mm, 0.5, np.inf)
-    places = np.concatenate([one.places()[one.open] for one in corridor.passages])
+    places = lumen_points(scene.anatomy)[0]
     on, off = [], []
     for image in range(IMAGES):
         dose = float(np.exp(random.uniform(*np.log(DOSES))))

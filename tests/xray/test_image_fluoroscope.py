@@ -61,7 +61,10 @@ def test_a_wire_is_found_where_the_known_motion_does_not_take_the_vessel(arm):
     moving.known_motion = Motion()
     moving.forget_wires()
     shown = moving.measure(nodes, 15.3, np.random.default_rng(0))
-    assert shown is not None and np.linalg.norm(shown.position - nodes[0] + [0.0, 2.0, 0.0]) < 1.0
+    assert shown is not None
+    error = shown.position - nodes[0] + [0.0, 2.0, 0.0]
+    # A straight vessel does not show how far it lies off along itself: the region says so.
+    assert np.linalg.norm(error[:2]) < 1.0 and error @ np.linalg.solve(shown.covariance, error) < 4.0
     assert shown.covariance[1, 1] > 0.1  # how far it lies off is not quite known
     assert not moving.displaced.shift.any()  # the patient lies where they lay
 

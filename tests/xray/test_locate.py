@@ -115,6 +115,23 @@ def test_a_landmark_registers_the_first_frame(anatomy) -> None:
     assert np.linalg.norm(found.position - device[0]) < 4.0
 
 
+def test_later_frames_tell_of_earlier_ones(anatomy) -> None:
+    """A tip that stays, in one view, where a landmark registers: breathing looks like travel by half as much."""
+    devices, moved = course(anatomy, anatomy.tree.leaves()[0], frames=24)
+    still = [devices[12]] * 12
+    frames = frames_of(still, moved[:12], CAMERAS[:1])
+    point = anatomy.tree.branches[0].centerline.points[0]
+    pixel = tuple(CAMERAS[0].project(point[None] + moved[0])[0])
+    follow = TipFilter(anatomy.tree, CAMERAS[:1], LocateConfig(landmark_mm=tuple(point), landmark_px=pixel))
+    by_then = [follow.update(one.number, one.lines) for one in frames]
+    smooth = follow.smooth()
+    before, after = (
+        np.array([np.linalg.norm(one.position - still[0][0]) for one in some]) for some in (by_then, smooth.values())
+    )
+    spread, left = (np.ptp([one.abscissa for one in some]) for some in (by_then, smooth.values()))
+    assert left < 0.6 * spread and after.mean() < before.mean() + 0.5
+
+
 def test_a_tip_in_the_wrong_branch_is_found_again(anatomy) -> None:
     """The first frame is told a tip in another branch, with all certainty; the following ones show where it is."""
     one, other = anatomy.tree.leaves()[:2]

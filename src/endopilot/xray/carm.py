@@ -95,8 +95,13 @@ class View:
 
     def slope(self, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2 3"]:
         """Return the derivative of the pixel by the point, pixels/mm."""
-        in_view = self.axes @ (point - self.source)
-        return self.scale / in_view[2] * (self.axes[:2] - np.outer(in_view[:2] / in_view[2], self.axes[2]))
+        return self.slopes(point[None])[0]
+
+    def slopes(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 3"]:
+        """Return the derivatives of the pixels by the points, pixels/mm."""
+        in_view = (points - self.source) @ self.axes.T
+        away = in_view[:, :2, None] / in_view[:, 2:, None]
+        return (self.scale / in_view[:, 2])[:, None, None] * (self.axes[:2] - away * self.axes[2])
 
 
 def view_of(view: View, pose: Pose, isocenter: Float[np.ndarray, "3"]) -> View:

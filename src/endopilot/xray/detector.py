@@ -23,12 +23,12 @@ from endopilot.settings import Finite, OpenShare, Positive, Share, settings
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import catheter_lumen_points, lumen_points
 from endopilot.xray.carm import View
-from endopilot.xray.corridor import CATHETER_MM, Corridor, make_corridor
-from endopilot.xray.corridor_view import CorridorView, box_around
 from endopilot.xray.displacement import displacements
 from endopilot.xray.projector import splat
-from endopilot.xray.tip_posterior import MODE_MM, Expected, TipEstimate, end_log, estimate_tip, longest_mm
+from endopilot.xray.tip_posterior import MODE_MM, TipEstimate, end_log, estimate_tip, longest_mm
+from endopilot.xray.vessel_grid import VesselGrid, make_grid, with_catheter
 from endopilot.xray.wire_end import fit_end
+from endopilot.xray.wire_following import STEP_MM, Follower
 
 Signal = Float32[np.ndarray, "rows columns"]
 SCALES_PX = (1.0, 1.7, 2.8)
@@ -151,10 +151,12 @@ _KEPT_LINES = 8
 """Lines of so many images from before, or doses, are kept for the next exposures."""
 _HIDDEN_MM = 1.5
 """Standard deviation that a tip on such a line has more, mm."""
+CATHETER_MM = 8.0
+"""Length of the catheter behind the ostium in which a wire is followed, mm."""
+_MOST_PLACES = 20000
+"""Places of a tree of 5 m: no coronary artery has more."""
 _SLACK_MM = 0.3
-"""How far outside the lumen the wire's axis may seem to lie, mm: the grid that it is followed on is 0.2 mm."""
-_WORTH, _STAYS_MM = 0.0, 0.5
-"""A wire is also followed in a displaced vessel where that is likelier by this logarithm, and by more than this, mm."""
+"""How far outside the lumen the wire's axis may seem to lie, mm."""
 _BELIEVABLE = 3.0
 """An end farther than this many standard deviations from the followed wire's is another line's."""
 
@@ -199,6 +201,9 @@ class TipDetector:
         """
         self._anatomy, self._radius_mm = anatomy, device.tip_radius_mm
         self.config, self._evidence = config or DetectorConfig(), evidence or RidgeEvidence.read()
+        grid = make_grid(anatomy.tree, step_mm=STEP_MM, most=_MOST_PLACES)
+        self.grid: VesselGrid = with_catheter(grid, anatomy, CATHETER_MM)
+        self._room_mm = self.grid.radius - device.tip_radius_mm + _SLACK_MM
         behind, size = catheter_lumen_points(anatomy)
         near = np.linalg.norm(behind - anatomy.insertion.position, axis=1) <= 1.25 * CATHETER_MM
         points, volume = lumen_points(anatomy)
@@ -218,7 +223,7 @@ class TipDetector:
         photons: Sequence[float],
         inserted_length: float | None,
         before: Sequence[Signal] | None = None,
-        expected: Expected | None = None,
+        expected: Float[np.ndarray, "places"] | None = None,
         displaced: Float[np.ndarray, "3 3"] | None = None,
     ) -> TipEstimate:
         """Return where the tip is in the images of one exposure if there is a wire, and how likely that is.
@@ -235,46 +240,41 @@ class TipDetector:
                 mm²; the configuration's if not given.
         """
         config, before = self.config, before or []
-        corridor = make_corridor(self._anatomy, self._radius_mm, _SLACK_MM, longest_mm(inserted_length))
-        seen = [self._look(corridor, *one) for one in zip(views, signals, photons, strict=True)]
+        deepest = longest_mm(inserted_length)
+        seen = [self._look(*one) for one in zip(views, signals, photons, strict=True)]
         plain, evidence = [one for one, _ in seen], [one for _, one in seen]
         lines = [self._lines(*one) for one in zip(views, before, photons, strict=False)]
         for image, line in zip(evidence, lines, strict=False):
             image[line] = 0.0
 
         def follow(seen: Sequence[View]) -> TipEstimate:
-            shown = [CorridorView(corridor, view, len(image)) for view, image in zip(seen, evidence, strict=True)]
-            return estimate_tip(corridor, shown, evidence, inserted_length, expected)
+            follower = Follower(self.grid, self._room_mm, seen, evidence, deepest)
+            return estimate_tip(follower, inserted_length, expected)
 
         here = follow(views)
         covariance = config.displaced_mm**2 * np.eye(3) if displaced is None else displaced
-        places = [(one.branch, one.abscissa, one.abscissa) for one in corridor.passages]
-        ends = [end_log(*place, inserted_length, expected) for place in places]
-        moved = displacements(corridor, views, evidence, covariance, ends)
-        log_share = float(np.log(config.displaced / (1 - config.displaced)))
-        found = here
-        if moved.log_odds + log_share > _WORTH and np.linalg.norm(moved.shift) > _STAYS_MM:
-            views = [replace(view, source=view.source - moved.shift) for view in views]
-            there = follow(views)
-            # Laplace's evidence: of all shifts that were possible, one as narrow as what the images leave.
-            fits = -0.5 * float(moved.shift @ np.linalg.solve(covariance, moved.shift))
-            fits += 0.5 * float(np.linalg.slogdet(moved.covariance)[1] - np.linalg.slogdet(covariance)[1])
-            # A vessel that lies farther back shows more of the same wire in its catheter.
-            behind = here if moved.shift @ self._anatomy.insertion.direction > 0 else there
-            in_catheter = behind.ends[behind.ends[:, 0] < 0, 2][-1] / CATHETER_MM
-            fits += float(in_catheter * (moved.shift @ self._anatomy.insertion.direction))
-            odds = there.log_odds - here.log_odds + log_share + fits
-            found = _either(here, replace(there, shift=moved.shift, shift_covariance=moved.covariance), odds)
-            if found.shift is here.shift:
-                views = [replace(view, source=view.source + moved.shift) for view in views]
+        ends = end_log(self.grid.abscissa, inserted_length) + (0.0 if expected is None else expected)
+        shift, left = displacements(self.grid, self._room_mm, views, evidence, covariance, ends)
+        shifted = [replace(view, source=view.source - shift) for view in views]
+        there = follow(shifted)
+        # Laplace's evidence: of all shifts that were possible, one as narrow as what the images leave.
+        odds = there.log_odds - here.log_odds + float(np.log(config.displaced / (1 - config.displaced)))
+        odds -= 0.5 * float(shift @ np.linalg.solve(covariance, shift))
+        odds += 0.5 * float(np.linalg.slogdet(left)[1] - np.linalg.slogdet(covariance)[1])
+        # A vessel that lies farther back shows more of the same wire in its catheter.
+        behind = here if shift @ self._anatomy.insertion.direction > 0 else there
+        in_catheter = behind.ends[self.grid.abscissa < 0][-1] / CATHETER_MM
+        odds += float(in_catheter * (shift @ self._anatomy.insertion.direction))
+        found = _either(here, replace(there, shift=shift, shift_covariance=left), odds)
+        views = views if found.shift is here.shift else shifted
         found = _refined(found, views, plain, self._radius_mm)
         hidden = any(_lies_on(line, view, found.position) for line, view in zip(lines, views, strict=False))
         return self._judged(found, hidden=hidden)
 
-    def _look(self, corridor: Corridor, view: View, signal: Signal, photons: float) -> tuple[Signal, Signal]:
+    def _look(self, view: View, signal: Signal, photons: float) -> tuple[Signal, Signal]:
         """Return an image without contrast, and how likely its pixels are on a wire, none far from the vessel."""
-        middle, evidence = np.concatenate([one.middle for one in corridor.passages]), np.zeros_like(signal)
-        box = box_around(view, middle, len(signal), around_px=_AROUND_PX)
+        evidence = np.zeros_like(signal)
+        box = _box_around(view, self.grid.middle, len(signal), around_px=_AROUND_PX)
         plain = self.without_contrast(view, signal, box)
         evidence[box] = self._saturated(self._evidence(plain[box], photons))
         return plain, evidence
@@ -288,7 +288,7 @@ class TipDetector:
             if image is before and count == photons:
                 return near
         box, near = (
-            box_around(view, self._vessel, len(before), _AROUND_MM, _AROUND_PX),
+            _box_around(view, self._vessel, len(before), _AROUND_MM, _AROUND_PX),
             np.zeros(before.shape, dtype=bool),
         )
         line = self._saturated(self._evidence(before[box], photons)) > _LINE
@@ -350,6 +350,18 @@ def _halved(image: Signal) -> Float32[np.ndarray, "half_rows half_columns"]:
     """Return means of two by two pixels."""
     rows, columns = len(image) // 2, image.shape[1] // 2
     return image[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2).mean(axis=(1, 3))
+
+
+def _box_around(
+    view: View, points: Float[np.ndarray, "n 3"], rows: int, around_mm: float = 0.0, around_px: int = 0
+) -> tuple[slice, slice]:
+    """Return the rows and columns of an image that show points, LPS mm, and what lies around them in space or image."""
+    right_up, middle = view.project(points), (rows - 1) / 2
+    around = around_px + around_mm * float(np.linalg.norm(view.slope(points.mean(axis=0)), 2)) + 1
+    at = np.stack([middle - right_up[:, 1], middle + right_up[:, 0]])
+    low = np.clip(at.min(axis=1) - around, 0, rows - 1).astype(int)
+    high = np.clip(at.max(axis=1) + around + 1, low + 1, rows).astype(int)
+    return slice(low[0], high[0]), slice(low[1], high[1])
 
 
 def _lies_on(line: Bool[np.ndarray, "rows columns"], view: View, point: Float[np.ndarray, "3"]) -> bool:

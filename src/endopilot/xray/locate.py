@@ -22,7 +22,7 @@ def locate(
     cameras: Sequence[Camera | View],
     config: LocateConfig | None = None,
 ) -> tuple[TipLocation, ...]:
-    """Find the tip of a device in each frame of a sequence.
+    """Find the tip of a device in each frame of a sequence, by all frames.
 
     Args:
         anatomy: the vessel; only its tree is used.
@@ -45,4 +45,4 @@ def locate(
         for frame in frames:
             found.append(follow.update(frame.number, frame.lines))
             advance()
-    return tuple(found)
+    return tuple(({one.frame: one for one in found} | follow.smooth()).values())

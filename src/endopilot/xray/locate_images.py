@@ -8,7 +8,7 @@ between, is the prior of the frame.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -25,10 +25,10 @@ from endopilot.xray.carm import Pose, View, view_of
 from endopilot.xray.cine import XrayCine
 from endopilot.xray.detector import TipDetector
 from endopilot.xray.image import isocenter_of
-from endopilot.xray.line_observations import VesselGrid, make_grid
 from endopilot.xray.registration import Registration, lay, observed_contrast, register
-from endopilot.xray.tip_filter import LocateConfig, TipLocation, goes
+from endopilot.xray.tip_filter import LocateConfig, TipLocation, goes, told_by_later
 from endopilot.xray.tip_posterior import TipEstimate
+from endopilot.xray.vessel_grid import VesselGrid, make_grid
 
 _EMPTY_SHARE = 0.9
 """A pixel's light where no contrast passes is this quantile of the frames': contrast and wire darken fewer."""
@@ -101,7 +101,7 @@ def locate_in_images(
     detector, photons = TipDetector(anatomy, device), [one.photons() for one in cines]
     found: list[TipEstimate] = []
 
-    def look(frame: int, expected: Callable[[int, np.ndarray], np.ndarray] | None) -> TipEstimate:
+    def look(frame: int, expected: Float[np.ndarray, "places"] | None) -> TipEstimate:
         shown = [one.signals[frame] for one in cines]
         return detector.estimate(views[frame], shown, photons, None, expected=expected, displaced=moves[frame])
 
@@ -109,8 +109,7 @@ def locate_in_images(
         for frame in range(count):
             found.append(look(frame, None))
             advance()
-    track = _Track(anatomy, config)
-    track.run([one.ends if one.status != "not found" else None for one in found], cines[0].times_s)
+    track = _Track(anatomy, detector.grid, config, cines[0].times_s, found)
     for frame, one in enumerate(found):
         if one.status != "not found" and track.elsewhere(frame, one):
             found[frame] = look(frame, track.expected(frame))
@@ -220,51 +219,38 @@ def _read_otherwise(
 
 
 class _Track:
-    """Where the tip is at each time, by all frames together: forward and backward messages over places of the tree."""
+    """Where the tip is at each time, by all frames together."""
 
-    def __init__(self, anatomy: Anatomy, config: LocateConfig) -> None:
-        self._grid: VesselGrid = make_grid(anatomy.tree, step_mm=1.0, stiff_mm=1.0)
-        self._near, self._config = KDTree(self._grid.middle), config
-        self._of = [np.flatnonzero(self._grid.branch == k) for k in range(len(anatomy.tree.branches))]
-        self._log: Float[np.ndarray, "frames n"] = np.zeros((0, len(self._grid.middle)))
-
-    def run(self, ends: Sequence[Float[np.ndarray, "_ 3"] | None], times_s: Float[np.ndarray, "frames"]) -> None:
-        """Take what each frame says of the tip's place; None where it shows no wire."""
-        count = len(self._grid.middle)
-        seen = np.zeros((len(ends), count))
-        for frame, rows in enumerate(ends):
-            if rows is not None:
-                seen[frame] = -np.inf
-                for branch, places in [(-1, np.zeros(1, dtype=int)), *enumerate(self._of)]:
-                    of = rows[rows[:, 0] == branch]
-                    if len(of) and len(places):
-                        at = places[np.abs(of[:, 1:2] - self._grid.abscissa[places]).argmin(axis=1)]
-                        np.logaddexp.at(seen[frame], at, of[:, 2])
-        ahead, back = np.zeros((len(ends), count)), np.zeros((len(ends), count))
-        ahead[0] = -np.log(count)
-        for k in range(1, len(ends)):
-            ahead[k] = self._gone(ahead[k - 1] + seen[k - 1], times_s[k] - times_s[k - 1])
-            back[-k - 1] = self._gone(back[-k] + seen[-k], times_s[-k] - times_s[-k - 1])
-        self._prior, self._log = ahead + back, ahead + back + seen
-
-    def _gone(self, log: Float[np.ndarray, "n"], seconds: float) -> Float[np.ndarray, "n"]:
-        flow = goes(self._grid, self._config, max(seconds, 1e-3) / _FRAME_S)
-        return np.log(flow.T @ np.exp(log - log.max()) + 1e-300)
+    def __init__(
+        self,
+        anatomy: Anatomy,
+        grid: VesselGrid,
+        config: LocateConfig,
+        times_s: Float[np.ndarray, "frames"],
+        found: Sequence[TipEstimate],
+    ) -> None:
+        """Take what each frame shows at the places of the detector's grid."""
+        coarse = make_grid(anatomy.tree, step_mm=1.0)
+        self._middle, self._of = coarse.middle, KDTree(coarse.middle).query(grid.middle)[1]
+        seen = [np.zeros(len(coarse.parent)) for _ in found]
+        for log, one in zip(seen, found, strict=True):
+            if one.status != "not found":
+                log[:] = -np.inf
+                np.logaddexp.at(log, self._of, one.ends)
+        steps = np.maximum(np.diff(times_s), 1e-3) / _FRAME_S
+        flows = [goes(coarse, config, float(one)) for one in steps]
+        later = told_by_later(seen, lambda k: flows[k])
+        before = told_by_later(seen[::-1], lambda k: flows[-1 - k].T)[::-1]
+        self._others = [a + b for a, b in zip(later, before, strict=True)]
+        self._mode = [int((log + one).argmax()) for log, one in zip(seen, self._others, strict=True)]
 
     def elsewhere(self, frame: int, one: TipEstimate) -> bool:
         """Return whether all frames together have the tip elsewhere than a frame by itself."""
-        mode = self._grid.middle[int(self._log[frame].argmax())]
-        return float(np.linalg.norm(one.position - mode)) > _ELSEWHERE_MM
+        return float(np.linalg.norm(one.position - self._middle[self._mode[frame]])) > _ELSEWHERE_MM
 
-    def expected(self, frame: int) -> Callable[[int, np.ndarray], np.ndarray]:
-        """Return what the other frames say of the tip's place in a frame."""
-        prior = self._prior[frame] - np.logaddexp.reduce(self._prior[frame])
-
-        def log(branch: int, abscissa: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-            places = self._of[branch] if branch >= 0 else np.zeros(1, dtype=int)
-            return np.interp(abscissa, self._grid.abscissa[places], prior[places])
-
-        return log
+    def expected(self, frame: int) -> Float[np.ndarray, "places"]:
+        """Return what the other frames say of the tip's place in a frame, a logarithm."""
+        return (self._others[frame] - np.logaddexp.reduce(self._others[frame]))[self._of]
 
 
 _FRAME_S = 0.133

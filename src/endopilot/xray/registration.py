@@ -93,6 +93,9 @@ def register(
     found, correlation, covariance, misfit = laid, 0.0, np.diag(_PRIOR**2), _MISFIT
     for averaged, blur in _LEVELS if start is None else _LEVELS[1:]:
         observed = observed_contrast(contrasted, before, averaged, blur, config)
+        if not any(np.ptp(image) for image in observed):
+            said = "images with and without contrast are the same; inject contrast"
+            return Registration(Pose.of_vector(laid), np.diag(_PRIOR**2), 0.0, said)
         points, size, along = (part[:: averaged // 2] for part in lumen)  # coarse images need fewer points
         size = size * (lumen[1].sum() / size.sum())
         level = Comparison(points, size, along, views, observed, averaged, blur, config, isocenter, laid, misfit)

@@ -11,7 +11,7 @@ of pose, of breathing, and of how far the device lies off its way.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -27,15 +27,14 @@ from endopilot.xray.line_observations import (
     Line,
     Observations,
     SeenLine,
-    VesselGrid,
     joined,
     line_observations,
-    make_grid,
     see,
     shown_by,
     tip_observations,
 )
 from endopilot.xray.tip_posterior import Status, around_mode
+from endopilot.xray.vessel_grid import VesselGrid, make_grid
 
 _STEP_MM = 1.0
 """Distance of the grid's places, mm."""
@@ -47,13 +46,15 @@ _ASIDE_SD_MM, _ASIDE_RADII, _ASIDE_MM = 1.5, 0.1, 20.0
 """How far the device lies off its way: this, and this share of the lumen's radius, mm; and over which length alike."""
 _DRIFT_MM, _DRIFT_RAD = 0.5, np.deg2rad(0.2)
 """Standard deviations of how the pose drifts from frame to frame."""
-_LANDMARK_SD_MM, _TIP_SD_MM = 6.0, 2.0
-"""Of the shift that a landmark shows, since the vessel breathes; and of a tip that is a landmark, along the vessel."""
+_LANDMARK_SD_MM, _DEPTH_SD_MM, _TIP_SD_MM = 6.0, 12.0, 2.0
+"""Of the shift that a landmark shows, since the vessel breathes; more along the beam, since a C-arm's distances are
+known to some 1.5 % of 800 mm, and depth and scale look alike; and of a tip that is a landmark, along the vessel."""
 _STRAY, _BEYOND = np.log(1 / 200), -2.5
 """Logarithm of the density, 1/mm, of a point that is not of the device, evenly in 200 mm; and of one in the catheter or
 vessel before the root, where the way is not known."""
 _LEAST_ODDS = 20.0
 """A line is the device's where it is likelier so, by this logarithm, than if its points were strays."""
+_LEAST = 1e-300
 _ROUNDS = 3
 _PRUNE, _MOST = 18.0, 600
 """Places whose tip alone is less likely than the best one's by this logarithm are not compared further, nor more than
@@ -150,6 +151,47 @@ def goes(grid: VesselGrid, config: LocateConfig, frames: float) -> Float[np.ndar
     return (1 - rare) * stay / stay.sum(axis=1, keepdims=True) + rare / len(stay)
 
 
+def told_by_later(
+    seen: Sequence[Float[np.ndarray, "_"]], going: Callable[[int], Float[np.ndarray, "_ _"]]
+) -> list[Float[np.ndarray, "_"]]:
+    """Return what all later frames say of the tip's place in each, a logarithm.
+
+    Args:
+        seen: what each frame says of some places by itself, a logarithm.
+        going: how likely the tip goes from each place of a frame to each of the next one, given the frame's index.
+    """
+    told = [np.zeros(len(seen[-1]))] if len(seen) else []
+    for k in range(len(seen) - 1, 0, -1):
+        log = seen[k] + told[-1]
+        told.append(np.log(going(k - 1) @ np.exp(log - log.max()) + _LEAST))
+    return told[::-1]
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What a frame says of some places of the tip.
+
+    Attributes:
+        frame: its number.
+        places: of the grid.
+        odds: of its line, a logarithm.
+        log: posterior by this frame and those before.
+        tips: where the tip is if it is at that place, LPS mm.
+        covariance: of that, mm².
+        moved: how far the vessel lies there from where the cameras have the CT, LPS mm.
+        residual_mm: mean distance of the line from the moved way; NaN without a line.
+    """
+
+    frame: int
+    places: Int[np.ndarray, "m"]
+    odds: Float[np.ndarray, "m"]
+    log: Float[np.ndarray, "m"]
+    tips: Float[np.ndarray, "m 3"]
+    covariance: Float[np.ndarray, "m 3 3"]
+    moved: Float[np.ndarray, "m 3"]
+    residual_mm: Float[np.ndarray, "m"]
+
+
 class TipFilter:
     """Follows the tip of one device through the frames of a sequence.
 
@@ -161,16 +203,18 @@ class TipFilter:
         """Take the vessel and what sees it; `config` says what is known before the first frame."""
         self.config = config or LocateConfig()
         self._tree, self._cameras = tree, tuple(cameras)
-        self.grid: VesselGrid = make_grid(tree, step_mm=_STEP_MM, stiff_mm=self.config.stiff_mm)
+        self.grid: VesselGrid = make_grid(tree, step_mm=_STEP_MM)
+        self._way = self.grid.straightened(self.config.stiff_mm)
         count = len(self.grid.middle)
-        self._centre = self.grid.way.mean(axis=0)
+        self._centre = self._way.mean(axis=0)
         self._aside = _ASIDE_SD_MM + _ASIDE_RADII * self.grid.radius
         turn = np.deg2rad(self.config.turn_sd_deg)
         spread = np.array([*[self.config.registration_sd_mm] * 3, *[turn] * 3])
         self._log = np.full(count, -np.log(count))
         self._mean = np.zeros((count, 6))
         self._covariance = np.tile(np.diag(spread**2), (count, 1, 1))
-        self._begun = False
+        self._begun, self._registers_itself = False, self.config.landmark_mm is None and len(self._cameras) == 1
+        self._seen: list[_Seen] = []
 
     def update(self, frame: int, lines: Sequence[Line | None]) -> TipLocation:
         """Return where the tip is, by this frame and those before.
@@ -202,12 +246,47 @@ class TipFilter:
         whole = rows.value.shape[1] > 2 * len(seen)
         if np.logaddexp.reduce(self._log[places] + odds) < (_LEAST_ODDS if whole else 0.0):
             return TipLocation.nowhere(frame)
-        log = self._log[places] + odds + (_BEYOND - _STRAY) * beyond
-        evidence = np.logaddexp.reduce(log)
+        odds = odds + (_BEYOND - _STRAY) * beyond
+        log = self._log[places] + odds
+        log -= np.logaddexp.reduce(log)
         self._log = np.full_like(self._log, -np.inf)
-        self._log[places] = log - evidence
+        self._log[places] = log
         self._mean[places], self._covariance[places] = fit.mean, fit.covariance
-        return self._answer(frame, places, fit, rows, base)
+        left = np.abs(rows.value - np.einsum("mri,mri->mr", rows.towards, fit.moved))
+        of_line = rows.used & (rows.place != places[:, None])
+        self._seen.append(
+            _Seen(
+                frame=frame,
+                places=places,
+                odds=odds,
+                log=log,
+                tips=self.grid.middle[places] + fit.aside,
+                covariance=fit.aside_covariance,
+                moved=(self._moved(base) - self._way)[places] + fit.moved[:, 0],
+                residual_mm=np.where(of_line, left, 0.0).sum(axis=1) / np.where(of_line.any(1), of_line.sum(1), np.nan),
+            )
+        )
+        return self._answer(self._seen[-1], log)
+
+    def smooth(self) -> dict[int, TipLocation]:
+        """Return where the tip is in each frame that shows it, by all frames, those after too.
+
+        One view of a patient whom the device alone registers shows travel and shift alike: what later frames say of the
+        tip's place is what they say of the pose, and tells nothing more. None is returned then.
+        """
+        if self._registers_itself:
+            return {}
+        found, all_seen = {}, self._seen
+        frames = np.diff([one.frame for one in all_seen])
+
+        def going(k: int) -> Float[np.ndarray, "_ _"]:
+            flow = goes(self.grid, self.config, float(frames[k]))
+            return flow[np.ix_(all_seen[k].places, all_seen[k + 1].places)]
+
+        for one, later in zip(all_seen, told_by_later([one.odds for one in all_seen], going), strict=True):
+            log = one.log + later
+            found[one.frame] = self._answer(one, log - np.logaddexp.reduce(log))
+        return found
 
     def _begin(self, lines: Sequence[Line | None]) -> bool:
         """Register the patient by the landmark, if there is one; return whether it was seen or is not needed."""
@@ -227,7 +306,8 @@ class TipFilter:
             shown, slope = shown_by(self._cameras[0], point[None] + shift)
             shift = shift + np.linalg.pinv(slope[0]) @ (np.array(pixel) - shown[0])
         self._mean[:, :3] = shift
-        self._covariance[:, :3, :3] = _LANDMARK_SD_MM**2 * np.eye(3)
+        beam = np.linalg.svd(shown_by(self._cameras[0], point[None] + shift)[1][0])[2][2]
+        self._covariance[:, :3, :3] = _LANDMARK_SD_MM**2 * np.eye(3) + _DEPTH_SD_MM**2 * np.outer(beam, beam)
         return True
 
     def _predict(self, frames: int) -> None:
@@ -235,16 +315,16 @@ class TipFilter:
         flow = goes(self.grid, self.config, float(frames)) * np.exp(self._log)[:, None]
         total = flow.sum(axis=0)
         flow /= total
+        drift = np.diag(np.array([*[_DRIFT_MM] * 3, *[_DRIFT_RAD] * 3]) ** 2)
         square = self._covariance + self._mean[:, :, None] * self._mean[:, None]
         mean = flow.T @ self._mean
         square = (flow.T @ square.reshape(len(total), -1)).reshape(square.shape)
-        drift = np.array([*[_DRIFT_MM] * 3, *[_DRIFT_RAD] * 3])
         self._log, self._mean = np.log(total), mean
-        self._covariance = square - mean[:, :, None] * mean[:, None] + frames * np.diag(drift**2)
+        self._covariance = square - mean[:, :, None] * mean[:, None] + frames * drift
 
     def _moved(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "n 3"]:
         matrix = Rotation.from_rotvec(pose[3:6]).as_matrix()
-        return (self.grid.way - self._centre) @ matrix.T + self._centre + pose[:3]
+        return (self._way - self._centre) @ matrix.T + self._centre + pose[:3]
 
     def _compare(
         self, seen: Sequence[SeenLine], places: Int[np.ndarray, "m"], base: Float[np.ndarray, "6"]
@@ -311,25 +391,20 @@ class TipFilter:
             aside_covariance=aside[:, :1, :1] * np.eye(3) - own.swapaxes(1, 2) @ solved[..., 7:],
         )
 
-    def _answer(
-        self, frame: int, places: Int[np.ndarray, "m"], fit: _Fit, rows: Observations, base: Float[np.ndarray, "6"]
-    ) -> TipLocation:
+    def _answer(self, seen: _Seen, log: Float[np.ndarray, "m"]) -> TipLocation:
         """Return mean and covariance around the mode of the posterior."""
-        grid, weight = self.grid, np.exp(self._log[places])
+        grid, places, weight = self.grid, seen.places, np.exp(log)
         best = int(weight.argmax())
         near = np.linalg.norm(grid.middle[places] - grid.middle[places[best]], axis=1) <= _NEAR_MM
-        close, tips = places[near], grid.middle[places] + fit.aside
-        share, mean, covariance = around_mode(tips, weight, near, grid.step_mm)
+        close = places[near]
+        share, mean, covariance = around_mode(seen.tips, weight, near, grid.step_mm)
         weight = weight[near] / share
-        covariance = covariance + np.einsum("m,mij->ij", weight, fit.aside_covariance[near])
+        covariance = covariance + np.einsum("m,mij->ij", weight, seen.covariance[near])
         place = int(close[np.linalg.norm(grid.middle[close] - weight @ grid.middle[close], axis=1).argmin()])
         here = self._tree.branches[grid.branch[place]]
         section = here.section[np.abs(here.centerline.abscissa - grid.abscissa[place]).argmin()]
-        left = np.abs(rows.value - np.einsum("mri,mri->mr", rows.towards, fit.moved))[best]
-        of_line = rows.used[best] & (rows.place[best] != places[best])
-        moved = self._moved(base)[places[best]] - grid.way[places[best]] + fit.moved[best, 0]
         return TipLocation(
-            frame=frame,
+            frame=seen.frame,
             status="found" if share >= _SURE else "ambiguous",
             position=mean,
             covariance=covariance,
@@ -337,8 +412,8 @@ class TipFilter:
             abscissa=float(grid.abscissa[place]),
             branch=int(grid.branch[place]),
             section=self._tree.section_names[section],
-            moved_mm=moved,
-            residual_mm=float(left[of_line].mean()) if of_line.any() else np.nan,
+            moved_mm=seen.moved[best],
+            residual_mm=float(seen.residual_mm[best]),
         )
 
 

@@ -7,16 +7,14 @@ with one the vessel gives it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float
 
-from endopilot.xray.corridor import STEP_MM, Corridor
-from endopilot.xray.corridor_view import CorridorView
-from endopilot.xray.wire_following import Follower, Leg, places_of
+from endopilot.xray.wire_following import Follower, Leg
 
 _SHORTER_SHARE, _LONGER_SHARE, _NEAR_MM = 0.1, 0.04, 2.0
 """The way to the tip differs from the inserted length by 2 mm, and a tenth of it where it is shorter, since wires snake
@@ -36,7 +34,6 @@ _FOLDS, _FOLDS_APART_MM, _FOLD_ODDS = 4, 4.0, 60.0
 likely than the likeliest."""
 
 Status = Literal["found", "ambiguous", "not found"]
-Expected = Callable[[int, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +48,9 @@ class TipEstimate:
         elsewhere: what the rest adds to the covariance, mm².
         status: "found"; "ambiguous" where the tip may well lie elsewhere; "not found" where there is no wire.
         wire: places of the wire from the catheter to the tip, LPS mm.
-        ends: branch (-1 in the catheter), abscissa, mm, and how likely a wire that does not fold ends there whatever
-            its length, a logarithm, of every section.
+        ends: how likely a wire that does not fold ends at each place of the grid whatever its length, a logarithm.
+        shift: how far the vessel lies from where registration has it, LPS mm.
+        shift_covariance: of that, mm².
     """
 
     log_odds: float
@@ -61,7 +59,7 @@ class TipEstimate:
     share: float
     elsewhere: Float[np.ndarray, "3 3"]
     wire: Float[np.ndarray, "n 3"]
-    ends: Float[np.ndarray, "sections 3"]
+    ends: Float[np.ndarray, "places"]
     status: Status = "found"
     shift: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     shift_covariance: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
@@ -80,85 +78,67 @@ def _spread(inserted_length: float | None) -> tuple[float, float]:
     return _NEAR_MM + _SHORTER_SHARE * wire_mm, _NEAR_MM + _LONGER_SHARE * wire_mm
 
 
-def end_log(
-    branch: int,
-    abscissa: Float[np.ndarray, "n"],
-    length: Float[np.ndarray, "n"],
-    inserted_length: float | None,
-    expected: Expected | None,
-) -> Float[np.ndarray, "n"]:
-    """Return how likely a wire ends at some places before images are seen, a logarithm; unnormalised.
+def end_log(length: Float[np.ndarray, "n"], inserted_length: float | None) -> Float[np.ndarray, "n"]:
+    """Return how likely a wire ends at some places by the encoder, a logarithm; unnormalised.
 
     Args:
-        branch: that they lie in; -1 for the catheter.
-        abscissa: of the places, mm.
-        length: of the wire up to them, mm.
-        inserted_length, expected: as `estimate_tip` takes them.
+        length: of the wire up to them, mm; negative in the catheter, where none ends that no encoder tells of.
+        inserted_length: by the encoder, mm; None where there is none.
     """
+    if inserted_length is None:
+        return np.where(length < 0, -np.inf, 0.0)
     shorter, longer = _spread(inserted_length)
-    excess = length - (inserted_length or 0.0)
-    log = -0.5 * (excess / np.where(excess > 0, longer, shorter)) ** 2
-    if inserted_length is None and branch < 0:
-        log = np.full(len(excess), -np.inf)
-    return log if expected is None else log + expected(branch, abscissa)
+    excess = length - inserted_length
+    return -0.5 * (excess / np.where(excess > 0, longer, shorter)) ** 2
 
 
 def estimate_tip(
-    corridor: Corridor,
-    shown: Sequence[CorridorView],
-    evidence: Sequence[Float32[np.ndarray, "rows columns"]],
-    inserted_length: float | None,
-    expected: Expected | None = None,
+    follower: Follower, inserted_length: float | None, expected: Float[np.ndarray, "places"] | None = None
 ) -> TipEstimate:
     """Find the tip of a wire.
 
     Args:
-        corridor: of the vessel.
-        shown: it in each view, as registration has them.
-        evidence: for each view the logarithm of how much likelier each pixel is on a wire than off it.
+        follower: of wires through the vessel in the images.
         inserted_length: Δ by the robot's encoder, mm; None where there is none.
-        expected: how likely the tip is at places of a branch before the images are seen, a logarithm, by other times.
+        expected: how likely the tip is at each place before the images are seen, a logarithm, by other times.
     """
-    follower = Follower(corridor, shown, evidence)
-    legs = follower.forwards()
-
-    def weighed(some: Sequence[Leg], everywhere: Sequence[np.ndarray], share: float) -> list[np.ndarray]:
-        whole = np.logaddexp.reduce(np.concatenate(everywhere)) - np.log(share)
-        return [leg.log_scale + before(leg) - whole for leg in some]
+    grid, legs = follower.grid, follower.forwards()
+    by_time = np.zeros(len(grid.parent)) if expected is None else expected
+    ends = np.full(len(grid.parent), -np.inf)
+    for leg in legs:
+        ends[leg.places] = leg.log_scale
 
     def before(leg: Leg) -> np.ndarray:
-        abscissa = leg.passage.abscissa[leg.section]
-        return end_log(leg.passage.branch, abscissa, leg.length, inserted_length, expected)
+        return end_log(leg.length, inserted_length) + by_time[leg.places]
 
-    ends = np.concatenate(
-        [np.column_stack([np.full(len(leg.section), leg.passage.branch), leg.length, leg.log_scale]) for leg in legs]
+    anywhere = np.logaddexp.reduce(end_log(grid.abscissa, inserted_length) + by_time)
+    scores = [leg.log_scale + before(leg) - anywhere + np.log(1 - _FOLDED_SHARE) for leg in legs]
+    folds = _folds(
+        follower, legs, np.inf if inserted_length is None else inserted_length + 2 * _spread(inserted_length)[1]
     )
-    places = [(one.branch, one.abscissa, one.abscissa) for one in corridor.passages]
-    scores = weighed(legs, [end_log(*place, inserted_length, expected) for place in places], 1 - _FOLDED_SHARE)
-    folds = _folds(legs, np.inf if inserted_length is None else inserted_length + 2 * _spread(inserted_length)[1])
-    back = [one for leg, at in folds for one in follower.backwards(leg, at, longest_mm(inserted_length))]
+    back = [follower.backwards(leg, at, longest_mm(inserted_length)) for leg, at in folds]
     if back:
-        scores += weighed(back, [before(leg) for leg in back], _FOLDED_SHARE)
-        legs += back
+        anywhere = np.logaddexp.reduce(np.concatenate([before(leg) for leg in back]))
+        scores += [leg.log_scale + before(leg) - anywhere + np.log(_FOLDED_SHARE) for leg in back]
     total = float(np.logaddexp.reduce(np.concatenate(scores)))
     # What lies in the catheter alone is a poor sign of a wire: the catheter is a dark line too.
     most = _MOST_OF_CATHETER if inserted_length is not None else 0.0
     catheter = max(float(legs[0].log_scale[-1]) - most, 0.0)
     weights = [np.exp(values - total) for values in scores]
-    return _summary(follower, legs, weights, total - catheter, ends)
+    return _summary(follower, [*legs, *back], weights, total - catheter, ends)
 
 
-def _folds(legs: Sequence[Leg], deepest_mm: float) -> list[tuple[Leg, int]]:
+def _folds(follower: Follower, legs: Sequence[Leg], deepest_mm: float) -> list[tuple[Leg, int]]:
     """Return where a wire may fold: the foremost places that it seems to reach, whatever its length there."""
     found: list[tuple[Leg, int]] = []
+    middle = follower.grid.middle
     ends = [(value, k, at) for k, leg in enumerate(legs) for at, value in enumerate(leg.log_scale)]
     ends.sort(reverse=True)
     for value, k, at in ends:
         leg = legs[k]
         if value < ends[0][0] - _FOLD_ODDS or len(found) == _FOLDS:
             break
-        place = leg.passage.middle[leg.section[at]]
-        apart = [np.linalg.norm(place - one.passage.middle[one.section[n]]) for one, n in found]
+        apart = [np.linalg.norm(middle[leg.places[at]] - middle[one.places[n]]) for one, n in found]
         if 0 < leg.length[at] <= deepest_mm and min(apart, default=np.inf) > _FOLDS_APART_MM:
             found.append((leg, at))
     return found
@@ -169,29 +149,31 @@ def _summary(
     legs: Sequence[Leg],
     weights: Sequence[Float[np.ndarray, "n"]],
     log_odds: float,
-    ends: Float[np.ndarray, "sections 3"],
+    ends: Float[np.ndarray, "places"],
 ) -> TipEstimate:
-    """Return mean and covariance around the mode of the posterior, whose weight in each leg's sections is given."""
+    """Return mean and covariance around the mode of the posterior, whose weight at each leg's places is given."""
     best = int(np.argmax([weight.max() for weight in weights]))
-    section = int(weights[best].argmax())
-    here = legs[best].alpha[section, ..., None]
-    mode = (here * legs[best].passage.places(legs[best].section[section : section + 1])[0]).sum(
-        axis=(0, 1)
-    ) / here.sum()
-    parts = [_counted(leg, weight) for leg, weight in zip(legs, weights, strict=True)]
-    places, weight = (np.concatenate(part) for part in zip(*parts, strict=True))
+    at, aside = int(weights[best].argmax()), follower.aside
+    counted = [np.flatnonzero(weight > _NOTHING) for weight in weights]
+    weight = np.concatenate([each[some] for each, some in zip(weights, counted, strict=True)])
+    of = np.concatenate([leg.places[some] for leg, some in zip(legs, counted, strict=True)])
+    alpha = np.concatenate([leg.alpha[some] for leg, some in zip(legs, counted, strict=True)])
+    mean_px = alpha @ aside
+    spread = np.maximum(alpha @ aside**2 - mean_px**2, 0.0) + 1 / 12
+    places, within = follower.in_space(of, mean_px, spread)
+    mode = places[int((weight * (of == legs[best].places[at])).argmax())]
     near = ((places - mode) ** 2).sum(axis=1) <= MODE_MM**2
-    # A cell has a size: that of a section's step and of its grid.
-    share, mean, covariance = around_mode(places, weight, near, STEP_MM)
+    share, mean, covariance = around_mode(places, weight, near, follower.grid.step_mm)
+    covariance = covariance + np.einsum("k,kij->ij", weight[near] / share, within[near])
     far = places[~near] - mean
-    elsewhere = (weight[~near, None] * far).T @ far
+    way, way_px = follower.way(legs[best], at)
     return TipEstimate(
         log_odds=log_odds,
         position=mean,
         covariance=covariance,
         share=share,
-        elsewhere=elsewhere,
-        wire=places_of(follower.way(legs[best], section)),
+        elsewhere=(weight[~near, None] * far).T @ far,
+        wire=follower.in_space(way, way_px, np.full(way_px.shape, 1 / 12))[0],
         ends=ends,
     )
 
@@ -212,12 +194,3 @@ def around_mode(
     mean = weight @ places[near]
     off = places[near] - mean
     return share, mean, (weight[:, None] * off).T @ off + cell_mm**2 / 12 * np.eye(3)
-
-
-def _counted(leg: Leg, weight: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k"]]:
-    """Return the places of a leg that count in the posterior, LPS mm, and their weights."""
-    sections = np.flatnonzero(weight > _NOTHING)
-    share = weight[sections, None, None] * leg.alpha[sections]
-    kept = np.flatnonzero(share.ravel() > _NOTHING)
-    which, row, column = np.unravel_index(kept, share.shape)
-    return leg.passage.place(leg.section[sections[which]], row, column), share.ravel()[kept]

@@ -1,32 +1,38 @@
-"""A wire followed through a corridor, section after section, forwards and, from where it may fold, back again.
+"""A wire followed along a vessel in images, place after place, forwards and, from where it may fold, back again.
 
-A forward recursion of a hidden Markov model: a state is a place in a cross-section of the vessel, an observation is how
-much more likely the pixel there is on a wire than off it. A pixel counts once: what the wire's own way has darkened
-says nothing of its later places, which may lie before or behind it.
+In an image a wire runs beside the projected centerline. A forward recursion of a hidden Markov model follows it in each
+view by itself: a state is how far aside it lies, an observation is how much more likely the pixel there is on a wire
+than off it. Two views see two coordinates of a cross-section, so their evidence adds up. A pixel counts once: what the
+wire's own way has darkened says nothing of its later places, which may lie before or behind it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
 from scipy.ndimage import map_coordinates
 
-from endopilot.xray.corridor import STEP_MM, Corridor, Passage
-from endopilot.xray.corridor_view import CorridorView, Evidence
+from endopilot.xray.carm import View
+from endopilot.xray.vessel_grid import VesselGrid
 
-_TURNS = np.array([0.5, 0.2, 0.05])
-"""How likely a wire moves aside by 0, 1 or 2 cells of 0.2 mm, either way, from a cross-section to the next, 0.25 mm
-on."""
-_REACH = len(_TURNS) - 1
-_AROUND = np.concatenate([_TURNS[:0:-1], _TURNS]).astype(np.float32)
-_BOTH = np.outer(_AROUND, _AROUND)
-_CHUNK, _GAP = 12, 12
-"""Sections that are followed at a time, and how many of the last ones do not darken what comes next: they are where it
+Evidence = Float32[np.ndarray, "rows columns"]
+STEP_MM = 0.25
+"""Distance of the places at which a wire is followed, mm: some 1.2 pixels."""
+_TURNS = np.array([0.05, 0.2, 0.5, 0.2, 0.05], dtype=np.float32)
+"""How likely a wire moves aside by up to 2 pixels, either way, from a place to the next."""
+_REACH = len(_TURNS) // 2
+_AROUND_MM = 1.0
+"""Tangents in an image are those over so far on either side, mm."""
+_ASIDE = 0.2
+"""Root mean square of the sine of the angle between a wire and the centerline."""
+_CHUNK, _GAP = 24, 12
+"""Places that are followed at a time, and how many of the last ones do not darken what comes next: they are where it
 comes from."""
+_COVER_PX = 3
+"""Pixels this near to the wire's way are darkened by it."""
 _LOST = 40.0
 """A way that is this much less likely in each view, in logarithms, than where it was likeliest is given up."""
 _BREAK = 50.0
@@ -35,27 +41,66 @@ _FOLD_MM = 45.0
 """Length of a wire behind its fold that is followed, mm."""
 
 
-@dataclass(frozen=True, eq=False)
-class Leg:
-    """A part of the wire's way, through one passage in one direction.
+class Shown:
+    """A vessel's grid as one view shows it, and an image's evidence beside it.
 
     Attributes:
-        index: of the passage in the corridor.
-        passage: that it lies in.
-        section: of the passage, in the order in which the wire passes them.
-        padded: share of every place, given what was seen up to its section, with zeros around each grid.
-        log_scale: logarithm of the evidence up to each section.
-        length: of the wire up to each section, mm.
-        before: the leg before, and the last of its sections that the way takes; None for the first.
+        slope: derivative of the places' pixels, pixels/mm.
+        across: unit vectors across the projected centerline, to the right and up in the image.
+        room_px: how far aside a wire may lie, pixels.
+        new: length of each step in the image, as a share of one across the beam: a wire along the beam is one dark
+            spot, whose pixels must not count anew at every place that lies in it.
+    """
+
+    def __init__(self, grid: VesselGrid, room_mm: Float[np.ndarray, "n"], view: View, image: Evidence) -> None:
+        """Project the grid; `room_mm` is how far from the centerline the wire's axis may lie."""
+        self._pixel, self.slope = view.project(grid.middle), view.slopes(grid.middle)
+        reach = round(_AROUND_MM / grid.step_mm)
+        ahead = np.zeros_like(self._pixel)
+        for run in grid.runs():
+            line = self._pixel[np.append(max(int(grid.parent[run[0]]), 0), run)]
+            index = np.arange(1, len(line))
+            ahead[run] = line[np.minimum(index + reach, len(line) - 1)] - line[np.maximum(index - reach, 0)]
+        ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+        self.across = np.stack([-ahead[:, 1], ahead[:, 0]], axis=-1)
+        for place in range(1, len(self.across)):  # where the vessel turns back in the image, sides stay
+            if self.across[place] @ self.across[grid.parent[place]] < 0:
+                self.across[place] *= -1
+        per_mm = np.sqrt((self.slope**2).sum(axis=(1, 2)) / 2)
+        self.room_px = np.maximum(room_mm * per_mm, 1.0)
+        step = np.linalg.norm(self._pixel - self._pixel[np.maximum(grid.parent, 0)], axis=1)
+        self.new = np.hypot(np.minimum(step / (per_mm * grid.step_mm), 1.0), _ASIDE).astype(np.float32)
+        self._middle = (len(image) - 1) / 2
+
+    def pixels(self, places: Int[np.ndarray, "k"], aside: Float[np.ndarray, "*m"]) -> Float[np.ndarray, "*m 2"]:
+        """Return row and column of what lies so many pixels aside of places; one for each, or a row of them."""
+        shape = (len(places), *[1] * (aside.ndim - 1), 2) if aside.ndim > 1 else (len(places), 2)
+        right_up = self._pixel[places].reshape(shape) + aside[..., None] * self.across[places].reshape(shape)
+        return self._middle + right_up[..., ::-1] * [-1.0, 1.0]
+
+    def from_before(self, place: int, before: int, aside: Float[np.ndarray, "j"]) -> Float[np.ndarray, "j"]:
+        """Return how far aside of one place lies what lies so far aside of another, pixels."""
+        away = self._pixel[place] - self._pixel[before] + aside[:, None] * self.across[place]
+        return away @ self.across[before]
+
+
+@dataclass(frozen=True, eq=False)
+class Leg:
+    """A part of the wire's way.
+
+    Attributes:
+        places: of the grid, in the order in which the wire passes them.
+        alpha: in each view, share of every distance aside, given what was seen up to that place.
+        log_scale: logarithm of the evidence up to each place.
+        length: of the wire up to each place, mm.
+        before: the leg before, and the last of its places that the way takes; None for the first.
         likeliest: largest `log_scale` of the way so far.
         lost: whether the way was given up at the leg's end.
         free: evidence of each view that the way has not used.
     """
 
-    index: int
-    passage: Passage
-    section: Int[np.ndarray, "n"]
-    padded: Float32[np.ndarray, "n g_and_4 g_and_4"]
+    places: Int[np.ndarray, "n"]
+    alpha: Float32[np.ndarray, "n views j"]
     log_scale: Float[np.ndarray, "n"]
     length: Float[np.ndarray, "n"]
     before: tuple[Leg, int] | None
@@ -63,235 +108,183 @@ class Leg:
     lost: bool
     free: Sequence[Evidence]
 
-    @property
-    def alpha(self) -> Float32[np.ndarray, "n g g"]:
-        """Share of every place, given what was seen up to its section."""
-        return self.padded[:, _REACH:-_REACH, _REACH:-_REACH]
-
-
-class Stop(NamedTuple):
-    """One place of a wire's way.
-
-    Attributes:
-        leg: that it lies in.
-        at: index of its section in the leg.
-        row, column: of the section's grid.
-    """
-
-    leg: Leg
-    at: int
-    row: int
-    column: int
-
-
-def places_of(stops: Sequence[Stop]) -> Float[np.ndarray, "k 3"]:
-    """Return where the stops of a way lie, LPS mm."""
-    found, low = np.empty((len(stops), 3)), 0
-    while low < len(stops):  # stops of one leg follow each other
-        leg, high = stops[low].leg, low
-        while high < len(stops) and stops[high].leg is leg:
-            high += 1
-        at, row, column = np.array([one[1:] for one in stops[low:high]]).T
-        found[low:high] = leg.passage.place(leg.section[at], row, column)
-        low = high
-    return found
-
 
 class Follower:
-    """Follows wires through a corridor in the images of one exposure."""
+    """Follows wires through a vessel in the images of one exposure."""
 
-    def __init__(self, corridor: Corridor, shown: Sequence[CorridorView], evidence: Sequence[Evidence]) -> None:
+    def __init__(
+        self,
+        grid: VesselGrid,
+        room_mm: Float[np.ndarray, "n"],
+        views: Sequence[View],
+        evidence: Sequence[Evidence],
+        deepest_mm: float = np.inf,
+    ) -> None:
         """Take the images.
 
         Args:
-            corridor: of the vessel.
-            shown: it in each view.
+            grid: of the vessel, its catheter before it.
+            room_mm: how far from the centerline the wire's axis may lie, mm.
+            views: of the images.
             evidence: for each view the logarithm of how much likelier each pixel is on a wire than off it.
+            deepest_mm: abscissa up to which wires are followed, mm.
         """
-        self._corridor, self._shown = corridor, shown
-        self._evidence = [view.cut(image) for view, image in zip(shown, evidence, strict=True)]
-        self._turns: dict[int, Float32[np.ndarray, "g g"]] = {}
+        self.grid, self._evidence, self._deepest = grid, evidence, deepest_mm
+        self._room_mm = np.maximum(room_mm, grid.step_mm)
+        self._tangent = grid.middle - grid.middle[np.maximum(grid.parent, 0)]
+        self._tangent[0] = self._tangent[1]
+        self._tangent /= np.maximum(np.linalg.norm(self._tangent, axis=1, keepdims=True), 1e-9)
+        self.shown = [Shown(grid, room_mm, *one) for one in zip(views, evidence, strict=True)]
+        half = int(np.ceil(max(float(one.room_px.max()) for one in self.shown)))
+        self.aside = np.arange(-half, half + 1.0)
+        self._open = np.stack([np.abs(self.aside) <= one.room_px[:, None] for one in self.shown], axis=1)
+        apart = np.abs(self.aside[:, None] - self.aside).astype(int)
+        self._turn = np.append(_TURNS[_REACH:], np.zeros(2 * half + 1, dtype=np.float32))[apart]
 
     def forwards(self) -> list[Leg]:
         """Return the legs of all ways from the catheter on, parents before their children."""
-        legs: dict[int, Leg] = {}
-        for index, passage in enumerate(self._corridor.passages):
-            before = None
-            if passage.parent >= 0:
-                parent = legs.get(passage.parent)
-                if parent is None or parent.lost:
-                    continue
-                before = parent, len(parent.section) - 1
-            legs[index] = self._walk(index, np.arange(len(passage.abscissa)), before)
-        return list(legs.values())
+        ends: dict[int, Leg] = {}
+        for run in self.grid.runs():
+            parent, run = int(self.grid.parent[run[0]]), run[self.grid.abscissa[run] <= self._deepest]
+            before = ends.get(parent)
+            if len(run) and (parent < 0 or (before is not None and not before.lost)):
+                ends[int(run[-1])] = self._walk(run, None if before is None else (before, len(before.places) - 1))
+        return list(ends.values())
 
-    def backwards(self, leg: Leg, at: int, longest_mm: float = np.inf) -> list[Leg]:
-        """Return the legs of a wire that folds at a section of a leg: back, and on into the branches that it passes.
+    def backwards(self, leg: Leg, at: int, longest_mm: float = np.inf) -> Leg:
+        """Return the leg of a wire that folds at a place of a leg, back to the root at most.
 
         Args:
             leg: that it folds in.
-            at: index of the section in the leg.
+            at: index of the place in the leg.
             longest_mm: a wire is not followed beyond this length.
         """
         free = [image.copy() for image in (self._evidence if leg.before is None else leg.before[0].free)]
-        self._darken(free, self.way(leg, at, at + 1 + _GAP))
-        most = round(min(_FOLD_MM, longest_mm - float(leg.length[at])) / STEP_MM)
-        index, sections = leg.index, leg.section[at::-1]
-        legs = [self._walk(index, sections[: max(most, 1)], (leg, at), free)]
-        came, most = index, most - len(sections)
-        # A wire that folds does not go back into the catheter, the first passage.
-        while (parent := self._corridor.passages[came].parent) > 0 and most > 0 and not legs[-1].lost:
-            back = legs[-1]
-            before, others = (back, len(back.section) - 1), []
-            for other, passage in enumerate(self._corridor.passages):
-                if passage.parent == parent and other != came:
-                    others.append(self._walk(other, np.arange(min(most, len(passage.abscissa))), before))
-            sections = np.arange(len(self._corridor.passages[parent].abscissa))[::-1]
-            legs += [*others, self._walk(parent, sections[:most], before)]
-            came, most = parent, most - len(sections)
-        return legs
+        self._darken(free, *self.way(leg, at, at + 1 + _GAP))
+        fold = leg.places[at]
+        most = max(round(min(_FOLD_MM, longest_mm - float(leg.length[at])) / self.grid.step_mm), 1)
+        back = self.grid.behind[fold, : self.grid.depth[fold] + 1][:most]
+        return self._walk(back[(self.grid.branch[back] >= 0) | (back == fold)], (leg, at), free)
 
-    def way(self, leg: Leg, at: int, most: int | None = None) -> list[Stop]:
-        """Return the likeliest way of a wire up to a section: each stop is the likeliest, given the one after.
+    def way(
+        self, leg: Leg, at: int, most: int | None = None
+    ) -> tuple[Int[np.ndarray, "k"], Float[np.ndarray, "k views"]]:
+        """Return the likeliest way of a wire up to a place: its places, and how far aside it lies in each view, pixels.
 
-        Args:
-            leg: that it ends in.
-            at: index of the section in the leg.
-            most: number of the last stops that are wanted; all if not given.
+        Each is the likeliest, given the one after; `most` is the number of the last places that are wanted.
         """
-        row, column = _likeliest(leg.padded[at])
-        row, column, side = row - _REACH, column - _REACH, 2 * _REACH + 1
-        found = [Stop(leg, at, row, column)]
-        while len(found) != most and (at > 0 or leg.before is not None):
-            if at > 0:
-                at -= 1
-                near = leg.padded[at, row : row + side, column : column + side] * _BOTH
-                best = int(near.argmax())
-                down, right = divmod(best, side)
-                if near[down, right] > 0:
-                    row, column = row + down - _REACH, column + right - _REACH
-                else:
-                    row, column = _likeliest(leg.alpha[at])
-            else:
-                assert leg.before is not None
-                place = places_of(found[-1:])[0]
-                leg, at = leg.before
-                away = leg.passage.places(leg.section[at : at + 1])[0] - place
-                near = (np.exp(-2 * (away**2).sum(axis=-1)) + 1e-9).astype(np.float32)
-                row, column = _likeliest(leg.alpha[at] * near)
-            found.append(Stop(leg, at, row, column))
-        return found[::-1]
+        index, places, found = leg.alpha[at].argmax(axis=1).tolist(), [], []
+        while True:
+            low = 0 if most is None else max(at + 1 + sum(map(len, places)) - most, 0)
+            part = np.empty((at + 1 - low, len(index)), dtype=np.int64)
+            for k, j in enumerate(index):
+                part[-1, k] = j
+                for back, share in enumerate(leg.alpha[low:at, k][::-1], start=2):
+                    left, right = max(j - _REACH, 0), j + _REACH + 1
+                    j = left + int((share[left:right] * self._turn[j, left:right]).argmax())
+                    part[-back, k] = j
+            places.append(leg.places[low : at + 1][::-1])
+            found.append(part[::-1])
+            if low > 0 or leg.before is None or sum(map(len, places)) == most:
+                break
+            last, (leg, at) = int(leg.places[0]), leg.before
+            for k, one in enumerate(self.shown):
+                expected = one.from_before(last, int(leg.places[at]), self.aside[part[0, k] : part[0, k] + 1])
+                away = np.exp(-0.5 * (self.aside - expected) ** 2) + 1e-9
+                index[k] = int((leg.alpha[at, k] * away).argmax())
+        return np.concatenate(places)[::-1], self.aside[np.concatenate(found)[::-1]]
+
+    def in_space(
+        self,
+        places: Int[np.ndarray, "k"],
+        aside: Float[np.ndarray, "k views"],
+        variance: Float[np.ndarray, "k views"],
+    ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3 3"]]:
+        """Return where a wire lies that views show so far aside of places, pixels, LPS mm, and the covariances, mm².
+
+        Before it is seen, the wire lies anywhere in the lumen of a cross-section.
+        """
+        tangent = self._tangent[places]
+        prior = np.eye(3) - tangent[:, :, None] * tangent[:, None]
+        prior *= (self._room_mm[places] ** 2 / 4)[:, None, None]
+        rows = np.stack([np.einsum("ki,kij->kj", one.across[places], one.slope[places]) for one in self.shown], axis=1)
+        gain = np.linalg.solve(
+            rows @ prior @ rows.swapaxes(1, 2) + variance[:, :, None] * np.eye(len(self.shown)), rows @ prior
+        ).swapaxes(1, 2)
+        return self.grid.middle[places] + np.einsum("kiv,kv->ki", gain, aside), prior - gain @ rows @ prior
 
     def _walk(
-        self,
-        index: int,
-        section: Int[np.ndarray, "n"],
-        before: tuple[Leg, int] | None,
-        free: list[Evidence] | None = None,
+        self, places: Int[np.ndarray, "n"], before: tuple[Leg, int] | None, free: list[Evidence] | None = None
     ) -> Leg:
-        """Run the forward recursion through sections of one passage.
+        """Run the forward recursion through places.
 
         Args:
-            index: of the passage.
-            section: neighbours, in the order in which they are passed.
-            before: the leg before, and its last section.
+            places: neighbours, in the order in which they are passed.
+            before: the leg before, and its last place.
             free: evidence that a wire which folds here has not used; that of the leg before if not given.
         """
-        passage, count = self._corridor.passages[index], len(section)
-        state, log_scale, length = self._entry(passage, int(section[0]), before, turned=free is not None)
-        likeliest = log_scale if before is None else before[0].likeliest
-        if free is None:
-            free = [image.copy() for image in (self._evidence if before is None else before[0].free)]
-        grid = len(passage.offsets)
-        turn, allowed = self._turn(grid), passage.open[section].astype(np.float32).reshape(count, -1)
-        padded, scales = np.zeros((count, grid + 2 * _REACH, grid + 2 * _REACH), dtype=np.float32), np.empty(count)
-        lengths, lost = length + STEP_MM * np.arange(count), False
-        leg = Leg(index, passage, section, padded, scales, lengths, before, likeliest, False, free)
-        alpha = leg.alpha
+        open_, count = self._open[places], len(places)
+        state = open_[0] / open_[0].sum(axis=1, keepdims=True, dtype=np.float32)
+        log_scale, length, likeliest = 0.0, float(self.grid.abscissa[places[0]]), 0.0
+        if before is not None:
+            leg, at = before
+            last = int(leg.places[at])
+            log_scale, likeliest = float(leg.log_scale[at]), leg.likeliest
+            length = float(leg.length[at]) + abs(float(self.grid.abscissa[places[0]] - self.grid.abscissa[last]))
+            if free is None:  # a fold crosses the lumen
+                for k, one in enumerate(self.shown):
+                    at_last = one.from_before(int(places[0]), last, self.aside)
+                    turned = np.interp(at_last, self.aside, leg.alpha[at, k], left=0.0, right=0.0) * open_[0, k]
+                    state[k] = turned if turned.sum() > 0 else state[k]
+                free = [image.copy() for image in leg.free]
+        free = free or [image.copy() for image in self._evidence]
+        alpha, scales = np.empty(open_.shape, dtype=np.float32), np.empty(count)
+        lengths, lost = length + self.grid.step_mm * np.arange(count), False
+        leg = Leg(places, alpha, scales, lengths, before, likeliest, False, free)
         for low in range(0, count, _CHUNK):
             high = min(low + _CHUNK, count)
-            factor, peak = self._gain(index, section[low:high], free)
-            gained = np.empty(high - low)
+            factor, peak = self._gain(places[low:high], open_[low:high], free)
+            gained = np.empty((high - low, len(state)))
             for number in range(high - low):
-                at = low + number
-                state = turn @ state @ turn
-                inside = float(state.ravel() @ allowed[at])  # a wire does not leave the vessel
-                state *= factor[number]
-                total = float(state.sum())
-                loss = 0.0
-                if total <= 0:  # no place can be reached: begin anew, at a great loss
+                reached = state @ self._turn
+                inside = (reached * open_[low + number]).sum(axis=1)  # a wire does not leave the vessel
+                state = reached * factor[number]
+                total = state.sum(axis=1)
+                loss = 1.0
+                if total.min() <= 0:  # no place can be reached: begin anew, at a great loss
                     state = factor[number].copy()
-                    total, inside, loss = float(state.sum()), float(allowed[at].sum()), _BREAK
-                state /= np.float32(total)
-                gained[number] = total / inside * np.exp(-loss)
-                alpha[at] = state
-            scales[low:high] = log_scale + np.cumsum(np.log(gained) + peak)
-            log_scale = float(scales[high - 1])
-            likeliest = max(likeliest, float(scales[low:high].max()))
-            self._darken(free, self.way(leg, high - 1, _CHUNK + _GAP)[:-_GAP])
-            if lost := bool(log_scale < likeliest - _LOST * len(self._shown)):
-                section, padded, scales, lengths = section[:high], padded[:high], scales[:high], lengths[:high]
+                    total, inside, loss = state.sum(axis=1), open_[low + number].sum(axis=1), np.exp(-_BREAK)
+                state /= total[:, None]
+                gained[number] = total / inside * loss
+                alpha[low + number] = state
+            scales[low:high] = log_scale + np.cumsum((np.log(gained) + peak).sum(axis=1))
+            log_scale, likeliest = float(scales[high - 1]), max(likeliest, float(scales[low:high].max()))
+            done = self.way(leg, high - 1, _CHUNK + _GAP)
+            self._darken(free, done[0][:-_GAP], done[1][:-_GAP])
+            if lost := bool(log_scale < likeliest - _LOST * len(self.shown)):
+                count = high
                 break
-        return Leg(index, passage, section, padded, scales, lengths, before, likeliest, lost, free)
+        return Leg(places[:count], alpha[:count], scales[:count], lengths[:count], before, likeliest, lost, free)
 
     def _gain(
-        self, index: int, section: Int[np.ndarray, "n"], free: Sequence[Evidence]
-    ) -> tuple[Float32[np.ndarray, "n g g"], Float32[np.ndarray, "n"]]:
-        """Return how much likelier all views make the places of some sections, over the likeliest's, and that one's."""
-        passage, backwards = self._corridor.passages[index], section[0] > section[-1]
-        low, high = int(section.min()), int(section.max()) + 1
-        start, grid = passage.start[low : high + 1], len(passage.offsets)
-        here, counts = slice(start[0], start[-1]), np.diff(start)
-        gain = np.zeros(int(start[-1] - start[0]), dtype=np.float32)
-        for shown, image in zip(self._shown, free, strict=True):
-            gain += np.repeat(shown.new[index][low:high], counts) * shown.read(image, index, here)
-        peak = np.maximum.reduceat(gain, start[:-1] - start[0])
-        factor = np.zeros((high - low, grid, grid), dtype=np.float32)
-        factor.ravel()[passage.cells[here] - low * grid * grid] = np.exp(gain - np.repeat(peak, counts))
-        return (factor[::-1], peak[::-1]) if backwards else (factor, peak)
+        self, places: Int[np.ndarray, "k"], open_: np.ndarray, free: Sequence[Evidence]
+    ) -> tuple[Float32[np.ndarray, "k views j"], Float32[np.ndarray, "k views"]]:
+        """Return how much likelier each view makes a wire aside of places, over the likeliest's, and that one's."""
+        aside, gains = np.broadcast_to(self.aside, (len(places), len(self.aside))), []
+        for one, image in zip(self.shown, free, strict=True):
+            pixels = one.pixels(places, aside).transpose(2, 0, 1)
+            gains.append(map_coordinates(image, pixels, order=1, mode="constant") * one.new[places, None])
+        gain = np.where(open_, np.stack(gains, axis=1), -np.inf)
+        peak = gain.max(axis=2)
+        return np.exp(gain - peak[..., None]), peak
 
-    def _entry(
-        self, passage: Passage, section: int, before: tuple[Leg, int] | None, *, turned: bool
-    ) -> tuple[Float32[np.ndarray, "g g"], float, float]:
-        """Return the shares with which a leg begins, the evidence so far, and the wire's length.
-
-        The shares are those at the end of the leg before, turned into this one's axes; a fold crosses the lumen.
-        """
-        allowed = passage.open[section]
-        anywhere = (allowed / allowed.sum()).astype(np.float32)
-        if before is None:
-            return anywhere, 0.0, float(passage.abscissa[section])
-        leg, at = before
-        end, last = leg.passage, leg.section[at]
-        step = abs(float(passage.abscissa[section] - end.abscissa[last]))
-        log_scale, length = float(leg.log_scale[at]), float(leg.length[at]) + step
-        if turned:
-            return anywhere, log_scale, length
-        away = passage.places(np.array([section]))[0] - end.middle[last]
-        grid = np.stack([away @ end.first[last], away @ end.second[last]])
-        index = (grid - end.offsets[0]) / (end.offsets[1] - end.offsets[0])
-        state = np.clip(map_coordinates(leg.alpha[at], index, order=1, mode="constant"), 0, None)
-        total = float(state.sum())
-        if total <= 0:
-            return anywhere, log_scale - _BREAK, length
-        return (state / total).astype(np.float32), log_scale, length
-
-    def _turn(self, grid: int) -> Float32[np.ndarray, "g g"]:
-        """Return how likely a wire moves aside, from each row or column of a grid to each."""
-        if grid not in self._turns:
-            cells = np.arange(grid)
-            aside = np.interp(np.abs(cells[:, None] - cells), np.arange(len(_TURNS)), _TURNS, right=0.0)
-            self._turns[grid] = aside.astype(np.float32)
-        return self._turns[grid]
-
-    def _darken(self, images: Sequence[Evidence], way: Sequence[Stop]) -> None:
+    def _darken(
+        self, images: Sequence[Evidence], places: Int[np.ndarray, "k"], aside: Float[np.ndarray, "k views"]
+    ) -> None:
         """Take away the evidence of the pixels that a way has darkened."""
-        if way:
-            places = places_of(way)
-            for shown, image in zip(self._shown, images, strict=True):
-                shown.darken(image, places)
-
-
-def _likeliest(share: Float32[np.ndarray, "a b"]) -> tuple[int, int]:
-    row, column = divmod(int(share.argmax()), share.shape[1])
-    return row, column
+        side = np.arange(-_COVER_PX, _COVER_PX + 1)
+        disc = np.argwhere(np.hypot(side[:, None], side) < _COVER_PX + 0.5) - _COVER_PX
+        for k, (one, image) in enumerate(zip(self.shown, images, strict=True)):
+            at = np.rint(one.pixels(places, aside[:, k])[:, None] + disc).astype(int).reshape(-1, 2)
+            at = at[((at >= 0) & (at < image.shape)).all(axis=1)]
+            image[tuple(at.T)] = 0.0
