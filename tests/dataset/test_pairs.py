@@ -10,7 +10,6 @@ import pytest
 
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.dataset import loader
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset, write_episode
 from endopilot.dataset.info import describe_dataset
@@ -162,12 +161,11 @@ def test_models_take_it_with_the_commands_of_both_devices(pairs):
     check_wire(pairs, {"device": data.manifest["device"]}, data)
 
 
-def test_what_does_not_go_together_is_refused(pairs, patient, tmp_path, monkeypatch):
+def test_what_does_not_go_together_is_refused(pairs, patient, tmp_path):
     data = read_dataset(pairs)
-    bare = replace(data, folder=tmp_path, manifest=data.manifest | {"catheters": []})
-    monkeypatch.setattr(loader, "read_dataset", {pairs: data, tmp_path: bare}.__getitem__)
+    generate_dataset([patient], output=tmp_path / "bare", device=WIRE, config=CONFIG)
     with pytest.raises(InputError, match=r"lies in no catheter, and that of .* in microcatheter-1\.7f; join"):
-        read_joined([pairs, tmp_path])
+        read_joined([pairs, tmp_path / "bare"])
     assert len(read_joined([pairs, pairs]).slip) == 2 * len(data)
     with pytest.raises(InputError, match="control: 'force' with catheters; give 'velocity'"):
         generate_dataset(

@@ -119,16 +119,6 @@ def test_pushes_and_pulls_with_friction(anatomy: Anatomy) -> None:
     assert rough.base_force[0, -1, 0] < smooth.base_force[0, -1, 0]
 
 
-def test_survives_the_blind_end_and_full_retraction(anatomy: Anatomy) -> None:
-    control = np.zeros((2, 40, 2))
-    control[0, :10, 0], control[0, 30:, 0] = 2.0, -8.5
-    control[1, :, 0] = -1.0
-    trajectory = simulate(anatomy, DEVICE, control, initial=np.array([[66.0, 0.0], [20.0, 1.0]]))
-    assert trajectory.valid.all()
-    assert np.isfinite(trajectory.tip_position).all()
-    assert trajectory.base_force[0, 9, 0] > 0.05
-
-
 def test_the_drive_slips_at_its_push_limit_and_cannot_pull_back_what_it_did_not_push(anatomy: Anatomy) -> None:
     control = np.zeros((2, 50, 2))
     control[:, :20, 0], control[:, 25:, 0] = 4.0, -8.0  # 20 s of pushing against the blind end, then out again
