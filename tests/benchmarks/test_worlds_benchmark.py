@@ -5,14 +5,12 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from benchmarks.agent import worlds
-from benchmarks.agent.worlds import DrivenAtRandom, counted, drive_in_worlds, driven_on, figures, identified, row
-from endopilot.belief.identification import Identified
+from benchmarks.agent.worlds import DrivenAtRandom, counted, drive_in_worlds, driven_on, figures, row
 from endopilot.errors import InputError
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.simulation.config import SimulatorConfig
@@ -99,13 +97,6 @@ def test_an_ostium_that_is_off_and_stated_walls_are_compared_with_the_truth():
         row("deeper", "planned", [GOOD]),
     ]
     assert figures(rows)["ostium_error_mm"] == 0.35 and figures(rows)["wall_right_share"] == 0.5
-    driver = DrivenAtRandom()
-    driver._monitor = SimpleNamespace(identified=Identified({}, 0.9, True))  # pyright: ignore[reportAttributeAccessIssue]
-    driver.ostium_mm = 1.7
-    assert identified(driver, World(ostium_mm=2.0)) == {"ostium_error_mm": pytest.approx(0.3), "wall_right": False}
-    assert identified(driver, World(compliant_wall_n_mm2=0.01)) == {"ostium_error_mm": None, "wall_right": True}
-    driver._monitor = SimpleNamespace(identified=Identified({}, 0.5, True))  # pyright: ignore[reportAttributeAccessIssue]
-    assert identified(driver, World())["wall_right"] is None
 
 
 def test_patients_are_those_of_no_task_and_of_one_set():

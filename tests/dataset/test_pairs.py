@@ -8,8 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from endopilot.anatomy.io import read_anatomy, write_anatomy
-from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset, write_episode
 from endopilot.dataset.info import describe_dataset
@@ -35,13 +34,6 @@ OF_EPISODES += ("tip_bend", "tip_stiffness_factor", "initial")
 OF_TRAJECTORY = ("command", "control", *(each.name for each in fields(Outputs)))
 OF_TIP = {"tip_abscissa": "abscissa", "tip_offset": "offset", "branch": "branch", "lumen_radius": "radius"}
 EXACT = {"command": np.float64, "slip": np.float64, "rotation_slip": np.float64, "valid": np.bool_}
-
-
-@pytest.fixture(scope="module")
-def patient(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("anatomies") / "patient"
-    write_anatomy(make_patient(AtlasConfig(count=1, seed=4, population="textbook"), 0), output=folder)
-    return folder
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from endopilot.anatomy.io import read_anatomy, write_anatomy
-from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset, write_episode
 from endopilot.dataset.loader import read_dataset
@@ -32,13 +31,6 @@ from endopilot.simulation.motion import motion_named
 from endopilot.simulation.simulate import simulate
 
 DEVICE = read_wire("workhorse-014")
-
-
-@pytest.fixture(scope="module")
-def patient(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("anatomies") / "patient"
-    write_anatomy(make_patient(AtlasConfig(count=1, seed=4, population="textbook"), 0), output=folder)
-    return folder
 
 
 def test_an_episode_simulated_from_the_disk_repeats_to_the_bit(tmp_path, patient):

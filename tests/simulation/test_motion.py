@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from bend import vessel
 
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.heart_reference import LEFT_VENTRICLE_AXIS, TO_CRUX
@@ -26,11 +25,6 @@ DEVICE = read_wire("workhorse-014")
 OSTIUM = np.array([10.0, -20.0, 30.0])
 MOTION = Motion()
 BEATS = Motion(breathing_caudal_mm=0.0, breathing_anterior_mm=0.0, breathing_dorsal_deg=0.0, breathing_dextral_deg=0.0)
-
-
-@pytest.fixture(scope="module")
-def anatomy() -> Anatomy:
-    return vessel()
 
 
 def maps(motion: Motion, times: np.ndarray) -> np.ndarray:

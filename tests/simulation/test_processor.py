@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bend import vessel
 
 from endopilot import _core
 from endopilot.devices.device import read_wire
@@ -23,11 +22,6 @@ ROOT = Path(__file__).parents[2]
 DEVICE = read_wire("workhorse-014")
 GPU = SimulatorConfig(element_mm=1.5, processor="cuda")
 CPU = SimulatorConfig(element_mm=1.5)
-
-
-@pytest.fixture(scope="module")
-def anatomy() -> Anatomy:
-    return vessel()
 
 
 def put_gpu(monkeypatch: pytest.MonkeyPatch, **changed: Any) -> list[int]:

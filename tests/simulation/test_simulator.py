@@ -27,11 +27,6 @@ PERIOD = 0.5
 
 
 @pytest.fixture(scope="module")
-def anatomy() -> Anatomy:
-    return vessel()
-
-
-@pytest.fixture(scope="module")
 def wider() -> Anatomy:
     return vessel(np.pi / 3)
 
