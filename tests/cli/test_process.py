@@ -194,6 +194,7 @@ def test_a_limit_of_memory_ends_in_one_line(tmp_path, mib):
         "anatomy odd.mrk.json",
         "segment odd",
         "simulate patient --controls odd.csv",
+        "simulate patient --controls odd.npz",
         "simulate patient --device odd.yaml",
         "simulate patient --config odd.yaml",
         "plan patient --target odd.csv",
