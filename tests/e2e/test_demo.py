@@ -12,7 +12,6 @@ from functools import partial
 import command
 
 from endopilot import __version__
-from endopilot.control.navigate import NavigateConfig
 from endopilot.devices.device import read_wire
 from endopilot.files import read_json
 from endopilot.phantom.phantom import PhantomConfig
@@ -39,7 +38,6 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path, capsys, monkey
 
     small = partial(PhantomConfig, in_plane_mm=0.75, slice_mm=0.8, margin_mm=10.0)  # seen sooner
     monkeypatch.setattr(study, "PhantomConfig", small)
-    monkeypatch.setattr(study, "NavigateConfig", partial(NavigateConfig, tip="own", seconds=12.0))
     again = command.run(capsys, "demo", "-o", folder, *SIZE)
     assert {path: path.stat().st_mtime_ns for path in before} == before  # finished work is not done twice
 
