@@ -48,7 +48,7 @@ def my_module(tmp_path, monkeypatch) -> Path:
     (tmp_path / "lacking.py").write_text("import numpy\nimport no_such_library\n")
     (tmp_path / "failing.py").write_text("x = 1\nraise ValueError('no\\nmodel')\n")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.syspath_prepend(tmp_path)
     yield tmp_path
     for name in ("my_module", "my_helper", "broken", "lacking", "failing"):
         sys.modules.pop(name, None)
@@ -57,7 +57,6 @@ def my_module(tmp_path, monkeypatch) -> Path:
 @pytest.fixture
 def installed(tmp_path, monkeypatch):
     """Return a function that installs a package which offers some entry points."""
-    monkeypatch.setattr(sys, "path", [*sys.path])
 
     def install(package: str, group: str, points: dict[str, str]) -> None:
         folder = tmp_path / package
@@ -69,7 +68,7 @@ def installed(tmp_path, monkeypatch):
         (folder / f"{package}_policies.py").write_text(
             "from endopilot.navigation.baseline_policies import Forward\nclass Pushes(Forward):\n    pass\n"
         )
-        sys.path.insert(0, str(folder))
+        monkeypatch.syspath_prepend(folder)
 
     yield install
     for name in [name for name in sys.modules if name.endswith("_policies") and "." not in name]:
@@ -187,7 +186,7 @@ class Throws(Waits):
 def test_whatever_a_policy_raises_names_the_policy(tmp_path, monkeypatch, capsys, name, said):
     (tmp_path / "rude.py").write_text(_RUDE)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.syspath_prepend(tmp_path)
     try:
         with pytest.raises(InputError, match=f"policy: 'rude:{name}': .*{said}, rude.py line .*mend it"):
             policy = make_policy(f"rude:{name}")

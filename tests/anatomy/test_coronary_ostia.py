@@ -101,14 +101,6 @@ def test_a_given_ostium_five_millimetres_off_enters_at_the_open_end(right_alone,
         assert np.linalg.norm(found.position) < 4.0 and not found.direction.any()
 
 
-def test_a_given_ostium_in_mid_vessel_faces_away_from_the_inlet(right_alone):
-    lumen = artery("rca")
-    points, clearance = grid_points(lumen, lumen.values > 0)
-    far = points[np.argmin(np.abs(np.linalg.norm(points, axis=1) - 30.0) - clearance)]
-    found = entrance(lumen, points, clearance, Insertion(far, np.zeros(3)), "rca")
-    assert found.direction @ far > 0.3 * np.linalg.norm(far)
-
-
 def test_a_cone_narrows_from_its_wide_end_and_widens_from_the_narrow_one():
     def cone(points):
         height = np.clip(points[..., 2], -30.0, 30.0)

@@ -262,33 +262,6 @@ def test_mask_away_from_the_ostium_is_refused(fork_mask):
         extract_anatomy(fork_mask, name="far", config=AnatomyConfig(ostium_mm=(90.0, 0.0, 0.0)))
 
 
-def test_bad_files_give_one_line(tmp_path):
-    points = forked_tree().path(1).points
-    save_lines(tmp_path / "bare.vtp", [points], None)
-    for name, content in (("empty.stl", b""), ("text.ply", b"hello, world, this is no mesh\n"), ("x.dat", b"1")):
-        (tmp_path / name).write_bytes(content)
-    (tmp_path / "cl.mrk.json").write_text("{}")
-    cases = {"bare.vtp": "without radii", "empty.stl": "empty", "text.ply": "text.ply", "x.dat": "unknown kind",
-             "cl.mrk.json": "no Slicer markups", "missing.stl": "no such file"}  # fmt: skip
-    for name, message in cases.items():
-        with pytest.raises(InputError, match=message) as error:
-            read_source(tmp_path / name)
-        assert "\n" not in str(error.value)
-
-
-def test_spheres_that_do_not_touch_are_joined_by_straight_pieces_with_a_note():
-    points = np.outer(np.arange(0, 40, 4.0), [0, 0, 1])
-    anatomy = extract_anatomy(Polylines((points,), (np.full(10, 1.5),)), name="beads")
-    assert abs(anatomy.tree.longest_path().abscissa[-1] - 36.0) < 1e-6 and is_sound(anatomy)
-    assert any("9 neighbouring points do not touch" in note for note in anatomy.provenance["notes"])
-
-
-@pytest.mark.parametrize("field", ["catheter_radius_mm", "spacing_mm", "minimum_branch_length_mm", "scale"])
-def test_config_names_field_and_value(field):
-    with pytest.raises(InputError, match=rf"^{field}: -1\.0; give a number (from|above) 0"):
-        AnatomyConfig(**{field: -1.0})
-
-
 @pytest.mark.skipif(not REAL.exists(), reason="the real patient's centerlines are not at hand")
 def test_real_patient_comes_back_from_the_rebuilt_lumen():
     truth = extract_anatomy(read_source(REAL / "rca_cl.vtp"), name="rca", config=AnatomyConfig(vessel="rca"))

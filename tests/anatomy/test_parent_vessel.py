@@ -10,7 +10,6 @@ from analytic_shapes import mask_of
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.errors import InputError
-from endopilot.vessels.inlet import piece_on_side
 from endopilot.vessels.surface import Surface, surface_from_mask
 from toy_coronaries import artery, mask_of_arteries
 
@@ -46,11 +45,6 @@ def test_of_two_vessels_the_larger_is_taken_and_the_other_named():
 def test_straight_tubes_are_not_answered_as_coronary_arteries(vessel):
     with pytest.raises(InputError, match="--ostium-mm"):
         extract_anatomy(mask_of(two_arteries, HALF_MM, (0.6, 0.6, 0.6)), config=AnatomyConfig(vessel=vessel))
-
-
-def test_small_pieces_do_not_count_as_the_other_artery():
-    sizes, centres = np.array([100.0, 5.0]), np.array([[10.0, 0, 0], [-10.0, 0, 0]])
-    assert piece_on_side(sizes, centres, "rca") == (0, [])
 
 
 def test_coronary_ostium_is_where_the_vessel_leaves_the_aorta():

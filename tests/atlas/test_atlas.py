@@ -9,7 +9,6 @@ from endopilot.anatomy.distance import sample
 from endopilot.atlas import curves as shape
 from endopilot.atlas.atlas import AtlasConfig, make_atlas, make_patient, make_patient_tree
 from endopilot.atlas.branching import Vessel, lumens_collide
-from endopilot.errors import InputError
 from endopilot.lines import length_along
 
 COUNT = 60
@@ -129,17 +128,3 @@ def test_side_branches_stay_outside_the_heart():
     curve = shape.steer(np.array([33.0, 0.0, 0.0]), along, [(0.0, down)], 60.0, 7.0, depth)
     height = np.linalg.norm(curve, axis=1) - 30.0
     assert height.min() > 0.5 and height.max() < 9
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"vessel": "spleen"}, "'spleen'; choose from .*rca"),
-        ({"count": 0}, "count: 0"),
-        ({"seed": -1}, "seed: -1"),
-        ({"stenosis_share": 1.5}, "stenosis_share: 1.5"),
-    ],
-)
-def test_a_bad_configuration_is_refused(options, message):
-    with pytest.raises(InputError, match=message):
-        AtlasConfig(**options)

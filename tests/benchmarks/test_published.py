@@ -17,11 +17,9 @@ from benchmarks.published.published import (
     Comparison,
     PublishedConfig,
     bending,
-    straightenings,
     tip_loads,
     unreinforced,
 )
-from benchmarks.published.straightening import AortoIliac, Straightened
 from benchmarks.published.three_point import flexural_modulus
 from benchmarks.published.tubing import BORE_MM, LENGTH_MM, Push, draw_tubing, push_through
 from endopilot.devices.catheter import read_catheter
@@ -144,37 +142,3 @@ def test_the_command_shows_every_test_and_counts_what_failed(monkeypatch, capsys
     seen = [each for each in seen if each not in smooth]
     assert len({wall for wall, _ in seen}) == 2  # friction is drawn once a path, and every device sees the same
     assert all(0.04 <= wall <= 0.15 and all(0.03 <= mu <= 0.1 for mu in coated) for wall, coated in seen)
-
-
-def test_straightened_paths_are_shown_without_a_verdict_and_those_that_fail_are_left_out(monkeypatch) -> None:
-    def straighten(path, anatomy, wire, *, rigid=False) -> Straightened:
-        seen.append((wire.name, rigid, path.tissue_mpa, path.stiffens_over_mm, anatomy.scale))
-        size = 0.0 if rigid else float(wire.name.split()[0])
-        line = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [6.0, 0.0, 0.0]])
-        moved = np.array([size, 0.0])
-        return Straightened(moved, 0.5 * line[:2], line, size + 1, through=len(seen) > 1, valid=len(seen) != 3)
-
-    seen: list[tuple] = []
-    monkeypatch.setattr(published, "straighten", straighten)
-    monkeypatch.setattr(AortoIliac, "anatomy", lambda path: SimpleNamespace(scale=path.scale))
-    rows = {each.case: each for each in straightenings(PublishedConfig(draws=2, seed=3))}
-    of = {name.removeprefix("aorto-iliac path, "): each for name, each in rows.items()}
-    softest = of["Amplatz: largest displacement"]
-    assert softest.published is None and softest.row()["verdict"] is None
-    assert softest.ours == (9.5, 9.5) and softest.note == "1 did not pass"
-    assert of["Lunderquist Extra Stiff: mean displacement"].ours == pytest.approx((79.2, 79.2))
-    assert of["Amplatz: tortuosity index"].ours == (1.0, 1.0)
-    assert of["no wire: tortuosity index"].ours == pytest.approx((10 / 6, 10 / 6))
-    assert of["Lunderquist Extra Stiff, rigid wall: force of the wall"].ours == (1.0, 1.0)
-    failed = of["Amplatz Super Stiff: force of the wall"]
-    assert failed.ours == (61.3,) and failed.note == "1 did not converge"
-    assert of["Amplatz Extra Stiff over Amplatz: largest displacement"].ours == pytest.approx((29.2 / 9.5,) * 2)
-    assert len(of["Lunderquist Extra Stiff over Amplatz Super Stiff: largest displacement"].ours) == 1
-    assert len([each for each in of.values() if each.kind == "sensitivity"]) == 4
-    drawn = of["tortuosity index of iliac arteries, drawn"]
-    assert drawn.kind == "calibration" and len(set(drawn.ours)) == 2
-    assert all(scale == pytest.approx(over / 4) for *_, over, scale in seen)
-    assert {tissue for _, _, tissue, _, _ in seen} >= set(published.TISSUE_MPA)
-    monkeypatch.setattr(published, "straighten", lambda *given, **how: replace(straighten(*given, **how), valid=False))
-    with pytest.raises(RuntimeError, match="no wire: tortuosity index did not converge in any draw"):
-        straightenings(PublishedConfig(draws=1))

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import gc
 import json
-import signal
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
-from endopilot import cli
-from endopilot.cli import COMMANDS, GROUPS, main, process
+from endopilot.cli import COMMANDS, GROUPS, main
 from endopilot.cli.arguments import show
 
 
@@ -62,23 +58,6 @@ def test_every_command_has_help(name: str, capsys: pytest.CaptureFixture[str]) -
         main([name, "--help"])
     assert leaving.value.code == 0
     assert f"usage: endopilot {name}" in capsys.readouterr().out
-
-
-def test_a_command_works_with_garbage_collected_though_it_is_imported_without(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = []
-
-    def imported(_: str) -> SimpleNamespace:
-        seen.append(gc.isenabled())
-        return SimpleNamespace(run=lambda _: seen.append(gc.isenabled()))
-
-    monkeypatch.setattr(cli, "command_of", imported)
-    monkeypatch.setattr(process, "own_streams", lambda: None)
-    monkeypatch.setattr(process, "leave", lambda code: seen.append(code))
-    monkeypatch.setattr(gc, "freeze", lambda: None)
-    monkeypatch.setattr(signal, "signal", lambda *_: None)
-    monkeypatch.setattr(sys, "argv", ["endopilot", "info"])
-    main()
-    assert seen == [False, True, 0]
 
 
 def test_an_unknown_command_proposes_a_near_one() -> None:

@@ -18,12 +18,7 @@ import pytest
 from endopilot.cli import main, process
 from endopilot.cli.arguments import show, show_rows
 from endopilot.cli.process import EXIT_DEFECT, carry_out
-from endopilot.devices.device import read_wire
 from endopilot.errors import InputError, Remark
-from endopilot.files import sha256
-from endopilot.imaging.volume import read_volume
-from endopilot.robot.log import read_log
-from endopilot.simulation.trajectory import read_trajectory
 
 _SLOW = """
 import os, signal, sys, threading, time
@@ -145,21 +140,17 @@ def test_a_signal_ends_in_one_line_even_where_a_library_turns_it_into_an_error(c
     assert capsys.readouterr().err == f"endopilot test: {'interrupted' if number == signal.SIGINT else 'terminated'}\n"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_while_vtk_is_imported_ends_in_one_line(number):
+def test_a_signal_while_vtk_is_imported_ends_in_one_line():
     """Send it at each of the imports that VTK's modules make while they are loaded, the second to the last one."""
     pytest.importorskip("vtkmodules")
-    script = [sys.executable, "-c", _IMPORTING, number.name]
+    script = [sys.executable, "-c", _IMPORTING, "SIGTERM"]
     done = subprocess.run(script, capture_output=True, text=True, check=True)
     *stopped, finished = done.stdout.split()
-    assert len(stopped) > 5 and set(stopped) == {str(128 + number)} and finished == "99"
-    assert set(done.stderr.splitlines()) == {
-        f"endopilot test: {'interrupted' if number == signal.SIGINT else 'terminated'}"
-    }
+    assert len(stopped) > 5 and set(stopped) == {str(128 + signal.SIGTERM)} and finished == "99"
+    assert set(done.stderr.splitlines()) == {"endopilot test: terminated"}
 
 
-@pytest.mark.parametrize("group", [True, False])
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(("number", "group"), [(signal.SIGINT, True), (signal.SIGTERM, False)])
 def test_a_signal_leaves_no_process_and_no_half_written_file(tmp_path, number, group):
     (tmp_path / "slow.py").write_text(_SLOW)
     running = subprocess.Popen(
@@ -183,7 +174,7 @@ def test_a_signal_leaves_no_process_and_no_half_written_file(tmp_path, number, g
     raise AssertionError("a process is left")
 
 
-@pytest.mark.parametrize("mib", [48, 130, 260, 420, 900, 1030])
+@pytest.mark.parametrize("mib", [48, 260, 1030])
 def test_a_limit_of_memory_ends_in_one_line(tmp_path, mib):
     def limited() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (mib << 20, mib << 20))
@@ -203,6 +194,7 @@ def test_a_limit_of_memory_ends_in_one_line(tmp_path, mib):
         "anatomy odd.mrk.json",
         "segment odd",
         "simulate patient --controls odd.csv",
+        "simulate patient --controls odd.npz",
         "simulate patient --device odd.yaml",
         "simulate patient --config odd.yaml",
         "plan patient --target odd.csv",
@@ -220,15 +212,6 @@ def test_what_is_no_file_is_refused(capsys, tmp_path, monkeypatch, given):
         said = f"endopilot {arguments[0]}: {odd}: is a FIFO, a socket or a device; give a file or a folder\n"
         assert capsys.readouterr() == ("", said)
     assert {path.name for path in Path().iterdir()} == {odd, "patient"}
-
-
-@pytest.mark.timeout(30)
-@pytest.mark.parametrize("read", [read_volume, read_trajectory, read_log, read_wire, sha256])
-def test_what_is_no_file_is_refused_in_python_too(tmp_path, read):
-    odd = tmp_path / "odd.yaml"
-    os.mkfifo(odd)
-    with pytest.raises(InputError, match=r"odd.yaml: is a FIFO, a socket or a device; give a file or a folder"):
-        read(odd)
 
 
 def test_a_name_that_is_not_utf_8_is_refused_in_one_line(tmp_path):

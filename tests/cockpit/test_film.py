@@ -13,8 +13,6 @@ from endopilot.cockpit.messages import Drive, Pedal, Replay, Target
 from endopilot.errors import InputError
 from endopilot.files import write_json
 from endopilot.ladder.attempt import attempt, navigation_seed
-from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.simulate import simulate
 from endopilot.tasks.task import find_task
 
 
@@ -47,32 +45,6 @@ def test_a_session_is_shown_as_it_was(session, tmp_path):
     assert shown[0] == pytest.approx(0.8, abs=0.051) and len(shown) == session.xray.frames
 
 
-def test_a_rollout_is_driven_again(fork, wire, vessel, tmp_path):
-    control = np.tile([[[8.0, 1.0], [4.0, -2.0], [0.0, 1.0]]], (2, 1, 1))
-    control[1] *= 0.5
-    rollout = simulate(
-        fork, wire, control, initial=np.array([[2.0, 0.1], [2.0, 0.1]]), config=SimulatorConfig(threads=1)
-    )
-    rollout.write(tmp_path / "r.npz")
-    film = driven(open_film(tmp_path / "r.npz", vessel, world=1))
-    assert len(film.frames) == 31
-    last = film.frames[-1].snapshot
-    assert last.inserted_length_mm == pytest.approx(rollout.inserted_length[1, -1, 0], abs=1e-9)
-    np.testing.assert_allclose(last.nodes[0], rollout.tip_position[1, -1, 0], atol=0.02)
-    with pytest.raises(InputError, match="worlds 0 to 1"):
-        open_film(tmp_path / "r.npz", vessel, world=2)
-    with pytest.raises(InputError, match="patient's folder"):
-        open_film(tmp_path / "r.npz")
-
-
-def test_a_plan_is_shown(found, vessel, tmp_path):
-    from endopilot.control.plan_file import write_plan
-
-    write_plan(found, output=tmp_path / "plan")
-    film = driven(open_film(tmp_path / "plan", vessel))
-    np.testing.assert_allclose(film.frames[-1].snapshot.nodes[0], found.trajectory.tip_position[0, -1, 0], atol=0.05)
-
-
 @pytest.mark.parametrize("version", [1, 2])
 def test_a_navigation_of_the_ladder_is_the_same_to_the_bit(tmp_path, version):
     task = find_task("straight", version=version)
@@ -84,19 +56,6 @@ def test_a_navigation_of_the_ladder_is_the_same_to_the_bit(tmp_path, version):
     np.testing.assert_array_equal(tips.round(3), np.array(result["course"]["tip_position"]))
     assert film.frames[-1].peak_n == pytest.approx(result["peak_force_n"], abs=1e-9)
     assert [frame.exposed for frame in film.frames].count(True) == result["exposures"]
-
-
-def test_an_episode_of_a_data_set_is_shown(fork, wire, vessel, tmp_path):
-    pytest.importorskip("pyarrow", reason="the extra `learn` is not installed")
-    from endopilot.dataset.config import DatasetConfig
-    from endopilot.dataset.generate import generate_dataset
-    from endopilot.dataset.loader import read_dataset
-
-    config = DatasetConfig(sequences=2, seconds=4.0, anatomy_shares=(1.0, 0.0, 0.0), seen_test_share=0.0)
-    generate_dataset([vessel], output=tmp_path / "data", device=wire, config=config)
-    data = read_dataset(tmp_path / "data")
-    film = driven(open_film(tmp_path / "data", world=1))
-    np.testing.assert_allclose(film.frames[-1].snapshot.nodes[0], data.tip_position[1, -1, 0], atol=0.05)
 
 
 def test_other_files_are_refused(tmp_path):

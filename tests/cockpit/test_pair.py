@@ -15,7 +15,7 @@ from endopilot.cockpit import game
 from endopilot.cockpit.film import open_film
 from endopilot.cockpit.frames import decode, scene
 from endopilot.cockpit.game import Attempt, GameSession
-from endopilot.cockpit.messages import Autopilot, Drive, Game, Pedal
+from endopilot.cockpit.messages import Autopilot, Drive, Game, Pedal, Target
 from endopilot.cockpit.open import resume_session
 from endopilot.cockpit.recording import read_session, replayed
 from endopilot.cockpit.session import SILENCE_S, Session
@@ -125,6 +125,8 @@ def test_a_session_replays_to_the_bit_and_goes_on(session, tmp_path):
     for cycle, (wire, catheter) in seen.items():
         np.testing.assert_array_equal(shown[cycle].nodes.astype("<f4"), wire)
         np.testing.assert_array_equal(shown[cycle].catheters[0].nodes.astype("<f4"), catheter)
+    with path.open("a") as stream:
+        stream.write('{"at": 199, "mo')  # what a killed server may leave
     resumed = resume_session(path).stage
     assert isinstance(resumed, Session) and resumed.world.digest() == session.world.digest()
     run(resumed, 0.4, message=both(catheter=(-5.0, 0.0)))
@@ -141,17 +143,30 @@ def test_a_session_becomes_an_episode_of_both(session, tmp_path):
     from endopilot.cockpit.recording import write_session_episode
     from endopilot.dataset.loader import read_dataset
 
+    session.handle(Target(type="target", branch=0, abscissa=14.0), 0.0)
     run(session, 1.0, message=both((12.0, 2.0), (8.0, 1.0)))
     snapshot = session.world.snapshot()
     session.close()
     write_session_episode(tmp_path / "a.cockpit.jsonl", output=tmp_path / "episode")
     data = read_dataset(tmp_path / "episode")
+    assert data.inserted_length.shape == (1, 2, 2) and data.manifest["settings"]["target_mm"] == 14.0
     assert [catheter.name for catheter in data.stack.catheters] == [NAME]
     assert data.inserted_length[0, -1, 1] == pytest.approx(snapshot.catheters[0].inserted_length_mm, abs=1e-4)
     np.testing.assert_allclose(data.tip_position[0, -1, 0], snapshot.nodes[0], atol=1e-4)
     made = np.diff([data.initial[0, 1, 0], *data.inserted_length[0, :, 1]])
     asked = 0.5 * data.control[0, :, 1, 0]
     np.testing.assert_allclose(made, asked, atol=1e-4)
+
+
+def test_a_session_without_a_sample_is_refused(session, tmp_path):
+    pytest.importorskip("pyarrow", reason="the extra `learn` is not installed")
+    from endopilot.cockpit.recording import write_session_episode
+
+    run(session, 0.3, message=both((5.0, 0.0)))
+    session.close()
+    with pytest.raises(InputError, match="drive for longer"):
+        write_session_episode(tmp_path / "a.cockpit.jsonl", output=tmp_path / "episode")
+    assert not (tmp_path / "episode").exists()
 
 
 def drive_alone(session, until, most_s=20.0):
@@ -224,6 +239,10 @@ def test_a_rollout_of_a_pair_is_driven_again(fork, vessel, navigation, tmp_path)
     assert last.inserted_length_mm == pytest.approx(rollout.inserted_length[0, -1, 0], abs=1e-9)
     assert last.catheters[0].inserted_length_mm == pytest.approx(rollout.inserted_length[0, -1, 1], abs=1e-9)
     np.testing.assert_allclose(last.catheters[0].nodes[0], rollout.tip_position[0, -1, 1], atol=0.02)
+    with pytest.raises(InputError, match="worlds 0 to 0"):
+        open_film(tmp_path / "r.npz", vessel, world=1)
+    with pytest.raises(InputError, match="patient's folder"):
+        open_film(tmp_path / "r.npz")
 
 
 def test_a_navigation_of_a_pair_is_shown(vessel, tmp_path):

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+import shutil
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from endopilot.dataset import loader
 from endopilot.dataset.loader import read_dataset, read_joined
 from endopilot.errors import InputError
+from endopilot.files import write_json
 from endopilot.simulation.motion import Motion
 from toy_navigation import make_toy_dataset
 
@@ -42,7 +43,7 @@ def test_a_patient_that_is_kept_for_a_test_trains_in_no_dataset(toy_dataset, sec
     assert not kept & {str(name) for name in both.anatomy[both.split == "train"]}
 
 
-def test_what_does_not_go_together_is_refused(toy_dataset, second, monkeypatch):
+def test_what_does_not_go_together_is_refused(toy_dataset, second):
     with pytest.raises(InputError, match="dataset: none given"):
         read_joined([])
     other = read_dataset(second)
@@ -56,11 +57,13 @@ def test_what_does_not_go_together_is_refused(toy_dataset, second, monkeypatch):
             "anatomies": [record | {"motion": asdict(Motion())} for record in other.manifest["anatomies"]]
         },
     }
-    for message, changed in cases.items():
-        made = {toy_dataset: read_dataset(toy_dataset), second: replace(other, manifest=other.manifest | changed)}
-        monkeypatch.setattr(loader, "read_dataset", made.__getitem__)
+    changed = second.with_name("changed")
+    shutil.copytree(second, changed)
+    for message, change in cases.items():
+        write_json(changed / "meta" / "manifest.json", other.manifest | change)
         with pytest.raises(InputError, match=message):
-            read_joined([toy_dataset, second])
-    same = replace(other, manifest=other.manifest | {"device": device | {"friction": 0.3, "name": "mine"}})
-    monkeypatch.setattr(loader, "read_dataset", {toy_dataset: read_dataset(toy_dataset), second: same}.__getitem__)
-    assert len(read_joined([toy_dataset, second])) > len(other)
+            read_joined([toy_dataset, changed])
+    write_json(
+        changed / "meta" / "manifest.json", other.manifest | {"device": device | {"friction": 0.3, "name": "me"}}
+    )
+    assert len(read_joined([toy_dataset, changed])) > len(other)

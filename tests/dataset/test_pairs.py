@@ -8,9 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from endopilot.anatomy.io import read_anatomy, write_anatomy
-from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.dataset import loader
+from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset, write_episode
 from endopilot.dataset.info import describe_dataset
@@ -36,13 +34,6 @@ OF_EPISODES += ("tip_bend", "tip_stiffness_factor", "initial")
 OF_TRAJECTORY = ("command", "control", *(each.name for each in fields(Outputs)))
 OF_TIP = {"tip_abscissa": "abscissa", "tip_offset": "offset", "branch": "branch", "lumen_radius": "radius"}
 EXACT = {"command": np.float64, "slip": np.float64, "rotation_slip": np.float64, "valid": np.bool_}
-
-
-@pytest.fixture(scope="module")
-def patient(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("anatomies") / "patient"
-    write_anatomy(make_patient(AtlasConfig(count=1, seed=4, population="textbook"), 0), output=folder)
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -162,12 +153,11 @@ def test_models_take_it_with_the_commands_of_both_devices(pairs):
     check_wire(pairs, {"device": data.manifest["device"]}, data)
 
 
-def test_what_does_not_go_together_is_refused(pairs, patient, tmp_path, monkeypatch):
+def test_what_does_not_go_together_is_refused(pairs, patient, tmp_path):
     data = read_dataset(pairs)
-    bare = replace(data, folder=tmp_path, manifest=data.manifest | {"catheters": []})
-    monkeypatch.setattr(loader, "read_dataset", {pairs: data, tmp_path: bare}.__getitem__)
+    generate_dataset([patient], output=tmp_path / "bare", device=WIRE, config=CONFIG)
     with pytest.raises(InputError, match=r"lies in no catheter, and that of .* in microcatheter-1\.7f; join"):
-        read_joined([pairs, tmp_path])
+        read_joined([pairs, tmp_path / "bare"])
     assert len(read_joined([pairs, pairs]).slip) == 2 * len(data)
     with pytest.raises(InputError, match="control: 'force' with catheters; give 'velocity'"):
         generate_dataset(

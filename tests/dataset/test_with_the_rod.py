@@ -8,8 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from endopilot.anatomy.io import read_anatomy, write_anatomy
-from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset, write_episode
 from endopilot.dataset.loader import read_dataset
@@ -32,13 +31,6 @@ from endopilot.simulation.motion import motion_named
 from endopilot.simulation.simulate import simulate
 
 DEVICE = read_wire("workhorse-014")
-
-
-@pytest.fixture(scope="module")
-def patient(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("anatomies") / "patient"
-    write_anatomy(make_patient(AtlasConfig(count=1, seed=4, population="textbook"), 0), output=folder)
-    return folder
 
 
 def test_an_episode_simulated_from_the_disk_repeats_to_the_bit(tmp_path, patient):
@@ -65,27 +57,6 @@ def test_an_episode_simulated_from_the_disk_repeats_to_the_bit(tmp_path, patient
         np.testing.assert_array_equal(again.tip.abscissa.astype(np.float32), one.tip_abscissa)
         np.testing.assert_array_equal(again.contact_force_sum.astype(np.float32), one.contact_force_sum)
         np.testing.assert_array_equal(again.drive_force.astype(np.float32), one.drive_force)
-
-
-def test_where_the_drive_slipped_its_commands_repeat_the_navigation(tmp_path, patient):
-    weak = replace(DEVICE, push_limit_n=0.1, pull_limit_n=0.02, torque_limit_n_mm=0.005)
-    config = DatasetConfig(sequences=6, seconds=30.0, seed=6, friction=(0.2, 0.3))
-    generate_dataset([patient], output=tmp_path / "dataset", device=weak, config=config)
-    data = read_dataset(tmp_path / "dataset")
-    assert (data.slip != 0).any() and (data.rotation_slip != 0).any()
-    slips = ((data.slip != 0) | (data.rotation_slip != 0)).any(axis=(1, 2))
-
-    def retraced(control):
-        return simulate(
-            read_anatomy(patient), weak, control, initial=data.initial, config=config.simulator, friction=data.friction
-        )
-
-    again = retraced(data.command)
-    np.testing.assert_array_equal(again.tip.abscissa.astype(np.float32), data.tip_abscissa)
-    np.testing.assert_array_equal(again.slip, data.slip)
-    np.testing.assert_array_equal(again.rotation_slip, data.rotation_slip)
-    # what was made of it, driven evenly, does not
-    assert np.abs(retraced(data.control.astype(float)).tip.abscissa - data.tip_abscissa)[slips].max() > 0.01
 
 
 def test_a_robot_makes_the_motions_and_what_it_was_told_and_measured_stands_beside_what_was_true(tmp_path, patient):

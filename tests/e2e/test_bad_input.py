@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,20 +11,11 @@ from command import refused, run
 
 import endopilot
 from dicom_by_itk import write_dicom
-from endopilot.anatomy.io import write_anatomy
-from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.cli import main
 from endopilot.devices.device_files import device_yaml
 from endopilot.files import read_json
-from endopilot.imaging.volume import write_mask, write_volume
+from endopilot.imaging.volume import write_mask
 from endopilot.types import Insertion, LumenMask, Volume
-
-
-@pytest.fixture(scope="module")
-def patient(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("patient") / "rca"
-    write_anatomy(make_patient(AtlasConfig(seed=7), 0), output=folder)
-    return folder
 
 
 def write_image(array: np.ndarray, path: Path, *, vector: bool = False) -> Path:
@@ -73,25 +63,7 @@ def test_masks(tmp_path, capsys):
     assert not (tmp_path / "anatomy").exists()
 
 
-def test_nothing_near_the_seed(tmp_path, capsys):
-    dark = Volume(np.full((40, 40, 40), -80, dtype=np.int16), np.ones(3), np.zeros(3), np.eye(3))
-    write_volume(dark, tmp_path / "dark.nii.gz")
-    seeds = ("--method", "aorta", "--seeds", "20", "20", "20")
-    line = refused(capsys, "segment", tmp_path / "dark.nii.gz", "-o", tmp_path / "mask.nii.gz", *seeds)
-    assert "seed" in line.lower()
-    assert not (tmp_path / "mask.nii.gz").exists()
-
-
-def test_centerline_without_radii(tmp_path, capsys):
-    import pyvista
-
-    line = pyvista.lines_from_points(np.linspace([0, 0, 0], [0, 0, 50.0], 51))
-    line.save(tmp_path / "bare.vtp")
-    assert "radi" in refused(capsys, "anatomy", tmp_path / "bare.vtp", "-o", tmp_path / "anatomy")
-    assert not (tmp_path / "anatomy").exists()
-
-
-def test_wire_and_controls(tmp_path, capsys, patient):
+def test_wire_and_controls(tmp_path, capsys, right_artery):
     device = (Path(endopilot.__file__).parent / "devices/wires/j-035.yaml").read_text(encoding="utf-8")
     assert "value: 0.89" in device
     (tmp_path / "thick.yaml").write_text(device.replace("value: 0.89", "value: 5.5", 1), encoding="utf-8")
@@ -99,35 +71,28 @@ def test_wire_and_controls(tmp_path, capsys, patient):
     (tmp_path / "nan.csv").write_text(header + "0.5,5,0\n1.0,nan,0\n")
     (tmp_path / "fast.csv").write_text(header + "0.5,5000,0\n")
     output = ("-o", tmp_path / "rollout.parquet")
-    assert "lumen" in refused(capsys, "simulate", patient, *output, "--device", tmp_path / "thick.yaml")
-    line = refused(capsys, "simulate", patient, *output, "--controls", tmp_path / "nan.csv")
+    assert "lumen" in refused(capsys, "simulate", right_artery, *output, "--device", tmp_path / "thick.yaml")
+    line = refused(capsys, "simulate", right_artery, *output, "--controls", tmp_path / "nan.csv")
     assert "nan.csv" in line and "row 3" in line and "translation_mm_s" in line
-    assert "limit" in refused(capsys, "simulate", patient, *output, "--controls", tmp_path / "fast.csv")
-    assert "sequences: 0; give" in refused(capsys, "simulate", patient, *output, "--sequences", "0")
+    assert "limit" in refused(capsys, "simulate", right_artery, *output, "--controls", tmp_path / "fast.csv")
+    assert "sequences: 0; give" in refused(capsys, "simulate", right_artery, *output, "--sequences", "0")
     assert not (tmp_path / "rollout.parquet").exists()
 
 
-def test_a_lumen_too_narrow_for_the_wire(tmp_path, capsys, patient):
-    anatomy = make_patient(AtlasConfig(seed=7), 0)
-    narrow = replace(anatomy, catheter_radius_mm=0.1, name="narrow")
-    write_anatomy(narrow, output=tmp_path / "narrow")
-    assert "catheter" in refused(capsys, "simulate", tmp_path / "narrow", "-o", tmp_path / "rollout.csv")
-
-
-def test_devices(patient, tmp_path, capsys):
+def test_devices(right_artery, tmp_path, capsys):
     """A wire of one's own needs no code: it is read by its path; a bad one is refused by every command alike."""
     main_line = "bend_stiffness_n_mm2.value[1]: -0.3; give a number from 0.0001 to 1000000 N·mm²"
     text = device_yaml("workhorse-014")[1]
     bad = tmp_path / "bad.yaml"
     bad.write_text(text.replace("[0.30, 0.30", "[0.30, -0.30"))
-    for command in (("simulate", patient), ("dataset", patient), ("devices", bad)):
+    for command in (("simulate", right_artery), ("dataset", right_artery), ("devices", bad)):
         chosen = () if command[0] == "devices" else ("--device", bad, "-o", tmp_path / "out")
         line = refused(capsys, *command, *chosen)
         assert str(bad) in line and main_line in line, line
         assert list(tmp_path.iterdir()) == [bad]
 
 
-def test_a_device_of_ones_own(patient, tmp_path, capsys):
+def test_a_device_of_ones_own(right_artery, tmp_path, capsys):
     with pytest.raises(SystemExit) as leaving:
         main(["devices", "workhorse-014", "--yaml"])
     assert leaving.value.code == 0
@@ -135,18 +100,20 @@ def test_a_device_of_ones_own(patient, tmp_path, capsys):
     own.write_text(capsys.readouterr().out.replace("name: workhorse-014", "name: my-wire").replace("0.36", "0.40"))
     assert run(capsys, "devices", own)[0]["diameter_mm"] == 0.40
     out = tmp_path / "rollout.csv"
-    figures = run(capsys, "simulate", patient, "--device", own, "-o", out, "--sequences", "1", "--seconds", "1")
+    figures = run(capsys, "simulate", right_artery, "--device", own, "-o", out, "--sequences", "1", "--seconds", "1")
     assert figures["valid_worlds"] == 1 and out.exists()
     made = tmp_path / "data"
-    run(capsys, "dataset", patient, "--device", own, "-o", made, "--sequences", "2", "--seconds", "1")
+    run(capsys, "dataset", right_artery, "--device", own, "-o", made, "--sequences", "2", "--seconds", "1")
     assert read_json(made / "meta" / "manifest.json")["device"]["diameter_mm"] == 0.40
 
 
-def test_the_cockpits_catheters(patient, tmp_path, capsys):
+def test_the_cockpits_catheters(right_artery, tmp_path, capsys):
     recordings = ("--output", tmp_path / "recordings")
-    narrow = refused(capsys, "cockpit", patient, "--device", "j-035", "--catheter", "microcatheter-1.7f", *recordings)
+    narrow = refused(
+        capsys, "cockpit", right_artery, "--device", "j-035", "--catheter", "microcatheter-1.7f", *recordings
+    )
     assert "is too wide for the bore of catheter microcatheter-1.7f" in narrow
-    assert "no such catheter" in refused(capsys, "cockpit", patient, "--catheter", "nonesuch", *recordings)
+    assert "no such catheter" in refused(capsys, "cockpit", right_artery, "--catheter", "nonesuch", *recordings)
     brought = refused(capsys, "cockpit", "--task", "follow", "--catheter", "microcatheter-1.7f", *recordings)
     assert brought.endswith("catheter: a replay, a task and a session have theirs; leave it out")
     assert "follow" in refused(capsys, "cockpit", "--task", "nonesuch", *recordings)
@@ -166,12 +133,15 @@ def test_the_cockpits_catheters(patient, tmp_path, capsys):
         ("simulate {patient} --seed abc", "--seed: 'abc'; give a whole number"),
         ("simulate {patient} --sequences 2.5", "--sequences: '2.5'; give a whole number"),
         ("phantom {patient} --slice-mm thin", "--slice-mm: 'thin'; give a number"),
-        ("simulate {patient} --controls aside.csv", "aside.csv: row 1 holds one name and then numbers; exchange rows"),
+        (
+            "simulate {patient} --controls aside.csv",
+            "aside.csv: row 1 holds one name and then numbers; exchange rows",
+        ),
     ],
 )
-def test_what_is_given_in_the_wrong_place_is_told(patient, tmp_path, capsys, monkeypatch, command, said):
+def test_what_is_given_in_the_wrong_place_is_told(right_artery, tmp_path, capsys, monkeypatch, command, said):
     monkeypatch.chdir(tmp_path)
     Path("mask.nrrd").write_bytes(b"")
     Path("aside.csv").write_text("time_s,0.5,1.0\ntranslation_mm_s,1,2\nrotation_rad_s,0,0\n")
-    words = [word.format(patient=patient) for word in command.split()]
-    assert said.format(patient=patient) in refused(capsys, *words, "-o", tmp_path / "out.csv")
+    words = [word.format(patient=right_artery) for word in command.split()]
+    assert said.format(patient=right_artery) in refused(capsys, *words, "-o", tmp_path / "out.csv")

@@ -65,15 +65,6 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path, capsys, monkey
     assert (folder / "report.html").stat().st_mtime_ns == finished
 
 
-def test_a_negative_training_time_is_refused(tmp_path, capsys):
-    for arguments, message in (
-        (("demo", "--training-seconds", "-1"), "training_seconds: -1.0; give a number from 0 to 864000"),
-        (("run", "ct.nii.gz", "--training-seconds", "-1"), "training_seconds: -1.0; give a number from 0 to 864000"),
-    ):
-        assert message in command.refused(capsys, *arguments, "-o", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
 def test_another_size_in_the_same_folder_is_refused(tmp_path, capsys):
     claim(
         tmp_path,

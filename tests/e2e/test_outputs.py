@@ -59,12 +59,10 @@ def test_an_output_in_which_an_input_lies_is_refused_and_all_of_it_stays(mask, p
     assert content(mask.parent) == before
 
 
-@pytest.mark.parametrize("words", ["anatomy MASK", "anatomy MASK MASK2", "plan PATIENT --target M1", "train DATA"])
+@pytest.mark.parametrize("words", ["anatomy MASK", "anatomy MASK MASK2", "plan PATIENT --target M1"])
 def test_a_folder_of_other_things_is_refused_and_all_of_it_stays(mask, patient, capsys, tmp_path, words):
     names = {"MASK": mask, "MASK2": straight_mask(tmp_path / "more" / "n.nrrd", 5.0), "PATIENT": patient}
-    names["DATA"] = tmp_path / "data"
-    if "DATA" in words:
-        run(capsys, "dataset", patient, "-o", names["DATA"], *SHORT, "--anatomy-shares", "1", "0", "0")
+
     theirs = tmp_path / "theirs"
     theirs.mkdir()
     (theirs / "manifest.json").write_text("{}")
@@ -153,11 +151,7 @@ def test_a_limit_on_files_leaves_no_compiled_module_cut_short(tmp_path):
     "words",
     [
         "anatomy MASK -o OUT",
-        "atlas --vessel portal -o OUT",
-        "phantom PATIENT --in-plane-mm 1 --slice-mm 2 -o OUT.nii.gz",
-        "phantom PATIENT --in-plane-mm 1 --slice-mm 2 -o OUT.nrrd",
         "phantom PATIENT --in-plane-mm 1 --slice-mm 2 -o OUT",
-        "plan PATIENT --target ICA -o OUT",
         "simulate PATIENT --sequences 4 --seconds 10 --shape -o OUT.npz",
         "xray PATIENT -o OUT.png",
     ],

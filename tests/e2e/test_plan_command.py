@@ -4,71 +4,46 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from command import refused, run
 
-from benchmarks.anatomy.analytic_lumens import forked_tree, tree_distance
 from endopilot.anatomy.io import write_anatomy
-from endopilot.types import Anatomy, Branch, DistanceMap, Insertion, VesselTree
+from endopilot.types import Branch, Insertion, VesselTree
 
 
-@pytest.fixture(scope="module")
-def fork() -> Anatomy:
-    tree, low = forked_tree(radius=(1.0, 0.8)), np.array([-4.0, -4.0, -26.0])
-    axes = [np.arange(a, b, 0.4) for a, b in zip(low, (22.0, 4.0, 44.0), strict=True)]
-    z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
-    grid = np.stack([x, y, z], axis=-1)
-    catheter = np.where(z < 1.0, 0.9 - np.hypot(x, y), -1.0)
-    values = np.maximum(np.maximum(np.where(z > 0, tree_distance(tree, grid), -1.0), catheter), -1.0)
-    field = DistanceMap(values, 0.4, low)
-    return Anatomy("fork", tree, field, Insertion(np.zeros(3), np.array([0.0, 0.0, 1.0])), 0.9)
-
-
-@pytest.fixture
-def patient(fork, tmp_path) -> Path:
-    write_anatomy(fork, output=tmp_path / "patient")
-    return tmp_path / "patient"
-
-
-def test_a_plan_is_written_whole(patient, tmp_path, capsys):
-    figures = run(capsys, "plan", patient, "--target", "0,0,33", "-o", tmp_path / "plan")
-    assert figures["reached"] and figures["tip_error_mm"] <= 2.0 and figures["peak_force_n"] < 0.5
-    assert set(figures["cost"]) == {"end", "tip", "ratio", "force", "time", "smooth"}
-    rollout = tmp_path / "again.csv"
-    again = run(capsys, "simulate", patient, "--controls", tmp_path / "plan" / "plan.csv", "-o", rollout)
-    assert again["valid_worlds"] == 1
-
-
-def test_a_plan_is_driven_where_it_was_made_and_nowhere_else(fork, patient, tmp_path, capsys):
-    planned = run(capsys, "plan", patient, "--target", "0,0,33", "-o", tmp_path / "plan")
+def test_a_plan_is_written_whole_and_driven_where_it_was_made_and_nowhere_else(fork, vessel, tmp_path, capsys):
+    planned = run(capsys, "plan", vessel, "--target", "0,0,33", "-o", tmp_path / "plan")
+    assert planned["reached"] and planned["tip_error_mm"] <= 2.0 and planned["peak_force_n"] < 0.5
+    assert set(planned["cost"]) == {"end", "tip", "ratio", "force", "time", "smooth"}
+    table = ("--controls", tmp_path / "plan" / "plan.csv", "-o", tmp_path / "by-table.csv")
+    assert run(capsys, "simulate", vessel, *table)["valid_worlds"] == 1
     drive = ("--controls", tmp_path / "plan", "-o", tmp_path / "again.csv")
-    again = run(capsys, "simulate", patient, *drive)
+    again = run(capsys, "simulate", vessel, *drive)
     assert again["samples"] == 2 * planned["seconds"] and again["deepest_tip_mm"] == pytest.approx(33.0, abs=2.0)
     (tmp_path / "again.csv").unlink()
     write_anatomy(
         replace(fork, insertion=Insertion(np.zeros(3), np.array([0.1, 0.0, 0.995]))), output=tmp_path / "other"
     )
     assert "another anatomy" in refused(capsys, "simulate", tmp_path / "other", *drive)
-    assert "another device" in refused(capsys, "simulate", patient, *drive, "--device", "wire-018")
+    assert "another device" in refused(capsys, "simulate", vessel, *drive, "--device", "wire-018")
     assert not (tmp_path / "again.csv").exists()
 
 
-def test_xray_is_foreseen_along_a_plan(patient, tmp_path, capsys):
-    plan = ("plan", patient, "--target", "0,0,33", "--xray", "-o", tmp_path / "plan")
+def test_xray_is_foreseen_along_a_plan(vessel, tmp_path, capsys):
+    plan = ("plan", vessel, "--target", "0,0,33", "--xray", "-o", tmp_path / "plan")
     table = tmp_path / "plan" / "plan.csv"
     by_wires = run(capsys, *plan)
     assert len(by_wires["xray_due_s"]) <= 1  # straight on, near the middle
     assert "band_tip_abscissa_mm" in table.read_text(encoding="utf-8").splitlines()[0]
 
 
-def test_desired_tips_that_no_drive_can_keep_up_with(patient, tmp_path, capsys):
+def test_desired_tips_that_no_drive_can_keep_up_with(vessel, tmp_path, capsys):
     (tmp_path / "tips.csv").write_text("time_s,tip_abscissa_mm,tip_offset_mm\n0.5,10,0.2\n")
-    run(capsys, "plan", patient, "--target", tmp_path / "tips.csv", "-o", tmp_path / "kept-up")
+    run(capsys, "plan", vessel, "--target", tmp_path / "tips.csv", "-o", tmp_path / "kept-up")
     (tmp_path / "tips.csv").write_text("time_s,tip_abscissa_mm,tip_offset_mm\n0.5,10,0.2\n1.0,43,0\n")
-    line = refused(capsys, "plan", patient, "--target", tmp_path / "tips.csv", "-o", tmp_path / "plan")
+    line = refused(capsys, "plan", vessel, "--target", tmp_path / "tips.csv", "-o", tmp_path / "plan")
     assert "1 s are too few for the 41 mm" in line and "40 mm/s" in line
     assert not (tmp_path / "plan").exists()
 
@@ -87,8 +62,8 @@ def test_desired_tips_that_no_drive_can_keep_up_with(patient, tmp_path, capsys):
         (("--target", "0,0,33", "--force-weight", "-1"), ("force_weight",)),
     ],
 )
-def test_what_cannot_be_planned_is_refused_in_one_line(patient, tmp_path, capsys, arguments, parts):
-    line = refused(capsys, "plan", patient, *arguments, "-o", tmp_path / "plan")
+def test_what_cannot_be_planned_is_refused_in_one_line(vessel, tmp_path, capsys, arguments, parts):
+    line = refused(capsys, "plan", vessel, *arguments, "-o", tmp_path / "plan")
     assert all(part in line for part in parts), line
     assert not (tmp_path / "plan").exists()
 
@@ -105,7 +80,7 @@ def test_a_target_behind_an_occlusion(fork, tmp_path, capsys):
     assert not (tmp_path / "plan").exists()
 
 
-def test_a_branch_that_the_wire_does_not_get_into(patient, tmp_path, capsys):
+def test_a_branch_that_the_wire_does_not_get_into(vessel, tmp_path, capsys):
     """A wire without a bend at its tip."""
     from endopilot.devices.device_files import device_yaml
 
@@ -113,7 +88,7 @@ def test_a_branch_that_the_wire_does_not_get_into(patient, tmp_path, capsys):
     (tmp_path / "straight.yaml").write_text(text)
     out = 20.0 * np.array([np.sin(np.pi / 3), 0.0, np.cos(np.pi / 3)]) * 0.8 + [0.0, 0.0, 20.0]
     target = ",".join(f"{x:.2f}" for x in out)
-    plan = ("plan", patient, "--target", target, "-o", tmp_path / "plan", "--device", tmp_path / "straight.yaml")
+    plan = ("plan", vessel, "--target", target, "-o", tmp_path / "plan", "--device", tmp_path / "straight.yaml")
     line = refused(capsys, *plan, "--tip", "own")
     assert "no path found to branch 2" in line
     assert "at the fork into section vessel (branch 2) at 20.0 mm, which its tip of 0/3 does not enter" in line
@@ -122,4 +97,4 @@ def test_a_branch_that_the_wire_does_not_get_into(patient, tmp_path, capsys):
     shaped = run(capsys, *plan)  # a hand bends it
     assert shaped["reached"] and shaped["tip"] != "0/3"
     assert re.search(r"enters vessel from \d+ of 24 rotations; as delivered from none", shaped["why"])
-    assert run(capsys, "simulate", patient, "--controls", tmp_path / "plan", "-o", tmp_path / "again.csv", *plan[-2:])
+    assert run(capsys, "simulate", vessel, "--controls", tmp_path / "plan", "-o", tmp_path / "again.csv", *plan[-2:])

@@ -83,12 +83,6 @@ def test_bootstrap_needs_two_patients():
     assert metrics.bootstrap_intervals(np.ones((4, 5)), np.zeros(4, dtype=int), seed=0) is None
 
 
-def test_bootstrap_repeats():
-    error = np.random.Generator(np.random.Philox(1)).normal(size=(12, 7))
-    anatomy = np.arange(12) % 4
-    assert metrics.bootstrap_intervals(error, anatomy, seed=5) == metrics.bootstrap_intervals(error, anatomy, seed=5)
-
-
 def test_diverged_counts_sequences_once_and_lost_ones_too():
     error = np.array([[0.0, 2.5, -9.0], [1.9, -1.9, 0.0], [0.0, NAN, NAN], [0.0, 0.0, -2.1]])
     assert metrics.diverged_share(error, np.isnan(error)) == 0.75

@@ -39,6 +39,8 @@ PLY = "ply\nformat {}\nelement vertex {}\nproperty float x\nproperty float y\npr
                       "ORIGIN 0 0 0\nSPACING 1 1 1\nPOINT_DATA 8\nSCALARS s float 1\nLOOKUP_TABLE default\n"
                       "1 1 1 1 1 1 1 1\n"),
         ("empty.obj", "# nothing but a comment\n"),
+        ("empty.stl", ""),
+        ("text.ply", "hello, world, this is no mesh\n"),
     ],
 )  # fmt: skip
 def test_headers_that_promise_what_is_not_there_are_refused(tmp_path, capfd, name, text):
@@ -71,3 +73,5 @@ def test_positions_and_radii_that_are_none_are_refused(tmp_path):
         read_source(write_lines(tmp_path / "lines.vtp", [line], [np.full(60, 1.5)]))
     with pytest.raises(InputError, match="without radii"):
         read_source(write_lines(tmp_path / "bare.vtp", [arc()], None))
+    with pytest.raises(InputError, match=r"missing\.stl: no such file"):
+        read_source(tmp_path / "missing.stl")

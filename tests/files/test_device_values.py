@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from make_devices import catheter, uniform, wire, write
 
-from endopilot.devices.catheter import list_catheters, read_catheter
+from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
-from endopilot.devices.device_files import list_wires
 from endopilot.errors import InputError
 
 SOURCED = "{name}.value: {value}; give a number from"
@@ -178,8 +177,3 @@ def test_extreme_devices_are_read(tmp_path, content) -> None:
     device = read_catheter(path) if "inner_diameter_mm" in content else read_wire(path)
     assert device.diameter_mm == content["diameter_mm"]["value"]
     assert list(device.bend_stiffness_n_mm2) == content["bend_stiffness_n_mm2"]["value"]
-
-
-def test_shipped_devices_are_read() -> None:
-    assert all(read_wire(name).name == name for name in list_wires())
-    assert all(read_catheter(name).name == name for name in list_catheters())

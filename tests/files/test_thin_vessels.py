@@ -18,8 +18,10 @@ from endopilot.vessels.surface import Surface
 STRAIGHT = line((0, 0, 0), (0, 0, 60))
 
 
-@pytest.mark.parametrize("voxel_mm", [(0.35, 0.35, 0.5), (0.7, 0.7, 0.5)])
-@pytest.mark.parametrize(("length_mm", "across"), [(1.0, 1), (2.0, 2), (6.0, 1)])
+@pytest.mark.parametrize(
+    ("voxel_mm", "length_mm", "across"),
+    [((0.35, 0.35, 0.5), 1.0, 1), ((0.7, 0.7, 0.5), 2.0, 2), ((0.35, 0.35, 0.5), 6.0, 1), ((0.7, 0.7, 0.5), 6.0, 1)],
+)
 def test_a_vessel_goes_on_behind_a_neck(voxel_mm, length_mm, across):
     mask = thinned_at(tubes((STRAIGHT, 1.6), voxel_mm=voxel_mm), (0, 0, 30), length_mm, across)
     anatomy = extract_anatomy(lumen(mask), name="neck")

@@ -38,8 +38,10 @@ def with_dome(size: float, neck: float, at_mm: float) -> Volume:
     return cut(tubes((trunk, 2.4), *arms, *dome, voxel_mm=(0.45, 0.45, 0.45)), 0.0)
 
 
-@pytest.mark.parametrize(("size", "neck", "at_mm"), [(3.5, 1.7, 30.0), (5.5, 2.2, 18.0), (7.0, 2.0, 36.0)])
-@pytest.mark.parametrize("kind", ["mask", "surface"])
+@pytest.mark.parametrize(
+    ("size", "neck", "at_mm", "kind"),
+    [(3.5, 1.7, 30.0, "mask"), (5.5, 2.2, 18.0, "surface"), (7.0, 2.0, 36.0, "mask")],
+)
 def test_the_device_does_not_enter_through_an_aneurysm(size, neck, at_mm, kind):
     mask = with_dome(size, neck, at_mm)
     source = LumenMask(mask) if kind == "mask" else surface_from_mask(mask)
@@ -70,10 +72,12 @@ def test_ends_that_look_alike_are_named_with_their_widths():
         float(x) for x in re.findall(r"is \((-?[\d.]+),", note)
     ]
     assert sorted(np.sign(places)) == [-1, 1] and len(re.findall(r"\(\d\.\d mm wide\)", note)) == 2
+    assert "--ostium-mm chooses" in note
 
 
-@pytest.mark.parametrize("ends", ["both open", "one open", "closed"])
-@pytest.mark.parametrize("kind", ["mask", "surface"])
+@pytest.mark.parametrize(
+    ("ends", "kind"), [("both open", "mask"), ("one open", "surface"), ("closed", "mask"), ("closed", "surface")]
+)
 def test_the_lumen_of_a_wall_is_taken(ends, kind):
     lines = [(line((0, 0, 0), (2, 1, 25), (0, 0, 50)), 2.6), (line((2, 1, 25), (20, 4, 40)), 1.9)]
     whole = tubes(*[(points, radius + 1.5) for points, radius in lines])

@@ -1,10 +1,7 @@
 from __future__ import annotations
 
-import json
-import logging
 import os
 import shutil
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from dicom_by_itk import write_dicom
 from endopilot.errors import InputError
-from endopilot.imaging.volume import read_volume, write_mask, write_volume
-from endopilot.types import LumenMask, Volume
+from endopilot.imaging.volume import read_volume, write_volume
+from endopilot.types import Volume
 
 _IDENTIFIERS = {
     "PatientName": "Doe^Jane",
@@ -161,12 +158,6 @@ def test_a_header_field_that_is_no_number_is_refused_without_its_content(series)
     assert caught.value.__cause__ is None
 
 
-def test_the_order_of_the_files_does_not_matter(series):
-    for number, file in enumerate(sorted(series.glob("*.dcm"), reverse=True)):
-        file.rename(series / f"IM{number}")
-    np.testing.assert_array_equal(read_volume(series).voxels, _oblique_ct().voxels)
-
-
 def test_the_rescale_is_applied(series):
     _change(series, RescaleSlope="2", RescaleIntercept="-24")
     np.testing.assert_array_equal(read_volume(series).voxels, _oblique_ct().voxels * 2 - 24)
@@ -263,25 +254,6 @@ def _pretend_compressed(file, syntax):
 def _assert_no_identifier(text):
     for value in _IDENTIFIERS.values():
         assert value not in text
-
-
-def test_no_identifier_reaches_an_output_or_a_log(series, tmp_path, caplog, capfd):
-    _change(series, PatientAge="not an age: Doe^Jane")  # an invalid value, which pydicom quotes in its warnings
-    caplog.clear(), capfd.readouterr()
-    with warnings.catch_warnings(record=True) as warned, caplog.at_level(logging.DEBUG):
-        warnings.simplefilter("always")
-        volume = read_volume(series)
-    write_volume(volume, tmp_path / "ct.nrrd")
-    write_volume(volume, tmp_path / "ct.nii")
-    write_volume(volume, tmp_path / "again")
-    inside = Volume(volume.voxels > 0, volume.spacing_mm, volume.origin_mm, volume.direction)
-    write_mask(LumenMask(inside), tmp_path / "mask.mha", manifest={})
-    written = [tmp_path / name for name in ("ct.nrrd", "ct.nii", "mask.mha", "mask.json")]
-    contents = [file.read_bytes().decode("latin-1") for file in (*written, *(tmp_path / "again").iterdir())]
-    _assert_no_identifier(
-        " ".join(contents) + caplog.text + "".join(capfd.readouterr()) + str([str(w.message) for w in warned])
-    )
-    assert json.loads((tmp_path / "mask.json").read_text())["ostium"] is None
 
 
 def test_a_series_is_not_written_over(series):

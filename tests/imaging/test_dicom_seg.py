@@ -55,26 +55,6 @@ def test_it_is_a_segmentation_that_names_no_other_image(tmp_path):
         read_volume(tmp_path / "rca.dcm")
 
 
-def test_one_segment_of_several_is_chosen(tmp_path):
-    ct = Volume(np.zeros((6, 8, 8), np.int16), np.array([0.5, 0.5, 1.0]), np.zeros(3), np.eye(3))
-    write_volume(ct, tmp_path / "ct")
-    slices = [pydicom.dcmread(file) for file in sorted((tmp_path / "ct").glob("*.dcm"))]
-    labels = np.zeros(ct.voxels.shape, np.uint8)
-    labels[1:3, 2:4], labels[2:5, 5:7] = 1, 2
-    code = hd.sr.CodedConcept("51114001", "SCT", "Artery")
-    segments = [hd.seg.SegmentDescription(n, f"Doe^Jane {n}", code, code, "MANUAL") for n in (1, 2)]
-    made = hd.seg.Segmentation(
-        slices, labels, "BINARY", segments, hd.UID(), 1, hd.UID(), 1, "x", "x", "1", "1", omit_empty_frames=True
-    )
-    made.save_as(tmp_path / "two.dcm")
-    with pytest.raises(InputError, match=r"2 labels \(1, 2\); choose one: label=N \(--label N\)") as caught:
-        read_mask(tmp_path / "two.dcm")
-    assert "Doe" not in str(caught.value)
-    for label in (1, 2):
-        expected = LumenMask(Volume(labels == label, ct.spacing_mm, ct.origin_mm, ct.direction))
-        np.testing.assert_allclose(_places(read_mask(tmp_path / "two.dcm", label=label)), _places(expected), atol=1e-6)
-
-
 def test_what_is_no_segmentation_is_refused(tmp_path):
     write_volume(Volume(np.zeros((4, 8, 8), np.int16), np.ones(3), np.zeros(3), np.eye(3)), tmp_path / "ct")
     write_mask(_mask(), tmp_path / "rca.dcm", manifest={})

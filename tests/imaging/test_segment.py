@@ -60,7 +60,7 @@ def plain_method(tmp_path, monkeypatch):
     """Put a module of methods into the current directory: what is bright is lumen."""
     (tmp_path / "plain_method.py").write_text(_METHOD)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.syspath_prepend(tmp_path)
     yield
     sys.modules.pop("plain_method", None)
 

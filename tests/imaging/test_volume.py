@@ -106,17 +106,6 @@ def test_an_unknown_output_suffix_writes_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch):
-    def fail(image, path, **_):
-        path.write_bytes(b"half")
-        raise RuntimeError("disk full")
-
-    monkeypatch.setattr(sitk, "WriteImage", fail)
-    with pytest.raises(InputError, match=r"ct\.nii\.gz: cannot be written"):
-        write_volume(_oblique_volume(), tmp_path / "ct.nii.gz")
-    assert not list(tmp_path.iterdir())
-
-
 _ON_A_FULL_DISK = """
 import resource, sys
 import numpy as np

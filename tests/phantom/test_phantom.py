@@ -233,10 +233,7 @@ def test_fit_recovers_a_moved_heart():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"in_plane_mm": 0.0}, "in_plane_mm: 0.0"),
         ({"noise_hu": (50.0, 20.0)}, "noise_hu"),
-        ({"calcium": -1.0}, "calcium: -1.0"),
-        ({"motion_mm": -1.0}, "motion_mm: -1.0"),
         ({"voxels": (512, 512, 3)}, "voxels"),
     ],
 )

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bend import vessel
 
 from endopilot.anatomy.distance import sample
 from endopilot.devices.device import read_wire
@@ -21,11 +20,6 @@ WIRE = read_wire("workhorse-014")
 CORE = SimulatorConfig(time_step_s=0.05, element_mm=1.5, threads=1, tolerance_mm=1e-6)
 PUSH = np.tile([5.0, 0.3], (1, 16, 1))
 START = np.array([[20.0, 0.0]])
-
-
-@pytest.fixture(scope="module")
-def bend():
-    return vessel()
 
 
 @pytest.fixture(scope="module")

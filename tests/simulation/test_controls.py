@@ -1,16 +1,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-import pytest
 from bend import vessel
 
 from endopilot.devices.device import read_wire
-from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.controls import ControlConfig, free_wire_load, random_controls, read_controls_csv
+from endopilot.simulation.controls import ControlConfig, free_wire_load, random_controls
 from endopilot.simulation.simulate import simulate
 
 
@@ -21,13 +18,6 @@ def test_a_sequence_does_not_depend_on_the_others() -> None:
     assert np.array_equal(few[0], many[0][:3])
     assert np.array_equal(few[1], many[1][:3])
     assert not np.array_equal(few[1], other[1])
-
-
-def test_later_sequences_are_those_of_a_whole_draw() -> None:
-    everything = random_controls(ControlConfig(), n_sequences=9, n_samples=50, seed=4, max_inserted_length_mm=60.0)
-    later = random_controls(ControlConfig(), n_sequences=4, n_samples=50, seed=4, max_inserted_length_mm=60.0, first=5)
-    assert np.array_equal(later[0], everything[0][5:])
-    assert np.array_equal(later[1], everything[1][5:])
 
 
 def test_the_load_of_a_free_wire_moves_it_at_the_drawn_speed() -> None:
@@ -61,40 +51,3 @@ def test_insertion_stays_in_its_range() -> None:
     assert np.abs(control[..., 0]).max() <= config.max_velocity_mm_s
     assert np.abs(control[..., 1]).max() <= config.max_rotation_rad_s
     assert np.abs(control[..., 1]).max() > 0.8 * config.max_rotation_rad_s
-
-
-def test_controls_from_csv(tmp_path: Path) -> None:
-    path = tmp_path / "c.csv"
-    path.write_text("time_s,translation_mm_s,rotation_rad_s\n0.5,2,0\n1.0,-1,0.5\n")
-    script = read_controls_csv(path)
-    np.testing.assert_array_equal(script.initial, [[[0, 0]]])
-    np.testing.assert_array_equal(script.control, [[[[2, 0]], [[-1, 0.5]]]])
-    assert script.period_s == 0.5
-
-
-def test_controls_from_csv_may_hold_for_another_time(tmp_path: Path) -> None:
-    path = tmp_path / "c.csv"
-    columns = "time_s,translation_mm_s,rotation_rad_s,inserted_length_mm,rotation_rad\n"
-    path.write_text(columns + "0.05,2,1,5.1,0.25\n0.1,-1,0.5,5.05,0.275\n")
-    script = read_controls_csv(path)
-    assert script.period_s == 0.05
-    np.testing.assert_allclose(script.initial, [[[5.0, 0.2]]], atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("time_s,translation_mm_s\n0.5,1\n", "rotation_rad_s is missing"),
-        ("time_s,translation_mm_s,rotation_rad_s\n0.5,1,0\n1.0,nan,0\n", "row 3: translation_mm_s"),
-        ("time_s,translation_mm_s,rotation_rad_s\n0.5,1,0\n2.0,1,0\n", "row 3: time_s"),
-        ("time_s,translation_mm_s,rotation_rad_s\n0.05,1,0\n0.2,1,0\n", "row 3: time_s = 0.2; .* count 0.05, 0.1"),
-        ("time_s,translation_mm_s,rotation_rad_s\n0,1,0\n0.5,1,0\n", "row 2: time_s = 0; the first row ends"),
-        ("time_s,translation_mm_s,rotation_rad_s\n", "no rows"),
-        ("", "is empty; give the columns time_s"),
-    ],
-)
-def test_bad_csv_is_refused(tmp_path: Path, text: str, message: str) -> None:
-    path = tmp_path / "c.csv"
-    path.write_text(text)
-    with pytest.raises(InputError, match=message):
-        read_controls_csv(path)

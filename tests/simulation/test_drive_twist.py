@@ -13,12 +13,8 @@ from endopilot.devices.device import Wire, read_wire
 from endopilot.devices.stack import Stack, Transmission
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.core import run_core
-from endopilot.simulation.groups import make_wall
-from endopilot.simulation.rod import lay_out
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.trajectory import read_trajectory
-from endopilot.simulation.tubes import lay_out_transmission
 
 CONFIG = SimulatorConfig(element_mm=1.25, time_step_s=0.025, threads=1)
 BEHIND = Transmission(length_mm=1000.0, twist_friction_n_mm_mm=2e-4)
@@ -85,29 +81,6 @@ def test_a_drive_slips_at_its_own_torque(vessel, wire: Wire) -> None:
     assert 0.1 <= held < 0.11  # with the introducer's valve
     assert world.drive_rotation[0, 0] < 2.0  # of 24 rad that were commanded
     assert world.rotation[0, 0] == pytest.approx(0.0, abs=0.05)
-
-
-def test_the_same_bits_for_any_number_of_lanes(vessel, wire: Wire) -> None:
-    stack, worlds = Stack(wire, (), (BEHIND,)), 5
-    found = [
-        run_core(
-            lay_out(wire, element_mm=CONFIG.element_mm, length_mm=80.0),
-            make_wall(vessel, stack, CONFIG),
-            vessel.insertion,
-            config=CONFIG,
-            initial=np.tile([20.0, 0.0], (worlds, 1)),
-            control=commands(worlds, 5)[:, :, 0],
-            friction=np.full((worlds, 1), 0.1),
-            lanes=lanes,
-            push_limit_n=wire.push_limit_n,
-            torque_limit_n_mm=wire.torque_limit_n_mm,
-            transmission=lay_out_transmission(stack, longest_mm=80.0),
-        )
-        for lanes in (1, 4, 8)
-    ]
-    assert found[0]["valid"].all()
-    for name in ("tip_position", "rotation", "drive_torque", "iterations"):
-        assert np.array_equal(found[0][name], found[1][name]) and np.array_equal(found[0][name], found[2][name]), name
 
 
 def test_a_trajectory_keeps_what_lies_behind(vessel, wire: Wire, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import importlib.util
 
 import numpy as np
 import pytest
-from bend import BEND, vessel
+from bend import BEND
 
 from endopilot.anatomy.distance import sample
 from endopilot.devices.catheter import read_catheter
@@ -27,11 +27,6 @@ CORE = SimulatorConfig(element_mm=1.5, time_step_s=0.05, threads=1)
 needs_mujoco = pytest.mark.skipif(
     importlib.util.find_spec("mujoco") is None, reason="MuJoCo is not installed; pip install 'endopilot[engine]'"
 )
-
-
-@pytest.fixture(scope="module")
-def bend():
-    return vessel()
 
 
 @needs_mujoco

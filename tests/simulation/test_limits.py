@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bend import vessel
 
 from endopilot import _core
 from endopilot.devices.device import read_wire
@@ -105,11 +104,6 @@ def test_a_wire_clamped_at_its_tip_is_turned_no_harder_than_the_limit(spin: floa
     lost = commanded - np.sign(spin) * TORQUE_N_MM / spring
     assert found["rotation_slip"][:TURNS_BACK].sum() == pytest.approx(lost, rel=1e-6)
     np.testing.assert_array_equal(found["slip"], 0.0)
-
-
-@pytest.fixture(scope="module")
-def anatomy() -> Anatomy:
-    return vessel()
 
 
 def navigation(worlds: int = 5, samples: int = 24) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from bend import vessel
 
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.heart_reference import LEFT_VENTRICLE_AXIS, TO_CRUX
@@ -20,18 +19,12 @@ from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion, draw_motion, motion_named, place
 from endopilot.simulation.simulate import simulate
-from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy
 
 DEVICE = read_wire("workhorse-014")
 OSTIUM = np.array([10.0, -20.0, 30.0])
 MOTION = Motion()
 BEATS = Motion(breathing_caudal_mm=0.0, breathing_anterior_mm=0.0, breathing_dorsal_deg=0.0, breathing_dextral_deg=0.0)
-
-
-@pytest.fixture(scope="module")
-def anatomy() -> Anatomy:
-    return vessel()
 
 
 def maps(motion: Motion, times: np.ndarray) -> np.ndarray:
@@ -111,16 +104,6 @@ def test_drawn_patients_differ_and_stay_in_the_published_ranges() -> None:
         Motion(annulus_mm=-1.0)
 
 
-def test_a_motion_of_nothing_leaves_the_wire_where_a_still_vessel_does(anatomy: Anatomy) -> None:
-    initial, control = drives(3, 6)
-    nothing = replace(BEATS, annulus_mm=0.0, heart_volume_share=0.0, heart_rotation_deg=0.0)
-    config = SimulatorConfig(tolerance_mm=1e-6)
-    still = simulate(anatomy, DEVICE, control, initial=initial, config=config)
-    moving = simulate(anatomy, DEVICE, control, initial=initial, config=config, motion=nothing)
-    np.testing.assert_allclose(moving.tip_position, still.tip_position, atol=1e-4)
-    np.testing.assert_allclose(moving.wall_force, still.wall_force, atol=1e-4)
-
-
 def test_a_breath_does_not_move_the_wire_in_its_vessel(anatomy: Anatomy) -> None:
     # A rigid motion of vessel and catheter: a wire without mass does not feel it.
     initial, control = drives(3, 6)
@@ -142,18 +125,6 @@ def test_a_contracting_vessel_loads_the_wire(anatomy: Anatomy) -> None:
     moving = simulate(anatomy, DEVICE, control, initial=initial, motion=BEATS)
     assert moving.valid.all()
     assert np.abs(moving.tip.abscissa - still.tip.abscissa).max() > 0.5
-
-
-def test_a_state_keeps_the_phase(anatomy: Anatomy) -> None:
-    initial, control = drives(3, 2)
-    simulator, again = (Simulator(anatomy, DEVICE, worlds=3, motion=MOTION) for _ in range(2))
-    simulator.reset(inserted_length=initial[:, 0], rotation=initial[:, 1])
-    np.testing.assert_array_equal(simulator.time, 0)
-    simulator.run(control[:, :, None])
-    again.set_state(simulator.state)
-    np.testing.assert_array_equal(again.time, 1.0)
-    with pytest.raises(InputError, match="equal actuation, motion and config"):
-        Simulator(anatomy, DEVICE, worlds=3).copy_worlds([0, 1, 2], of=again)
 
 
 def test_wires_in_catheters_move_with_the_vessel_too(anatomy: Anatomy) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,9 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bend import vessel
 
-from benchmarks.core.gpu import bench_gpu
 from endopilot import _core
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
@@ -26,11 +22,6 @@ ROOT = Path(__file__).parents[2]
 DEVICE = read_wire("workhorse-014")
 GPU = SimulatorConfig(element_mm=1.5, processor="cuda")
 CPU = SimulatorConfig(element_mm=1.5)
-
-
-@pytest.fixture(scope="module")
-def anatomy() -> Anatomy:
-    return vessel()
 
 
 def put_gpu(monkeypatch: pytest.MonkeyPatch, **changed: Any) -> list[int]:
@@ -59,19 +50,6 @@ def test_a_machine_without_gpu_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
         InputError, match=r"processor: 'cuda': no GPU can be used here \(no CUDA-capable device is detected\)"
     ):
         core_for("cuda")
-
-
-def test_the_bench_says_in_one_line_that_there_is_no_gpu() -> None:
-    code = (
-        "import sys\n"
-        "sys.modules['endopilot._core_cuda'] = None\n"
-        "sys.argv = ['benchmarks', 'simulation', '--device', 'cuda']\n"
-        "from benchmarks.__main__ import main\n"
-        "main()\n"
-    )
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
-    assert ran.returncode == 2 and ran.stdout == ""
-    assert ran.stderr.count("\n") == 1 and "processor: 'cuda': endopilot was built without it" in ran.stderr
 
 
 def test_the_gpu_steps_whole_navigations(monkeypatch: pytest.MonkeyPatch, anatomy: Anatomy) -> None:
@@ -105,19 +83,6 @@ def test_what_the_gpu_reports_is_said_in_one_line(monkeypatch: pytest.MonkeyPatc
         simulate(anatomy, DEVICE, control, config=GPU)
     with pytest.raises(InputError, match="out of memory"):
         Simulator(anatomy, DEVICE, config=GPU)
-    monkeypatch.setattr(_core, "Simulation", full)
-    with pytest.raises(RuntimeError, match="out of memory"):
-        simulate(anatomy, DEVICE, control, config=CPU)
-
-
-def test_the_bench_of_the_gpu_compares_with_the_processor(monkeypatch: pytest.MonkeyPatch) -> None:
-    put_gpu(monkeypatch)
-    rows = bench_gpu(worlds=(2, 3), samples=2)
-    assert [row["worlds"] for row in rows] == [2, 3]
-    for row in rows:
-        assert row["tip_distance_max_mm"] == 0.0 and row["valid_worlds"] == 1.0 and row["passed"] is None
-        assert row["realtime_factor"] == pytest.approx(row["worlds"] * row["realtime_factor_per_wire"], rel=0.01)
-    json.dumps(rows)
 
 
 def test_a_gpu_agrees_with_the_processor(anatomy: Anatomy) -> None:

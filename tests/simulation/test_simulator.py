@@ -5,8 +5,6 @@ from __future__ import annotations
 import doctest
 import re
 import signal
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,11 +25,6 @@ from endopilot.types import Anatomy
 DEVICE = read_wire("workhorse-014")
 STIFF = read_wire("stiff-014")
 PERIOD = 0.5
-
-
-@pytest.fixture(scope="module")
-def anatomy() -> Anatomy:
-    return vessel()
 
 
 @pytest.fixture(scope="module")
@@ -106,43 +99,6 @@ def test_ctrl_c_stops_a_step_that_has_begun(anatomy: Anatomy, worlds: int) -> No
     assert simulator.step(np.ones((worlds, 2)), 0.1).valid.all()
 
 
-def test_restored_state_goes_on_with_the_same_bits(anatomy: Anatomy, tmp_path: Path) -> None:
-    control = controls(6, 3)
-    simulator = begun(Simulator(anatomy, DEVICE, worlds=3), 3)
-    for t in range(3):
-        simulator.step(control[t], 0.2)
-    state = simulator.state
-    state.write(tmp_path / "state.npz")
-    for t in range(3, 6):
-        step = simulator.step(control[t], 0.2)
-    after = simulator.state.values[0]
-
-    simulator.set_state(state)
-    for t in range(3, 6):
-        again = simulator.step(control[t], 0.2)
-    assert np.array_equal(step.tip_position, again.tip_position)
-
-    np.save(tmp_path / "control.npy", control)
-    script = f"""
-import sys; sys.path[:0] = [{str(Path(__file__).parent)!r}, {str(Path(__file__).parents[2])!r}]
-import numpy as np
-from bend import vessel
-from endopilot.devices.device import read_wire
-from endopilot.simulation.state import SimulatorState
-from endopilot.simulation.readout import Readout
-from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import SimulatorState
-from pathlib import Path
-simulator = Simulator(vessel(), read_wire("workhorse-014"), worlds=3)
-simulator.set_state(SimulatorState.read(Path("state.npz")))
-for row in np.load("control.npy")[3:]:
-    simulator.step(row, 0.2)
-np.save("after.npy", simulator.state.values[0])
-"""
-    subprocess.run([sys.executable, "-c", script], cwd=tmp_path, check=True)
-    assert np.load(tmp_path / "after.npy").tobytes() == after.tobytes()
-
-
 def test_worlds_go_over_into_another_simulator_of_the_same_kind(anatomy: Anatomy, wider: Anatomy) -> None:
     first = begun(Simulator(anatomy, [DEVICE, STIFF, DEVICE]), 3)
     second = Simulator(anatomy, [STIFF, DEVICE], sharing=[first])
@@ -175,28 +131,6 @@ def test_equal_anatomies_and_devices_are_stepped_together(anatomy: Anatomy) -> N
     simulator.set_state(shared.state)
 
 
-def test_a_wall_is_made_once_for_simulators_that_follow_each_other(anatomy: Anatomy, wider: Anatomy) -> None:
-    first, again = (Simulator(anatomy, DEVICE)._groups[0].lumen for _ in range(2))
-    assert again is first
-    for other in (
-        Simulator(wider, DEVICE),
-        Simulator(anatomy, replace(DEVICE, diameter_mm=2 * DEVICE.diameter_mm)),
-        Simulator(anatomy, DEVICE, config=SimulatorConfig(compliant_wall_n_mm2=0.05)),
-    ):
-        assert other._groups[0].lumen is not first
-
-
-def test_a_state_is_taken_without_reading_the_anatomy_again(anatomy: Anatomy, monkeypatch: pytest.MonkeyPatch) -> None:
-    simulator = begun(Simulator(replace(anatomy), DEVICE, worlds=2), 2)
-    simulator.set_state(simulator.state)
-
-    def hashed(*_) -> None:
-        raise AssertionError("an anatomy is hashed again")
-
-    monkeypatch.setattr("endopilot.types.hashlib.sha256", hashed)
-    simulator.set_state(simulator.state)
-
-
 def test_a_seed_draws_the_same_start_whatever_the_number_of_worlds(anatomy: Anatomy) -> None:
     few, many = Simulator(anatomy, DEVICE, worlds=2), Simulator(anatomy, DEVICE, worlds=5)
     few.reset(seed=7)
@@ -207,14 +141,6 @@ def test_a_seed_draws_the_same_start_whatever_the_number_of_worlds(anatomy: Anat
     many.reset(seed=8, worlds=[1, 3])
     assert np.array_equal(many.position[[0, 2, 4]], kept)
     assert not np.array_equal(many.position[1], few.position[1])
-
-
-def test_a_reset_leaves_other_wires_as_they_are(anatomy: Anatomy) -> None:
-    simulator = begun(Simulator(anatomy, [DEVICE, STIFF]), 2)
-    kept, moved = simulator.position[1], simulator.position[0]
-    simulator.reset(inserted_length=[30.0, 0.0], rotation=[1.0, 0.0], worlds=[0])
-    assert np.array_equal(simulator.position[1], kept)
-    assert not np.array_equal(simulator.position[0], moved)
 
 
 def test_forces_replay_a_velocity_run(anatomy: Anatomy) -> None:
@@ -240,16 +166,6 @@ def test_forces_replay_a_velocity_run(anatomy: Anatomy) -> None:
     assert np.abs(led.inserted_length - leading.inserted_length).max() < 1e-6
     assert np.abs(led.rotation - leading.rotation).max() < 1e-6
     assert np.array_equal(led.drive_load, leading.drive_load)
-
-
-def test_no_force_moves_nothing_and_more_force_moves_more(anatomy: Anatomy) -> None:
-    simulator = Simulator(anatomy, DEVICE, worlds=3, actuation="force")
-    simulator.reset(inserted_length=np.full(3, 10.0), rotation=np.zeros(3))
-    for _ in range(10):
-        simulator.step(np.array([[0.0, 0.0], [0.09, 0.0], [0.12, 0.0]]), 0.1)
-    still, slow, fast = simulator.inserted_length[:, 0] - 10
-    assert abs(still) < 0.1  # the bent tip may push itself back a little against the valve's friction
-    assert 1.0 < slow < fast
 
 
 def test_force_drive_stops_where_the_wire_is_out(anatomy: Anatomy) -> None:
@@ -318,15 +234,6 @@ def test_torch_tensors_go_in_and_out(anatomy: Anatomy) -> None:
     simulator = begun(Simulator(anatomy, DEVICE, worlds=2), 2)
     step = simulator.step(torch.tensor([[1.0, 0.5], [2.0, 0.0]]), 0.1)
     assert torch.from_dlpack(step.tip_position).shape == (2, 1, 3)
-
-
-def test_pulling_out_stops_at_the_ostium(anatomy: Anatomy) -> None:
-    simulator = Simulator(anatomy, DEVICE)
-    simulator.reset(inserted_length=np.array([2.0]), rotation=np.array([0.0]))
-    for _ in range(4):
-        step = simulator.step(np.array([[-6.0, 0.0]]), PERIOD)
-    assert simulator.inserted_length[0, 0] == pytest.approx(0, abs=0.03)
-    assert step.slip[0, 0] < -2.9 and simulator.valid.all()
 
 
 @pytest.mark.parametrize(

@@ -77,12 +77,6 @@ def assert_same(first: Trajectory, second: Trajectory) -> None:
     assert (first.period_s, first.about) == (second.period_s, second.about)
 
 
-def test_a_wire_and_a_wire_in_a_catheter_that_moves_are_driven_again_to_the_bit(wire_alone, moving_pair) -> None:
-    assert wire_alone.valid.all() and moving_pair.valid.all()
-    assert_same(wire_alone.replay(), wire_alone)
-    assert_same(moving_pair.replay(), moving_pair)
-
-
 def test_friction_of_each_world_and_motion_are_those_of_the_recording(vessel, wire_alone, moving_pair) -> None:
     other = wire_alone.set_up.friction * [[1.0], [0.25]]  # of the second world alone
     changed = wire_alone.replay(friction=other)

@@ -34,21 +34,15 @@ def test_there_are_twelve_tasks_one_a_level_each_with_its_environment():
             assert spec.max_episode_steps == round(each.seconds * 7.5)
 
 
-def test_tasks_of_version_2_and_of_wire_and_catheter_are_environments_in_their_training_patients(monkeypatch):
-    asked = []
-    monkeypatch.setattr(task.Task, "patient", lambda self, patients, place: asked.append((self, patients, place)))
-    monkeypatch.setattr(task.Task, "navigation", lambda self, anatomy: task.reference_navigation())
-    for name, version in [(each.name, kind) for kind in (2, "coaxial") for each in list_tasks(kind)]:
+def test_tasks_of_version_2_and_of_wire_and_catheter_are_environments_in_their_training_patients():
+    named = [(each.name, kind) for kind in (2, "coaxial") for each in list_tasks(kind)]
+    for name, version in named:
         given = gymnasium.spec(f"endopilot/{name.title()}-v2").kwargs
-        task.training_navigations(given["task"], 1, 2, given["version"])
-        found = find_task(name, version=version)
-        assert asked[-2:] == [(found, found.training, 1), (found, found.training, 2)]
-    assert len(asked) == 2 * 16
-
-
-def test_a_patient_is_drawn_once_however_often_its_environment_is_made():
-    straight = find_task("straight", version=1)
-    assert straight.patient(straight.training, 0) is straight.patient(straight.training, 0)
+        assert (given["task"], given["version"]) == (name, version)
+    assert len(named) == 16
+    (first, second), straight = task.training_navigations("straight", 1, 2, 2), find_task("straight", version=2)
+    for place, navigation in ((1, first), (2, second)):
+        assert navigation.anatomy.identity == straight.patient(straight.training, place).identity
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}/{path.stem}")

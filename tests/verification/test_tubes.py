@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from benchmarks.verification.tubes import ELEMENTS, Sliding, Uniform, curvature, drive, lay_out, mesh
-from endopilot.simulation.tubes import TubeLayout
 from endopilot.verification.case import Loading
 
 
@@ -19,18 +18,6 @@ def test_three_precurved_tubes_lie_where_their_moments_balance() -> None:
     found = curvature(result["shape"][-1][:ELEMENTS], float(rod.abscissa_mm[1]))
     assert found == pytest.approx(np.full(len(found), expected), rel=1e-5)
     assert np.abs(result["base_torque"][-1]).max() < 1e-6  # no torque: the opposed tube is in balance there
-
-
-def test_tubes_of_unequal_torsional_stiffness_share_a_torque() -> None:
-    # A moment on the tip of tube 0 twists it alone, by M L / GJ: the other tube, free at its end, carries none of it.
-    inner, outer, length, moment = Uniform(10.0, 6.0), Uniform(40.0, 25.0), 12.0, 0.05
-    rod = mesh(length)
-    loading = Loading.none(len(rod.abscissa_mm))
-    loading.moment_n_mm[0, 2] = moment
-    result = drive(rod, lay_out((inner, outer), length), np.full(2, length), loading=loading)
-    between = length - 0.5 * rod.abscissa_mm[1]  # from the clamp to the middle of the foremost element
-    assert result["tip_twist"][-1, 1] == pytest.approx(-moment * between / inner.twist, rel=1e-6)
-    assert result["base_torque"][-1] == pytest.approx([-moment, 0.0], abs=1e-9)
 
 
 def test_the_catheter_slides_over_a_bent_wire_and_straightens_it() -> None:
@@ -79,18 +66,3 @@ def test_a_catheter_on_a_bent_wire_is_pushed_back() -> None:
     both = wire.bend + catheter.bend
     expected = moment**2 / 2 * (1 / wire.bend - 1 / both) + catheter.bend * (moment / both) ** 2 / 2
     assert result["base_force"][-1, 1] == pytest.approx(expected, rel=0.02)
-
-
-def test_a_drive_slips_at_its_torque_limit() -> None:
-    # A precurved tube in another like it resists being turned: its drive turns it no harder than its limit.
-    stack = (Uniform(60.0, 46.0, 1 / 30), Uniform(60.0, 46.0, 1 / 30))
-    layout = lay_out(stack, 30.0)
-    limited = TubeLayout(**{**vars(layout), "limits": np.array([[np.inf] * 3, [np.inf, np.inf, 0.5]])})
-    control = np.zeros((10, 2, 2))
-    control[:, 1, 1] = 0.4
-    free = drive(mesh(30.0), layout, np.full(2, 30.0), control=control)
-    held = drive(mesh(30.0), limited, np.full(2, 30.0), control=control)
-    assert np.abs(free["base_torque"][:, 1]).max() > 0.6
-    assert np.abs(held["base_torque"][:, 1]).max() <= 0.5 * (1 + 1e-5)
-    assert held["rotation_slip"][-1, 1] > 0.1  # rotation that was asked and not made
-    assert held["rotation"][-1, 1] + held["rotation_slip"][:, 1].sum() == pytest.approx(0.4 * 5.0)
