@@ -71,10 +71,9 @@ def identify(belief: Belief, past: Past) -> tuple[Belief, Identified]:
             spread = np.diag(np.clip(2 * found.sd, _NARROWEST, 1.0))
             drawn = family.drawn(found.mean, spread, _KINDS, _EACH, vessels=_VESSELS, seed=generation)
             drawn[:, family.costly] = first[:, family.costly]
-        worlds = [family.world(each) for each in drawn]
-        tips, scale = _replayed(belief, past, worlds)
+        tips, scale = _replayed(belief, past, [family.world(each) for each in drawn])
         found = family.update(drawn, tips, shown, scale)
-    belief.vessels.keep(worlds)
+    belief.vessels.keep([family.world(each) for each in first])
     made = belief.like(_members(family, found, belief))
     made.replay(past)
     return made, _stated(family, found)
