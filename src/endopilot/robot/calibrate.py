@@ -266,21 +266,21 @@ def fit_wire(
         for row in values:
             rows.append(_wire_costs(of, *with_found(device, robot, dict(zip(WIRE, row.tolist(), strict=True))), config))
             advance(1)
-        return np.array(rows)
+        return np.array(rows) @ of_unit
 
-    first, draws = config.wires // 2, config.wires // 4
+    first, draws, of_unit = config.wires // 2, config.wires // 4, np.eye(_units(of).max() + 1)[_units(of)]
     advance: Advance
     with progress("Fitting the wire", total=first + 2 * draws) as advance:
         tried = search(costs, WIRE, first=first, rounds=2, draws=draws, seed=config.seed)
-    return tried, _wire_costs(of, device, robot, config)
+    return tried, _wire_costs(of, device, robot, config) @ of_unit
 
 
-def _wire_costs(of: Prepared, device: Wire, robot: RobotConfig, config: CalibrateConfig) -> Float[np.ndarray, "units"]:
-    """Return what a wire costs in the episodes of each unit."""
-    unit = _units(of)
-    found, costs = replay_prepared(of, Stack(device), robot, ReplayConfig(given=config.given)), np.zeros(unit.max() + 1)
-    np.add.at(costs, unit, [_cost(each, robot) for each in found])
-    return costs
+def _wire_costs(
+    of: Prepared, device: Wire, robot: RobotConfig, config: CalibrateConfig
+) -> Float[np.ndarray, "episodes"]:
+    """Return what a wire costs in each episode."""
+    found = replay_prepared(of, Stack(device), robot, ReplayConfig(given=config.given))
+    return np.array([_cost(each, robot) for each in found])
 
 
 def _cost(episode: EpisodeReplay, robot: RobotConfig) -> float:
@@ -379,4 +379,4 @@ def _units(of: Prepared) -> Int[np.ndarray, "episodes"]:
     """Return what each episode counts to: its log where there are enough, for logs differ more than their episodes."""
     names = [log.name for log in of.logs]
     logs = list(dict.fromkeys(names))
-    return np.array([logs.index(name) for name in names]) if len(logs) >= LEAST_EPISODES else np.arange(len(names))
+    return np.array([logs.index(name) for name in names]) if len(logs) >= _LEAST_LOGS else np.arange(len(names))
