@@ -40,10 +40,15 @@ _PLAYS = np.linspace(0.0, 8.0, 33)
 _SCANS, _NEWTON_STEPS = 3, 8
 """A fit that has converged goes on from any of these plays that cost less, so often at most: commands come in steps,
 so the cost has valleys."""
-_USUAL_NOISE = (0.05, 4.0, 0.01)
+_USUAL_NOISE = (0.04, 0.25, 0.16, 0.5)
 """That of the public logs (docs/evidence/reality.md)."""
-_NOISE = (0.1, 1.0, 0.1)
-"""Noise that the search begins with: of a tip, mm, and drift, in that variance a mm of travel. Both are fitted."""
+_NOISES = ((0.1, 1.0, 0.1, 0.5), (0.1, 1.0, 0.1, 1.0))
+"""`Noise` that the search begins with: slips that leap as often as they lose, and such that only lose."""
+
+
+Noise = tuple[float, float, float, float]
+"""Standard deviation of a tip, mm; variance of the offset a mm of travel, in variances of a tip; share of tips that
+slip by anything up to their travel; and the share of slips that are losses, not leaps: half, or all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,10 +115,9 @@ def filtered(
     Args:
         residual: mm; NaN where there is no tip.
         travel: of the drive since the tip before, mm, backward negative.
-        noise: standard deviation of a tip, mm; variance of the offset a mm of travel, in variances of a tip; and the
-            share of tips that lose anything up to the travel. Each for all, or to be broadcast.
+        noise: of `Noise`, each for all or to be broadcast.
     """
-    sd, drift, slips = noise
+    sd, drift, slips, lost = noise
     shape = np.broadcast_shapes(residual.shape[:-1], np.shape(sd))
     offset, variance, cost = np.zeros(shape), np.full(shape, np.inf), np.zeros(shape)
     kept = np.zeros((3, residual.shape[-1], *shape))  # by time first: much faster
@@ -122,9 +126,10 @@ def filtered(
             there, begun, far = np.isfinite(value), np.isfinite(variance), np.maximum(np.abs(way), _FEW_MM)
             variance = variance + drift * np.abs(way)
             spread, ahead = sd * np.sqrt(variance + 1), np.where(begun & there, value - offset, 0.0)
-            z, lost = ahead / spread, -np.sign(way) * ahead
+            z, on = ahead / spread, np.where(way < 0, -ahead, ahead) / spread
             follows = (1 - slips - _JUMPS) * np.exp(-(z**2) / 2) / (math.sqrt(2 * np.pi) * spread)
-            slipped = slips / far * (ndtr(lost / spread) - ndtr((lost - far) / spread))
+            behind, before = ndtr(on + far / spread) - ndtr(on), ndtr(on) - ndtr(on - far / spread)
+            slipped = slips / far * (lost * behind + (1 - lost) * before)
             whole = follows + slipped + _JUMPS / _WITHIN_MM
             share = np.where(begun, follows / whole, 0.0)
             cost -= np.where(there & begun, 2 * np.log(np.where(begun, whole, 1.0)), 0.0)
@@ -146,7 +151,7 @@ class DriveFit:
         values: of `NAMES`.
         half_width: of their intervals of 95 %.
         free: which of them were fitted.
-        noise: standard deviation of a tip, mm, and drift, variance a mm of travel, in variances of a tip.
+        noise: of the tips.
         unit: what each episode counts to.
         left_out: what each unit costs, -2 log likelihood, by values that are fitted to all others.
     """
@@ -154,7 +159,7 @@ class DriveFit:
     values: Float[np.ndarray, "values"]
     half_width: Float[np.ndarray, "values"]
     free: Bool[np.ndarray, "values"]
-    noise: tuple[float, float, float]
+    noise: Noise
     unit: Int[np.ndarray, "episodes"]
     left_out: Float[np.ndarray, "units"]
 
@@ -179,9 +184,20 @@ def fit_drive(
     free = np.array([k < 3 or name == layer for k, name in enumerate(NAMES)])
     free |= False if begin is None else begin.free
     if begin is None:
-        values, noise = _best_of_grid(tracks.rows(np.unique(np.linspace(0, len(unit) - 1, 8).astype(int)))), _NOISE
+        few = tracks.rows(np.unique(np.linspace(0, len(unit) - 1, 8).astype(int)))
+        fits = [_converged(tracks, _best_of_grid(few, noise), noise, free) for noise in _NOISES]
     else:
-        values, noise = begin.values, begin.noise
+        fits = [_converged(tracks, begin.values, begin.noise, free)]
+    values, noise = min(fits, key=lambda fit: starts(tracks, fit[0][None], fit[1])[1].sum())
+    found, slope = _sloped(tracks, values, starts(tracks, values[None], noise)[0][0], noise, free)
+    half_width, left_out = _left_out(found, slope, unit)
+    return DriveFit(values, half_width, free, noise, unit, left_out)
+
+
+def _converged(
+    tracks: Tracks, values: Float[np.ndarray, "values"], noise: Noise, free: Bool[np.ndarray, "values"]
+) -> tuple[Float[np.ndarray, "values"], Noise]:
+    """Return values and noise from which no step and no other play costs less."""
     for _ in range(_SCANS):
         for _ in range(_NEWTON_STEPS):
             start = starts(tracks, values[None], noise)[0][0]
@@ -196,9 +212,7 @@ def fit_drive(
         values = scanned[best]
         if best == 0:
             break
-    found, slope = _sloped(tracks, values, starts(tracks, values[None], noise)[0][0], noise, free)
-    half_width, left_out = _left_out(found, slope, unit)
-    return DriveFit(values, half_width, free, noise, unit, left_out)
+    return values, noise
 
 
 def _left_out(
@@ -220,17 +234,17 @@ def _left_out(
     return stdtrit(units - 1, 0.975) * np.sqrt(variance), cost
 
 
-def _best_of_grid(tracks: Tracks) -> Float[np.ndarray, "values"]:
+def _best_of_grid(tracks: Tracks, noise: Noise) -> Float[np.ndarray, "values"]:
     tried = np.array([(*row, 0.0, 0.0) for row in product(*_FIRST)])
     cost = np.full((len(tried), len(tracks.abscissa)), np.inf)
     for start in (-1.0, 0.0, 1.0):
         residual = tracks.abscissa - tracks.motion(tried, start)
-        cost = np.minimum(cost, filtered(residual, tracks.travel(0.1), _NOISE).cost)
+        cost = np.minimum(cost, filtered(residual, tracks.travel(0.1), noise).cost)
     return tried[np.argmin(cost.sum(axis=1))]
 
 
 def starts(
-    tracks: Tracks, values: Float[np.ndarray, "candidates values"], noise: tuple[float, float, float]
+    tracks: Tracks, values: Float[np.ndarray, "candidates values"], noise: Noise
 ) -> tuple[Float[np.ndarray, "candidates episodes"], Float[np.ndarray, "candidates episodes"]]:
     """Return where in its play the device of each episode begins, of five places and then those between; its cost."""
     best, travel = np.zeros((len(values), len(tracks.abscissa))), tracks.travel(values[0, 2])
@@ -247,15 +261,15 @@ def fit_noise(
     tracks: Tracks,
     values: Float[np.ndarray, "values"],
     start: Float[np.ndarray, "episodes"],
-    noise: tuple[float, float, float],
-) -> tuple[float, float, float]:
+    noise: Noise,
+) -> Noise:
     """Return the likeliest noise of tips, mm, and drift of their offset, in variances of a tip a mm of travel."""
     residual, travel = tracks.abscissa - tracks.motion(values[None], start)[0], tracks.travel(values[2])
     for factor in (4.0, 2.0, 1.4, 1.2):
         sd = noise[0] * factor ** np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
         drift = np.clip(noise[1] * factor ** (2.0 * np.arange(-2, 3)), 1e-6, 1e3)
         slips = np.clip(noise[2] * factor ** np.array([-2.0, 0.0, 2.0]), 1e-4, 0.5)
-        tried = np.array(list(product(sd, drift, slips)))
+        tried = np.array(list(product(sd, drift, slips, noise[3:])))
         cost = filtered(residual[None], travel, tuple(tried.T[..., None])).cost.sum(axis=1)
         noise = tuple(tried[np.argmin(cost)].tolist())
     return noise
@@ -263,7 +277,7 @@ def fit_noise(
 
 def led(
     tracks: Tracks, robot: RobotConfig
-) -> tuple[Float[np.ndarray, "episodes tips"], Filtered, Float[np.ndarray, "episodes"], tuple[float, float, float]]:
+) -> tuple[Float[np.ndarray, "episodes tips"], Filtered, Float[np.ndarray, "episodes"], Noise]:
     """Return where a robot's drive alone leads tips after those that tracks have, Δtip, mm, with what made it so.
 
     That is the filter of the tips that were seen, where in its play each device begins, and the noise of the tips.
@@ -281,7 +295,7 @@ def _sloped(
     tracks: Tracks,
     values: Float[np.ndarray, "values"],
     start: Float[np.ndarray, "episodes"],
-    noise: tuple[float, float, float],
+    noise: Noise,
     free: Bool[np.ndarray, "values"],
 ) -> tuple[Filtered, Float[np.ndarray, "episodes tips values"]]:
     """Return innovations and their slopes, jumps where they are, without what other starts in the play would do."""
@@ -307,7 +321,7 @@ def _newton(
     tracks: Tracks,
     values: Float[np.ndarray, "values"],
     start: Float[np.ndarray, "episodes"],
-    noise: tuple[float, float, float],
+    noise: Noise,
     free: Bool[np.ndarray, "values"],
 ) -> Float[np.ndarray, "values"]:
     """Return values after a step of Gauss and Newton, as long as it costs less."""
