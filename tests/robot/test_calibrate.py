@@ -78,13 +78,12 @@ def test_intervals_hold_the_constants_of_the_robot_in_the_simulator(fork, wire) 
     assert found.robot.encoders_at == "motor"
 
 
-@pytest.mark.parametrize(
-    ("gain", "said"),
-    [(-1.0, "forward is counted negative: the tip goes -1"), (2.5, "not 0.5 to 2 mm: the tip goes 2.5")],
-)
-def test_a_translation_counted_otherwise_is_refused(fork, wire, gain, said) -> None:
+@pytest.mark.parametrize("gain", [-1.0, 2.5])
+def test_a_translation_counted_otherwise_is_refused(fork, wire, gain) -> None:
     log = BlindRobot(gain=gain).logged(fork, episodes=6, seconds=8.0, seed=0)
-    with pytest.raises(InputError, match=f"^synthetic: translation_mm: {said}"):
+    with pytest.raises(
+        InputError, match=f"^synthetic: translation_mm: the tip goes {gain}.* give mm, forward positive$"
+    ):
         calibrate([log], fork, wire, config=NO_WIRE)
 
 

@@ -1,11 +1,7 @@
-"""The tip as its drive alone leads it: gain, play, lag and an offset, fitted exactly, with intervals.
+"""The tip as its drive alone leads it: y(t) = a(t) + g P(u(t − τ)) + noise, fitted exactly, with intervals.
 
-The tip lies at y(t) = a(t) + g P(u(t − τ)) + noise, with the commanded course u, the play operator P, the gain g and
-the lag τ. Nobody logs the offset a: it drifts as the wire slides, by equal variances in equal travel, and begins anew
-where the tip jumps. So it is a state, and a Kalman filter takes it out of tip and model alike; what remains are
-innovations, independent of each other, to which g, the play and τ are fitted by Gauss and Newton. Two layers may come
-on top: a share of all pushes that the grip loses, and a share of what a simulated wire's tip went farther than its
-proximal end.
+With the commanded course u, the play operator P, the gain g and the lag τ. Nobody logs the offset a, which drifts,
+slips and jumps: a Kalman filter takes it out of tip and model alike. docs/concepts/calibration.md has the rest.
 """
 
 from __future__ import annotations
@@ -40,12 +36,8 @@ _PLAYS = np.linspace(0.0, 8.0, 33)
 _SCANS, _NEWTON_STEPS = 3, 8
 """A fit that has converged goes on from any of these plays that cost less, so often at most: commands come in steps,
 so the cost has valleys."""
-_USUAL_NOISE = (0.04, 0.25, 0.16, 0.5)
-"""That of the public logs (docs/evidence/reality.md)."""
 _NOISES = ((0.1, 1.0, 0.1, 0.5), (0.1, 1.0, 0.1, 1.0))
 """`Noise` that the search begins with: slips that leap as often as they lose, and such that only lose."""
-
-
 Noise = tuple[float, float, float, float]
 """Standard deviation of a tip, mm; variance of the offset a mm of travel, in variances of a tip; share of tips that
 slip by anything up to their travel; and the share of slips that are losses, not leaps: half, or all."""
@@ -80,10 +72,6 @@ class Tracks:
         """Return how far each drive goes from one tip to the next, mm, backward negative."""
         at = self.motion(np.array([[1.0, 0.0, latency_s, 0.0, 0.0]]), 0.0)[0]
         return np.diff(at, axis=1, prepend=at[:, :1])
-
-    def rows(self, chosen: Int[np.ndarray, "some"]) -> Tracks:
-        """Return some of the episodes, without slack."""
-        return Tracks(Courses(*(array[chosen] for array in vars(self.courses).values())), self.abscissa[chosen])
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,11 +171,20 @@ def fit_drive(
     """
     free = np.array([k < 3 or name == layer for k, name in enumerate(NAMES)])
     free |= False if begin is None else begin.free
-    if begin is None:
-        few = tracks.rows(np.unique(np.linspace(0, len(unit) - 1, 8).astype(int)))
-        fits = [_converged(tracks, _best_of_grid(few, noise), noise, free) for noise in _NOISES]
-    else:
-        fits = [_converged(tracks, begin.values, begin.noise, free)]
+    some, fits = np.unique(np.linspace(0, len(unit) - 1, 8).astype(int)), []
+    few = Tracks(Courses(*(array[some] for array in vars(tracks.courses).values())), tracks.abscissa[some])
+    for noise in _NOISES if begin is None else [begin.noise]:
+        values = _best_of_grid(few, noise) if begin is None else begin.values
+        for _ in range(_SCANS):
+            values, noise = _converged(tracks, values, noise, free)
+            scanned = np.repeat(values[None], len(_PLAYS) + 1, axis=0)
+            scanned[1:, 1] = _PLAYS
+            parts = np.array_split(scanned, len(scanned) // 4)  # at a time, for memory
+            best = int(np.argmin(np.concatenate([starts(tracks, part, noise)[1] for part in parts]).sum(axis=1)))
+            values = scanned[best]
+            if best == 0:
+                break
+        fits.append((values, noise))
     values, noise = min(fits, key=lambda fit: starts(tracks, fit[0][None], fit[1])[1].sum())
     found, slope = _sloped(tracks, values, starts(tracks, values[None], noise)[0][0], noise, free)
     half_width, left_out = _left_out(found, slope, unit)
@@ -197,20 +194,12 @@ def fit_drive(
 def _converged(
     tracks: Tracks, values: Float[np.ndarray, "values"], noise: Noise, free: Bool[np.ndarray, "values"]
 ) -> tuple[Float[np.ndarray, "values"], Noise]:
-    """Return values and noise from which no step and no other play costs less."""
-    for _ in range(_SCANS):
-        for _ in range(_NEWTON_STEPS):
-            start = starts(tracks, values[None], noise)[0][0]
-            noise = fit_noise(tracks, values, start, noise)
-            before, values = values, _newton(tracks, values, start, noise, free)
-            if (np.abs(values - before) < 0.1 * _STEPS).all():
-                break
-        scanned = np.repeat(values[None], len(_PLAYS) + 1, axis=0)
-        scanned[1:, 1] = _PLAYS
-        few = np.array_split(scanned, len(scanned) // 4)  # at a time, for memory
-        best = int(np.argmin(np.concatenate([starts(tracks, some, noise)[1] for some in few]).sum(axis=1)))
-        values = scanned[best]
-        if best == 0:
+    """Return values and noise from which no step costs less."""
+    for _ in range(_NEWTON_STEPS):
+        start = starts(tracks, values[None], noise)[0][0]
+        noise = fit_noise(tracks, values, start, noise)
+        before, values = values, _newton(tracks, values, start, noise, free)
+        if (np.abs(values - before) < 0.1 * _STEPS).all():
             break
     return values, noise
 
@@ -284,7 +273,7 @@ def led(
     """
     drive = robot.wire
     values = np.array([drive.gain_translation, drive.play_mm, robot.latency_s, 0.0, 0.0])
-    noise = fit_noise(tracks, values, starts(tracks, values[None], _USUAL_NOISE)[0][0], _USUAL_NOISE)
+    noise = fit_noise(tracks, values, starts(tracks, values[None], _NOISES[0])[0][0], _NOISES[0])
     begun = starts(tracks, values[None], noise)[0][0]
     motion = tracks.motion(values[None], begun)[0]
     seen = filtered(tracks.abscissa - motion, tracks.travel(robot.latency_s), noise)

@@ -318,11 +318,11 @@ def _likeliest(of: Prepared, tried: _Tried, angles: Float[np.ndarray, "worlds"])
     A wire that nobody clamped anew keeps its rotation on the drive. Whether that is so is told by how well the
     rotations so far were foretold.
     """
-    best, count = np.zeros(len(of.logs), dtype=int), len(angles)
-    known, trust = np.full(count, 1 / count), 0.5  # rotations on the drive
+    best, count, before = np.zeros(len(of.logs), dtype=int), len(angles), ""
+    known, trust = np.empty(count), 0.0
     for k, log in enumerate(of.logs):
-        if k and log.name != of.logs[k - 1].name:
-            known, trust = np.full(count, 1 / count), 0.5
+        if log.name != before:  # rotations on the drive, and whether they are kept
+            known, trust, before = np.full(count, 1 / count), 0.5, log.name
         on_drive = angles[:, None] - log.command[log.commanded, 0, 1][0] - angles
         near = np.exp((np.cos(on_drive) - 1) / _KEEPS_RAD**2)
         near /= near.sum(axis=0)
