@@ -66,6 +66,22 @@ def test_a_prediction_goes_on_from_where_the_tip_was_seen_last(fork, wire, robot
         assert np.abs(each.in_view[each.given, 1]).mean() > 0.4 and abs(each.in_view[each.given.sum(), 1]) < 0.25
 
 
+def test_a_wire_keeps_its_rotation_from_one_episode_to_the_next(fork, wire, robot, made) -> None:
+    """The same episode twice; the second time half of its tips are seen within 2 mm only, and tell no rotation."""
+    log, true = made
+    once, off = next(log.episodes()), 2.0 * np.random.default_rng(2).standard_normal((len(log), 3))
+    count = len(once) // 2
+    blurred = np.concatenate([once.tip[:count] + off[:count], once.tip[count:]])
+    again = dataclasses.replace(once, tip=blurred, episode=once.episode + 1, time_s=once.time_s + 100.0)
+    names = [name for name, value in vars(once).items() if isinstance(value, np.ndarray)]
+    both = {name: np.concatenate([getattr(once, name), getattr(again, name)]) for name in names}
+    wrong = []
+    for each in (again, dataclasses.replace(once, **both)):
+        turned = replay_log([each], fork, Stack(wire), robot=robot, config=FEW)[-1].rotation_rad - true[0, 1]
+        wrong.append(abs((turned + np.pi) % (2 * np.pi) - np.pi))
+    assert wrong[0] > 1.0 > wrong[1]
+
+
 def test_what_a_drive_did_before_the_first_tip_is_left_out(fork, robot, log) -> None:
     """The first twenty periods of each episode show no tip; the rest moves the wire as it did."""
     rows = np.concatenate([np.flatnonzero(log.episode == number)[:40] for number in np.unique(log.episode)])

@@ -1,11 +1,7 @@
 """A robot and its wire from logs: what each constant is, how sure that is, and what a log does not tell.
 
-First the drive's kinematics: lag, gain and play of the translation, of Δtip alone (`kinematics`). Then two layers that
-must earn their place, for a model may be wrong: what they predict of episodes that were left out has to be better, or
-they are left out themselves. They are the slack of a simulated wire, which counts by a share that is fitted with gain
-and play, so that they are only as sure as that share; and the wire with what lies between it and its drive: bent tip,
-friction, stiffness, play or twist of the rotation, and grip, from where the real tip lies beside that of the rod core,
-and from the drive's force where the log has it.
+docs/concepts/calibration.md says how: the drive's kinematics first, then layers that must earn their place on episodes
+left out.
 """
 
 from __future__ import annotations
@@ -206,10 +202,8 @@ def check_forward(log: str, fit: DriveFit) -> None:
     gain, half = float(fit.values[0]), float(fit.half_width[0])
     least, most = DRIVE["gain_translation"]
     if gain + half < least or gain - half > most:
-        why, mend = f"not {least:g} to {most:g} mm", "give mm"
-        if gain + half < 0:
-            why, mend = "forward is counted negative", "change its sign"
-        raise InputError(f"{log}: translation_mm: {why}: the tip goes {gain:.2f} mm for each mm; {mend}")
+        said = f"the tip goes {gain:.2f} mm for each mm, not {least:g} to {most:g}; give mm, forward positive"
+        raise InputError(f"{log}: translation_mm: {said}")
 
 
 def check_clockwise(of: Prepared, device: Wire, robot: RobotConfig, config: CalibrateConfig) -> None:
@@ -266,21 +260,21 @@ def fit_wire(
         for row in values:
             rows.append(_wire_costs(of, *with_found(device, robot, dict(zip(WIRE, row.tolist(), strict=True))), config))
             advance(1)
-        return np.array(rows)
+        return np.array(rows) @ of_unit
 
-    first, draws = config.wires // 2, config.wires // 4
+    first, draws, of_unit = config.wires // 2, config.wires // 4, np.eye(_units(of).max() + 1)[_units(of)]
     advance: Advance
     with progress("Fitting the wire", total=first + 2 * draws) as advance:
         tried = search(costs, WIRE, first=first, rounds=2, draws=draws, seed=config.seed)
-    return tried, _wire_costs(of, device, robot, config)
+    return tried, _wire_costs(of, device, robot, config) @ of_unit
 
 
-def _wire_costs(of: Prepared, device: Wire, robot: RobotConfig, config: CalibrateConfig) -> Float[np.ndarray, "units"]:
-    """Return what a wire costs in the episodes of each unit."""
-    unit = _units(of)
-    found, costs = replay_prepared(of, Stack(device), robot, ReplayConfig(given=config.given)), np.zeros(unit.max() + 1)
-    np.add.at(costs, unit, [_cost(each, robot) for each in found])
-    return costs
+def _wire_costs(
+    of: Prepared, device: Wire, robot: RobotConfig, config: CalibrateConfig
+) -> Float[np.ndarray, "episodes"]:
+    """Return what a wire costs in each episode."""
+    found = replay_prepared(of, Stack(device), robot, ReplayConfig(given=config.given))
+    return np.array([_cost(each, robot) for each in found])
 
 
 def _cost(episode: EpisodeReplay, robot: RobotConfig) -> float:
@@ -306,15 +300,7 @@ def with_found(device: Wire, robot: RobotConfig, found: Mapping[str, float]) -> 
 
 
 def where_encoders_sit(episodes: Sequence[RobotLog], robot: RobotConfig) -> str | None:
-    """Return where the wire's encoders sit: "motor" if they follow its commands, "wire" if they follow gain and play.
-
-    Args:
-        episodes: logs of one episode each.
-        robot: with lag, gain and play as they were found.
-
-    Returns:
-        None where no log has readings.
-    """
+    """Return "motor" if the wire's encoders follow its commands, "wire" if gain and play too; None without readings."""
     far, drive = [], robot.wire
     for log in episodes:
         nothing = np.full_like(log.pixel, np.nan)
@@ -379,4 +365,4 @@ def _units(of: Prepared) -> Int[np.ndarray, "episodes"]:
     """Return what each episode counts to: its log where there are enough, for logs differ more than their episodes."""
     names = [log.name for log in of.logs]
     logs = list(dict.fromkeys(names))
-    return np.array([logs.index(name) for name in names]) if len(logs) >= LEAST_EPISODES else np.arange(len(names))
+    return np.array([logs.index(name) for name in names]) if len(logs) >= _LEAST_LOGS else np.arange(len(names))

@@ -3,14 +3,8 @@
 Time and bytes come in as arguments, so that it can be tested without a clock or a socket. A drive that stopped stays so
 until it is armed again.
 
-What moves the drive bears a ticket: a random word that the answers of the drive bring, a new one at each instant. A
-ticket lasts for 200 ms less the time that braking takes, and a stop makes all of them void. So a command says when its
-client last heard the drive, and 200 ms after that the drive stands still. Whatever waited in a buffer between them is
-dropped, however much it is, and nobody can write a command for later.
-
-docs/concepts/drive-protocol.md holds the table of messages. A line is ASCII text, `VERB ARGUMENT...`, fields separated
-by one space, at most `LONGEST_LINE` bytes with its newline. Lines travel over TLS 1.3, and each side trusts one
-certificate, that of the other: so nobody else can read a line, make one, change it or send it again.
+What moves the drive bears a ticket, which proves when its client last heard the drive. Lines of ASCII text, `VERB
+ARGUMENT...`, travel over TLS 1.3. docs/concepts/drive-protocol.md has tickets, messages and reasons to stop.
 """
 
 from __future__ import annotations

@@ -1,22 +1,19 @@
-"""The tip as its drive alone leads it: gain, play, lag and an offset, fitted exactly, with intervals.
+"""The tip as its drive alone leads it: y(t) = a(t) + g P(u(t − τ)) + noise, fitted exactly, with intervals.
 
-The tip lies at y(t) = a(t) + g P(u(t − τ)) + noise, with the commanded course u, the play operator P, the gain g and
-the lag τ. Nobody logs the offset a: it drifts as the wire slides, by equal variances in equal travel, and begins anew
-where the tip jumps. So it is a state, and a Kalman filter takes it out of tip and model alike; what remains are
-innovations, independent of each other, to which g, the play and τ are fitted by Gauss and Newton. Two layers may come
-on top: a share of all pushes that the grip loses, and a share of what a simulated wire's tip went farther than its
-proximal end.
+With the commanded course u, the play operator P, the gain g and the lag τ. Nobody logs the offset a, which drifts,
+slips and jumps: a Kalman filter takes it out of tip and model alike. docs/concepts/calibration.md has the rest.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.special import stdtrit
+from scipy.special import ndtr, stdtrit
 
 from endopilot.devices.robot import RobotConfig
 from endopilot.robot.log import Courses
@@ -31,16 +28,19 @@ _FIRST = ((-1.0, -0.7, 0.7, 1.0, 1.4), (0.0, 0.7, 1.5, 3.0, 5.0), (0.0, 0.06, 0.
 """Gains, plays and lags from the best of which the fit goes on."""
 _STEPS = np.array([0.01, 0.05, 0.005, 0.02, 0.05])
 """Steps of the derivatives: less than noise makes of each."""
-_JUMP_COST = -2 * math.log(0.01 / 10.0)
-"""What a tip costs that jumps: -2 log p where one in a hundred does, to anywhere within 10 mm."""
+_JUMPS, _WITHIN_MM = 0.01, 10.0
+"""One tip in a hundred jumps, to anywhere within 10 mm."""
+_FEW_MM = 0.01
+"""Travel below which a tip has none to lose, mm: far below the noise of a tip."""
 _PLAYS = np.linspace(0.0, 8.0, 33)
 _SCANS, _NEWTON_STEPS = 3, 8
 """A fit that has converged goes on from any of these plays that cost less, so often at most: commands come in steps,
 so the cost has valleys."""
-_USUAL_NOISE = (0.05, 4.0)
-"""That of the public logs (docs/evidence/reality.md)."""
-_NOISE = (0.1, 1.0)
-"""Noise that the search begins with: of a tip, mm, and drift, in that variance a mm of travel. Both are fitted."""
+_NOISES = ((0.1, 1.0, 0.1, 0.5), (0.1, 1.0, 0.1, 1.0))
+"""`Noise` that the search begins with: slips that leap as often as they lose, and such that only lose."""
+Noise = tuple[float, float, float, float]
+"""Standard deviation of a tip, mm; variance of the offset a mm of travel, in variances of a tip; share of tips that
+slip by anything up to their travel; and the share of slips that are losses, not leaps: half, or all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,13 +69,9 @@ class Tracks:
         return followed - slip[:, None, None] * pushed + share[:, None, None] * np.nan_to_num(self.slack)
 
     def travel(self, latency_s: float) -> Float[np.ndarray, "episodes tips"]:
-        """Return how far each drive goes from one tip to the next, mm."""
+        """Return how far each drive goes from one tip to the next, mm, backward negative."""
         at = self.motion(np.array([[1.0, 0.0, latency_s, 0.0, 0.0]]), 0.0)[0]
-        return np.abs(np.diff(at, axis=1, prepend=at[:, :1]))
-
-    def rows(self, chosen: Int[np.ndarray, "some"]) -> Tracks:
-        """Return some of the episodes, without slack."""
-        return Tracks(Courses(*(array[chosen] for array in vars(self.courses).values())), self.abscissa[chosen])
+        return np.diff(at, axis=1, prepend=at[:, :1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,33 +96,37 @@ class Filtered:
 def filtered(
     residual: Float[np.ndarray, "*of tips"],
     travel: Float[np.ndarray, "episodes tips"],
-    sd: Float[np.ndarray, "..."] | float,
-    drift: Float[np.ndarray, "..."] | float,
+    noise: Sequence[Float[np.ndarray, "..."] | float],
 ) -> Filtered:
-    """Filter residuals whose mean drifts with travel and jumps now and then.
+    """Filter residuals whose mean drifts with travel, and slips or jumps now and then.
 
     Args:
         residual: mm; NaN where there is no tip.
-        travel: of the drive since the tip before, mm.
-        sd: standard deviation of a tip, mm, for all or to be broadcast.
-        drift: variance of the offset a mm of travel, in variances of a tip, likewise.
+        travel: of the drive since the tip before, mm, backward negative.
+        noise: of `Noise`, each for all or to be broadcast.
     """
+    sd, drift, slips, lost = noise
     shape = np.broadcast_shapes(residual.shape[:-1], np.shape(sd))
     offset, variance, cost = np.zeros(shape), np.full(shape, np.inf), np.zeros(shape)
     kept = np.zeros((3, residual.shape[-1], *shape))  # by time first: much faster
     with np.errstate(invalid="ignore"):
         for i, (value, way) in enumerate(zip(np.moveaxis(residual, -1, 0), travel.T, strict=True)):
-            there, begun = np.isfinite(value), np.isfinite(variance)
-            variance = variance + drift * way
-            spread = sd * np.sqrt(variance + 1)
-            z = np.where(begun, value - offset, 0.0) / spread
-            ordinary = z**2 + np.log(2 * np.pi * np.where(begun, spread, 1.0) ** 2)
-            jumps = ~begun | (ordinary > _JUMP_COST)
-            cost += np.where(there & begun, np.minimum(ordinary, _JUMP_COST), 0.0)
-            gain = np.where(jumps, 1.0, variance / (variance + 1)) * there
-            kept[:, i] = np.where(there & ~jumps, z, 0.0), gain, np.where(jumps, np.inf, spread)
-            offset = np.where(there, np.where(jumps, value, offset + gain * (value - offset)), offset)
-            variance = np.where(there, np.where(jumps, 1.0, gain), variance)
+            there, begun, far = np.isfinite(value), np.isfinite(variance), np.maximum(np.abs(way), _FEW_MM)
+            variance = variance + drift * np.abs(way)
+            spread, ahead = sd * np.sqrt(variance + 1), np.where(begun & there, value - offset, 0.0)
+            z, on = ahead / spread, np.where(way < 0, -ahead, ahead) / spread
+            follows = (1 - slips - _JUMPS) * np.exp(-(z**2) / 2) / (math.sqrt(2 * np.pi) * spread)
+            behind, before = ndtr(on + far / spread) - ndtr(on), ndtr(on) - ndtr(on - far / spread)
+            slipped = slips / far * (lost * behind + (1 - lost) * before)
+            whole = follows + slipped + _JUMPS / _WITHIN_MM
+            share = np.where(begun, follows / whole, 0.0)
+            cost -= np.where(there & begun, 2 * np.log(np.where(begun, whole, 1.0)), 0.0)
+            follow = np.where(begun, variance / (variance + 1), 1.0)
+            gain = (1 - share * (1 - follow)) * there
+            kept[:, i] = z * np.sqrt(share) * there, gain, spread / np.sqrt(np.maximum(share, 1e-12))
+            apart = share * (1 - share) * ((1 - follow) * ahead / sd) ** 2
+            offset = np.where(there, np.where(begun, offset + gain * ahead, value), offset)
+            variance = np.where(there, np.where(begun, gain + apart, 1.0), variance)
     innovation, gain, spread = np.moveaxis(kept, 1, -1)
     return Filtered(innovation, gain, spread, cost, offset)
 
@@ -139,7 +139,7 @@ class DriveFit:
         values: of `NAMES`.
         half_width: of their intervals of 95 %.
         free: which of them were fitted.
-        noise: standard deviation of a tip, mm, and drift, variance a mm of travel, in variances of a tip.
+        noise: of the tips.
         unit: what each episode counts to.
         left_out: what each unit costs, -2 log likelihood, by values that are fitted to all others.
     """
@@ -147,7 +147,7 @@ class DriveFit:
     values: Float[np.ndarray, "values"]
     half_width: Float[np.ndarray, "values"]
     free: Bool[np.ndarray, "values"]
-    noise: tuple[float, float]
+    noise: Noise
     unit: Int[np.ndarray, "episodes"]
     left_out: Float[np.ndarray, "units"]
 
@@ -171,27 +171,37 @@ def fit_drive(
     """
     free = np.array([k < 3 or name == layer for k, name in enumerate(NAMES)])
     free |= False if begin is None else begin.free
-    if begin is None:
-        values, noise = _best_of_grid(tracks.rows(np.unique(np.linspace(0, len(unit) - 1, 8).astype(int)))), _NOISE
-    else:
-        values, noise = begin.values, begin.noise
-    for _ in range(_SCANS):
-        for _ in range(_NEWTON_STEPS):
-            start = starts(tracks, values[None], noise)[0][0]
-            noise = fit_noise(tracks, values, start, noise)
-            before, values = values, _newton(tracks, values, start, noise, free)
-            if (np.abs(values - before) < 0.1 * _STEPS).all():
+    some, fits = np.unique(np.linspace(0, len(unit) - 1, 8).astype(int)), []
+    few = Tracks(Courses(*(array[some] for array in vars(tracks.courses).values())), tracks.abscissa[some])
+    for noise in _NOISES if begin is None else [begin.noise]:
+        values = _best_of_grid(few, noise) if begin is None else begin.values
+        for _ in range(_SCANS):
+            values, noise = _converged(tracks, values, noise, free)
+            scanned = np.repeat(values[None], len(_PLAYS) + 1, axis=0)
+            scanned[1:, 1] = _PLAYS
+            parts = np.array_split(scanned, len(scanned) // 4)  # at a time, for memory
+            best = int(np.argmin(np.concatenate([starts(tracks, part, noise)[1] for part in parts]).sum(axis=1)))
+            values = scanned[best]
+            if best == 0:
                 break
-        scanned = np.repeat(values[None], len(_PLAYS) + 1, axis=0)
-        scanned[1:, 1] = _PLAYS
-        few = np.array_split(scanned, len(scanned) // 4)  # at a time, for memory
-        best = int(np.argmin(np.concatenate([starts(tracks, some, noise)[1] for some in few]).sum(axis=1)))
-        values = scanned[best]
-        if best == 0:
-            break
+        fits.append((values, noise))
+    values, noise = min(fits, key=lambda fit: starts(tracks, fit[0][None], fit[1])[1].sum())
     found, slope = _sloped(tracks, values, starts(tracks, values[None], noise)[0][0], noise, free)
     half_width, left_out = _left_out(found, slope, unit)
     return DriveFit(values, half_width, free, noise, unit, left_out)
+
+
+def _converged(
+    tracks: Tracks, values: Float[np.ndarray, "values"], noise: Noise, free: Bool[np.ndarray, "values"]
+) -> tuple[Float[np.ndarray, "values"], Noise]:
+    """Return values and noise from which no step costs less."""
+    for _ in range(_NEWTON_STEPS):
+        start = starts(tracks, values[None], noise)[0][0]
+        noise = fit_noise(tracks, values, start, noise)
+        before, values = values, _newton(tracks, values, start, noise, free)
+        if (np.abs(values - before) < 0.1 * _STEPS).all():
+            break
+    return values, noise
 
 
 def _left_out(
@@ -213,24 +223,24 @@ def _left_out(
     return stdtrit(units - 1, 0.975) * np.sqrt(variance), cost
 
 
-def _best_of_grid(tracks: Tracks) -> Float[np.ndarray, "values"]:
+def _best_of_grid(tracks: Tracks, noise: Noise) -> Float[np.ndarray, "values"]:
     tried = np.array([(*row, 0.0, 0.0) for row in product(*_FIRST)])
     cost = np.full((len(tried), len(tracks.abscissa)), np.inf)
     for start in (-1.0, 0.0, 1.0):
         residual = tracks.abscissa - tracks.motion(tried, start)
-        cost = np.minimum(cost, filtered(residual, tracks.travel(0.1), *_NOISE).cost)
+        cost = np.minimum(cost, filtered(residual, tracks.travel(0.1), noise).cost)
     return tried[np.argmin(cost.sum(axis=1))]
 
 
 def starts(
-    tracks: Tracks, values: Float[np.ndarray, "candidates values"], noise: tuple[float, float]
+    tracks: Tracks, values: Float[np.ndarray, "candidates values"], noise: Noise
 ) -> tuple[Float[np.ndarray, "candidates episodes"], Float[np.ndarray, "candidates episodes"]]:
     """Return where in its play the device of each episode begins, of five places and then those between; its cost."""
     best, travel = np.zeros((len(values), len(tracks.abscissa))), tracks.travel(values[0, 2])
     for offsets in ((0.0, -1.0, -0.5, 0.5, 1.0), (0.0, -0.25, 0.25), (0.0, -0.125, 0.125), (0.0, -0.0625, 0.0625)):
         around = np.clip([best + step for step in offsets], -1.0, 1.0)
         moved = tracks.motion(np.tile(values, (len(offsets), 1)), np.concatenate(around))
-        cost = filtered(tracks.abscissa - moved, travel, *noise).cost.reshape(around.shape)
+        cost = filtered(tracks.abscissa - moved, travel, noise).cost.reshape(around.shape)
         chosen = np.argmin(cost, axis=0)[None]
         best, least = (np.take_along_axis(each, chosen, axis=0)[0] for each in (around, cost))
     return best, least
@@ -240,32 +250,33 @@ def fit_noise(
     tracks: Tracks,
     values: Float[np.ndarray, "values"],
     start: Float[np.ndarray, "episodes"],
-    noise: tuple[float, float],
-) -> tuple[float, float]:
+    noise: Noise,
+) -> Noise:
     """Return the likeliest noise of tips, mm, and drift of their offset, in variances of a tip a mm of travel."""
     residual, travel = tracks.abscissa - tracks.motion(values[None], start)[0], tracks.travel(values[2])
     for factor in (4.0, 2.0, 1.4, 1.2):
         sd = noise[0] * factor ** np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
         drift = np.clip(noise[1] * factor ** (2.0 * np.arange(-2, 3)), 1e-6, 1e3)
-        pairs = np.array(list(product(sd, drift)))
-        cost = filtered(residual[None], travel, pairs[:, :1], pairs[:, 1:]).cost.sum(axis=1)
-        noise = tuple(pairs[np.argmin(cost)].tolist())
+        slips = np.clip(noise[2] * factor ** np.array([-2.0, 0.0, 2.0]), 1e-4, 0.5)
+        tried = np.array(list(product(sd, drift, slips, noise[3:])))
+        cost = filtered(residual[None], travel, tuple(tried.T[..., None])).cost.sum(axis=1)
+        noise = tuple(tried[np.argmin(cost)].tolist())
     return noise
 
 
 def led(
     tracks: Tracks, robot: RobotConfig
-) -> tuple[Float[np.ndarray, "episodes tips"], Filtered, Float[np.ndarray, "episodes"], tuple[float, float]]:
+) -> tuple[Float[np.ndarray, "episodes tips"], Filtered, Float[np.ndarray, "episodes"], Noise]:
     """Return where a robot's drive alone leads tips after those that tracks have, Δtip, mm, with what made it so.
 
     That is the filter of the tips that were seen, where in its play each device begins, and the noise of the tips.
     """
     drive = robot.wire
     values = np.array([drive.gain_translation, drive.play_mm, robot.latency_s, 0.0, 0.0])
-    noise = fit_noise(tracks, values, starts(tracks, values[None], _USUAL_NOISE)[0][0], _USUAL_NOISE)
+    noise = fit_noise(tracks, values, starts(tracks, values[None], _NOISES[0])[0][0], _NOISES[0])
     begun = starts(tracks, values[None], noise)[0][0]
     motion = tracks.motion(values[None], begun)[0]
-    seen = filtered(tracks.abscissa - motion, tracks.travel(robot.latency_s), *noise)
+    seen = filtered(tracks.abscissa - motion, tracks.travel(robot.latency_s), noise)
     return motion + seen.offset[:, None], seen, begun, noise
 
 
@@ -273,7 +284,7 @@ def _sloped(
     tracks: Tracks,
     values: Float[np.ndarray, "values"],
     start: Float[np.ndarray, "episodes"],
-    noise: tuple[float, float],
+    noise: Noise,
     free: Bool[np.ndarray, "values"],
 ) -> tuple[Filtered, Float[np.ndarray, "episodes tips values"]]:
     """Return innovations and their slopes, jumps where they are, without what other starts in the play would do."""
@@ -283,7 +294,7 @@ def _sloped(
     residual = tracks.abscissa - tracks.motion(values[None], start)[0]
     slopes = -(tracks.motion(up, start) - tracks.motion(down, start)) / apart
     sides = [tracks.motion(values[None], np.clip(start + step, -1, 1))[0] for step in (-0.1, 0.1)]
-    found = filtered(residual, tracks.travel(values[2]), *noise)
+    found = filtered(residual, tracks.travel(values[2]), noise)
     columns = np.concatenate([slopes, [sides[1] - sides[0]]])
     white, offset = np.zeros_like(columns), np.zeros(columns.shape[:2])
     for i in range(columns.shape[2]):  # the filter, with jumps where they were
@@ -299,7 +310,7 @@ def _newton(
     tracks: Tracks,
     values: Float[np.ndarray, "values"],
     start: Float[np.ndarray, "episodes"],
-    noise: tuple[float, float],
+    noise: Noise,
     free: Bool[np.ndarray, "values"],
 ) -> Float[np.ndarray, "values"]:
     """Return values after a step of Gauss and Newton, as long as it costs less."""

@@ -1,24 +1,7 @@
 """What a robot logged: `RobotLog`, and its file, a table that a spreadsheet or any robot's own program writes.
 
-A CSV file with a row for each moment at which something was commanded, read or seen. A cell is empty where a row says
-nothing of its column. All lengths are mm, angles rad, times s, and forward and clockwise (for the operator) count
-positive. Columns of catheters begin with `catheter_1_` and `catheter_2_`.
-
-=================================================  =====================================================================
-columns                                            meaning
-=================================================  =====================================================================
-`time_s`                                           by one clock, never going back
-`translation_mm`, `rotation_rad`                   where the drive is sent, by its own count; it gets there by the next
-                                                   command
-`translation_mm_s`, `rotation_rad_s`               or with what velocity it is sent, until the next command
-`encoder_mm`, `encoder_rad`                        what the encoders read
-`force_n`, `torque_nmm`                            load of the drive: positive where it pushes, and turns clockwise
-`tip_x_mm`, `tip_y_mm`, `tip_z_mm`                 the wire's tip as it was seen, LPS
-`tip_column_px`, `tip_row_px`                      or the pixel that shows it, by the camera of `camera.yaml` beside it
-`episode`                                          whole number; another one wherever the device was moved by hand, or
-                                                   was reset: what is known of a position ends there. One if not given
-`flag`                                             0; another number where what was seen is not to be used
-=================================================  =====================================================================
+A CSV file with a row for each moment at which something was commanded, read or seen; docs/concepts/calibration.md lists
+its columns. A cell is empty where a row says nothing of its column.
 
 `Courses` is what a drive makes of the commands. A command moves the drive from where it is to the commanded position by
 the time of the next one, and it begins `latency` later. The device follows by `gain` and through the play, as in the

@@ -1,8 +1,7 @@
 """A robot at the other end of a TLS connection: the client of a drive.
 
-The drive stands still 200 ms after the caller's last command, whatever else this process does: a call alone moves the
-wire. A caller that thinks for longer finds a wire that has stopped, and its next command moves it again. `run` holds a
-command for longer, while the caller waits.
+The drive stands still 200 ms after the caller's last command: a call alone moves the wire. `run` holds a command for
+longer, while the caller waits.
 """
 
 from __future__ import annotations
