@@ -6,7 +6,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -174,7 +174,7 @@ class _Thread(threading.Thread):
     def __init__(self, work: Callable[..., object], budget: Budget) -> None:
         super().__init__(daemon=True)
         self._work, self._budget, self.ended, self.took_s = work, budget, False, 0.0
-        self.found: object | None = None
+        self.found: Any = None
         self.error: Exception | None = None
 
     def run(self) -> None:
@@ -194,5 +194,5 @@ class _Thread(threading.Thread):
         if threading.current_thread() is not self:
             self.join()
 
-    def _note(self, found: object) -> None:
+    def _note(self, found: Any) -> None:
         self.found = found
