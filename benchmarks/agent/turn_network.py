@@ -193,7 +193,8 @@ class Forks:
 
     def _try(self, place: float, waypoint: float) -> tuple[np.ndarray, Outcome]:
         """Turn the wire to all sides, and push it past a waypoint; return the azimuths, and what became of it."""
-        many, limit_n = self._many.copy_of(self._one), self._navigation.force_limit_n
+        many = self._many.copy_of(self._one, np.arange(self._one.wires))
+        limit_n = self._navigation.force_limit_n
         for _ in range(TURN_PERIODS):
             rotation = sides(TURNS) / (TURN_PERIODS * DECISION_PERIOD_S)
             many.still |= many.move(many.control(Move(WIRE, rotation=rotation)), force_n=limit_n)

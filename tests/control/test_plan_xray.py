@@ -46,7 +46,7 @@ def test_the_agents_wires_follow_the_plan_and_observe_its_tip(found, monkeypatch
     monkeypatch.setattr(Belief, "weigh", watched_weigh)
     monkeypatch.setattr(Belief, "follow", watched_follow)
     xray = plan_xray(found, calibration=calibration(abscissa=(5.0, 0.0, 0.0, 0.0)))  # wider than 2 mm from the start
-    assert due(xray) == list(range(3, 1 + len(found.control), 3))  # not sooner than 1.5 s after the last
+    assert due(xray) == list(range(2, 1 + len(found.control), 2))  # not sooner than 1 s after the last
     np.testing.assert_array_equal(observed, found.trajectory.tip_position[0, xray.exposure, 0])
     np.testing.assert_array_equal(followed, found.trajectory.proximal[0])
 
@@ -75,7 +75,7 @@ def test_it_is_written_beside_the_plan(found, vessel, tmp_path):
     assert (
         figures["xray_due_s"]
         == table.time_s[table.xray == 1].tolist()
-        == [1.5 * (k + 1) for k in range(len(figures["xray_due_s"]))]
+        == [1.0 * (k + 1) for k in range(len(figures["xray_due_s"]))]
     )
     assert figures["xray_due_s"]
     np.testing.assert_allclose(table[["band_tip_abscissa_mm", "band_tip_offset_mm"]], xray.half_width)

@@ -32,6 +32,9 @@ before; and so is what explains the images where none of the hypotheses is likel
 _GENERATIONS, _KINDS, _EACH, _VESSELS = 2, 16, 4, 3
 """Generations of members; kinds of wires in vessels in each, so many of each, and lumens and walls among them, which
 stay the same: making a lumen takes a second."""
+_MOST = 60_000_000
+"""Evaluations of nodes after which no other generation is driven: in an aorta one takes ten seconds of a core, and all
+that the second adds to the first is narrower intervals."""
 _SAME_LUMEN = 0.02
 """A lumen that differs by less is taken as given."""
 _NARROWEST = 0.1
@@ -68,6 +71,8 @@ def identify(belief: Belief, past: Past) -> tuple[Belief, Identified]:
     drawn = first = family.drawn(found.mean, np.eye(len(found.mean)), _KINDS, _EACH, vessels=_VESSELS)
     for generation in range(_GENERATIONS):
         if generation:
+            if belief.budget is not None and belief.budget.spent > _MOST:
+                break
             spread = np.diag(np.clip(2 * found.sd, _NARROWEST, 1.0))
             drawn = family.drawn(found.mean, spread, _KINDS, _EACH, vessels=_VESSELS, seed=generation)
             drawn[:, family.costly] = first[:, family.costly]

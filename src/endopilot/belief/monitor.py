@@ -153,9 +153,9 @@ class Monitor:
         return self.states.lost
 
     @property
-    def thinks(self) -> bool:
-        """Whether it seeks what explains the exposures: the devices rest as long, without X-ray."""
-        return self._thought is not None
+    def rests(self) -> bool:
+        """Whether devices rest, without X-ray, while it is sought what explains the last image: no wire does."""
+        return self._thought is not None and not self.belief.explains
 
     @property
     def alarm(self) -> bool:
@@ -192,14 +192,15 @@ class Monitor:
         back = self.belief.drives.proximal[0, 0] <= self._navigation.start_inserted_length_mm
         if exposure is not None:
             self._see(exposure, period, at)
-        told = exposure is not None or self.thinks
-        if self._thought is not None:
-            self._think(self._thought)
+        told, thought = exposure is not None, self._thought
+        if thought is not None:
+            self._think(thought)
+            told |= self._thought is None
         if told:
             at = predicted_tip(self.belief)
         explained = self.belief.explains if told else True
         event = Event.UNEXPLAINED if not explained else Event.DOUBTED if self.alarm else Event.TRUSTED
-        self.states.take(event if (told or back) and not self.thinks else None)
+        self.states.take(event if (told or back) and not self.rests else None)
         if watch is None:
             return BelievedTip(float(at.tip[0]), float(at.tip[1]), branch=int(self.belief.tip.branch[self.belief.best]))
         if self.seen is not None:
@@ -207,7 +208,7 @@ class Monitor:
         motion = _MOTION_SD_MM * (self.belief.motion is not None)
         changed = self.identified is not None or self.moves is not None or self.belief.drives.unknown
         pressed = self.load_ratio * float(self.belief.force[self.belief.best]) / self._navigation.force_limit_n
-        due = not self.thinks and watch.advise(
+        due = not self.rests and watch.advise(
             at, self.belief.play_spread() ** 2 + motion**2, changed=changed, pressed=pressed
         )
         return self._believed(watch, at.tip, due)

@@ -45,6 +45,7 @@ class Budget:
 
     Attributes:
         over: whether it is spent.
+        spent: evaluations of nodes that it took since it began.
     """
 
     def __init__(self, seconds: float = np.inf, evaluations: float | int = np.inf) -> None:
@@ -60,7 +61,7 @@ class Budget:
 
     def begin(self, granted: float = np.inf) -> None:
         """Begin anew; what is not granted has to be waited for."""
-        self.over, self._until, self._spent = False, np.inf, 0.0
+        self.over, self._until, self.spent = False, np.inf, 0.0
         self._granted, self._cancelled, self._ended = granted, False, False
 
     def spend(self, evaluations: float | int) -> None:
@@ -72,13 +73,13 @@ class Budget:
         """
         if np.isinf(self._until):
             self._until = time.thread_time() + self._seconds
-        self._spent += evaluations
-        if self._spent > self._evaluations or time.thread_time() > self._until:
+        self.spent += evaluations
+        if self.spent > self._evaluations or time.thread_time() > self._until:
             self.over = True
             raise OutOfBudgetError
         with self._turn:
             self._turn.notify_all()
-            self._turn.wait_for(lambda: self._spent < self._granted or self._cancelled)
+            self._turn.wait_for(lambda: self.spent < self._granted or self._cancelled)
             if self._cancelled:
                 raise CancelledError
 
@@ -95,7 +96,7 @@ class Budget:
         with self._turn:
             self._granted += evaluations
             self._turn.notify_all()
-            self._turn.wait_for(lambda: self._ended or self._spent >= self._granted, timeout=seconds)
+            self._turn.wait_for(lambda: self._ended or self.spent >= self._granted, timeout=seconds)
 
     def end(self) -> None:
         """Tell who waits that the work has ended."""

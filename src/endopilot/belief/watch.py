@@ -96,7 +96,7 @@ class Innovations:
             self._inside, self._needed = 0, 2
 
 
-_LUMEN_SHARE, _LUMEN_MM = 0.16, 0.4
+_LUMEN_SHARE, _LUMEN_MM = 0.12, 0.3
 """The lumen's radius may be off by this share, and no more than this, mm: CT shows it to a tenth or a voxel and blooms,
 an assumption."""
 _FREE_MM, _HELD_SHARE = 5.0, np.array([0.3, 0.05])

@@ -90,14 +90,14 @@ class _PlanningPolicy:
         """Follow the course, search another one, or pull back, as the module describes."""
         self._observe(observation)
         self._shows, lost = False, self.monitor.lost
-        if self.monitor.thinks:
+        if self.monitor.rests:
             wanted = self._follower.move([0.0 for _ in self.navigation.devices])
         else:
             wanted = self._pull_back() if lost else self._go_on(observation)
         self.belief.drives.sent(wanted)
         ends = self._failed >= self.config.tries and self._follower.course is None and not lost
         ends = ends and not self.monitor.may_return
-        expose = not self.monitor.thinks and (self._back_far_enough() if lost else self.wants_xray())
+        expose = not self.monitor.rests and (self._back_far_enough() if lost else self.wants_xray())
         return Decision(wanted, expose=expose, gives_up=self.halt if ends else "")
 
     def watch(self, observation: Observation) -> None:
@@ -155,7 +155,7 @@ class _PlanningPolicy:
             self.belief = monitor.belief
             self._begin_anew()
         self._limit_load()
-        if monitor.thinks or monitor.sought or (monitor.seen is not None and (before or monitor.lost)):
+        if monitor.rests or monitor.sought or (monitor.seen is not None and (before or monitor.lost)):
             self._forget()  # they lie otherwise than the course was searched for
         if monitor.seen is not None:
             self._back_mm = self.belief.drives.proximal[0, 0] - self._way_back(monitor.seen)
