@@ -44,15 +44,6 @@ def test_a_plan_reaches_its_target_and_counts_its_cost(found):
     assert {name: dearer[name] for name in terms if name != "tip"} == {n: v for n, v in terms.items() if n != "tip"}
 
 
-def test_cost_charges_what_is_unsafe():
-    cost = Cost()
-    charge = cost.running(
-        error=np.zeros(4), ratio=np.array([0.5, 1.0, 0.5, 0.5]), force_share=np.array([0, 0, 0.5, 1.0])
-    )
-    assert charge[0] == cost.time_weight and (np.diff(charge[[0, 1]]) > 0).all() and charge[0] < charge[2] < charge[3]
-    assert charge[3] > 10 * charge[2]  # near the limit no time that is saved outweighs it
-
-
 def test_a_written_plan_is_read_back_and_drives_the_simulator(found, vessel, tmp_path):
     figures = write_plan(found, output=tmp_path / "plan")
     assert figures["reached"] is True

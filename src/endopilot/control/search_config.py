@@ -9,9 +9,6 @@ from jaxtyping import Float
 
 from endopilot.settings import NonNegative, Positive, Seconds, Within, settings
 
-_OVERLOAD = 100.0
-"""What each share of the force limit beyond `forbidden_share` costs, mm/s."""
-Samples = Float[np.ndarray, "*n"]
 
 
 @settings
@@ -19,9 +16,9 @@ class Cost:
     """Weights of the cost of a navigation. One unit is one mm of tip error at the end.
 
     The cost of a control sequence is e_T + Σ_t c_t·h + w_smooth·Σ_t [ (Δv_t/v_max)² + (Δω_t/ω_max)² ] with
-    c = w_tip·e + w_ratio·max(0, ρ − ρ₀)² + w_force·f² + 100 max(0, f − f₀) + w_time: h is the sample period (s), e the
-    distance of the tip from where it is to be (mm), ρ = γ/(r − r_w) the safety ratio and ρ₀ the safe one, f the largest
-    wall force on a node over the limit and f₀ the forbidden share, v and ω the controls.
+    c = w_tip·e + w_ratio·max(0, ρ − ρ₀)² + w_force·f² + w_time: h is the sample period (s), e the distance of the tip from
+    where it is to be (mm), ρ = γ/(r − r_w) the safety ratio and ρ₀ the safe one, f the largest wall force on a node over
+    the limit, v and ω the controls.
     """
 
     tip_weight: NonNegative = 0.1
@@ -36,30 +33,10 @@ class Cost:
     """Time, mm/s."""
     smooth_weight: NonNegative = 0.05
     """Changes of the control, as a share of the drive's limits squared, mm."""
-    forbidden_share: NonNegative = 0.7
-    """Share of the force limit above which a path is not taken where there is another."""
-
-    def running(self, *, error: Samples, ratio: Samples, force_share: Samples | float = 0.0) -> Samples:
-        """Return what a second in some states costs, mm/s.
-
-        Args:
-            error: distance of the tip from where it is to be, mm.
-            ratio: safety ratio.
-            force_share: contact force over its limit; 0 where a model does not predict it.
-        """
-        excess = np.maximum(ratio - self.safe_ratio, 0.0)
-        overload = _OVERLOAD * np.maximum(np.asarray(force_share) - self.forbidden_share, 0.0)
-        return (
-            self.tip_weight * error
-            + self.ratio_weight * excess**2
-            + self.force_weight * np.square(force_share)
-            + overload
-            + self.time_weight
-        )
 
     def roughness(
         self, before: Float[np.ndarray, "*n 2"], after: Float[np.ndarray, "*n 2"], limits: Float[np.ndarray, "2"]
-    ) -> Samples:
+    ) -> Float[np.ndarray, "*n"]:
         """Return what a change from one control to the next costs, mm."""
         return self.smooth_weight * np.square((after - before) / limits).sum(axis=-1)
 
