@@ -16,7 +16,6 @@ from endopilot.control import plan as plan_module
 from endopilot.control.plan import plan, read_tips, within_limits
 from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan
-from endopilot.control.search_config import Cost
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
