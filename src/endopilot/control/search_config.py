@@ -16,8 +16,8 @@ class Cost:
 
     The cost of a control sequence is e_T + Σ_t c_t·h + w_smooth·Σ_t [ (Δv_t/v_max)² + (Δω_t/ω_max)² ] with
     c = w_tip·e + w_ratio·max(0, ρ − ρ₀)² + w_force·f² + w_time: h is the sample period (s), e the distance of the tip
-    from where it is to be (mm), ρ = γ/(r − r_w) the safety ratio and ρ₀ the safe one, f the largest wall force on a node
-    over the limit, v and ω the controls.
+    from where it is to be (mm), ρ = γ/(r − r_w) the safety ratio and ρ₀ the safe one, f the largest wall force
+    on a node over the limit, v and ω the controls.
     """
 
     tip_weight: NonNegative = 0.1
