@@ -13,8 +13,20 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import model_validator
 
-from endopilot.devices.device import Device, DeviceFile, Sourced, Wire, WireFile, check_built, file_constants
-from endopilot.devices.device_files import MOST_VALUES, ArcLength, Friction, Width, named_file
+from endopilot.devices.device import Device, Sourced, Wire, WireFile, check_built, file_constants
+from endopilot.devices.device_files import (
+    MOST_VALUES,
+    Abscissa,
+    ArcLength,
+    Force,
+    Friction,
+    Rotation,
+    Stiffness,
+    Torque,
+    Velocity,
+    Width,
+    named_file,
+)
 from endopilot.errors import InputError
 from endopilot.files import read_text, write_yaml
 from endopilot.settings import NonNegative, Positive, Text, Within, read_settings, settings
@@ -62,12 +74,26 @@ class _Shape:
 
 
 @settings
-class CatheterFile(DeviceFile):
-    """What a catheter's file holds; `Catheter` says what each constant means."""
+class CatheterFile:
+    """What a catheter's file holds; `Catheter` says what each constant means.
 
+    The order of the fields is part of the identity of tasks that hold a catheter.
+    """
+
+    name: Text
+    diameter_mm: Sourced[Width]
     inner_diameter_mm: Sourced[Width]
-    bore_friction: Sourced[Friction]
+    abscissa_mm: Sourced[tuple[Abscissa, ...]]
+    bend_stiffness_n_mm2: Sourced[tuple[Stiffness, ...]]
+    twist_stiffness_n_mm2: Sourced[tuple[Stiffness, ...]]
     shape: _Shape
+    friction: Sourced[Friction]
+    bore_friction: Sourced[Friction]
+    max_velocity_mm_s: Sourced[Velocity]
+    max_rotation_rad_s: Sourced[Rotation]
+    push_limit_n: Sourced[Force]
+    pull_limit_n: Sourced[Force]
+    torque_limit_n_mm: Sourced[Torque]
 
 
 def list_catheters() -> tuple[str, ...]:

@@ -231,8 +231,8 @@ class _Shaping(TipShaping):
 
 
 @settings
-class DeviceFile:
-    """What the files of wires and catheters hold; `Device` says what each constant means."""
+class WireFile:
+    """What a wire's file holds; `Wire` says what each constant means."""
 
     name: Text
     diameter_mm: Sourced[Width]
@@ -245,12 +245,6 @@ class DeviceFile:
     abscissa_mm: Sourced[tuple[Abscissa, ...]]
     bend_stiffness_n_mm2: Sourced[tuple[Stiffness, ...]]
     twist_stiffness_n_mm2: Sourced[tuple[Stiffness, ...]]
-
-
-@settings
-class WireFile(DeviceFile):
-    """What a wire's file holds."""
-
     tip_load_n: Sourced[TipLoad | None]
     tip_bend: _TipBend
     tip_shaping: _Shaping | None = None
