@@ -79,9 +79,11 @@ class CArm(Protocol):
 
     Attributes:
         known_motion: what is known of how the patient moves; an exposure takes it off.
+        registration_mm: the wire shows displaced by this, LPS mm.
     """
 
     known_motion: Motion | None
+    registration_mm: tuple[float, float, float]
 
     def expose(
         self, simulator: Simulator, inserted_length: float, random: np.random.Generator, *, time_s: float
