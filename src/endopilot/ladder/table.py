@@ -68,7 +68,7 @@ def shown_row(row: Mapping[str, Any]) -> dict[str, Any]:
     safe, *interval = (f"{100 * row[name]:.0f}" for name in ("safe_success", "safe_from", "safe_to"))
     figures = {"task": row["task"], "policy": row["policy"], "n": row["navigations"]}
     figures |= {"safe_%": safe, "95_%": "–".join(interval), "X-rays": row["exposures"], "force_N": row["peak_force_n"]}
-    figures |= {"time_s": row["seconds"], "decision_ms": row["decision_ms"], "p99_ms": row["p99_ms"]}
+    figures |= {"time_s": row["seconds"], "decide_ms": row["decision_ms"], "p99_ms": row["p99_ms"]}
     return figures | {"late_%": None if row["late"] is None else f"{100 * row['late']:.1f}"}
 
 
