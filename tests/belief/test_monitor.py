@@ -12,6 +12,7 @@ import pytest
 from endopilot.belief.identification import Identified
 from endopilot.belief.monitor import BelievedTip, Monitor
 from endopilot.belief.patient_motion import FoundMotion
+from endopilot.belief.thought import Pace
 from endopilot.belief.watch import ASSUMED_SD_MM, MISMATCH, Innovations
 from endopilot.control.agent_config import read_agent_calibration
 from endopilot.devices.robot import DriveConfig, RobotConfig
@@ -94,6 +95,28 @@ def test_a_deeper_ostium_is_noticed_and_identified(along_the_fork) -> None:
             held.append(bool(np.less_equal(off, np.add(believed.half_width, 4.0 * 0.5)).all()))
     assert found == pytest.approx(2.5, abs=0.5)
     assert np.mean(held) > 0.75
+
+
+class Paced(Rocks):
+    """The same, where each decision grants identification little."""
+
+    def start(self, navigation: Navigation, seed: int) -> None:
+        super().start(navigation, seed)
+        self.monitor = Monitor(navigation, read_agent_calibration("assumed", 1), pace=Pace(1_000_000))
+
+
+def test_identification_goes_on_over_decisions_and_its_belief_follows_what_came_meanwhile(along_the_fork) -> None:
+    shown, identified_s = (0.4, 1.1, -0.9), list[float]()
+    for kind in (Rocks, Paced):
+        for policy, loop in driven(along_the_fork, World(registration_mm=shown), kind=kind):
+            if policy.monitor.identified is not None:
+                identified_s.append(loop.time_s)
+                break
+    assert identified_s[1] > identified_s[0] + 1.0
+    belief, past = policy.monitor.belief, policy.monitor.past
+    np.testing.assert_allclose(belief.members[0].registered_mm(0.0)[1:], shown[1:], atol=0.5)
+    deep_mm = belief.simulator.inserted_length[belief.best, 0] - belief.ostium_mm[belief.best]
+    assert deep_mm == pytest.approx(past.proximal[-1][0, 0], abs=0.05)
 
 
 def test_a_wrong_registration_is_noticed_and_taken_off_what_x_ray_shows(along_the_fork) -> None:
