@@ -31,7 +31,7 @@ BLOCK = re.compile(
     r"|^<!-- (?P<mark>not run|until Ctrl-C|columns|picture)(?:: (?P<file>[^\n]*?))? -->\n(?P<next>(?:\|[^\n]*\n)*)",
     re.MULTILINE | re.DOTALL,
 )
-PICTURE_PIXELS, PICTURE_COLOURS = 1200, 64
+PICTURE_PIXELS, PICTURE_COLOURS = 1200, 256
 
 
 @dataclass(frozen=True)
