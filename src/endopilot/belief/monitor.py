@@ -278,9 +278,8 @@ class Monitor:
             if found.evidence < still.evidence + BETTER:
                 found, self.moves = still, None
             self.belief, self._returned = found, True
-            period = len(self.past.proximal) - 1
             if self.seen is not None:
-                self.seen = self.belief.in_vessel(self.past.exposures[period], period)
+                self.seen = self._last_seen()
 
     def _is_to_change(self) -> bool:
         """Return whether another belief is sought: the first does not explain the images, or no longer the last one."""
@@ -293,8 +292,12 @@ class Monitor:
         """Begin with another belief."""
         self._since, self._loads = 0, LoadRatio()
         self._innovations.renew(unknown=self.identified is not None and not self.identified.explains)
+        self.seen = self._last_seen()
+
+    def _last_seen(self) -> TipMeasurement:
+        """Return the last exposure, which may be some periods ago, as it is in the vessel that is believed now."""
         period, seen = list(self.past.exposures.items())[-1]
-        self.seen = self.belief.in_vessel(seen, period)
+        return self.belief.in_vessel(seen, period)
 
     def _may_move(self) -> bool:
         """Return whether a motion of the vessel may explain the exposures."""

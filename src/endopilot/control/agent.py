@@ -205,8 +205,9 @@ class _PlanningPolicy:
 
     def _go_on(self, observation: Observation) -> Proximals:
         """Return the velocities that lead to the next place of the course."""
-        arriving, waits = self.navigation.arriving, self._thought is not None
-        if self._off_course() or (self._follower.ended and not waits and not (self._follower.reached and arriving)):
+        arriving, follower = self.navigation.arriving, self._follower
+        over = follower.ended and self._thought is None and not (follower.reached and arriving)
+        if self._off_course() or over:
             self._plan(observation)
         if self._thought is not None:
             self._think(self._thought)
@@ -220,8 +221,7 @@ class _PlanningPolicy:
             left = along_mm / DECISION_PERIOD_S
             return self._follower.move([float(np.clip(left, -_WIRE_CREEP_MM_S, _WIRE_CREEP_MM_S))])
         if self._follower.ended:
-            another = self._thought is None and not self._search.draws
-            self._shows = another  # a look, before another search
+            self._shows = self._thought is None and not self._search.draws  # another look, before another search
             return ((0.0, 0.0),)
         wanted = self._follower.step()
         self._shows = self._follower.shows

@@ -7,7 +7,6 @@ believed it to be.
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -248,13 +247,9 @@ def drive(set_up: SetUp) -> PatientNavigation:
     )
     loop = NavigationLoop(navigation, policy, config=config, seed=set_up.config.seed, world=set_up.world)
     wires: list[Float[np.ndarray, "wires nodes 3"]] = []
-    decision_s: list[float] = []
     with progress(f"Navigating, {set_up.policy_name}", total=navigation.seconds) as advance:
         while loop.reason is None:
-            began = time.perf_counter()
-            loop.begin()
-            decision_s.append(time.perf_counter() - began)
-            loop.advance(DECISION_PERIOD_S)
+            loop.step()
             if loop.gives_up:
                 loop.stop()
             advance(DECISION_PERIOD_S, f"{loop.simulator.inserted_length[0, 0]:.0f} mm inserted")
@@ -276,7 +271,7 @@ def drive(set_up: SetUp) -> PatientNavigation:
         wires=tuple(wires) if wires else None,
         plans=getattr(policy, "plans", None),
         planning_s=getattr(policy, "planning_s", None),
-        decision_s=np.array(decision_s),
+        decision_s=np.array(loop.decision_s),
         proposal=propose_devices(navigation) if loop.gives_up and isinstance(policy, AgentPolicy) else "",
     )
 
