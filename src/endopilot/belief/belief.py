@@ -86,7 +86,6 @@ class BeliefConfig:
             time_step_s=self.time_step_s,
             tolerance_mm=fast.tolerance_mm,
             sample_tolerance_mm=fast.sample_tolerance_mm,
-            threads=1,
         )
 
 
@@ -180,7 +179,7 @@ class Belief:
         self.drives = drives or Drives(navigation.robot, navigation.start, fastest)
         self.ostium_mm = np.array([each.ostium_mm for each in self.members])
         self.vessels = vessels or SharedVessels(navigation.anatomy)
-        self.kinds, self.kind = self.vessels.kinds(navigation.stack, self.members)
+        self.kinds, self.kind = self.vessels.kinds(navigation.stack, self.members, budget)
         self._fans = Fans(self.kinds, self.navigation.known_motion, self._core)
         self.error, self.force = np.zeros((len(self.members), 2)), np.zeros(len(self.members))
         self._error_sd = self.error
@@ -330,7 +329,7 @@ class Belief:
             step = simulator.step(control, DECISION_PERIOD_S)
         self.force = step.contact_force_max
         if self.budget is not None:
-            self.budget.simulated(step, -(-simulator.worlds // len(self.kinds)))
+            self.budget.simulated(simulator, step)
         self.tip = simulator.project()[:, 0]
 
     def errors(

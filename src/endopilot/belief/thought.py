@@ -10,7 +10,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from endopilot.simulation.config import LANES
+from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
 
 Found = TypeVar("Found")
@@ -46,13 +46,14 @@ class Budget:
     Attributes:
         over: whether it is spent.
         spent: evaluations of nodes that it took since it began.
+        worked_s: time that it took since it began, s, less that in which it waited.
     """
 
     def __init__(self, seconds: float = np.inf, evaluations: float | int = np.inf) -> None:
         """Give a budget.
 
         Args:
-            seconds: processor time of this thread, s: wall time where nothing else takes the processor.
+            seconds: time at work, s.
             evaluations: of nodes (Newton's iterations times active nodes): by them alone the bits of a search repeat.
         """
         self._seconds, self._evaluations = seconds, evaluations
@@ -61,7 +62,7 @@ class Budget:
 
     def begin(self, granted: float = np.inf) -> None:
         """Begin anew; what is not granted has to be waited for."""
-        self.over, self._until, self.spent = False, np.inf, 0.0
+        self.over, self.spent, self.worked_s, self._resumed_s = False, 0.0, 0.0, time.perf_counter()
         self._granted, self._cancelled, self._ended = granted, False, False
 
     def spend(self, evaluations: float | int) -> None:
@@ -71,10 +72,9 @@ class Budget:
             OutOfBudgetError: nothing is left.
             CancelledError: nobody waits any more.
         """
-        if np.isinf(self._until):
-            self._until = time.thread_time() + self._seconds
+        self.worked_s += time.perf_counter() - self._resumed_s
         self.spent += evaluations
-        if self.spent > self._evaluations or time.thread_time() > self._until:
+        if self.spent > self._evaluations or self.worked_s > self._seconds:
             self.over = True
             raise OutOfBudgetError
         with self._turn:
@@ -82,14 +82,11 @@ class Budget:
             self._turn.wait_for(lambda: self.spent < self._granted or self._cancelled)
             if self._cancelled:
                 raise CancelledError
+        self._resumed_s = time.perf_counter()
 
-    def simulated(self, step: Step, alike: int) -> None:
-        """Take a step of the rod core off, of so many worlds of each vessel and stack.
-
-        Packs of `LANES` worlds may not be full; a node of a pair costs twice a wire's.
-        """
-        packed, devices = -(-alike // LANES) * LANES / alike, step.inserted_length.shape[1]
-        self.spend(devices * packed * float(step.node_iterations.sum()) + _CALL)
+    def simulated(self, simulator: Simulator, step: Step) -> None:
+        """Take a step of the rod core off."""
+        self.spend(simulator.evaluations(step) + _CALL)
 
     def grant(self, evaluations: float | int, seconds: float | None) -> None:
         """Let the work in another thread spend more, and wait until it has, or has ended, or some time is over, s."""
@@ -145,11 +142,6 @@ class Thought(Generic[Found]):
         """The answer as far as it is known; None if nothing of it is."""
         return self._thread.found
 
-    @property
-    def took_s(self) -> float:
-        """Processor time that it has taken once it has ended, s."""
-        return self._thread.took_s
-
     def wait(self) -> None:
         """Let it go on for a decision; what fails in it is raised here."""
         self._budget.grant(self._granted if self._seconds is None else np.inf, self._seconds)
@@ -167,26 +159,25 @@ class _Thread(threading.Thread):
     """The thread of a thought, which does not hold it.
 
     Attributes:
-        found, took_s: as those of the thought.
+        found: the answer as far as it is known.
         error: what the work raised.
         ended: whether it is over.
     """
 
     def __init__(self, work: Callable[..., object], budget: Budget) -> None:
         super().__init__(daemon=True)
-        self._work, self._budget, self.ended, self.took_s = work, budget, False, 0.0
+        self._work, self._budget, self.ended = work, budget, False
         self.found: Any = None
         self.error: Exception | None = None
 
     def run(self) -> None:
-        began_s = time.thread_time()
         try:
             self.found = self._work(self._note)
         except CancelledError:
             pass
         except Exception as error:  # raised where it is waited for
             self.error = error
-        self.took_s, self.ended = time.thread_time() - began_s, True
+        self.ended = True
         self._budget.end()
 
     def stop(self) -> None:

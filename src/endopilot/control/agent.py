@@ -47,7 +47,7 @@ class _PlanningPolicy:
 
     Attributes:
         plans: how often a course was searched.
-        planning_s: processor time that the searches took which have ended, s.
+        planning_s: time that the searches took which have ended, s, less that in which they waited.
     """
 
     def __init__(self, config: AgentConfig | None = None) -> None:
@@ -265,7 +265,7 @@ class _PlanningPolicy:
             self._follower.extend(course)
         if thought.busy:
             return
-        self._thought, self.planning_s = None, self.planning_s + thought.took_s
+        self._thought, self.planning_s = None, self.planning_s + self._search.budget.worked_s
         if not self.halt:
             self._failed = 0
         elif not (self._search.budget.over and course is not None and len(course.control)):  # that came on in its time
@@ -275,7 +275,7 @@ class _PlanningPolicy:
         """Follow no course, and search none."""
         if self._thought is not None:
             self._thought.stop()
-            self._thought, self.planning_s = None, self.planning_s + self._thought.took_s
+            self._thought, self.planning_s = None, self.planning_s + self._search.budget.worked_s
         self._follower.begin(None)
 
 

@@ -50,7 +50,7 @@ class AgentConfig:
     """Wall time that a decision waits for a search instead, s: the search goes on while the devices move. That is for
     real robots, since the bits of a navigation then hang on the machine's speed."""
     planning_s: Annotated[float, Within(0, 86_400, above_low=True)] | None = None
-    """Processor time after which a search ends likewise, s: then its bits hang on the machine's speed."""
+    """Time at work after which a search ends likewise, s: then its bits hang on the machine's speed."""
     most_exposures: Annotated[int, Within(1, 10**6)] = 40
     """Exposures that an agent which looks when its adviser asks may take; it gives up where it needs more."""
 

@@ -140,7 +140,7 @@ class PatientNavigation:
         wires: the wires that the policy held possible at the end of each period, the likeliest first: nodes from the
             tip on, LPS mm; None for a policy that does not tell.
         plans: how often the policy searched a course; None for one that does not count.
-        planning_s: processor time that its searches took, s; None likewise.
+        planning_s: time that its searches took, s; None likewise.
         decision_s: wall time that each decision took, s.
         proposal: shipped devices that a search brings to the target where the agent gave up; empty if there are none.
     """

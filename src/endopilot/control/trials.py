@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -244,9 +243,7 @@ class Trials:
         Raises:
             OutOfBudgetError: the search has spent its budget.
         """
-        step = drive_period(
-            self.simulator, np.tile(control, (self.wires, 1, 1)), partial(self._budget.simulated, alike=self.count)
-        )
+        step = drive_period(self.simulator, np.tile(control, (self.wires, 1, 1)), self._budget)
         self._seen = None
         proximal, tips = self._see()
         self.rows.append(Period(control, proximal, tips[:, WIRE], step.contact_force_max))
@@ -290,14 +287,14 @@ class Trials:
 def drive_period(
     simulator: Simulator,
     control: Float[np.ndarray, "worlds *devices 2"],
-    took: Callable[[Step], None] = lambda step: None,
+    budget: Budget | None = None,
 ) -> Step:
     """Drive all worlds for a decision period; a world that fails stays where it was.
 
     Args:
         simulator: of the wires.
         control: mm/s and rad/s of each wire, then of its catheters.
-        took: called with each part of the period.
+        budget: that each part of the period is taken off.
 
     Returns:
         The worlds at the end of the period, but with the largest `contact_force_max` within it.
@@ -305,5 +302,6 @@ def drive_period(
     steps = list[Step]()
     for _ in range(_LOOKS):
         steps.append(simulator.step(control, DECISION_PERIOD_S / _LOOKS))
-        took(steps[-1])
+        if budget is not None:
+            budget.simulated(simulator, steps[-1])
     return replace(steps[-1], contact_force_max=np.max([step.contact_force_max for step in steps], axis=0))

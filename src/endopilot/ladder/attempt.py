@@ -81,8 +81,8 @@ def navigation_seed(task: Task, place: int) -> int:
 def attempt(policy: str, navigation: Navigation, *, seed: int, terms: Terms | None = None) -> dict[str, Any]:
     """Let a policy drive a navigation, and return its figures, its course and its recording.
 
-    `decision_s` is the wall time that each decision took, s, and `planning_s`, where the policy searches, the processor
-    time of its searches. They are no figures: they differ from run to run.
+    `decision_s` is the wall time that each decision took, s, and `planning_s`, where the policy searches, the time
+    that its searches took. They are no figures: they differ from run to run.
 
     Args:
         seed: of encoder noise, detection errors and the policy.

@@ -23,7 +23,7 @@ def score(tasks: Sequence[Task], results: Mapping[str, Sequence[Mapping[str, Any
     `safe_from` to `safe_to` its 95 % interval over patients. `seconds` and `path_ratio` (the tip's path over the
     centerline) are medians of those that arrived, `peak_force_n` (N) that of all, `exposures` the mean. Rows of `agent`
     have `missed_events`, the share of events that X-ray did not show, of tasks with `near_mm` `near`, the share that
-    came so near, and of policies that search `planning_s`, the mean processor time of a navigation's searches, s.
+    came so near, and of policies that search `planning_s`, the mean time of a navigation's searches, s.
     """
     rows = [{"level": task.level, "task": task.name} | score_navigations(results[task.name]) for task in tasks]
     levels = {task.level: task.name for task in tasks}

@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -18,6 +19,7 @@ from numpy.typing import ArrayLike
 from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
+from endopilot.parallel import CORES
 from endopilot.progress import Advance
 from endopilot.settings import public
 from endopilot.simulation.checks import ROUNDING_MM, check_control, check_memory, check_travel, with_device_axis
@@ -32,6 +34,7 @@ from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 _DEEPEST_START = 0.8  # share of the longest path that a random start may lie at
 _LEAST_BYTES = 4000  # no world takes less memory; too many are refused before they are listed
+_AT_ONCE = ThreadPoolExecutor(CORES)  # steps groups of worlds side by side; no interrupt reaches its threads
 
 
 class Simulator(Readout):
@@ -211,7 +214,7 @@ class Simulator(Readout):
             raise InputError(f"duration_s: {duration_s}; give a positive number of seconds")
         array = self._checked(control, duration_s, sequence=False)
         steps = self.config.steps_of(duration_s)
-        result = self._run_all(array, duration_s / steps, steps)
+        result = self._run_all(array, duration_s / steps, steps, at_once=True)
         return Step(**{name: result[name][:, 0] for name in Step.__dataclass_fields__})
 
     def run(
@@ -271,6 +274,12 @@ class Simulator(Readout):
             vessel_to_laboratory=None if set_up.motion is None else self._placements(times),
             **recorded,
         )
+
+    def evaluations(self, step: Step) -> float:
+        """Return how many evaluations of nodes a step cost, those of lanes among them that waited for another world."""
+        of = [step.node_iterations[group.index] for group in self._groups]
+        packs = [max(-(-len(each) // LANES) * each.mean(), each.max()) for each in of]
+        return float(self._devices * LANES * sum(packs))
 
     @property
     def state(self) -> SimulatorState:
@@ -377,12 +386,12 @@ class Simulator(Readout):
         *,
         record_shape: bool = False,
         advance: Advance | None = None,
+        at_once: bool = False,
     ) -> dict[str, np.ndarray]:
-        """Step all worlds; from now on they are on their way."""
-        results = [
-            self._run(group, control[group.index], time_step, steps, shape=record_shape, advance=advance)
-            for group in self._groups
-        ]
+        """Step all worlds, their groups at once or one by one; from now on they are on their way."""
+        run = partial(self._run, time_step=time_step, steps=steps, shape=record_shape, advance=advance)
+        each = _AT_ONCE.map if at_once and len(self._groups) > 1 and self.config.threads != 1 else map
+        results = list(each(run, self._groups, [control[group.index] for group in self._groups]))
         if control.size and not np.isnan(self._set_up.initial).all():
             self._go_on_their_way()
         if record_shape:  # of the wires that were needed
