@@ -43,6 +43,7 @@ BENCHMARKS = {
     "wire-evidence": "imaging.wire_evidence:train_evidence",
     "agent-calibration": "agent.calibration:calibrate_agent",
     "agent-replanning": "agent.replanning:compare_replanning",
+    "agent-samplers": "agent.samplers:compare_samplers",
     "coronary-navigation": "agent.coronary_navigation:navigate_coronaries",
     "ladder-patients": "agent.ladder_patients:choose_patients",
     "xray-conditions": "agent.xray_conditions:drive_under_conditions",

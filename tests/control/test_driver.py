@@ -29,7 +29,7 @@ def drive(navigation: Navigation, row: Row, place: float, *, force_n: float = np
     )
     trials = Trials.of(navigation, belief.kinds, row.count, like=belief.simulator)
     trials.put(np.zeros(1, dtype=int), belief.simulator, np.ones(1))
-    motions = row.motions(20.0, 4.0, CONFIG, trials.devices, RANDOM, 0)
+    motions = row.motions(20.0, 4.0, CONFIG, trials.devices, RANDOM)
     limits = Limits(force_n=force_n, off_mm=3.0, slack_mm=15.0)
     return Driver(trials, motions, Goal(navigation, route, place), limits, CONFIG).run(periods)
 
@@ -99,24 +99,39 @@ def test_pressing_lagging_slack_and_time_cost(worse) -> None:
 
 def test_a_row_combines_places_leads_and_rotations() -> None:
     row = Row(at=(-1.0, 2.0), lead_mm=(-3.0, -15.0), turns=4)
-    made = row.motions(20.0, 5.0, CONFIG, 2, RANDOM, 0)
+    made = row.motions(20.0, 5.0, CONFIG, 2, RANDOM)
     assert row.count == len(made.at_mm) == 16
     assert sorted(set(made.at_mm)) == [15.0, 30.0] and np.array_equal(made.turn_rad[:4], sides(4))
     # A wire that is placed deep in its catheter stays there; one at its mouth leads all along.
     assert set(made.follow_mm[made.lead_mm == -15.0]) == {-15.0} and (made.follow_mm[made.lead_mm == -3.0] > 100).all()
 
 
-def test_motions_of_later_rounds_are_drawn_and_begin_where_devices_are() -> None:
-    row = Row(at=(-1.0,), back=(0.0, 2.0), turns=64, rounds=2)
-    first, later = (row.motions(20.0, 5.0, CONFIG, 1, np.random.default_rng(1), number) for number in (0, 1))
+def test_later_rounds_that_go_onward_are_drawn_anew_where_devices_are() -> None:
+    row, random = Row(at=(-1.0,), back=(0.0, 2.0), turns=64, rounds=2, onward=True), np.random.default_rng(1)
+    first = row.motions(20.0, 5.0, CONFIG, 1, random)
+    later = row.motions(20.0, 5.0, CONFIG, 1, random, first)
     assert (first.at_mm == 15.0).all() and np.isnan(later.at_mm).all()
     assert 0 <= later.back_mm.min() < 1.0 and 9.0 < later.back_mm.max() <= 10.0
     assert later.turn_rad.min() < -2.0 and later.turn_rad.max() > 2.0
 
 
+def test_later_rounds_are_drawn_near_the_best_and_some_anew() -> None:
+    row, random = Row(at=(-2.0, 2.0), back=(0.0, 2.0), turns=1000, rounds=2), np.random.default_rng(1)
+    first = row.motions(20.0, 5.0, CONFIG, 1, random)
+    placed = first.at_mm[~np.isnan(first.at_mm)]
+    assert 10.0 <= placed.min() < 10.5 and 29.5 < placed.max() <= 30.0 and 600 < len(placed) < 800
+    at, none = np.array([12.0]), np.zeros(1)
+    best = Motions(at, none, np.array([1.0]), np.array([5.0]), none, np.zeros((1, 1, 2)))
+    later = row.motions(20.0, 5.0, CONFIG, 1, random, best)
+    # Near: within two standard deviations, 7 % of the ranges 20 mm, 10 mm and a full turn.
+    near = (abs(later.at_mm - 12.0) < 2.8) & (abs(later.back_mm - 5.0) < 1.4) & (abs(later.turn_rad - 1.0) < 0.88)
+    assert near.mean() == pytest.approx(0.75 * 0.954**3, abs=0.05)
+    assert np.isnan(later.at_mm).mean() == pytest.approx(0.3 * 0.25, abs=0.03)
+
+
 def test_velocities_are_drawn_as_the_row_says() -> None:
     row = Row(turns=1000, draws=Draws(speeds=(-0.5, 1.0), spins=(-1.0, 0.0, 1.0)))
-    made = row.motions(20.0, 5.0, CONFIG, 2, np.random.default_rng(1), 0)
+    made = row.motions(20.0, 5.0, CONFIG, 2, np.random.default_rng(1))
     assert np.isnan(made.follow_mm).all() and not made.turn_rad.any()
     assert made.velocity[0].tolist() == [[CONFIG.speed_mm_s, 0.0], [0.0, 0.0]]
     assert set(made.velocity[:, WIRE, 0]) == {-5.0, 10.0} and set(made.velocity[:, WIRE, 1]) == {-7.0, 0.0, 7.0}

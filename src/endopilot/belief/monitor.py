@@ -242,7 +242,7 @@ class Monitor:
         thought.wait()
         if thought.busy:
             return
-        self._thought, found = None, thought.found
+        rested, self._thought, found = self.rests, None, thought.found
         if found is None:
             return
         found.belief.budget = None
@@ -255,6 +255,8 @@ class Monitor:
                 self._given = found.belief.members
         self.belief, self.identified, self.moves = found.belief, found.identified, found.moves
         self._renew()
+        if rested or self.seen is not None:  # they lie where they were seen
+            self.seen = self._last_seen()
 
     @property
     def may_return(self) -> bool:
@@ -292,7 +294,6 @@ class Monitor:
         """Begin with another belief."""
         self._since, self._loads = 0, LoadRatio()
         self._innovations.renew(unknown=self.identified is not None and not self.identified.explains)
-        self.seen = self._last_seen()
 
     def _last_seen(self) -> TipMeasurement:
         """Return the last exposure, which may be some periods ago, as it is in the vessel that is believed now."""

@@ -87,7 +87,7 @@ def rotations_that_enter(navigation: Navigation, device: Wire) -> Int[np.ndarray
         """Turn and push up to a waypoint, put all where the middle of those is that pass it; return how many do."""
         here, trials = float(route.progress(simulator.project()[:, 0])[0]), Trials(simulator, limits)
         straight = int(1.5 * max(waypoint - here, 0.0) / (config.speed_mm_s * DECISION_PERIOD_S))
-        motions = row.motions(waypoint, 0.0, config, 1, np.random.default_rng(0), 0)
+        motions = row.motions(waypoint, 0.0, config, 1, np.random.default_rng(0))
         goal, limit_n = Goal(navigation, route, waypoint), navigation.force_limit_n
         given_up = Repertoire.of(navigation, route, config, here).limits(row, route, here, waypoint, limit_n)
         outcome = Driver(trials, motions, goal, given_up, config).run(straight + _MORE_PERIODS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -24,6 +25,9 @@ _WITHDRAWN_MM = -10.0
 """A wire that is placed deeper in its catheter than this stays there; else it is pushed out first, mm."""
 _MOUTH_RADII = 1.4
 """Half the width of a branch's mouth, lumen radii."""
+_AS_IS, _ANEW, _NEAR = 0.3, 0.25, 0.07
+"""Shares of the motions that are drawn in which devices stay, or are not retracted, and of later ones that are drawn
+anew; and the standard deviation of others around the best, as a share of the range of what is drawn."""
 
 
 @settings
@@ -63,6 +67,9 @@ class Draws:
 class Row:
     """Motions that are tried at once: every place, lead and retraction with every rotation.
 
+    Where there are several rounds they are drawn instead: evenly at first, then around the best so far. Where a value
+    is drawn, its first and last are the ends.
+
     A *step* is half the width of a branch's mouth: 1.4 lumen radii at the obstacle, `SearchConfig.lead_mm` at least.
     The *obstacle* is the fork before the place that is to be passed, or where the first row came to.
     """
@@ -81,24 +88,23 @@ class Row:
     off_radii: NonNegative = 3.0
     """A tip that is so many radii of the route's lumen deep in another branch does not come back: in a wide fork it may
     seem to leave the route."""
-    slack_widths: NonNegative = 0.0
-    """Devices that were pushed so far and did not come forward fold, widths of the lumen; `Repertoire.slack_mm` if that
-    is more."""
     draws: Draws | None = None
     """Devices keep velocities that are drawn, as many as there are rotations; they are not turned before."""
     rounds: Annotated[int, Within(1, 1000)] = 1
-    """Motions one after another: the best go on, each with several others. Where there are more than one, rotations are
-    drawn at random, and retractions up to the last that is given."""
+    """Times that motions are tried."""
+    onward: bool = False
+    """Each round goes on where the best of the one before have led, instead of where the devices are."""
     agree: Share = 1.0
-    """Share of the wires, by weight, that is to pass the place; the others are no longer believed."""
+    """Share of the wires, by weight, that is to pass the place in the last round; in the first all have to. The others
+    are no longer believed."""
     force: Share = 1.0
     """Share of the force limit that a motion which is taken stays within, at most."""
 
     @property
     def count(self) -> int:
         """Number of motions."""
-        backs = 1 if self.rounds > 1 else len(self.back)
-        return self.turns * len(self.at or (0,)) * len(self.lead_mm) * backs * max(len(self.follow_mm), 1)
+        grid = len(self.at or (0,)) * len(self.lead_mm) * len(self.back) * max(len(self.follow_mm), 1)
+        return self.turns * (grid if self.rounds == 1 else 1)
 
     def motions(
         self,
@@ -107,7 +113,7 @@ class Row:
         config: SearchConfig,
         devices: int,
         random: np.random.Generator,
-        number: int,
+        best: Motions | None = None,
     ) -> Motions:
         """Return the motions, rotations next to each other.
 
@@ -117,24 +123,44 @@ class Row:
             config: speed.
             devices: of a stack.
             random: what is drawn from.
-            number: of the round, from 0 on.
+            best: of the rounds before; None in the first.
         """
-        leads = [(lead, lead if lead < _WITHDRAWN_MM else _ALL_ALONG_MM) for lead in self.lead_mm]
-        leads = list(product(self.lead_mm, self.follow_mm)) if self.follow_mm else leads
-        backs = self.back[-1:] if self.rounds > 1 else self.back
-        each = np.array([(at, *lead, back) for at in self.at or (np.nan,) for lead in leads for back in backs])
-        at, lead, follow, back = np.repeat(each, self.turns, axis=0).T
-        turn, velocity = np.tile(sides(self.turns), len(each)), np.zeros((len(at), devices, 2))
-        velocity[:, WIRE, 0] = config.speed_mm_s
+        lead, follow = np.zeros(self.turns), np.full(self.turns, _ALL_ALONG_MM)
         if self.rounds > 1:
-            turn, back = random.uniform(-np.pi, np.pi, len(at)), random.uniform(0.0, back)
-        if number:
-            at = np.full(len(at), np.nan)
+            at, turn, back = self._drawn(obstacle_mm, step_mm, random, best)
+        else:
+            leads = [(lead, lead if lead < _WITHDRAWN_MM else _ALL_ALONG_MM) for lead in self.lead_mm]
+            leads = list(product(self.lead_mm, self.follow_mm)) if self.follow_mm else leads
+            each = np.array([(at, *lead, back) for at in self.at or (np.nan,) for lead in leads for back in self.back])
+            at, lead, follow, back = np.repeat(each, self.turns, axis=0).T
+            at, back = np.maximum(obstacle_mm + at * step_mm, 0.0), back * step_mm
+            turn = np.tile(sides(self.turns), len(each)) if self.turns > 1 else np.zeros(len(at))
+        velocity = np.zeros((len(at), devices, 2))
+        velocity[:, WIRE, 0] = config.speed_mm_s
         if self.draws is not None:
             velocity, follow = self.draws.velocity(len(at), devices, config, random), np.full(len(at), np.nan)
-        if self.draws is not None or self.turns == 1:
             turn = np.zeros(len(at))
-        return Motions(np.maximum(obstacle_mm + at * step_mm, 0.0), lead, turn, back * step_mm, follow, velocity)
+        return Motions(at, lead, turn, back, follow, velocity)
+
+    def _drawn(
+        self, obstacle_mm: float, step_mm: float, random: np.random.Generator, best: Motions | None
+    ) -> tuple[Each, Each, Each]:
+        """Return places, rotations and retractions that are drawn: evenly, and most of later rounds near the best."""
+        count, ends = self.turns, np.array([(each[0], each[-1]) for each in (self.at or (np.nan,), self.back)])
+        turn = random.uniform(-np.pi, np.pi, count)
+        if self.onward:
+            at, back = np.full(count, ends[0, 0] if best is None else np.nan), random.uniform(0.0, ends[1, 1], count)
+            return np.maximum(obstacle_mm + at * step_mm, 0.0), turn, back * step_mm
+        drawn = ends[:, :1] + np.diff(ends) * random.random((2, count))
+        stays = random.random((2, count)) < _AS_IS
+        at = np.where(stays[0], np.nan, obstacle_mm + drawn[0] * step_mm)
+        back = np.where(stays[1], 0.0, drawn[1] * step_mm)
+        if best is not None:
+            chosen, anew = random.integers(0, len(best.at_mm), count), random.random(count) < _ANEW
+            off = _NEAR * np.append(np.diff(ends)[:, 0] * step_mm, 2 * np.pi)[:, None] * random.normal(size=(3, count))
+            near = np.stack([best.at_mm, best.back_mm, best.turn_rad])[:, chosen] + off
+            at, back, turn = np.where(anew, [at, back, turn], near)
+        return np.maximum(at, 0.0), turn, np.maximum(back, 0.0)
 
 
 @settings
@@ -144,36 +170,47 @@ class Repertoire:
     rows: tuple[Row, ...]
     """In the order in which they are tried; the first is straight on."""
     drawn: tuple[Row, ...] = ()
-    """Those that are tried where none of these passes."""
+    """Those that are drawn where none of these passes."""
     force: tuple[Share, ...] = (0.9, 1.0)
     """Shares of the force limit: where no row passes within one, the next will do."""
     slack_mm: Positive = 40.0
     """Devices that were pushed so far and did not come forward fold, mm."""
+    slack_widths: NonNegative = 0.0
+    """The same in widths of the lumen, where that is more."""
     agree: Share = 1.0
     """Share of the wires, by weight, that has to come to the target."""
 
     @staticmethod
-    def of(navigation: Navigation, route: Route, config: SearchConfig, here_mm: float) -> Repertoire:
-        """Return what is tried in a navigation, from a place of the route on, mm."""
+    def of(
+        navigation: Navigation, route: Route, config: SearchConfig, here_mm: float, table: Table | None = None
+    ) -> Repertoire:
+        """Return what is tried in a navigation, from a place of the route on, mm; the package's own table if no other
+        is given.
+        """
         if not navigation.catheters:
             kind = "wire in a wide lumen" if route.is_wide(route.target.abscissa) else "wire"
         elif config.together:
             kind = "soft pair in a narrow lumen" if here_mm >= route.narrow_from() else "soft pair"
         else:
             kind = "wire in a shaped catheter" if navigation.catheters[0].shape else "wire in a catheter"
-        return _table()[kind]
+        return (table or read_table())[kind]
 
     def limits(self, row: Row, route: Route, begun_mm: float, end_mm: float, force_n: float) -> Limits:
         """Return when trials of a row that lead from one place of the route to another, mm, are given up."""
         return Limits(
             force_n=force_n,
             off_mm=row.off_radii * float(route.radius(np.array([begun_mm, end_mm])).max()),
-            slack_mm=max(self.slack_mm, row.slack_widths * route.width_mm(end_mm)),
+            slack_mm=max(self.slack_mm, self.slack_widths * route.width_mm(end_mm)),
         )
 
 
+Table = Mapping[str, Repertoire]
+"""What is tried with each kind of stack in each kind of lumen."""
+
+
 @cache
-def _table() -> dict[str, Repertoire]:
+def read_table() -> Table:
+    """Return the package's own table."""
     return {kind: Repertoire(**record) for kind, record in read_yaml(_TABLE).items()}
 
 

@@ -13,14 +13,15 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from endopilot.belief.belief import Belief
 from endopilot.belief.thought import Budget, OutOfBudgetError
 from endopilot.control.course import Course, places_of
-from endopilot.control.drive import ROUNDING, Driver, Goal, Halt, Outcome
-from endopilot.control.repertoire import Repertoire, Row, stand_off
+from endopilot.control.drive import ROUNDING, Driver, Goal, Halt, Motions, Outcome
+from endopilot.control.repertoire import Repertoire, Row, Table, stand_off
 from endopilot.control.search_config import SearchConfig
 from endopilot.control.set_up import describe_halt
 from endopilot.control.trials import Trials
@@ -54,6 +55,7 @@ class Search:
         config: SearchConfig,
         seed: int,
         budget: Budget | None = None,
+        table: Table | None = None,
     ) -> None:
         """Lay out the trials.
 
@@ -64,6 +66,7 @@ class Search:
             config: settings of the search.
             seed: of what is drawn at random.
             budget: of each call of `find`; none if not given.
+            table: what is tried; the package's own if not given.
 
         Raises:
             InputError: there is more than one catheter.
@@ -71,7 +74,7 @@ class Search:
         check_devices(navigation)
         self._navigation, self.route, self.config = navigation, route, config
         self.budget = budget or Budget()
-        self._belief, self._trials = belief, dict[tuple[int, ...], Trials]()
+        self._belief, self._table, self._trials = belief, table, dict[tuple[int, ...], Trials]()
         self._course = self._new_trials(1, range(len(belief.kinds)))
         self._random = np.random.default_rng([seed, 0x5EA])
         self.halt = ""
@@ -83,7 +86,7 @@ class Search:
 
     @property
     def _repertoire(self) -> Repertoire:
-        return Repertoire.of(self._navigation, self.route, self.config, self._here)
+        return Repertoire.of(self._navigation, self.route, self.config, self._here, self._table)
 
     def _new_trials(self, count: int, wires: Iterable[int]) -> Trials:
         like, kinds = self._belief.simulator, self._belief.kinds
@@ -92,11 +95,11 @@ class Search:
     def _trials_of(self, row: Row) -> Trials:
         """Return the trials by which the motions of a row are driven.
 
-        A single motion is driven with all wires, and so are those that go on round by round, since few of them pass;
+        A single motion is driven with all wires, and so are those that go onward, since few of them pass;
         others with the likeliest few, and what passes is tried with all when it is followed.
         """
         course = self._course
-        few = course.wires if row.count == 1 or row.rounds > 1 else math.isqrt(course.wires)
+        few = course.wires if row.count == 1 or row.onward else math.isqrt(course.wires)
         wires = np.sort(np.argsort(-course.weight, kind="stable")[:few])
         key = (row.count, *wires.tolist())
         if key not in self._trials:
@@ -191,8 +194,9 @@ class Search:
                 if self._follow(tried[row], goal, row, min(row.force, share) * limit_n):
                     return None
         for row in repertoire.drawn:
-            for outcome in self._drive(row, goal):
-                if self._follow(outcome, goal, row, row.force * limit_n):
+            for number, outcome in enumerate(self._drive(row, goal)):
+                agree = row.agree if row.onward else 1 - (1 - row.agree) * number / (row.rounds - 1)
+                if self._follow(outcome, goal, replace(row, agree=agree), row.force * limit_n):
                     return None
         course.restore(self._kept)
         straight = tried[repertoire.rows[0]]
@@ -208,14 +212,22 @@ class Search:
         limit_n = self._navigation.force_limit_n
         limits = self._repertoire.limits(row, self.route, self._here, goal.at_mm, limit_n)
         periods = self._left if row.draws is None else min(row.draws.periods, self._left)
-        for number in range(row.rounds):
-            motions = row.motions(obstacle, step, self.config, trials.devices, self._random, number)
+        best, costs = None, np.empty(0)
+        for _ in range(row.rounds):
+            motions = row.motions(obstacle, step, self.config, trials.devices, self._random, best)
             outcome = Driver(trials, motions, goal, limits, self.config).run(
                 min(periods, self._left - len(trials.rows))
             )
             yield outcome
-            best = np.argsort(outcome.cost(limit_n))[:_KEEP]
-            trials.copy_trials(np.resize(best, trials.count))
+            cost = outcome.cost(limit_n)
+            if row.onward:
+                trials.copy_trials(np.resize(np.argsort(cost)[:_KEEP], trials.count))
+                best = motions
+                continue
+            tried = motions if best is None else Motions(*map(np.concatenate, zip(best, motions, strict=True)))
+            costs = np.concatenate([costs, cost])
+            kept = np.argsort(costs)[:_KEEP]
+            best, costs, trials = Motions(*(each[kept] for each in tried)), costs[kept], self._trials_of(row)
 
     def _follow(self, outcome: Outcome, goal: Goal, row: Row, force_n: float) -> bool:
         """Let the course do what the cheapest trial did; return whether it has passed the place, or come on, then."""
