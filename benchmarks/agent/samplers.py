@@ -9,6 +9,7 @@ method, with elites). `own`: the package's table.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from tyro.conf import Positional
@@ -21,7 +22,7 @@ from endopilot.control.repertoire import Repertoire, Row, Table, read_table
 from endopilot.control.search import Search
 from endopilot.ladder.attempt import navigation_seed
 from endopilot.progress import progress
-from endopilot.settings import Count
+from endopilot.settings import Count, Within
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.route import Route
 from endopilot.tasks.task import list_tasks
@@ -61,7 +62,7 @@ def compare_samplers(
     /,
     *,
     patients: Count = 4,
-    evaluations: Count = 300_000_000,
+    evaluations: Annotated[int, Within(1, 10**15)] = 300_000_000,
 ) -> None:
     """Search courses for navigations by three samplers, and print a table.
 

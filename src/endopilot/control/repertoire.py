@@ -26,8 +26,8 @@ _WITHDRAWN_MM = -10.0
 _MOUTH_RADII = 1.4
 """Half the width of a branch's mouth, lumen radii."""
 _AS_IS, _ANEW, _NEAR = 0.3, 0.25, 0.07
-"""Shares of the motions that are drawn in which devices stay, or are not retracted, and of later ones that are drawn
-anew; and the standard deviation of others around the best, as a share of the range of what is drawn."""
+"""Shares of the motions that are drawn in which devices stay, are not retracted, or not turned, and of later ones that
+are drawn anew; and the standard deviation of others around the best, as a share of the range of what is drawn."""
 
 
 @settings
@@ -152,9 +152,9 @@ class Row:
             at, back = np.full(count, ends[0, 0] if best is None else np.nan), random.uniform(0.0, ends[1, 1], count)
             return np.maximum(obstacle_mm + at * step_mm, 0.0), turn, back * step_mm
         drawn = ends[:, :1] + np.diff(ends) * random.random((2, count))
-        stays = random.random((2, count)) < _AS_IS
+        stays = random.random((3, count)) < _AS_IS
         at = np.where(stays[0], np.nan, obstacle_mm + drawn[0] * step_mm)
-        back = np.where(stays[1], 0.0, drawn[1] * step_mm)
+        back, turn = np.where(stays[1:], 0.0, [drawn[1] * step_mm, turn])
         if best is not None:
             chosen, anew = random.integers(0, len(best.at_mm), count), random.random(count) < _ANEW
             off = _NEAR * np.append(np.diff(ends)[:, 0] * step_mm, 2 * np.pi)[:, None] * random.normal(size=(3, count))
