@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from endopilot.belief.thought import Budget, OutOfBudgetError
+from endopilot.belief.vessels import SharedVessels
 from endopilot.control.agent import OraclePolicy
 from endopilot.navigation.loop import NavigationLoop
+from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation
 from toy_belief import QUICK
 
@@ -24,6 +26,14 @@ def test_seconds_or_evaluations_end_a_budget() -> None:
         assert budget.over
         budget.begin()
         assert not budget.over
+
+
+def test_another_lumen_is_taken_off_the_budget(side_branch) -> None:
+    """Making it takes as long as 0.3 evaluations for each point of its map; what is made already costs nothing."""
+    budget, vessels = Budget(), SharedVessels(side_branch.anatomy)
+    for members in ([World()], [World(), World(lumen_factor=1.1)], [World(lumen_factor=1.1)]):
+        vessels.kinds(side_branch.stack, members, budget)
+    assert budget.spent == pytest.approx(0.3 * vessels.of(World(lumen_factor=1.1)).distance_map.values.size)
 
 
 def test_a_search_ends_with_what_it_has(side_branch) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import doctest
 import re
 import signal
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -129,6 +130,27 @@ def test_equal_anatomies_and_devices_are_stepped_together(anatomy: Anatomy) -> N
     elsewhere.copy_worlds([2, 1], of=simulator)
     assert np.array_equal(elsewhere.position, simulator.position[[2, 1]])
     simulator.set_state(shared.state)
+
+
+def test_groups_that_are_stepped_side_by_side_do_the_same(anatomy: Anatomy) -> None:
+    """That is done where Ctrl-C does not reach: in any but the main thread."""
+    devices = [DEVICE, STIFF] * 9
+    alone, beside = (begun(Simulator(anatomy, devices), 18) for _ in "ab")
+    control = controls(1, 18)[0]
+    wanted = alone.step(control, PERIOD)
+    with ThreadPoolExecutor(1) as pool:
+        step = pool.submit(beside.step, control, PERIOD).result()
+    assert np.array_equal(step.tip_position, wanted.tip_position)
+    assert np.array_equal(step.node_iterations, wanted.node_iterations)
+
+
+def test_lanes_that_wait_for_a_slower_world_count_as_evaluations(anatomy: Anatomy) -> None:
+    """Nine alike fill two packs of eight lanes; where one does the most, the others wait for it."""
+    alike = begun(Simulator(anatomy, DEVICE, worlds=9), 9)
+    step = replace(alike.step(controls(1, 9)[0], PERIOD), node_iterations=np.full(9, 100.0))
+    assert alike.evaluations(step) == 2 * 8 * 100
+    slow = replace(step, node_iterations=np.array([1000.0, *[10.0] * 8]))
+    assert alike.evaluations(slow) == 8 * 1000
 
 
 def test_a_seed_draws_the_same_start_whatever_the_number_of_worlds(anatomy: Anatomy) -> None:

@@ -4,8 +4,8 @@ A wire alone is a stack of one. The course grows from place to place of the rout
 that the route takes at a fork; with a catheter, others lie between forks that are far apart. To pass a place, the rows
 of a table (`Repertoire`) are tried in order. All motions of a row are driven side by side, in a world for each wire
 that is held possible (`Driver`). One cost compares them (`Outcome.cost`), and one rule accepts: enough of the wires
-come past the place, and none presses harder than a share of the force limit. Where no row passes, motions are drawn at
-random: of each round the best go on, every one with several others.
+come past the place, and none presses harder than a share of the force limit. Where no row passes, motions are drawn
+round by round: each goes on from the best of the one before, or is drawn around the best so far.
 """
 
 from __future__ import annotations

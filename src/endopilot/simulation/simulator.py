@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import threading
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -34,7 +35,9 @@ from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 _DEEPEST_START = 0.8  # share of the longest path that a random start may lie at
 _LEAST_BYTES = 4000  # no world takes less memory; too many are refused before they are listed
-_AT_ONCE = ThreadPoolExecutor(CORES)  # steps groups of worlds side by side; no interrupt reaches its threads
+_AT_ONCE = ThreadPoolExecutor(
+    CORES
+)  # steps groups of worlds side by side, but for the main thread: Ctrl-C stops a step there
 
 
 class Simulator(Readout):
@@ -214,7 +217,7 @@ class Simulator(Readout):
             raise InputError(f"duration_s: {duration_s}; give a positive number of seconds")
         array = self._checked(control, duration_s, sequence=False)
         steps = self.config.steps_of(duration_s)
-        result = self._run_all(array, duration_s / steps, steps, at_once=True)
+        result = self._run_all(array, duration_s / steps, steps)
         return Step(**{name: result[name][:, 0] for name in Step.__dataclass_fields__})
 
     def run(
@@ -276,7 +279,13 @@ class Simulator(Readout):
         )
 
     def evaluations(self, step: Step) -> float:
-        """Return how many evaluations of nodes a step cost, those of lanes among them that waited for another world."""
+        """Return how many evaluations of nodes a step cost, those of lanes among them that waited for another world.
+
+        Example:
+            >>> step = simulator.step(np.zeros((4, 2)), 0.1)
+            >>> simulator.evaluations(step) >= step.node_iterations.sum()
+            True
+        """
         of = [step.node_iterations[group.index] for group in self._groups]
         packs = [max(-(-len(each) // LANES) * each.mean(), each.max()) for each in of]
         return float(self._devices * LANES * sum(packs))
@@ -386,11 +395,11 @@ class Simulator(Readout):
         *,
         record_shape: bool = False,
         advance: Advance | None = None,
-        at_once: bool = False,
     ) -> dict[str, np.ndarray]:
-        """Step all worlds, their groups at once or one by one; from now on they are on their way."""
+        """Step all worlds; from now on they are on their way."""
         run = partial(self._run, time_step=time_step, steps=steps, shape=record_shape, advance=advance)
-        each = _AT_ONCE.map if at_once and len(self._groups) > 1 and self.config.threads != 1 else map
+        one_by_one = self.config.threads == 1 or threading.current_thread() is threading.main_thread()
+        each = map if one_by_one or len(self._groups) == 1 else _AT_ONCE.map
         results = list(each(run, self._groups, [control[group.index] for group in self._groups]))
         if control.size and not np.isnan(self._set_up.initial).all():
             self._go_on_their_way()
