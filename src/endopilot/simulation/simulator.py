@@ -283,7 +283,7 @@ class Simulator(Readout):
 
         Example:
             >>> step = simulator.step(np.zeros((4, 2)), 0.1)
-            >>> simulator.evaluations(step) >= step.node_iterations.sum()
+            >>> bool(simulator.evaluations(step) >= step.node_iterations.sum())
             True
         """
         of = [step.node_iterations[group.index] for group in self._groups]
