@@ -131,26 +131,6 @@ def test_volumes_that_miss_the_ostium(enhanced, tmp_path, capsys):
         assert "seeds: the ostium first" in line or "the ostium is probably outside; give a CT" in line, line
 
 
-def test_methods_and_outputs_that_do_not_fit(few, tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    for file in few.iterdir():  # deep enough for what comes before the method: the slices are 9 mm in all
-        slice_ = pydicom.dcmread(file)
-        slice_.ImagePositionPatient[2] = 10.0 * float(slice_.ImagePositionPatient[2])
-        slice_.save_as(file)
-    for options, fragment in {
-        ("--method", "magic"): "choose from aorta, coronary, nnunet, totalsegmentator",
-        ("--method", "totalsegmentator"): "the program TotalSegmentator is not on the PATH",
-        ("--method", "nnunet"): "--options model=FOLDER",
-        ("--options", "model=x"): "no setting of method 'coronary'",
-        ("--method", "aorta"): "--seeds x y z",
-        ("--seeds", "0", "0", "900"): "lies outside the volume",
-        ("--series", "9"): "no series '9'",
-        ("--picture", "slices.jpeg2"): "slices.jpeg2: a picture is written as PNG",
-    }.items():
-        assert fragment in _refused(capsys, few, *options)
-    assert "unknown format" in refused(capsys, "segment", few, "-o", tmp_path / "mask.png")
-
-
 def test_a_mask_made_elsewhere_becomes_an_anatomy(tmp_path, capsys):
     """Without sidecar, in any format, DICOM-SEG among them; a first seed given later is the ostium."""
     pytest.importorskip("highdicom", reason="DICOM-SEG needs highdicom (the extra dicom-seg)")
