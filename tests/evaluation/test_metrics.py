@@ -23,39 +23,24 @@ from endopilot.report import tables
 NAN = np.nan
 
 
-def test_spans_hold_the_samples_after_the_given_states():
+def test_spans_hold_the_samples_after_the_given_states_as_far_as_a_prediction_reaches():
     spans = metrics.span_slices(90, 0.5)
     assert {name: (part.start, part.stop) for name, part in spans.items()} == {
         "0-10": (0, 20),  # the 20th prediction is 10 s after the last given state and still belongs here
         "10-30": (20, 60),
         "30-45": (60, 90),
     }
-
-
-def test_spans_that_a_short_prediction_does_not_reach_are_left_out():
     assert list(metrics.span_slices(25, 0.5)) == ["0-10", "10-30"]
     assert metrics.span_slices(25, 0.5)["10-30"].stop == 25
 
 
 def test_error_statistics_by_hand():
     found = metrics.error_statistics(np.array([[1.0, -1.0, NAN], [-3.0, 3.0, NAN]]))
-    assert found["mae"] == 2.0
-    assert found["sd"] == 1.0  # of |error| = 1, 1, 3, 3
-    assert found["median"] == 2.0
-    assert found["rmse"] == pytest.approx(np.sqrt(5.0))
-    assert found["bias"] == 0.0
-    assert found["count"] == 4
-
-
-def test_p95_is_the_quantile_of_the_absolute_error():
-    found = metrics.error_statistics(-np.arange(101.0)[None])
-    assert found["p95"] == pytest.approx(95.0)
-
-
-def test_no_sample_gives_none_and_not_zero():
-    found = metrics.error_statistics(np.full((2, 3), NAN))
-    assert found["count"] == 0
-    assert found["mae"] is None
+    expected = {"mae": 2.0, "sd": 1.0, "median": 2.0, "rmse": pytest.approx(np.sqrt(5.0)), "bias": 0.0, "count": 4}
+    assert found | expected == found  # of |error| = 1, 1, 3, 3
+    assert metrics.error_statistics(-np.arange(101.0)[None])["p95"] == pytest.approx(95.0)
+    none = metrics.error_statistics(np.full((2, 3), NAN))
+    assert none["count"] == 0 and none["mae"] is None
 
 
 def test_skill_by_hand():
@@ -64,13 +49,8 @@ def test_skill_by_hand():
     assert metrics.skill(np.array([[1.0, 1.0]]), baseline) == pytest.approx(0.5)
     assert metrics.skill(baseline, baseline) == pytest.approx(0.0)
     assert metrics.skill(np.array([[4.0, 4.0]]), baseline) == pytest.approx(-1.0)
-
-
-def test_skill_compares_only_samples_that_both_have():
+    # of the samples that both have; against a perfect baseline it is undefined
     assert metrics.skill(np.array([[1.0, NAN]]), np.array([[2.0, 50.0]])) == pytest.approx(0.5)
-
-
-def test_skill_against_a_perfect_baseline_is_undefined():
     assert metrics.skill(np.ones((1, 2)), np.zeros((1, 2))) is None
 
 
@@ -80,6 +60,7 @@ def test_bootstrap_draws_patients_not_samples():
     found = metrics.bootstrap_intervals(error, np.repeat([0, 1], 100), seed=0)
     assert found["mae"] == found["rmse"] == found["p95"] == (1.0, 3.0)
     assert found["sd"] == (0.0, 1.0)  # of ones and threes alike
+    assert metrics.bootstrap_intervals(np.ones((4, 5)), np.zeros(4, dtype=int), seed=0) is None  # of one patient
 
 
 def test_bootstrap_intervals_are_those_of_patients_put_together_again():
@@ -92,10 +73,6 @@ def test_bootstrap_intervals_are_those_of_patients_put_together_again():
     for name in ("mae", "sd", "rmse", "p95"):
         expected = np.quantile([one[name] for one in drawn], [0.025, 0.975])
         np.testing.assert_allclose(found[name], expected, rtol=0.1 if name == "p95" else 1e-9)
-
-
-def test_bootstrap_needs_two_patients():
-    assert metrics.bootstrap_intervals(np.ones((4, 5)), np.zeros(4, dtype=int), seed=0) is None
 
 
 def test_diverged_counts_sequences_once_and_lost_ones_too():
@@ -223,11 +200,8 @@ def test_the_generalisation_gap_is_new_patients_error_against_known_ones(results
     known, new = (np.abs(results[split].error("P4", "offset")[:, 20:60]).mean() for split in ("seen_test", "test"))
     assert gap["10-30"] == {"difference": pytest.approx(new - known), "ratio": pytest.approx(new / known)}
     assert list(gap) == ["0-10", "10-30", "30-45", "all"]
-
-
-def test_there_is_no_gap_without_both_kinds_of_patients(splits):
-    assert generalisation_gap({"test": splits["test"]}) == {}
-    assert generalisation_gap({"seen_test": splits["seen_test"]}) == {}
+    for kind, split in splits.items():  # there is none of one kind alone
+        assert generalisation_gap({kind: split}) == {}
 
 
 def test_drive_difference_table_holds_the_rmse_of_each_sequence(results):
