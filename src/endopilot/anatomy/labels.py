@@ -190,7 +190,7 @@ def dominance(tree: VesselTree) -> str | None:
     that ends long before the crux left; a left one with a posterior descending branch left-dominant, with a branch to
     the inferior wall balanced.
     """
-    used = {tree.section_names[index] for branch in tree.branches for index in np.unique(branch.section)}
+    used = set(tree.sections_present)
     if tree.section_names == RCA_SECTIONS:
         if not used & {"4", "16"}:
             return "left" if float(tree.longest_path().abscissa[-1]) < NEAREST_CRUX_MM else None
