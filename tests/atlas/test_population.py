@@ -20,7 +20,7 @@ from endopilot.atlas.branching import SidePlan, Vessel, lumens_collide, stenoses
 from endopilot.atlas.population import Population, population_of
 from endopilot.atlas.variation import TIGHTEST, Fork, bent, catheter_direction, drawn_from, ectasia, opened_fork
 
-COUNT = 24
+COUNT = 32
 COARSE = partial(distance_map_from_spheres, spacing_mm=3.0)
 """A wall where lines are what counts: a fine one takes most of the time."""
 REAL = {
