@@ -124,18 +124,15 @@ def test_a_recording_that_cannot_be_written_is_told(world, vessel, tmp_path):
         Recorder(tmp_path / "file" / "a.jsonl", world, Where(patient=vessel), 0)
 
 
-def test_a_session_of_an_older_version_says_which(tmp_path):
-    path = tmp_path / "x.cockpit.jsonl"
-    path.write_text('{"format": "endopilot cockpit 1", "version": "0.0.9"}\n')
-    with pytest.raises(InputError, match=r"a session of endopilot 0\.0\.9, whose loop differs; replay it with that"):
-        read_session(path)
+OLDER = '{"format": "endopilot cockpit 1", "version": "0.0.9"}\n'
 
 
-@pytest.mark.parametrize("text", ["", "{}\n", "nonsense\n", '{"format": "endopilot cockpit 2"}\n'])
-def test_what_is_no_session_is_told(tmp_path, text):
+@pytest.mark.parametrize("text", ["", "{}\n", "nonsense\n", '{"format": "endopilot cockpit 2"}\n', OLDER])
+def test_what_is_no_session_of_this_version_is_told(tmp_path, text):
     path = tmp_path / "x.cockpit.jsonl"
     path.write_text(text)
-    with pytest.raises(InputError, match="session"):
+    said = "a session of endopilot 0.0.9, whose loop differs; replay it with that" if text == OLDER else "session"
+    with pytest.raises(InputError, match=said):
         read_session(path)
 
 
@@ -252,17 +249,13 @@ def test_a_hand_takes_over_and_hands_back(driven):
     assert policy.seen[decisions].tip is not None
 
 
-def test_a_policy_that_fails_stops_the_wire(driven):
-    start(driven, "test_session:Broken")
-    drive(driven, until=lambda: driven.autopilot.status == "failed")
-    assert "no idea" in driven.autopilot.failure
-    assert driven.values(driven.world.snapshot())["command"] == (0.0, 0.0)
-
-
-def test_a_policy_that_gives_up_says_why(driven):
-    start(driven, "test_session:Hopeless")
-    drive(driven, until=lambda: driven.autopilot.status == "gave up")
-    assert "at the first fork" in driven.autopilot.values()["failure"]
+@pytest.mark.parametrize(
+    ("policy", "status", "why"), [("Broken", "failed", "no idea"), ("Hopeless", "gave up", "at the first fork")]
+)
+def test_a_policy_that_fails_or_gives_up_says_why_and_the_wire_stops(driven, policy, status, why):
+    start(driven, f"test_session:{policy}")
+    drive(driven, until=lambda: driven.autopilot.status == status)
+    assert why in driven.autopilot.values()["failure"]
     assert driven.values(driven.world.snapshot())["command"] == (0.0, 0.0)
 
 

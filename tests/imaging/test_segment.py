@@ -121,26 +121,16 @@ def test_a_method_says_whether_the_volume_must_hold_contrast(plain_method):
 
 
 @pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        (("below=3",), r"'below=3' is no setting of method 'plain_method:plain'; give above=…"),
-        (("above",), "'above' is no setting"),
-    ],
-)
-def test_a_setting_that_a_method_does_not_know_is_refused(plain_method, options, expected):
-    with pytest.raises(InputError, match=expected):
-        SegmentConfig(method=PLAIN, options=options)
-
-
-@pytest.mark.parametrize(
     ("values", "expected"),
     [
         ({"method": "magic"}, "method: 'magic'; choose from aorta, coronary, nnunet, totalsegmentator, or give MODULE"),
         ({"seeds": ((0.0, float("nan"), 0.0),)}, r"seeds\[0\]\[1\]: nan; give a finite number"),
         ({"options": ("device=cpu",)}, "no setting of method 'coronary'; leave --options out"),
+        ({"method": PLAIN, "options": ("below=3",)}, r"'below=3' is no setting of method '.*:plain'; give above=…"),
+        ({"method": PLAIN, "options": ("above",)}, "'above' is no setting"),
     ],
 )
-def test_a_bad_configuration_is_refused(values, expected):
+def test_a_bad_configuration_is_refused(plain_method, values, expected):
     with pytest.raises(InputError, match=expected):
         SegmentConfig(**values)
 
