@@ -1,8 +1,9 @@
-"""Results are written whole or not at all."""
+"""Atomic writes, hashes, manifests, and folders that runs claim."""
 
 from __future__ import annotations
 
 import errno
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from endopilot.errors import InputError
 from endopilot.files import input_hash, manifest, read_json, sha256, write_json, writing
+from endopilot.runs import claim, make_missing
 
 
 def test_a_finished_block_leaves_the_file_alone(tmp_path: Path) -> None:
@@ -81,3 +83,106 @@ def test_the_hash_of_a_folder_sees_every_file(tmp_path: Path) -> None:
     before = input_hash(folder)
     (folder / "2").write_text("c")
     assert input_hash(folder) != before
+
+
+@dataclass(frozen=True)
+class Settings:
+    seed: int = 1
+    shares: tuple[float, float] = (0.5, 0.5)
+
+
+def begin(folder: Path, **identity) -> None:
+    claim(folder, "endopilot test", **({"config": Settings(), "input": "a", "at": np.float64(2)} | identity))
+
+
+def test_the_same_run_may_go_on_and_its_record_stays(tmp_path):
+    folder = tmp_path / "deep" / "run"
+    begin(folder)
+    (folder / "result").write_text("whole")
+    before = (folder / "run.json").stat().st_mtime_ns
+    begin(folder)
+    assert (folder / "run.json").stat().st_mtime_ns == before
+    assert read_json(folder / "run.json") == {
+        "command": "endopilot test", "config": {"seed": 1, "shares": [0.5, 0.5]}, "input": "a", "at": 2.0,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"input": "b"}, "was begun with input = a, now it is b"),
+        ({"config": Settings(seed=2)}, r"was begun with config\.seed = 1, now it is 2"),
+        ({"more": 3}, "was begun with more = absent, now it is 3"),
+        ({"config": {"seed": 1}}, r"was begun with config\.shares = \[0\.5, 0\.5\], now it is absent"),
+        ({"input": "x" * 500}, f"now it is {'x' * 60}…; choose another folder, or remove this one$"),
+    ],
+)
+def test_another_run_is_refused_and_changes_nothing(tmp_path, change, message):
+    begin(tmp_path)
+    (tmp_path / "result").write_text("mine")
+    (tmp_path / ".part-1-half").write_text("of another process")
+    before = (tmp_path / "run.json").read_text()
+    with pytest.raises(InputError, match=message):
+        begin(tmp_path, **change)
+    assert (tmp_path / "run.json").read_text() == before
+    assert (tmp_path / ".part-1-half").exists()
+
+
+def test_another_command_is_refused(tmp_path):
+    begin(tmp_path)
+    (tmp_path / "result").write_text("mine")
+    with pytest.raises(InputError, match="was begun with command = endopilot test, now it is endopilot other"):
+        claim(tmp_path, "endopilot other", config=Settings(), input="a", at=2.0)
+
+
+def test_a_folder_without_results_goes_to_the_new_run(tmp_path):
+    begin(tmp_path)
+    (tmp_path / ".part-1-half").write_text("")
+    begin(tmp_path, input="b")
+    assert read_json(tmp_path / "run.json")["input"] == "b"
+    assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
+
+
+def test_a_folder_of_other_things_is_refused(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"is not empty and holds no run\.json; choose another folder"):
+        begin(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize("text", ["{", "[]"])
+def test_a_damaged_record_is_refused(tmp_path, text):
+    (tmp_path / "run.json").write_text(text)
+    (tmp_path / "result").write_text("mine")
+    with pytest.raises(InputError, match=str(tmp_path)):
+        begin(tmp_path)
+    assert (tmp_path / "run.json").read_text() == text
+
+
+def test_a_file_in_the_folder_s_place_is_refused(tmp_path):
+    (tmp_path / "run").write_text("")
+    with pytest.raises(InputError, match="cannot be written"):
+        begin(tmp_path / "run")
+
+
+def test_half_written_files_and_folders_of_a_killed_run_are_removed(tmp_path):
+    begin(tmp_path)
+    (tmp_path / "deep" / ".part-7-folder").mkdir(parents=True)
+    (tmp_path / "deep" / ".part-7-folder" / "a").write_text("half")
+    (tmp_path / "deep" / ".part-7-file").write_text("half")
+    begin(tmp_path)
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["deep", "run.json"]
+
+
+def make(path: Path) -> None:
+    if path.stem == "bad":
+        raise InputError("cannot be made; mend it")
+    path.write_text("new")
+
+
+def test_only_missing_files_are_made_and_a_bad_one_is_named(tmp_path):
+    paths = [tmp_path / f"{name}.json" for name in ("old", "bad", "fresh")]
+    paths[0].write_text("kept")
+    with pytest.raises(InputError, match=r"bad\.json: cannot be made; mend it"):
+        make_missing("Test", paths, make)
+    assert paths[0].read_text() == "kept" and paths[2].read_text() == "new" and not paths[1].exists()

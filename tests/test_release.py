@@ -1,4 +1,4 @@
-"""Version, changelog and citation agree, and the notes of a release come from the changelog."""
+"""What a release and the README say agrees with the package."""
 
 from __future__ import annotations
 
@@ -61,3 +61,15 @@ def test_a_release_that_does_not_agree_with_itself_is_refused(released, file, ol
     path.write_text(path.read_text(encoding="utf-8").replace(old, new))
     with pytest.raises(InputError, match=says):
         notes("2.0.0", folder=released)
+
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_it_is_short() -> None:
+    assert len(README.split()) <= 1250
+
+
+def test_its_table_is_that_of_the_pages() -> None:
+    table = README.split("<!-- stands:begin -->\n")[1].split("\n<!-- stands:end -->")[0]
+    assert table == runpy.run_path(str(ROOT / "docs/readme.py"))["stands"](), "run: python docs/readme.py"

@@ -1,10 +1,23 @@
-"""Frames along a line against the helix's closed forms."""
+"""Trees, their sections, the signed distance to the wall, and the catheter's axis."""
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
 
-from endopilot.anatomy.tree import parallel_transport, tangents
+import numpy as np
+import pytest
+from analytic_shapes import BEND_MM, forked_tree, mask_of, torus_distance, tree_distance
+from scipy.spatial.transform import Rotation
+
+from endopilot.anatomy.catheter_axis import lean_between, turned_axis
+from endopilot.anatomy.distance import add_catheter, distance_map_from_spheres, sample, smooth_union
+from endopilot.anatomy.labels import label_tree
+from endopilot.anatomy.tree import make_centerline, parallel_transport, tangents
+from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
+from endopilot.errors import InputError
+from endopilot.types import Branch, Insertion, VesselTree
+from endopilot.vessels.surface import surface_from_mask
+from endopilot.vessels.surface_distance import distance_map_from_surface
 
 A_MM, B_MM = 8.0, 2.0
 SPEED = np.hypot(A_MM, B_MM)
@@ -32,3 +45,107 @@ def test_tangents_are_exact_to_second_order_up_to_both_ends():
     angle, points = helix()
     exact = np.stack([-A_MM * np.sin(angle), A_MM * np.cos(angle), np.full(len(angle), B_MM)], axis=1) / SPEED
     assert np.linalg.norm(tangents(points) - exact, axis=1).max() < 2e-3
+
+
+@pytest.mark.parametrize("tilt_deg", [0.3, 20.0, 89.0, 120.0])
+@pytest.mark.parametrize("side_deg", [-170.0, -45.0, 0.0, 90.0, 179.0])
+def test_a_turned_axis_leans_by_its_angle_to_its_side(tilt_deg, side_deg) -> None:
+    random = np.random.default_rng(round(tilt_deg + side_deg) % 97)
+    axis = random.standard_normal(3)
+    axis /= np.linalg.norm(axis)
+    other = turned_axis(axis, tilt_deg, side_deg)
+    assert np.degrees(np.arccos(axis @ other)) == pytest.approx(tilt_deg, abs=1e-6)
+    assert lean_between(axis, other) == pytest.approx((tilt_deg, side_deg), abs=1e-6)
+
+
+def test_generic_names_count_generations():
+    assert label_tree(forked_tree(), "generic").section_names == ("G0", "G1.1", "G1.2")
+
+
+def test_a_tree_names_only_the_sections_that_it_has():
+    tree, _ = make_patient_tree(AtlasConfig(vessel="rca", count=1, seed=7), 0)
+    root = replace(tree, branches=tree.branches[:1])
+    assert len(tree.sections_present) > 1 and root.sections_present == ("1",)
+
+
+def grid_points(distance_map):
+    k, j, i = np.indices(distance_map.values.shape)
+    return distance_map.origin_mm + distance_map.spacing_mm * np.stack([i, j, k], axis=-1)
+
+
+def test_cone_has_its_exact_distance():
+    # max over τ of r₀ − sτ − √(ρ² + (z − τ)²), at z − τ = sρ/√(1 − s²), is r₀ − sz − ρ√(1 − s²).
+    length, first, slope = 30.0, 3.0, 0.05
+    z = np.linspace(0, length, 61)
+    centerline = make_centerline(np.outer(z, [0, 0, 1.0]), first - slope * z)
+    tree = VesselTree((Branch(centerline, -1, np.zeros(61, dtype=np.int64)),), ("v",))
+    found = distance_map_from_spheres(tree, spacing_mm=0.5)
+    points = grid_points(found)
+    rho = np.hypot(points[..., 0], points[..., 1])
+    exact = first - slope * points[..., 2] - rho * np.sqrt(1 - slope**2)
+    middle = (points[..., 2] > 5) & (points[..., 2] < 25) & (np.abs(exact) < 2)
+    assert np.abs(found.values - exact)[middle].max() < 1e-3
+
+
+def test_neighbouring_spheres_leave_no_scallops():
+    z = np.arange(0, 31, 1.5)
+    tree = VesselTree(
+        (Branch(make_centerline(np.outer(z, [0, 0, 1.0]), np.full(21, 1.0)), -1, np.zeros(21, int)),), ("v",)
+    )
+    found = distance_map_from_spheres(tree, spacing_mm=0.25)
+    on_wall = np.stack([np.ones(200), np.zeros(200), np.linspace(5, 25, 200)], axis=1)
+    assert np.abs(sample(found, on_wall)).max() < 0.02
+
+
+def test_fillet_widens_the_fork_and_nothing_else():
+    tree = forked_tree()
+    found = distance_map_from_spheres(tree, spacing_mm=0.8)
+    exact = np.maximum(tree_distance(tree, grid_points(found)), -2.5)
+    away = np.linalg.norm(grid_points(found) - [0, 0, 20], axis=-1) > 9.0
+    assert np.abs(found.values - exact)[away & (exact > -2)].max() < 0.02
+    assert (found.values - exact).min() > -0.02
+    assert 0.05 < (found.values - exact).max() < 0.5
+
+
+def test_smooth_union_does_not_bulge_where_tubes_carry_on():
+    x = np.arange(-10, 10.1, 0.5, dtype=np.float32)
+    tube = 3 - np.hypot(*np.meshgrid(x, x))[None].repeat(20, axis=0)
+    assert np.abs(smooth_union(tube, tube.copy(), spacing_mm=0.5, fillet_mm=1.0) - tube).max() < 1e-6
+
+
+@pytest.mark.parametrize("spacing", [(0.5, 0.5, 0.5), (0.45, 0.45, 0.6)])
+def test_mask_gives_a_sub_voxel_distance(spacing):
+    rotation = Rotation.from_rotvec([0.3, 0.2, 0.5]).as_matrix()
+    mask = mask_of(lambda p: torus_distance(p, 2.0), (25, 25, 9), spacing, rotation)
+    found = distance_map_from_surface(surface_from_mask(mask.volume), spacing_mm=0.5)
+    exact = torus_distance(grid_points(found), 2.0)
+    error = (found.values - exact)[np.abs(exact) < 2.0]
+    assert np.sqrt(np.mean(error**2)) < 0.1 * max(spacing)
+    assert abs(error.mean()) < 0.05 * min(spacing)
+
+
+def test_thin_vessel_of_one_voxel_radius_survives():
+    mask = mask_of(lambda p: torus_distance(p, 0.5), (23, 23, 2), (0.5, 0.5, 0.5))
+    found = distance_map_from_surface(surface_from_mask(mask.volume), spacing_mm=0.25)
+    angle = np.linspace(0, 2 * np.pi, 100)
+    axis = BEND_MM * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    assert sample(found, axis).min() > 0.1
+
+
+def test_catheter_opens_the_ostium():
+    tree = forked_tree()
+    insertion = Insertion(tree.branches[0].centerline.points[0], np.array([0.0, 0, 1]))
+    vessel = distance_map_from_spheres(tree, spacing_mm=0.4)
+    found = add_catheter(vessel, insertion, 1.2, 15.0)
+    axis = np.outer(np.linspace(-14, 5, 80), [0, 0, 1.0])
+    assert sample(found, axis).min() > 1.2 - 0.3
+    assert sample(vessel, axis[:20]).max() < 0
+    tube_wall = np.stack([np.full(40, 1.2), np.zeros(40), np.linspace(-13, -4, 40)], axis=1)
+    assert np.abs(sample(found, tube_wall)).max() < 0.05
+
+
+def test_catheter_refuses_nonsense():
+    tree = forked_tree()
+    vessel = distance_map_from_spheres(tree, spacing_mm=0.5)
+    with pytest.raises(InputError, match="radius -1"):
+        add_catheter(vessel, Insertion(np.zeros(3), np.array([0.0, 0, 1])), -1.0)

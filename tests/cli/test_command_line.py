@@ -1,16 +1,24 @@
-"""The command line: help, exit codes, one line for bad input."""
+"""How commands are called: options, help, files of options, and what a bad one is answered."""
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from tyro.conf import Positional
 
-from endopilot.cli import COMMANDS, GROUPS, main
-from endopilot.cli.arguments import show
+from endopilot.cli import COMMANDS, GROUPS, command_of, main
+from endopilot.cli.arguments import OutputFolder, show
+from endopilot.cli.options import LISTED, LISTED_AT_MOST, Command, Option
+from endopilot.errors import InputError
+from endopilot.files import read_yaml
+from endopilot.settings import Count, Positive, Seed, read_settings, settings
+from endopilot.simulation.trajectory import read_trajectory
 
 
 def run(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -124,3 +132,209 @@ def test_what_is_absent_is_shown_as_a_dash(capsys: pytest.CaptureFixture[str]) -
     assert [line.split() for line in capsys.readouterr().out.splitlines()] == [
         ["remarks", "-"], ["rejected", "-"], ["difference", "-"], ["count", "0"],
     ]  # fmt: skip
+
+
+EVERY = [command_of(name) for name in COMMANDS]
+ROOT = Path(__file__).parents[2]
+
+
+@settings
+class Weights:
+    """Weights."""
+
+    force: Positive = 8.0
+    """Of the force, mm/s."""
+    time: Positive = 1.0
+    """Of the time, mm/s."""
+
+
+@settings
+class SearchConfig:
+    """How to search."""
+
+    rounds: Count = 4
+    """Rounds."""
+    quick: bool = True
+    """Stop at the first success."""
+    weights: Weights = Weights(time=2.0)
+    """What is weighed."""
+
+
+FIVE_ROUNDS = SearchConfig(rounds=5)
+
+
+def search(
+    patient: Positional[Path],
+    /,
+    *,
+    output: OutputFolder,
+    points: tuple[tuple[float, float], ...] = (),
+    seed: Seed | None = None,
+    config: SearchConfig = FIVE_ROUNDS,
+) -> dict[str, object]:
+    """Search.
+
+    Args:
+        patient: where.
+        output: folder of the result.
+        points: pairs of numbers, in 100 % of the cases.
+        seed: of the search.
+        config: how.
+    """
+    return {"patient": patient, "output": output, "points": points, "seed": seed, "config": config}
+
+
+SEARCH = Command("endopilot search", search)
+
+
+def flags(text: str) -> list[str]:
+    return [line.split()[-1 if "," in line else 0] for line in text.splitlines() if line.startswith("  -")]
+
+
+def documented(command: Command) -> list[Option]:
+    return [leaf for one in command.options() for leaf in (one, *one.leaves())]
+
+
+@pytest.mark.parametrize("command", EVERY, ids=lambda command: command.name)
+def test_help_fits_a_head(command: Command) -> None:
+    listed, everything = (flags(command.help(everything=every)) for every in (False, True))
+    assert len(listed) <= LISTED_AT_MOST < 11 and set(listed) <= set(everything)
+    by_name = [leaf for one in command.options() for leaf in one.leaves() if not leaf.positional]
+    assert len(everything) == len(by_name) and len({leaf.name for leaf in by_name}) == len(by_name)
+    assert ("--help-all" in command.help(everything=False)) == (len(listed) < len(everything))
+
+
+def test_what_is_listed_are_options_of_commands_that_have_more() -> None:
+    for name, listed in LISTED.items():
+        command = command_of(name)
+        names = [leaf.name for one in command.options() for leaf in one.leaves() if not leaf.positional]
+        assert set(listed.split()) <= set(names) and len(names) > LISTED_AT_MOST
+
+
+@pytest.mark.parametrize("command", EVERY, ids=lambda command: command.name)
+def test_every_option_says_what_it_means(command: Command) -> None:
+    assert [one.name for one in documented(command) if not one.meaning.endswith((".", ")"))] == []
+
+
+@pytest.mark.parametrize("command", EVERY, ids=lambda command: command.name)
+def test_a_printed_file_is_read_back_the_same(command: Command, tmp_path) -> None:
+    file = tmp_path / "options.yaml"
+    file.write_text(command.file(), encoding="utf-8")
+    content = read_yaml(file)
+    assert set(content or ()) == {one.name for one in command.options() if not one.required}
+    if content:
+        assert read_settings(file, command.settings) == command.defaults
+        assert command.file(command.read(["--config", str(file), "--print-config"])) == command.file()
+
+
+def test_flags_win_over_the_file_which_wins_over_defaults(tmp_path) -> None:
+    file = tmp_path / "options.yaml"
+    file.write_text("output: out\nseed: 3\npoints: [[1, 2]]\nquick: false\nweights: {force: 9}\nrounds: 7\n")
+    read = SEARCH.read(["p", "--config", str(file), "--seed", "4"])
+    assert (read.output, read.points, read.seed, read.quick) == (Path("out"), ((1.0, 2.0),), 4, False)
+    assert (read.rounds, read.weights) == (7, Weights(force=9.0, time=2.0))
+    assert SEARCH.read(["p", f"--config={file}", "--quick", "--time", "5"]).weights == Weights(force=9.0, time=5.0)
+    assert SEARCH.read(["p", f"--config={file}", "--quick"]).quick
+    assert SEARCH.read(["p", "-o", "o"]) == SEARCH.settings(
+        patient=Path("p"), output=Path("o"), rounds=5, weights=Weights(time=2.0)
+    )
+
+
+def test_the_function_is_called_with_all_of_it(tmp_path, capsys) -> None:
+    file = tmp_path / "options.yaml"
+    file.write_text("patient: p\nweights: {force: 9}\n")
+    SEARCH.run(["-o", "o", "--config", str(file), "--points", "1", "-2", "3", "4", "--no-quick"])
+    shown = capsys.readouterr().out
+    assert "patient  p\n" in shown and "points   1, -2, 3, 4\n" in shown
+    assert "SearchConfig(rounds=5, quick=False, weights=Weights(force=9.0, time=2.0))" in shown
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("weights: {force: -1}", "options.yaml: weights.force: -1; give a positive number"),
+        ("weights: {forse: 1}", "options.yaml: weights.forse: no such field; did you mean force?"),
+        ("rouns: 1", "options.yaml: rouns: no such field; did you mean rounds?"),
+        ("weights: 1", "options.yaml: weights: 1; write it as {force: ..., time: ...}"),
+        ("seed: -1", "options.yaml: seed: -1; give a whole number from 0"),
+        ("quick: 3", "options.yaml: quick: 3; give true or false"),
+        ("- 1", "options.yaml: holds no mapping of fields"),
+        ("a: [", "options.yaml: line 2: not valid YAML"),
+        (None, "options.yaml: no such file; check the path"),
+    ],
+)
+def test_a_bad_file_is_refused_in_one_line(tmp_path, text, said) -> None:
+    file = tmp_path / "options.yaml"
+    if text is not None:
+        file.write_text(f"{text}\n")
+    with pytest.raises(InputError) as refused:
+        SEARCH.read(["p", "-o", "o", "--config", str(file)])
+    assert said in str(refused.value) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["p"], "Missing from endopilot search: -o DIR, --output DIR"),
+        (["-o", "o"], "Missing from endopilot search: PATIENT"),
+        (["p", "-o", "o", "--config"], "--config: names no file; give one"),
+        (["p", "-o", "o", "--force", "-1"], "force: -1.0; give a positive number"),
+    ],
+)
+def test_bad_flags_are_refused_in_one_line(arguments, said) -> None:
+    with pytest.raises(InputError) as refused:
+        SEARCH.read(arguments)
+    assert said in str(refused.value)
+
+
+def test_a_file_can_be_started_from_flags(tmp_path, capsys, monkeypatch) -> None:
+    """On a real command, through the command line: what is required may be left out, and flags are printed too."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as leaving:
+        main(["plan", "--tip-weight", "0.3", "--print-config"])
+    printed = capsys.readouterr().out
+    assert leaving.value.code == 0
+    assert (
+        "# Tip error before the end, 1/s.\n  tip_weight: 0.3\n" in printed and "# target: TEXT  (required)" in printed
+    )
+    Path("plan.yaml").write_text(printed)
+    again = command_of("plan").read(["patient", "--target", "4", "-o", "o", "--config", "plan.yaml"])
+    assert again.cost.tip_weight == 0.3 and again.target == "4"
+
+
+def test_the_page_is_made_of_the_commands() -> None:
+    spec = importlib.util.spec_from_file_location("commands_page", ROOT / "docs" / "commands.py")
+    assert spec and spec.loader
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    page = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    assert script.page() == page, "run `python docs/commands.py`"
+    for command in EVERY:
+        assert f"## {command.name}\n" in page
+        for one in documented(command):
+            assert one.group or f"| `{', '.join(one.flags)}` |" in page
+
+
+@pytest.mark.parametrize(("option", "deepest_mm"), [((), 35.0), (("--no-stop-short",), 39.0)])
+def test_random_navigations_stop_short_of_ends_unless_asked_otherwise(vessel, tmp_path, capsys, option, deepest_mm):
+    """The vessel ends at 40 mm, its branch too; a tip stops 5 mm before."""
+    options = ("--sequences", "3", "--seconds", "20", "--seed", "1", "--json")
+    with pytest.raises(SystemExit) as leaving:
+        main(["simulate", str(vessel), "-o", str(tmp_path / "run.csv"), *option, *options])
+    assert leaving.value.code == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["valid_worlds"] == 3
+    if not option:
+        assert figures["worlds_stopped_short"] > 0 and figures["deepest_tip_mm"] <= deepest_mm + 0.5
+    else:
+        assert "worlds_stopped_short" not in figures and figures["deepest_tip_mm"] >= deepest_mm
+
+
+def test_a_random_navigation_is_written_with_its_shapes(vessel, tmp_path, capsys):
+    options = ("--sequences", "1", "--seconds", "5", "--seed", "1", "--shape", "--json")
+    with pytest.raises(SystemExit) as leaving:
+        main(["simulate", str(vessel), "-o", str(tmp_path / "run.npz"), *options])
+    assert leaving.value.code == 0 and json.loads(capsys.readouterr().out)["worlds_stopped_short"] >= 0
+    made = read_trajectory(tmp_path / "run.npz")
+    assert made.shape is not None
+    np.testing.assert_array_equal(made.shape[:, :, 0], made.tip_position[:, :, 0])

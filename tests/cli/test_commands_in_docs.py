@@ -1,4 +1,4 @@
-"""Commands that README, docs and Makefile show: they are understood, and each option is one that the command knows."""
+"""What the docs say of commands, shipped things and messages is so."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import pytest
 import endopilot
 from endopilot.cli import command_of, main
 from endopilot.errors import InputError
+from endopilot.files import read_json
 
 ROOT = Path(__file__).parents[2]
 PAGES = ["README.md", "Makefile"]
@@ -96,3 +97,53 @@ def test_some_are_found() -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     assert sum(bool(OPTION.findall(rest)) for _, rest in COMMAND.findall(text)) > 3
     assert len(list(whole_commands("README.md"))) > 10
+
+
+PACKAGE = Path(endopilot.__file__).parent
+PAGE = (ROOT / "docs/concepts/shipped.md").read_text(encoding="utf-8")
+
+
+def test_every_file_of_data_has_a_card() -> None:
+    files = [
+        path for kind in ("*.json", "*.safetensors", "*.npz", "*.yaml", "*/vendor/*") for path in PACKAGE.rglob(kind)
+    ]
+    assert len(files) > 60
+    for path in files:
+        named = [path.relative_to(PACKAGE), *path.relative_to(PACKAGE).parents][:-1]
+        assert any(f"`{name}`" in PAGE for name in named), path
+
+
+def test_calibrations_are_of_as_many_patients_as_the_page_says() -> None:
+    for path in PACKAGE.rglob("xray.json"):
+        row = next(line for line in PAGE.splitlines() if line.startswith(f"| `{path.relative_to(PACKAGE)}`"))
+        calibration = read_json(path)
+        assert f"| {calibration['anatomies']}, {calibration['intervals']} |" in row
+
+
+TROUBLESHOOTING = ROOT / "docs/concepts/troubleshooting.md"
+
+
+def texts() -> str:
+    """Return all texts of the source, one a line, with `…` for what is put into them."""
+    found = []
+    for path in sorted(Path(endopilot.__file__).parent.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.JoinedStr):
+                parts = [part.value if isinstance(part, ast.Constant) else "…" for part in node.values]
+                found.append("".join(map(str, parts)))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.append(node.value)
+    return "\n".join(found)
+
+
+def test_lines_that_are_quoted_exist() -> None:
+    source, missing = texts(), []
+    rows = [
+        line.split(" | ")[0]
+        for line in TROUBLESHOOTING.read_text(encoding="utf-8").splitlines()
+        if line.startswith("| ")
+    ]
+    quoted = [text for row in rows for text in re.findall(r"`([^`]+)`", row)]
+    for text in quoted:
+        missing += [f"{part!r} of {text!r}" for part in re.split(r"\s*…\s*", text) if part not in source]
+    assert len(quoted) > 20 and not missing

@@ -1,15 +1,19 @@
-"""A session: the wire moves by messages, stops by itself, is counted and recorded, and replays to the bit."""
+"""A session: a hand that drives, and a policy that takes over."""
 
 from __future__ import annotations
+
+import time
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
 from endopilot.cockpit.frames import decode
-from endopilot.cockpit.messages import Contrast, Drive, Pedal, Target
+from endopilot.cockpit.messages import Autopilot, Contrast, Drive, Pedal, Target
 from endopilot.cockpit.recording import Recorder, read_session
-from endopilot.cockpit.session import HICCUP_S
+from endopilot.cockpit.session import AUTOPILOT_SILENCE_S, HICCUP_S, Session
 from endopilot.errors import InputError
+from endopilot.navigation.policy import BelievedTip, Decision
 
 
 def run(session, seconds, *, message=None, start=0.0):
@@ -120,16 +124,151 @@ def test_a_recording_that_cannot_be_written_is_told(world, vessel, tmp_path):
         Recorder(tmp_path / "file" / "a.jsonl", world, Where(patient=vessel), 0)
 
 
-def test_a_session_of_an_older_version_says_which(tmp_path):
-    path = tmp_path / "x.cockpit.jsonl"
-    path.write_text('{"format": "endopilot cockpit 1", "version": "0.0.9"}\n')
-    with pytest.raises(InputError, match=r"a session of endopilot 0\.0\.9, whose loop differs; replay it with that"):
-        read_session(path)
+OLDER = '{"format": "endopilot cockpit 1", "version": "0.0.9"}\n'
 
 
-@pytest.mark.parametrize("text", ["", "{}\n", "nonsense\n", '{"format": "endopilot cockpit 2"}\n'])
-def test_what_is_no_session_is_told(tmp_path, text):
+@pytest.mark.parametrize("text", ["", "{}\n", "nonsense\n", '{"format": "endopilot cockpit 2"}\n', OLDER])
+def test_what_is_no_session_of_this_version_is_told(tmp_path, text):
     path = tmp_path / "x.cockpit.jsonl"
     path.write_text(text)
-    with pytest.raises(InputError, match="session"):
+    said = "a session of endopilot 0.0.9, whose loop differs; replay it with that" if text == OLDER else "session"
+    with pytest.raises(InputError, match=said):
         read_session(path)
+
+
+POLICIES = (
+    "forward",
+    "test_session:Scripted",
+    "test_session:Broken",
+    "test_session:Slow",
+    "test_session:Hopeless",
+)
+
+
+class Scripted:
+    """Pushes, asks for X-ray at every third decision, and can be led."""
+
+    made: ClassVar[list] = []
+
+    def start(self, navigation, seed):
+        self.navigation, self.seen, self.watched = navigation, [], 0
+        Scripted.made.append(self)
+
+    def decide(self, observation):
+        self.seen.append(observation)
+        return Decision(((10.0, 0.0),), expose=len(self.seen) % 3 == 2)
+
+    def watch(self, observation):
+        self.watched += 1
+
+    def believed(self):
+        return BelievedTip(3.0, 0.1, (1.0, 0.2), asks="it is dark" if len(self.seen) % 3 == 2 else "")
+
+    def believed_wires(self):
+        import numpy as np
+
+        return np.zeros((2, 5, 3))
+
+
+class Broken(Scripted):
+    def decide(self, observation):
+        raise ValueError("no idea")
+
+
+class Hopeless(Scripted):
+    def decide(self, observation):
+        return Decision(((1.0, 0.0),), gives_up="at the first fork")
+
+
+class Slow(Scripted):
+    def decide(self, observation):
+        time.sleep(0.3)
+        return super().decide(observation)
+
+
+@pytest.fixture
+def driven(world, xray):
+    Scripted.made.clear()
+    made = Session(world, xray, None, POLICIES)
+    yield made
+    made.close()
+
+
+def drive(driven, *, until, most_s=20.0, alive=True):
+    """Let cycles pass until something holds; return all messages but images."""
+    sent, began = [], time.monotonic()
+    now = 0.0
+    while not until() and time.monotonic() - began < most_s:
+        now = time.monotonic() - began
+        if alive:
+            driven.handle(Drive(type="drive", translation=0.0, rotation=0.0), now)
+        sent += [decode(message)[0] for channel, message in driven.cycle(now) if not channel.startswith("image")]
+        time.sleep(0.0005)
+    assert until()
+    return sent
+
+
+def start(driven, name):
+    driven.handle(Autopilot(type="autopilot", action="start", policy=name), 0.0)
+
+
+def test_a_policy_reaches_the_target(driven):
+    start(driven, "test_session:Scripted")
+    sent = drive(driven, until=lambda: driven.autopilot.status == "reached")
+    assert abs(driven.world.snapshot().tip.abscissa[0] - driven.target.abscissa) <= 2.0
+    seen = Scripted.made[0].seen
+    assert [one.time_s for one in seen] == [0.5 * number for number in range(len(seen))]
+    # X-ray is on at the first decision, and at those that follow one that asked for it.
+    assert [one.tip is not None for one in seen] == [number == 0 or number % 3 == 2 for number in range(len(seen))]
+    assert driven.xray.frames == sum(one.tip is not None for one in seen)
+    assert any(header.get("autopilot", {}).get("asks") == "it is dark" for header in sent)
+    assert any(header["type"] == "belief" and header["wires_shown"] == 2 for header in sent)
+
+
+def test_time_stands_still_while_a_policy_thinks(driven):
+    start(driven, "test_session:Slow")
+    drive(driven, until=lambda: Scripted.made and len(Scripted.made[0].seen) == 2)
+    assert driven.world.cycle in (40, 41)  # 0.5 s; the decision may have been taken by now
+
+
+def test_a_hand_takes_over_and_hands_back(driven):
+    start(driven, "test_session:Scripted")
+    drive(driven, until=lambda: driven.world.time_s > 0.6)
+    driven.handle(Drive(type="drive", translation=-5.0, rotation=0.0), 0.0)
+    assert driven.autopilot.status == "watches"
+    policy, decisions = Scripted.made[0], len(Scripted.made[0].seen)
+    for number in range(90):
+        driven.handle(Drive(type="drive", translation=-5.0, rotation=0.0), number * 0.0125)
+        driven.cycle(number * 0.0125)
+        time.sleep(0.001)
+    assert driven.world.loop.robot.velocity[0, 0] == -5.0
+    assert policy.watched >= 1 and len(policy.seen) == decisions
+    start(driven, "test_session:Scripted")
+    drive(driven, until=lambda: len(policy.seen) > decisions)
+    assert Scripted.made == [policy]  # it was led, and goes on
+    assert policy.seen[decisions].tip is not None
+
+
+@pytest.mark.parametrize(
+    ("policy", "status", "why"), [("Broken", "failed", "no idea"), ("Hopeless", "gave up", "at the first fork")]
+)
+def test_a_policy_that_fails_or_gives_up_says_why_and_the_wire_stops(driven, policy, status, why):
+    start(driven, f"test_session:{policy}")
+    drive(driven, until=lambda: driven.autopilot.status == status)
+    assert why in driven.autopilot.values()["failure"]
+    assert driven.values(driven.world.snapshot())["command"] == (0.0, 0.0)
+
+
+def test_a_page_that_falls_silent_pauses_the_policy(driven):
+    start(driven, "test_session:Scripted")
+    drive(driven, until=lambda: driven.world.time_s > 0.3)
+    driven.cycle(100.0)
+    assert driven.autopilot.status == "paused"
+    for number in range(100):
+        driven.cycle(100.0 + AUTOPILOT_SILENCE_S + number)
+    assert driven.world.loop.robot.velocity[0, 0] == 0.0
+
+
+def test_a_page_cannot_name_a_module(driven):
+    with pytest.raises(InputError, match="choose from"):
+        start(driven, "os:system")

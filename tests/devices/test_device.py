@@ -1,5 +1,8 @@
+"""Wires, catheters and robots, and their files."""
+
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -7,10 +10,12 @@ import numpy as np
 import pytest
 
 import endopilot
+from endopilot.cli import main
 from endopilot.devices.catheter import read_catheter, write_device
 from endopilot.devices.device import Wire, read_wire
-from endopilot.devices.device_files import list_wires
-from endopilot.devices.stack import Stack
+from endopilot.devices.device_files import device_yaml, list_wires, user_devices
+from endopilot.devices.robot import DriveConfig, RobotConfig, list_robots, read_robot
+from endopilot.devices.stack import Stack, Transmission
 from endopilot.errors import InputError
 
 SHIPPED = Path(endopilot.__file__).parent / "devices/wires"
@@ -113,3 +118,137 @@ def test_a_stack_is_made_of_names() -> None:
     named, around = Stack.of("workhorse-014", "microcatheter-1.7f"), read_catheter("microcatheter-1.7f")
     assert named == Stack(read_wire("workhorse-014"), (around,)) == Stack.of(Stack.of("workhorse-014"), around)
     assert Stack.of(named) == named
+
+
+@pytest.fixture
+def folders(tmp_path, monkeypatch) -> tuple[Path, Path]:
+    """Return the folder of the user's configuration and that of the environment variable, a thick wire in each."""
+    own, named = tmp_path / "config" / "endopilot" / "devices", tmp_path / "lab"
+    for folder in (own, named):
+        folder.mkdir(parents=True)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    monkeypatch.setenv("ENDOPILOT_DEVICES", str(named))
+    for folder, name in ((own, "mine"), (named, "ours")):
+        text = device_yaml("workhorse-014")[1].replace("name: workhorse-014", f"name: {name}")
+        (folder / f"{name}.yaml").write_text(text.replace("value: 0.36", "value: 0.5"), encoding="utf-8")
+    return own, named
+
+
+def test_devices_in_both_folders_are_read_by_their_names(folders):
+    assert user_devices() == ("mine", "ours")
+    for name in ("mine", "ours"):
+        assert read_wire(name).diameter_mm == 0.5
+    assert "mine" not in list_wires()  # tasks and benchmarks use shipped devices alone
+    with pytest.raises(InputError, match=r"device 'theirs': no such device or file; .*workhorse-014, mine, ours"):
+        read_wire("theirs")
+
+
+def test_without_a_variable_the_folder_is_in_the_user_s_home(folders, tmp_path, monkeypatch):
+    monkeypatch.delenv("XDG_CONFIG_HOME")
+    monkeypatch.delenv("ENDOPILOT_DEVICES")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert user_devices() == ()
+    (tmp_path / "config").rename(tmp_path / ".config")
+    assert user_devices() == ("mine",)
+
+
+def test_the_same_folder_named_twice_is_one(folders, monkeypatch):
+    monkeypatch.setenv("ENDOPILOT_DEVICES", str(folders[0] / ".." / "devices"))
+    assert user_devices() == ("mine",) and read_wire("mine").diameter_mm == 0.5
+
+
+@pytest.mark.parametrize("name", ["ours", "workhorse-014"])
+def test_a_name_that_two_files_bear_is_refused(folders, name):
+    (folders[0] / f"{name}.yaml").write_text(device_yaml(name)[1], encoding="utf-8")
+    with pytest.raises(
+        InputError, match=f"device '{name}': .*{name}.yaml and .*{name}.yaml both hold it; rename yours"
+    ):
+        read_wire(name)
+    assert read_wire(folders[0] / f"{name}.yaml").name == name  # by its path it can be read
+    assert read_wire("mine").name == "mine"  # other names are not concerned
+
+
+def test_a_variable_that_names_no_folder_is_refused(folders, monkeypatch):
+    monkeypatch.setenv("ENDOPILOT_DEVICES", "/nowhere/devices")
+    with pytest.raises(InputError, match="ENDOPILOT_DEVICES=/nowhere/devices: no such folder"):
+        read_wire("workhorse-014")
+
+
+def test_the_command_lists_devices_with_their_origin(folders, capsys):
+    with pytest.raises(SystemExit) as leaving:
+        main(["devices", "--json"])
+    assert leaving.value.code == 0
+    rows = {row["name"]: row["origin"] for row in json.loads(capsys.readouterr().out)}
+    assert list(rows) == [*list_wires(), "mine", "ours"]
+    assert rows["j-035"] == "endopilot" and rows["ours"] == str(folders[1] / "ours.yaml")
+
+
+def test_a_robot_is_written_and_read_back(tmp_path) -> None:
+    robot = RobotConfig(
+        encoders_at="motor",
+        jitter_s=0.01,
+        wire=DriveConfig(gain_translation=1.03, play_mm=2.4, grip_n=0.3, transmission=Transmission(length_mm=900.0)),
+        catheters=(DriveConfig(play_rad=0.2), DriveConfig(grip_n_mm=0.1)),
+        sources=("play_mm: measured — 2,4 mm",),
+    )
+    robot.write(tmp_path / "robot.yaml")
+    assert read_robot(tmp_path / "robot.yaml") == robot
+    assert read_robot(str(tmp_path / "robot.yaml")) == robot
+
+
+def test_what_a_file_leaves_out_is_assumed(tmp_path) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_text("encoders_at: motor\nwire: {play_mm: 2.4}\n", encoding="utf-8")
+    expected = replace(RobotConfig(), encoders_at="motor", wire=replace(DriveConfig(), play_mm=2.4))
+    assert read_robot(path) == expected
+
+
+def test_the_robots_of_the_package() -> None:
+    robots = {name: read_robot(name) for name in list_robots()}
+    assert next(iter(robots)) == "assumed" and robots["assumed"] == RobotConfig()
+    ideal = robots.pop("ideal")
+    assert (ideal.latency_s, ideal.jitter_s, ideal.wire.play_mm, ideal.wire.play_rad) == (0, 0, 0, 0)
+    assert not ideal.of_drives(1, "encoder_sd_mm", "encoder_sd_rad", "load_sd_n", "load_sd_n_mm").any()
+    assert ideal.catheters == (ideal.wire,)
+    measured = {name: robot for name, robot in robots.items() if name != "assumed"}
+    assert all(robot.sources and robot.encoders_at == "motor" for robot in measured.values())
+    flat, deep = measured["kweon-2021-2d"].wire, measured["kweon-2021-3d"].wire
+    assert (flat.play_mm, deep.play_mm) == (2.6, 1.1)
+    assert all(wire.transmission.length_mm and not wire.play_rad for wire in (flat, deep))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("latency_s: 50", r"latency_s: 50; give a number from 0 to 10 s \(50 ms is 0\.05 s\)"),
+        ("encoders_at: gears", "encoders_at: 'gears'; choose from 'motor' or 'wire'"),
+        ("wire: {play_mm: -1}", "wire.play_mm: -1; give a number from 0 to 50 mm"),
+        ("wire: {play_rad: 324}", r"wire.play_rad: 324; give a number from 0 to 50 rad \(324 ° is 5\.655 rad\)"),
+        ("wire: {gain_translation: 101}", "wire.gain_translation: 101; give a number from 0.5 to 2"),
+        (
+            "wire: {transmission: {length_mm: 9000}}",
+            r"wire.transmission.length_mm: 9000; give a number from 0 to 3000 mm",
+        ),
+        ("wire: {backlash_mm: 1}", "wire.backlash_mm: no such field"),
+        ("catheters: []", r"catheters: \[\]; give at least one drive"),
+        ("catheters: [{grip_n: 0}]", r"catheters\[0\].grip_n: 0; give a positive number"),
+    ],
+)
+def test_a_fault_is_told_in_one_line(tmp_path, text, message) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_text(text + "\n", encoding="utf-8")
+    with pytest.raises(InputError, match=f"robot.yaml: {message}"):
+        read_robot(path)
+
+
+def test_a_name_that_is_none_is_refused_with_those_there_are() -> None:
+    with pytest.raises(InputError, match="robot 'corpath': no such robot or file; give a path, or choose from assumed"):
+        read_robot("corpath")
+
+
+def test_a_grip_weakens_a_device_and_never_strengthens_it() -> None:
+    wire = read_wire("workhorse-014")
+    assert DriveConfig().gripped(wire) is wire and DriveConfig(grip_n=9.0, grip_n_mm=9.0).gripped(wire) is wire
+    held = DriveConfig(grip_n=0.2, grip_n_mm=0.1).gripped(wire)
+    assert (held.push_limit_n, held.pull_limit_n, held.torque_limit_n_mm) == (0.2, 0.2, 0.1)
+    assert np.isclose(RobotConfig(latency_s=0.05).delayed(1.2).latency_s, 0.06)

@@ -4,63 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
-import SimpleITK as sitk
 from command import refused, run
 
 import endopilot
-from dicom_by_itk import write_dicom
 from endopilot.cli import main
-from endopilot.devices.device_files import device_yaml
 from endopilot.files import read_json
-from endopilot.imaging.volume import write_mask
-from endopilot.types import Insertion, LumenMask, Volume
-
-
-def write_image(array: np.ndarray, path: Path, *, vector: bool = False) -> Path:
-    sitk.WriteImage(sitk.GetImageFromArray(array, isVector=vector), str(path))
-    return path
-
-
-def write_slices(folder: Path, series: str, first: int) -> None:
-    image = sitk.GetImageFromArray(np.zeros((4, 8, 8), dtype=np.int16))
-    for k in range(4):
-        cut = image[:, :, k]
-        tags = {"0008|0060": "CT", "0020|000e": series, "0020|0013": str(k), "0008|0018": f"{series}.{k}"}
-        tags |= {"0020|0032": f"0\\0\\{k}", "0020|0037": "1\\0\\0\\0\\1\\0", "0028|1052": "-1024", "0028|1053": "1"}
-        for tag, value in tags.items():
-            cut.SetMetaData(tag, value)
-        write_dicom(cut, folder / f"{first + k}.dcm")
-
-
-def test_volumes(tmp_path, capsys):
-    series = tmp_path / "dicom"
-    series.mkdir()
-    write_slices(series, "1.2.3.1", 0)
-    write_slices(series, "1.2.3.2", 4)
-    four = write_image(np.zeros((3, 6, 6, 6), dtype=np.int16), tmp_path / "four.nii.gz")
-    colour = write_image(np.zeros((6, 6, 6, 3), dtype=np.uint8), tmp_path / "colour.nrrd", vector=True)
-    whole = write_image(np.arange(8000, dtype=np.int16).reshape(20, 20, 20), tmp_path / "whole.nii")
-    truncated = tmp_path / "truncated.nii"
-    truncated.write_bytes(whole.read_bytes()[:9000])
-    for volume, fragment in ((series, "series"), (four, "4"), (colour, "colour"), (truncated, "truncated")):
-        line = refused(capsys, "segment", volume, "-o", tmp_path / "mask.nii.gz")
-        assert volume.name in line and fragment in line.lower(), line
-        assert not list(tmp_path.glob("*mask*"))
-
-
-def test_masks(tmp_path, capsys):
-    grid = (np.ones(3), np.zeros(3), np.eye(3))
-    voxels = np.zeros((30, 30, 30), dtype=bool)
-    write_mask(LumenMask(Volume(voxels, *grid), None), tmp_path / "empty.nrrd", manifest={})
-    voxels[5:25, 10:14, 10:14] = voxels[5:9, 10:25, 10:14] = True
-    ostium = Insertion(np.array([200.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
-    write_mask(LumenMask(Volume(voxels, *grid), ostium), tmp_path / "far.nrrd", manifest={})
-    assert "empty" in refused(capsys, "anatomy", tmp_path / "empty.nrrd", "-o", tmp_path / "anatomy")
-    line = refused(capsys, "anatomy", tmp_path / "far.nrrd", "-o", tmp_path / "anatomy")
-    assert "ostium" in line and "mm" in line
-    assert not (tmp_path / "anatomy").exists()
 
 
 def test_wire_and_controls(tmp_path, capsys, right_artery):
@@ -77,19 +26,6 @@ def test_wire_and_controls(tmp_path, capsys, right_artery):
     assert "limit" in refused(capsys, "simulate", right_artery, *output, "--controls", tmp_path / "fast.csv")
     assert "sequences: 0; give" in refused(capsys, "simulate", right_artery, *output, "--sequences", "0")
     assert not (tmp_path / "rollout.parquet").exists()
-
-
-def test_devices(right_artery, tmp_path, capsys):
-    """A wire of one's own needs no code: it is read by its path; a bad one is refused by every command alike."""
-    main_line = "bend_stiffness_n_mm2.value[1]: -0.3; give a number from 0.0001 to 1000000 N·mm²"
-    text = device_yaml("workhorse-014")[1]
-    bad = tmp_path / "bad.yaml"
-    bad.write_text(text.replace("[0.30, 0.30", "[0.30, -0.30"))
-    for command in (("simulate", right_artery), ("dataset", right_artery), ("devices", bad)):
-        chosen = () if command[0] == "devices" else ("--device", bad, "-o", tmp_path / "out")
-        line = refused(capsys, *command, *chosen)
-        assert str(bad) in line and main_line in line, line
-        assert list(tmp_path.iterdir()) == [bad]
 
 
 def test_a_device_of_ones_own(right_artery, tmp_path, capsys):
@@ -133,6 +69,7 @@ def test_the_cockpits_catheters(right_artery, tmp_path, capsys):
         ("simulate {patient} --seed abc", "--seed: 'abc'; give a whole number"),
         ("simulate {patient} --sequences 2.5", "--sequences: '2.5'; give a whole number"),
         ("phantom {patient} --slice-mm thin", "--slice-mm: 'thin'; give a number"),
+        ("segment mask.nrrd --picture slices.jpeg2", "slices.jpeg2: a picture is written as PNG"),
         (
             "simulate {patient} --controls aside.csv",
             "aside.csv: row 1 holds one name and then numbers; exchange rows",

@@ -1,8 +1,13 @@
-"""Images at the command line: synthetic CT as DICOM, and bad ones, each refused in one line with nothing written."""
+"""Images at the command line: synthetic CT as DICOM, bad ones, and none of a patient's identifiers in any output."""
 
 from __future__ import annotations
 
+import gzip
+import logging
+import re
 import shutil
+import warnings
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +15,9 @@ import numpy as np
 import pydicom
 import pytest
 from command import refused, run
+from pydicom.datadict import DicomDictionary
+from pydicom.dataset import Dataset
+from pydicom.sequence import Sequence
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.imaging.volume import read_mask, read_volume, write_mask, write_volume
@@ -123,26 +131,6 @@ def test_volumes_that_miss_the_ostium(enhanced, tmp_path, capsys):
         assert "seeds: the ostium first" in line or "the ostium is probably outside; give a CT" in line, line
 
 
-def test_methods_and_outputs_that_do_not_fit(few, tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    for file in few.iterdir():  # deep enough for what comes before the method: the slices are 9 mm in all
-        slice_ = pydicom.dcmread(file)
-        slice_.ImagePositionPatient[2] = 10.0 * float(slice_.ImagePositionPatient[2])
-        slice_.save_as(file)
-    for options, fragment in {
-        ("--method", "magic"): "choose from aorta, coronary, nnunet, totalsegmentator",
-        ("--method", "totalsegmentator"): "the program TotalSegmentator is not on the PATH",
-        ("--method", "nnunet"): "--options model=FOLDER",
-        ("--options", "model=x"): "no setting of method 'coronary'",
-        ("--method", "aorta"): "--seeds x y z",
-        ("--seeds", "0", "0", "900"): "lies outside the volume",
-        ("--series", "9"): "no series '9'",
-        ("--picture", "slices.jpeg2"): "slices.jpeg2: a picture is written as PNG",
-    }.items():
-        assert fragment in _refused(capsys, few, *options)
-    assert "unknown format" in refused(capsys, "segment", few, "-o", tmp_path / "mask.png")
-
-
 def test_a_mask_made_elsewhere_becomes_an_anatomy(tmp_path, capsys):
     """Without sidecar, in any format, DICOM-SEG among them; a first seed given later is the ostium."""
     pytest.importorskip("highdicom", reason="DICOM-SEG needs highdicom (the extra dicom-seg)")
@@ -167,3 +155,126 @@ def test_a_mask_made_elsewhere_becomes_an_anatomy(tmp_path, capsys):
     assert "2 labels (1, 3)" in refused(capsys, "anatomy", tmp_path / "e.nrrd", "-o", tmp_path / "none")
     figures = run(capsys, "anatomy", tmp_path / "e.nrrd", "-o", tmp_path / "e-anatomy", "--label", "3", *start)
     assert 28 < figures["longest_path_mm"] < 40
+
+
+_MARKED = {
+    "PN": "Zq7Dœ^Zq7Jürgen",
+    "LO": "Zq7 Hospital",
+    "SH": "Zq7-4711",
+    "ST": "Zq7 street",
+    "LT": "Zq7 remarks",
+    "UT": "Zq7 report",
+    "UC": "Zq7 characters",
+    "UR": "https://zq7.example",
+    "AE": "ZQ7AE",
+    "CS": "ZQ7CS",
+    "DA": "19370517",
+    "DT": "19370517031742",
+    "TM": "031742.937",
+    "IS": "73193705",
+    "DS": "73.193705",
+    "UI": "1.2.9999.73.193705",
+}
+_MARKS = re.compile(
+    rb"zq7|z\0q\0007|19370517|1937-05-17|031742|03:17:42|73193705|73\.193705|1\.2\.9999\.73", re.IGNORECASE
+)
+_NEEDED = {
+    *("SOPClassUID", "Modality", "ImageType", "SeriesNumber", "ImagePositionPatient", "ImageOrientationPatient"),
+    *("RescaleSlope", "RescaleIntercept", "RescaleType", "SpecificCharacterSet", "NumberOfFrames"),
+}
+_SEEDS = ("--method", "aorta", "--seeds", "0", "0", "-50", "0", "0", "50")
+
+
+def _identified(header: Dataset) -> None:
+    """Fill a header with marks."""
+    header.SpecificCharacterSet = "ISO_IR 192"
+    for tag, (vr, _, _, retired, keyword) in DicomDictionary.items():
+        group = tag >> 16
+        if (
+            vr in _MARKED
+            and keyword
+            and keyword not in _NEEDED
+            and group not in (0x0000, 0x0002, 0x0028)
+            and not retired
+        ):
+            header.add_new(tag, vr, _MARKED[vr])
+    item = Dataset()
+    item.PatientName, item.RequestedProcedureID = _MARKED["PN"], _MARKED["SH"]
+    header.RequestAttributesSequence = header.OtherPatientIDsSequence = Sequence([item])
+    block = header.private_block(0x0029, "ZQ7 PRIVATE", create=True)
+    block.add_new(0x01, "LO", "Zq7 private")
+    block.add_new(0x02, "UN", b"Zq7 unknown")
+
+
+@pytest.fixture
+def case(tmp_path) -> Path:
+    """Return a folder of slices of a contrasted tube of 10 mm radius in muscle, their headers full of marks."""
+    voxels = np.full((26, 32, 32), 40, dtype=np.int16)
+    y, x = (np.mgrid[:32, :32] - 15.5) * 2.0
+    voxels[:, np.hypot(x, y) < 10.0] = 400
+    voxels[:, :2] = -100
+    folder = tmp_path / "case"
+    write_volume(Volume(voxels, np.array([2.0, 2.0, 5.0]), np.array([-31.0, -31.0, -63.0]), np.eye(3)), folder)
+    made = pydicom.dcmread(next(folder.iterdir()))
+    _identified(made)
+    identifying = {element.keyword for element in made} - _NEEDED
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for k, file in enumerate(sorted(folder.iterdir())):
+            slice_ = pydicom.dcmread(file)
+            for element in made:
+                if element.tag not in slice_ or (element.keyword in identifying and element.tag.group < 0x28):
+                    slice_[element.tag] = element
+            slice_.SOPInstanceUID = slice_.file_meta.MediaStorageSOPInstanceUID = f"{_MARKED['UI']}.{k}"
+            slice_.preamble = b"Zq7 preamble".ljust(128, b"\0")
+            slice_.save_as(file)
+    return folder
+
+
+def _content(file: Path) -> bytes:
+    """Return all that a file holds, packed parts unpacked."""
+    content = file.read_bytes()
+    if file.suffix == ".gz":
+        return gzip.decompress(content)
+    if file.suffix == ".nrrd":
+        head, _, body = content.partition(b"\n\n")
+        return head + zlib.decompress(body, wbits=47)
+    if file.suffix == ".parquet":
+        import pandas as pd
+
+        return content + pd.read_parquet(file).to_csv().encode()
+    return content
+
+
+def test_a_header_full_of_identifiers_leaves_no_trace(case, tmp_path, capfd, caplog):
+    pytest.importorskip("highdicom", reason="DICOM-SEG needs highdicom (the extra dicom-seg)")
+    assert all(len(_MARKS.findall(file.read_bytes())) > 1000 for file in case.iterdir())
+    out, told, said = tmp_path / "out", [], []
+
+    def command(*arguments: str | Path) -> None:
+        said.append(str(run(capfd, *arguments)))
+
+    with warnings.catch_warnings(record=True) as warned, caplog.at_level(logging.DEBUG):
+        warnings.simplefilter("always")
+        command("segment", case, "-o", out / "mask.nii.gz", "--picture", out / "mask.png", *_SEEDS)
+        command("segment", case / "slice-0003.dcm", "-o", out / "seg.dcm", *_SEEDS)
+        command("anatomy", out / "mask.nii.gz", "-o", out / "anatomy")
+        command("simulate", out / "anatomy", "-o", out / "rollout.parquet", "--sequences", "1", "--seconds", "1")
+        file = sorted(case.iterdir())[5]
+        content = file.read_bytes()
+        for bad in (
+            content[:-900],
+            content.replace(b"2.0\\2.0 ", b"Zq7^Zq7 "),
+            content[: len(content) // 3],
+        ):
+            file.write_bytes(bad)
+            told.append(refused(capfd, "segment", case, "-o", out / "other.nii.gz", *_SEEDS))
+    assert "truncated" in told[0] and "damaged" in told[1] and all("slice" in line for line in told)
+    files = [path for path in out.rglob("*") if path.is_file()]
+    assert {"mask.nii.gz", "mask.json", "mask.png", "seg.dcm", "anatomy.json", "rollout.parquet"} <= {
+        f.name for f in files
+    }
+    for path in files:
+        assert not _MARKS.search(_content(path)), path
+    for text in (*told, *said, *map(str, files), caplog.text, *(str(w.message) for w in warned), *capfd.readouterr()):
+        assert not _MARKS.search(text.encode()), text

@@ -1,9 +1,10 @@
-"""What a command may write: nothing of the user's is replaced, and what does not arrive whole is not there."""
+"""Where commands write, what they replace, and what they leave."""
 
 from __future__ import annotations
 
 import marshal
 import os
+import re
 import resource
 import shutil
 import subprocess
@@ -172,3 +173,19 @@ def test_what_does_not_fit_is_told_in_one_line_and_is_not_there(words, mask, pat
     assert ended.returncode == 2 and len(lines) == 1 and "ulimit -f" in lines[0], ended.stderr
     assert str(out) in lines[0]
     assert not [path for path in out.parent.rglob("*") if path.is_file()]
+
+
+ROOT = Path(__file__).parents[2]
+LADDER = {"runs/ladder", "runs/ladder-mismatch"}
+"""Where `endopilot ladder` keeps its results, and where with a model mismatch."""
+
+
+def test_no_two_commands_keep_their_results_in_one_folder():
+    sources = [path for folder in ("src/endopilot", "benchmarks") for path in (ROOT / folder).rglob("*.py")]
+    found: dict[str, list[str]] = {}
+    for path in sources:
+        for name in re.findall(r'(?:Path|OutputFolder) = Path\("(runs/[\w-]+)"\)', path.read_text(encoding="utf-8")):
+            found.setdefault(name, []).append(str(path))
+    assert len(found) > 8 and not LADDER & found.keys()
+    for name, paths in found.items():  # or in files that are named as the folder is, as the cockpit's are
+        assert len(paths) == 1 or all(name.partition("/")[2] in path for path in paths), name

@@ -1,6 +1,6 @@
 """The sdist holds the whole package; what `make release` builds of it does what the base install promises.
 
-Wheels are tried where `make release` has built them: `make test` builds the sdist alone, and test_extras.py hides all
+Wheels are tried where `make release` has built them: `make test` builds the sdist alone, and test_plugins.py hides all
 libraries but the base ones instead of installing these.
 """
 

@@ -1,11 +1,16 @@
-"""An anatomy whose files someone edited is refused in one line, even where the hashes were made to fit."""
+"""Anatomies whose files someone edited, or that were damaged: read, or refused in one line."""
 
 from __future__ import annotations
 
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from make_fuzz import bounded, damaged, outcome
 from make_meshes import arc
 
 from endopilot import files
@@ -87,3 +92,50 @@ def test_a_record_without_identity_is_read_where_the_rest_is_whole(anatomy, tmp_
     write_anatomy(anatomy, output=tmp_path / "a")
     resigned(tmp_path / "a")
     assert read_anatomy(tmp_path / "a").identity == anatomy.identity
+
+
+FLIPS = st.lists(st.tuples(st.integers(0, 1 << 16), st.integers(0, 255)), max_size=4)
+CUT = st.one_of(st.none(), st.integers(0, 4000))
+ODD = st.one_of(
+    st.none(), st.booleans(), st.integers(-(10**20), 10**20), st.floats(), st.text(max_size=4), st.just([]), st.just({})
+)
+
+
+def replaced(content: object, steps: list[int], value: object) -> object:
+    """Return JSON content in which what the steps lead to is replaced by another value."""
+    if not steps or not isinstance(content, (dict, list)) or not content:
+        return value
+    result = content.copy()
+    key = list(content)[steps[0] % len(content)] if isinstance(content, dict) else steps[0] % len(content)
+    result[key] = replaced(content[key], steps[1:], value)
+    return result
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    line = arc()
+    made = tmp_path_factory.mktemp("anatomies") / "vessel"
+    write_anatomy(extract_anatomy(Polylines((line,), (np.full(len(line), 2.0),)), name="vessel"), output=made)
+    return made
+
+
+@bounded(40)
+@given(steps=st.lists(st.integers(0, 20), min_size=1, max_size=4), value=ODD)
+def test_entries_of_an_anatomy(tmp_path, capfd, folder, steps, value):
+    copy = tmp_path / "vessel"
+    shutil.copytree(folder, copy, dirs_exist_ok=True)
+    record = json.loads((folder / "anatomy.json").read_text())
+    (copy / "anatomy.json").write_text(json.dumps(replaced(record, steps, value)))
+    found = outcome(lambda: read_anatomy(copy), capfd)
+    if found is not None:  # what does not count, such as provenance
+        assert found.identity == read_anatomy(folder).identity
+
+
+@pytest.mark.parametrize("file", ["anatomy.json", "centerline.vtp", "lumen.nrrd"])
+@bounded(10)
+@given(flips=FLIPS.filter(len), cut=CUT)
+def test_bytes_of_an_anatomy(tmp_path, capfd, folder, file, flips, cut):
+    copy = tmp_path / "vessel"
+    shutil.copytree(folder, copy, dirs_exist_ok=True)
+    (copy / file).write_bytes(damaged((folder / file).read_bytes(), flips, cut))
+    outcome(lambda: read_anatomy(copy), capfd)

@@ -25,8 +25,9 @@ def positions(grid: Volume) -> np.ndarray:
 
 def inside_tube(grid: Volume, points: np.ndarray, radius) -> np.ndarray:
     """Return where voxels lie within `radius` mm (one, or one a point) of a dense polyline."""
-    distance, nearest = KDTree(points).query(positions(grid))
-    return distance < np.broadcast_to(radius, len(points))[nearest]
+    reach = np.broadcast_to(radius, len(points))
+    distance, nearest = KDTree(points).query(positions(grid), distance_upper_bound=reach.max())
+    return distance < np.append(reach, 0.0)[nearest]
 
 
 def scan(grid: Volume, hu: np.ndarray, *, blur_mm: float = 0.25, noise_hu: float = 20.0, seed: int = 0) -> Volume:

@@ -1,3 +1,5 @@
+"""Contrast, the aorta, and where arteries leave it."""
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -7,8 +9,9 @@ import pytest
 from shapes import BLOOD_HU, dice, empty_grid, inside_tube, positions, scan
 
 from endopilot.errors import InputError
+from endopilot.imaging.aortic_root import find_ostium
 from endopilot.imaging.grid import interpolate_like
-from endopilot.imaging.segment import SegmentConfig, segment
+from endopilot.imaging.segment import SegmentConfig, refuse_without_contrast, segment
 from endopilot.imaging.volume import read_mask, read_volume
 from endopilot.types import Volume
 
@@ -109,3 +112,65 @@ def test_the_real_aorta_agrees_with_the_network_s_mask():
     found = mask.volume.voxels
     assert dice(found, reference) > 0.84
     assert (found & reference).sum() > 0.92 * found.sum()
+
+
+@pytest.fixture(scope="module")
+def thorax() -> Volume:
+    if not _SAMPLE.exists():
+        pytest.skip(f"{_SAMPLE} is absent: the real CT angiogram is not part of the repository")
+    return read_volume(_SAMPLE / "cta_thorax_1p5mm.nii.gz")
+
+
+@pytest.mark.parametrize("noise_hu", [0.0, 40.0])
+def test_blood_is_distinguished_from_bone(thorax, noise_hu):
+    """The whole thorax holds contrast; a box around ten vertebrae, in front of which the aorta is cut off, does not."""
+    noise = np.random.default_rng(0).normal(0.0, noise_hu, thorax.voxels.shape)
+    noisy = Volume(thorax.voxels + noise, thorax.spacing_mm, thorax.origin_mm, thorax.direction)
+    refuse_without_contrast(noisy)
+    corners = noisy.world_to_index(np.array([[-45.0, -122.0, 560.0], [8.0, -70.0, 760.0]])).round().astype(int)
+    box = tuple(slice(a, b) for a, b in zip(corners[0, ::-1], corners[1, ::-1], strict=True))
+    spine = Volume(noisy.voxels[box], noisy.spacing_mm, noisy.index_to_world(corners[0].astype(float)), noisy.direction)
+    assert (spine.voxels > 130).mean() > 0.15  # bone
+    with pytest.raises(InputError, match="no contrast: homogeneous soft tissue peaks at"):
+        refuse_without_contrast(spine)
+
+
+@pytest.mark.parametrize("thickness_mm", [4.0, 8.0, 16.0])
+def test_a_thin_slab_of_an_aorta_holds_contrast(thickness_mm):
+    """Its cross-section of 7 cm² is that of any pool; its volume is what the slab leaves of it."""
+    shape = (round(thickness_mm / 0.5), 160, 160)
+    j, i = np.indices(shape[1:]) * 0.4
+    inside = np.hypot(j - 32.0, i - 32.0) < 15.0
+    noise = np.random.default_rng(0).normal(0.0, 25.0, shape)
+    for blood_hu in (400.0, 45.0):
+        voxels = (np.where(inside, blood_hu, -90.0) + noise).astype(np.int16)
+        slab = Volume(voxels, np.array([0.4, 0.4, 0.5]), np.zeros(3), np.eye(3))
+        if blood_hu > 130.0:
+            refuse_without_contrast(slab)
+            continue
+        with pytest.raises(
+            InputError, match=rf"only {thickness_mm:.0f} mm thick.*too little to recognise blood"
+        ) as caught:
+            refuse_without_contrast(slab)
+        assert "no contrast" not in str(caught.value)
+
+
+AORTA_MM, ARTERY_MM, LENGTH_MM = 14.0, 2.8, 20.0
+
+
+@pytest.mark.parametrize("slant_deg", [0.0, 40.0, 60.0])
+def test_the_ostium_lies_on_the_aortas_wall_and_on_the_arterys_axis(slant_deg):
+    grid = empty_grid((110, 90, 130), (0.5, 0.5, 0.5), (-33.0, -22.0, -25.0))
+    place = positions(grid)
+    slant = np.deg2rad(slant_deg)
+    direction = np.array([np.cos(slant), 0.0, np.sin(slant)])  # the aorta's wall passes through the origin, normal to x
+    aorta = np.hypot(place[..., 0] + AORTA_MM, place[..., 1]) < AORTA_MM
+    along = np.clip(place @ direction, -AORTA_MM, LENGTH_MM)
+    artery = np.linalg.norm(place - along[..., None] * direction, axis=-1) < ARTERY_MM
+    # The tracked path begins at the artery's edge, where that comes nearest to the aorta.
+    begin = 3.0 * direction + 1.2 * ARTERY_MM * np.array([-np.sin(slant), 0.0, np.cos(slant)])
+    share = np.linspace(0.0, 1.0, 60)[:, None]
+    path = (1 - share) * (begin + share * 12.0 * direction) + share * LENGTH_MM * direction
+    ostium, _ = find_ostium(path, aorta | artery, aorta, grid)
+    assert np.linalg.norm(ostium.position) < 0.5
+    assert ostium.direction @ direction > 0.97

@@ -43,7 +43,7 @@ def index(tmp_path, monkeypatch):
             pass
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Index)
-    Thread(target=server.serve_forever, daemon=True).start()
+    Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
     monkeypatch.setattr(samples, "_URL", f"http://127.0.0.1:{server.server_port}/package-1.tar.gz")
     monkeypatch.setattr(samples, "_SHA256", _sha256(state["archive"]))
     monkeypatch.setattr(samples, "_FILES", {"ct.nii.gz": ("package-1/tests/ct.nii.gz", _sha256(b"the CT"))})

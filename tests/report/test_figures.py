@@ -1,5 +1,8 @@
+"""The figures of reports, and those of an evaluation."""
+
 from __future__ import annotations
 
+import shutil
 from itertools import pairwise
 
 import numpy as np
@@ -7,9 +10,11 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
-from endopilot.evaluation.results import TIP_BASELINES
+from endopilot.errors import InputError
+from endopilot.evaluation.results import METRICS_FILE, RESULTS_FILE, TIP_BASELINES
 from endopilot.plotting import png
 from endopilot.report import figures, tables
+from endopilot.report.report import report_evaluation
 from endopilot.types import Insertion, LumenMask, Volume
 
 TITLES = {"seen_test": "New navigations, known patients", "test": "New patients"}
@@ -138,3 +143,35 @@ def test_every_loss_is_in_the_picture(lowest, scale):
     ax = figures.loss_figure(pd.DataFrame(curve)).axes[0]
     low, high = ax.get_ylim()
     assert ax.get_yscale() == scale and low < lowest < 2.0 < high
+
+
+@pytest.fixture(scope="module")
+def reported(evaluated, tmp_path_factory):
+    folder, metrics = evaluated
+    copy = tmp_path_factory.mktemp("reported")
+    for name in (RESULTS_FILE, METRICS_FILE):
+        shutil.copy(folder / "evaluation" / name, copy)
+    report_evaluation(copy)
+    return copy, folder / "run", metrics
+
+
+@pytest.mark.parametrize("name", ["tip_error", "safety_ratio", "control_error", "drive_difference"])
+def test_every_figure_has_its_table(reported, name):
+    folder = reported[0] / "figures"
+    assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    assert set(pd.read_csv(folder / f"{name}.csv")["split"]) == {"seen_test", "test"}
+
+
+def test_the_evaluation_ends_with_a_report_that_needs_nothing_beside_it(reported):
+    folder, run, metrics = reported
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert 'src="data:image/png' in page
+    assert 'src="http' not in page
+    assert f"endopilot evaluate {run} -o {folder}" in page
+    assert f"{metrics['splits']['test']['tip']['P4']['abscissa']['0-10']['mae']:.2f}" in page
+
+
+def test_a_folder_without_an_evaluation_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"metrics\.json: no such file"):
+        report_evaluation(tmp_path)
+    assert not any(tmp_path.iterdir())

@@ -1,12 +1,23 @@
-"""Drag, stick-slip, torque lag and whip, tip buckling: what docs/evidence/physics.md shows."""
+"""The rod core's scenes against closed forms: what docs/evidence/physics.md shows."""
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from benchmarks.verification import scenes as scenarios
+from benchmarks.verification.transmission import LAG_RAD, turn
+from benchmarks.verification.tubes import ELEMENTS, Sliding, Uniform, curvature, drive, lay_out, mesh
+from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.device import read_wire
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.controls import ControlConfig, random_controls
+from endopilot.simulation.simulate import simulate
+from endopilot.verification import free_rod
+from endopilot.verification.case import Loading
 
 
 def test_a_string_is_dragged_as_the_capstan_equation_says() -> None:
@@ -70,3 +81,167 @@ def test_a_tip_buckles_on_a_plate_as_its_hold_allows() -> None:
     # where it sticks and buckles, it slips in the end, and the force falls to the sliding one's
     run = scenarios.push_against_a_plate(friction=0.1, tip_bend_deg=1.0)
     assert run.force_n[run.pushed_mm > 1.0][0] < 0.2 * run.force_n.max()
+
+
+def test_friction_keeps_twist() -> None:
+    # |T'| <= m everywhere: a device at rest neither creeps nor unwinds
+    path = np.concatenate([np.linspace(0.0, 1.7 * LAG_RAD, 20), np.full(50, 1.7 * LAG_RAD)])
+    rotation, torque = turn(path)
+    assert 0 < rotation[19] < path[19]
+    assert rotation[20:] == pytest.approx(rotation[19], abs=1e-9)
+    assert torque[20:] == pytest.approx(torque[19], abs=1e-9)
+
+
+def test_what_the_ostium_does_depends_on_the_path_alone() -> None:
+    # rate independence: where the path of the drive is cut into more steps, it ends the same
+    corners = np.array([0.0, 5.0, 1.5, 3.0, -4.0, 0.5])
+    ends = []
+    for steps in (1, 7, 40):
+        legs = [np.linspace(a, b, steps + 1)[1:] for a, b in pairwise(corners)]
+        rotation, torque = turn(np.concatenate(legs))
+        ends.append([rotation[steps - 1 :: steps], torque[steps - 1 :: steps]])
+    assert np.allclose(ends[0], ends[1], atol=1e-9) and np.allclose(ends[0], ends[2], atol=1e-9)
+
+
+def test_a_small_loop_closes() -> None:
+    # return-point memory: after a small loop the device goes on as if it had not been made
+    whole = np.linspace(0.0, 0.9 * LAG_RAD, 10)
+    loop = np.concatenate([whole[:6], whole[4:1:-1], whole[2:]])
+    straight, looped = turn(whole[1:]), turn(loop[1:])
+    assert looped[1][-1] == pytest.approx(straight[1][-1], abs=1e-12)
+    assert looped[0][-1] == pytest.approx(straight[0][-1], abs=1e-12)
+
+
+ELASTICA = {
+    1: (0.301721, 0.056433),
+    2: (0.493457, 0.160642),
+    3.7: (0.653000, 0.308452),
+    5: (0.713792, 0.387628),
+    10: (0.810609, 0.554996),
+    15: (0.847716, 0.635286),
+    40: (0.907371, 0.776395),
+}
+"""Deflection w/L and shortening u/L of a clamped rod of 100 elements, by α = F L²/EI."""
+
+
+@pytest.mark.parametrize(("name", "tip"), [("P=300", (-7.045, -11.932, 40.192)), ("P=600", (-13.605, -23.561, 53.475))])
+def test_bend_of_45_degrees(name: str, tip: tuple[float, ...]) -> None:
+    # Bathe and Bolourchi (1979), converged; the error is the distance of the tips over the tip's displacement.
+    case = next(case for case in free_rod.bend_of_45_degrees() if case.case.endswith(name))
+    assert case.reference == pytest.approx(np.linalg.norm(tip), rel=1e-4)
+    assert case.error <= 3e-3
+
+
+@pytest.mark.parametrize("alpha", [1.0, 2.0, 5.0, 10.0])
+def test_closed_form_of_the_elastica(alpha: float) -> None:
+    # elliptic integrals against Mattiasson's table
+    assert free_rod.elastica_closed_form(alpha)[:2] == pytest.approx(ELASTICA[alpha], abs=1e-6)
+
+
+@pytest.mark.parametrize("alpha", [1.0, 10.0, 40.0])
+def test_whole_elastica(alpha: float) -> None:
+    # Not the tip alone: all nodes lie on the solution of θ'' = -α cos θ, θ(0) = 0, θ'(L) = 0.
+    x, y = free_rod.elastica_curve(alpha)
+    shape = free_rod.elastica_tip(alpha, 100)[1][:100]
+    assert np.abs(np.interp(shape[::-1, 1], y, x) - shape[::-1, 0])[3:].max() < 1e-3
+
+
+def test_the_push_balances_the_wall() -> None:
+    # At rest and without friction the drive's push along the catheter's axis d and the wall's forces on the wire
+    # cancel: push = -d · Σ k (r - φ) ∇φ over the contact points with φ < r, φ being the quadratic spline of the
+    # distance map. They are the nodes and the middles of elements, where the wire's curve passes them.
+    anatomy, device = make_patient(AtlasConfig(population="textbook"), 0), read_wire("workhorse-014")
+    longest = float(anatomy.tree.longest_path().abscissa[-1])
+    initial, control = random_controls(
+        ControlConfig(), n_sequences=6, n_samples=24, seed=3, max_inserted_length_mm=longest
+    )
+    control[:, -4:] = 0.0  # at rest, where drag has gone
+    config = SimulatorConfig(tolerance_mm=1e-7, wall_stiffness_n_mm=5.0, threads=1)
+    rollout = simulate(
+        anatomy, device, control, initial=initial, config=config, record_shape=True, friction=np.zeros(len(control))
+    )
+    assert rollout.valid.all() and rollout.shape is not None
+    nodes, field = rollout.shape[:, -1].astype(float), anatomy.distance_map
+    chord = nodes[:, :-1] - nodes[:, 1:]
+    length = np.linalg.norm(chord, axis=-1, keepdims=True)
+    bend = (chord / length)[:, :-1] - (chord / length)[:, 1:]
+    bend /= 0.5 * (length[:, :-1] + length[:, 1:])  # curvature vectors at the nodes
+    bend = np.concatenate([bend[:, :1], bend, bend[:, -1:]], axis=1)
+    middles = 0.5 * (nodes[:, :-1] + nodes[:, 1:]) - length**2 / 16 * (bend[:, :-1] + bend[:, 1:])
+    points = np.concatenate([nodes, middles], axis=1)
+
+    def distance(points: np.ndarray) -> np.ndarray:
+        index = ((points - field.origin_mm) / field.spacing_mm)[..., ::-1]
+        return map_coordinates(field.values.astype(float), np.moveaxis(index, -1, 0), order=2, mode="nearest")
+
+    small = 1e-3 * np.eye(3)
+    slope = np.stack([(distance(points + step) - distance(points - step)) / 2e-3 for step in small], axis=-1)
+    depth = np.maximum(device.tip_radius_mm - distance(points), 0.0)
+    behind = (nodes - anatomy.insertion.position) @ anatomy.insertion.direction
+    held = (np.cumsum(behind[:, ::-1] > -3.0, axis=1) == 0)[:, ::-1]  # by the drive, in the catheter
+    held = np.concatenate([held, held[:, 1:]], axis=1)  # the element that joins the base touches nothing
+    pressed = np.where(held, 0.0, config.wall_stiffness_n_mm * depth)
+    wall = (pressed[..., None] * slope).sum(axis=1) @ anatomy.insertion.direction
+    push = rollout.base_force[:, -1, 0]
+    assert np.abs(pressed.sum(axis=1) - rollout.contact_force_sum[:, -1]).max() < 0.05 * rollout.contact_force_sum.max()
+    assert np.abs(push).max() > 5e-3
+    assert np.abs(push + wall).max() < 0.01 * np.abs(push).max() + 1e-4, (push, wall)
+
+
+def test_three_precurved_tubes_lie_where_their_moments_balance() -> None:
+    # Σ EIk (κ - κk) = 0: κ = Σ EIk κk / Σ EIk, with the third opposed
+    stack = (Uniform(30.0, 24.0, 0.02), Uniform(50.0, 40.0, 0.01), Uniform(20.0, 16.0, 0.03))
+    rod = mesh(20.0)
+    result = drive(rod, lay_out(stack, 20.0), np.full(3, 20.0), rotation=np.array([0.0, 0.0, np.pi]))
+    expected = (30 * 0.02 + 50 * 0.01 - 20 * 0.03) / 100
+    found = curvature(result["shape"][-1][:ELEMENTS], float(rod.abscissa_mm[1]))
+    assert found == pytest.approx(np.full(len(found), expected), rel=1e-5)
+    assert np.abs(result["base_torque"][-1]).max() < 1e-6  # no torque: the opposed tube is in balance there
+
+
+def test_the_catheter_slides_over_a_bent_wire_and_straightens_it() -> None:
+    # Curvature of the stretch that a straight catheter covers: EIw κw / (EIw + EIc); beyond its end the wire's own.
+    wire, catheter, length, covered = Uniform(20.0, 16.0, 0.03), Uniform(60.0, 48.0), 30.0, 18.3
+    rod = mesh(length)
+    control = np.zeros((14, 2, 2))
+    control[1:13, 1, 0] = covered / 12 / 0.5
+    result = drive(rod, lay_out((wire, catheter), length), np.array([length, 0.0]), control=control)
+    size = float(rod.abscissa_mm[1])
+    found = curvature(result["shape"][-1][:ELEMENTS], size)
+    joints = rod.abscissa_mm[1 : ELEMENTS - 1]
+    ahead, behind = joints < length - covered - size, joints > length - covered + size
+    assert found[ahead] == pytest.approx(np.full(ahead.sum(), wire.curvature), rel=1e-5)
+    assert found[behind] == pytest.approx(np.full(behind.sum(), 20 * 0.03 / 80), rel=1e-5)
+    # where it ends in a joint, the angle there is that of both parts
+    (between,) = found[~ahead & ~behind][[int(np.argmin(np.abs(joints[~ahead & ~behind] - (length - covered))))]]
+    assert 20 * 0.03 / 80 < between < wire.curvature
+
+
+def test_it_does_not_matter_which_tip_is_foremost() -> None:
+    # The stack (wire ahead of catheter) and the stack with the same two tubes in each other's places are the same rod.
+    first, second, length = Uniform(20.0, 16.0, 0.02), Uniform(60.0, 48.0, 0.01), 30.0
+    rod, shapes = mesh(length), []
+    for stack, inserted in (((first, second), (length, 17.0)), ((second, first), (17.0, length))):
+        result = drive(rod, lay_out(stack, length), np.array(inserted))
+        shapes.append(result["shape"][-1][:ELEMENTS])
+    assert shapes[1] == pytest.approx(shapes[0], abs=1e-8)
+
+
+def test_pushed_in_a_wire_keeps_less_than_its_load() -> None:
+    # The friction of the way in is kept at rest: the pull is exp(-µθ) times the load on the tip.
+    pull, _ = Sliding(0.25, 1.2).drive((0.0, 0.0), 2)
+    assert pull[-1] == pytest.approx(np.exp(-0.25 * 1.2), rel=0.01)
+
+
+def test_a_catheter_on_a_bent_wire_is_pushed_back() -> None:
+    # Without friction, a mm more of a straight catheter over a wire that a moment M bends takes
+    # M²/2 (1/EIw - 1/(EIw + EIc)) (D. Bigoni et al., Mechanics of Materials 80, 2015, have it for a rigid sleeve). At
+    # the base it is bent itself, and T + EIc κ²/2 is the same all along a uniform tube.
+    wire, catheter, length, covered, moment = Uniform(10.0, 8.0), Uniform(30.0, 24.0), 30.0, 16.0, 0.2
+    rod = mesh(length, elements=240)
+    loading = Loading.none(len(rod.abscissa_mm))
+    loading.moment_n_mm[0, 0] = moment
+    result = drive(rod, lay_out((wire, catheter), length), np.array([length, covered]), loading=loading)
+    both = wire.bend + catheter.bend
+    expected = moment**2 / 2 * (1 / wire.bend - 1 / both) + catheter.bend * (moment / both) ** 2 / 2
+    assert result["base_force"][-1, 1] == pytest.approx(expected, rel=0.02)

@@ -1,10 +1,13 @@
-"""What `endopilot verify` and `python -m benchmarks verification` print, draw and leave with."""
+"""Every case of the verification keeps its bar; what the commands print, draw and leave with."""
 
 from __future__ import annotations
 
+import importlib.util
 import json
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from benchmarks.__main__ import main as benchmarks
@@ -69,3 +72,109 @@ def test_the_installed_package_verifies_itself(cases: list[Case], capsys: pytest
     assert left.value.code == 0
     said = capsys.readouterr().out
     assert "Timoshenko tip" in said and "python -m benchmarks verification" in said
+
+
+GROUPS = {
+    f"{module.__name__.rsplit('.', 1)[-1]}.{group.__name__}": group
+    for module in (free_rod, contact, motion, order, stability, transmission, tube, tubes, engine)
+    for group in module.CASES
+}
+LARGEST_BAR = 0.02
+WIDER = {"tube.sinusoidal_buckling": 0.05, "tube.helical_buckling": 0.05, "order.order_in_element_length": 0.05}
+WIDER |= {"order.order_in_navigation": 0.2, "order.order_in_time_step": 0.05, "motion.order_in_a_beating_heart": 0.2}
+
+
+def turned_by(share: float, low: float, high: float) -> Callable[[Case], None]:
+    """Return a check of the angle, rad, whose capstan a case compares with: T2/T1 = exp(µ θ)."""
+
+    def check(case: Case) -> None:
+        assert low < np.log(case.reference) / share < high
+
+    return check
+
+
+def in_the_laboratory(case: Case) -> None:
+    assert curves(case)[0].y.max() > 20  # mm
+
+
+def friction_has_its_share(case: Case) -> None:
+    work, elastic, _ = curves(case)
+    assert work.y[-1] > 1.2 * elastic.y[-1] > 0
+
+
+def errs_by_the_leading_term(case: Case) -> None:
+    # c dδ/dt = F - 3 EI δ/L³: after one time constant implicit Euler errs by h/(2 e τ) of F L³/3EI
+    error = curves(case)[1]
+    assert abs(error.y * 2 * order.RELAXATION_S * (np.e - 1) / error.x - 1).max() < 0.1
+
+
+def loses_its_stiffness(case: Case) -> None:
+    # a ring's stiffness against cos 2θ falls towards its critical twist as 1 - (Tw/Tw_critical)²
+    core = curves(case)[1]
+    assert abs(core.y - (1 - (core.x / case.reference) ** 2)).max() < 0.01
+
+
+def lies_as_winkler_says(case: Case) -> None:
+    # along the whole rod: w = F β/(2k) exp(-β|x|) (cos βx + sin β|x|), β = (k/4EI)^¼ (Hetényi 1946)
+    exact, core = curves(case)
+    assert np.abs(core.y - exact.y).max() < 0.005 * exact.y.max()
+    assert exact.y.min() < 0  # it lifts beside the load
+
+
+def sinks_to_depths(case: Case) -> None:
+    np.testing.assert_allclose(curves(case)[1].x, [0.5, 1.0, 1.5, 2.0], rtol=1e-3)
+
+
+def follows_or_whips(case: Case) -> None:
+    # Far from θ = π the short wire's tip follows the closed form; the long one's jumps twice in a turn there and back.
+    formula, short, _, long = curves(case)
+    expected = np.interp(short.x, formula.x[np.argsort(formula.x)], np.sort(formula.y))
+    assert np.abs(short.y - expected).max() < 0.05
+    assert (np.abs(np.diff(long.y)) > 2.0).sum() == 2
+
+
+SHOWN = {
+    "contact.capstan": turned_by(0.4, 0.98 * np.pi / 2, np.pi / 2),
+    "contact.capstan_over_bends": turned_by(0.3, np.pi - 0.97, np.pi - 0.93),  # a string cuts 0.95 rad off corners
+    "contact.capstan_in_a_helix": turned_by(0.2, 2 * np.pi * 0.5**0.5 - 0.13, 2 * np.pi * 0.5**0.5 - 0.09),
+    "motion.rigid_motion": in_the_laboratory,
+    "motion.power_balance": friction_has_its_share,
+    "order.order_in_time_step": errs_by_the_leading_term,
+    "stability.michell_ring": loses_its_stiffness,
+    "tube.compliant_wall": lies_as_winkler_says,
+    "tube.stiffening_wall": sinks_to_depths,
+    "tube.torque_whip": follows_or_whips,
+}
+REFERENCES = {
+    "free_rod.euler_column": np.pi**2 / 4,  # P = π² EI/(2L)² of a clamped-free column
+    "stability.greenhill": 20.0,  # M = 2 √(EI T) (Greenhill 1883) with EI = 100 N mm², T = 1 N
+    "tube.helical_buckling": 2 * np.sqrt(2) * tube.LOAD_N,  # Chen, Lin and Cheatham 1990
+}
+
+
+def curves(case: Case):
+    assert case.picture is not None
+    return case.picture.curves
+
+
+@pytest.mark.parametrize("name", GROUPS)
+def test_every_case_keeps_its_bar(name: str) -> None:
+    if name.startswith("engine.") and importlib.util.find_spec("mujoco") is None:
+        pytest.skip(engine.MISSING)
+    cases = GROUPS[name]()
+    assert cases
+    for case in cases:
+        assert case.error <= case.bar <= WIDER.get(name, LARGEST_BAR), case.case
+    if name in REFERENCES:
+        assert cases[0].reference == pytest.approx(REFERENCES[name])
+    if name in SHOWN:
+        SHOWN[name](cases[0])
+
+
+def test_skipped_without_mujoco(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    rows = [case.row() for group in engine.CASES for case in group()]
+    assert len(rows) == 3
+    for row in rows:
+        assert row["passed"] is None and row["value"] is None
+        assert "MuJoCo is not installed" in row["case"]

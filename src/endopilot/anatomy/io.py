@@ -24,14 +24,13 @@ import numpy as np
 
 from endopilot import files
 from endopilot.errors import InputError
+from endopilot.imaging.text_headers import read_nrrd
 from endopilot.settings import public
 from endopilot.types import Anatomy, Branch, Centerline, DistanceMap, Insertion, VesselTree
 from endopilot.vessels import mesh_process
 from endopilot.vessels.surface import polydata_of
 
 SCHEMA_VERSION = 2
-
-_SPACE = "left-posterior-superior"
 
 _CENTERLINE, _LUMEN, _RECORD = "centerline.vtp", "lumen.nrrd", "anatomy.json"
 
@@ -194,29 +193,13 @@ def _write_distance_map(distance_map: DistanceMap, path: Path) -> None:
 
 
 def _read_distance_map(path: Path) -> DistanceMap:
-    import SimpleITK
-
-    reader = SimpleITK.ImageFileReader()
-    reader.SetFileName(str(path))
-    try:
-        reader.ReadImageInformation()
-        keys = {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys()}
-        axes, spacing = np.array(reader.GetDirection()), np.array(reader.GetSpacing())
-        wrong = None
-        if reader.GetDimension() != 3 or reader.GetNumberOfComponents() != 1:
-            wrong = f"it has {reader.GetDimension()} dimensions of {reader.GetNumberOfComponents()} values"
-        elif keys.get("NRRD_space", _SPACE) != _SPACE:
-            wrong = f"its space is {keys['NRRD_space']}, not {_SPACE}"
-        elif np.abs(axes - np.eye(3).ravel()).max() > 1e-6:
-            wrong = f"its space directions {axes.round(4).tolist()} are not along the LPS axes"
-        elif np.ptp(spacing) > 1e-6 * spacing.max():
-            wrong = f"its spacing {spacing.tolist()} mm is not the same along all axes"
-        if wrong is not None:
-            raise InputError(f"{path}: {wrong}; make the anatomy again")
-        image = SimpleITK.ReadImage(str(path), SimpleITK.sitkFloat32)
-    except RuntimeError as error:
-        raise InputError(f"{path}: cannot be read as NRRD; make the anatomy again") from error
-    values = SimpleITK.GetArrayFromImage(image)
-    if not np.isfinite(values).all():
-        raise InputError(f"{path}: some distances are not finite numbers; make the anatomy again")
-    return DistanceMap(values=values, spacing_mm=float(spacing[0]), origin_mm=np.array(image.GetOrigin(), dtype=float))
+    with files.reading(path, "make the anatomy again"):
+        volume = read_nrrd(path).volume
+        values, spacing, axes = volume.voxels.astype(np.float32), volume.spacing_mm, volume.direction
+        if np.abs(axes - np.eye(3)).max() > 1e-6:
+            raise ValueError(f"its axes {axes.round(4).tolist()} are not along the LPS axes")
+        if np.ptp(spacing) > 1e-6 * spacing.max():
+            raise ValueError(f"its spacing {spacing.tolist()} mm is not the same along all axes")
+        if not np.isfinite(values).all():
+            raise ValueError("some distances are not finite numbers")
+    return DistanceMap(values=values, spacing_mm=float(spacing[0]), origin_mm=volume.origin_mm)

@@ -220,14 +220,13 @@ def anatomy_facts(anatomy: Anatomy) -> list[tuple[str, str]]:
     """Return the key facts of a vessel."""
     tree = anatomy.tree
     longest = tree.longest_path()
-    present = {int(section) for branch in tree.branches for section in np.unique(branch.section)}
     chord = float(np.linalg.norm(longest.points[-1] - longest.points[0]))
     return [
         ("longest path", f"{longest.abscissa[-1]:.0f} mm"),
         ("branches", f"{len(tree.branches)}"),
         ("lumen radius", f"{np.median(longest.radius):.1f} mm (median on that path)"),
         ("tortuosity", f"{longest.abscissa[-1] / max(chord, 1e-6):.2f}"),
-        ("sections", ", ".join(tree.section_names[section] for section in sorted(present))),
+        ("sections", ", ".join(tree.sections_present)),
     ]
 
 

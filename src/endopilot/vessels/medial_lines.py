@@ -9,7 +9,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import distance_transform_edt, find_objects
+from scipy.ndimage import binary_erosion, distance_transform_edt, find_objects
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 from scipy.spatial import KDTree
@@ -172,7 +172,7 @@ def _traced_piece(
 def _clearance(
     voxels: Bool[np.ndarray, "nz ny nx"], index: Int[np.ndarray, "n 3"], edges_mm: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "n"]:
-    border, edges = _border(voxels), edges_mm[::-1]
+    border, edges = voxels & ~np.asarray(binary_erosion(voxels), dtype=bool), edges_mm[::-1]
     tree, places = KDTree(np.argwhere(border) * edges), index * edges
     gap = np.asarray(tree.query(places, distance_upper_bound=_NEAR_VOXELS * float(edges.max()))[0])
     deep = np.isinf(gap)
@@ -181,18 +181,6 @@ def _clearance(
     elif deep.any():
         gap[deep] = tree.query(places[deep])[0]
     return gap + 0.5 * float(edges.min())
-
-
-def _border(voxels: Bool[np.ndarray, "nz ny nx"]) -> Bool[np.ndarray, "nz ny nx"]:
-    inner = np.zeros_like(voxels)
-    core = voxels[1:-1, 1:-1, 1:-1].copy()
-    for axis in range(3):
-        for side in (slice(0, -2), slice(2, None)):
-            window = [slice(1, -1)] * 3
-            window[axis] = side
-            core &= voxels[tuple(window)]
-    inner[1:-1, 1:-1, 1:-1] = core
-    return voxels & ~inner
 
 
 def _widest_forest(

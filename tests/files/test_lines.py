@@ -1,16 +1,92 @@
-"""Whatever of the lines a tree does not reach is bridged, or said with its length and place; loops and inlets too."""
+"""Centerlines: sorted or refused, joined or cut; what a tree does not reach is said; so are loops and inlets."""
 
 from __future__ import annotations
 
+import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_lines_in_order import made, straight
 
+from endopilot.anatomy.tree import tree_from_polylines
 from endopilot.errors import InputError
+from endopilot.vessels.read_source import read_source
+from endopilot.vessels.sources import Polylines
+
+
+def made(lines, radius=1.5, **given):
+    source = Polylines(tuple(lines), tuple(np.full(len(line), radius) for line in lines))
+    return tree_from_polylines(source, given.get("ostium"), "lines.vtp", given.get("vessel", "generic"))
+
+
+def helix(count=240):
+    turn = np.linspace(0.0, 2 * np.pi, count)
+    return np.column_stack([15 * np.cos(turn), 15 * np.sin(turn), 6 * turn])
+
+
+def straight(first, last, count=100):
+    return np.linspace(first, last, count)
+
+
+def test_points_in_another_order_than_along_the_vessel_are_sorted():
+    line = helix()
+    found = made([line[np.random.default_rng(3).permutation(len(line))]])
+    length = np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
+    assert abs(found.tree.longest_path().abscissa[-1] - length) < 0.5
+    assert any("in another order than along the vessel, and are sorted" in note for note in found.notes)
+
+
+def test_two_points_that_are_swapped_are_sorted():
+    line = straight([0, 0, 0], [0, 0, 60], 121)
+    line[[40, 41]] = line[[41, 40]]
+    found = made([line])
+    assert abs(found.tree.longest_path().abscissa[-1] - 60) < 0.01
+    assert any("sorted (61 mm became 60 mm)" in note for note in found.notes)
+
+
+def test_points_in_no_order_are_refused_as_such_and_not_as_coarse():
+    cloud = 50 * np.random.default_rng(0).random((60, 3))
+    with pytest.raises(InputError, match=r"line 0: its points are not in order along a vessel .*; sort them") as error:
+        made([cloud])
+    assert "resample" not in str(error.value)
+
+
+@pytest.mark.parametrize("line", [helix(), helix()[::-1], np.concatenate([helix(), helix()[::-1]])])
+def test_points_in_order_are_left_as_they_are(line):
+    assert made([line]).notes == []
+
+
+def test_a_line_that_leads_there_and_back_is_one_vessel():
+    line = straight([0, 0, 0], [0, 0, 60])
+    found = made([np.concatenate([line, line[::-1]])])
+    assert len(found.tree.branches) == 1
+    assert abs(found.tree.longest_path().abscissa[-1] - 60) < 0.5
+
+
+def test_one_line_through_a_whole_tree_is_that_tree():
+    trunk, branch = straight([0, 0, 0], [0, 0, 60], 121), straight([0, 0, 30], [20, 0, 60])
+    found = made([np.concatenate([trunk, trunk[60:][::-1], branch])])
+    assert len(found.tree.leaves()) == 2 and found.notes == []
+
+
+@pytest.mark.parametrize("step_mm", [4.0, 9.0, 20.0])
+def test_coarse_lines_are_joined_by_straight_pieces_and_noted(step_mm):
+    line = np.outer(np.arange(0, 100.1, step_mm), [0.0, 0.6, 0.8])
+    found = made([line])
+    length = np.linalg.norm(line[-1] - line[0])
+    assert abs(found.tree.longest_path().abscissa[-1] - length) < 1e-6
+    assert len(found.notes) == 1 and f"the longest step, {step_mm:.1f} mm" in found.notes[0]
+
+
+def test_a_jump_to_another_vessel_is_cut_and_noted():
+    trunk = straight([0, 0, 0], [0, 0, 60], 121)
+    found = made([np.concatenate([trunk, straight([0, 0, 30], [20, 0, 60])])])
+    assert len(found.tree.leaves()) == 2
+    assert any("line 0 jumps by 30.0 mm at (0.0, 0.0, 60.0) mm: cut there" in note for note in found.notes)
+
 
 TURN = np.linspace(0.0, 2 * np.pi, 300)
 RING = np.column_stack([20 * np.cos(TURN), 20 * np.sin(TURN), 0 * TURN])
@@ -141,3 +217,43 @@ def test_a_second_inlet_is_said_with_its_place():
 def test_the_root_is_an_end_and_no_place_that_a_vessel_passes():
     lines = [straight([0, 0, 0], [0, 0, 40]), straight([0, 0, 40], [0, 0, 80]), straight([0, 0, 40], [30, 0, 60])]
     assert np.abs(made(lines).tree.branches[0].centerline.points[0, 2] - 40) > 15
+
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+
+
+def made_of_file(path, vessel="generic"):
+    content = read_source(path).content
+    assert isinstance(content, Polylines)
+    return tree_from_polylines(content, None, path.name, vessel)
+
+
+@pytest.mark.skipif(not (DATA / "steve_bench").exists(), reason="the benchmark's curves are not at hand")
+def test_the_loop_of_the_vertebral_arteries_is_said():
+    folder = DATA / "steve_bench" / "dualdevicenav"
+    curves = [curve for file in folder.glob("*.mrk.json") for curve in json.loads(file.read_text())["markups"]]
+    found = made_of_file(folder)
+    assert found.coverage["left_out_mm"] < 1.0
+    basilar = next(np.array(c["controlPoints"][0]["position"]) for c in curves if len(c["controlPoints"]) == 30)
+    (loop,) = [note for note in found.notes if "close a loop" in note]
+    place = np.array(loop[loop.index("(") + 1 : loop.index(")")].split(","), dtype=float)
+    assert np.linalg.norm(place - basilar) < 5.0
+    assert any("do not touch" in note for note in found.notes)
+    root = found.tree.branches[0].centerline.points[0]
+    assert np.linalg.norm(root - [-367.5, 3.9, -10.2]) < 1.0  # the ascending aorta, which no vessel passes
+
+
+@pytest.mark.skipif(not (DATA / "liver_tace").exists(), reason="the liver's vessel tree is not at hand")
+def test_a_liver_tree_is_covered_but_for_its_parent_vessel():
+    found = made_of_file(DATA / "liver_tace" / "tace-lps-0.75mm.vtp")
+    assert len(found.tree.leaves()) > 40
+    assert len(found.notes) == 1 and "lies in the parent vessel that the lines start in" in found.notes[0]
+
+
+@pytest.mark.skipif(
+    not (DATA / "coronary_centerlines").exists(), reason="the real patient's centerlines are not at hand"
+)
+@pytest.mark.parametrize("vessel", ["rca", "lca"])
+def test_coronary_lines_are_covered_but_for_the_aorta(vessel):
+    found = made_of_file(DATA / "coronary_centerlines" / f"{vessel}_cl.vtp", vessel)
+    assert len(found.notes) == 1 and "lies in the parent vessel that the lines start in" in found.notes[0]
