@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.imaging.xray import vessel_error_mm
 from endopilot.errors import InputError
 from endopilot.simulation.motion import Motion
 from endopilot.xray import image_fluoroscope
 from endopilot.xray.image_fluoroscope import ImageFluoroscope
-from endopilot.xray.registration import vessel_error_mm
 
 
 @pytest.fixture(scope="module")

@@ -22,9 +22,8 @@ from endopilot.xray.detector import TipDetector
 from endopilot.xray.displacement import Displaced
 from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement, measurement_at
 from endopilot.xray.image import ImageConfig, Plane, XrayImager
-from endopilot.xray.motion_registration import register_motion, take_run
 from endopilot.xray.moving_patient import seen_wire
-from endopilot.xray.registration import Registration, register
+from endopilot.xray.registration import Registration, register, register_motion, take_run
 
 _NO_WIRE = np.zeros((0, 3))
 _MOVES_MM = 2.0
