@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from scipy.ndimage import binary_dilation, gaussian_filter
 from scipy.ndimage import label as connected_parts
+from scipy.special import ndtr
 
 from endopilot.devices.device import Wire
 from endopilot.files import read_json
@@ -23,9 +24,9 @@ from endopilot.settings import Finite, OpenShare, Positive, Share, settings
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import catheter_lumen_points, lumen_points
 from endopilot.xray.carm import View
-from endopilot.xray.displacement import displacements
+from endopilot.xray.displacement import Seat, displacements
 from endopilot.xray.projector import splat
-from endopilot.xray.tip_posterior import MODE_MM, TipEstimate, end_log, estimate_tip, longest_mm
+from endopilot.xray.tip_posterior import TipEstimate, end_log, estimate_tip, longest_mm, mixed
 from endopilot.xray.vessel_grid import VesselGrid, make_grid, with_catheter
 from endopilot.xray.wire_end import fit_end
 from endopilot.xray.wire_following import STEP_MM, Follower
@@ -157,6 +158,8 @@ _MOST_PLACES = 20000
 """Places of a tree of 5 m: no coronary artery has more."""
 _SLACK_MM = 0.3
 """How far outside the lumen the wire's axis may seem to lie, mm."""
+_NEAR_PX = 10.0
+"""A tip is where it is found if it lies within this, pixels of each image: 2 mm in the vessel."""
 _BELIEVABLE = 3.0
 """An end farther than this many standard deviations from the followed wire's is another line's."""
 
@@ -165,9 +168,9 @@ _BELIEVABLE = 3.0
 class DetectorConfig:
     """How far an image is trusted."""
 
-    displaced: OpenShare = 0.05
+    displaced: OpenShare = 0.5
     """Share of the exposures in which the vessel lies elsewhere than registration has it."""
-    displaced_mm: Positive = 1.5
+    displaced_mm: Positive = 2.0
     """How far it lies from there then, along each axis: standard deviation, mm."""
     hidden: OpenShare = 0.02
     """Share of the wire that is not seen, whatever the evidence against it."""
@@ -178,7 +181,7 @@ class DetectorConfig:
     least_log_odds: Finite = 10.0
     """There is a wire where the images are likelier with one by this logarithm."""
     sure: OpenShare = 0.92
-    """A tip is ambiguous where less of the posterior lies near it."""
+    """A tip is ambiguous where less of the posterior lies within 10 pixels of it."""
 
 
 class TipDetector:
@@ -204,6 +207,7 @@ class TipDetector:
         grid = make_grid(anatomy.tree, step_mm=STEP_MM, most=_MOST_PLACES)
         self.grid: VesselGrid = with_catheter(grid, anatomy, CATHETER_MM)
         self._room_mm = self.grid.radius - device.tip_radius_mm + _SLACK_MM
+        self._seat = Seat(anatomy)
         behind, size = catheter_lumen_points(anatomy)
         near = np.linalg.norm(behind - anatomy.insertion.position, axis=1) <= 1.25 * CATHETER_MM
         points, volume = lumen_points(anatomy)
@@ -251,25 +255,19 @@ class TipDetector:
             follower = Follower(self.grid, self._room_mm, seen, evidence, deepest)
             return estimate_tip(follower, inserted_length, expected)
 
-        here = follow(views)
         covariance = config.displaced_mm**2 * np.eye(3) if displaced is None else displaced
         ends = end_log(self.grid.abscissa, inserted_length) + (0.0 if expected is None else expected)
-        shift, left = displacements(self.grid, self._room_mm, views, evidence, covariance, ends)
-        shifted = [replace(view, source=view.source - shift) for view in views]
-        there = follow(shifted)
-        # Laplace's evidence: of all shifts that were possible, one as narrow as what the images leave.
-        odds = there.log_odds - here.log_odds + float(np.log(config.displaced / (1 - config.displaced)))
-        odds -= 0.5 * float(shift @ np.linalg.solve(covariance, shift))
-        odds += 0.5 * float(np.linalg.slogdet(left)[1] - np.linalg.slogdet(covariance)[1])
-        # A vessel that lies farther back shows more of the same wire in its catheter.
-        behind = here if shift @ self._anatomy.insertion.direction > 0 else there
-        in_catheter = behind.ends[self.grid.abscissa < 0][-1] / CATHETER_MM
-        odds += float(in_catheter * (shift @ self._anatomy.insertion.direction))
-        found = _either(here, replace(there, shift=shift, shift_covariance=left), odds)
-        views = views if found.shift is here.shift else shifted
-        found = _refined(found, views, plain, self._radius_mm)
-        hidden = any(_lies_on(line, view, found.position) for line, view in zip(lines, views, strict=False))
-        return self._judged(found, hidden=hidden)
+        seats = [(self._seat, image) for image in plain]
+        moved = displacements(self.grid, self._room_mm, views, evidence, seats, covariance, config.displaced, ends)
+        found = []
+        for share, shift, left in moved:
+            there = [replace(view, source=view.source - shift) for view in views]
+            one = replace(follow(there), shift=shift, shift_covariance=left)
+            found.append((share, _refined(one, there, plain, self._radius_mm)))
+        chosen = mixed(found)
+        there = [replace(view, source=view.source - chosen.shift) for view in views]
+        hidden = any(_lies_on(line, view, chosen.position) for line, view in zip(lines, there, strict=False))
+        return self._judged(chosen, there, hidden=hidden)
 
     def _look(self, view: View, signal: Signal, photons: float) -> tuple[Signal, Signal]:
         """Return an image without contrast, and how likely its pixels are on a wire, none far from the vessel."""
@@ -300,19 +298,24 @@ class TipDetector:
         self._known_lines = [*self._known_lines[1 - _KEPT_LINES :], (before, photons, near)]
         return near
 
-    def _judged(self, found: TipEstimate, *, hidden: bool) -> TipEstimate:
+    def _judged(self, found: TipEstimate, views: Sequence[View], *, hidden: bool) -> TipEstimate:
         """Return an estimate with its status; an ambiguous one is as uncertain as the places are far apart.
 
         Args:
             found: the tip.
+            views: of the images, in the CT's frame where the vessel lies.
             hidden: whether it lies on a line from before: the wire may end elsewhere on it.
         """
         if found.log_odds < self.config.least_log_odds:
             return replace(found, status="not found")
-        if found.share >= self.config.sure and not hidden:
-            return found
+        slopes = [view.slope(found.position) for view in views]
+        sd_px = max(float(np.linalg.norm(slope @ found.covariance @ slope.T, 2)) for slope in slopes) ** 0.5
+        share = found.share * (1 - 2 * float(ndtr(-_NEAR_PX / sd_px)))
+        if share >= self.config.sure and not hidden:
+            return replace(found, share=share)
         along = _HIDDEN_MM**2 * np.eye(3) if hidden else 0.0
-        return replace(found, status="ambiguous", covariance=found.covariance + found.elsewhere + along)
+        covariance = found.covariance + found.elsewhere + along
+        return replace(found, share=share, status="ambiguous", covariance=covariance)
 
     def _saturated(self, log_ratio: Signal) -> Signal:
         """Return evidence that no single pixel can overrule all others with."""
@@ -333,17 +336,6 @@ class TipDetector:
         edges, dark = (one - gaussian_filter(one, _HIGH_PASS_PX / 2, truncate=_TRUNCATE) for one in (path, -part))
         strength = float(dark[filled] @ edges[filled] / (edges[filled] @ edges[filled]))
         return signal + np.float32(strength) * path_mm if strength > _LEAST_CONTRAST else signal
-
-
-def _either(here: TipEstimate, there: TipEstimate, odds: float) -> TipEstimate:
-    """Return the likelier of two estimates, given the logarithm of the second's odds; the other one is elsewhere."""
-    chosen, other, share = (there, here, odds) if odds > 0 else (here, there, -odds)
-    share = 1 / (1 + float(np.exp(-min(share, 30.0))))
-    off = other.position - chosen.position
-    if float(np.linalg.norm(off)) < MODE_MM:
-        return replace(chosen, covariance=chosen.covariance + (1 - share) * np.outer(off, off))
-    elsewhere = share * chosen.elsewhere + (1 - share) * np.outer(off, off)
-    return replace(chosen, share=share * chosen.share, elsewhere=elsewhere)
 
 
 def _halved(image: Signal) -> Float32[np.ndarray, "half_rows half_columns"]:

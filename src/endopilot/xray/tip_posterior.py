@@ -8,7 +8,7 @@ with one the vessel gives it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -176,6 +176,19 @@ def _summary(
         wire=follower.in_space(way, way_px, np.full(way_px.shape, 1 / 12))[0],
         ends=ends,
     )
+
+
+def mixed(found: Sequence[tuple[float, TipEstimate]]) -> TipEstimate:
+    """Return the likeliest of some estimates, given how likely each is; the others belong to its posterior."""
+    (most, chosen), *others = sorted(found, key=lambda one: -one[0])
+    share, covariance, elsewhere = most * chosen.share, chosen.covariance, most * chosen.elsewhere
+    for weight, other in others:
+        off = other.position - chosen.position
+        if float(np.linalg.norm(off)) < MODE_MM:
+            share, covariance = share + weight * other.share, covariance + weight * np.outer(off, off)
+        else:
+            elsewhere = elsewhere + weight * np.outer(off, off)
+    return replace(chosen, share=share, covariance=covariance, elsewhere=elsewhere)
 
 
 def around_mode(
