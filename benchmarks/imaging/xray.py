@@ -20,8 +20,8 @@ from endopilot.simulation.motion import Motion, draw_motion, place, published_me
 from endopilot.types import Anatomy
 from endopilot.xray.carm import Pose
 from endopilot.xray.detector import TipDetector
-from endopilot.xray.displacement import Displaced
 from endopilot.xray.image import ImageConfig, isocenter_of
+from endopilot.xray.image_fluoroscope import Displaced
 from endopilot.xray.registration import Registration, register, register_motion, take_run
 from endopilot.xray.tip_posterior import TipEstimate
 

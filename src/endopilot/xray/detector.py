@@ -1,7 +1,7 @@
 """The tip of a wire found in X-ray images: `TipDetector`.
 
-Ridges say how likely each pixel is on a wire (`ridge`), a hidden Markov model follows the wire through the vessel as
-registration has it (`wire_following`, `tip_posterior`), and its end is fitted to the pixels there (`wire_end`).
+Ridges say how likely each pixel is on a wire (`ridge`); where it ends, and how far the vessel lies off, is one
+posterior (`tip_posterior`), and the end is fitted to the pixels there (`wire_end`).
 Contrast in the vessel is estimated and taken away first: a filled branch is a dark line too.
 """
 
@@ -14,22 +14,20 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
-from scipy.ndimage import binary_dilation, gaussian_filter
+from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates, uniform_filter1d
 from scipy.ndimage import label as connected_parts
 from scipy.special import ndtr
 
 from endopilot.devices.device import Wire
 from endopilot.files import read_json
-from endopilot.settings import Finite, OpenShare, Positive, Share, settings
+from endopilot.settings import Finite, OpenShare, Positive, settings
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import catheter_lumen_points, lumen_points
 from endopilot.xray.carm import View
-from endopilot.xray.displacement import Seat, displacements
 from endopilot.xray.projector import splat
-from endopilot.xray.tip_posterior import TipEstimate, end_log, estimate_tip, longest_mm, mixed
+from endopilot.xray.tip_posterior import Seat, TipEstimate, estimate_tip, possible_shifts
 from endopilot.xray.vessel_grid import VesselGrid, make_grid, with_catheter
 from endopilot.xray.wire_end import fit_end
-from endopilot.xray.wire_following import STEP_MM, Follower
 
 Signal = Float32[np.ndarray, "rows columns"]
 SCALES_PX = (1.0, 1.7, 2.8)
@@ -132,19 +130,17 @@ _FILLED_MM, _FEWEST_PX = 0.3, 10
 """Contrast is looked for where this much of the lumen lies behind a pixel, mm, if there are so many pixels."""
 _LEAST_CONTRAST = 0.01
 """Contrast below this, 1/mm, is none."""
-_END_SECTIONS = 6
-"""Cross-sections of the wire's end that give its first direction."""
-_DOUBT = 1.5
-"""The followed wire's errors are this many times as large as the model says: found on synthetic patients."""
-_LOOSE_MM = 0.4
-"""Standard deviation that the followed wire's end is taken to have at least, mm: it cuts the corner of a bent tip."""
+_END_PLACES = 4
+"""Places of the wire's end that give its first direction, and how far aside of the centerline it runs there."""
+_BESIDE_STRAND_PX = 3.0
+"""So far on either side the end of a wire that folds is looked for, pixels: the other strand lies in the middle."""
+_LEAD_PX, _OF_PIXEL, _OWN_PX = 12, 0.3, 1.0
+"""Length of the wire before its end that shows how far aside it runs, pixels; weight of the evidence of each, since
+neighbours share their noise; standard deviation of what a straight line leaves out, pixels."""
 _BLUR_PX = 0.6
 """Standard deviation of the detector's blur, pixels."""
 _SEEN_SHARE = 0.35
 """An end that is foreshortened to less than this share of its length shows no direction, and is not fitted."""
-_WIDER, _FIT_SHARE = {1: 2.0, 2: 1.0}, {1: 1.0, 2: 0.5}
-"""With so many views the covariance is so many times as large, and has a standard deviation more of this share of what
-the fit moves the end: then 95 % of the tips lie in the region of 95 %, in synthetic patients and five real arteries."""
 _LINE, _LINE_PX, _MOVED_PX = 0.3, 60, 2
 """An image from before shows a line where the evidence for a wire is larger than this over so many pixels together; it
 may be displaced by so many pixels."""
@@ -154,8 +150,8 @@ _HIDDEN_MM = 1.5
 """Standard deviation that a tip on such a line has more, mm."""
 CATHETER_MM = 8.0
 """Length of the catheter behind the ostium in which a wire is followed, mm."""
-_MOST_PLACES = 20000
-"""Places of a tree of 5 m: no coronary artery has more."""
+_PLACES_MM = 1.0
+"""Distance of the places at which a wire may end, before its end is fitted, mm."""
 _SLACK_MM = 0.3
 """How far outside the lumen the wire's axis may seem to lie, mm."""
 _NEAR_PX = 10.0
@@ -168,7 +164,7 @@ _BELIEVABLE = 3.0
 class DetectorConfig:
     """How far an image is trusted."""
 
-    displaced: OpenShare = 0.5
+    displaced: OpenShare = 0.8
     """Share of the exposures in which the vessel lies elsewhere than registration has it."""
     displaced_mm: Positive = 2.0
     """How far it lies from there then, along each axis: standard deviation, mm."""
@@ -176,9 +172,7 @@ class DetectorConfig:
     """Share of the wire that is not seen, whatever the evidence against it."""
     alike: OpenShare = 0.05
     """Share of the places off the wire that look like one, whatever the evidence."""
-    independent: Share = 0.35
-    """Weight of a cross-section's evidence: neighbouring pixels share their noise."""
-    least_log_odds: Finite = 10.0
+    least_log_odds: Finite = 3.0
     """There is a wire where the images are likelier with one by this logarithm."""
     sure: OpenShare = 0.92
     """A tip is ambiguous where less of the posterior lies within 10 pixels of it."""
@@ -204,8 +198,7 @@ class TipDetector:
         """
         self._anatomy, self._radius_mm = anatomy, device.tip_radius_mm
         self.config, self._evidence = config or DetectorConfig(), evidence or RidgeEvidence.read()
-        grid = make_grid(anatomy.tree, step_mm=STEP_MM, most=_MOST_PLACES)
-        self.grid: VesselGrid = with_catheter(grid, anatomy, CATHETER_MM)
+        self.grid: VesselGrid = with_catheter(make_grid(anatomy.tree, step_mm=_PLACES_MM), anatomy, CATHETER_MM)
         self._room_mm = self.grid.radius - device.tip_radius_mm + _SLACK_MM
         self._seat = Seat(anatomy)
         behind, size = catheter_lumen_points(anatomy)
@@ -244,30 +237,21 @@ class TipDetector:
                 mm²; the configuration's if not given.
         """
         config, before = self.config, before or []
-        deepest = longest_mm(inserted_length)
         seen = [self._look(*one) for one in zip(views, signals, photons, strict=True)]
         plain, evidence = [one for one, _ in seen], [one for _, one in seen]
         lines = [self._lines(*one) for one in zip(views, before, photons, strict=False)]
         for image, line in zip(evidence, lines, strict=False):
             image[line] = 0.0
-
-        def follow(seen: Sequence[View]) -> TipEstimate:
-            follower = Follower(self.grid, self._room_mm, seen, evidence, deepest)
-            return estimate_tip(follower, inserted_length, expected)
-
         covariance = config.displaced_mm**2 * np.eye(3) if displaced is None else displaced
-        ends = end_log(self.grid.abscissa, inserted_length) + (0.0 if expected is None else expected)
-        seats = [(self._seat, image) for image in plain]
-        moved = displacements(self.grid, self._room_mm, views, evidence, seats, covariance, config.displaced, ends)
-        found = []
-        for share, shift, left in moved:
-            there = [replace(view, source=view.source - shift) for view in views]
-            one = replace(follow(there), shift=shift, shift_covariance=left)
-            found.append((share, _refined(one, there, plain, self._radius_mm)))
-        chosen = mixed(found)
-        there = [replace(view, source=view.source - chosen.shift) for view in views]
-        hidden = any(_lies_on(line, view, chosen.position) for line, view in zip(lines, there, strict=False))
-        return self._judged(chosen, there, hidden=hidden)
+        ostium = np.asarray(self._anatomy.insertion.position)
+        shifts = possible_shifts(views, ostium, covariance, config.displaced)
+        for view, image in zip(views, plain, strict=True):
+            shifts = replace(shifts, log=shifts.log + self._seat(view, image, shifts.mm @ view.slope(ostium).T))
+        found = estimate_tip(self.grid, self._room_mm, views, evidence, shifts, inserted_length, expected)
+        found = _refined(found, views, plain, evidence, self._radius_mm)
+        there = [replace(view, source=view.source - found.shift) for view in views]
+        hidden = any(_lies_on(line, view, found.position) for line, view in zip(lines, there, strict=False))
+        return self._judged(found, there, hidden=hidden)
 
     def _look(self, view: View, signal: Signal, photons: float) -> tuple[Signal, Signal]:
         """Return an image without contrast, and how likely its pixels are on a wire, none far from the vessel."""
@@ -313,16 +297,15 @@ class TipDetector:
         share = found.share * (1 - 2 * float(ndtr(-_NEAR_PX / sd_px)))
         if share >= self.config.sure and not hidden:
             return replace(found, share=share)
-        along = _HIDDEN_MM**2 * np.eye(3) if hidden else 0.0
-        covariance = found.covariance + found.elsewhere + along
-        return replace(found, share=share, status="ambiguous", covariance=covariance)
+        spread = found.spread.copy()
+        spread[:3, :3] += _HIDDEN_MM**2 * np.eye(3) if hidden else 0.0
+        return replace(found, share=share, status="ambiguous", spread=spread)
 
     def _saturated(self, log_ratio: Signal) -> Signal:
         """Return evidence that no single pixel can overrule all others with."""
         likelier = np.exp(np.clip(log_ratio, -30, 30))
         config = self.config
-        bounded = np.log((likelier + config.hidden) / (1 + config.alike * likelier))
-        return np.asarray(config.independent * bounded, dtype=np.float32)
+        return np.log((likelier + config.hidden) / (1 + config.alike * likelier)).astype(np.float32)
 
     def without_contrast(self, view: View, signal: Signal, box: tuple[slice, slice] | None = None) -> Signal:
         """Return an image without the contrast in the vessel, whose strength is estimated from a part of the image."""
@@ -363,29 +346,76 @@ def _lies_on(line: Bool[np.ndarray, "rows columns"], view: View, point: Float[np
     return bool(line[row, column])
 
 
-def _refined(found: TipEstimate, views: Sequence[View], signals: Sequence[Signal], radius_mm: float) -> TipEstimate:
-    """Return the estimate after each image's fit of the wire's end: a Kalman update of position and covariance."""
-    position = found.position
-    covariance = _DOUBT**2 * found.covariance + _LOOSE_MM**2 * np.eye(3)
-    before = found.wire[-1 - min(_END_SECTIONS, len(found.wire) - 1)]
-    length, fitted = float(np.linalg.norm(found.position - before)), False
-    for view, signal in zip(views, signals, strict=True):
-        guess, slope = view.project(position), view.slope(position)
-        forwards, per_mm = guess - view.project(before), float(np.linalg.norm(slope, 2))
-        if float(np.linalg.norm(forwards)) < _SEEN_SHARE * per_mm * length:
-            continue
-        end = fit_end(signal, guess, forwards, float(np.hypot(0.5 * radius_mm * per_mm, _BLUR_PX)))
-        if end is None:
-            continue
-        expected = slope @ covariance @ slope.T + end.covariance
-        error = end.place - guess
+def _refined(
+    found: TipEstimate,
+    views: Sequence[View],
+    signals: Sequence[Signal],
+    evidence: Sequence[Signal],
+    radius_mm: float,
+) -> TipEstimate:
+    """Return the estimate after each image's fit of the wire's end: a Kalman update of place and shift."""
+    mean, spread = found.mean, found.spread
+    wire = found.wire[-_END_PLACES:] - found.position
+
+    def seen(
+        view: View, row: Float[np.ndarray, "k 2"], error: Float[np.ndarray, "k"], own: Float[np.ndarray, "k k"]
+    ) -> bool:
+        """Take an error in pixels, along some directions of the image, if it is believable."""
+        nonlocal mean, spread
+        slope = row @ view.slope(mean[:3] + mean[3:])
+        both = np.hstack([slope, slope])
+        expected = both @ spread @ both.T + own
         if error @ np.linalg.solve(expected, error) > _BELIEVABLE**2:
+            return False
+        gain = spread @ both.T @ np.linalg.inv(expected)
+        mean, spread = mean + gain @ error, (np.eye(6) - gain @ both) @ spread
+        return True
+
+    for view, signal, image in zip(views, signals, evidence, strict=True):
+        at = mean[:3] + mean[3:]
+        per_mm = float(np.linalg.norm(view.slope(at), 2))
+        forwards = view.project(at) - view.project(at + wire[0])
+        seen_px, there_mm = float(np.linalg.norm(forwards)), float(np.linalg.norm(wire[0]))
+        if seen_px < _SEEN_SHARE * per_mm * there_mm:
             continue
-        gain = covariance @ slope.T @ np.linalg.inv(expected)
-        position = position + gain @ error
-        covariance, fitted = (np.eye(3) - gain @ slope) @ covariance, True
-    if not fitted:
-        position, covariance = found.position, found.covariance
-    moved_mm, count = float(np.linalg.norm(position - found.position)), len(views)
-    covariance = _WIDER[count] * covariance + (_FIT_SHARE[count] * moved_mm) ** 2 * np.eye(3) + found.shift_covariance
-    return replace(found, position=position, covariance=covariance)
+        axes = np.array([forwards, [-forwards[1], forwards[0]]]) / seen_px
+        if not found.folded:  # the other strand goes on
+            slope = axes @ np.hstack([view.slope(at)] * 2)
+            seen(view, axes, *_ends(image, view.project(at), axes, slope @ spread @ slope.T))
+        guess, width_px = view.project(mean[:3] + mean[3:]), float(np.hypot(0.5 * radius_mm * per_mm, _BLUR_PX))
+        for aside in (0.0, -_BESIDE_STRAND_PX, _BESIDE_STRAND_PX)[: 3 if found.folded else 1]:
+            end = fit_end(signal, guess + aside * axes[1], forwards, width_px)
+            if end is not None and seen(view, np.eye(2), end.place - guess, end.covariance):
+                break
+    return replace(found, mean=mean, spread=spread)
+
+
+def _ends(
+    image: Signal, guess: Float[np.ndarray, "2"], axes: Float[np.ndarray, "2 2"], expected: Float[np.ndarray, "2 2"]
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
+    """Return how far along and aside a wire ends from a guess, by the evidence of an image, and its covariance.
+
+    Args:
+        image: the evidence.
+        guess: to the right of the image's middle and up from it, pixels.
+        axes: unit vectors along the wire and across it.
+        expected: covariance of the end about the guess, along and across, pixels².
+    """
+    reach, sides = np.ceil(2.5 * np.sqrt(np.diag(expected)))
+    along, across = np.arange(-reach - _LEAD_PX, reach + 1), np.arange(-sides, sides + 1)
+    right, up = guess[:, None, None] + axes[0][:, None, None] * along[:, None] + axes[1][:, None, None] * across
+    middle = (len(image) - 1) / 2
+    score = map_coordinates(image, [middle - up, middle + right], order=1)
+    prior = -0.5 * across**2 / expected[1, 1]
+    prior -= np.logaddexp.reduce(prior)
+    log = _OF_PIXEL * np.cumsum(np.logaddexp.reduce(score + prior, axis=1)) - 0.5 * along**2 / expected[0, 0]
+    weight = np.exp(log - log[_LEAD_PX:].max())
+    weight[:_LEAD_PX] = 0.0
+    lately = np.exp(uniform_filter1d(score, _LEAD_PX // 2, axis=0, origin=_LEAD_PX // 4 - 1) + prior)
+    weight = (weight / weight.sum())[:, None] * lately / lately.sum(axis=1, keepdims=True)
+    off = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1)
+    mean = np.einsum("ij,ijk->k", weight, off)
+    posterior = np.einsum("ij,ijk,ijl->kl", weight, off - mean, off - mean) + _OWN_PX**2 * np.eye(2)
+    # What the image alone says: the posterior without the prior.
+    own = np.linalg.inv(np.linalg.inv(posterior) - np.diag(0.9 / np.maximum(np.diag(expected), np.diag(posterior))))
+    return own @ np.linalg.solve(posterior, mean), own

@@ -14,7 +14,6 @@ from itertools import product
 
 import numpy as np
 from jaxtyping import Float, Float32
-from scipy.spatial import KDTree
 
 from endopilot.anatomy.projection import TipProjector
 from endopilot.devices.device import Wire
@@ -28,7 +27,7 @@ from endopilot.xray.image import isocenter_of
 from endopilot.xray.registration import Registration, lay, observed_contrast, register
 from endopilot.xray.tip_filter import LocateConfig, TipLocation, goes, told_by_later
 from endopilot.xray.tip_posterior import TipEstimate
-from endopilot.xray.vessel_grid import VesselGrid, make_grid
+from endopilot.xray.vessel_grid import VesselGrid
 
 _EMPTY_SHARE = 0.9
 """A pixel's light where no contrast passes is this quantile of the frames': contrast and wire darken fewer."""
@@ -109,7 +108,7 @@ def locate_in_images(
         for frame in range(count):
             found.append(look(frame, None))
             advance()
-    track = _Track(anatomy, detector.grid, config, cines[0].times_s, found)
+    track = _Track(detector.grid, config, cines[0].times_s, found)
     for frame, one in enumerate(found):
         if one.status != "not found" and track.elsewhere(frame, one):
             found[frame] = look(frame, track.expected(frame))
@@ -222,23 +221,12 @@ class _Track:
     """Where the tip is at each time, by all frames together."""
 
     def __init__(
-        self,
-        anatomy: Anatomy,
-        grid: VesselGrid,
-        config: LocateConfig,
-        times_s: Float[np.ndarray, "frames"],
-        found: Sequence[TipEstimate],
+        self, grid: VesselGrid, config: LocateConfig, times_s: Float[np.ndarray, "frames"], found: Sequence[TipEstimate]
     ) -> None:
         """Take what each frame shows at the places of the detector's grid."""
-        coarse = make_grid(anatomy.tree, step_mm=1.0)
-        self._middle, self._of = coarse.middle, KDTree(coarse.middle).query(grid.middle)[1]
-        seen = [np.zeros(len(coarse.parent)) for _ in found]
-        for log, one in zip(seen, found, strict=True):
-            if one.status != "not found":
-                log[:] = -np.inf
-                np.logaddexp.at(log, self._of, one.ends)
-        steps = np.maximum(np.diff(times_s), 1e-3) / _FRAME_S
-        flows = [goes(coarse, config, float(one)) for one in steps]
+        self._middle, catheter = grid.middle, grid.branch < 0
+        seen = [np.where(catheter, -np.inf, 0.0 if one.status == "not found" else one.ends) for one in found]
+        flows = [goes(grid, config, float(step)) for step in np.maximum(np.diff(times_s), 1e-3) / _FRAME_S]
         later = told_by_later(seen, lambda k: flows[k])
         before = told_by_later(seen[::-1], lambda k: flows[-1 - k].T)[::-1]
         self._others = [a + b for a, b in zip(later, before, strict=True)]
@@ -250,7 +238,7 @@ class _Track:
 
     def expected(self, frame: int) -> Float[np.ndarray, "places"]:
         """Return what the other frames say of the tip's place in a frame, a logarithm."""
-        return (self._others[frame] - np.logaddexp.reduce(self._others[frame]))[self._of]
+        return self._others[frame] - np.logaddexp.reduce(self._others[frame])
 
 
 _FRAME_S = 0.133
