@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
-from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates, uniform_filter1d
+from scipy.ndimage import binary_dilation, gaussian_filter
 from scipy.ndimage import label as connected_parts
 from scipy.special import ndtr
 
@@ -27,7 +27,7 @@ from endopilot.xray.carm import View
 from endopilot.xray.projector import splat
 from endopilot.xray.tip_posterior import Seat, TipEstimate, estimate_tip, possible_shifts
 from endopilot.xray.vessel_grid import VesselGrid, make_grid, with_catheter
-from endopilot.xray.wire_end import fit_end
+from endopilot.xray.wire_end import BLUR_PX, refined
 
 Signal = Float32[np.ndarray, "rows columns"]
 SCALES_PX = (1.0, 1.7, 2.8)
@@ -130,18 +130,7 @@ _FILLED_MM, _FEWEST_PX = 0.3, 10
 """Contrast is looked for where this much of the lumen lies behind a pixel, mm, if there are so many pixels."""
 _LEAST_CONTRAST = 0.01
 """Contrast below this, 1/mm, is none."""
-_END_PLACES = 4
-"""Places of the wire's end that give its first direction, and how far aside of the centerline it runs there."""
-_BESIDE_STRAND_PX = 3.0
-"""So far on either side the end of a wire that folds is looked for, pixels: the other strand lies in the middle."""
-_LEAD_PX, _OF_PIXEL, _OWN_PX = 12, 0.3, 1.0
-"""Length of the wire before its end that shows how far aside it runs, pixels; weight of the evidence of each, since
-neighbours share their noise; standard deviation of what a straight line leaves out, pixels."""
-_BLUR_PX = 0.6
-"""Standard deviation of the detector's blur, pixels."""
-_SEEN_SHARE = 0.35
-"""An end that is foreshortened to less than this share of its length shows no direction, and is not fitted."""
-_LINE, _LINE_PX, _MOVED_PX = 0.3, 60, 2
+_LINE, _LINE_PX, _MOVED_PX = 0.86, 60, 2
 """An image from before shows a line where the evidence for a wire is larger than this over so many pixels together; it
 may be displaced by so many pixels."""
 _KEPT_LINES = 8
@@ -156,8 +145,6 @@ _SLACK_MM = 0.3
 """How far outside the lumen the wire's axis may seem to lie, mm."""
 _NEAR_PX = 10.0
 """A tip is where it is found if it lies within this, pixels of each image: 2 mm in the vessel."""
-_BELIEVABLE = 3.0
-"""An end farther than this many standard deviations from the followed wire's is another line's."""
 
 
 @settings
@@ -248,7 +235,7 @@ class TipDetector:
         for view, image in zip(views, plain, strict=True):
             shifts = replace(shifts, log=shifts.log + self._seat(view, image, shifts.mm @ view.slope(ostium).T))
         found = estimate_tip(self.grid, self._room_mm, views, evidence, shifts, inserted_length, expected)
-        found = _refined(found, views, plain, evidence, self._radius_mm)
+        found = refined(found, views, plain, evidence, self._radius_mm)
         there = [replace(view, source=view.source - found.shift) for view in views]
         hidden = any(_lies_on(line, view, found.position) for line, view in zip(lines, there, strict=False))
         return self._judged(found, there, hidden=hidden)
@@ -311,7 +298,7 @@ class TipDetector:
         """Return an image without the contrast in the vessel, whose strength is estimated from a part of the image."""
         box = box or (slice(None), slice(None))
         width_mm = 0.5 * self._anatomy.distance_map.spacing_mm
-        path_mm = splat(view, len(signal), *self._filled, width_mm=width_mm, blur_px=_BLUR_PX)
+        path_mm = splat(view, len(signal), *self._filled, width_mm=width_mm, blur_px=BLUR_PX)
         path, part = _halved(path_mm[box]), _halved(signal[box])
         filled = path > _FILLED_MM
         if 4 * filled.sum() < _FEWEST_PX:
@@ -344,78 +331,3 @@ def _lies_on(line: Bool[np.ndarray, "rows columns"], view: View, point: Float[np
     (right, up), middle = view.project(point), (len(line) - 1) / 2
     row, column = np.clip(np.rint([middle - up, middle + right]), 0, len(line) - 1).astype(int)
     return bool(line[row, column])
-
-
-def _refined(
-    found: TipEstimate,
-    views: Sequence[View],
-    signals: Sequence[Signal],
-    evidence: Sequence[Signal],
-    radius_mm: float,
-) -> TipEstimate:
-    """Return the estimate after each image's fit of the wire's end: a Kalman update of place and shift."""
-    mean, spread = found.mean, found.spread
-    wire = found.wire[-_END_PLACES:] - found.position
-
-    def seen(
-        view: View, row: Float[np.ndarray, "k 2"], error: Float[np.ndarray, "k"], own: Float[np.ndarray, "k k"]
-    ) -> bool:
-        """Take an error in pixels, along some directions of the image, if it is believable."""
-        nonlocal mean, spread
-        slope = row @ view.slope(mean[:3] + mean[3:])
-        both = np.hstack([slope, slope])
-        expected = both @ spread @ both.T + own
-        if error @ np.linalg.solve(expected, error) > _BELIEVABLE**2:
-            return False
-        gain = spread @ both.T @ np.linalg.inv(expected)
-        mean, spread = mean + gain @ error, (np.eye(6) - gain @ both) @ spread
-        return True
-
-    for view, signal, image in zip(views, signals, evidence, strict=True):
-        at = mean[:3] + mean[3:]
-        per_mm = float(np.linalg.norm(view.slope(at), 2))
-        forwards = view.project(at) - view.project(at + wire[0])
-        seen_px, there_mm = float(np.linalg.norm(forwards)), float(np.linalg.norm(wire[0]))
-        if seen_px < _SEEN_SHARE * per_mm * there_mm:
-            continue
-        axes = np.array([forwards, [-forwards[1], forwards[0]]]) / seen_px
-        if not found.folded:  # the other strand goes on
-            slope = axes @ np.hstack([view.slope(at)] * 2)
-            seen(view, axes, *_ends(image, view.project(at), axes, slope @ spread @ slope.T))
-        guess, width_px = view.project(mean[:3] + mean[3:]), float(np.hypot(0.5 * radius_mm * per_mm, _BLUR_PX))
-        for aside in (0.0, -_BESIDE_STRAND_PX, _BESIDE_STRAND_PX)[: 3 if found.folded else 1]:
-            end = fit_end(signal, guess + aside * axes[1], forwards, width_px)
-            if end is not None and seen(view, np.eye(2), end.place - guess, end.covariance):
-                break
-    return replace(found, mean=mean, spread=spread)
-
-
-def _ends(
-    image: Signal, guess: Float[np.ndarray, "2"], axes: Float[np.ndarray, "2 2"], expected: Float[np.ndarray, "2 2"]
-) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
-    """Return how far along and aside a wire ends from a guess, by the evidence of an image, and its covariance.
-
-    Args:
-        image: the evidence.
-        guess: to the right of the image's middle and up from it, pixels.
-        axes: unit vectors along the wire and across it.
-        expected: covariance of the end about the guess, along and across, pixels².
-    """
-    reach, sides = np.ceil(2.5 * np.sqrt(np.diag(expected)))
-    along, across = np.arange(-reach - _LEAD_PX, reach + 1), np.arange(-sides, sides + 1)
-    right, up = guess[:, None, None] + axes[0][:, None, None] * along[:, None] + axes[1][:, None, None] * across
-    middle = (len(image) - 1) / 2
-    score = map_coordinates(image, [middle - up, middle + right], order=1)
-    prior = -0.5 * across**2 / expected[1, 1]
-    prior -= np.logaddexp.reduce(prior)
-    log = _OF_PIXEL * np.cumsum(np.logaddexp.reduce(score + prior, axis=1)) - 0.5 * along**2 / expected[0, 0]
-    weight = np.exp(log - log[_LEAD_PX:].max())
-    weight[:_LEAD_PX] = 0.0
-    lately = np.exp(uniform_filter1d(score, _LEAD_PX // 2, axis=0, origin=_LEAD_PX // 4 - 1) + prior)
-    weight = (weight / weight.sum())[:, None] * lately / lately.sum(axis=1, keepdims=True)
-    off = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1)
-    mean = np.einsum("ij,ijk->k", weight, off)
-    posterior = np.einsum("ij,ijk,ijl->kl", weight, off - mean, off - mean) + _OWN_PX**2 * np.eye(2)
-    # What the image alone says: the posterior without the prior.
-    own = np.linalg.inv(np.linalg.inv(posterior) - np.diag(0.9 / np.maximum(np.diag(expected), np.diag(posterior))))
-    return own @ np.linalg.solve(posterior, mean), own

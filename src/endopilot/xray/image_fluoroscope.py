@@ -65,11 +65,10 @@ class Displaced:
         return [replace(view, source=view.source - self.shift) for view in views]
 
     def update(self, found: TipEstimate) -> None:
-        """Take what an exposure shows, a Kalman update; one view shows a shift across its beam alone."""
-        if found.status == "found" and found.shift.any():
-            gain = self.covariance @ np.linalg.inv(self.covariance + found.spread[3:, 3:])
-            self.shift = self.shift + gain @ found.shift
-            self.covariance = (np.eye(3) - gain) @ self.covariance + _DRIFTS_MM**2 * np.eye(3)
+        """Take what an exposure shows: its posterior of the shift is the next one's prior."""
+        if found.status == "found":
+            self.shift = self.shift + found.shift
+            self.covariance = found.spread[3:, 3:] + _DRIFTS_MM**2 * np.eye(3)
 
 
 class ImageFluoroscope:

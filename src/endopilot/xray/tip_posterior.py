@@ -10,13 +10,14 @@ places. The vessel lies where it is registered, or displaced; the guiding cathet
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter
 from scipy.signal import fftconvolve
+from scipy.special import logsumexp
 
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import CATHETER_MM, catheter_points
@@ -223,52 +224,78 @@ def estimate_tip(
     way = _way(grid, room_mm, views, evidence, shifts.mm)
     by_time = np.zeros(len(way)) if expected is None else expected
     ends = end_log(grid.abscissa, inserted_length) + by_time
-    ends = ends - np.logaddexp.reduce(ends)
-    place, fold = np.arange(len(way)), np.arange(len(way))
-    if inserted_length is not None:
-        likeliest = int((shifts.log + _ALIKE * np.logaddexp.reduce(way + ends[:, None], axis=0)).argmax())
-        second = np.zeros(len(way))
-        for view, image in zip(views, evidence, strict=True):
-            second += _second_strand(grid, room_mm, view, image, shifts.mm[likeliest])
-        back, at, seen = _folds(grid, way, shifts.log, second)
-        before = end_log(2 * grid.abscissa[at] - grid.abscissa[back], inserted_length) + by_time[back]
-        before += seen + np.log(_FOLDED_SHARE) - np.logaddexp.reduce(before, initial=-np.inf)
-        place, fold = np.append(place, back), np.append(fold, at)
-        ends = np.append(ends + np.log(1 - _FOLDED_SHARE), before)
-    log = way[fold] + ends[:, None]
-    by_shift = np.logaddexp.reduce(log, axis=0)
-    total = float(np.logaddexp.reduce(shifts.log + by_shift))
-    log += shifts.log - (1 - _ALIKE) * by_shift
-    log -= np.logaddexp.reduce(log, axis=None)
+    ends = ends - logsumexp(ends)
+    by_shift = logsumexp(way + ends[:, None], axis=0)
     # What lies in the catheter alone is a poor sign of a wire: the catheter is a dark line too.
     most = _MOST_OF_CATHETER if inserted_length is not None else 0.0
     catheter = max(float(way[np.flatnonzero(grid.branch < 0)[-1]].max()) - most, 0.0)
+    log_odds = float(logsumexp(shifts.log + by_shift)) - catheter
+    level = shifts.log + _ALIKE * by_shift
+    level -= logsumexp(level)
+    kept = level > np.log(_NOTHING)
+    way, shifts = way[:, kept], replace(shifts, mm=shifts.mm[kept], log=level[kept])
+    log = way + ends[:, None] + shifts.log - by_shift[kept]
+    place, fold = np.arange(len(way)), np.arange(len(way))
+    if inserted_length is not None:
+        second = np.zeros(len(way))
+        for view, image in zip(views, evidence, strict=True):
+            second += _second_strand(grid, room_mm, view, image, shifts.mm[shifts.log.argmax()])
+        back, at, seen = _folds(grid, way, shifts.log - by_shift[kept], second)
+        before = end_log(2 * grid.abscissa[at] - grid.abscissa[back], inserted_length) + by_time[back]
+        before += seen + np.log(_FOLDED_SHARE / (1 - _FOLDED_SHARE)) - np.logaddexp.reduce(before, initial=-np.inf)
+        place, fold = np.append(place, back), np.append(fold, at)
+        log = np.concatenate([log, way[at] + before[:, None] + shifts.log - by_shift[kept]])
+    return _summary(
+        grid,
+        room_mm,
+        shifts,
+        log - logsumexp(log),
+        (place, fold),
+        log_odds=log_odds,
+        ends=logsumexp(way + shifts.log - by_shift[kept], axis=1),
+    )
+
+
+def _summary(
+    grid: VesselGrid,
+    room_mm: Float[np.ndarray, "n"],
+    shifts: Shifts,
+    log: Float[np.ndarray, "k t"],
+    of: tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]],
+    *,
+    log_odds: float,
+    ends: Float[np.ndarray, "n"],
+) -> TipEstimate:
+    """Return mean and covariance around the mode of a posterior, given where each row's wire ends, and where it folds.
+
+    Rows of wires that do not fold are the places of the grid.
+    """
     row, shift = np.nonzero(log > np.log(_NOTHING))
-    weight, of = np.exp(log[row, shift]), place[row]
-    folded = bool(weight[row >= len(way)].sum() > 0.5)
-    of_kind = (row >= len(way)) == folded
-    mode = int(np.bincount(of[of_kind], weight[of_kind]).argmax())
-    near = ((grid.middle[of] - grid.middle[mode]) ** 2).sum(axis=1) <= MODE_MM**2
-    both = np.concatenate([grid.middle[of], shifts.mm[shift]], axis=1)
-    share, mean, spread = around_mode(both, weight, near, 0.0)
+    weight, place = np.exp(log[row, shift]), of[0][row]
+    back = row >= len(grid.parent)
+    folded = bool(weight[back].sum() > 0.5)
+    own = np.where(back == folded, weight, 0.0)
+    mode = int(np.bincount(place, own).argmax())
+    near = ((grid.middle[place] - grid.middle[mode]) ** 2).sum(axis=1) <= MODE_MM**2
+    share, mean, spread = around_mode(np.concatenate([grid.middle[place], shifts.mm[shift]], axis=1), weight, near, 0.0)
     tangent = grid.middle[mode] - grid.middle[max(int(grid.parent[mode]), 0)]
     tangent /= max(float(np.linalg.norm(tangent)), 1e-9)
     spread[:3, :3] += grid.step_mm**2 / 12 * np.eye(3)
     spread[:3, :3] += max(room_mm[mode], grid.step_mm) ** 2 / 4 * (np.eye(3) - np.outer(tangent, tangent))
-    spread[3:, 3:] += float(weight[near & (shift > 0)].sum()) / share * shifts.unseen
-    far = grid.middle[of[~near]] - mean[:3]
-    reached = int(fold[row[of_kind][(weight * (of == mode))[of_kind].argmax()]])
+    displaced = shifts.mm[shift].any(axis=1)
+    spread[3:, 3:] += float(weight[near & displaced].sum()) / share * shifts.unseen
+    far = grid.middle[place[~near]] - mean[:3]
+    reached = int(of[1][row[(own * (place == mode)).argmax()]])
     path = grid.behind[reached, : grid.depth[reached] + 1]
     path = np.append(path[::-1], path[1 : 1 + int(grid.depth[reached] - grid.depth[mode])])
-    level = shifts.log - (1 - _ALIKE) * by_shift
     return TipEstimate(
-        log_odds=total - catheter,
+        log_odds=log_odds,
         mean=mean,
         spread=spread,
         share=share,
         elsewhere=(weight[~near, None] * far).T @ far,
         wire=np.concatenate([grid.middle[path[:-1]], mean[None, :3]]),
-        ends=np.logaddexp.reduce(way + level, axis=1),
+        ends=ends,
         folded=folded,
     )
 
@@ -280,7 +307,7 @@ def _folds(
 
     They fold at the foremost places that a wire seems to reach, whatever its length there.
     """
-    reached = np.where(grid.abscissa > 0, np.logaddexp.reduce(way + log, axis=1), -np.inf)
+    reached = np.where(grid.abscissa > 0, logsumexp(way + log, axis=1), -np.inf)
     rows = [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))]
     for _ in range(_FOLDS):
         at = int(reached.argmax())
