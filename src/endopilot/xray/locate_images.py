@@ -24,6 +24,7 @@ from endopilot.xray.carm import Pose, View, view_of
 from endopilot.xray.cine import XrayCine
 from endopilot.xray.detector import TipDetector
 from endopilot.xray.image import isocenter_of
+from endopilot.xray.line_observations import shift_onto
 from endopilot.xray.registration import Registration, lay, observed_contrast, register
 from endopilot.xray.tip_filter import LocateConfig, TipLocation, goes, told_by_later
 from endopilot.xray.tip_posterior import TipEstimate
@@ -119,7 +120,23 @@ def locate_in_images(
     for frame, one in enumerate(found):
         views[frame] = [replace(view, source=view.source - one.shift) for view in views[frame]]
         moved = poses[frame].move(one.position + one.shift, isocenter) - one.position
-        tips.append(_location(anatomy, project, frame, one, moved))
+        if one.status == "not found":
+            tips.append(TipLocation.nowhere(frame))
+            continue
+        at = project(one.position[None])
+        tips.append(
+            TipLocation.at(
+                anatomy.tree,
+                (int(at.branch[0]), float(at.abscissa[0])),
+                frame=frame,
+                status=one.status,
+                position=one.position,
+                covariance=one.covariance,
+                share=one.share,
+                moved_mm=moved,
+                residual_mm=np.nan,
+            )
+        )
     return ImagesLocated(
         tips=tuple(tips),
         wires=tuple(None if one.status == "not found" else one.wire for one in found),
@@ -144,11 +161,8 @@ def _registered(
     if config.landmark_mm is not None:
         if config.landmark_px is None:
             raise InputError("landmark_px: missing; give the pixel of the first frame that shows landmark_mm")
-        view, point, shift = cines[0].view(isocenter), np.array(config.landmark_mm), np.zeros(3)
-        middle = (cines[0].signals.shape[1] - 1) / 2
-        pixel = (np.array(config.landmark_px) - middle) * [1, -1]
-        for _ in range(4):
-            shift = shift + np.linalg.pinv(view.slope(point + shift)) @ (pixel - view.project(point + shift))
+        pixel = (np.array(config.landmark_px) - (cines[0].signals.shape[1] - 1) / 2) * [1, -1]
+        shift = shift_onto(cines[0].view(isocenter), np.array(config.landmark_mm), pixel)
         return cines, [Pose(translation_mm=shift)] * count, [_MOVES_MM**2 * np.eye(3)] * count, None, 0, notes
     before = [np.quantile(one.signals, _EMPTY_SHARE, axis=0).astype(np.float32) for one in cines]
     contrast = np.sum([_contrast(one, empty) for one, empty in zip(cines, before, strict=True)], axis=0)
@@ -243,27 +257,3 @@ class _Track:
 
 _FRAME_S = 0.133
 """Time of a frame at which `LocateConfig.travel_mm` is meant, s: 7.5 frames a second, usual in fluoroscopy."""
-
-
-def _location(
-    anatomy: Anatomy, project: TipProjector, frame: int, one: TipEstimate, moved_mm: Float[np.ndarray, "3"]
-) -> TipLocation:
-    """Return where a tip of the detector lies in the tree."""
-    if one.status == "not found":
-        return TipLocation.nowhere(frame)
-    at = project(one.position[None])
-    branch, abscissa = int(at.branch[0]), float(at.abscissa[0])
-    here = anatomy.tree.branches[branch]
-    section = here.section[np.abs(here.centerline.abscissa - abscissa).argmin()]
-    return TipLocation(
-        frame=frame,
-        status=one.status,
-        position=one.position,
-        covariance=one.covariance,
-        share=one.share,
-        abscissa=abscissa,
-        branch=branch,
-        section=anatomy.tree.section_names[section],
-        moved_mm=moved_mm,
-        residual_mm=np.nan,
-    )
