@@ -182,6 +182,17 @@ def test_lines_that_were_there_before_are_none_of_the_wire(imager, planes, fork)
     assert np.linalg.norm(detector.find(*images, before=empty).position - nodes[0]) < 1.5
 
 
+def test_a_straight_vessel_that_lies_off_along_itself_is_not_taken_for_sure(imager, planes, fork):
+    """The wire shows no shift along a straight vessel; the catheter's end says that the vessel may lie elsewhere."""
+    nodes = wire_to(fork, 0)
+    views = [replace(plane.view, source=plane.view.source + [0.0, 0.0, 2.5]) for plane in planes]
+    photons = [imager.photons(plane) for plane in planes]
+    found = TipDetector(fork, imager.stack.wire).find(views, exposed(imager, planes, nodes), photons, TIP[0])
+    error = found.position - nodes[0]
+    assert found.status == "ambiguous" and np.linalg.norm(error[:2]) < 0.82  # of the room in the lumen
+    assert error @ np.linalg.solve(found.covariance, error) < 2.795**2  # the region of 95 %
+
+
 def test_an_estimate_that_is_not_sure_is_ambiguous_and_its_region_holds_the_rest(imager, planes, fork):
     images = [planes[0].view], exposed(imager, planes, wire_to(fork, 1))[:1], [imager.photons(planes[0])], TIP[1]
     sure, strict = (

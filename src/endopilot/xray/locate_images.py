@@ -103,7 +103,8 @@ def locate_in_images(
 
     def look(frame: int, expected: Float[np.ndarray, "places"] | None) -> TipEstimate:
         shown = [one.signals[frame] for one in cines]
-        return detector.estimate(views[frame], shown, photons, None, expected=expected, displaced=moves[frame])
+        spread = _STIRS_MM**2 * np.eye(3) if moves[frame] is None else moves[frame]
+        return detector.estimate(views[frame], shown, photons, None, expected=expected, displaced=spread)
 
     with progress(f"locate {anatomy.name}", count) as advance:
         for frame in range(count):
