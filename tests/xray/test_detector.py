@@ -185,7 +185,7 @@ def test_lines_that_were_there_before_are_none_of_the_wire(imager, planes, fork)
 def test_a_straight_vessel_that_lies_off_along_itself_is_not_taken_for_sure(imager, planes, fork):
     """The wire shows no shift along a straight vessel; the catheter's end says that the vessel may lie elsewhere."""
     nodes = wire_to(fork, 0)
-    views = [replace(plane.view, source=plane.view.source + [0.0, 0.0, 2.5]) for plane in planes]
+    views = [replace(plane.view, source=plane.view.source + np.array([0.0, 0.0, 2.5])) for plane in planes]
     photons = [imager.photons(plane) for plane in planes]
     found = TipDetector(fork, imager.stack.wire).find(views, exposed(imager, planes, nodes), photons, TIP[0])
     error = found.position - nodes[0]

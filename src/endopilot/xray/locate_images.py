@@ -171,7 +171,7 @@ def _registered(
     tried: list[tuple[Registration, tuple[XrayCine, ...], list[np.ndarray], str]] = []
     for seen, empty, said in _read_otherwise(cines, before):
         views, lit = [one.view(isocenter) for one in seen], [one.signals[best] for one in seen]
-        start = lay(anatomy, views, lit, empty, seen[0].image)[0]
+        start = lay(anatomy, views, lit, empty, seen[0].image)
         tried.append((register(anatomy, views, lit, empty, seen[0].image, start), seen, empty, said))
         if not tried[-1][0].failure:
             break

@@ -177,17 +177,15 @@ def take_run(
     return run
 
 
-def lay(
-    anatomy: Anatomy, views: Sequence[View], contrasted: Images, before: Images, config: ImageConfig
-) -> tuple[Pose, float]:
-    """Return the shift, up to half an image, in which the vessel fits the images best, and their correlation then.
+def lay(anatomy: Anatomy, views: Sequence[View], contrasted: Images, before: Images, config: ImageConfig) -> Pose:
+    """Return the shift, up to half an image, in which the vessel fits the images best.
 
     It begins a registration where nobody says how far the vessel lies from the isocenter; arguments as `register` has.
     """
     averaged, blur = _LEVELS[0]
     observed = observed_contrast(contrasted, before, averaged, blur, config)
     points, size, _ = sampled_lumen(anatomy)
-    rows, shifts, fits = [], [], []
+    rows, shifts = [], []
     for view, theirs in zip(views, observed, strict=True):
         ours = Shadow(view.magnified(1 / averaged), config.pixels // averaged, points).of(size, blur_px=blur)
         ours, theirs = ours - ours.mean(), theirs - np.median(theirs)
@@ -195,12 +193,11 @@ def lay(
         alike = np.fft.irfft2(
             np.fft.rfft2(theirs, (side, side)) * np.fft.rfft2(ours, (side, side)).conj(), (side, side)
         )
-        fits.append(alike.max() / max(float(np.linalg.norm(ours) * np.linalg.norm(theirs)), 1e-12))
         down, right = (int(at) - side * (at >= side // 2) for at in np.unravel_index(alike.argmax(), alike.shape))
         rows.append(view.slope(isocenter_of(anatomy)))
         shifts.append([averaged * right, -averaged * down])
     shift = np.linalg.pinv(np.concatenate(rows)) @ np.concatenate(shifts)
-    return Pose(translation_mm=shift), float(np.mean(fits))
+    return Pose(translation_mm=shift)
 
 
 @dataclass(frozen=True, eq=False)
