@@ -18,7 +18,7 @@ _END_PLACES = 4
 """Places of the wire's end that give its first direction, and how far aside of the centerline it runs there."""
 _BESIDE_STRAND_PX = 3.0
 """So far on either side the end of a wire that folds is looked for, pixels: the other strand lies in the middle."""
-_LEAD_PX, _OF_PIXEL, _OWN_PX = 12, 0.3, 1.0
+_LEAD_PX, _OF_PIXEL, _STRAIGHT_PX = 12, 0.3, 1.0
 """Length of the wire before its end that shows how far aside it runs, pixels; weight of the evidence of each, since
 neighbours share their noise; standard deviation of what a straight line leaves out, pixels."""
 _SEEN_SHARE = 0.35
@@ -175,7 +175,7 @@ def _ends(
     weight = (weight / weight.sum())[:, None] * lately / lately.sum(axis=1, keepdims=True)
     off = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1)
     mean = np.einsum("ij,ijk->k", weight, off)
-    posterior = np.einsum("ij,ijk,ijl->kl", weight, off - mean, off - mean) + _OWN_PX**2 * np.eye(2)
+    posterior = np.einsum("ij,ijk,ijl->kl", weight, off - mean, off - mean) + _STRAIGHT_PX**2 * np.eye(2)
     # What the image alone says: the posterior without the prior.
     own = np.linalg.inv(np.linalg.inv(posterior) - np.diag(0.9 / np.maximum(np.diag(expected), np.diag(posterior))))
     return own @ np.linalg.solve(posterior, mean), own
