@@ -23,6 +23,9 @@ _LEAD_PX, _OF_PIXEL, _STRAIGHT_PX = 12, 0.3, 1.0
 neighbours share their noise; standard deviation of what a straight line leaves out, pixels."""
 _SEEN_SHARE = 0.35
 """An end that is foreshortened to less than this share of its length shows no direction, and is not fitted."""
+_FIT_PX = 0.6
+"""Standard deviation by which fits of ends err besides, pixels: their median errors were 0.3 to 0.6 in one view of
+three arteries, and with 0.35 alone the region of 95 % held 62 % of the tips in one of them."""
 _BELIEVABLE = 3.0
 """An end farther than this many standard deviations from the posterior's is another line's."""
 BLUR_PX = 0.6
@@ -145,7 +148,7 @@ def refined(
         guess, width_px = view.project(mean[:3] + mean[3:]), float(np.hypot(0.5 * radius_mm * per_mm, BLUR_PX))
         for aside in (0.0, -_BESIDE_STRAND_PX, _BESIDE_STRAND_PX)[: 3 if found.folded else 1]:
             end = fit_end(signal, guess + aside * axes[1], forwards, width_px)
-            if end is not None and seen(view, np.eye(2), end.place - guess, end.covariance):
+            if end is not None and seen(view, np.eye(2), end.place - guess, end.covariance + _FIT_PX**2 * np.eye(2)):
                 break
     return replace(found, mean=mean, spread=spread)
 
