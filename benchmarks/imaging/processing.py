@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.imaging.scenes import SceneConfig, draw_scenes
-from benchmarks.imaging.xray import SHOWN, Case, Exposure, XrayBenchConfig, expose, summary
+from benchmarks.imaging.xray import SHOWN, Case, Exposure, XrayBenchConfig, expose, summary, vessel_error_mm
 from endopilot.xray.image import XrayImager
-from endopilot.xray.registration import register, vessel_error_mm
+from endopilot.xray.registration import register
 
 CHANGES: dict[str, dict[str, float]] = {
     "as the detector was trained": {},

@@ -16,13 +16,13 @@ from benchmarks.imaging.scenes import Scene, SceneConfig, Signal, draw_scenes
 from endopilot.anatomy.projection import project_tip
 from endopilot.angiograms.draw import view_text
 from endopilot.settings import Seed, Within, settings
-from endopilot.simulation.motion import draw_motion, published_mean
+from endopilot.simulation.motion import Motion, draw_motion, place, published_mean
+from endopilot.types import Anatomy
 from endopilot.xray.carm import Pose
 from endopilot.xray.detector import TipDetector
-from endopilot.xray.displacement import Displaced
-from endopilot.xray.image import ImageConfig
-from endopilot.xray.motion_registration import motion_error_mm, register_motion, take_run
-from endopilot.xray.registration import Registration, register, vessel_error_mm
+from endopilot.xray.image import ImageConfig, isocenter_of
+from endopilot.xray.image_fluoroscope import Displaced
+from endopilot.xray.registration import Registration, register, register_motion, take_run
 from endopilot.xray.tip_posterior import TipEstimate
 
 BARS = {
@@ -192,8 +192,28 @@ def _motion_errors(
     run = take_run(scene.imager, scene.angles_deg, scene.pose, motion, np.random.default_rng(seed))
     views = registered.views([scene.view(0), scene.view(1)], scene.imager.isocenter)
     found = register_motion(scene.anatomy, views, run, before, mean, scene.imager.config)
-    measured = None if found.failure else motion_error_mm(scene.anatomy, motion, found.motion)
+    measured = None if found.failure or found.motion is None else motion_error_mm(scene.anatomy, motion, found.motion)
     return {"mean": motion_error_mm(scene.anatomy, motion, mean), "measured": measured}
+
+
+def vessel_error_mm(anatomy: Anatomy, true: Pose, found: Pose) -> float:
+    """Return how far a vessel in one pose lies from itself in another: the mean over its centerlines, mm."""
+    points = anatomy.tree.line.points
+    isocenter = isocenter_of(anatomy)
+    return float(np.linalg.norm(true.move(points, isocenter) - found.move(points, isocenter), axis=1).mean())
+
+
+def motion_error_mm(anatomy: Anatomy, true: Motion, taken: Motion) -> float:
+    """Return how far a vessel that moves in one way lies from itself moving in another, mm.
+
+    The mean is taken over its centerlines and over two breaths.
+    """
+    points = anatomy.tree.line.points
+    ostium, times_s = np.asarray(anatomy.insertion.position), np.linspace(0, 2 * true.breathing_period_s, 49)
+    lies, taken_to_lie = (
+        np.stack([place(maps, points) for maps in one.core(ostium).placements(times_s)[0]]) for one in (true, taken)
+    )
+    return float(np.linalg.norm(lies - taken_to_lie, axis=-1).mean())
 
 
 def _refined(scene: Scene, registered: Registration, used: Sequence[int]) -> list[float]:

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.imaging.xray import vessel_error_mm
 from endopilot.errors import InputError
 from endopilot.simulation.motion import Motion
 from endopilot.xray import image_fluoroscope
 from endopilot.xray.image_fluoroscope import ImageFluoroscope
-from endopilot.xray.registration import vessel_error_mm
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +33,7 @@ def test_an_exposure_measures_the_tip_with_its_uncertainty(arm):
     assert np.linalg.norm(shown.position - nodes[0]) < 0.8
     assert shown.abscissa == pytest.approx(15.0, abs=0.6)
     assert all(0.02 < sd < 1.0 for sd in shown.tip_sd_mm)
+    arm.forget_wires()
     again = arm.measure(nodes, 15.3, np.random.default_rng(0))
     np.testing.assert_array_equal(shown.position, again.position)
 
@@ -47,10 +48,10 @@ def test_exposures_show_a_vessel_that_lies_beside_where_it_is_registered(arm, fo
         nodes = np.stack([0 * at, np.where(at > 0, side, 0.0), at], axis=-1)
         shown = unsure.measure(nodes, 15.3, np.random.default_rng(index))
         errors.append(np.linalg.norm(shown.position - nodes[0]))
-    assert np.linalg.norm(unsure.displaced.shift - [0.0, 2.5, 0.0]) < 1.2 and errors[1] < 1.2
-    known = arm.displaced.shift
+    room_mm = 1.0 - 0.18  # of the lumen and of the wire
+    assert np.linalg.norm(unsure.displaced.shift - [0.0, 2.5, 0.0]) < room_mm and errors[1] < room_mm
     unsure.forget_wires()
-    assert not unsure.displaced.shift.any() and not known.any()
+    assert not unsure.displaced.shift.any()
 
 
 def test_a_wire_is_found_where_the_known_motion_does_not_take_the_vessel(arm):
@@ -64,7 +65,7 @@ def test_a_wire_is_found_where_the_known_motion_does_not_take_the_vessel(arm):
     assert shown is not None
     error = shown.position - nodes[0] + [0.0, 2.0, 0.0]
     # A straight vessel does not show how far it lies off along itself: the region says so.
-    assert np.linalg.norm(error[:2]) < 1.0 and error @ np.linalg.solve(shown.covariance, error) < 4.0
+    assert np.linalg.norm(error[:2]) < 0.82 and error @ np.linalg.solve(shown.covariance, error) < 4.0
     assert shown.covariance[1, 1] > 0.1  # how far it lies off is not quite known
     assert not moving.displaced.shift.any()  # the patient lies where they lay
 

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.imaging.xray import motion_error_mm
 from endopilot.errors import InputError
 from endopilot.simulation.motion import draw_motion, motion_named, published_mean
 from endopilot.xray import image_fluoroscope
 from endopilot.xray.image import XrayImager
 from endopilot.xray.image_fluoroscope import ImageFluoroscope
-from endopilot.xray.motion_registration import motion_error_mm, register_motion
+from endopilot.xray.registration import register_motion
 
 
 @pytest.fixture(scope="module")

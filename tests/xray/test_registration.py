@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.imaging.xray import vessel_error_mm
 from endopilot.xray.carm import Pose, view_at
 from endopilot.xray.image import XrayImager
-from endopilot.xray.registration import register, vessel_error_mm
+from endopilot.xray.registration import register
 
 ANGLES = ((-30.0, 0.0), (60.0, 0.0))
 POSE = Pose(np.deg2rad([2.0, -2.5, 1.5]), np.array([4.0, -3.0, 3.5]))

@@ -29,7 +29,7 @@ from endopilot.xray.moving_patient import seen_in_episodes
 
 EXPOSURES_FOLDER = "exposures"
 """Folder of a dataset in which what images show of its navigations is kept."""
-_FORMAT_VERSION = 4
+_FORMAT_VERSION = 5
 
 
 @dataclass(frozen=True, eq=False)

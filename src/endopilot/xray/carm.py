@@ -11,6 +11,7 @@ from pydantic import model_validator
 from scipy.spatial.transform import Rotation
 
 from endopilot.settings import Within, settings
+from endopilot.simulation.motion import place
 
 _Distance = Annotated[float, Within(100, 5000, unit="mm", mistaken=(("m", 1000.0), ("cm", 10.0)))]
 
@@ -66,8 +67,12 @@ class Pose:
 
     def move(self, points: Float[np.ndarray, "*n 3"], isocenter: Float[np.ndarray, "3"]) -> Float[np.ndarray, "*n 3"]:
         """Return where points of the CT, LPS mm, lie in the C-arm's frame."""
+        return place(self.affine(isocenter), points)
+
+    def affine(self, isocenter: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 4"]:
+        """Return the map that `move` applies."""
         matrix = Rotation.from_rotvec(self.rotation_rad).as_matrix()
-        return (points - isocenter) @ matrix.T + isocenter + self.translation_mm
+        return np.column_stack([matrix, isocenter + self.translation_mm - matrix @ isocenter])
 
 
 @dataclass(frozen=True, eq=False)

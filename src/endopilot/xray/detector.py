@@ -1,7 +1,7 @@
 """The tip of a wire found in X-ray images: `TipDetector`.
 
-Ridges say how likely each pixel is on a wire (`ridge`), a hidden Markov model follows the wire through the vessel as
-registration has it (`wire_following`, `tip_posterior`), and its end is fitted to the pixels there (`wire_end`).
+Ridges say how likely each pixel is on a wire (`ridge`); where it ends, and how far the vessel lies off, is one
+posterior (`tip_posterior`), and the end is fitted to the pixels there (`wire_end`).
 Contrast in the vessel is estimated and taken away first: a filled branch is a dark line too.
 """
 
@@ -16,19 +16,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from scipy.ndimage import binary_dilation, gaussian_filter
 from scipy.ndimage import label as connected_parts
+from scipy.special import ndtr
 
 from endopilot.devices.device import Wire
 from endopilot.files import read_json
-from endopilot.settings import Finite, OpenShare, Positive, Share, settings
+from endopilot.settings import Finite, OpenShare, Positive, settings
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import catheter_lumen_points, lumen_points
 from endopilot.xray.carm import View
-from endopilot.xray.displacement import displacements
 from endopilot.xray.projector import splat
-from endopilot.xray.tip_posterior import MODE_MM, TipEstimate, end_log, estimate_tip, longest_mm
+from endopilot.xray.tip_posterior import Seat, TipEstimate, estimate_tip, possible_shifts
 from endopilot.xray.vessel_grid import VesselGrid, make_grid, with_catheter
-from endopilot.xray.wire_end import fit_end
-from endopilot.xray.wire_following import STEP_MM, Follower
+from endopilot.xray.wire_end import BLUR_PX, refined
 
 Signal = Float32[np.ndarray, "rows columns"]
 SCALES_PX = (1.0, 1.7, 2.8)
@@ -131,20 +130,7 @@ _FILLED_MM, _FEWEST_PX = 0.3, 10
 """Contrast is looked for where this much of the lumen lies behind a pixel, mm, if there are so many pixels."""
 _LEAST_CONTRAST = 0.01
 """Contrast below this, 1/mm, is none."""
-_END_SECTIONS = 6
-"""Cross-sections of the wire's end that give its first direction."""
-_DOUBT = 1.5
-"""The followed wire's errors are this many times as large as the model says: found on synthetic patients."""
-_LOOSE_MM = 0.4
-"""Standard deviation that the followed wire's end is taken to have at least, mm: it cuts the corner of a bent tip."""
-_BLUR_PX = 0.6
-"""Standard deviation of the detector's blur, pixels."""
-_SEEN_SHARE = 0.35
-"""An end that is foreshortened to less than this share of its length shows no direction, and is not fitted."""
-_WIDER, _FIT_SHARE = {1: 2.0, 2: 1.0}, {1: 1.0, 2: 0.5}
-"""With so many views the covariance is so many times as large, and has a standard deviation more of this share of what
-the fit moves the end: then 95 % of the tips lie in the region of 95 %, in synthetic patients and five real arteries."""
-_LINE, _LINE_PX, _MOVED_PX = 0.3, 60, 2
+_LINE, _LINE_PX, _MOVED_PX = 0.86, 60, 2
 """An image from before shows a line where the evidence for a wire is larger than this over so many pixels together; it
 may be displaced by so many pixels."""
 _KEPT_LINES = 8
@@ -153,32 +139,30 @@ _HIDDEN_MM = 1.5
 """Standard deviation that a tip on such a line has more, mm."""
 CATHETER_MM = 8.0
 """Length of the catheter behind the ostium in which a wire is followed, mm."""
-_MOST_PLACES = 20000
-"""Places of a tree of 5 m: no coronary artery has more."""
+_PLACES_MM = 1.0
+"""Distance of the places at which a wire may end, before its end is fitted, mm."""
 _SLACK_MM = 0.3
 """How far outside the lumen the wire's axis may seem to lie, mm."""
-_BELIEVABLE = 3.0
-"""An end farther than this many standard deviations from the followed wire's is another line's."""
+_NEAR_PX = 10.0
+"""A tip is where it is found if it lies within this, pixels of each image: 2 mm in the vessel."""
 
 
 @settings
 class DetectorConfig:
     """How far an image is trusted."""
 
-    displaced: OpenShare = 0.05
+    displaced: OpenShare = 0.8
     """Share of the exposures in which the vessel lies elsewhere than registration has it."""
-    displaced_mm: Positive = 1.5
+    displaced_mm: Positive = 2.0
     """How far it lies from there then, along each axis: standard deviation, mm."""
     hidden: OpenShare = 0.02
     """Share of the wire that is not seen, whatever the evidence against it."""
     alike: OpenShare = 0.05
     """Share of the places off the wire that look like one, whatever the evidence."""
-    independent: Share = 0.35
-    """Weight of a cross-section's evidence: neighbouring pixels share their noise."""
-    least_log_odds: Finite = 10.0
+    least_log_odds: Finite = 3.0
     """There is a wire where the images are likelier with one by this logarithm."""
     sure: OpenShare = 0.92
-    """A tip is ambiguous where less of the posterior lies near it."""
+    """A tip is ambiguous where less of the posterior lies within 10 pixels of it."""
 
 
 class TipDetector:
@@ -201,9 +185,9 @@ class TipDetector:
         """
         self._anatomy, self._radius_mm = anatomy, device.tip_radius_mm
         self.config, self._evidence = config or DetectorConfig(), evidence or RidgeEvidence.read()
-        grid = make_grid(anatomy.tree, step_mm=STEP_MM, most=_MOST_PLACES)
-        self.grid: VesselGrid = with_catheter(grid, anatomy, CATHETER_MM)
+        self.grid: VesselGrid = with_catheter(make_grid(anatomy.tree, step_mm=_PLACES_MM), anatomy, CATHETER_MM)
         self._room_mm = self.grid.radius - device.tip_radius_mm + _SLACK_MM
+        self._seat = Seat(anatomy)
         behind, size = catheter_lumen_points(anatomy)
         near = np.linalg.norm(behind - anatomy.insertion.position, axis=1) <= 1.25 * CATHETER_MM
         points, volume = lumen_points(anatomy)
@@ -240,36 +224,21 @@ class TipDetector:
                 mm²; the configuration's if not given.
         """
         config, before = self.config, before or []
-        deepest = longest_mm(inserted_length)
         seen = [self._look(*one) for one in zip(views, signals, photons, strict=True)]
         plain, evidence = [one for one, _ in seen], [one for _, one in seen]
         lines = [self._lines(*one) for one in zip(views, before, photons, strict=False)]
         for image, line in zip(evidence, lines, strict=False):
             image[line] = 0.0
-
-        def follow(seen: Sequence[View]) -> TipEstimate:
-            follower = Follower(self.grid, self._room_mm, seen, evidence, deepest)
-            return estimate_tip(follower, inserted_length, expected)
-
-        here = follow(views)
         covariance = config.displaced_mm**2 * np.eye(3) if displaced is None else displaced
-        ends = end_log(self.grid.abscissa, inserted_length) + (0.0 if expected is None else expected)
-        shift, left = displacements(self.grid, self._room_mm, views, evidence, covariance, ends)
-        shifted = [replace(view, source=view.source - shift) for view in views]
-        there = follow(shifted)
-        # Laplace's evidence: of all shifts that were possible, one as narrow as what the images leave.
-        odds = there.log_odds - here.log_odds + float(np.log(config.displaced / (1 - config.displaced)))
-        odds -= 0.5 * float(shift @ np.linalg.solve(covariance, shift))
-        odds += 0.5 * float(np.linalg.slogdet(left)[1] - np.linalg.slogdet(covariance)[1])
-        # A vessel that lies farther back shows more of the same wire in its catheter.
-        behind = here if shift @ self._anatomy.insertion.direction > 0 else there
-        in_catheter = behind.ends[self.grid.abscissa < 0][-1] / CATHETER_MM
-        odds += float(in_catheter * (shift @ self._anatomy.insertion.direction))
-        found = _either(here, replace(there, shift=shift, shift_covariance=left), odds)
-        views = views if found.shift is here.shift else shifted
-        found = _refined(found, views, plain, self._radius_mm)
-        hidden = any(_lies_on(line, view, found.position) for line, view in zip(lines, views, strict=False))
-        return self._judged(found, hidden=hidden)
+        ostium = np.asarray(self._anatomy.insertion.position)
+        shifts = possible_shifts(views, ostium, covariance, config.displaced)
+        for view, image in zip(views, plain, strict=True):
+            shifts = replace(shifts, log=shifts.log + self._seat(view, image, shifts.mm @ view.slope(ostium).T))
+        found = estimate_tip(self.grid, self._room_mm, views, evidence, shifts, inserted_length, expected)
+        found = refined(found, views, plain, evidence, self._radius_mm)
+        there = [replace(view, source=view.source - found.shift) for view in views]
+        hidden = any(_lies_on(line, view, found.position) for line, view in zip(lines, there, strict=False))
+        return self._judged(found, there, hidden=hidden)
 
     def _look(self, view: View, signal: Signal, photons: float) -> tuple[Signal, Signal]:
         """Return an image without contrast, and how likely its pixels are on a wire, none far from the vessel."""
@@ -300,32 +269,36 @@ class TipDetector:
         self._known_lines = [*self._known_lines[1 - _KEPT_LINES :], (before, photons, near)]
         return near
 
-    def _judged(self, found: TipEstimate, *, hidden: bool) -> TipEstimate:
+    def _judged(self, found: TipEstimate, views: Sequence[View], *, hidden: bool) -> TipEstimate:
         """Return an estimate with its status; an ambiguous one is as uncertain as the places are far apart.
 
         Args:
             found: the tip.
+            views: of the images, in the CT's frame where the vessel lies.
             hidden: whether it lies on a line from before: the wire may end elsewhere on it.
         """
         if found.log_odds < self.config.least_log_odds:
             return replace(found, status="not found")
-        if found.share >= self.config.sure and not hidden:
-            return found
-        along = _HIDDEN_MM**2 * np.eye(3) if hidden else 0.0
-        return replace(found, status="ambiguous", covariance=found.covariance + found.elsewhere + along)
+        slopes = [view.slope(found.position) for view in views]
+        sd_px = max(float(np.linalg.norm(slope @ found.covariance @ slope.T, 2)) for slope in slopes) ** 0.5
+        share = found.share * (1 - 2 * float(ndtr(-_NEAR_PX / sd_px)))
+        if share >= self.config.sure and not hidden:
+            return replace(found, share=share)
+        spread = found.spread.copy()
+        spread[:3, :3] += _HIDDEN_MM**2 * np.eye(3) if hidden else 0.0
+        return replace(found, share=share, status="ambiguous", spread=spread)
 
     def _saturated(self, log_ratio: Signal) -> Signal:
         """Return evidence that no single pixel can overrule all others with."""
         likelier = np.exp(np.clip(log_ratio, -30, 30))
         config = self.config
-        bounded = np.log((likelier + config.hidden) / (1 + config.alike * likelier))
-        return np.asarray(config.independent * bounded, dtype=np.float32)
+        return np.log((likelier + config.hidden) / (1 + config.alike * likelier)).astype(np.float32)
 
     def without_contrast(self, view: View, signal: Signal, box: tuple[slice, slice] | None = None) -> Signal:
         """Return an image without the contrast in the vessel, whose strength is estimated from a part of the image."""
         box = box or (slice(None), slice(None))
         width_mm = 0.5 * self._anatomy.distance_map.spacing_mm
-        path_mm = splat(view, len(signal), *self._filled, width_mm=width_mm, blur_px=_BLUR_PX)
+        path_mm = splat(view, len(signal), *self._filled, width_mm=width_mm, blur_px=BLUR_PX)
         path, part = _halved(path_mm[box]), _halved(signal[box])
         filled = path > _FILLED_MM
         if 4 * filled.sum() < _FEWEST_PX:
@@ -333,17 +306,6 @@ class TipDetector:
         edges, dark = (one - gaussian_filter(one, _HIGH_PASS_PX / 2, truncate=_TRUNCATE) for one in (path, -part))
         strength = float(dark[filled] @ edges[filled] / (edges[filled] @ edges[filled]))
         return signal + np.float32(strength) * path_mm if strength > _LEAST_CONTRAST else signal
-
-
-def _either(here: TipEstimate, there: TipEstimate, odds: float) -> TipEstimate:
-    """Return the likelier of two estimates, given the logarithm of the second's odds; the other one is elsewhere."""
-    chosen, other, share = (there, here, odds) if odds > 0 else (here, there, -odds)
-    share = 1 / (1 + float(np.exp(-min(share, 30.0))))
-    off = other.position - chosen.position
-    if float(np.linalg.norm(off)) < MODE_MM:
-        return replace(chosen, covariance=chosen.covariance + (1 - share) * np.outer(off, off))
-    elsewhere = share * chosen.elsewhere + (1 - share) * np.outer(off, off)
-    return replace(chosen, share=share * chosen.share, elsewhere=elsewhere)
 
 
 def _halved(image: Signal) -> Float32[np.ndarray, "half_rows half_columns"]:
@@ -369,31 +331,3 @@ def _lies_on(line: Bool[np.ndarray, "rows columns"], view: View, point: Float[np
     (right, up), middle = view.project(point), (len(line) - 1) / 2
     row, column = np.clip(np.rint([middle - up, middle + right]), 0, len(line) - 1).astype(int)
     return bool(line[row, column])
-
-
-def _refined(found: TipEstimate, views: Sequence[View], signals: Sequence[Signal], radius_mm: float) -> TipEstimate:
-    """Return the estimate after each image's fit of the wire's end: a Kalman update of position and covariance."""
-    position = found.position
-    covariance = _DOUBT**2 * found.covariance + _LOOSE_MM**2 * np.eye(3)
-    before = found.wire[-1 - min(_END_SECTIONS, len(found.wire) - 1)]
-    length, fitted = float(np.linalg.norm(found.position - before)), False
-    for view, signal in zip(views, signals, strict=True):
-        guess, slope = view.project(position), view.slope(position)
-        forwards, per_mm = guess - view.project(before), float(np.linalg.norm(slope, 2))
-        if float(np.linalg.norm(forwards)) < _SEEN_SHARE * per_mm * length:
-            continue
-        end = fit_end(signal, guess, forwards, float(np.hypot(0.5 * radius_mm * per_mm, _BLUR_PX)))
-        if end is None:
-            continue
-        expected = slope @ covariance @ slope.T + end.covariance
-        error = end.place - guess
-        if error @ np.linalg.solve(expected, error) > _BELIEVABLE**2:
-            continue
-        gain = covariance @ slope.T @ np.linalg.inv(expected)
-        position = position + gain @ error
-        covariance, fitted = (np.eye(3) - gain @ slope) @ covariance, True
-    if not fitted:
-        position, covariance = found.position, found.covariance
-    moved_mm, count = float(np.linalg.norm(position - found.position)), len(views)
-    covariance = _WIDER[count] * covariance + (_FIT_SHARE[count] * moved_mm) ** 2 * np.eye(3) + found.shift_covariance
-    return replace(found, position=position, covariance=covariance)

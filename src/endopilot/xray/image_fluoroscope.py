@@ -7,6 +7,9 @@ that is found bounds the pose.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float, Float32
 
@@ -17,14 +20,13 @@ from endopilot.simulation.motion import Motion, published_mean
 from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import surroundings
-from endopilot.xray.carm import Pose, view_at
+from endopilot.xray.carm import Pose, View, view_at
 from endopilot.xray.detector import TipDetector
-from endopilot.xray.displacement import Displaced
 from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement, measurement_at
-from endopilot.xray.image import ImageConfig, Plane, XrayImager
-from endopilot.xray.motion_registration import register_motion, take_run
+from endopilot.xray.image import ImageConfig, Plane, XrayImager, isocenter_of
 from endopilot.xray.moving_patient import seen_wire
-from endopilot.xray.registration import Registration, register
+from endopilot.xray.registration import Registration, register, register_motion, take_run
+from endopilot.xray.tip_posterior import TipEstimate
 
 _NO_WIRE = np.zeros((0, 3))
 _MOVES_MM = 2.0
@@ -32,8 +34,41 @@ _MOVES_MM = 2.0
 known one."""
 
 
+_DRIFTS_MM = 0.3
+"""A vessel that lies shifted drifts by this from exposure to exposure, mm: an assumption."""
+
+
 class NotRegistered(InputError):
     """A vessel is not recognised in the X-ray images that were to register the patient."""
+
+
+class Displaced:
+    """Where a vessel lies from where it is registered, by all exposures so far.
+
+    Attributes:
+        shift: LPS mm of the CT, the likeliest.
+        covariance: mm².
+    """
+
+    def __init__(self, anatomy: Anatomy, registration: Registration, sd_mm: float) -> None:
+        """Begin with what registration leaves open, and how far a vessel may lie off besides, mm along each axis."""
+        points, pose = anatomy.tree.line.points[::8], registration.pose
+        isocenter = isocenter_of(anatomy)
+        steps = np.linalg.cholesky(registration.covariance).T
+        moved = [Pose.of_vector(pose.vector + step).move(points, isocenter) for step in steps]
+        off = np.array(moved) - pose.move(points, isocenter)
+        self.shift = np.zeros(3)
+        self.covariance = np.einsum("kni,knj->ij", off, off) / len(points) + sd_mm**2 * np.eye(3)
+
+    def views(self, views: Sequence[View]) -> list[View]:
+        """Return views, in the CT's frame as it is registered, in that of the vessel as it lies."""
+        return [replace(view, source=view.source - self.shift) for view in views]
+
+    def update(self, found: TipEstimate) -> None:
+        """Take what an exposure shows: its posterior of the shift is the next one's prior."""
+        if found.status == "found":
+            self.shift = self.shift + found.shift
+            self.covariance = found.spread[3:, 3:] + _DRIFTS_MM**2 * np.eye(3)
 
 
 class ImageFluoroscope:

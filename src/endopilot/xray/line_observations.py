@@ -140,42 +140,38 @@ def see(grid: VesselGrid, camera: Camera | View, line: Line, way: Float[np.ndarr
     )
 
 
-def tip_observations(seen: Sequence[SeenLine], places: Int[np.ndarray, "m"]) -> Observations:
-    """Return what the ends of the lines say: two observations a view."""
-    shape = len(places), 2 * len(seen)
-    return Observations(
-        place=np.repeat(places[:, None], shape[1], axis=1),
-        towards=np.concatenate([one.slope[places] / one.scale[places, None, None] for one in seen], axis=1),
-        value=np.concatenate([(one.tip - one.shown[places]) / one.scale[places, None] for one in seen], axis=1),
-        variance=np.repeat([_POINT_SD_MM**2 + _END_SD_MM**2 + one.end_mm**2 for one in seen], 2),
-        used=np.ones(shape, dtype=bool),
-    )
-
-
-def line_observations(
-    grid: VesselGrid, seen: SeenLine, places: Int[np.ndarray, "m"], moved: Float[np.ndarray, "m k 3"]
+def observe(
+    grid: VesselGrid, seen: SeenLine, places: Int[np.ndarray, "m"], moved: Float[np.ndarray, "m k 3"] | None
 ) -> tuple[Observations, Int[np.ndarray, "m"]]:
-    """Return what a line's points say, and its length, and how many of them lie before the root.
+    """Return what a line's end says, in both directions, and its points and length, and how many lie before the root.
 
     Args:
         grid: the places.
         seen: the line.
         places: of its tip.
-        moved: how far the way is moved at each point, as found so far, mm.
+        moved: how far the way is moved at each point, as found so far, mm; None for the end alone.
     """
+    scale = seen.scale[places, None]
+    end = Observations(
+        place=np.repeat(places[:, None], 2, axis=1),
+        towards=seen.slope[places] / scale[..., None],
+        value=(seen.tip - seen.shown[places]) / scale,
+        variance=np.full(2, _POINT_SD_MM**2 + _END_SD_MM**2 + seen.end_mm**2),
+        used=np.ones((len(places), 2), dtype=bool),
+    )
+    if moved is None or not len(seen.at):
+        return end, np.zeros(len(places), dtype=np.int64)
     each, behind = np.arange(len(places)), grid.behind[places]
     arc = seen.along[places, None] - seen.along[behind]
-    within = np.arange(behind.shape[1]) <= grid.depth[places, None]
-    arc[~within] = np.inf
+    arc[np.arange(behind.shape[1]) > grid.depth[places, None]] = np.inf
     first = (arc[:, None, :] < seen.at[:, None]).sum(axis=2)
     window = np.clip(first[..., None] + np.arange(-_WINDOW, _WINDOW + 1), 0, behind.shape[1] - 1)
     near = each[:, None, None]
     candidates = behind[near, window]
     slack = _SLACK_MM + _SLACK_SHARE * seen.at
-    inside = np.abs(arc[near, window] - seen.at[:, None]) <= slack[:, None]
     wanted = seen.points - np.einsum("mij,mkj->mki", seen.slope[places], moved)
     gap = ((seen.shown[candidates] - wanted[:, :, None]) ** 2).sum(axis=3)
-    gap[~inside] = np.inf
+    gap[np.abs(arc[near, window] - seen.at[:, None]) > slack[:, None]] = np.inf
     chosen = gap.argmin(axis=2)[..., None]
     place = np.take_along_axis(candidates, chosen, axis=2)[..., 0]
     beyond = seen.at > seen.along[places, None]
@@ -186,24 +182,29 @@ def line_observations(
     any_used = used.any(axis=1)
     last = np.where(any_used, len(seen.at) - 1 - used[:, ::-1].argmax(axis=1), 0)
     longer = seen.along[places] - seen.along[place[each, last]] - seen.at[last]
-    rows = Observations(
+    points = np.full(len(seen.at), _POINT_SD_MM**2 + seen.rough_mm**2)
+    line = Observations(
         place=np.column_stack([place, places]),
         towards=np.concatenate([towards, np.zeros((len(places), 1, 3))], axis=1),
         value=np.column_stack([value, longer]),
-        variance=np.array(
-            [*[_POINT_SD_MM**2 + seen.rough_mm**2] * len(seen.at), (_LENGTH_SD_MM + _LENGTH_SHARE * seen.at[-1]) ** 2]
-        ),
+        variance=np.append(points, (_LENGTH_SD_MM + _LENGTH_SHARE * seen.at[-1]) ** 2),
         used=np.column_stack([used, any_used]),
     )
-    return rows, beyond.sum(axis=1)
+    return joined([end, line]), beyond.sum(axis=1)
 
 
 def joined(parts: Sequence[Observations]) -> Observations:
     """Return several observations of the same places of the tip as one."""
-    fields = vars(parts[0])
-    return Observations(
-        **{
-            name: np.concatenate([getattr(part, name) for part in parts], axis=min(1, fields[name].ndim - 1))
-            for name in fields
-        }
-    )
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return Observations(*(np.concatenate(one, axis=min(1, one[0].ndim - 1)) for one in columns))
+
+
+def shift_onto(
+    camera: Camera | View, point: Float[np.ndarray, "3"], pixel: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, "3"]:
+    """Return the shift across the beam that takes a point, LPS mm, to the pixel that shows it."""
+    shift = np.zeros(3)
+    for _ in range(4):
+        shown, slope = shown_by(camera, point[None] + shift)
+        shift = shift + np.linalg.pinv(slope[0]) @ (pixel - shown[0])
+    return shift

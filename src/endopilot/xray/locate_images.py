@@ -14,7 +14,6 @@ from itertools import product
 
 import numpy as np
 from jaxtyping import Float, Float32
-from scipy.spatial import KDTree
 
 from endopilot.anatomy.projection import TipProjector
 from endopilot.devices.device import Wire
@@ -25,10 +24,11 @@ from endopilot.xray.carm import Pose, View, view_of
 from endopilot.xray.cine import XrayCine
 from endopilot.xray.detector import TipDetector
 from endopilot.xray.image import isocenter_of
+from endopilot.xray.line_observations import shift_onto
 from endopilot.xray.registration import Registration, lay, observed_contrast, register
 from endopilot.xray.tip_filter import LocateConfig, TipLocation, goes, told_by_later
 from endopilot.xray.tip_posterior import TipEstimate
-from endopilot.xray.vessel_grid import VesselGrid, make_grid
+from endopilot.xray.vessel_grid import VesselGrid
 
 _EMPTY_SHARE = 0.9
 """A pixel's light where no contrast passes is this quantile of the frames': contrast and wire darken fewer."""
@@ -103,13 +103,14 @@ def locate_in_images(
 
     def look(frame: int, expected: Float[np.ndarray, "places"] | None) -> TipEstimate:
         shown = [one.signals[frame] for one in cines]
-        return detector.estimate(views[frame], shown, photons, None, expected=expected, displaced=moves[frame])
+        spread = _STIRS_MM**2 * np.eye(3) if moves[frame] is None else moves[frame]
+        return detector.estimate(views[frame], shown, photons, None, expected=expected, displaced=spread)
 
     with progress(f"locate {anatomy.name}", count) as advance:
         for frame in range(count):
             found.append(look(frame, None))
             advance()
-    track = _Track(anatomy, detector.grid, config, cines[0].times_s, found)
+    track = _Track(detector.grid, config, cines[0].times_s, found)
     for frame, one in enumerate(found):
         if one.status != "not found" and track.elsewhere(frame, one):
             found[frame] = look(frame, track.expected(frame))
@@ -120,7 +121,23 @@ def locate_in_images(
     for frame, one in enumerate(found):
         views[frame] = [replace(view, source=view.source - one.shift) for view in views[frame]]
         moved = poses[frame].move(one.position + one.shift, isocenter) - one.position
-        tips.append(_location(anatomy, project, frame, one, moved))
+        if one.status == "not found":
+            tips.append(TipLocation.nowhere(frame))
+            continue
+        at = project(one.position[None])
+        tips.append(
+            TipLocation.at(
+                anatomy.tree,
+                (int(at.branch[0]), float(at.abscissa[0])),
+                frame=frame,
+                status=one.status,
+                position=one.position,
+                covariance=one.covariance,
+                share=one.share,
+                moved_mm=moved,
+                residual_mm=np.nan,
+            )
+        )
     return ImagesLocated(
         tips=tuple(tips),
         wires=tuple(None if one.status == "not found" else one.wire for one in found),
@@ -145,11 +162,8 @@ def _registered(
     if config.landmark_mm is not None:
         if config.landmark_px is None:
             raise InputError("landmark_px: missing; give the pixel of the first frame that shows landmark_mm")
-        view, point, shift = cines[0].view(isocenter), np.array(config.landmark_mm), np.zeros(3)
-        middle = (cines[0].signals.shape[1] - 1) / 2
-        pixel = (np.array(config.landmark_px) - middle) * [1, -1]
-        for _ in range(4):
-            shift = shift + np.linalg.pinv(view.slope(point + shift)) @ (pixel - view.project(point + shift))
+        pixel = (np.array(config.landmark_px) - (cines[0].signals.shape[1] - 1) / 2) * [1, -1]
+        shift = shift_onto(cines[0].view(isocenter), np.array(config.landmark_mm), pixel)
         return cines, [Pose(translation_mm=shift)] * count, [_MOVES_MM**2 * np.eye(3)] * count, None, 0, notes
     before = [np.quantile(one.signals, _EMPTY_SHARE, axis=0).astype(np.float32) for one in cines]
     contrast = np.sum([_contrast(one, empty) for one, empty in zip(cines, before, strict=True)], axis=0)
@@ -157,7 +171,7 @@ def _registered(
     tried: list[tuple[Registration, tuple[XrayCine, ...], list[np.ndarray], str]] = []
     for seen, empty, said in _read_otherwise(cines, before):
         views, lit = [one.view(isocenter) for one in seen], [one.signals[best] for one in seen]
-        start = lay(anatomy, views, lit, empty, seen[0].image)[0]
+        start = lay(anatomy, views, lit, empty, seen[0].image)
         tried.append((register(anatomy, views, lit, empty, seen[0].image, start), seen, empty, said))
         if not tried[-1][0].failure:
             break
@@ -222,23 +236,12 @@ class _Track:
     """Where the tip is at each time, by all frames together."""
 
     def __init__(
-        self,
-        anatomy: Anatomy,
-        grid: VesselGrid,
-        config: LocateConfig,
-        times_s: Float[np.ndarray, "frames"],
-        found: Sequence[TipEstimate],
+        self, grid: VesselGrid, config: LocateConfig, times_s: Float[np.ndarray, "frames"], found: Sequence[TipEstimate]
     ) -> None:
         """Take what each frame shows at the places of the detector's grid."""
-        coarse = make_grid(anatomy.tree, step_mm=1.0)
-        self._middle, self._of = coarse.middle, KDTree(coarse.middle).query(grid.middle)[1]
-        seen = [np.zeros(len(coarse.parent)) for _ in found]
-        for log, one in zip(seen, found, strict=True):
-            if one.status != "not found":
-                log[:] = -np.inf
-                np.logaddexp.at(log, self._of, one.ends)
-        steps = np.maximum(np.diff(times_s), 1e-3) / _FRAME_S
-        flows = [goes(coarse, config, float(one)) for one in steps]
+        self._middle, catheter = grid.middle, grid.branch < 0
+        seen = [np.where(catheter, -np.inf, 0.0 if one.status == "not found" else one.ends) for one in found]
+        flows = [goes(grid, config, float(step)) for step in np.maximum(np.diff(times_s), 1e-3) / _FRAME_S]
         later = told_by_later(seen, lambda k: flows[k])
         before = told_by_later(seen[::-1], lambda k: flows[-1 - k].T)[::-1]
         self._others = [a + b for a, b in zip(later, before, strict=True)]
@@ -250,32 +253,8 @@ class _Track:
 
     def expected(self, frame: int) -> Float[np.ndarray, "places"]:
         """Return what the other frames say of the tip's place in a frame, a logarithm."""
-        return (self._others[frame] - np.logaddexp.reduce(self._others[frame]))[self._of]
+        return self._others[frame] - np.logaddexp.reduce(self._others[frame])
 
 
 _FRAME_S = 0.133
 """Time of a frame at which `LocateConfig.travel_mm` is meant, s: 7.5 frames a second, usual in fluoroscopy."""
-
-
-def _location(
-    anatomy: Anatomy, project: TipProjector, frame: int, one: TipEstimate, moved_mm: Float[np.ndarray, "3"]
-) -> TipLocation:
-    """Return where a tip of the detector lies in the tree."""
-    if one.status == "not found":
-        return TipLocation.nowhere(frame)
-    at = project(one.position[None])
-    branch, abscissa = int(at.branch[0]), float(at.abscissa[0])
-    here = anatomy.tree.branches[branch]
-    section = here.section[np.abs(here.centerline.abscissa - abscissa).argmin()]
-    return TipLocation(
-        frame=frame,
-        status=one.status,
-        position=one.position,
-        covariance=one.covariance,
-        share=one.share,
-        abscissa=abscissa,
-        branch=branch,
-        section=anatomy.tree.section_names[section],
-        moved_mm=moved_mm,
-        residual_mm=np.nan,
-    )

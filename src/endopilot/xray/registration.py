@@ -1,14 +1,15 @@
-"""Registration: how the patient lies in the C-arm's frame, from one or two images of the contrasted vessel.
+"""Registration: how the patient lies in the C-arm's frame, and moves, from one or two views of the contrasted vessel.
 
 What contrast adds to an image, the logarithm of the image before it less that with it, is the attenuation of the
-iodine times the path through the lumen. The lumen of the CT is laid onto the detector in a pose, and the pose is moved
-until both agree, first blurred, then finely. Where they do not agree in the end, registration has failed, and says so.
+iodine times the path through the lumen. The lumen of the CT is placed by what is sought, a pose or the amplitudes of
+heart and breath, and laid onto the detector; that is changed until all images agree, first blurred, then finely. Where
+they do not agree in the end, registration has failed, and says so.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,27 +19,33 @@ from scipy.optimize import least_squares
 from scipy.spatial import KDTree
 from skimage.transform import downscale_local_mean
 
+from endopilot.simulation.motion import AMPLITUDES, Motion
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import catheter_lumen_points, lumen_points
 from endopilot.xray.carm import Pose, View, view_of
-from endopilot.xray.image import ImageConfig, isocenter_of
+from endopilot.xray.image import ImageConfig, XrayImager, isocenter_of
 from endopilot.xray.projector import Shadow
 
+RUN_TIMES_S = tuple(0.5 * np.arange(1, 9))
+"""When the images of a run are taken, s: over a breath, and at eight phases of the heart, two images a second."""
 _PRIOR = np.concatenate([np.full(3, np.deg2rad(2.0)), np.full(3, 3.5)])
 """Standard deviations of a pose before any image: rad, mm. Poses of up to 3° and 5 mm lie within."""
-_FAR = 3.0
-"""A pose this many of these standard deviations from where the patient was laid is not believed."""
+_FAR, _AMPLITUDE_FAR = 3.0, 4.0
+"""A pose this many of these standard deviations from where the patient was laid is not believed; and an amplitude is
+sought up to so many from its published mean."""
 _LEVELS = ((8, 3.0), (8, 1.5), (4, 1.5), (2, 1.0))
 """Pixels that are averaged along a side, and the blur of what is left, in averaged pixels: the first sees 5 mm."""
+_MOTION_LEVELS = ((8, 3.0), (4, 1.5))
+"""A vessel that moves by the published mean lies within the reach of the first."""
 _POINTS = 30000
 _STEP_SHARE = 0.01
 """The derivative is taken over this share of a standard deviation either way, times the averaged pixels."""
 _DARKEST = 0.05
 """Share of the light below which none is taken to be unscattered."""
-AGREES = 0.8
+_AGREES = 0.8
 """Least correlation of image and projected vessel. Without contrast it is near 0."""
 _FELT = 0.02
-"""Pixels that a pose changes by more than this share of what it changes the most show how well it fits."""
+"""Pixels that a change moves by more than this share of the most show how well it fits."""
 _WEAKEST = 0.05
 """Contrast is not taken to show weaker than by this share of what `ImageConfig.iodine_mm` says."""
 _LITTLE = 0.01
@@ -46,22 +53,27 @@ _LITTLE = 0.01
 _MISFIT = 0.1
 """Residuals are scaled by this share of the full contrast; beyond it they count less."""
 
+Images = Sequence[Float32[np.ndarray, "rows columns"]]
+
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """A pose, and whether to believe it.
+    """How a patient lies and moves, and whether to believe it.
 
     Attributes:
         pose: of the patient.
-        covariance: of its rotation vector, rad, and translation, mm.
-        correlation: of the contrast in the images and of the vessel projected in this pose.
+        covariance: of what was sought: the pose's rotation vector, rad, and translation, mm, or the motion's
+            amplitudes, each in standard deviations of its published distribution.
+        correlation: of the contrast in the images and of the vessel projected so, at the worst moment.
         failure: why it is not to be believed, in words; empty if it is.
+        motion: as a run of images shows it; None where it was not sought.
     """
 
     pose: Pose
-    covariance: Float[np.ndarray, "6 6"]
+    covariance: Float[np.ndarray, "k k"]
     correlation: float
     failure: str
+    motion: Motion | None = None
 
     def views(self, views: Sequence[View], isocenter: Float[np.ndarray, "3"]) -> list[View]:
         """Return views that were given in the C-arm's frame in the CT's frame."""
@@ -71,8 +83,8 @@ class Registration:
 def register(
     anatomy: Anatomy,
     views: Sequence[View],
-    contrasted: Sequence[Float32[np.ndarray, "rows columns"]],
-    before: Sequence[Float32[np.ndarray, "rows columns"]],
+    contrasted: Images,
+    before: Images,
     config: ImageConfig | None = None,
     start: Pose | None = None,
 ) -> Registration:
@@ -87,181 +99,269 @@ def register(
         start: the pose that is looked around, such as that of the frame before, in a cine, whose contrast need not fill
             the vessel alike; the pose that the CT has, and a vessel that is filled, if not given.
     """
-    config, isocenter = config or ImageConfig(), isocenter_of(anatomy)
-    lumen = sampled_lumen(anatomy, alike=start is None)
+    isocenter, lumen = isocenter_of(anatomy), sampled_lumen(anatomy, alike=start is None)
     laid = np.zeros(6) if start is None else start.vector
-    found, correlation, covariance, misfit = laid, 0.0, np.diag(_PRIOR**2), _MISFIT
-    for averaged, blur in _LEVELS if start is None else _LEVELS[1:]:
-        observed = observed_contrast(contrasted, before, averaged, blur, config)
-        if not any(np.ptp(image) for image in observed):
-            said = "images with and without contrast are the same; inject contrast"
-            return Registration(Pose.of_vector(laid), np.diag(_PRIOR**2), 0.0, said)
+
+    def maps(pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "1 3 4"]:
+        return Pose.of_vector(pose).affine(isocenter)[None]
+
+    sought = _Sought(maps, laid, _PRIOR, (laid - _FAR * _PRIOR, laid + _FAR * _PRIOR))
+    levels = _LEVELS if start is None else _LEVELS[1:]
+    found, covariance, correlation, failure = _fit(sought, lumen, views, [contrasted], before, config, levels)
+    # How far off a vessel lies that was laid by its images says nothing against it.
+    far = float(np.abs((found - laid) / _PRIOR)[: 6 if start is None else 3].max()) + 1e-2
+    if not failure and far > _FAR:
+        failure = "the vessel fits the image only far from where the patient was laid; check the views' angles"
+    return Registration(Pose.of_vector(found), covariance, correlation, failure)
+
+
+def register_motion(
+    anatomy: Anatomy,
+    views: Sequence[View],
+    contrasted: Sequence[Images],
+    before: Images,
+    mean: Motion,
+    config: ImageConfig | None = None,
+) -> Registration:
+    """Find the amplitudes of a patient's motion; phase and period of heart and breath are known, by ECG and belt.
+
+    Args:
+        anatomy: the vessel of the CT.
+        views: of the images, in the frame of the CT as the patient was registered.
+        contrasted: an image of the filled vessel for each of `RUN_TIMES_S` and view, from `XrayImager.signal`.
+        before: an image for each view before the injection, with heart and breath at rest.
+        mean: what is known beforehand: the published mean of what moves, with the patient's periods.
+        config: detector and beam.
+    """
+    names = [name for name in AMPLITUDES if getattr(mean, name) != 0]
+    centre = np.array([getattr(mean, name) for name in names])
+    deviation = np.array([AMPLITUDES[name][1] for name in names])
+    least = np.array([0.0 if name in ("annulus_mm", "heart_volume_share") else -np.inf for name in names])
+    bounds = np.maximum((least - centre) / deviation, -_AMPLITUDE_FAR), np.full(len(names), _AMPLITUDE_FAR)
+
+    def motion(deviations: Float[np.ndarray, "k"]) -> Motion:
+        found = centre + np.clip(deviations, *bounds) * deviation  # derivatives step across the bounds
+        return replace(mean, **dict(zip(names, found.tolist(), strict=True)))
+
+    def maps(deviations: Float[np.ndarray, "k"]) -> Float[np.ndarray, "times 3 4"]:
+        core = motion(deviations).core(np.asarray(anatomy.insertion.position))
+        return core.placements(np.array(RUN_TIMES_S))[0]
+
+    sought = _Sought(maps, np.zeros(len(names)), np.ones(len(names)), bounds)
+    found, covariance, correlation, failure = _fit(
+        sought, sampled_lumen(anatomy), views, contrasted, before, config, _MOTION_LEVELS
+    )
+    return Registration(Pose(), covariance, correlation, failure, motion(found))
+
+
+def take_run(
+    imager: XrayImager,
+    angles_deg: Sequence[tuple[float, float]],
+    pose: Pose,
+    motion: Motion,
+    random: np.random.Generator,
+) -> list[list[Float32[np.ndarray, "rows columns"]]]:
+    """Inject contrast, and return an image for each of `RUN_TIMES_S` and view, as `register_motion` takes them.
+
+    Args:
+        imager: of the patient.
+        angles_deg: of the views: LAO (positive) or RAO, and cranial (positive) or caudal, degrees.
+        pose: in which the patient lies.
+        motion: how the patient moves.
+        random: where the noise is drawn from.
+    """
+    run, none = [], np.zeros((0, 3))
+    for placed in motion.core(np.asarray(imager.anatomy.insertion.position)).placements(np.array(RUN_TIMES_S))[0]:
+        planes = [imager.plane(angle, pose=pose, placed=placed) for angle in angles_deg]
+        run.append([imager.signal(each, none, contrast=1.0, seed=int(random.integers(2**31))) for each in planes])
+    return run
+
+
+def lay(anatomy: Anatomy, views: Sequence[View], contrasted: Images, before: Images, config: ImageConfig) -> Pose:
+    """Return the shift, up to half an image, in which the vessel fits the images best.
+
+    It begins a registration where nobody says how far the vessel lies from the isocenter; arguments as `register` has.
+    """
+    averaged, blur = _LEVELS[0]
+    observed = observed_contrast(contrasted, before, averaged, blur, config)
+    points, size, _ = sampled_lumen(anatomy)
+    rows, shifts = [], []
+    for view, theirs in zip(views, observed, strict=True):
+        ours = Shadow(view.magnified(1 / averaged), config.pixels // averaged, points).of(size, blur_px=blur)
+        ours, theirs = ours - ours.mean(), theirs - np.median(theirs)
+        side = 2 * len(ours)
+        alike = np.fft.irfft2(
+            np.fft.rfft2(theirs, (side, side)) * np.fft.rfft2(ours, (side, side)).conj(), (side, side)
+        )
+        down, right = (int(at) - side * (at >= side // 2) for at in np.unravel_index(alike.argmax(), alike.shape))
+        rows.append(view.slope(isocenter_of(anatomy)))
+        shifts.append([averaged * right, -averaged * down])
+    shift = np.linalg.pinv(np.concatenate(rows)) @ np.concatenate(shifts)
+    return Pose(translation_mm=shift)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sought:
+    """What is sought: numbers, and where they place the vessel.
+
+    Attributes:
+        maps: return the affine map of the CT's points at each moment, LPS mm, given the numbers.
+        laid: the likeliest numbers before any image.
+        sd: their standard deviations then.
+        bounds: within which they are sought.
+    """
+
+    maps: Callable[[Float[np.ndarray, "k"]], Float[np.ndarray, "moments 3 4"]]
+    laid: Float[np.ndarray, "k"]
+    sd: Float[np.ndarray, "k"]
+    bounds: tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k"]]
+
+
+_Lumen = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]
+
+
+def _fit(
+    sought: _Sought,
+    lumen: _Lumen,
+    views: Sequence[View],
+    contrasted: Sequence[Images],
+    before: Images,
+    config: ImageConfig | None,
+    levels: Sequence[tuple[int, float]],
+) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k k"], float, str]:
+    """Return the numbers that are sought, their covariance, the correlation, and why not to believe them."""
+    config, found, covariance = config or ImageConfig(), sought.laid, np.diag(sought.sd**2)
+    correlation = 0.0
+    for averaged, blur in levels:
+        observed = [observed_contrast(images, before, averaged, blur, config) for images in contrasted]
+        if not any(np.ptp(image) for images in observed for image in images):
+            return found, covariance, 0.0, "images with and without contrast are the same; inject contrast"
         points, size, along = (part[:: averaged // 2] for part in lumen)  # coarse images need fewer points
-        size = size * (lumen[1].sum() / size.sum())
-        level = Comparison(points, size, along, views, observed, averaged, blur, config, isocenter, laid, misfit)
+        fewer = points, size * (lumen[1].sum() / size.sum()), along
+        level = _Comparison(sought, fewer, views, observed, averaged, blur, config)
         slope: Any = level.slope  # the annotation of scipy knows names of schemes alone
         found = least_squares(
             level.residuals,
             found,
             slope,
-            bounds=(laid - _FAR * _PRIOR, laid + _FAR * _PRIOR),
-            x_scale=_PRIOR,
+            bounds=sought.bounds,
+            x_scale=sought.sd,
             loss="soft_l1",
             max_nfev=10,
             xtol=1e-4,
             ftol=1e-4,
         ).x
         correlation, covariance = level.correlation(found), level.covariance(found)
-        misfit = max(_MISFIT, misfit * level.misfit_of(found))
-    # How far off a vessel lies that was laid by its images says nothing against it.
-    far = float(np.abs((found - laid) / _PRIOR)[: 6 if start is None else 3].max()) + 1e-2
-    failure = ""
-    if correlation < AGREES:
-        failure = f"the image and the vessel agree by {correlation:.2f} only; inject contrast, or choose another view"
-    elif far > _FAR:
-        failure = "the vessel fits the image only far from where the patient was laid; check the views' angles"
-    return Registration(Pose.of_vector(found), covariance, correlation, failure)
-
-
-def lay(
-    anatomy: Anatomy,
-    views: Sequence[View],
-    contrasted: Sequence[Float32[np.ndarray, "rows columns"]],
-    before: Sequence[Float32[np.ndarray, "rows columns"]],
-    config: ImageConfig,
-) -> tuple[Pose, float]:
-    """Return the shift, up to half an image, in which the vessel fits the images best, and their correlation then.
-
-    It begins a registration where nobody says how far the vessel lies from the isocenter; arguments as `register` has.
-    """
-    averaged, blur = _LEVELS[0]
-    observed = observed_contrast(contrasted, before, averaged, blur, config)
-    laid = Comparison(*sampled_lumen(anatomy), views, observed, averaged, blur, config, isocenter_of(anatomy))
-    rows, shifts, fits = [], [], []
-    for view, ours, theirs in zip(views, laid.expected(np.zeros(6)), observed, strict=True):
-        ours, theirs = ours[0] - ours[0].mean(), theirs - np.median(theirs)
-        side = 2 * len(ours)
-        alike = np.fft.irfft2(
-            np.fft.rfft2(theirs, (side, side)) * np.fft.rfft2(ours, (side, side)).conj(), (side, side)
-        )
-        fits.append(alike.max() / max(float(np.linalg.norm(ours) * np.linalg.norm(theirs)), 1e-12))
-        down, right = (int(at) - side * (at >= side // 2) for at in np.unravel_index(alike.argmax(), alike.shape))
-        rows.append(view.slope(laid.isocenter))
-        shifts.append([averaged * right, -averaged * down])
-    shift = np.linalg.pinv(np.concatenate(rows)) @ np.concatenate(shifts)
-    return Pose(translation_mm=shift), float(np.mean(fits))
+    disagrees = f"the image and the vessel agree by {correlation:.2f} only; inject contrast, or choose another view"
+    return found, covariance, correlation, "" if correlation >= _AGREES else disagrees
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class _Comparison:
     """The comparison of images and projected vessel at one resolution.
 
     Attributes:
-        points: of the lumen, LPS mm.
-        size: volume that each stands for, mm³.
-        along: how far along the vessel each lies, as a share of the deepest.
+        sought: what places the vessel.
+        lumen: from `sampled_lumen`.
         views: of the images.
-        observed: what contrast added to each image, pixels averaged and blurred.
+        observed: what contrast added to each image at each moment, pixels averaged and blurred.
         averaged: pixels along a side that are averaged.
         blur: of what is left, in averaged pixels.
         config: detector and beam.
-        isocenter: about which poses turn, LPS mm.
-        laid: pose that is likeliest before any image.
-        misfit: usual difference of image and projected vessel, as a share of the full contrast.
     """
 
-    points: Float[np.ndarray, "n 3"]
-    size: Float[np.ndarray, "n"]
-    along: Float[np.ndarray, "n"]
+    sought: _Sought
+    lumen: _Lumen
     views: Sequence[View]
-    observed: Sequence[np.ndarray]
+    observed: Sequence[Sequence[np.ndarray]]
     averaged: int
     blur: float
     config: ImageConfig
-    isocenter: Float[np.ndarray, "3"]
-    laid: Float[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6))
-    misfit: float = _MISFIT
 
-    def expected(self, pose: Float[np.ndarray, "6"]) -> list[np.ndarray]:
-        """Return what contrast would add to each image in a pose: everywhere alike, and growing along the vessel."""
-        images = []
-        for view in self.views:
-            coarse = view_of(view, Pose.of_vector(pose), self.isocenter).magnified(1 / self.averaged)
-            shadow = Shadow(coarse, self.config.pixels // self.averaged, self.points)
-            parts = [shadow.of(size, blur_px=self.blur) for size in (self.size, self.size * self.along)]
-            images.append(self.config.iodine_mm * np.stack(parts))
-        return images
+    def expected(self, sought: Float[np.ndarray, "k"]) -> list[list[np.ndarray]]:
+        """Return what contrast would add to each image: everywhere alike, and, if it may, growing along the vessel."""
+        (points, size, along), moments = self.lumen, []
+        fillings = (size, size * along) if along.any() else (size,)
+        coarse = [view.magnified(1 / self.averaged) for view in self.views]
+        for placed in self.sought.maps(sought):
+            shadows = [Shadow(view, self.config.pixels // self.averaged, points, placed) for view in coarse]
+            parts = [[one.of(each, blur_px=self.blur) for each in fillings] for one in shadows]
+            moments.append([self.config.iodine_mm * np.stack(two) for two in parts])
+        return moments
 
-    def fitted(self, pose: Float[np.ndarray, "6"]) -> list[tuple[np.ndarray, np.ndarray, float]]:
-        """Return for each image what is expected in a pose, what is observed, and how strong the contrast shows.
+    def fitted(self, sought: Float[np.ndarray, "k"]) -> list[list[tuple[np.ndarray, np.ndarray, float]]]:
+        """Return for each image what is expected, what is observed, and how strong the contrast shows.
 
         Unless the vessel is filled alike, by an injection of one's own, nobody knows how strong it shows, how that
         changes along the vessel as the blood carries it, and on which ground: each is what fits best.
         """
-        found = []
-        for parts, theirs in zip(self.expected(pose), self.observed, strict=True):
-            if not self.along.any():
-                found.append((parts[0], theirs, 1.0))
-                continue
-            flat = np.stack([part - part.mean() for part in parts]).reshape(2, -1)
-            theirs = theirs - theirs.mean()
-            square = flat @ flat.T
-            square[np.diag_indices(2)] *= 1 + _LITTLE
-            shares = np.linalg.lstsq(square, flat @ theirs.ravel(), rcond=None)[0]
-            strength = max(float(shares @ [1.0, self.along.mean()]), _WEAKEST)
-            found.append(((shares @ flat).reshape(theirs.shape), theirs, strength))
-        return found
+        pairs = zip(self.expected(sought), self.observed, strict=True)
+        return [[self._scaled(*one) for one in zip(*moment, strict=True)] for moment in pairs]
 
-    def residuals(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "n"]:
-        """Return all differences, and that of the pose from the prior."""
-        return np.concatenate([self.differences(pose), (pose - self.laid) / _PRIOR])
+    def _scaled(self, parts: np.ndarray, theirs: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        along = self.lumen[2]
+        if not along.any():
+            return parts[0], theirs, 1.0
+        flat = np.stack([part - part.mean() for part in parts]).reshape(2, -1)
+        theirs = theirs - theirs.mean()
+        square = flat @ flat.T
+        square[np.diag_indices(2)] *= 1 + _LITTLE
+        shares = np.linalg.lstsq(square, flat @ theirs.ravel(), rcond=None)[0]
+        return (shares @ flat).reshape(theirs.shape), theirs, max(float(shares @ [1.0, along.mean()]), _WEAKEST)
 
-    def differences(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "n"]:
-        """Return how the images differ from what is expected in a pose, in units of the usual misfit."""
-        full = self.misfit * self.config.iodine_mm * 3.0  # a vessel of 3 mm
-        return np.concatenate(
-            [((ours - theirs) / (strength * full)).ravel() for ours, theirs, strength in self.fitted(pose)]
-        )
+    def residuals(self, sought: Float[np.ndarray, "k"]) -> Float[np.ndarray, "n"]:
+        """Return how the images differ from what is expected, in units of the usual misfit, and the prior's terms."""
+        full = _MISFIT * self.config.iodine_mm * 3.0  # a vessel of 3 mm
+        images = [
+            ((ours - theirs) / (strength * full)).ravel()
+            for moment in self.fitted(sought)
+            for ours, theirs, strength in moment
+        ]
+        return np.concatenate([*images, (sought - self.sought.laid) / self.sought.sd])
 
-    def slope(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "n 6"]:
-        """Return the derivative of the residuals by the pose."""
-        steps = _STEP_SHARE * self.averaged * np.diag(_PRIOR)
-        columns = [(self.residuals(pose + step) - self.residuals(pose - step)) / (2 * step.sum()) for step in steps]
+    def slope(self, sought: Float[np.ndarray, "k"]) -> Float[np.ndarray, "n k"]:
+        """Return the derivative of the residuals by what is sought."""
+        steps = _STEP_SHARE * self.averaged * np.diag(self.sought.sd)
+        columns = [(self.residuals(sought + step) - self.residuals(sought - step)) / (2 * step.sum()) for step in steps]
         return np.stack(columns, axis=-1)
 
-    def covariance(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "6 6"]:
-        """Return the covariance of a pose that fits: what the pixels leave open, with the prior.
+    def covariance(self, sought: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k k"]:
+        """Return the covariance of what fits: what the pixels leave open, with the prior.
 
         Neighbouring pixels that were blurred together err together.
         """
-        slope, misfit = self.slope(pose)[:-6], self.misfit_of(pose)
-        return np.linalg.inv(slope.T @ slope / misfit**2 + np.diag(_PRIOR**-2.0))
+        slope, misfit = self.slope(sought)[: -len(sought)], self.misfit_of(sought)
+        return np.linalg.inv(slope.T @ slope / misfit**2 + np.diag(self.sought.sd**-2.0))
 
-    def misfit_of(self, pose: Float[np.ndarray, "6"]) -> float:
+    def misfit_of(self, sought: Float[np.ndarray, "k"]) -> float:
         """Return how large the differences near the vessel are, in units of the usual misfit, as if none were alike."""
-        slope, residual = self.slope(pose)[:-6], self.residuals(pose)[:-6]
+        slope, residual = self.slope(sought)[: -len(sought)], self.residuals(sought)[: -len(sought)]
         near = np.abs(slope).max(axis=1) >= _FELT * np.abs(slope).max()
         return float(np.sqrt(np.mean(residual[near] ** 2) * 4 * np.pi)) * self.blur
 
-    def correlation(self, pose: Float[np.ndarray, "6"]) -> float:
-        """Return the correlation of what was expected and observed around the vessel."""
-        pairs = [(ours - ours.min(), theirs) for ours, theirs, _ in self.fitted(pose)]
-        ours, theirs = (np.concatenate([image.ravel() for image in images]) for images in zip(*pairs, strict=True))
-        near = ours > 0.02 * ours.max()
-        wide = near | (gaussian_filter(near.astype(np.float32), 2.0) > 0)
-        if wide.sum() < 3 or np.ptp(theirs[wide]) == 0:
-            return 0.0
-        return float(np.corrcoef(ours[wide], theirs[wide])[0, 1])
+    def correlation(self, sought: Float[np.ndarray, "k"]) -> float:
+        """Return the correlation of what was expected and observed around the vessel, at the worst moment."""
+        return min(_correlation(moment) for moment in self.fitted(sought))
+
+
+def _correlation(images: Sequence[tuple[np.ndarray, np.ndarray, float]]) -> float:
+    pairs = [((ours - ours.min()).ravel(), theirs.ravel()) for ours, theirs, _ in images]
+    ours, theirs = (np.concatenate(both) for both in zip(*pairs, strict=True))
+    near = ours > 0.02 * ours.max()
+    wide = near | (gaussian_filter(near.astype(np.float32), 2.0) > 0)
+    if wide.sum() < 3 or np.ptp(theirs[wide]) == 0:
+        return 0.0
+    return float(np.corrcoef(ours[wide], theirs[wide])[0, 1])
 
 
 def observed_contrast(
-    contrasted: Sequence[Float32[np.ndarray, "rows columns"]],
-    before: Sequence[Float32[np.ndarray, "rows columns"]],
+    contrasted: Images,
+    before: Images,
     averaged: int,
     blur: float,
     config: ImageConfig,
 ) -> list[np.ndarray]:
-    """Return what contrast added to each image, as `Comparison` takes it.
+    """Return what contrast added to each image, as `_Comparison` takes it.
 
     Args:
         contrasted: an image of the filled vessel for each view.
@@ -321,10 +421,3 @@ def sampled_lumen(
         ),
         np.concatenate([along, np.zeros(len(inside))]),
     )
-
-
-def vessel_error_mm(anatomy: Anatomy, true: Pose, found: Pose) -> float:
-    """Return how far a vessel in one pose lies from itself in another: the mean over its centerlines, mm."""
-    points = anatomy.tree.line.points
-    isocenter = isocenter_of(anatomy)
-    return float(np.linalg.norm(true.move(points, isocenter) - found.move(points, isocenter), axis=1).mean())

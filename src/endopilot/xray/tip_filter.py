@@ -13,26 +13,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
 
 from endopilot.settings import Finite, NonNegative, OpenShare, Positive, Within, settings
 from endopilot.types import VesselTree
 from endopilot.xray.camera import Camera
-from endopilot.xray.carm import View
-from endopilot.xray.line_observations import (
-    Line,
-    Observations,
-    SeenLine,
-    joined,
-    line_observations,
-    see,
-    shown_by,
-    tip_observations,
-)
+from endopilot.xray.carm import Pose, View
+from endopilot.xray.line_observations import Line, Observations, SeenLine, joined, observe, see, shift_onto, shown_by
 from endopilot.xray.tip_posterior import Status, around_mode
 from endopilot.xray.vessel_grid import VesselGrid, make_grid
 
@@ -116,6 +106,14 @@ class TipLocation:
     section: str
     moved_mm: Float[np.ndarray, "3"]
     residual_mm: float
+
+    @classmethod
+    def at(cls, tree: VesselTree, place: tuple[int, float], **rest: Any) -> TipLocation:
+        """Return a location, given branch and abscissa, mm, of the place, and all attributes that do not follow."""
+        branch, abscissa = place
+        line = tree.branches[branch]
+        section = line.section[np.abs(line.centerline.abscissa - abscissa).argmin()]
+        return cls(branch=branch, abscissa=abscissa, section=tree.section_names[section], **rest)
 
     @classmethod
     def nowhere(cls, frame: int) -> TipLocation:
@@ -236,14 +234,13 @@ class TipFilter:
         pairs, way = zip(self._cameras, lines, strict=True), self._moved(base)
         seen = [see(self.grid, camera, line, way) for camera, line in pairs if line is not None]
         everywhere = np.arange(len(self._log))
-        tips = tip_observations(seen, everywhere)
-        score = self._log + self._fit(everywhere, tips, base).log_density
+        score = self._log + self._compare(seen, everywhere, base, rounds=0)[0].log_density
         best = np.argsort(-score, kind="stable")[:_MOST]
         places = np.sort(best[score[best] > score[best[0]] - _PRUNE])
-        fit, rows, beyond = self._compare(seen, places, base)
+        whole = any(len(one.at) for one in seen)
+        fit, rows, beyond = self._compare(seen, places, base, rounds=_ROUNDS if whole else 0)
         # Points that fit no place are strays; so would all be that lie in the vessel, were there no device.
         odds = fit.log_density - _STRAY * rows.used.sum(axis=1)
-        whole = rows.value.shape[1] > 2 * len(seen)
         if np.logaddexp.reduce(self._log[places] + odds) < (_LEAST_ODDS if whole else 0.0):
             return TipLocation.nowhere(frame)
         odds = odds + (_BEYOND - _STRAY) * beyond
@@ -301,10 +298,7 @@ class TipFilter:
             nearest = int(np.linalg.norm(self.grid.middle - point, axis=1).argmin())
             log = -self.grid.distance[nearest] / _TIP_SD_MM
             self._log = log - np.logaddexp.reduce(log)
-        shift = np.zeros(3)
-        for _ in range(4):  # the shift across the beam that takes the point to the pixel
-            shown, slope = shown_by(self._cameras[0], point[None] + shift)
-            shift = shift + np.linalg.pinv(slope[0]) @ (np.array(pixel) - shown[0])
+        shift = shift_onto(self._cameras[0], point, np.array(pixel))
         self._mean[:, :3] = shift
         beam = np.linalg.svd(shown_by(self._cameras[0], point[None] + shift)[1][0])[2][2]
         self._covariance[:, :3, :3] = _LANDMARK_SD_MM**2 * np.eye(3) + _DEPTH_SD_MM**2 * np.outer(beam, beam)
@@ -323,36 +317,27 @@ class TipFilter:
         self._covariance = square - mean[:, :, None] * mean[:, None] + frames * drift
 
     def _moved(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "n 3"]:
-        matrix = Rotation.from_rotvec(pose[3:6]).as_matrix()
-        return (self._way - self._centre) @ matrix.T + self._centre + pose[:3]
+        return Pose(pose[3:], pose[:3]).move(self._way, self._centre)
 
     def _compare(
-        self, seen: Sequence[SeenLine], places: Int[np.ndarray, "m"], base: Float[np.ndarray, "6"]
+        self, seen: Sequence[SeenLine], places: Int[np.ndarray, "m"], base: Float[np.ndarray, "6"], *, rounds: int
     ) -> tuple[_Fit, Observations, Int[np.ndarray, "m"]]:
-        """Return what whole lines say of some places of the tip, and how many of their points lie before the root."""
-        tips = tip_observations(seen, places)
-        fit, rows, beyond = self._fit(places, tips, base), tips, np.zeros(len(places), dtype=np.int64)
-        count = [len(one.at) for one in seen]
-        if not any(count):
-            return fit, rows, beyond
-        moved = np.repeat(fit.moved[:, :1], sum(count), axis=1)
-        bounds = np.cumsum([0, *count])
-        for _ in range(_ROUNDS):
-            parts = [
-                line_observations(self.grid, one, places, moved[:, low:high])
-                for one, low, high in zip(seen, bounds[:-1], bounds[1:], strict=True)
-                if high > low
-            ]
-            rows = joined([tips, *(part for part, _ in parts)])
-            beyond = np.sum([outside for _, outside in parts], axis=0)
+        """Return what lines say of some places of the tip, and how many of their points lie before the root.
+
+        At first the ends alone are compared; then, so many times, the points with the way as it is moved by then.
+        """
+        parts = [observe(self.grid, one, places, None) for one in seen]
+        rows = joined([part for part, _ in parts])
+        fit = self._fit(places, rows, base)
+        moved = [np.repeat(fit.moved[:, :1], len(one.at), axis=1) for one in seen]
+        for _ in range(rounds):
+            parts = [observe(self.grid, one, places, shift) for one, shift in zip(seen, moved, strict=True)]
+            rows = joined([part for part, _ in parts])
             fit = self._fit(places, rows, base)
-            # Each view's rows are those of its points, and one of its length.
-            first, kept = tips.value.shape[1], []
-            for number in (n for n in count if n):
-                kept.append(fit.moved[:, first : first + number])
-                first += number + 1
-            moved = np.concatenate(kept, axis=1)
-        return fit, rows, beyond
+            bounds = np.cumsum([part.value.shape[1] for part, _ in parts])[:-1]
+            of_lines = zip(seen, np.split(fit.moved, bounds, axis=1), strict=True)
+            moved = [of_line[:, 2 : 2 + len(one.at)] for one, of_line in of_lines]
+        return fit, rows, np.sum([outside for _, outside in parts], axis=0)
 
     def _fit(self, places: Int[np.ndarray, "m"], rows: Observations, base: Float[np.ndarray, "6"]) -> _Fit:
         """Return the density of observations, and the posterior of what they depend on."""
@@ -401,17 +386,14 @@ class TipFilter:
         weight = weight[near] / share
         covariance = covariance + np.einsum("m,mij->ij", weight, seen.covariance[near])
         place = int(close[np.linalg.norm(grid.middle[close] - weight @ grid.middle[close], axis=1).argmin()])
-        here = self._tree.branches[grid.branch[place]]
-        section = here.section[np.abs(here.centerline.abscissa - grid.abscissa[place]).argmin()]
-        return TipLocation(
+        return TipLocation.at(
+            self._tree,
+            (int(grid.branch[place]), float(grid.abscissa[place])),
             frame=seen.frame,
             status="found" if share >= _SURE else "ambiguous",
             position=mean,
             covariance=covariance,
             share=share,
-            abscissa=float(grid.abscissa[place]),
-            branch=int(grid.branch[place]),
-            section=self._tree.section_names[section],
             moved_mm=seen.moved[best],
             residual_mm=float(seen.residual_mm[best]),
         )

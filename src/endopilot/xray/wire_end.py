@@ -2,12 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32
+from scipy.ndimage import map_coordinates, uniform_filter1d
 from scipy.special import ndtr
 
+from endopilot.xray.carm import View
+from endopilot.xray.tip_posterior import TipEstimate
+
+Image = Float32[np.ndarray, "rows columns"]
+_END_PLACES = 4
+"""Places of the wire's end that give its first direction, and how far aside of the centerline it runs there."""
+_BESIDE_STRAND_PX = 3.0
+"""So far on either side the end of a wire that folds is looked for, pixels: the other strand lies in the middle."""
+_LEAD_PX, _OF_PIXEL, _STRAIGHT_PX = 12, 0.3, 1.0
+"""Length of the wire before its end that shows how far aside it runs, pixels; weight of the evidence of each, since
+neighbours share their noise; standard deviation of what a straight line leaves out, pixels."""
+_SEEN_SHARE = 0.35
+"""An end that is foreshortened to less than this share of its length shows no direction, and is not fitted."""
+_FIT_PX = 0.6
+"""Standard deviation by which fits of ends err besides, pixels: their median errors were 0.3 to 0.6 in one view of
+three arteries, and with 0.35 alone the region of 95 % held 62 % of the tips in one of them."""
+_BELIEVABLE = 3.0
+"""An end farther than this many standard deviations from the posterior's is another line's."""
+BLUR_PX = 0.6
+"""Standard deviation of the detector's blur, pixels."""
 _RADIUS_PX = 9
 """Half a side of the square that the line is fitted in, pixels."""
 _TURNS = np.deg2rad([0.0, -40.0, 40.0, -90.0, 90.0])
@@ -77,6 +99,89 @@ def fit_end(
         return None
     spread = variance * np.linalg.pinv(slope.T @ slope)[:2, :2]
     return WireEnd(best[:2], spread + _OWN_PX**2 * np.eye(2))
+
+
+def refined(
+    found: TipEstimate,
+    views: Sequence[View],
+    signals: Sequence[Image],
+    evidence: Sequence[Image],
+    radius_mm: float,
+) -> TipEstimate:
+    """Return a tip after each image's fit of the wire's end: a Kalman update of its place and the vessel's shift.
+
+    Args:
+        found: the tip.
+        views: of the images, in the CT's frame as the vessel is registered.
+        signals: the images, without contrast.
+        evidence: how much likelier each pixel is on a wire than off it, a logarithm.
+        radius_mm: of the wire.
+    """
+    mean, spread = found.mean, found.spread
+    wire = found.wire[-_END_PLACES:] - found.position
+
+    def seen(
+        view: View, row: Float[np.ndarray, "k 2"], error: Float[np.ndarray, "k"], own: Float[np.ndarray, "k k"]
+    ) -> bool:
+        """Take an error in pixels, along some directions of the image, if it is believable."""
+        nonlocal mean, spread
+        slope = row @ view.slope(mean[:3] + mean[3:])
+        both = np.hstack([slope, slope])
+        expected = both @ spread @ both.T + own
+        if error @ np.linalg.solve(expected, error) > _BELIEVABLE**2:
+            return False
+        gain = spread @ both.T @ np.linalg.inv(expected)
+        mean, spread = mean + gain @ error, (np.eye(6) - gain @ both) @ spread
+        return True
+
+    for view, signal, image in zip(views, signals, evidence, strict=True):
+        at = mean[:3] + mean[3:]
+        per_mm = float(np.linalg.norm(view.slope(at), 2))
+        forwards = view.project(at) - view.project(at + wire[0])
+        seen_px, there_mm = float(np.linalg.norm(forwards)), float(np.linalg.norm(wire[0]))
+        if seen_px < _SEEN_SHARE * per_mm * there_mm:
+            continue
+        axes = np.array([forwards, [-forwards[1], forwards[0]]]) / seen_px
+        if not found.folded:  # the other strand goes on
+            slope = axes @ np.hstack([view.slope(at)] * 2)
+            seen(view, axes, *_ends(image, view.project(at), axes, slope @ spread @ slope.T))
+        guess, width_px = view.project(mean[:3] + mean[3:]), float(np.hypot(0.5 * radius_mm * per_mm, BLUR_PX))
+        for aside in (0.0, -_BESIDE_STRAND_PX, _BESIDE_STRAND_PX)[: 3 if found.folded else 1]:
+            end = fit_end(signal, guess + aside * axes[1], forwards, width_px)
+            if end is not None and seen(view, np.eye(2), end.place - guess, end.covariance + _FIT_PX**2 * np.eye(2)):
+                break
+    return replace(found, mean=mean, spread=spread)
+
+
+def _ends(
+    image: Image, guess: Float[np.ndarray, "2"], axes: Float[np.ndarray, "2 2"], expected: Float[np.ndarray, "2 2"]
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
+    """Return how far along and aside a wire ends from a guess, by the evidence of an image, and its covariance.
+
+    Args:
+        image: the evidence.
+        guess: to the right of the image's middle and up from it, pixels.
+        axes: unit vectors along the wire and across it.
+        expected: covariance of the end about the guess, along and across, pixels².
+    """
+    reach, sides = np.ceil(2.5 * np.sqrt(np.diag(expected)))
+    along, across = np.arange(-reach - _LEAD_PX, reach + 1), np.arange(-sides, sides + 1)
+    right, up = guess[:, None, None] + axes[0][:, None, None] * along[:, None] + axes[1][:, None, None] * across
+    middle = (len(image) - 1) / 2
+    score = map_coordinates(image, [middle - up, middle + right], order=1)
+    prior = -0.5 * across**2 / expected[1, 1]
+    prior -= np.logaddexp.reduce(prior)
+    log = _OF_PIXEL * np.cumsum(np.logaddexp.reduce(score + prior, axis=1)) - 0.5 * along**2 / expected[0, 0]
+    weight = np.exp(log - log[_LEAD_PX:].max())
+    weight[:_LEAD_PX] = 0.0
+    lately = np.exp(uniform_filter1d(score, _LEAD_PX // 2, axis=0, origin=_LEAD_PX // 4 - 1) + prior)
+    weight = (weight / weight.sum())[:, None] * lately / lately.sum(axis=1, keepdims=True)
+    off = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1)
+    mean = np.einsum("ij,ijk->k", weight, off)
+    posterior = np.einsum("ij,ijk,ijl->kl", weight, off - mean, off - mean) + _STRAIGHT_PX**2 * np.eye(2)
+    # What the image alone says: the posterior without the prior.
+    own = np.linalg.inv(np.linalg.inv(posterior) - np.diag(0.9 / np.maximum(np.diag(expected), np.diag(posterior))))
+    return own @ np.linalg.solve(posterior, mean), own
 
 
 class _Line:
