@@ -8,46 +8,55 @@ Curnier, Comput. Methods Appl. Mech. Eng. 92 (1991) 353): at rest nothing lies i
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import LinAlgError, solveh_banded
+from scipy.linalg.lapack import dpbsv
 from scipy.spatial import KDTree
 
 from endopilot.devices.device import Wire
 from endopilot.types import DistanceMap, Insertion
 
 NODE_MM = 0.8  # distance between nodes, mm; the sharpest bends of coronaries have a radius of some 3 mm
-STEP_S = 0.004  # time step at most, s
+STEP_S = 0.01  # time step at most, s
 STRETCH_N = 500.0  # EA at most, N: at 0.2 N a wire is 0.04 % shorter
 BEHIND_MM = 3.0  # nodes farther behind the ostium follow the drive, mm
 POINTS_MM = 0.15  # distance between the wall's points, mm
 SHARPEST_1_MM = 2.0
+BLOCK = 16  # voxels of the map that are looked at together, along each axis
 NEIGHBOURS = 12  # points that a place on the wall is found from
-PENALTY_N_MM = 20.0  # by which multipliers follow gaps and slips, N/mm; what is at rest does not depend on it
-TOLERANCE_MM = 1e-4  # nodes move by less between two rounds of a time step's contacts, mm
+PENALTY_N_MM = 10.0  # by which multipliers follow gaps and slips, N/mm; what is at rest does not depend on it
+TOLERANCE_MM = 1e-3  # nodes move by less between two rounds of a time step's contacts, mm
 ROUNDS = 20  # at most; multipliers go on in the next step
 LEAP_MM = 0.15  # a node that would move farther beside the drive's motion is damped more, as where the wire snaps, mm
+MOST_DAMPING = 1e8
 DRAG_N_S_MM2 = 1e-6  # of one mm of wire, N·s/mm²; 100 mm at 10 mm/s add 0.001 N
 
 
+ROUND=[0]
 class PointWall:
     """The inner surface of a vessel as oriented points, and between them their weighted planes (R. Kolluri, ACM Trans.
     Algorithms 4 (2008) 18)."""
 
     def __init__(self, field: DistanceMap) -> None:
-        """Find the points where a distance map is zero."""
+        """Find the points where a distance map is zero, block by block: most of a map is far from the wall."""
         from scipy.ndimage import zoom
         from skimage.measure import marching_cubes
 
-        finer = max(1, round(field.spacing_mm / POINTS_MM))
-        size = np.array(field.values.shape)
-        values = zoom(field.values, (finer * (size - 1) + 1) / size, order=1) if finer > 1 else field.values
-        spacing = field.spacing_mm / finer
-        points, _, normals, _ = marching_cubes(values, 0.0, gradient_direction="ascent")
-        self._points = field.origin_mm + spacing * points[:, ::-1].astype(float)
-        self._normals = -normals[:, ::-1].astype(float)
+        finer, parts = max(1, round(field.spacing_mm / POINTS_MM)), []
+        corners = [range(0, size - 1, BLOCK) for size in field.values.shape]
+        for corner in itertools.product(*corners):
+            block = field.values[tuple(slice(at, at + BLOCK + 1) for at in corner)]
+            if not block.min() < 0 < block.max():
+                continue
+            size = np.array(block.shape)
+            fine = zoom(block, (finer * (size - 1) + 1) / size, order=1)
+            points, _, normals, _ = marching_cubes(fine, 0.0, gradient_direction="ascent")
+            parts.append((corner + points / finer, -normals))
+        points, normals = (np.concatenate(part)[:, ::-1].astype(float) for part in zip(*parts, strict=True))
+        self._points, self._normals = field.origin_mm + field.spacing_mm * points, normals
         self._tree = KDTree(self._points)
 
     def at(
@@ -66,6 +75,56 @@ class PointWall:
         beside = np.einsum("nki,ni->nk", off, around)
         bent = np.einsum("nk,nk,nki,ni->n", weight, beside, normals, around) / (weight * beside**2).sum(axis=1)
         return depth, np.stack([normal, axial, around], axis=1), bent
+
+
+class _Contacts:
+    """What the wall does to nodes in one time step; a row a node. `rows` are directions in a node's place and its edge's
+    angle: off the wall, along the wire and around it; `bent` is how fast the wall's normal turns around, 1/mm; `pressed`
+    and `rubbed` are the forces before, N."""
+
+    def __init__(
+        self,
+        gap: Float[np.ndarray, "n"],
+        rows: Float[np.ndarray, "n 3 4"],
+        bent: Float[np.ndarray, "n"],
+        pressed: Float[np.ndarray, "n"],
+        rubbed: Float[np.ndarray, "n 2"],
+        friction: float,
+    ) -> None:
+        self.gap, self.rows, self._friction = gap, rows, friction
+        self._pressed, self._rubbed = pressed, rubbed
+        swing = np.sqrt(np.clip(bent, 0.0, SHARPEST_1_MM))[:, None] * rows[:, 2, :3]  # the force turns with its normal
+        self._bands = _banded(rows[:, :1]), _banded(rows[:, 1:]), _banded(np.pad(swing, ((0, 0), (0, 1)))[:, None])
+        self._right = rows[:, 0], np.einsum("nk,nki->ni", rubbed, rows[:, 1:])
+
+    def forces(self, motion: Float[np.ndarray, "n 4"]) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 2"]]:
+        """Return what presses on the nodes after a motion, and rubs along and around, N: the augmented Lagrangian's."""
+        off = np.einsum("nij,nj->ni", self.rows, motion)
+        bears = np.maximum(self._pressed - PENALTY_N_MM * (self.gap + off[:, 0]), 0.0)
+        rubs = self._rubbed - PENALTY_N_MM * off[:, 1:]
+        self._share = np.minimum(1.0, self._friction * bears / (np.hypot(rubs[:, 0], rubs[:, 1]) + 1e-12))
+        return bears, self._share[:, None] * rubs
+
+    def solve(
+        self, band: Float[np.ndarray, "11 m"], damped: Float[np.ndarray, "m"], right: Float[np.ndarray, "m"], motion: Float[np.ndarray, "n 4"]
+    ) -> Float[np.ndarray, "n 4"]:
+        """Return the motion that balances slopes and the wall's forces; `motion` is a guess at it."""
+        for _ in range(ROUNDS):
+            bears, _ = self.forces(motion)
+            touches = (bears > 0).astype(float)
+            matrix = band.copy()
+            for factor, added in zip((PENALTY_N_MM * touches, PENALTY_N_MM * self._share, bears), self._bands, strict=True):
+                matrix[:4] += np.repeat(factor, 4) * added
+            matrix[0] += damped
+            load = touches * (self._pressed - PENALTY_N_MM * self.gap)
+            force = right + (load[:, None] * self._right[0] + self._share[:, None] * self._right[1]).ravel()
+            before, motion = motion, np.zeros_like(motion)
+            _, found, failed = dpbsv(matrix[:, 7:-1], force[7:-1], lower=1)
+            motion.reshape(-1)[7:-1] = np.nan if failed else found
+            ROUND[0]+=1
+            if not np.abs(motion - before)[:, :3].max() > TOLERANCE_MM:
+                break
+        return motion
 
 
 class KirchhoffRod:
@@ -89,7 +148,7 @@ class KirchhoffRod:
             ends = np.minimum(np.maximum(np.stack([at - NODE_MM / 2, at + NODE_MM / 2]), 0.0), length)
             self._rest[:, 0] = wire.tip_bend_rad / length * (ends[1] - ends[0])
         self.tip_force_n = np.zeros(3)
-        self.rounds = 0
+        self.rounds=0
         self.reset(0.0, friction=0.0)
 
     def reset(self, rotation_rad: float, *, friction: float, inserted_mm: float = 0.0) -> None:
@@ -99,10 +158,10 @@ class KirchhoffRod:
         self.position = self._origin + (inserted_mm - self.abscissa_mm)[:, None] * self._axes[:, 2]
         self._tangent = np.tile(self._axes[:, 2], (nodes - 1, 1))
         self._first = np.tile(self._axes[:, 0], (nodes - 1, 1))
-        self._angle = np.full(nodes - 1, rotation_rad)
+        self._angle = np.full(nodes - 1, float(rotation_rad))
         self._turned = np.zeros(nodes - 2)
         self.pressed, self._rubbed = np.zeros(nodes), np.zeros((nodes, 2))
-        self._last, self._damping = np.zeros(4 * nodes), 1.0
+        self._last, self._damping = np.zeros((nodes, 4)), 1.0
         self.load = (0.0, 0.0)
 
     def drive(
@@ -141,67 +200,34 @@ class KirchhoffRod:
         self.pressed[:held] = self._rubbed[:held] = 0.0
         begin = held - 2
         slope, band = self._elastic(begin)
-        free = len(slope) - 7  # numbers of the free nodes' places and of the edges' angles ahead of the held one
-        nodes = slice(begin, None)
-        place, tangent = self.position[nodes], self._tangent[begin:]
-        along = np.concatenate([tangent, tangent[-1:]])
-        # rows of each contact: across the wall, along the wire and around it, of the node's place and its edge's angle
-        rows = np.zeros((len(place), 3, 4))
-        gap, rows[:, :, :3], bent = self.wall.at(place, along)
-        gap -= self._wire.tip_radius_mm
-        bent = np.clip(bent, 0.0, SHARPEST_1_MM)
-        swing = rows[:, 2].copy()
-        rows[:-1, 2, 3] = -self._wire.tip_radius_mm
-        rows[:2] = 0.0
-        gap[:2] = np.inf
-        pressed, rubbed = self.pressed[nodes], self._rubbed[nodes]
-        drag = DRAG_N_S_MM2 * NODE_MM / dt
-        carried = np.zeros((len(place), 4))
-        carried[:, :3] = advance * along
-        carried[:-1, 3] = turn
-        slope.reshape(-1, 4)[-1, :3] -= self.tip_force_n
-        motion = self._last[4 * begin :].reshape(-1, 4) * 1.0
-        gap = np.minimum(gap, 1e3)
-        weigh = np.array([1.0, 1.0, 1.0, self._wire.tip_radius_mm**2])
-        while True:
-            for _ in range(ROUNDS):
-                off = np.einsum("nij,nj->ni", rows, motion)
-                bears = np.maximum(pressed - PENALTY_N_MM * (gap + off[:, 0]), 0.0)
-                rubs = rubbed - PENALTY_N_MM * off[:, 1:]
-                share = np.minimum(1.0, self.friction * bears / (np.hypot(rubs[:, 0], rubs[:, 1]) + 1e-12))
-                factor = np.stack([bears > 0, share, share], axis=1).astype(float)
-                stiff = PENALTY_N_MM * np.einsum("nk,nki,nkj->nij", factor, rows, rows)
-                turning = (bears * bent)[:, None] * swing  # the wall's force turns with its normal
-                stiff += turning[:, :, None] * swing[:, None, :]
-                stiff[:, range(4), range(4)] += self._damping * drag * weigh
-                force = factor * np.concatenate([(pressed - PENALTY_N_MM * gap)[:, None], rubbed], axis=1)
-                right = np.einsum("nk,nki->ni", force, rows) + self._damping * drag * weigh * carried
-                matrix = band.copy()
-                for row in range(4):
-                    for column in range(row + 1):
-                        matrix[row - column, column::4] += stiff[:, row, column]
-                right = right.ravel() - slope
-                before, motion = motion, np.zeros_like(right)
-                motion[7:-1] = solveh_banded(matrix[:, 7:-1], right[7:-1], lower=True, check_finite=False)
-                motion = motion.reshape(-1, 4)
-                self.rounds += 1
-                if np.abs(motion - before)[2:, :3].max() < TOLERANCE_MM:
-                    break
-            leap = float(np.abs(motion[2:, :3] - carried[2:, :3]).max())
-            if leap <= LEAP_MM or self._damping > 1e8:
-                break
-            self._damping *= 4
-        self._damping = max(1.0, 0.5 * self._damping)
-        off = np.einsum("nij,nj->ni", rows, motion)
-        self.pressed[nodes] = bears = np.maximum(pressed - PENALTY_N_MM * (gap + off[:, 0]), 0.0)
-        rubs = rubbed - PENALTY_N_MM * off[:, 1:]
-        most = self.friction * bears
-        self._rubbed[nodes] = rubs * np.minimum(1.0, most / (np.hypot(rubs[:, 0], rubs[:, 1]) + 1e-12))[:, None]
-        self._last[4 * begin :] = motion.ravel()
+        contacts = self._contacts(begin)
+        drag = DRAG_N_S_MM2 * NODE_MM / dt * np.array([1.0, 1.0, 1.0, self._wire.tip_radius_mm**2])
+        carried = np.zeros((len(contacts.gap), 4))  # what the drive alone would move
+        carried[:, :3], carried[:-1, 3] = advance * contacts.rows[:, 1, :3], turn
+        slope[-4:-1] -= self.tip_force_n
+        motion, leap = self._last[begin:], np.inf
+        while leap > LEAP_MM:
+            damped = np.tile(self._damping * drag, len(carried))
+            motion = contacts.solve(band, damped, damped * carried.ravel() - slope, motion)
+            leap = float(np.abs(motion - carried)[2:, :3].max()) if self._damping < MOST_DAMPING else 0.0
+            self._damping *= 4.0 if leap > LEAP_MM else 0.5
+        self._damping = max(1.0, self._damping)
+        self.pressed[begin:], self._rubbed[begin:] = contacts.forces(motion)
+        self._last[begin:] = motion
         self._load(slope, band, motion.ravel())
         self.position[begin:] += motion[:, :3]
         self._angle[begin:] += motion[:-1, 3]
         self._carry(begin)
+
+    def _contacts(self, begin: int) -> _Contacts:
+        along = self._tangent[begin:][np.append(np.arange(len(self._tangent) - begin), -1)]
+        gap, axes, bent = self.wall.at(self.position[begin:], along)
+        rows = np.zeros((len(gap), 3, 4))
+        rows[:, :, :3] = axes
+        rows[:-1, 2, 3] = -self._wire.tip_radius_mm
+        gap -= self._wire.tip_radius_mm
+        gap[:2] = 1e3  # these follow the drive
+        return _Contacts(gap, rows, bent, self.pressed[begin:], self._rubbed[begin:], self.friction)
 
     def _load(self, slope: np.ndarray, band: np.ndarray, motion: np.ndarray) -> None:
         """Keep the force and the torque that hold the base: the slope of the energy there after the motion."""
@@ -295,6 +321,14 @@ class KirchhoffRod:
                     band[row - column, 4 + column :: 4] += axial[:, row, column]
                 band[4 + row - column, column : 4 * nodes - 4 : 4] -= axial[:, row, column]
         return slope.ravel(), band
+
+
+def _banded(rows: Float[np.ndarray, "n k 4"]) -> Float[np.ndarray, "4 m"]:
+    """Return the sums of the rows' squares of each node as bands of a lower matrix."""
+    squares, band = np.einsum("nki,nkj->nij", rows, rows), np.zeros((4, len(rows), 4))
+    for below in range(4):
+        band[below, :, : 4 - below] = np.diagonal(squares, -below, 1, 2)
+    return band.reshape(4, -1)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
