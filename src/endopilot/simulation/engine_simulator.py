@@ -84,9 +84,10 @@ class EngineSimulator(Simulator):
             if values[row, at.TIME] > 0:
                 continue
             if world not in self._rods:
-                axes = Rotation.from_quat(insertion_arguments(group.anatomy.insertion)["orientation"], scalar_first=True)
+                base = insertion_arguments(group.anatomy.insertion)
+                axes = Rotation.from_quat(base["orientation"], scalar_first=True).as_matrix()
                 self._rods[world] = KirchhoffRod(
-                    _wall(group.anatomy), group.anatomy.insertion, axes.as_matrix(), stack.wire, group.longest_mm
+                    _wall(group.anatomy), base["origin"], axes, stack.wire, group.longest_mm
                 )
             rod, (length, rotation) = self._rods[world], values[row, [at.LENGTH, at.ROTATION]].tolist()
             rod.reset(rotation, friction=float(values[row, at.FRICTION]))
@@ -95,9 +96,7 @@ class EngineSimulator(Simulator):
                 rod.drive((0.0, 0.0), 0.5)
         self._write(group, np.zeros((len(values), 2)), 0.0)
 
-    def _driven(
-        self, group: Group, velocity: Float[np.ndarray, "members 2"], seconds: float
-    ) -> dict[str, np.ndarray]:
+    def _driven(self, group: Group, velocity: Float[np.ndarray, "members 2"], seconds: float) -> dict[str, np.ndarray]:
         simulation, slipped = group.simulation, np.zeros((2, len(velocity), 1))
         for row, world in enumerate(group.index.tolist()):
             rod = self._rods[world]
