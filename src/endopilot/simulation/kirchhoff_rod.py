@@ -13,7 +13,9 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg.blas import dsbmv
 from scipy.linalg.lapack import dpbsv
+from scipy.optimize import brentq
 from scipy.spatial import KDTree
 
 from endopilot.devices.device import Wire
@@ -28,7 +30,8 @@ _POINTS_MM, _NEIGHBOURS = 0.15, 12  # between the wall's points, mm, and how man
 _BLOCK = 16  # voxels of a map that are looked at together, along each axis
 _SHARPEST_1_MM = 2.0  # curvature across a vessel, 1/mm, at most: of one that a wire hardly enters
 _PENALTY_N_MM = 10.0  # by which forces follow gaps and slips, N/mm; what is at rest does not depend on it
-_TOLERANCE_MM, _ROUNDS = 1e-3, 20  # a step's contacts are solved until nodes move by less, mm, or so often
+_TOLERANCE_MM, _ROUNDS = 1e-4, 40  # a step's contacts are solved until nodes move by less, mm, or so often
+_FULL = 8
 _LEAP_MM = 0.15  # a node that would move farther beside the drive's motion is damped more, as where the wire snaps, mm
 _MOST_DAMPING = 1e8  # times the drag; nothing leaps then
 
@@ -86,42 +89,76 @@ class _Contacts:
         self._rows[:, :, :3] = axes
         swing = np.sqrt(np.clip(bent, 0.0, _SHARPEST_1_MM))[:, None] * self._rows[:, 2]
         self._rows[:-1, 2, 3] = -rod.radius_mm
-        # forces turn with the wall's normal, which keeps a wire from swinging to and fro
-        self._bands = _banded(self._rows[:, :1]), _banded(self._rows[:, 1:]), _banded(swing[:, None])
         self._pressed, self._rubbed, self._friction = rod.pressed[begin:], rod.rubbed[begin:], rod.friction
+        self.turning = np.repeat(self._pressed, 4) * _banded(swing[:, None])
+        self._bands = _banded(self._rows[:, :1]), _banded(self._rows[:, 1:])
 
-    def forces(
-        self, motion: Float[np.ndarray, "n 4"]
-    ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
-        """Return what presses on the nodes after a motion, N, what rubs on them along and around, N, and the share of
-        what it would take to hold them."""
+    def forces(self, motion: Float[np.ndarray, "n 4"]) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 2"]]:
+        """Return what presses on the nodes after a motion, N, and what rubs on them along and around, N."""
         off = np.einsum("nij,nj->ni", self._rows, motion)
-        pressed = np.maximum(self._pressed - _PENALTY_N_MM * (self._gap + off[:, 0]), 0.0)
+        pressed = self._pressing(off)
+        holds, share = self._rubbing(off, self._friction * pressed)
+        return pressed, share[:, None] * holds
+
+    def _pressing(self, off: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        return np.maximum(self._pressed - _PENALTY_N_MM * (self._gap + off[:, 0]), 0.0)
+
+    def _rubbing(
+        self, off: Float[np.ndarray, "n 3"], limit: Float[np.ndarray, "n"]
+    ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
+        """Return what it would take to hold the nodes, N, and the share of it that friction has."""
         holds = self._rubbed - _PENALTY_N_MM * off[:, 1:]
-        share = np.minimum(1.0, self._friction * pressed / (np.hypot(holds[:, 0], holds[:, 1]) + 1e-12))
-        return pressed, share[:, None] * holds, share
+        return holds, np.minimum(1.0, limit / (np.hypot(holds[:, 0], holds[:, 1]) + 1e-12))
 
     def solve(
         self, band: Float[np.ndarray, "11 m"], right: Float[np.ndarray, "m"], motion: Float[np.ndarray, "n 4"]
     ) -> Float[np.ndarray, "n 4"]:
         """Return the motion that balances the rod's forces and the wall's; `motion` is a guess at it."""
-        for _ in range(_ROUNDS):
-            pressed, _, share = self.forces(motion)
+        free, gap = slice(7, -1), np.minimum(self._gap, 1e3)
+        for turn in range(_ROUNDS):
+            off = np.einsum("nij,nj->ni", self._rows, motion)
+            pressed = self._pressing(off)
+            _, share = self._rubbing(off, self._friction * pressed)
             touches = pressed > 0
             matrix = band.copy()
-            for factor, added in zip(
-                (_PENALTY_N_MM * touches, _PENALTY_N_MM * share, pressed), self._bands, strict=True
-            ):
-                matrix[:4] += np.repeat(factor, 4) * added
-            free = np.where(touches, self._pressed - _PENALTY_N_MM * np.where(touches, self._gap, 0.0), 0.0)
-            wall = np.concatenate([free[:, None], share[:, None] * self._rubbed], axis=1)
+            for factor, added in zip((touches, share), self._bands, strict=True):
+                matrix[:4] += np.repeat(_PENALTY_N_MM * factor, 4) * added
+            wall = np.concatenate(
+                [(touches * (self._pressed - _PENALTY_N_MM * gap))[:, None], share[:, None] * self._rubbed], axis=1
+            )
             force = right + np.einsum("nk,nki->ni", wall, self._rows).ravel()
-            before, motion = motion, np.zeros_like(motion)
-            _, found, failed = dpbsv(matrix[:, 7:-1], force[7:-1], lower=1)
-            motion.reshape(-1)[7:-1] = np.nan if failed else found
-            if not np.abs(motion - before)[:, :3].max() > _TOLERANCE_MM:
+            _, found, failed = dpbsv(matrix[:, free], force[free], lower=1)
+            way = np.zeros_like(motion)
+            way.reshape(-1)[free] = (np.nan if failed else found) - motion.ravel()[free]
+            part = (
+                1.0
+                if turn < _FULL
+                else self._part_of(way, motion, band[:, free], right[free], self._friction * pressed)
+            )
+            motion = motion + part * way
+            if not np.abs(way)[:, :3].max() > _TOLERANCE_MM:
                 break
         return motion
+
+    def _part_of(
+        self, way: np.ndarray, motion: np.ndarray, band: np.ndarray, right: np.ndarray, limit: np.ndarray
+    ) -> float:
+        """Return how far along a way from a motion what is minimised falls, where friction has given limits."""
+        at, to = (values.ravel()[7:-1] for values in (motion, way))
+        stiff = dsbmv(10, 1.0, band, to, lower=1)
+        begin, grows = float(stiff @ at - right @ to), float(stiff @ to)
+        off, turn = np.einsum("nij,nj->ni", self._rows, motion), np.einsum("nij,nj->ni", self._rows, way)
+
+        def slope(part: float) -> float:
+            here = off + part * turn
+            holds, share = self._rubbing(here, limit)
+            wall = self._pressing(here) @ turn[:, 0] + np.einsum("nk,n,nk->", holds, share, turn[:, 1:])
+            return begin + part * grows - float(wall)
+
+        first = slope(0.0)
+        if not slope(1.0) > -0.1 * first > 0:
+            return 1.0
+        return float(brentq(slope, 0.0, 1.0, xtol=1e-6)) + 2e-6
 
 
 class KirchhoffRod:
@@ -210,11 +247,12 @@ class KirchhoffRod:
         while leap > _LEAP_MM:
             damped = band.copy()
             damped[0] += self._damping * drag
+            damped[:4] += contacts.turning
             motion = contacts.solve(damped, self._damping * drag * carried.ravel() - slope, motion)
             leap = float(np.abs(motion - carried)[2:, :3].max()) if self._damping < _MOST_DAMPING else 0.0
             self._damping *= 4.0 if leap > _LEAP_MM else 0.5
         self._damping = max(1.0, self._damping)
-        self.pressed[begin:], self.rubbed[begin:], _ = contacts.forces(motion)
+        self.pressed[begin:], self.rubbed[begin:] = contacts.forces(motion)
         self._last[begin:] = motion
         # the energy's slope at what follows the drive, once the others have moved
         held_by = [slope[k] + band[7 - k :, k] @ motion.ravel()[7 : k + 11] for k in range(7)]
