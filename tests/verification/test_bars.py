@@ -8,18 +8,19 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from benchmarks.verification import contact, engine, motion, order, stability, transmission, tube, tubes
+from benchmarks.verification import contact, engine, kirchhoff, motion, order, stability, transmission, tube, tubes
 from endopilot.verification import free_rod
 from endopilot.verification.case import Case
 
 GROUPS = {
     f"{module.__name__.rsplit('.', 1)[-1]}.{group.__name__}": group
-    for module in (free_rod, contact, motion, order, stability, transmission, tube, tubes, engine)
+    for module in (free_rod, contact, motion, order, stability, transmission, tube, tubes, engine, kirchhoff)
     for group in module.CASES
 }
 LARGEST_BAR = 0.02
 WIDER = {"tube.sinusoidal_buckling": 0.05, "tube.helical_buckling": 0.05, "order.order_in_element_length": 0.05}
 WIDER |= {"order.order_in_navigation": 0.2, "order.order_in_time_step": 0.05, "motion.order_in_a_beating_heart": 0.2}
+WIDER |= {"kirchhoff.pushed_into_a_bend": 0.15, "kirchhoff.capstan": 0.05, "kirchhoff.helix_in_a_tube": 0.1}
 
 
 def turned_by(share: float, low: float, high: float) -> Callable[[Case], None]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.__main__ import main as benchmarks
-from benchmarks.verification import contact, engine, motion, order, stability, transmission, tube, tubes
+from benchmarks.verification import contact, engine, kirchhoff, motion, order, stability, transmission, tube, tubes
 from endopilot.cli import main
 from endopilot.verification import free_rod
 from endopilot.verification.case import Case, compare
@@ -20,7 +20,7 @@ KEYS = ["case", "reference", "value", "error", "bar", "passed"]
 def cases(monkeypatch: pytest.MonkeyPatch) -> list[Case]:
     """The cases that are run, in place of all."""
     found = free_rod.timoshenko()
-    for module in (contact, engine, motion, order, stability, transmission, tube, tubes):
+    for module in (contact, engine, kirchhoff, motion, order, stability, transmission, tube, tubes):
         monkeypatch.setattr(module, "CASES", ())
     monkeypatch.setattr(free_rod, "CASES", (lambda: found,))
     return found

@@ -2,14 +2,15 @@
 reality than the rod core's. Its wire, wall, contact and friction are laws of their own.
 
 The rod is a discrete elastic rod (M. Bergou et al., ACM Trans. Graphics 27 (2008) 63 and 29 (2010) 116): curvature
-binormals at the nodes, material frames by one angle an edge against frames that are carried along in time. Each time step
-is one linearised minimisation, of a band matrix. Contacts bear what an augmented Lagrangian finds (P. Alart and A.
+binormals at the nodes, material frames by one angle an edge against frames that are carried along in time. Each time
+step is one linearised minimisation, of a band matrix. Contacts bear what an augmented Lagrangian finds (P. Alart and A.
 Curnier, Comput. Methods Appl. Mech. Eng. 92 (1991) 353): at rest nothing lies in the wall, and nothing creeps."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -31,9 +32,10 @@ _BLOCK = 16  # voxels of a map that are looked at together, along each axis
 _SHARPEST_1_MM = 2.0  # curvature across a vessel, 1/mm, at most: of one that a wire hardly enters
 _PENALTY_N_MM = 10.0  # by which forces follow gaps and slips, N/mm; what is at rest does not depend on it
 _TOLERANCE_MM, _ROUNDS = 1e-4, 40  # a step's contacts are solved until nodes move by less, mm, or so often
-_FULL = 8
+_DIRECT = 8  # rounds that go all the way; further ones search along it, or the sets that touch may go in circles
 _LEAP_MM = 0.15  # a node that would move farther beside the drive's motion is damped more, as where the wire snaps, mm
 _MOST_DAMPING = 1e8  # times the drag; nothing leaps then
+_FAR_MM = 1e3  # from the wall is what follows the drive, mm
 
 
 class PointWall:
@@ -82,83 +84,78 @@ class _Contacts:
 
     def __init__(self, rod: KirchhoffRod, begin: int, along: Float[np.ndarray, "n 3"]) -> None:
         """Look at the nodes from one on, of which two follow the drive; `along` are the wire's directions there."""
-        gap, axes, bent = rod.wall.at(rod.position[begin:], along)
-        self._gap = gap - rod.radius_mm
-        self._gap[:2] = np.inf
-        self._rows = np.zeros((len(gap), 3, 4))  # directions off the wall, along the wire, and around it as it turns
-        self._rows[:, :, :3] = axes
+        depth, axes, bent = rod.wall.at(rod.position[begin:], along)
+        self._gap, self._rows = depth - rod.radius_mm, np.zeros((len(depth), 3, 4))
+        self._gap[:2] = _FAR_MM
+        self._rows[:, :, :3] = axes  # off the wall, along the wire, and around it as it turns
         swing = np.sqrt(np.clip(bent, 0.0, _SHARPEST_1_MM))[:, None] * self._rows[:, 2]
         self._rows[:-1, 2, 3] = -rod.radius_mm
         self._pressed, self._rubbed, self._friction = rod.pressed[begin:], rod.rubbed[begin:], rod.friction
+        # forces turn with the wall's normal as a wire swings to and fro
         self.turning = np.repeat(self._pressed, 4) * _banded(swing[:, None])
         self._bands = _banded(self._rows[:, :1]), _banded(self._rows[:, 1:])
 
-    def forces(self, motion: Float[np.ndarray, "n 4"]) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 2"]]:
-        """Return what presses on the nodes after a motion, N, and what rubs on them along and around, N."""
-        off = np.einsum("nij,nj->ni", self._rows, motion)
-        pressed = self._pressing(off)
-        holds, share = self._rubbing(off, self._friction * pressed)
-        return pressed, share[:, None] * holds
+    def forces(
+        self, motion: Float[np.ndarray, "n 4"]
+    ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
+        """Return what presses on the nodes after a motion, N, what rubs on them along and around, N, and the latter's
+        share of what would hold them."""
+        return self._forces(np.einsum("nij,nj->ni", self._rows, motion))
 
-    def _pressing(self, off: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-        return np.maximum(self._pressed - _PENALTY_N_MM * (self._gap + off[:, 0]), 0.0)
-
-    def _rubbing(
-        self, off: Float[np.ndarray, "n 3"], limit: Float[np.ndarray, "n"]
-    ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
-        """Return what it would take to hold the nodes, N, and the share of it that friction has."""
+    def _forces(
+        self, off: Float[np.ndarray, "n 3"], limit: Float[np.ndarray, "n"] | None = None
+    ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
+        pressed = np.maximum(self._pressed - _PENALTY_N_MM * (self._gap + off[:, 0]), 0.0)
         holds = self._rubbed - _PENALTY_N_MM * off[:, 1:]
-        return holds, np.minimum(1.0, limit / (np.hypot(holds[:, 0], holds[:, 1]) + 1e-12))
+        most = self._friction * pressed if limit is None else limit
+        share = np.minimum(1.0, most / (np.hypot(holds[:, 0], holds[:, 1]) + 1e-12))
+        return pressed, share[:, None] * holds, share
 
     def solve(
         self, band: Float[np.ndarray, "11 m"], right: Float[np.ndarray, "m"], motion: Float[np.ndarray, "n 4"]
     ) -> Float[np.ndarray, "n 4"]:
         """Return the motion that balances the rod's forces and the wall's; `motion` is a guess at it."""
-        free, gap = slice(7, -1), np.minimum(self._gap, 1e3)
+        free = slice(7, -1)
         for turn in range(_ROUNDS):
-            off = np.einsum("nij,nj->ni", self._rows, motion)
-            pressed = self._pressing(off)
-            _, share = self._rubbing(off, self._friction * pressed)
-            touches = pressed > 0
-            matrix = band.copy()
+            pressed, _, share = self.forces(motion)
+            touches, matrix = pressed > 0, band.copy()
             for factor, added in zip((touches, share), self._bands, strict=True):
                 matrix[:4] += np.repeat(_PENALTY_N_MM * factor, 4) * added
-            wall = np.concatenate(
-                [(touches * (self._pressed - _PENALTY_N_MM * gap))[:, None], share[:, None] * self._rubbed], axis=1
-            )
+            unmoved = touches * (self._pressed - _PENALTY_N_MM * self._gap)
+            wall = np.concatenate([unmoved[:, None], share[:, None] * self._rubbed], axis=1)
             force = right + np.einsum("nk,nki->ni", wall, self._rows).ravel()
             _, found, failed = dpbsv(matrix[:, free], force[free], lower=1)
             way = np.zeros_like(motion)
-            way.reshape(-1)[free] = (np.nan if failed else found) - motion.ravel()[free]
-            part = (
-                1.0
-                if turn < _FULL
-                else self._part_of(way, motion, band[:, free], right[free], self._friction * pressed)
-            )
+            way.ravel()[free] = np.nan if failed else found - motion.ravel()[free]
+            searched = turn >= _DIRECT and not failed
+            part = self._part(way, motion, band[:, free], right[free], self._friction * pressed) if searched else 1.0
             motion = motion + part * way
             if not np.abs(way)[:, :3].max() > _TOLERANCE_MM:
                 break
         return motion
 
-    def _part_of(
-        self, way: np.ndarray, motion: np.ndarray, band: np.ndarray, right: np.ndarray, limit: np.ndarray
+    def _part(
+        self,
+        way: Float[np.ndarray, "n 4"],
+        motion: Float[np.ndarray, "n 4"],
+        band: Float[np.ndarray, "11 m"],
+        right: Float[np.ndarray, "m"],
+        limit: Float[np.ndarray, "n"],
     ) -> float:
-        """Return how far along a way from a motion what is minimised falls, where friction has given limits."""
+        """Return how far along a way from a motion the energy falls, friction's limits being given."""
         at, to = (values.ravel()[7:-1] for values in (motion, way))
         stiff = dsbmv(10, 1.0, band, to, lower=1)
-        begin, grows = float(stiff @ at - right @ to), float(stiff @ to)
-        off, turn = np.einsum("nij,nj->ni", self._rows, motion), np.einsum("nij,nj->ni", self._rows, way)
+        off, turn = (np.einsum("nij,nj->ni", self._rows, values) for values in (motion, way))
 
         def slope(part: float) -> float:
-            here = off + part * turn
-            holds, share = self._rubbing(here, limit)
-            wall = self._pressing(here) @ turn[:, 0] + np.einsum("nk,n,nk->", holds, share, turn[:, 1:])
-            return begin + part * grows - float(wall)
+            pressed, rubbed, _ = self._forces(off + part * turn, limit)
+            wall = pressed @ turn[:, 0] + (rubbed * turn[:, 1:]).sum()
+            return float(stiff @ at - right @ to + part * (stiff @ to) - wall)
 
-        first = slope(0.0)
-        if not slope(1.0) > -0.1 * first > 0:
+        if not slope(1.0) > -0.1 * slope(0.0) > 0:  # it falls, or nearly, all along
             return 1.0
-        return float(brentq(slope, 0.0, 1.0, xtol=1e-6)) + 2e-6
+        kink: Any = brentq(slope, 0.0, 1.0, xtol=1e-6)
+        return kink + 1e-6  # beyond where a node begins to touch
 
 
 class KirchhoffRod:
@@ -172,8 +169,8 @@ class KirchhoffRod:
         wire: Wire,
         length_mm: float,
     ) -> None:
-        """Lay a wire out that may be inserted by some length from an origin, mm; `axes` has a column for each of its axes
-        at rotation 0, the third along it."""
+        """Lay a wire out that may be inserted by some length from an origin, mm; `axes` has a column for each of its
+        axes at rotation 0, the third along it."""
         self.wall, self.radius_mm, self._origin, self._axes = wall, wire.tip_radius_mm, origin, axes
         nodes = int(np.ceil((length_mm + BEHIND_MM) / NODE_MM)) + 4
         self.abscissa_mm = NODE_MM * np.arange(nodes)[::-1].astype(float)
@@ -205,8 +202,8 @@ class KirchhoffRod:
     def drive(
         self, velocity: tuple[float, float], seconds: float, *, limits: Sequence[float] = (np.inf, np.inf, np.inf)
     ) -> tuple[float, float]:
-        """Move the base for some time, mm/s and rad/s; return the advance (mm) and the rotation (rad) that slipped, where
-        it would have pushed, pulled (N) or turned (N·mm) harder than the limits."""
+        """Move the base for some time, mm/s and rad/s; return the advance (mm) and the rotation (rad) that slipped,
+        where it would have pushed, pulled (N) or turned (N·mm) harder than the limits."""
         steps = max(1, int(np.ceil(seconds / STEP_S - 1e-9)))
         advance, turn = velocity[0] * seconds / steps, velocity[1] * seconds / steps
         slipped, turned = 0, 0
@@ -252,7 +249,7 @@ class KirchhoffRod:
             leap = float(np.abs(motion - carried)[2:, :3].max()) if self._damping < _MOST_DAMPING else 0.0
             self._damping *= 4.0 if leap > _LEAP_MM else 0.5
         self._damping = max(1.0, self._damping)
-        self.pressed[begin:], self.rubbed[begin:] = contacts.forces(motion)
+        self.pressed[begin:], self.rubbed[begin:], _ = contacts.forces(motion)
         self._last[begin:] = motion
         # the energy's slope at what follows the drive, once the others have moved
         held_by = [slope[k] + band[7 - k :, k] @ motion.ravel()[7 : k + 11] for k in range(7)]
