@@ -102,7 +102,7 @@ class EngineSimulator(Simulator):
             rod = self._rods[world]
             velocity[row, 0] = max(velocity[row, 0], -rod.inserted_mm / seconds)
             if simulation.reason()[row] == 0:
-                slipped[:, row, 0] = rod.drive(tuple(velocity[row]), seconds, limits=group.stack.limits[0])
+                slipped[:, row, 0] = rod.drive(velocity[row].tolist(), seconds)
         self._write(group, velocity, seconds)
         pressed = np.stack([self._rods[world].pressed for world in group.index.tolist()])
         window = np.ones(1 + 2 * int(_RESULTANT_MM / 2 / NODE_MM))

@@ -180,6 +180,7 @@ class KirchhoffRod:
         bend, twist = wire.bend_stiffness(at), wire.twist_stiffness(at)
         self._stiffness = np.stack([bend, bend, twist], axis=1) / NODE_MM
         self._rest = np.zeros((nodes - 2, 3))
+        self._limits = wire.push_limit_n, wire.pull_limit_n, wire.torque_limit_n_mm
         if wire.tip_bend_length_mm > 0:  # a node has the bend of half an edge to either side
             ends = np.clip(at + NODE_MM / 2 * np.array([[1], [-1]]), 0.0, wire.tip_bend_length_mm)
             self._rest[:, 0] = wire.tip_bend_rad / wire.tip_bend_length_mm * (ends[0] - ends[1])
@@ -199,21 +200,19 @@ class KirchhoffRod:
         self._last, self._damping = np.zeros((nodes, 4)), 1.0
         self.load = (0.0, 0.0)
 
-    def drive(
-        self, velocity: tuple[float, float], seconds: float, *, limits: Sequence[float] = (np.inf, np.inf, np.inf)
-    ) -> tuple[float, float]:
+    def drive(self, velocity: Sequence[float], seconds: float) -> tuple[float, float]:
         """Move the base for some time, mm/s and rad/s; return the advance (mm) and the rotation (rad) that slipped,
-        where it would have pushed, pulled (N) or turned (N·mm) harder than the limits."""
+        where the drive would have pushed, pulled or turned harder than the wire's limits."""
         steps = max(1, int(np.ceil(seconds / STEP_S - 1e-9)))
-        advance, turn = velocity[0] * seconds / steps, velocity[1] * seconds / steps
-        slipped, turned = 0, 0
+        advance, turn = (each * seconds / steps for each in velocity)
+        push, pull, twist = self._limits
+        slips = turns = 0
         for _ in range(steps):
             force, torque = self.load
-            slips = force * np.sign(advance) > (limits[0] if advance > 0 else limits[1])
-            whirls = torque * np.sign(turn) > limits[2]
-            self._step(0.0 if slips else advance, 0.0 if whirls else turn, seconds / steps)
-            slipped, turned = slipped + slips, turned + whirls
-        return slipped * advance, turned * turn
+            slip, whirl = force * np.sign(advance) > (push if advance > 0 else pull), torque * np.sign(turn) > twist
+            self._step(0.0 if slip else advance, 0.0 if whirl else turn, seconds / steps)
+            slips, turns = slips + slip, turns + whirl
+        return slips * advance, turns * turn
 
     @property
     def frames(self) -> Float[np.ndarray, "edges 3 3"]:
