@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg.blas import dsbmv
-from scipy.linalg.lapack import dpbsv
+from scipy.linalg import get_blas_funcs, get_lapack_funcs
 from scipy.optimize import brentq
 from scipy.spatial import KDTree
 
@@ -36,6 +35,8 @@ _DIRECT = 8  # rounds that go all the way; further ones search along it, or the 
 _LEAP_MM = 0.15  # a node that would move farther beside the drive's motion is damped more, as where the wire snaps, mm
 _MOST_DAMPING = 1e8  # times the drag; nothing leaps then
 _FAR_MM = 1e3  # from the wall is what follows the drive, mm
+_solved: Any = get_lapack_funcs("pbsv", dtype=np.float64)  # of matrices as bands
+_times: Any = get_blas_funcs("sbmv", dtype=np.float64)
 
 
 class PointWall:
@@ -117,40 +118,41 @@ class _Contacts:
         """Return the motion that balances the rod's forces and the wall's; `motion` is a guess at it."""
         free = slice(7, -1)
         for turn in range(_ROUNDS):
-            pressed, _, share = self.forces(motion)
+            off = np.einsum("nij,nj->ni", self._rows, motion)
+            pressed, _, share = self._forces(off)
             touches, matrix = pressed > 0, band.copy()
             for factor, added in zip((touches, share), self._bands, strict=True):
                 matrix[:4] += np.repeat(_PENALTY_N_MM * factor, 4) * added
             unmoved = touches * (self._pressed - _PENALTY_N_MM * self._gap)
             wall = np.concatenate([unmoved[:, None], share[:, None] * self._rubbed], axis=1)
             force = right + np.einsum("nk,nki->ni", wall, self._rows).ravel()
-            _, found, failed = dpbsv(matrix[:, free], force[free], lower=1)
+            _, found, failed = _solved(matrix[:, free], force[free], lower=1)
             way = np.zeros_like(motion)
             way.ravel()[free] = np.nan if failed else found - motion.ravel()[free]
-            searched = turn >= _DIRECT and not failed
-            part = self._part(way, motion, band[:, free], right[free], self._friction * pressed) if searched else 1.0
+            part = 1.0
+            if turn >= _DIRECT and not failed:
+                stiff = _times(10, 1.0, band[:, free], way.ravel()[free], lower=1)
+                begin = stiff @ motion.ravel()[free] - right @ way.ravel()
+                slope = float(begin), float(stiff @ way.ravel()[free])
+                part = self._falls(slope, off, np.einsum("nij,nj->ni", self._rows, way), self._friction * pressed)
             motion = motion + part * way
             if not np.abs(way)[:, :3].max() > _TOLERANCE_MM:
                 break
         return motion
 
-    def _part(
+    def _falls(
         self,
-        way: Float[np.ndarray, "n 4"],
-        motion: Float[np.ndarray, "n 4"],
-        band: Float[np.ndarray, "11 m"],
-        right: Float[np.ndarray, "m"],
+        rod: tuple[float, float],
+        off: Float[np.ndarray, "n 3"],
+        turn: Float[np.ndarray, "n 3"],
         limit: Float[np.ndarray, "n"],
     ) -> float:
-        """Return how far along a way from a motion the energy falls, friction's limits being given."""
-        at, to = (values.ravel()[7:-1] for values in (motion, way))
-        stiff = dsbmv(10, 1.0, band, to, lower=1)
-        off, turn = (np.einsum("nij,nj->ni", self._rows, values) for values in (motion, way))
+        """Return the part of a way along which the energy falls, friction's limits being given. `rod` is the slope of
+        its own part and how that grows; nodes have moved by `off` along their directions, and move by `turn`."""
 
         def slope(part: float) -> float:
             pressed, rubbed, _ = self._forces(off + part * turn, limit)
-            wall = pressed @ turn[:, 0] + (rubbed * turn[:, 1:]).sum()
-            return float(stiff @ at - right @ to + part * (stiff @ to) - wall)
+            return rod[0] + part * rod[1] - float(pressed @ turn[:, 0] + (rubbed * turn[:, 1:]).sum())
 
         if not slope(1.0) > -0.1 * slope(0.0) > 0:  # it falls, or nearly, all along
             return 1.0
@@ -233,6 +235,7 @@ class KirchhoffRod:
         self._turned[: held - 2] = 0.0
         self.pressed[:held] = self.rubbed[:held] = 0.0
         begin = held - 2
+        self._carry(begin)
         slope, band = self._elastic(begin)
         slope[-4:-1] -= self.tip_force_n
         along = self._tangent[begin:][[*range(len(self._tangent) - begin), -1]]
@@ -255,6 +258,10 @@ class KirchhoffRod:
         self.load = float((np.array(held_by[:3]) + held_by[4:7]) @ self._axes[:, 2]), float(held_by[3])
         self.position[begin:] += motion[:, :3]
         self._angle[begin:] += motion[:-1, 3]
+        self._carry(begin)
+
+    def _carry(self, begin: int) -> None:
+        """Carry edges' frames along to where the edges point now."""
         now = _unit(np.diff(self.position[begin:], axis=0))
         first = _transport(self._first[begin:], self._tangent[begin:], now)
         self._first[begin:], self._tangent[begin:] = _unit(first - _dot(first, now) * now), now
