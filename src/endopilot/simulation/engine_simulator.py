@@ -18,16 +18,14 @@ from endopilot.simulation import core_state as at
 from endopilot.simulation.config import FREE_BEHIND_MM
 from endopilot.simulation.controls import free_wire_load
 from endopilot.simulation.core import insertion_arguments
-from endopilot.simulation.groups import Group
+from endopilot.simulation.groups import Group, kept
 from endopilot.simulation.kirchhoff_rod import NODE_MM, KirchhoffRod, PointWall
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState, Step
-from endopilot.types import Anatomy
 
 _RESULTANT_MM = 2.0  # length of wire whose forces of the wall are added up, mm, as the core does
 _NOT_FINITE, _THROUGH_WALL = 1, 3  # reasons of an invalid world
-_KEPT = 4  # walls that are kept for the next simulator, as the core's are
-_walls: dict[str, PointWall] = {}
+_READ = ("inserted_length", "rotation", "base_force", "base_torque", "drive_force", "drive_torque")  # from the core's
 
 
 class EngineSimulator(Simulator):
@@ -86,9 +84,8 @@ class EngineSimulator(Simulator):
             if world not in self._rods:
                 base = insertion_arguments(group.anatomy.insertion)
                 axes = Rotation.from_quat(base["orientation"], scalar_first=True).as_matrix()
-                self._rods[world] = KirchhoffRod(
-                    _wall(group.anatomy), base["origin"], axes, stack.wire, group.longest_mm
-                )
+                wall = kept((group.anatomy.identity, "points"), lambda: PointWall(group.anatomy.distance_map))
+                self._rods[world] = KirchhoffRod(wall, base["origin"], axes, stack.wire, group.longest_mm)
             rod, (length, rotation) = self._rods[world], values[row, [at.LENGTH, at.ROTATION]].tolist()
             rod.reset(rotation, friction=float(values[row, at.FRICTION]))
             if length > 0:
@@ -114,13 +111,8 @@ class EngineSimulator(Simulator):
             "valid": simulation.reason() == 0,
             "tip_position": simulation.tips(),
             "tip_direction": simulation.tip_directions(),
-            "inserted_length": simulation.inserted_length(),
-            "rotation": simulation.rotation(),
             "shape": simulation.positions(),
-            "base_force": simulation.base_force(),
-            "base_torque": simulation.base_torque(),
-            "drive_force": simulation.drive_force(),
-            "drive_torque": simulation.drive_torque(),
+            **{name: getattr(simulation, name)() for name in _READ},
             "tip_twist": nothing[:, None],
             "slip": slipped[0],
             "rotation_slip": slipped[1],
@@ -166,15 +158,6 @@ class EngineSimulator(Simulator):
             if sample(group.anatomy.distance_map, inside).min() < -self.config.wall_reach_mm:
                 values[row, at.REASON] = _THROUGH_WALL
         group.simulation.set_state(at.with_nodes(values, numbers, 1))
-
-
-def _wall(anatomy: Anatomy) -> PointWall:
-    """Return a vessel's wall, as it was made where it is one of the last few: that takes seconds."""
-    wall = _walls.pop(anatomy.identity, None) or PointWall(anatomy.distance_map)
-    _walls[anatomy.identity] = wall
-    while len(_walls) > _KEPT:
-        _walls.pop(next(iter(_walls)))
-    return wall
 
 
 ENGINES: Mapping[str, type[Simulator]] = MappingProxyType({"rod": Simulator, "kirchhoff": EngineSimulator})
