@@ -96,10 +96,13 @@ class EngineSimulator(Simulator):
     def _driven(self, group: Group, velocity: Float[np.ndarray, "members 2"], seconds: float) -> dict[str, np.ndarray]:
         simulation, slipped = group.simulation, np.zeros((2, len(velocity), 1))
         for row, world in enumerate(group.index.tolist()):
-            rod = self._rods[world]
+            if simulation.reason()[row]:
+                continue
+            rod, asked = self._rods[world], velocity[row] * seconds
+            before = np.array([rod.inserted_mm, rod.rotation_rad])
             velocity[row, 0] = max(velocity[row, 0], -rod.inserted_mm / seconds)
-            if simulation.reason()[row] == 0:
-                slipped[:, row, 0] = rod.drive(velocity[row].tolist(), seconds)
+            rod.drive(velocity[row].tolist(), seconds)
+            slipped[:, row, 0] = before + asked - [rod.inserted_mm, rod.rotation_rad]
         self._write(group, velocity, seconds)
         pressed = np.stack([self._rods[world].pressed for world in group.index.tolist()])
         window = np.ones(1 + 2 * int(_RESULTANT_MM / 2 / NODE_MM))
@@ -123,7 +126,7 @@ class EngineSimulator(Simulator):
     def _write(self, group: Group, velocity: Float[np.ndarray, "members 2"], seconds: float) -> None:
         """Put wires' poses and loads into the core's state, from which everything is read."""
         values, abscissa = group.simulation.state(), group.rod.abscissa_mm
-        numbers = np.zeros((len(values), len(abscissa), at.NODE))
+        numbers = at.nodes_of(values, len(abscissa), 1)
         middles = np.append(0.5 * (abscissa[1:] + abscissa[:-1]), np.inf)
         valve = free_wire_load(
             velocity,
@@ -139,6 +142,7 @@ class EngineSimulator(Simulator):
             if not np.isfinite(rod.position).all():
                 values[row, at.REASON] = _NOT_FINITE
                 continue
+            numbers[row] = 0.0
             # nodes ahead of the catheter, as the core counts them: those whose element's middle is
             ahead = rod.inserted_mm - middles + FREE_BEHIND_MM > 0
             active = int(np.clip(np.argmin(ahead), 1, len(middles) - 2))

@@ -202,19 +202,19 @@ class KirchhoffRod:
         self._last, self._damping = np.zeros((nodes, 4)), 1.0
         self.load = (0.0, 0.0)
 
-    def drive(self, velocity: Sequence[float], seconds: float) -> tuple[float, float]:
-        """Move the base for some time, mm/s and rad/s; return the advance (mm) and the rotation (rad) that slipped,
-        where the drive would have pushed, pulled or turned harder than the wire's limits."""
+    def drive(self, velocity: Sequence[float], seconds: float) -> None:
+        """Move the base for some time, mm/s and rad/s, except where the drive slips rather than push, pull or turn
+        harder than the wire's limits. A wire that is no longer finite stays."""
         steps = max(1, int(np.ceil(seconds / STEP_S - 1e-9)))
         advance, turn = (each * seconds / steps for each in velocity)
         push, pull, twist = self._limits
-        slips = turns = 0
         for _ in range(steps):
             force, torque = self.load
-            slip, whirl = force * np.sign(advance) > (push if advance > 0 else pull), torque * np.sign(turn) > twist
-            self._step(0.0 if slip else advance, 0.0 if whirl else turn, seconds / steps)
-            slips, turns = slips + slip, turns + whirl
-        return slips * advance, turns * turn
+            slips = force * np.sign(advance) > (push if advance > 0 else pull)
+            turns = torque * np.sign(turn) <= twist
+            self._step(0.0 if slips else advance, turn if turns else 0.0, seconds / steps)
+            if not np.isfinite(self.position).all():
+                return
 
     @property
     def frames(self) -> Float[np.ndarray, "edges 3 3"]:
