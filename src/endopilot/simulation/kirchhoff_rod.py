@@ -32,8 +32,9 @@ _SHARPEST_1_MM = 2.0  # curvature across a vessel, 1/mm, at most: of one that a 
 _PENALTY_N_MM = 10.0  # by which forces follow gaps and slips, N/mm; what is at rest does not depend on it
 _TOLERANCE_MM, _ROUNDS = 1e-4, 40  # a step's contacts are solved until nodes move by less, mm, or so often
 _DIRECT = 8  # rounds that go all the way; further ones search along it, or the sets that touch may go in circles
-_LEAP_MM = 0.15  # a node that would move farther beside the drive's motion is damped more, as where the wire snaps, mm
-_MOST_DAMPING = 1e8  # times the drag; nothing leaps then
+_LEAP_MM = 0.15  # a node that would move so much farther than the drive is damped more, as where the wire snaps, mm
+_STRIDE_MM = 0.12  # advance in a step at most, mm, as of the fastest hand, 12 mm/s, in `STEP_S`
+_MOST_DAMPING = 1e5  # times the drag: as stiff as what forces follow gaps by
 _FAR_MM = 1e3  # from the wall is what follows the drive, mm
 _solved: Any = get_lapack_funcs("pbsv", dtype=np.float64)  # of matrices as bands
 _times: Any = get_blas_funcs("sbmv", dtype=np.float64)
@@ -111,6 +112,11 @@ class _Contacts:
         most = self._friction * pressed if limit is None else limit
         share = np.minimum(1.0, most / (np.hypot(holds[:, 0], holds[:, 1]) + 1e-12))
         return pressed, share[:, None] * holds, share
+
+    def keep_out(self, motion: Float[np.ndarray, "n 4"]) -> None:
+        """Take from a motion what would enter the wall."""
+        into = np.minimum(self._gap + _dot(self._rows[:, 0], motion)[:, 0], 0.0)
+        motion -= into[:, None] * self._rows[:, 0]
 
     def solve(
         self, band: Float[np.ndarray, "11 m"], right: Float[np.ndarray, "m"], motion: Float[np.ndarray, "n 4"]
@@ -205,7 +211,7 @@ class KirchhoffRod:
     def drive(self, velocity: Sequence[float], seconds: float) -> None:
         """Move the base for some time, mm/s and rad/s, except where the drive slips rather than push, pull or turn
         harder than the wire's limits. A wire that is no longer finite stays."""
-        steps = max(1, int(np.ceil(seconds / STEP_S - 1e-9)))
+        steps = max(1, int(np.ceil(max(seconds / STEP_S, abs(velocity[0]) * seconds / _STRIDE_MM) - 1e-9)))
         advance, turn = (each * seconds / steps for each in velocity)
         push, pull, twist = self._limits
         for _ in range(steps):
@@ -241,6 +247,7 @@ class KirchhoffRod:
         along = self._tangent[begin:][[*range(len(self._tangent) - begin), -1]]
         contacts = _Contacts(self, begin, along)
         carried = np.concatenate([advance * along, np.full((len(along), 1), turn)], axis=1)  # by the drive alone
+        contacts.keep_out(carried)
         drag = _DRAG_N_S_MM2 * NODE_MM / dt * np.tile([1.0, 1.0, 1.0, self.radius_mm**2], len(along))
         motion, leap = self._last[begin:], np.inf
         while leap > _LEAP_MM:
@@ -248,7 +255,7 @@ class KirchhoffRod:
             damped[0] += self._damping * drag
             damped[:4] += contacts.turning
             motion = contacts.solve(damped, self._damping * drag * carried.ravel() - slope, motion)
-            leap = float(np.abs(motion - carried)[2:, :3].max()) if self._damping < _MOST_DAMPING else 0.0
+            leap = float(np.abs(motion[2:, :3]).max()) - abs(advance) if self._damping < _MOST_DAMPING else 0.0
             self._damping *= 4.0 if leap > _LEAP_MM else 0.5
         self._damping = max(1.0, self._damping)
         self.pressed[begin:], self.rubbed[begin:], _ = contacts.forces(motion)
