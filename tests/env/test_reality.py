@@ -113,7 +113,7 @@ def test_another_engine_moves_the_wires(near):
     own.reset(seed=0)
     own.step(PUSH)
     off = np.linalg.norm(env.simulator.tip_position - own.simulator.tip_position, axis=-1)
-    assert (0.0 < off).all() and (off < 0.3).all()
+    assert (off > 0.0).all() and (off < 0.3).all()
     env.reset(seed=0)
     np.testing.assert_array_equal(env.step(PUSH)[4]["inserted_length"], infos["inserted_length"])
 

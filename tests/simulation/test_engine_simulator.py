@@ -138,7 +138,9 @@ def test_what_it_cannot_move_is_refused(bend):
     with pytest.raises(InputError, match="engine: kirchhoff with friction_along"):
         World(engine="kirchhoff", friction_along=(1.0, 2.0))
     stack = Stack(WIRE, (read_catheter("microcatheter-1.7f"),))
-    with pytest.raises(InputError, match="it has a wire alone, driven by velocities, in a rigid vessel of one friction"):
+    with pytest.raises(
+        InputError, match="it has a wire alone, driven by velocities, in a rigid vessel of one friction"
+    ):
         EngineSimulator(bend, stack, config=CORE)
     navigation = Navigation(anatomy=bend, device=WIRE, target=Target(branch=0, abscissa=60.0))
     with pytest.raises(InputError, match="that lies still"):
