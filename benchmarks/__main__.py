@@ -23,6 +23,7 @@ BENCHMARKS = {
     "env": "core.env:bench_env",
     "robustness": "core.robustness:measure_robustness",
     "verification": "verification.verification:bench_verification",
+    "engine": "verification.kirchhoff:drive_engine",
     "published": "published.published:bench_published",
     "judges": "judges.judges:bench_judges",
     "robot-twist": "robot.twist:bench_twist",

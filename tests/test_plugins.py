@@ -248,12 +248,6 @@ def test_the_mend_names_the_extra(module: str, extra: str) -> None:
     assert missing is not None and missing.endswith(f"pip install 'endopilot[{extra}]'")
 
 
-def test_a_library_that_is_imported_by_another_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.metadata.requires", lambda _: ["mujoco-core>=4; extra == 'engine'"])
-    missing = what_is_missing(ModuleNotFoundError("No module named 'mujoco'", name="mujoco"))
-    assert missing == "needs mujoco; install it with: pip install 'endopilot[engine]'"
-
-
 def test_a_defect_stays_a_defect() -> None:
     error = ModuleNotFoundError("No module named 'nonsense'", name="nonsense")
     assert what_is_missing(error) is None

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from benchmarks.verification import contact, engine, motion, order, stability, transmission, tube, tubes
+from benchmarks.verification import contact, engine, kirchhoff, motion, order, stability, transmission, tube, tubes
 from benchmarks.verification.plots import draw
 from endopilot.verification import free_rod
 from endopilot.verification.case import run
@@ -28,7 +28,7 @@ def bench_verification(*, plots: Path | None = None) -> list[dict[str, Any]]:
     cases = run(
         [
             group
-            for module in (free_rod, transmission, stability, contact, tube, tubes, motion, engine, order)
+            for module in (free_rod, transmission, stability, contact, tube, tubes, motion, engine, kirchhoff, order)
             for group in module.CASES
         ]
     )

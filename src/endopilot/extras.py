@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from endopilot.errors import InputError
 
 FOR_DEVELOPERS = ("dev", "docs")  # extras that no command needs
-_IMPORTED_AS = {"mujoco-core": "mujoco"}  # libraries that are imported by another name
 
 
 def requirements_of_extras() -> dict[str, tuple[str, ...]]:
@@ -20,7 +19,7 @@ def requirements_of_extras() -> dict[str, tuple[str, ...]]:
     for line in metadata.requires("endopilot") or ():
         parts = re.match(r"([\w.-]+).*\bextra == ['\"]([\w-]+)['\"]", line)
         if parts and parts[1] != "endopilot":  # `all` only repeats the others
-            found[parts[2]] = (*found.get(parts[2], ()), _IMPORTED_AS.get(_normal(parts[1]), _normal(parts[1])))
+            found[parts[2]] = (*found.get(parts[2], ()), _normal(parts[1]))
     return found
 
 

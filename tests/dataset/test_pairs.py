@@ -192,7 +192,7 @@ def test_a_dataset_is_made_in_a_world_and_simulated_again_in_it(patient, tmp_pat
     both = read_joined([tmp_path / "plain", tmp_path / "world"])
     with pytest.raises(InputError, match="holds episodes of several worlds"):
         _ = both.world
-    for name, value in (("share", 0.1), ("backs_out_mm", 2.0), ("engine", "mujoco")):
+    for name, value in (("share", 0.1), ("backs_out_mm", 2.0), ("engine", "kirchhoff")):
         with pytest.raises(InputError, match=f"world: {name} = .*leave it out"):
             generate_dataset([patient], output=tmp_path / "no", device="workhorse-014", world=World(**{name: value}))
     assert not (tmp_path / "no").exists()

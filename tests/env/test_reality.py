@@ -101,10 +101,24 @@ def test_what_all_worlds_share_may_not_differ(near):
         NavigateVectorEnv(2, navigations=near, world=["moving", "nominal"])
     with pytest.raises(InputError, match="world 'none': no such world or file"):
         NavigateEnv(navigations=near, world="none")
-    with pytest.raises(InputError, match="world: engine = mujoco; environments are of the rod core alone"):
-        NavigateVectorEnv(2, navigations=near, world=World(engine="mujoco"))
+    with pytest.raises(InputError, match="world: worlds differ in engine"):
+        NavigateVectorEnv(2, navigations=near, world=["nominal", "other-engine"])
     with pytest.raises(InputError, match="an empty list"):
         NavigateVectorEnv(2, navigations=near, world=[])
+
+
+def test_another_engine_moves_the_wires(near):
+    env = NavigateVectorEnv(2, navigations=near, world="other-engine")
+    env.reset(seed=0)
+    *_, infos = env.step(PUSH)
+    np.testing.assert_allclose(infos["inserted_length"], 6.0 + 0.8 * 12 * 2 / 15, atol=1e-6)
+    own = NavigateVectorEnv(2, navigations=near)
+    own.reset(seed=0)
+    own.step(PUSH)
+    off = np.linalg.norm(env.simulator.tip_position - own.simulator.tip_position, axis=-1)
+    assert (off > 0.0).all() and (off < 0.3).all()
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env.step(PUSH)[4]["inserted_length"], infos["inserted_length"])
 
 
 def test_a_folder_of_tasks_is_an_environment(tmp_path):

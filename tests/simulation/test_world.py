@@ -268,8 +268,6 @@ def test_an_unknown_world_names_those_that_are_there():
 @pytest.mark.parametrize("name", list_worlds())
 def test_a_shipped_world_says_what_it_is_and_is_driven_in(name, straight):
     world = read_world(name)
-    if world.engine == "mujoco":
-        pytest.importorskip("mujoco")
     assert (name == NOMINAL) or (world.about and "\n" not in world.about and len(world.differences()) > 1)
     record = drive(replace(straight, seconds=2.0), world)
     assert record.reason in ("time", "reached") and record.trajectory.valid.all()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks.__main__ import main as benchmarks
-from benchmarks.verification import contact, engine, motion, order, stability, transmission, tube, tubes
+from benchmarks.verification import contact, engine, kirchhoff, motion, order, stability, transmission, tube, tubes
 from endopilot.cli import main
 from endopilot.verification import free_rod
 from endopilot.verification.case import Case, compare
@@ -23,7 +23,7 @@ KEYS = ["case", "reference", "value", "error", "bar", "passed"]
 def cases(monkeypatch: pytest.MonkeyPatch) -> list[Case]:
     """The cases that are run, in place of all."""
     found = free_rod.timoshenko()
-    for module in (contact, engine, motion, order, stability, transmission, tube, tubes):
+    for module in (contact, engine, kirchhoff, motion, order, stability, transmission, tube, tubes):
         monkeypatch.setattr(module, "CASES", ())
     monkeypatch.setattr(free_rod, "CASES", (lambda: found,))
     return found
@@ -76,11 +76,12 @@ def test_the_installed_package_verifies_itself(cases: list[Case], capsys: pytest
 
 GROUPS = {
     f"{module.__name__.rsplit('.', 1)[-1]}.{group.__name__}": group
-    for module in (free_rod, contact, motion, order, stability, transmission, tube, tubes, engine)
+    for module in (free_rod, contact, motion, order, stability, transmission, tube, tubes, engine, kirchhoff)
     for group in module.CASES
 }
 LARGEST_BAR = 0.02
 WIDER = {"tube.sinusoidal_buckling": 0.05, "tube.helical_buckling": 0.05, "order.order_in_element_length": 0.05}
+WIDER |= {"kirchhoff.pushed_into_a_bend": 0.15, "kirchhoff.capstan": 0.05, "kirchhoff.helix_in_a_tube": 0.1}
 WIDER |= {"order.order_in_navigation": 0.2, "order.order_in_time_step": 0.05, "motion.order_in_a_beating_heart": 0.2}
 
 

@@ -16,9 +16,9 @@ from endopilot.devices.robot import IDEAL, DriveConfig, RobotConfig, read_robot
 from endopilot.errors import InputError
 from endopilot.robot.robot import BACKS_OUT_MM_S
 from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.engine_simulator import ENGINES
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.robots import Robots, in_grip
-from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
 from endopilot.simulation.world import NOMINAL, World, read_world
 from endopilot.tasks.navigation import Navigation
@@ -95,8 +95,7 @@ class Reality:
             for number, (each, navigation) in enumerate(zip(worlds, navigations, strict=True))
         ]
         fixed = [each or World() for each in self._worlds]
-        for each in fixed:
-            each.check_engine("environments")
+        engine = ENGINES[_common(fixed, "engine", [each.engine for each in fixed])]
         motion = _common(fixed, "motion", [each.motion or motion for each in fixed])
         config = _common(fixed, "core or wall", [each.core(config) for each in fixed])
         self._robots: list[RobotConfig | None] | None = None  # where devices do as commanded; None of one that is drawn
@@ -116,7 +115,7 @@ class Reality:
         # the same differences, one vessel
         made = {id(each.anatomy): SharedVessels(each.anatomy) for each in navigations}
         vessels = [made[id(each.anatomy)].of(world) for each, world in zip(navigations, fixed, strict=True)]
-        self.simulator = Simulator(vessels, stacks, motion=motion, config=config)
+        self.simulator = engine(vessels, stacks, motion=motion, config=config)
         self._friction = np.array([[device.friction for device in stack.devices] for stack in stacks])
         self._start = np.array([navigation.start for navigation in navigations])
         self._backs_out_s = np.array([each.backs_out_after_s for each in fixed])

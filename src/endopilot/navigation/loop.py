@@ -21,7 +21,7 @@ from endopilot.navigation.record import NavigationRecord, Track
 from endopilot.robot.robot import CYCLE_S, SimulatedRobot
 from endopilot.settings import Within, settings
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.engine_simulator import EngineSimulator
+from endopilot.simulation.engine_simulator import ENGINES
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.robots import in_grip
 from endopilot.simulation.simulator import Simulator
@@ -312,12 +312,7 @@ def start_world(
     if robot is not None:
         stack, config = in_grip(stack, robot, config)
     anatomy = world.anatomy(navigation.anatomy)
-    if world.engine == "rod":
-        simulator = Simulator(anatomy, stack, motion=motion, config=config)
-    elif motion is not None:
-        raise InputError(f"engine: {world.engine}; it has a vessel that lies still; leave motion out")
-    else:
-        simulator = EngineSimulator(anatomy, stack, config=config)
+    simulator = ENGINES[world.engine](anatomy, stack, motion=motion, config=config)
     start = navigation.start
     simulator.reset(
         inserted_length=np.maximum(start[None, :, 0] + world.ostium_mm, 0.0),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -95,7 +95,7 @@ def _inscribed_spheres(wall: Lumen, anatomy: Anatomy) -> Float[np.ndarray, "line
 
 GroupKey = tuple[str, tuple[Any, ...]]  # identity of an anatomy, and constants of its devices
 _KEPT = 4  # walls that are kept for the next simulator; each takes 4 bytes a point of the distance map
-_walls: dict[tuple[Any, ...], Lumen] = {}  # the last walls that were made, the latest last
+_walls: dict[tuple[Any, ...], Any] = {}  # the last walls that were made, the latest last
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,12 +133,19 @@ def _wall_key(anatomy: Anatomy, stack: Stack) -> tuple[str, float, bool]:
 
 def _wall(anatomy: Anatomy, stack: Stack, config: SimulatorConfig) -> Lumen:
     """Return a vessel's wall, as it was made where it is one of the last few: that takes longer than a short run."""
-    key = (*_wall_key(anatomy, stack), config.wall_reach_mm, config.wall_along, config.processor)
-    wall = _walls.pop(key, None)
-    if wall is None:
+
+    def make() -> Lumen:
         check_distance_map(anatomy)
-        wall = make_wall(anatomy, stack, config)
-    _walls[key] = wall
+        return make_wall(anatomy, stack, config)
+
+    key = (*_wall_key(anatomy, stack), config.wall_reach_mm, config.wall_along, config.processor)
+    return kept(key, make)
+
+
+def kept(key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
+    """Return a wall of this key, as it was made where it is one of the last few."""
+    wall = _walls.pop(key, None)
+    _walls[key] = wall = make() if wall is None else wall
     while len(_walls) > _KEPT:
         _walls.pop(next(iter(_walls)), None)
     return wall

@@ -126,9 +126,9 @@ class World:
     """Length of the wire's elements at its tip in reality, mm; as given if not here."""
     time_step_s: Annotated[float, Within(1e-5, SAMPLE_PERIOD_S)] | None = None
     """Time step in reality, s, which divides 0.5 s; as given if not here."""
-    engine: Literal["rod", "mujoco"] = "rod"
-    """What moves the wire in reality: the rod core, which policies simulate too, or MuJoCo, an engine of other people
-    (`pip install 'endopilot[engine]'`). That moves a wire alone in a rigid vessel that lies still."""
+    engine: Literal["rod", "kirchhoff"] = "rod"
+    """What moves the wire in reality: the rod core, which policies simulate too, or a Kirchhoff rod that shares none of
+    its laws of wire, wall, contact and friction. That moves a wire alone in a rigid vessel that lies still."""
     motion: Annotated[Motion | None, BeforeValidator(_motion)] = None
     """How heart and breath truly move the vessel: breathing, heartbeat, both, or amplitudes; as given if not here."""
     registration_mm: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
