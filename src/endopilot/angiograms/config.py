@@ -22,6 +22,9 @@ from endopilot.xray.image import ImageConfig
 RANDOM = "random"
 """Drives the devices at random."""
 
+CINE_IMAGE = ImageConfig(
+    scatter=1.0, scintillator_mm=0.36, focal_spot_mm=0.8, iodine_mm=0.19, edge_weight=0.3, temporal_weight=0.4
+)
 
 @settings
 class AngiogramsConfig:
@@ -51,7 +54,7 @@ class AngiogramsConfig:
     motion: MotionName = "both"
     """How heart and breath move vessel, catheter and wire: still, breathing, heartbeat or both. The amplitudes of each
     patient are drawn from the published distributions."""
-    dose: Annotated[tuple[Positive, Positive], Ascending] = (1.0, 6.0)
+    dose: Annotated[tuple[Positive, Positive], Ascending] = (3.0, 10.0)
     """Range of the dose of a frame, as multiples of fluoroscopy's; the logarithm is drawn evenly."""
     view_angles_deg: tuple[tuple[Finite, Finite], ...] = ()
     """LAO (positive) or RAO, and cranial (positive) or caudal angles that are drawn from, degrees; the views of clinics
@@ -60,7 +63,7 @@ class AngiogramsConfig:
     """Shares of the patients that train, calibrate and test; 0.6 0.2 0.2 if not given, and a single patient trains."""
     segmentation: SegmentConfig = field(default_factory=SegmentConfig)
     """How the vessel is segmented where a CT is given."""
-    image: ImageConfig = field(default_factory=ImageConfig)
+    image: ImageConfig = field(default_factory=lambda: CINE_IMAGE)
     """Detector and beam."""
 
     @property

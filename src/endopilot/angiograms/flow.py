@@ -13,7 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy.signal import lfilter
 from scipy.spatial import KDTree
 
 from endopilot.types import VesselTree
@@ -21,6 +22,7 @@ from endopilot.types import VesselTree
 MIXING_S = 0.03
 """Time in which blood passes one well-mixed volume, s: an assumption. After one second of transit a sharp front is then
 spread by √(1 s · 0.03 s) = 0.17 s, standard deviation."""
+REFLUX_S = 0.3
 _STEPS = 24
 """Steps of the balance of contrast in `MIXING_S`."""
 _INLET_MM = 10.0
@@ -53,7 +55,9 @@ class Flow:
 
     Attributes:
         points: of all centerlines, branch after branch, LPS mm.
+        radius: of the vessel at each, mm.
         branch: that each belongs to.
+        section: of the tree's `section_names`, of each.
         transit_s: time from the ostium to each, s.
         inflow_ml_s: blood that flows in at the ostium, ml/s.
     """
@@ -81,8 +85,22 @@ class Flow:
                 inflow[child], arrival[child] = inflow[index] * share, transits[-1][-1]
         sizes = [len(line.points) for line in lines]
         self.points = np.concatenate([line.points for line in lines])
+        self.radius = np.concatenate([line.radius for line in lines])
         self.branch = np.repeat(np.arange(len(lines)), sizes)
+        self.section = np.concatenate([branch.section for branch in tree.branches])
         self.rate_ml_s, self.transit_s = inflow[self.branch], np.concatenate(transits)
+
+    def append(
+        self,
+        points: Float[np.ndarray, "n 3"],
+        radius: Float[np.ndarray, "n"],
+        transit_s: Float[np.ndarray, "n"],
+        section: Int[np.ndarray, "n"],
+    ) -> None:
+        """Append a branch that is not in the tree."""
+        self.points, self.radius = np.concatenate([self.points, points]), np.append(self.radius, radius)
+        self.branch = np.append(self.branch, np.full(len(points), self.branch[-1] + 1))
+        self.section, self.transit_s = np.append(self.section, section), np.append(self.transit_s, transit_s)
 
     def contrast(
         self, injection: Injection, times_s: Float[np.ndarray, "frames"]
@@ -101,6 +119,13 @@ class Flow:
                 frame += 1
             share[1:] -= np.diff(share) / _STEPS
         return np.append(0.0, (np.arange(tanks) + 0.5) * MIXING_S), shares
+
+    def reflux_ml(self, injection: Injection, times_s: Float[np.ndarray, "frames"]) -> Float[np.ndarray, "frames"]:
+        """Return the contrast around the ostium that the vessel does not take, at some times from 0 on, ml."""
+        step = MIXING_S / _STEPS
+        every = np.arange(int(times_s[-1] / step) + 2) * step
+        excess = np.maximum(injection.rate(every) - self.inflow_ml_s, 0) * step
+        return lfilter([1.0], [1.0, -np.exp(-step / REFLUX_S)], excess)[np.rint(times_s / step).astype(int)]
 
     def transit_of(self, places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Return the time, s, that blood takes from the ostium to the centerline nearest to each place, LPS mm."""

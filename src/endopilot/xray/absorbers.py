@@ -8,6 +8,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from scipy.ndimage import gaussian_filter
+
 from endopilot.devices.catheter import Catheter
 from endopilot.lines import length_along, places_on
 from endopilot.phantom.chest import is_left
@@ -28,7 +30,7 @@ _MARKED_MM = 1.1
 _STRAIGHT_MM, _BEND_MM, _SHOWN_MM = 10.0, 25.0, 180.0
 """Length of the catheter behind the ostium that is straight, radius of its bend into the aorta, and the length that is
 shown, mm."""
-_BLOOD_HU = 40.0
+_BLOOD_HU, _SOFT_SHARE, _LUNG_HU = 40.0, 0.2, 80.0
 _STEP_MM, _RING, _RINGS, _SPOKES = 0.15, 48, 4, 16
 _MARKER_STEP_MM, _SPOKE_MM = 0.05, 0.25
 _SURROUNDINGS = PhantomConfig(  # without contrast, as the chest is between two injections
@@ -44,8 +46,18 @@ def is_coronary(anatomy: Anatomy) -> bool:
 
 
 def surroundings(anatomy: Anatomy) -> Volume | None:
-    """Return the CT of a synthetic chest around a coronary artery, HU; None for any other vessel."""
-    return make_phantom(anatomy, config=_SURROUNDINGS, seed=0) if is_coronary(anatomy) else None
+    """Return the CT of a synthetic chest around a coronary artery, HU, without contrast; None for any other vessel."""
+    if not is_coronary(anatomy):
+        return None
+    chest = make_phantom(anatomy, config=_SURROUNDINGS, seed=0)
+    hu, random = chest.voxels.astype(np.float32), np.random.default_rng(0)
+    soft = (hu > -20) & (hu < 210)
+    hu[soft] = _BLOOD_HU + _SOFT_SHARE * (hu[soft] - _BLOOD_HU)
+    lung, grain = hu < -600, random.standard_normal(hu.shape, dtype=np.float32)
+    for size, share in ((2.0, 1.0), (6.0, 1.0)):
+        texture = gaussian_filter(grain, size / chest.spacing_mm[0])
+        hu[lung] += np.float32(_LUNG_HU / texture.std()) * texture[lung]
+    return Volume(hu, chest.spacing_mm, chest.origin_mm, chest.direction)
 
 
 def without_contrast(ct: Volume, points: Places) -> Volume:
@@ -129,7 +141,7 @@ def catheter_lumen_points(anatomy: Anatomy) -> tuple[Places, Float[np.ndarray, "
     distance, places, heading = catheter_line(anatomy)
     at = np.arange(_STEP_MM / 2, distance[-1], _STEP_MM)
     middle = places_on(places, distance, at)
-    first, second = _across(places_on(heading, distance, at))
+    first, second = across(places_on(heading, distance, at))
     turn = np.linspace(0, 2 * np.pi, _SPOKES, endpoint=False)
     shares = (np.arange(_RINGS) + 0.5) / _RINGS
     radius = anatomy.catheter_radius_mm * shares
@@ -146,14 +158,14 @@ def catheter_points(anatomy: Anatomy) -> tuple[Places, float]:
     radius = anatomy.catheter_radius_mm + GUIDE_WALL_MM / 2
     at = np.arange(_STEP_MM / 2, distance[-1], _STEP_MM)
     middle = places_on(places, distance, at)
-    first, second = _across(places_on(heading, distance, at))
+    first, second = across(places_on(heading, distance, at))
     turn = np.linspace(0, 2 * np.pi, _RING, endpoint=False)[:, None, None]
     ring = radius * (np.cos(turn) * first + np.sin(turn) * second)
     size = 2 * np.pi * radius * GUIDE_WALL_MM * _STEP_MM / _RING
     return (middle + ring).reshape(-1, 3), size
 
 
-def _across(axis: Places) -> tuple[Places, Places]:
+def across(axis: Places) -> tuple[Places, Places]:
     """Return two unit vectors across each axis, and across each other."""
     axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
     first = np.cross(axis, np.eye(3)[int(np.abs(axis).max(axis=0).argmin())])
@@ -207,7 +219,7 @@ def _tube(
     at = np.arange(step_mm / 2, min(along[-1], most_mm), step_mm)
     axis = places_on(nodes, along, at)
     heading = np.stack([np.interp(at, along, part) for part in np.gradient(nodes, along, axis=0).T], axis=-1)
-    first, second = _across(heading)
+    first, second = across(heading)
     spokes = int(np.ceil(2 * np.pi * radius_mm / _SPOKE_MM))
     turn = np.linspace(0, 2 * np.pi, spokes, endpoint=False)[:, None, None]
     points = (axis + radius_mm * (np.cos(turn) * first + np.sin(turn) * second)).reshape(-1, 3)

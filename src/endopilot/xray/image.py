@@ -161,7 +161,7 @@ class XrayImager:
             check_covers(ct, anatomy)
         self.anatomy, self.stack, self.config = anatomy, Stack.of(device), config or ImageConfig()
         self.isocenter = isocenter_of(anatomy)
-        self.lumen_points, self._lumen_size = lumen_points(anatomy)
+        self.lumen_points, self.lumen_sizes = lumen_points(anatomy)
         self.ct = None if ct is None else without_contrast(ct, self.lumen_points)
         self._guide = catheter_line(anatomy)
         self._guide_wall, self._guide_lumen = catheter_points(anatomy), catheter_lumen_points(anatomy)
@@ -260,7 +260,7 @@ class XrayImager:
         """
         width = self.anatomy.distance_map.spacing_mm / 2
         shadow = Shadow(view, self.config.pixels, self.lumen_points, placed)
-        return [shadow.of(share * self._lumen_size, width_mm=width, blur_px=blur) for share, blur in parts]
+        return [shadow.of(share * self.lumen_sizes, width_mm=width, blur_px=blur) for share, blur in parts]
 
     def signal(
         self,

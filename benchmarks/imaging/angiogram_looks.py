@@ -1,0 +1,138 @@
+"""How much cines look like those of clinics, by the figures that were measured on 42 public ones: `looks`."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pydicom
+from jaxtyping import Float
+from PIL import Image
+from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, uniform_filter
+
+from benchmarks.figures import Bar
+from endopilot.angiograms.config import AngiogramsConfig
+from endopilot.angiograms.masks import CLASSES
+
+BARS: dict[str, tuple[Bar, Bar]] = {
+    name: (Bar(low, at_least=True), Bar(high))
+    for name, low, high in (
+        ("background_range", 0.3, 0.7),
+        ("clipped_labels", 0.0, 0.0),
+        ("contrast_over_background", 0.27, 0.48),
+        ("noise_correlation", 0.7, 0.9),
+        ("contrast_to_6_px", 0.7 * 0.12, 1.3 * 0.12),
+        ("contrast_6_to_11_px", 0.7 * 0.18, 1.3 * 0.18),
+        ("contrast_from_11_px", 0.7 * 0.30, 1.3 * 0.30),
+        ("wire_coil_contrast", 0.08, 0.20),
+        ("empty_catheter_contrast", 0.13, 0.22),
+    )
+}
+"""Lower and upper bars: real cines' quartiles, or their medians and 30 % on either side."""
+_WIDTHS = {"contrast_to_6_px": (0, 6), "contrast_6_to_11_px": (6, 11), "contrast_from_11_px": (11, 1000)}
+_AROUND_PX, _BESIDE_PX = 4, 10.0
+"""Background begins this far from labels, and stands for a place within this standard deviation, pixels."""
+_BLOCK = 24
+
+
+def looks(cines: Sequence[Path]) -> dict[str, Any]:
+    """Measure cines as they are written.
+
+    Returns:
+        For each of `BARS` the `median` over the cines, the quartiles, the bars and whether the median `passed`; and
+        the medians of `vessel_width_px`, on the centerlines, and of their `length_px` in the image.
+    """
+    found: dict[str, list[float]] = defaultdict(list)
+    for folder in cines:
+        for name, value in _measured(folder).items():
+            if np.isfinite(value):
+                found[name].append(value)
+    figures: dict[str, Any] = {}
+    for name, values in found.items():
+        low, median, high = np.percentile(values, (25, 50, 75))
+        figures[name] = {"median": round(float(median), 3), "quartiles": [round(float(low), 3), round(float(high), 3)]}
+        if name in BARS:
+            least, most = BARS[name]
+            figures[name] |= {"bars": [round(least.limit, 3), round(most.limit, 3)]}
+            figures[name]["passed"] = least.met(float(median)) and most.met(float(median))
+    return figures
+
+
+def _measured(folder: Path) -> dict[str, float]:
+    """Return the figures of one cine; NaN where it does not show what they are of."""
+    truth = np.load(folder / "truth.npz")
+    header = pydicom.dcmread(folder / "cine.dcm")
+    centre, width, per_e = float(header.WindowCenter), float(header.WindowWidth), 2 * AngiogramsConfig().image.window
+    light = (header.pixel_array.astype(float) - centre) / width * per_e
+    count = len(light)
+    masks, grey = (
+        np.stack([np.asarray(Image.open(folder / part / f"{k:04d}.png")) for k in range(count)])
+        for part in ("masks", "frames")
+    )
+    field = np.zeros(light.shape[1:], dtype=bool)
+    left, right = int(header.ShutterLeftVerticalEdge), int(header.ShutterRightVerticalEdge)
+    upper, lower = int(header.ShutterUpperHorizontalEdge), int(header.ShutterLowerHorizontalEdge)
+    field[upper + 8 : lower - 8, left + 8 : right - 8] = True
+    fullest = int(np.argmax([((mask & CLASSES["contrast"]) > 0).sum() for mask in masks]))
+    labels, shown = masks[fullest] > 0, light[fullest]
+    off = field & ~binary_dilation(labels, iterations=_AROUND_PX)
+    background = float(np.ptp(np.percentile(shown[off], (5, 95))))
+    figures = {"background_range": background, "noise_correlation": _correlation(grey, per_e)}
+    inside = np.zeros_like(field)
+    inside[upper + 2 : lower - 2, left + 2 : right - 2] = True
+    figures["clipped_labels"] = float((np.isin(grey, (0, 255)) & (masks > 0) & inside).mean())
+    contrast = (masks[fullest] & CLASSES["contrast"]) > 0
+    if contrast.any():
+        devices = (masks[fullest] & (CLASSES["guide"] | CLASSES["wire"] | CLASSES["catheter"])) > 0
+        wide = 2 * np.asarray(distance_transform_edt(contrast))
+        places = np.rint(truth["centerline_px"][fullest][truth["centerline_contrast"][fullest] > 0.5]).astype(int)
+        column, row = np.unique(places[((places >= 0) & (places < len(shown))).all(axis=1)], axis=0).T
+        kept = (field & contrast & ~devices)[row, column]
+        row, column = row[kept], column[kept]
+        depth, lumen = _beside(shown, off)[row, column] - shown[row, column], wide[row, column]
+        figures |= {"contrast_over_background": float(np.median(depth)) / background}
+        figures |= {"vessel_width_px": float(np.median(lumen)), "length_px": float(len(row))}
+        for name, (low, high) in _WIDTHS.items():
+            within = (lumen >= low) & (lumen < high)
+            figures[name] = float(np.median(depth[within])) if within.sum() > 20 else np.nan
+    empty = masks[0]  # no contrast yet
+    off = field & ~binary_dilation(empty > 0, iterations=_AROUND_PX)
+    depth = _beside(light[0], off) - light[0]
+    for name, line, other in (
+        ("empty_catheter_contrast", "guide", CLASSES["wire"] | CLASSES["catheter"]),
+        ("wire_coil_contrast", "wire", CLASSES["guide"] | CLASSES["catheter"]),
+    ):
+        if f"{line}_px" in truth:
+            nodes, along = truth[f"{line}_px"][0], truth[f"{line}_mm"][0]
+            nodes = nodes[np.linalg.norm(along - along[0], axis=1) < 30]
+            nodes = np.rint(nodes[np.isfinite(nodes).all(axis=1)]).astype(int)
+            nodes = nodes[((nodes >= 0) & (nodes < len(shown))).all(axis=1)]
+            on = (field & ((empty & CLASSES[line]) > 0) & ((empty & other) == 0))[nodes[:, 1], nodes[:, 0]]
+            values = [depth[r - 2 : r + 3, c - 2 : c + 3].max() for c, r in nodes[on]]
+            figures[name] = float(np.median(values)) if len(values) > 4 else np.nan
+    return figures
+
+
+def _beside(light: Float[np.ndarray, "r c"], off: np.ndarray) -> Float[np.ndarray, "r c"]:
+    """Return the background's mean around each pixel."""
+    weight = gaussian_filter(off.astype(float), _BESIDE_PX) + 1e-9
+    return gaussian_filter(np.where(off, light, 0.0), _BESIDE_PX) / weight
+
+
+def _correlation(grey: np.ndarray, per_e: float) -> float:
+    """Return the correlation of neighbours' noise: of frames less those before, in the quietest quarter of squares."""
+    found = []
+    for before, after in zip(grey[:-1], grey[1:], strict=True):
+        noise = after.astype(float) - before
+        rows, columns = (np.arange(64, side - 64 - _BLOCK, _BLOCK) for side in noise.shape)
+        power = uniform_filter(noise**2, _BLOCK)[np.ix_(rows + _BLOCK // 2, columns + _BLOCK // 2)]
+        for index in np.argsort(power.ravel())[: power.size // 4]:
+            i, j = divmod(int(index), len(columns))
+            block = noise[rows[i] :, columns[j] :][:_BLOCK, :_BLOCK]
+            block = block - block.mean()
+            if block.any():
+                found.append(float((block[:, 1:] * block[:, :-1]).mean() / (block**2).mean()))
+    return float(np.median(found)) if found else np.nan
