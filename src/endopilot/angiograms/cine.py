@@ -143,7 +143,8 @@ class Cine:
                 path = shadow.of(share * sizes, width_mm=width_mm, blur_px=blur)
             masks["contrast"] = masks["vessel"] & (path > CONTRAST_SHARE * lumen)
             if draw.injection is not None:
-                path += imager.guide_lumen(self.view, 1.0, placed)
+                if number / config.frames_per_second > draw.injection.start_s:  # saline fills the catheter before
+                    path += imager.guide_lumen(self.view, 1.0, placed)
                 volume = self._reflux_mm3[number] / _REFLUX
                 path += splat(self.view, config.image.pixels, reflux, volume, placed=placed, width_mm=_REFLUX_BLUR_MM)
             background = patient + imager.guide(self.view, 1.0, placed)

@@ -18,8 +18,8 @@ from endopilot.types import Anatomy
 from endopilot.xray.absorbers import across
 
 _STEP_MM = 0.4
-_THINNEST_MM = 0.1
-"""Radius at which a branch ends, mm: filled with contrast, it takes away less than the noise of a frame."""
+_THINNEST_MM = 0.2
+"""Radius at which a branch ends, mm: what is thinner hardly rises above the noise of a frame."""
 _LENGTH = 75.0
 """Length of a vessel over its radius: an anterior descending artery's 1.85 mm taper over some 140 mm (Dodge 1992)."""
 _APART_MM = 7.0
@@ -30,7 +30,7 @@ _ANGLE_RAD, _ANGLE_SD = 0.9, 0.3
 """Mean and standard deviation of the angle at which it leaves, rad: 52° [22–97] in fourteen real right arteries."""
 _DIVES = 0.3
 """Share of the side branches that dive into the muscle: an assumption."""
-_CURVATURE, _BENDS_MM = 0.1, 6.0
+_CURVATURE, _BENDS_MM = 0.08, 4.0
 """Curvature of what runs over the heart, standard deviation, 1/mm, and the length after which it is another: the
 curvature's 95th percentile is 0.12–0.17 /mm in thirty real trees."""
 _SPOKES = 6
@@ -73,7 +73,7 @@ def grow(
         points, heading = _run(bud, centre, random)
         radius = np.linspace(bud.radius, _THINNEST_MM, len(points))
         pace, section = np.full(len(points), bud.pace), np.full(len(points), bud.section)
-        transit = bud.transit_s + np.cumsum(_STEP_MM / (bud.pace * radius))
+        transit = bud.transit_s + _STEP_MM * np.arange(1, len(points) + 1) / (bud.pace * bud.radius)
         flow.append(points, radius, transit, section)
         buds += _sides(points, heading, radius, transit, pace, section, centre, random)
         first, second = across(heading)

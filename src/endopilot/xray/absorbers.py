@@ -54,7 +54,7 @@ def surroundings(anatomy: Anatomy) -> Volume | None:
     soft = (hu > -20) & (hu < 210)
     hu[soft] = _BLOOD_HU + _SOFT_SHARE * (hu[soft] - _BLOOD_HU)
     lung, grain = hu < -600, random.standard_normal(hu.shape, dtype=np.float32)
-    for size, share in ((2.0, 1.0), (6.0, 1.0)):
+    for size, share in ((1.5, 1.0), (4.0, 1.0)):
         texture = gaussian_filter(grain, size / chest.spacing_mm[0])
         hu[lung] += np.float32(_LUNG_HU / texture.std()) * texture[lung]
     return Volume(hu, chest.spacing_mm, chest.origin_mm, chest.direction)
@@ -174,7 +174,7 @@ def across(axis: Places) -> tuple[Places, Places]:
 
 
 def wire_points(
-    nodes: Places, radius_mm: float, opaque_tip_mm: float, step_mm: float = 0.1
+    nodes: Places, radius_mm: float, opaque_tip_mm: float, step_mm: float = 0.1, coil_mm: float = COIL_MM
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
     """Return a wire as small volumes: their places, LPS mm, and sizes times their attenuation, mm².
 
@@ -183,11 +183,12 @@ def wire_points(
         radius_mm: of the wire.
         opaque_tip_mm: length of the radiopaque coil.
         step_mm: distance of the places.
+        coil_mm: attenuation of the coil, 1/mm.
     """
     along = length_along(nodes)
     at = np.arange(step_mm / 2, along[-1], step_mm)
     points = places_on(nodes, along, at)
-    per_mm = np.where(at <= opaque_tip_mm, COIL_MM, STEEL_MM)
+    per_mm = np.where(at <= opaque_tip_mm, coil_mm, STEEL_MM)
     return points, per_mm * np.pi * radius_mm**2 * step_mm
 
 

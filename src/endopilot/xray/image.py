@@ -26,6 +26,7 @@ from endopilot.simulation.motion import place
 from endopilot.types import Anatomy, Volume
 from endopilot.xray.absorbers import (
     CATHETER_MM,
+    COIL_MM,
     WATER_MM,
     catheter_line,
     catheter_lumen_points,
@@ -79,6 +80,8 @@ class ImageConfig:
     """Attenuation of the contrasted blood, 1/mm: 185 mg iodine/ml at 7.6 cm²/g."""
     opaque_tip_mm: Annotated[float, Within(0, 5000, above_low=True)] = 30.0
     """Length of the wire's radiopaque coil, mm."""
+    coil_mm: Positive = COIL_MM
+    """Attenuation of that coil, 1/mm."""
     electronic_noise_ugy: Annotated[float, Within(0, 10)] = 0.0
     """Air kerma at the detector at which the electronics' noise is as large as the quantum noise, µGy; none at 0."""
     edge_weight: Annotated[float, Within(0, 10)] = 0.0
@@ -350,6 +353,7 @@ class XrayImager:
         radius = self.stack.wire.tip_radius_mm
         step_mm = _WIRE_STEP_MM * max(1.0, self.config.geometry.pixel_mm / CArmGeometry().pixel_mm)
         draw = partial(wire_points, radius_mm=radius, opaque_tip_mm=self.config.opaque_tip_mm, step_mm=step_mm)
+        draw = partial(draw, coil_mm=self.config.coil_mm)
         return self._device(plane, draw, lines, radius / 2)
 
     def catheter(
