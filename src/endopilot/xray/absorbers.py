@@ -30,8 +30,12 @@ _MARKED_MM = 1.1
 _STRAIGHT_MM, _BEND_MM, _SHOWN_MM = 10.0, 25.0, 180.0
 """Length of the catheter behind the ostium that is straight, radius of its bend into the aorta, and the length that is
 shown, mm."""
-_BLOOD_HU, _SOFT_SHARE, _LUNG_HU = 40.0, 0.2, 80.0
-_STEP_MM, _RING, _RINGS, _SPOKES = 0.15, 48, 4, 16
+_BLOOD_HU = 40.0
+_SOFT_SHARE = 0.2
+"""Soft tissue without contrast is so much nearer to blood: 45 to 60 HU where a CT angiogram has 80 to 200."""
+_LUNG_HU, _LUNG_MM = 80.0, (1.5, 4.0)
+"""Standard deviation of the lung's density by its vessels and lobules, HU, at each of two sizes, mm: an assumption."""
+_STEP_MM, _RINGS = 0.15, 4
 _MARKER_STEP_MM, _SPOKE_MM = 0.05, 0.25
 _SURROUNDINGS = PhantomConfig(  # without contrast, as the chest is between two injections
     in_plane_mm=1.5, slice_mm=1.5, margin_mm=60.0, lumen_hu=(45.0, 45.0), noise_hu=(0.0, 0.0), calcium=0.0
@@ -54,7 +58,7 @@ def surroundings(anatomy: Anatomy) -> Volume | None:
     soft = (hu > -20) & (hu < 210)
     hu[soft] = _BLOOD_HU + _SOFT_SHARE * (hu[soft] - _BLOOD_HU)
     lung, grain = hu < -600, random.standard_normal(hu.shape, dtype=np.float32)
-    for size, share in ((1.5, 1.0), (4.0, 1.0)):
+    for size in _LUNG_MM:
         texture = gaussian_filter(grain, size / chest.spacing_mm[0])
         hu[lung] += np.float32(_LUNG_HU / texture.std()) * texture[lung]
     return Volume(hu, chest.spacing_mm, chest.origin_mm, chest.direction)
@@ -138,31 +142,15 @@ def in_catheter(
 
 def catheter_lumen_points(anatomy: Anatomy) -> tuple[Places, Float[np.ndarray, "n"]]:
     """Return the inside of the guiding catheter, through which contrast is injected, as `lumen_points` does."""
-    distance, places, heading = catheter_line(anatomy)
-    at = np.arange(_STEP_MM / 2, distance[-1], _STEP_MM)
-    middle = places_on(places, distance, at)
-    first, second = across(places_on(heading, distance, at))
-    turn = np.linspace(0, 2 * np.pi, _SPOKES, endpoint=False)
-    shares = (np.arange(_RINGS) + 0.5) / _RINGS
-    radius = anatomy.catheter_radius_mm * shares
-    side = np.stack([np.outer(radius, np.cos(turn)).ravel(), np.outer(radius, np.sin(turn)).ravel()], axis=-1)
-    ring = side[:, 0, None, None] * first + side[:, 1, None, None] * second
-    area = np.repeat(2 * np.pi * radius * anatomy.catheter_radius_mm / _RINGS / _SPOKES, _SPOKES)
-    size = np.broadcast_to((area * _STEP_MM)[:, None], ring.shape[:2])
-    return (middle + ring).reshape(-1, 3), size.ravel()
+    places, width = catheter_line(anatomy)[1], anatomy.catheter_radius_mm / _RINGS
+    tubes = [_tube(places, width * (ring + 0.5), width, _STEP_MM, 1.0) for ring in range(_RINGS)]
+    return np.concatenate([tube[0] for tube in tubes]), np.concatenate([tube[1] for tube in tubes])
 
 
-def catheter_points(anatomy: Anatomy) -> tuple[Places, float]:
-    """Return the wall of the guiding catheter as small volumes: their places, LPS mm, and the size of each, mm³."""
-    distance, places, heading = catheter_line(anatomy)
+def catheter_points(anatomy: Anatomy) -> tuple[Places, Float[np.ndarray, "n"]]:
+    """Return the wall of the guiding catheter as small volumes: their places, LPS mm, and sizes, mm³."""
     radius = anatomy.catheter_radius_mm + GUIDE_WALL_MM / 2
-    at = np.arange(_STEP_MM / 2, distance[-1], _STEP_MM)
-    middle = places_on(places, distance, at)
-    first, second = across(places_on(heading, distance, at))
-    turn = np.linspace(0, 2 * np.pi, _RING, endpoint=False)[:, None, None]
-    ring = radius * (np.cos(turn) * first + np.sin(turn) * second)
-    size = 2 * np.pi * radius * GUIDE_WALL_MM * _STEP_MM / _RING
-    return (middle + ring).reshape(-1, 3), size
+    return _tube(catheter_line(anatomy)[1], radius, GUIDE_WALL_MM, _STEP_MM, 1.0)
 
 
 def across(axis: Places) -> tuple[Places, Places]:

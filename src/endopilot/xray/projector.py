@@ -16,7 +16,7 @@ _RAY_STEP_MM = 1.5
 _COARSE_MM, _COARSE_RAYS, _SIDES_MM = 8.0, 64, 15.0
 """What lies beyond a CT's sides: its voxels, the rays through it along a side, and how far along a side is averaged, mm."""
 _BODY_MM = (161.0, 122.0)
-"""Half the breadth and half the depth of a chest about the CT's middle, mm: 322 and 243 mm, men's means of ANSUR 1988."""
+"""Half the breadth and depth of a chest about the CT's middle, mm: 322 and 243 mm, means of men in ANSUR 1988."""
 _AIR_HU = -1000.0
 _SHARP_PX = 0.17
 """A Gaussian of a standard deviation below this leaves all of a pixel in it, to a part in 10⁷."""
@@ -35,32 +35,37 @@ def cast(ct: Volume, view: View, pixels: int, rays: int) -> Float32[np.ndarray, 
         pixels: of the image along a side.
         rays: along a side.
     """
-    # A voxel of air around ends the volume half a voxel beyond its last middles.
-    inside = Volume(np.pad(ct.voxels, 1, constant_values=_AIR_HU), ct.spacing_mm, ct.index_to_world(-np.ones(3)), ct.direction)
-    coarse = _march(_beyond(ct), view, pixels, _COARSE_RAYS, _COARSE_MM / 2)
-    return _march(inside, view, pixels, rays, _RAY_STEP_MM) + zoom(
-        coarse, rays / _COARSE_RAYS, order=1, grid_mode=True, mode="nearest"
-    )
+    # A layer of air ends the volume half a voxel beyond its last middles.
+    aired = np.pad(ct.voxels, 1, constant_values=_AIR_HU)
+    inside = Volume(aired, ct.spacing_mm, ct.index_to_world(-np.ones(3)), ct.direction)
+    beyond = _march(_beyond(ct), view, pixels, _COARSE_RAYS, _COARSE_MM / 2)
+    wide = zoom(beyond, rays / _COARSE_RAYS, order=1, grid_mode=True, mode="nearest")
+    return _march(inside, view, pixels, rays, _RAY_STEP_MM) + wide
 
 
 def _beyond(ct: Volume) -> Volume:
-    """Return the body around a CT, HU, with air where the CT is: it goes on as the CT's sides do on average, as far as
-    a chest reaches, and to head and feet without end. A CT that holds the body whole has air at its sides."""
+    """Return the body around a CT, HU, with air where the CT is.
+
+    The body goes on as the CT's sides do on average, as far as a chest reaches, and to head and feet without end. So a
+    CT that holds the body whole, with air at its sides, has none around.
+    """
     size = np.array(ct.voxels.shape[::-1])
-    count = np.maximum(np.rint(size * ct.spacing_mm / _COARSE_MM), 1).astype(int)
+    count = np.maximum(np.rint(size * ct.spacing_mm / _COARSE_MM), 2).astype(int)
+    index = np.stack(np.meshgrid(*(np.linspace(0, n - 1, k) for n, k in zip(size, count, strict=True)), indexing="ij"))
+    sampled = _between(ct.voxels.astype(np.float32), index.reshape(3, -1).astype(np.float32)).reshape(count).T
     spacing = size * ct.spacing_mm / count
-    axes = [(np.arange(n) + 0.5) * (s / n) - 0.5 for n, s in zip(count[::-1], size[::-1], strict=True)]
-    index = np.stack(np.meshgrid(*axes, indexing="ij"))[::-1].reshape(3, -1)
-    sampled = _between(ct.voxels.astype(np.float32, copy=False), index.astype(np.float32)).reshape(count[::-1])
-    around = np.ceil(np.array(_BODY_MM).max() / spacing).astype(int)
-    body = np.pad(gaussian_filter(sampled, _SIDES_MM / spacing[::-1], mode="nearest"), around[::-1, None], mode="edge")
-    low, high = around[::-1], (around + count)[::-1]
-    body[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] = _AIR_HU
-    origin = ct.index_to_world(-0.5 + 0.5 * size / count - around * size / count)
-    grown = Volume(body, spacing, origin, ct.direction)
-    places = grown.index_to_world(np.stack(np.meshgrid(*map(np.arange, body.shape), indexing="ij")[::-1], axis=-1))
+    around = np.ceil(max(_BODY_MM) / spacing).astype(int)
+    body = np.pad(sampled, around[::-1, None], mode="edge")
+    inner = tuple(slice(a + 1, a + n - 1) for a, n in zip(around[::-1], count[::-1], strict=True))
+    weight = np.ones_like(body)
+    weight[inner] = 1e-6  # the sides alone count
+    body, weight = (gaussian_filter(part, _SIDES_MM / spacing[::-1]) for part in (body * weight, weight))
+    body /= weight
+    body[tuple(slice(a, a + n) for a, n in zip(around[::-1], count[::-1], strict=True))] = _AIR_HU
+    grown = Volume(body, spacing, ct.index_to_world((0.5 - around) * size / count - 0.5), ct.direction)
+    places = grown.index_to_world(np.stack(np.meshgrid(*map(np.arange, body.shape[::-1]), indexing="ij"), axis=-1))
     across = (places - ct.index_to_world((size - 1) / 2))[..., :2] / _BODY_MM
-    body[(across**2).sum(axis=-1) > 1] = _AIR_HU
+    body[((across**2).sum(axis=-1) > 1).T] = _AIR_HU
     return grown
 
 
