@@ -127,14 +127,13 @@ def test_contrast_arrives_near_the_ostium_first(cines):
 
 
 def test_contrast_darkens_the_vessel(cines):
-    """The vessel is darker than what is around it where contrast is, by more than where none is."""
+    """Where contrast is in the vessel, a frame is darker than before the injection."""
     folder, _, _ = next(one for one in cines if not one[1]["devices"])
     masks, greys = (np.stack([picture(folder, part, k) for k in range(FRAMES)]) for part in ("masks", "frames"))
     assert not (masks[0] & CLASSES["contrast"]).any()
     last = (masks[-1] & CLASSES["contrast"]) > 0
     assert last.sum() > 20 and not (last & ((masks[-1] & CLASSES["vessel"]) == 0)).any()
-    outside = masks[-1] == 0
-    assert greys[-1][last].mean() < greys[-1][outside].mean() - 10
+    assert greys[-1][last].mean() < greys[0][last].mean() - 15
 
 
 def test_dicom_shows_the_same_frames_and_is_valid(cines):
@@ -148,7 +147,8 @@ def test_dicom_shows_the_same_frames_and_is_valid(cines):
     )
     angles = [float(read.PositionerPrimaryAngle), float(read.PositionerSecondaryAngle)]
     assert angles == record["view_angles_deg"]
-    assert not read.PatientName and not read.PatientID
+    assert (read.PatientName, read.PatientID, read.PatientPosition) == ("Simulated^Patient", "fork", "HFS")
+    assert 81 <= read.KVP <= 125 and 474 <= read.XRayTubeCurrent <= 841 and read.ExposureTime == 8
     low = read.WindowCenter - read.WindowWidth / 2
     shown = np.clip((read.pixel_array[1] - float(low)) / float(read.WindowWidth) * 255, 0, 255)
     np.testing.assert_allclose(shown, picture(folder, "frames", 1), atol=1.1)

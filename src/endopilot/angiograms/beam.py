@@ -21,11 +21,10 @@ CLOSED = -0.6
 """What a monitor shows beyond the collimator's edges, logarithm of the light: a grey of 35 to 60 in public cines."""
 _WEDGE_SHARE, _WEDGE, _WEDGE_RAMP = 0.5, (0.3, 0.8), (0.1, 0.25)
 """Share of the cines with a wedge filter, its attenuation, and its ramp as a share of the image's side: assumptions."""
-_LEADS, _LEAD_MM, _LEAD_PER_E = (0, 3), 0.7, 0.08
-"""Number of cables of the electrocardiogram in the image, less one, width on the detector, mm, and attenuation:
-assumptions."""
-_PAD_MM, _PAD_PER_E, _STUD_MM, _STUD_PER_E = 9.0, 0.05, 2.5, 0.35
-"""Radii on the detector and attenuation of a cable's electrode, and of the metal stud in it: assumptions."""
+_LEADS = 3
+"""Cables of the electrocardiogram in the image are fewer than this: an assumption."""
+_CABLE = ((0.35, 0.08), (9.0, 0.05), (2.5, 0.35))
+"""Of a cable, its electrode and the stud in it: radius on the detector, mm, and attenuation; assumptions."""
 _BRIGHT = 80
 """Percentile of the background in the middle of the grey scale: vessels are darker than it."""
 _HARMONISED_MM = 15.0
@@ -59,7 +58,7 @@ class Beam:
         attenuation = np.zeros_like(patient)
         if random.random() < _WEDGE_SHARE:
             attenuation += _wedge(random, patient)
-        for _ in range(int(random.integers(*_LEADS))):
+        for _ in range(int(random.integers(_LEADS))):
             attenuation += _cable(random, pixels, pixel_mm)
         field = np.outer(rows, columns).astype(np.float32)
         return cls((left, pixels - right, upper, pixels - lower), field, attenuation)
@@ -76,17 +75,12 @@ def _wedge(random: np.random.Generator, patient: Float32[np.ndarray, "rows colum
 
 
 def _cable(random: np.random.Generator, pixels: int, pixel_mm: float) -> Float32[np.ndarray, "rows columns"]:
-    """Return the attenuation of a cable that runs through the image to an electrode, which may lie outside."""
-    share = np.linspace(0, 1, 64)[:, None]
-    begin, bow, end = random.uniform((-0.1, -0.1), (1.1, 0.1), (3, 2)) * pixels
-    end[1], bow[1] = random.uniform(0.3, 1.6) * pixels, random.uniform(0.2, 0.9) * pixels
-    line = (1 - share) ** 2 * begin + 2 * share * (1 - share) * bow + share**2 * end
+    """Return the attenuation of a cable that runs from above to an electrode, which may lie outside the image."""
+    share, places = np.linspace(0, 1, 64)[:, None], random.uniform((-0.1, -0.1), (1.1, 1.6), (3, 2)) * pixels
+    places[0, 1] = -1
+    line = (1 - share) ** 2 * places[0] + 2 * share * (1 - share) * places[1] + share**2 * places[2]
     drawn = np.zeros((pixels, pixels), dtype=np.float32)
-    for part, radius, attenuation in (
-        (line, _LEAD_MM / 2, _LEAD_PER_E),
-        (line[-1:] + [[0, 0], [0.1, 0]], _PAD_MM, _PAD_PER_E),
-        (line[-1:] + [[0, 0], [0.1, 0]], _STUD_MM, _STUD_PER_E),
-    ):
+    for part, (radius, attenuation) in zip((line, line[-2:], line[-2:]), _CABLE, strict=True):
         drawn += np.float32(attenuation) * stroke(part, np.full(len(part), radius / pixel_mm), pixels)
     return gaussian_filter(drawn, _PENUMBRA_MM / 2 / pixel_mm)
 
@@ -101,5 +95,5 @@ def harmonised(
     """
     slow, inside = gaussian_filter(light, _HARMONISED_MM / pixel_mm, mode="nearest"), beam.field > 0.5
     low, high = np.percentile(slow[inside], (5, 95))
-    pressed = max(1 - span / (high - low), 0.0) * slow
+    pressed = np.float32(1 - span / max(high - low, span)) * slow
     return pressed + np.float32(np.percentile((light - pressed)[inside], _BRIGHT))

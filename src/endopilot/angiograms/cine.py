@@ -30,7 +30,6 @@ KEYPOINTS = {
 """Keypoints of each device: their names, and their distance behind its tip along it, mm."""
 _MOST_RAYS = 256
 SPAN = (0.15, 0.3)
-_NO_TWIGS = np.zeros((0, 3)), np.zeros(0), np.zeros(0)
 _REFLUX, _REFLUX_MM, _REFLUX_BLUR_MM = 300, 4.0, 2.0
 
 
@@ -88,10 +87,10 @@ class Cine:
             self._before = core.placements(self.times_s - config.image.pulse_s)[0]
         self.flow = Flow(anatomy.tree, draw.blood_mm_s)
         random = np.random.default_rng(patient_seed(config, anatomy.name))
-        lumen_transit_s = self.flow.transit_of(imager.lumen_points)
-        places, sizes, transit_s = grow(anatomy, self.flow, random) if is_coronary(anatomy) else _NO_TWIGS
-        self._lumen = np.concatenate([imager.lumen_points, places]), np.append(imager.lumen_sizes, sizes)
-        self._transit_s = np.append(lumen_transit_s, transit_s)
+        self._lumen = imager.lumen_points, imager.lumen_sizes
+        if is_coronary(anatomy):
+            self._lumen = tuple(map(np.concatenate, zip(self._lumen, grow(anatomy, self.flow, random), strict=True)))
+        self._transit_s = self.flow.transit_of(self._lumen[0])
         self.contrast = np.zeros((config.frames, len(self.flow.points)))
         if draw.injection is not None:
             times = np.arange(config.frames) / config.frames_per_second

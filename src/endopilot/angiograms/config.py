@@ -23,8 +23,15 @@ RANDOM = "random"
 """Drives the devices at random."""
 
 CINE_IMAGE = ImageConfig(
-    scatter=1.0, scintillator_mm=0.36, focal_spot_mm=0.8, iodine_mm=0.28, edge_weight=0.3, temporal_weight=0.2, coil_mm=1.3
+    scatter=1.0,
+    scintillator_mm=0.36,
+    focal_spot_mm=0.8,
+    iodine_mm=0.28,
+    edge_weight=0.3,
+    temporal_weight=0.2,
+    coil_mm=1.3,
 )
+
 
 @settings
 class AngiogramsConfig:

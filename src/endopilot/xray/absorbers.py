@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-
 from scipy.ndimage import gaussian_filter
 
 from endopilot.devices.catheter import Catheter
