@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +81,7 @@ def _measured(folder: Path) -> dict[str, float]:
     labels, shown = masks[fullest] > 0, light[fullest]
     off = field & ~binary_dilation(labels, iterations=_AROUND_PX)
     background = float(np.ptp(np.percentile(shown[off], (5, 95))))
-    figures = {"background_range": background, "noise_correlation": _correlation(grey, per_e)}
+    figures = {"background_range": background, "noise_correlation": _correlation(grey)}
     inside = np.zeros_like(field)
     inside[upper + 2 : lower - 2, left + 2 : right - 2] = True
     figures["clipped_labels"] = float((np.isin(grey, (0, 255)) & (masks > 0) & inside).mean())
@@ -101,18 +102,20 @@ def _measured(folder: Path) -> dict[str, float]:
     empty = masks[0]  # no contrast yet
     off = field & ~binary_dilation(empty > 0, iterations=_AROUND_PX)
     depth = _beside(light[0], off) - light[0]
-    for name, line, other in (
-        ("empty_catheter_contrast", "guide", CLASSES["wire"] | CLASSES["catheter"]),
-        ("wire_coil_contrast", "wire", CLASSES["guide"] | CLASSES["catheter"]),
-    ):
+    devices = CLASSES["guide"] | CLASSES["wire"] | CLASSES["catheter"]
+    for name, line in (("empty_catheter_contrast", "guide"), ("wire_coil_contrast", "wire")):
         if f"{line}_px" in truth:
             nodes, along = truth[f"{line}_px"][0], truth[f"{line}_mm"][0]
             nodes = nodes[np.linalg.norm(along - along[0], axis=1) < 30]
             nodes = np.rint(nodes[np.isfinite(nodes).all(axis=1)]).astype(int)
-            nodes = nodes[((nodes >= 0) & (nodes < len(shown))).all(axis=1)]
-            on = (field & ((empty & CLASSES[line]) > 0) & ((empty & other) == 0))[nodes[:, 1], nodes[:, 0]]
-            values = [depth[r - 2 : r + 3, c - 2 : c + 3].max() for c, r in nodes[on]]
-            figures[name] = float(np.median(values)) if len(values) > 4 else np.nan
+            column, row = nodes[((nodes >= 0) & (nodes < len(shown))).all(axis=1)].T
+            near = np.zeros_like(field)
+            near[row, column] = True
+            alone = field & ((empty & devices) == CLASSES[line]) & binary_dilation(near, iterations=_AROUND_PX)
+            if alone.sum() > 50:  # a coil is thinner than its pixels: its middle counts
+                figures[name] = (
+                    float(np.median(depth[alone])) if line == "guide" else float(np.quantile(depth[alone], 0.9))
+                )
     return figures
 
 
@@ -122,10 +125,10 @@ def _beside(light: Float[np.ndarray, "r c"], off: np.ndarray) -> Float[np.ndarra
     return gaussian_filter(np.where(off, light, 0.0), _BESIDE_PX) / weight
 
 
-def _correlation(grey: np.ndarray, per_e: float) -> float:
+def _correlation(grey: np.ndarray) -> float:
     """Return the correlation of neighbours' noise: of frames less those before, in the quietest quarter of squares."""
     found = []
-    for before, after in zip(grey[:-1], grey[1:], strict=True):
+    for before, after in pairwise(grey):
         noise = after.astype(float) - before
         rows, columns = (np.arange(64, side - 64 - _BLOCK, _BLOCK) for side in noise.shape)
         power = uniform_filter(noise**2, _BLOCK)[np.ix_(rows + _BLOCK // 2, columns + _BLOCK // 2)]

@@ -25,6 +25,8 @@ _LEADS = 3
 """Cables of the electrocardiogram in the image are fewer than this: an assumption."""
 _CABLE = ((0.35, 0.08), (9.0, 0.05), (2.5, 0.35))
 """Of a cable, its electrode and the stud in it: radius on the detector, mm, and attenuation; assumptions."""
+_SHOULDER = 0.25
+"""What lies beyond is pressed into this much of the grey scale's 0.9 to either side, logarithm of the light."""
 _BRIGHT = 80
 """Percentile of the background in the middle of the grey scale: vessels are darker than it."""
 _HARMONISED_MM = 15.0
@@ -83,6 +85,14 @@ def _cable(random: np.random.Generator, pixels: int, pixel_mm: float) -> Float32
     for part, (radius, attenuation) in zip((line, line[-2:], line[-2:]), _CABLE, strict=True):
         drawn += np.float32(attenuation) * stroke(part, np.full(len(part), radius / pixel_mm), pixels)
     return gaussian_filter(drawn, _PENUMBRA_MM / 2 / pixel_mm)
+
+
+def shown(light: Float32[np.ndarray, "rows columns"], beam: Beam) -> Float32[np.ndarray, "rows columns"]:
+    """Return what a monitor shows of the logarithm of the light: pressed beyond `CLOSED` on either side of the middle,
+    so that nothing is black or white, and even beyond the collimator's edges."""
+    within = np.clip(light, CLOSED, -CLOSED)
+    within += np.float32(_SHOULDER) * np.tanh((light - within) / np.float32(_SHOULDER))
+    return np.float32(CLOSED) + beam.field * (within - np.float32(CLOSED))
 
 
 def harmonised(

@@ -26,11 +26,16 @@ CINE_IMAGE = ImageConfig(
     scatter=1.0,
     scintillator_mm=0.36,
     focal_spot_mm=0.8,
-    iodine_mm=0.28,
+    iodine_mm=0.265,
     edge_weight=0.3,
     temporal_weight=0.2,
-    coil_mm=1.3,
+    coil_mm=1.1,
 )
+"""Detector and beam of a cine. Behind a cardiac grid scatter is 1 to 1.3 of the primary light (Niklason 1981, Altunbas
+2016). Scintillator and noise filter blur by 1.2 pixels, which gives the noise of real cines: neighbours' correlation
+0.85, power at 0.25 over 0.09 a pixel 0.056. Edges are enhanced by 25 to 32 % there, and the focal spot is 0.8 mm.
+Contrast of 350 mg iodine/ml takes the blood's place: 7.58 cm²/g at 60 keV (NIST). The coil has a contrast of 0.08 to
+0.2 then."""
 
 
 @settings

@@ -45,8 +45,8 @@ tags: [x-ray, angiography, guidewire, simulated]
 
 # Angiograms with the truth in them
 
-{cines} cines of {frames} frames at {rate} frames a second, {pixels} × {pixels} pixels. Patients: {patients}. Seed {seed}.
-Simulated by {version}; no patient was exposed. Devices: {devices}. `manifest.json` holds all settings.
+{cines} cines of {frames} frames at {rate} frames a second, {pixels} × {pixels} pixels. Patients: {patients}.
+Seed {seed}. Simulated by {version}; no patient was exposed. Devices: {devices}. `manifest.json` holds all settings.
 
 ![Frames, and their masks](samples.png)
 
@@ -54,9 +54,9 @@ Simulated by {version}; no patient was exposed. Devices: {devices}. `manifest.js
 | --- | --- | --- | --- |
 {splits}
 
-Splits are by patient. `annotations/SPLIT.json` is COCO; `cines/NAME/` holds `cine.dcm` (DICOM XA, 12 bits), `frames` (as a
-monitor shows them), `masks` (as bits: {bits}), `truth.npz` and `cine.json`; `patients/NAME/` the vessel and the CT. The
-documentation of `endopilot angiograms` says what they hold, and what the images lack.
+Splits are by patient. `annotations/SPLIT.json` is COCO; `cines/NAME/` holds `cine.dcm` (DICOM XA, 12 bits), `frames`
+(as a monitor shows them), `masks` (as bits: {bits}), `truth.npz` and `cine.json`; `patients/NAME/` the vessel and
+the CT. The documentation of `endopilot angiograms` says what they hold, and what the images lack.
 
 For research and teaching. Who may use them depends on the CTs that they were made of.
 """

@@ -16,13 +16,13 @@ from endopilot.types import Anatomy
 from endopilot.xray.absorbers import across
 
 _STEP_MM, _SPOKES = 0.4, 6
-_THINNEST_MM = 0.2
-"""Radius at which a branch ends, mm: what is thinner hardly rises above the noise of a frame."""
+_THINNEST_MM, _FADES = 0.35, 20
+"""Radius at which a branch ends, mm: what is thinner hardly rises above the noise. It fades in the last steps."""
 _LENGTH = 75.0
 """Length of a vessel over its radius: an anterior descending artery's 1.85 mm taper over some 140 mm (Dodge 1992)."""
 _APART_MM, _SHARES, _DIVES = 7.0, (0.2, 0.5), 0.3
-"""Mean distance of side branches, mm: eight to ten septal branches along some 70 mm. Range of their radius as a share of
-the vessel's, and share of those that dive: assumptions."""
+"""Mean distance of side branches, mm: eight to ten septal branches along some 70 mm. Range of their radius as a share
+of the vessel's, and share of those that dive: assumptions."""
 _ANGLE_RAD, _ANGLE_SD = 0.9, 0.3
 """Mean and standard deviation of the angle at which they leave, rad: 52° [22–97] in fourteen real right arteries."""
 _CURVATURE, _BENDS_MM = 0.08, 4.0
@@ -48,14 +48,15 @@ def grow(
             buds.append((len(line) - 1, points[-1] - points[-3], float(radius[-1]), False))
         for place, heading, wide, dives in buds:
             run = _run(points[place], heading, wide, dives, centre, random)
-            thin = np.linspace(wide, _THINNEST_MM, len(run))
+            thin = np.linspace(wide, min(wide, _THINNEST_MM), len(run))
             lines.append(len(flow.points) + np.arange(len(run)))
             flow.append(run, thin, int(line[place]))
             first, second = across(np.gradient(run, axis=0))
             turn = 2 * np.pi * np.arange(_SPOKES) / _SPOKES
             ring = np.cos(turn)[:, None] * first[:, None] + np.sin(turn)[:, None] * second[:, None]
             places.append((run[:, None] + thin[:, None, None] / np.sqrt(2) * ring).reshape(-1, 3))
-            sizes.append(np.repeat(np.pi * thin**2 * _STEP_MM / _SPOKES, _SPOKES))
+            fading = np.minimum(np.arange(len(run), 0, -1) / _FADES, 1)
+            sizes.append(np.repeat(fading * np.pi * thin**2 * _STEP_MM / _SPOKES, _SPOKES))
     return np.concatenate(places), np.concatenate(sizes)
 
 
@@ -72,7 +73,7 @@ def _sides(
     share, apart = random.uniform(*_SHARES), random.exponential(_APART_MM)
     for place in range(1, len(points) - 1):
         side = float(min(share * widest[place], max(whole - widest[place] ** 3, 0.0) ** (1 / 3)))
-        if side < 1.5 * _THINNEST_MM or along[place] - last < apart:
+        if side < _THINNEST_MM or along[place] - last < apart:
             continue
         whole, last = whole - side**3, along[place]
         share, apart, dives = random.uniform(*_SHARES), random.exponential(_APART_MM), random.random() < _DIVES
@@ -94,7 +95,9 @@ def _run(
 ) -> Float[np.ndarray, "n 3"]:
     """Return the places of a branch, at equal distances."""
     places, kept = [], np.exp(-_STEP_MM / _BENDS_MM)
-    shocks = random.normal(0, _CURVATURE * np.sqrt(1 - kept**2), 3 + int(_LENGTH * (radius - _THINNEST_MM) / _STEP_MM))
+    shocks = random.normal(
+        0, _CURVATURE * np.sqrt(1 - kept**2), _FADES + int(_LENGTH * max(radius - _THINNEST_MM, 0) / _STEP_MM)
+    )
     bend, heading, height = 0.0, heading / np.linalg.norm(heading), np.linalg.norm(place - centre)
     for shock in shocks:
         place, bend = place + _STEP_MM * heading, kept * bend + shock

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from endopilot.devices.catheter import Catheter
 from endopilot.lines import length_along, places_on
@@ -30,6 +30,8 @@ _STRAIGHT_MM, _BEND_MM, _SHOWN_MM = 10.0, 25.0, 180.0
 """Length of the catheter behind the ostium that is straight, radius of its bend into the aorta, and the length that is
 shown, mm."""
 _BLOOD_HU = 40.0
+_POOL_MM, _POOL_HU = 8.0, (150.0, 650.0)
+"""Least width of a chamber's or a large vessel's blood, mm, and its range in a CT angiogram, HU."""
 _SOFT_SHARE = 0.2
 """Soft tissue without contrast is so much nearer to blood: 45 to 60 HU where a CT angiogram has 80 to 200."""
 _LUNG_HU, _LUNG_MM = 80.0, (1.5, 4.0)
@@ -64,8 +66,20 @@ def surroundings(anatomy: Anatomy) -> Volume | None:
 
 
 def without_contrast(ct: Volume, points: Places) -> Volume:
-    """Return a CT, HU, with the blood at the points of the vessel's lumen, LPS mm, as it is without contrast."""
-    voxels = ct.voxels.astype(np.float32)
+    """Return a CT, HU, with the blood at the points of the vessel's lumen, LPS mm, as it is without contrast.
+
+    So is all blood in chambers and large vessels: what stays contrasted where anything thinner than `_POOL_MM` is
+    opened; bone is denser, or thinner.
+    """
+    voxels, every = ct.voxels.astype(np.float32), np.maximum((2.0 / ct.spacing_mm[::-1]).astype(int), 1)
+    coarse = voxels[:: every[0], :: every[1], :: every[2]]
+    size = np.maximum(np.rint(_POOL_MM / (ct.spacing_mm[::-1] * every)).astype(int), 1)
+    opened = maximum_filter(minimum_filter(coarse, tuple(size)), tuple(size + 2))
+    for axis, count in enumerate(every):
+        opened = np.repeat(opened, count, axis)
+    opened = opened[tuple(map(slice, voxels.shape))]
+    pool = (opened > _POOL_HU[0]) & (opened < _POOL_HU[1])
+    voxels[pool] = np.minimum(voxels[pool], _BLOOD_HU)
     index = np.rint(ct.world_to_index(points)).astype(int)[:, ::-1]
     index = index[((index >= 0) & (index < voxels.shape)).all(axis=1)]
     at = tuple(index.T)

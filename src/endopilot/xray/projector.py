@@ -14,7 +14,7 @@ from endopilot.xray.carm import View
 
 _RAY_STEP_MM = 1.5
 _COARSE_MM, _COARSE_RAYS, _SIDES_MM = 8.0, 64, 15.0
-"""What lies beyond a CT's sides: its voxels, the rays through it along a side, and how far along a side is averaged, mm."""
+"""What lies beyond a CT's sides: its voxels, mm, the rays along a side of the image, and how far is averaged, mm."""
 _BODY_MM = (161.0, 122.0)
 """Half the breadth and depth of a chest about the CT's middle, mm: 322 and 243 mm, means of men in ANSUR 1988."""
 _AIR_HU = -1000.0
