@@ -26,7 +26,8 @@ from endopilot.settings import Within
 
 CORES = 2
 BARS = {"frames_per_second_on_2_cores": Bar(20.0, at_least=True)}
-_DEVICE = "workhorse-014"
+_DEVICE, _PATIENTS = "workhorse-014", 70
+"""The wire, and the patients' seed, to which that of the data set is added."""
 _PARTS = {
     "cast rays through the CT": "patient",
     "lumen and contrast": "of",
@@ -49,7 +50,6 @@ def bench_angiograms(
     *,
     output: OutputFolder = Path("runs/bench-angiograms"),
     patients: Annotated[int, Within(1, 100)] = 4,
-    seed: Annotated[int, Within(0, 2**31)] = 70,
     config: AngiogramsConfig = AngiogramsConfig(cines=4),
 ) -> dict[str, Any]:
     """Make angiograms of synthetic patients with all that is written beside them, and say what takes the time.
@@ -57,13 +57,13 @@ def bench_angiograms(
     Args:
         output: a new folder.
         patients: right and left coronary trees in turn.
-        seed: of the patients.
         config: of the data set.
 
     Returns:
         `frames_per_second_on_2_cores`, extrapolated from the processor time of everything, the patients' chests
-        included, with its bar; `looks` beside those of real cines; `processor_ms_a_frame`, `wall_seconds`, `megabytes_a_frame`; and `parts_ms_a_frame`,
-        measured in one more cine by a profiler, which slows it; parts overlap where one calls the other.
+        included, with its bar; `looks` beside real cines; `processor_ms_a_frame`, `wall_seconds`, `megabytes_a_frame`;
+        and `parts_ms_a_frame`, measured in one more cine by a profiler, which slows it; parts overlap where one calls
+        the other.
 
     Raises:
         InputError: the folder is there already.
@@ -72,7 +72,7 @@ def bench_angiograms(
         raise InputError(f"{output}: is there already; remove it, or choose another folder")
     folders = []
     for index in range(patients):
-        anatomy = make_patient(AtlasConfig(vessel=("rca", "lca")[index % 2], seed=seed), index)
+        anatomy = make_patient(AtlasConfig(vessel=("rca", "lca")[index % 2], seed=_PATIENTS + config.seed), index)
         folders.append(output / "anatomies" / anatomy.name)
         write_anatomy(anatomy, output=folders[-1])
     if config.anatomy_shares is None and patients < 3:

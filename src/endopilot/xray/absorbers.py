@@ -73,12 +73,12 @@ def without_contrast(ct: Volume, points: Places) -> Volume:
     """
     voxels, every = ct.voxels.astype(np.float32), np.maximum((2.0 / ct.spacing_mm[::-1]).astype(int), 1)
     coarse = voxels[:: every[0], :: every[1], :: every[2]]
-    size = np.maximum(np.rint(_POOL_MM / (ct.spacing_mm[::-1] * every)).astype(int), 1)
-    opened = maximum_filter(minimum_filter(coarse, tuple(size)), tuple(size + 2))
+    size = 2 * (_POOL_MM / 2 / (ct.spacing_mm[::-1] * every)).astype(int) + 1
+    blood = (coarse > _POOL_HU[0]) & (coarse < _POOL_HU[1])
+    pool = maximum_filter(minimum_filter(blood, tuple(size)), tuple(size + 2))
     for axis, count in enumerate(every):
-        opened = np.repeat(opened, count, axis)
-    opened = opened[tuple(map(slice, voxels.shape))]
-    pool = (opened > _POOL_HU[0]) & (opened < _POOL_HU[1])
+        pool = np.repeat(pool, count, axis)
+    pool = pool[tuple(map(slice, voxels.shape))] & (voxels < _POOL_HU[1])
     voxels[pool] = np.minimum(voxels[pool], _BLOOD_HU)
     index = np.rint(ct.world_to_index(points)).astype(int)[:, ::-1]
     index = index[((index >= 0) & (index < voxels.shape)).all(axis=1)]
