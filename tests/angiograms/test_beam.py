@@ -66,14 +66,14 @@ def test_fine_branches_obey_murray_and_go_on_from_the_ends(fork):
     assert len(flow.points) > own and len(places) == len(sizes) == 6 * (len(flow.points) - own)
     for branch in np.unique(flow.branch[own:]):
         line = np.flatnonzero(flow.branch == branch)
-        gap = np.linalg.norm(flow.points[:own] - flow.points[line[0]], axis=1)
+        gap = np.linalg.norm(flow.points[:own] - flow.points[line[0]], axis=1) - flow.radius[:own]
         assert (np.diff(flow.transit_s[line]) > 0).all() and (np.diff(flow.radius[line]) <= 0).all()
         if gap.min() < 0.5:  # it leaves a vessel of the CT: blood is as much slower as it is thinner
             parent = int(gap.argmin())
             speed = flow.rate_ml_s[[parent, line[0]]] / flow.radius[[parent, line[0]]] ** 3
             assert speed[1] == pytest.approx(speed[0], rel=0.05)
     ends = [branch.centerline.points[-1] for branch in fork.tree.branches[1:]]
-    assert all(np.linalg.norm(flow.points[own:] - end, axis=1).min() < 0.5 for end in ends)
+    assert all(np.linalg.norm(flow.points[own:] - end, axis=1).min() < 2.0 for end in ends)
 
 
 def test_what_the_vessel_does_not_take_is_around_the_ostium_for_a_while():

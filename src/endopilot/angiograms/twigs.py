@@ -47,7 +47,10 @@ def grow(
         if number in leaves:
             buds.append((len(line) - 1, points[-1] - points[-3], float(radius[-1]), False))
         for place, heading, wide, dives in buds:
-            run = _run(points[place], heading, wide, dives, centre, random)
+            heading = heading / np.linalg.norm(heading)
+            run = _run(
+                points[place] + radius[place] * heading, heading, wide, dives, centre, random
+            )  # from the wall on
             thin = np.linspace(wide, min(wide, _THINNEST_MM), len(run))
             lines.append(len(flow.points) + np.arange(len(run)))
             flow.append(run, thin, int(line[place]))
@@ -98,7 +101,7 @@ def _run(
     shocks = random.normal(
         0, _CURVATURE * np.sqrt(1 - kept**2), _FADES + int(_LENGTH * max(radius - _THINNEST_MM, 0) / _STEP_MM)
     )
-    bend, heading, height = 0.0, heading / np.linalg.norm(heading), np.linalg.norm(place - centre)
+    bend, height = 0.0, np.linalg.norm(place - centre)
     for shock in shocks:
         place, bend = place + _STEP_MM * heading, kept * bend + shock
         away = np.linalg.norm(place - centre)
