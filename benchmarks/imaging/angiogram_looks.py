@@ -79,7 +79,7 @@ def _measured(folder: Path) -> dict[str, float]:
     field[upper + 8 : lower - 8, left + 8 : right - 8] = True
     fullest = int(np.argmax([((mask & CLASSES["contrast"]) > 0).sum() for mask in masks]))
     labels, shown = masks[fullest] > 0, light[fullest]
-    off = field & ~binary_dilation(labels, iterations=_AROUND_PX)
+    off = field & ~np.asarray(binary_dilation(labels, iterations=_AROUND_PX), dtype=bool)
     background = float(np.ptp(np.percentile(shown[off], (5, 95))))
     figures = {"background_range": background, "noise_correlation": _correlation(grey)}
     inside = np.zeros_like(field)
@@ -100,7 +100,7 @@ def _measured(folder: Path) -> dict[str, float]:
             within = (lumen >= low) & (lumen < high)
             figures[name] = float(np.median(depth[within])) if within.sum() > 20 else np.nan
     empty = masks[0]  # no contrast yet
-    off = field & ~binary_dilation(empty > 0, iterations=_AROUND_PX)
+    off = field & ~np.asarray(binary_dilation(empty > 0, iterations=_AROUND_PX), dtype=bool)
     depth = _beside(light[0], off) - light[0]
     devices = CLASSES["guide"] | CLASSES["wire"] | CLASSES["catheter"]
     for name, line in (("empty_catheter_contrast", "guide"), ("wire_coil_contrast", "wire")):

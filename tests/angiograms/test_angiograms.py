@@ -265,5 +265,5 @@ def test_a_ct_is_segmented_and_the_rays_pass_it(fork, tmp_path, monkeypatch):
     config = replace(CONFIG, cines=1, seconds=0.25, device_share=0.0, view_angles_deg=((0.0, 0.0),))
     make_angiograms([tmp_path / "heart.nii.gz"], output=tmp_path / "o", config=config)
     frame = picture(tmp_path / "o" / "cines" / "heart-0000", "frames", 0).astype(float)
-    assert frame[:, :40].mean() > frame[:, -40:].mean() + 50
+    assert frame[:, :40].mean() > frame[:, -40:].mean() + 30  # harmonised: no more than that is left of it
     assert read_volume(tmp_path / "o" / "patients" / "heart" / "ct.nii.gz").voxels.max() == 800

@@ -111,7 +111,7 @@ class Flow:
         every = (np.arange(int(times_s[-1] / step) + 2) + 0.5) * step
         share = [np.minimum(injection.rate(every) / self.inflow_ml_s, 1)]  # at the ostium, then in each volume
         for _ in range(tanks):
-            share.append(lfilter([0.0, 1 / _STEPS], [1.0, 1 / _STEPS - 1], share[-1]))
+            share.append(np.asarray(lfilter([0.0, 1 / _STEPS], [1.0, 1 / _STEPS - 1], share[-1])))
         shares = np.stack(share, axis=1)[np.rint(times_s / step).astype(int)]
         return np.append(0.0, (np.arange(tanks) + 0.5) * MIXING_S), shares
 

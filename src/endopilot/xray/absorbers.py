@@ -75,7 +75,7 @@ def without_contrast(ct: Volume, points: Places) -> Volume:
     coarse = voxels[:: every[0], :: every[1], :: every[2]]
     size = 2 * (_POOL_MM / 2 / (ct.spacing_mm[::-1] * every)).astype(int) + 1
     blood = (coarse > _POOL_HU[0]) & (coarse < _POOL_HU[1])
-    pool = maximum_filter(minimum_filter(blood, tuple(size)), tuple(size + 2))
+    pool = np.asarray(maximum_filter(minimum_filter(blood, tuple(size)), tuple(size + 2)), dtype=bool)
     for axis, count in enumerate(every):
         pool = np.repeat(pool, count, axis)
     pool = pool[tuple(map(slice, voxels.shape))] & (voxels < _POOL_HU[1])
