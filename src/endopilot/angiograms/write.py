@@ -31,10 +31,7 @@ _BITS = 12
 _LARGEST = 2**_BITS - 1
 _WIDER = 2.0
 """The stored values reach this many times as far as the grey scale of a monitor."""
-_EMPTY = (
-    *("PatientBirthDate", "PatientSex", "StudyDate", "StudyTime", "ReferringPhysicianName", "AccessionNumber"),
-    *("ContentDate", "ContentTime"),
-)
+_EMPTY = ("PatientBirthDate", "PatientSex", "ReferringPhysicianName", "AccessionNumber")
 _KV, _MA, _THIN_MM, _THICK_MM = (81.0, 125.0), (474.0, 841.0), 150.0, 300.0
 """Voltage and current of 45 public cines; the exposure control goes through them with the water that stands for the
 patient: an assumption."""
@@ -94,6 +91,8 @@ def _header(cine: Cine, number: int, identity: str) -> Dataset:
     for empty in _EMPTY:
         setattr(header, empty, None)
     header.PatientName, header.PatientID, header.StudyID = "Simulated^Patient", identity.rpartition(" ")[2][:64], "1"
+    header.StudyDate = header.ContentDate = "20000101"  # that files can be sorted; nothing was taken on any day
+    header.StudyTime = header.ContentTime = "000000"
     header.Manufacturer, header.PatientPosition = "endopilot", "HFS"
     header.PatientOrientation = [_towards(cine.view.axes[0]), _towards(-cine.view.axes[1])]
     share = np.clip((-cine.reference / WATER_MM - _THIN_MM) / (_THICK_MM - _THIN_MM), 0, 1)

@@ -38,7 +38,7 @@ from endopilot.xray.absorbers import (
     without_contrast,
 )
 from endopilot.xray.carm import CArmGeometry, Pose, View, view_at, view_of
-from endopilot.xray.projector import Shadow, blurred, cast, splat
+from endopilot.xray.projector import blurred, cast, splat
 
 PHOTONS_MM2_UGY = 30174.0
 """Photons a mm² and µGy of a fluoroscopy beam (RQA 5 of IEC 62220-1)."""
@@ -138,7 +138,7 @@ class XrayImager:
         config: detector and beam.
         isocenter: the middle of the vessel, about which the C-arm turns, LPS mm.
         ct: of the patient, HU, without contrast in the vessel's blood; None for 200 mm of water.
-        lumen_points: where the small volumes lie that the vessel's lumen is made of, LPS mm.
+        lumen_points: where the small volumes lie that the vessel's lumen is made of, LPS mm; `lumen_sizes`, mm³.
     """
 
     def __init__(
@@ -210,7 +210,9 @@ class XrayImager:
             placed: affine map of vessel and catheter, as `plane` takes it.
         """
         background = patient + self.guide(view, zoom_factor, placed)
-        (vessel,) = self.lumen(view, placed, (1.0, self.blur_px(zoom_factor)))
+        width, blur = self.anatomy.distance_map.spacing_mm / 2, self.blur_px(zoom_factor)
+        points, sizes = self.lumen_points, self.lumen_sizes
+        vessel = splat(view, self.config.pixels, points, sizes, placed=placed, width_mm=width, blur_px=blur)
         vessel += self.guide_lumen(view, zoom_factor, placed)
         primary = np.exp(-background)
         scatter = self._scattered(primary, zoom_factor)
@@ -246,24 +248,6 @@ class XrayImager:
         points, size = self._guide_lumen
         blur = self.blur_px(zoom_factor)
         return splat(view, self.config.pixels, points, size, placed=placed, width_mm=0.1, blur_px=blur)
-
-    def lumen(
-        self,
-        view: View,
-        placed: Float[np.ndarray, "3 4"],
-        *parts: tuple[Float[np.ndarray, "n"] | float, float],
-    ) -> list[Float32[np.ndarray, "rows columns"]]:
-        """Return the path of each ray through the vessel's lumen, mm, once for each of some parts of it.
-
-        Args:
-            view: source and detector.
-            placed: affine map of the vessel, as `plane_through` takes it.
-            parts: the share by which the path counts at each of `lumen_points`, such as that of contrast in the blood,
-                and the standard deviation of the detector's blur, pixels.
-        """
-        width = self.anatomy.distance_map.spacing_mm / 2
-        shadow = Shadow(view, self.config.pixels, self.lumen_points, placed)
-        return [shadow.of(share * self.lumen_sizes, width_mm=width, blur_px=blur) for share, blur in parts]
 
     def signal(
         self,
