@@ -38,7 +38,7 @@ _LUNG_HU, _LUNG_MM = 80.0, (1.5, 4.0)
 """Standard deviation of the lung's density by its vessels and lobules, HU, at each of two sizes, mm: an assumption."""
 _STEP_MM, _RINGS = 0.15, 4
 _MARKER_STEP_MM, _SPOKE_MM = 0.05, 0.25
-_SURROUNDINGS = PhantomConfig(  # without contrast, as the chest is between two injections
+SURROUNDINGS = PhantomConfig(  # without contrast, as the chest is between two injections
     in_plane_mm=1.5, slice_mm=1.5, margin_mm=60.0, lumen_hu=(45.0, 45.0), noise_hu=(0.0, 0.0), calcium=0.0
 )
 
@@ -54,7 +54,7 @@ def surroundings(anatomy: Anatomy) -> Volume | None:
     """Return the CT of a synthetic chest around a coronary artery, HU, without contrast; None for any other vessel."""
     if not is_coronary(anatomy):
         return None
-    chest = make_phantom(anatomy, config=_SURROUNDINGS, seed=0)
+    chest = make_phantom(anatomy, config=SURROUNDINGS, seed=0)
     hu, random = chest.voxels.astype(np.float32), np.random.default_rng(0)
     soft = (hu > -20) & (hu < 210)
     hu[soft] = _BLOOD_HU + _SOFT_SHARE * (hu[soft] - _BLOOD_HU)
