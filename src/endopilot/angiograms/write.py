@@ -104,7 +104,10 @@ def _header(cine: Cine, number: int, identity: str) -> Dataset:
         setattr(header, f"Shutter{edge}", place)
         setattr(header, f"Collimator{edge}", place)
     header.ShutterPresentationValue = 0
-    header.BodyPartExamined = "HEART" if is_coronary(cine.imager.anatomy) else "ARTERY"
+    if is_coronary(cine.imager.anatomy):
+        header.BodyPartExamined = "HEART"
+    else:
+        header.Laterality = None
     header.Modality, header.SeriesNumber, header.InstanceNumber = "XA", number + 1, 1
     header.ImageType = ["DERIVED", "SECONDARY", "SINGLE PLANE"]
     header.DerivationDescription = "simulated from a CT angiogram or a synthetic patient"
