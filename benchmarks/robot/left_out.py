@@ -27,9 +27,8 @@ from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import input_hash
 from endopilot.robot.calibrate import bands, worst
-from endopilot.robot.kinematics import NAMES, DriveFit, Tracks, fit_drive, led
+from endopilot.robot.kinematics import NAMES, Tracks, fit_drive, led
 from endopilot.robot.learned import Learned, LoggedEpisode, figures, left_out, logged
-from endopilot.robot.learned import predicted as said_of
 from endopilot.robot.log import RobotLog, read_log
 from endopilot.robot.replay import EpisodeReplay, Prepared, ReplayConfig, prepare, replay_prepared, usable_episodes
 from endopilot.types import Anatomy
@@ -75,23 +74,16 @@ class LeftOut:
     states: States
 
 
-def calibrated(
-    logs: Sequence[RobotLog], anatomy: Anatomy, known: RobotConfig, episodes: int, begin: DriveFit | None = None
-) -> tuple[RobotConfig, DriveFit]:
-    """Return a robot with the kinematics of logs, fitted to so many episodes at most, evenly chosen, and the fit.
-
-    Args:
-        begin: where the fit begins, for time; from a grid if not given.
-    """
+def calibrated(logs: Sequence[RobotLog], anatomy: Anatomy, known: RobotConfig, episodes: int) -> RobotConfig:
+    """Return a robot with the kinematics of logs, fitted to so many episodes at most, evenly chosen."""
     usable = usable_episodes(logs, anatomy)
     chosen = np.unique(np.linspace(0, len(usable) - 1, episodes).round().astype(int))
     of = prepare([usable[k] for k in chosen], anatomy, 0.5, known)
     names = [log.name for log in of.logs]
     unit = np.unique(names, return_inverse=True)[1]
-    fit = fit_drive(Tracks(of.courses, of.abscissa), unit, begin)
-    values = dict(zip(NAMES, fit.values.tolist(), strict=True))
+    values = dict(zip(NAMES, fit_drive(Tracks(of.courses, of.abscissa), unit).values.tolist(), strict=True))
     wire = replace(known.wire, gain_translation=values["gain_translation"], play_mm=values["play_mm"])
-    return replace(known, latency_s=values["latency_s"], wire=wire), fit
+    return replace(known, latency_s=values["latency_s"], wire=wire)
 
 
 def predicted(of: Prepared, robot: RobotConfig, wire: Wire) -> list[LeftOut]:
@@ -140,9 +132,9 @@ def bench_left_out(
     anatomy: Path,
     robot: str = "kweon-2021-2d",
     device: str = "workhorse-014",
-    episodes: int = 48,
+    episodes: int = 96,
     sessions: tuple[str, ...] = ("2D",),
-    epochs: int = 3,
+    epochs: int = 1,
     write: bool = False,
 ) -> list[dict[str, Any]]:
     """Predict each session by what all others teach, beside an offset, play alone and kinematics alone.
@@ -166,9 +158,8 @@ def bench_left_out(
     patient, known, wire = read_anatomy(anatomy), read_robot(robot), read_wire(device)
     read = [read_log(path) for path in paths]
     of: dict[str, list[LeftOut]] = {}
-    _, begin = calibrated(read, patient, known, episodes)
     for log in read:
-        found, _ = calibrated([each for each in read if each is not log], patient, known, episodes, begin)
+        found = calibrated([each for each in read if each is not log], patient, known, episodes)
         of[log.name] = predicted(prepare(usable_episodes([log], patient), patient, 0.5, known), found, wire)
     curve = _taught([one for each in of.values() for one in each], patient, input_hash(anatomy)[anatomy.name], epochs)
     tables = []
@@ -197,11 +188,12 @@ def _taught(of: Sequence[LeftOut], anatomy: Anatomy, vessel: str, epochs: int) -
         one.along["the paper's pair"], one.in_plane["the paper's pair"] = np.abs(off[:, 0]), np.linalg.norm(off, axis=1)
     beside, found = [each.beside for each in of], {}
     count = len({each.log.name for each in of}) - 1
-    models = {}
-    for number in [*(k for k in (1, 2, 4) if k < count), count]:
-        models["learned" if number == count else f"{number} of them"] = left_out(beside, anatomy.tree, vessel, number)
-    for name, before in [*((name, True) for name in models), ("learned, given half alone", False)]:
-        made = said_of(models[name if before else "learned"], beside, before=before)
+    for name, number, before in [
+        *((f"{k} of them", k, True) for k in (1, 2, 4) if k < count),
+        ("learned", count, True),
+        ("learned, given half alone", count, False),
+    ]:
+        made = left_out(beside, vessel, sessions=number, before=before)
         found[name] = figures(beside, made) | {"side_r": _side_r(of, made, anatomy)}
         for one, learned in zip(of, made, strict=True):
             rest, driven = ~one.replay.given, one.replay.driven[~one.replay.given]
@@ -305,7 +297,7 @@ def _curve(of: dict[str, dict[str, Any]]) -> list[str]:
         lines.append(
             f"| {title} | {row['in_plane_of_learned_mm']:.2f} | {row['side_r']} | "
             f"{row['bands_of_90_percent_hold_share']:.2f} | {row['jumps_expected']:.0f}; {row['jumps']}; "
-            f"{row['jump_skill']:.2f} | {row['ends_expected_share']:.2f}; {row['ends_in_the_real_branch_share']:.2f}; "
-            f"{row['branch_skill']:.2f} |"
+            f"{row['jumps_skill']:.2f} | {row['real_branch_ends_expected']:.0f}; {row['real_branch_ends']}; "
+            f"{row['real_branch_ends_skill']:.2f} |"
         )
     return lines

@@ -14,7 +14,7 @@ from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import input_hash, manifest, read_json, write_json
 from endopilot.models.config import TrainConfig
-from endopilot.robot.learned import judged, learn, logged
+from endopilot.robot.learned import figures, learn, left_out, logged
 from endopilot.robot.log import read_log
 from endopilot.robot.replay import ReplayConfig, prepare, replay_prepared, usable_episodes
 from endopilot.runs import claim
@@ -41,8 +41,8 @@ def command(
         dataset: folders made by `endopilot dataset`, or the folder `episode` that `endopilot navigate` leaves; several,
             of one wire and with episodes of one length, are trained on together.
         output: folder of the run.
-        logs: in place of a dataset, CSV files of a robot's commands and tips, or folders of them: by how much a real tip
-            is beside the predicted one is learned (docs/concepts/calibration.md), and judged on logs left out.
+        logs: in place of a dataset, CSV files of a robot's commands and tips, or folders of them: by how much a real
+            tip is beside the predicted one is learned (docs/concepts/calibration.md), and judged on logs left out.
         anatomy: with logs: folder made by `endopilot anatomy` of what the wire was driven through.
         device: with logs: name of a device (`endopilot devices`) or a YAML file.
         robot: with logs: name of a robot or a YAML file, such as `endopilot calibrate` writes.
@@ -72,8 +72,14 @@ def _learn(logs: tuple[Path, ...], anatomy: Path, device: str, robot: str, outpu
     claim(output, "endopilot train --logs", inputs=inputs, device=wire, robot=drives)
     of = prepare(usable_episodes(read, patient), patient, ReplayConfig().given, drives)
     episodes = logged(of, replay_prepared(of, Stack(wire), drives, ReplayConfig()))
-    rows = judged(episodes, patient.tree, inputs[anatomy.name])
-    learn(episodes, patient.tree, inputs[anatomy.name]).write(output / LEARNED_FILE)
+    most = len({each.session for each in episodes}) - 1
+    taught = {
+        count: left_out(episodes, inputs[anatomy.name], sessions=count)
+        for count in {1, 2, 4, most}
+        if 0 < count <= most
+    }
+    rows = [{"sessions": count} | figures(episodes, said) for count, said in sorted(taught.items())]
+    learn(episodes, inputs[anatomy.name]).write(output / LEARNED_FILE)
     write_json(output / "training.json", {"curve": rows})
     write_json(output / "manifest.json", manifest(config=ReplayConfig(), inputs=inputs, curve=rows))
     said = "gain" if rows and rows[-1]["gain"] else "no gain"

@@ -8,7 +8,6 @@ a run with a fixed number of steps repeats to the bit.
 
 from __future__ import annotations
 
-import copy
 import math
 import os
 import time
@@ -43,7 +42,6 @@ VALIDATION_WINDOWS = 512
 WARM_UP_EPOCHS = 0.5
 """Epochs over which the learning rate rises to its peak; afterwards it falls to zero along a cosine."""
 _SCALE_WINDOWS = 16384
-_TIMED_STEPS = 12
 _GRADIENT_NORM = 1.0
 
 
@@ -150,26 +148,31 @@ class Job:
     def _epoch(self, network: Network, optimizer: torch.optim.Adam, state: dict[str, Any], advance: Advance) -> None:
         """Go through one epoch, check the loss on held-out navigations, and add both to the state's curve."""
         config, epoch, start = self.config, len(state["curve"]), time.perf_counter()
-        batches = self.batches(epoch, self._steps(network, state))
+        batches, allowed_s = self.batches(epoch), math.inf
+        if config.max_seconds is not None:  # an epoch has its share of what is left
+            allowed_s = max((config.max_seconds - state["seconds"]) / (config.epochs - epoch), 1e-3)
         torch.manual_seed(_seed(config.seed, self.name, epoch))
         network.train()
-        total, rate, steps, first = 0.0, 0.0, len(batches), time.perf_counter()
+        losses, rate, samples, first = [], 0.0, 0, time.perf_counter()
         for step, targets in enumerate(batches):
-            rate = config.learning_rate * _schedule(epoch + step / steps, config.epochs)
-            loss = self.step(network, optimizer, targets, rate)
-            if not math.isfinite(loss):
+            share = max(step / len(batches), (time.perf_counter() - first) / allowed_s)
+            if step and share >= 1:
+                break
+            rate = config.learning_rate * _schedule(epoch + min(share, 1.0), config.epochs)
+            losses.append(self.step(network, optimizer, targets, rate))
+            if not math.isfinite(losses[-1]):
                 episodes = sorted(set(targets[:, 0].tolist()))[:8]
                 raise InputError(
-                    f"{self.run_folder}: the loss of {self.name} became {loss} in epoch {epoch + 1}, batch {step + 1} "
-                    f"(train episodes {episodes} and others); the checkpoint of epoch {epoch} is kept; "
+                    f"{self.run_folder}: the loss of {self.name} became {losses[-1]} in epoch {epoch + 1}, batch "
+                    f"{step + 1} (train episodes {episodes} and others); the checkpoint of epoch {epoch} is kept; "
                     "look for bad samples in the dataset or lower learning_rate"
                 )
-            total += loss
-            speed = (step + 1) * config.batch_size / (time.perf_counter() - first)
-            advance(1 / steps, f"loss {total / (step + 1):.3f}, {speed:.0f} samples/s")
-        seconds = time.perf_counter() - first
-        entry = {"epoch": epoch + 1, "steps": steps, "loss": total / steps, "validation_loss": self._validate(network)}
-        entry |= {"learning_rate": rate, "samples_per_second": sum(map(len, batches)) / seconds, "seconds": seconds}
+            samples += len(targets)
+            speed = samples / (time.perf_counter() - first)
+            advance(1 / len(batches), f"loss {np.mean(losses):.3f}, {speed:.0f} samples/s")
+        seconds, loss = time.perf_counter() - first, float(np.mean(losses))
+        entry = {"epoch": epoch + 1, "steps": len(losses), "loss": loss, "validation_loss": self._validate(network)}
+        entry |= {"learning_rate": rate, "samples_per_second": samples / seconds, "seconds": seconds}
         state["curve"].append(entry)
         state["seconds"] += time.perf_counter() - start
 
@@ -197,8 +200,9 @@ class Job:
         *window, truth = self._window(self.validation, targets[chosen])
         return network.loss(network(*window), truth).item()
 
-    def batches(self, epoch: int, steps: int) -> Sequence[Tensor]:
+    def batches(self, epoch: int) -> Sequence[Tensor]:
         """Return the targets of every batch of an epoch: all windows in random order, or the first of them."""
+        steps = math.ceil((self.config.windows_per_epoch or 2**62) / self.config.batch_size)
         targets = self.training.targets()
         generator = torch.Generator().manual_seed(_seed(self.config.seed, self.name, "order", epoch))
         order = torch.randperm(len(targets), generator=generator)
@@ -206,24 +210,6 @@ class Job:
 
     def _window(self, examples: Windows, targets: Tensor) -> list[Tensor]:
         return [part.to(self._device) for part in examples.window(self.name, targets)]
-
-    def _steps(self, network: Network, state: dict[str, Any]) -> int:
-        """Return the steps of the next epoch: every window once, or what `windows_per_epoch` or the time allow.
-
-        How long a step takes is tried out on a copy of the network.
-        """
-        config = self.config
-        steps = math.ceil(min(len(self.training.targets()), config.windows_per_epoch or 2**62) / config.batch_size)
-        if config.max_seconds is None:
-            return steps
-        trial, times = copy.deepcopy(network).train(), []
-        optimizer, targets = torch.optim.Adam(trial.parameters(), fused=True), self.batches(0, 1)[0]
-        for _ in range(_TIMED_STEPS):
-            start = time.perf_counter()
-            self.step(trial, optimizer, targets, 0.0)
-            times.append(time.perf_counter() - start)
-        left = (config.max_seconds - state["seconds"]) / (config.epochs - len(state["curve"])) - sum(times)
-        return max(min(steps, int(left / np.median(times))), 1)
 
     def _resume(self, network: Network, optimizer: torch.optim.Adam) -> dict[str, Any] | None:
         if not self._checkpoint.exists():

@@ -1,52 +1,50 @@
 """What logs teach beyond the simulator: by how much a real tip is beside where drive and rod core have it, `learn`.
 
 Kinematics lead the tip along the branch that the core takes (`replay`). What the real tip is off by, along the vessel
-and to its side, is on each axis the sum of three Gaussian processes and noise (kriging; Rasmussen & Williams 2006,
-chapters 2 and 5):
-
-* a map of the vessel, the same in all sessions; what the training sessions say of it has a covariance of its own;
-* what a session adds to it: another wire, or camera, drives there all day;
-* what an episode adds, which is forgotten as the wire slides and turns.
-
-Given tips, and the same log's episodes before, condition them. All scales follow from the likelihood of the logs.
-Whether the core's branch is the real one, and whether the tip jumps in a step, are logistic regressions.
+and to its side, is on each axis a Gaussian process (Rasmussen & Williams 2006, chapters 2 and 5): a map of the vessel,
+in part the same in all sessions and in part each session's own, since another wire drives there or another camera
+looks; what an episode adds, which is forgotten as the wire slides and turns; and noise. Tips of other sessions, of the
+same log's episodes before, and the given ones condition it. Its scales are the likeliest for the logs. Whether the
+core's branch is the real one, and whether the tip jumps in a step, are logistic regressions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
+from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
 from endopilot.errors import InputError
-from endopilot.files import reading, regular, writing
+from endopilot.files import regular, writing
 from endopilot.robot.kinematics import earns
 from endopilot.robot.replay import EpisodeReplay, Prepared
 from endopilot.types import VesselTree
 
-AXES = 2
-"""Along the vessel, and to its left as the camera sees it."""
 JUMP_MM = 0.57
 """A tip jumps that moves by so much more, or otherwise, than its drive in one step: six pixels of the public logs."""
-_PLACE_MM = 1.0
-"""Distance of the places of the map, mm: less than any length over which a tip's side changes in the public logs."""
-_FIRST = np.log([0.25, 2.0, 0.25, 10.0, 3.0, 0.12])
-_RANGES = np.log([[0.01, 2.0], [0.5, 20.0], [0.01, 2.0], [0.5, 100.0], [0.2, 100.0], [0.02, 1.0]])
-"""Where the search for `LearnedTip.scales` begins, mm and rad, and its widest values."""
-_SHARES = np.linspace(0.0, 0.9, 10)
-_EPISODES, _TIPS, _BEFORE = 10, 20, 200
-"""Episodes of a session and tips of each that scales are fitted to at most, and tips of the episodes before that
-condition a prediction, evenly chosen: for memory and time."""
+_ALONG_MM = 1.0
+"""Length over which the direction of a vessel is taken, mm: its line is drawn to a tenth of that."""
+_FIRST = np.array([0.2, 1.5, 0.6, 0.3, 10.0, 2.0, 0.1])
+_RANGES = np.array([[0.01, 2], [0.5, 20], [1e-3, 1], [0.01, 2], [0.5, 100], [0.1, 100], [0.02, 1]])
+"""Where the search for `LearnedTip.scales` begins, those of six public logs rounded, and its widest values."""
+_FITTED, _TAUGHT, _BEFORE, _GIVEN = 300, 400, 200, 50
+"""Tips that scales are fitted to at once, and that condition a prediction at most: of other sessions, of the episodes
+before, and given ones; evenly chosen, for time."""
+_JUDGED = 20
+"""Episodes of each session that spreads and regressions are fitted to at most."""
 _LEVEL, _NORMAL, _SURE = 0.9, 1.645, 0.95
 """Share of tips that stated spreads are to hold for, the normal distribution's quantile for it, and the level at which
 sessions must err less than without what was learned."""
 _RIDGE = 1.0
 """Penalty of the square of each weight of a logistic regression whose features have deviations of 1."""
+Rows = Float[np.ndarray, "n 7"]
+"""Tips: place x, y, z, mm; travel of the drive, mm, and turning, rad, since the first tip; session and episode."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +55,7 @@ class LoggedEpisode:
         session: name of its log.
         given: which tips are given; the others are predicted.
         at: where kinematics have the tip, on the centerline of the real branch and of the predicted one, LPS mm.
-        axes: unit vectors along and to the left there.
+        axes: unit vectors there along the vessel, and to its left as the camera sees it.
         apart: what the real tip is off by, on those axes, mm.
         travel: of the drive since the first tip, mm.
         turned: likewise, rad.
@@ -83,43 +81,41 @@ class LoggedEpisode:
         by = np.diff(self.apart[0], axis=0, prepend=self.apart[0, :1])
         return np.linalg.norm(by, axis=1) > JUMP_MM
 
+    def rows(self, session: int, number: int, *, predicted: bool = False) -> Rows:
+        """Return its tips, in the real branch or in the predicted one."""
+        of = np.broadcast_to([session, number], (len(self.given), 2))
+        return np.column_stack([self.at[int(predicted)], self.travel, self.turned, of])
+
 
 def logged(of: Prepared, replays: Sequence[EpisodeReplay]) -> list[LoggedEpisode]:
     """Return episodes beside their replays."""
-    found = []
-    turns = of.courses.followed(
-        1, at_s=of.courses.seen_s, latency_s=np.zeros(1), gain=np.ones(1), play=np.zeros(1)
-    )[0]  # fmt: skip
-    for k, (log, replay) in enumerate(zip(of.logs, replays, strict=True)):
-        count, ray = len(replay.given), np.array([0.0, 0.0, 1.0])
-        if log.camera is not None:
-            ray = log.camera.rays(log.pixel[log.seen])[1]
+    at_tips = {"at_s": of.courses.seen_s, "latency_s": np.zeros(1), "gain": np.ones(1), "play": np.zeros(1)}
+    turns, found = of.courses.followed(1, **at_tips)[0], []
+    for log, replay, turn in zip(of.logs, replays, turns, strict=True):
+        ray = np.array([0.0, 0.0, 1.0]) if log.camera is None else log.camera.rays(log.pixel[log.seen])[1]
         branches = replay.branch[:, 0], np.where(replay.given, *replay.branch.T)
         at, along = np.stack([_on_lines(of.anatomy.tree, replay.driven, each) for each in branches], axis=1)
         left = np.cross(ray, along)
         axes = np.stack([along, left / np.maximum(np.linalg.norm(left, axis=-1, keepdims=True), 1e-9)], axis=-2)
         apart = ((replay.seen - at)[:, :, None] * axes).sum(axis=-1)
-        travel, turned = (
-            np.cumsum(np.abs(np.diff(each, prepend=each[0]))) for each in (replay.driven, turns[k, :count])
-        )
+        steps = (np.abs(np.diff(each, prepend=each[0])) for each in (replay.driven, turn[: len(replay.given)]))
         right, core = replay.branch[:, 0] == replay.branch[:, 1], np.linalg.norm(replay.in_view, axis=1)
-        found.append(LoggedEpisode(log.name, replay.given, at, axes, apart, travel, turned, replay.sure, right, core))
+        ways = (np.cumsum(each) for each in steps)
+        found.append(LoggedEpisode(log.name, replay.given, at, axes, apart, *ways, replay.sure, right, core))
     return found
 
 
 def _on_lines(
     tree: VesselTree, abscissa: Float[np.ndarray, "tips"], branch: Float[np.ndarray, "tips"]
 ) -> tuple[Float[np.ndarray, "tips 3"], Float[np.ndarray, "tips 3"]]:
-    """Return points at abscissas on the lines to some branches, and unit vectors along them over `_PLACE_MM`."""
-    point, along = np.empty((len(branch), 3)), np.empty((len(branch), 3))
+    """Return points at abscissas on the lines to some branches, and unit vectors along them."""
+    found = np.empty((3, len(branch), 3))
     for one in np.unique(branch):
         line, here = tree.path(int(one)), branch == one
-        on = np.stack([np.interp(abscissa[here], line.abscissa, column) for column in line.points.T], axis=-1)
-        steps = abscissa[here, None] + np.array([-_PLACE_MM, _PLACE_MM])
-        steps = np.clip(steps, *line.abscissa[[0, -1]])
-        ends = np.stack([np.interp(steps, line.abscissa, column) for column in line.points.T], axis=-1)
-        point[here], along[here] = on, np.diff(ends, axis=1)[:, 0]
-    return point, along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+        places = np.clip(abscissa[here] + _ALONG_MM * np.arange(-1, 2)[:, None], *line.abscissa[[0, -1]])
+        found[:, here] = np.stack([np.interp(places, line.abscissa, column) for column in line.points.T], axis=-1)
+    along = found[2] - found[0]
+    return found[1], along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,37 +135,19 @@ class Learned:
     jump: Float[np.ndarray, "tips"]
 
 
-@dataclass(frozen=True, eq=False)
-class _Tips:
-    """Some tips, one after the other; `of` numbers their episodes."""
-
-    at: Float[np.ndarray, "n 3"]
-    travel: Float[np.ndarray, "n"]
-    turned: Float[np.ndarray, "n"]
-    of: Int[np.ndarray, "n"]
-    apart: Float[np.ndarray, "n axes"]
-
-    @staticmethod
-    def take(
-        episodes: Sequence[LoggedEpisode], rows: Sequence[Int[np.ndarray, "rows"]], *, predicted: bool = False
-    ) -> _Tips:
-        """Return rows of episodes, in the real branch or in the predicted one."""
-        pairs, k = list(zip(episodes, rows, strict=True)), int(predicted)
-        return _Tips(
-            np.concatenate([each.at[k, at] for each, at in pairs]),
-            np.concatenate([each.travel[at] for each, at in pairs]),
-            np.concatenate([each.turned[at] for each, at in pairs]),
-            np.repeat(np.arange(len(pairs)), [len(at) for _, at in pairs]),
-            np.concatenate([each.apart[k, at] for each, at in pairs]),
-        )
+def _alike(a: Float[np.ndarray, "a 7"], b: Float[np.ndarray, "b 7"]) -> Float[np.ndarray, "5 a b"]:
+    """Return squares of distances, differences of travel and turning, and whether session and episode are the same."""
+    apart = np.abs(a[:, None] - b)
+    return np.stack([(apart[..., :3] ** 2).sum(axis=-1), *np.moveaxis(apart[..., 3:5], -1, 0), *(
+        np.moveaxis(apart[..., 5:] == 0, -1, 0))])  # fmt: skip
 
 
-def _near(a: _Tips, b: _Tips, scales: Float[np.ndarray, "6"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return covariances of what places add, as shares of their variance, and of what episodes add, mm²."""
-    _, place_mm, episode_mm, travel_mm, turned_rad, _ = scales
-    far = ((a.at[:, None] - b.at) ** 2).sum(axis=-1)
-    since = np.abs(a.travel[:, None] - b.travel) / travel_mm + np.abs(a.turned[:, None] - b.turned) / turned_rad
-    return np.exp(-far / (2 * place_mm**2)), episode_mm**2 * (a.of[:, None] == b.of) * np.exp(-since)
+def _covariance(alike: Float[np.ndarray, "5 a b"], scales: Float[np.ndarray, "7"]) -> Float[np.ndarray, "a b"]:
+    """Return the covariance of what tips are off by, without noise, mm²."""
+    place_mm, length_mm, shared, episode_mm, travel_mm, turned_rad, _ = scales
+    far, travel, turned, session, episode = alike
+    place = place_mm**2 * np.exp(-far / (2 * length_mm**2)) * (shared + (1 - shared) * session)
+    return place + episode_mm**2 * episode * np.exp(-travel / travel_mm - turned / turned_rad)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,25 +157,22 @@ class LearnedTip:
     Attributes:
         sessions: that it was learned from.
         vessel: SHA-256 of the vessel.
-        scales: of each axis: deviation of what places add, and the length over which they are alike, mm; deviation of
-            what an episode adds, mm, travel, mm, and turning, rad, after which 1/e of it is left; noise, mm.
-        shared: of each axis, the share of the places' variance that all sessions have in common.
+        scales: of each axis: deviation of what places add, mm, the length over which they are alike, mm, and the share
+            of its variance that all sessions have in common; deviation of what an episode adds, mm, travel, mm, and
+            turning, rad, after which 1/e of it is left; noise, mm.
         spread: of each axis, by how much errors in sessions that were left out are larger than stated.
-        places: of the map, LPS mm.
-        mean: of each axis there, mm.
-        covariance: of each axis between places, mm².
-        branch: weights of the regression of the branch.
-        jump: weights of the regression of jumps.
+        rows: tips of the sessions.
+        apart: what these are off by, mm.
+        branch: regression of the branch: weights, means and deviations of its features.
+        jump: of jumps.
     """
 
     sessions: tuple[str, ...]
     vessel: str
-    scales: Float[np.ndarray, "axes 6"]
-    shared: Float[np.ndarray, "axes"]
+    scales: Float[np.ndarray, "axes 7"]
     spread: Float[np.ndarray, "axes"]
-    places: Float[np.ndarray, "places 3"]
-    mean: Float[np.ndarray, "axes places"]
-    covariance: Float[np.ndarray, "axes places places"]
+    rows: Rows
+    apart: Float[np.ndarray, "n axes"]
     branch: Float[np.ndarray, "features 3"]
     jump: Float[np.ndarray, "features 3"]
 
@@ -208,39 +183,30 @@ class LearnedTip:
             episode: its other tips are not read.
             before: episodes of the same log before it, with all of their tips.
         """
-        apart, sd = self._krige(episode, before)
-        right = _chance(self.branch, _branch_features(episode, before)[~episode.given])
-        return Learned(apart, sd * self.spread, right, _chance(self.jump, _jump_features(episode, apart)))
-
-    def _krige(
-        self, episode: LoggedEpisode, before: Sequence[LoggedEpisode]
-    ) -> tuple[Float[np.ndarray, "tips axes"], Float[np.ndarray, "tips axes"]]:
-        last = np.flatnonzero(episode.given)
-        each = max(1, _BEFORE // max(1, len(before)))
-        rows = [_evenly(len(one.given), each) for one in before]
-        known = _Tips.take([*before, episode], [*rows, last[_evenly(len(last), _BEFORE // 4)]])
-        wanted = _Tips.take([episode], [np.flatnonzero(~episode.given)], predicted=True)
-        wanted.of[:] = len(before)
-        there, here = (self._place(tips.at) for tips in (known, wanted))
-        made = np.empty((2, len(wanted.at), AXES))
+        given, own = episode.given, len(self.sessions)
+        parts = [(self.rows, self.apart)]
+        if before:
+            rows = np.concatenate([each.rows(own, -1 - k) for k, each in enumerate(before)])
+            chosen = _evenly(len(rows), _BEFORE)
+            parts.append((rows[chosen], np.concatenate([each.apart[0] for each in before])[chosen]))
+        chosen = np.flatnonzero(given)[_evenly(int(given.sum()), _GIVEN)]
+        parts.append((episode.rows(own, -1 - len(before))[chosen], episode.apart[0, chosen]))
+        known, y = (np.concatenate(each) for each in zip(*parts, strict=True))
+        wanted = episode.rows(own, -1 - len(before), predicted=True)[~given]
+        inner, outer, made = _alike(known, known), _alike(wanted, known), []
         for k, scales in enumerate(self.scales):
-            own, noise = (1 - self.shared[k]) * scales[0] ** 2, scales[-1] ** 2
-            inner, outer = (_near(a, known, scales) for a in (known, wanted))
-            inner = self.covariance[k][np.ix_(there, there)] + own * inner[0] + inner[1]
-            outer = self.covariance[k][np.ix_(here, there)] + own * outer[0] + outer[1]
-            factor = cho_factor(inner + noise * np.eye(len(inner)))
-            made[0, :, k] = self.mean[k, here] + outer @ cho_solve(factor, known.apart[:, k] - self.mean[k, there])
-            prior = np.diag(self.covariance[k])[here] + own + scales[2] ** 2 + noise
-            made[1, :, k] = np.sqrt(np.maximum(prior - (outer * cho_solve(factor, outer.T).T).sum(axis=1), noise))
-        return made[0], made[1]
-
-    def _place(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
-        return ((points[:, None] - self.places) ** 2).sum(axis=-1).argmin(axis=1)
+            noise, cross = scales[-1] ** 2, _covariance(outer, scales)
+            factor = cho_factor(_covariance(inner, scales) + noise * np.eye(len(known)))
+            left = scales[0] ** 2 + scales[3] ** 2 - (cross * cho_solve(factor, cross.T).T).sum(axis=1)
+            made.append((cross @ cho_solve(factor, y[:, k]), np.sqrt(np.maximum(left, 0.0) + noise) * self.spread[k]))
+        apart, sd = np.moveaxis(np.array(made), 0, -1)
+        right = _chance(self.branch, _branch_features(episode, before)[~given])
+        return Learned(apart, sd, right, _chance(self.jump, _jump_features(episode)[~given]))
 
     def write(self, path: Path) -> None:
         """Write a file, whole or not at all."""
         with writing(path) as partial, partial.open("wb") as stream:
-            np.savez_compressed(stream, **{each.name: getattr(self, each.name) for each in fields(self)})  # pyright: ignore[reportArgumentType]
+            np.savez_compressed(stream, **vars(self))  # pyright: ignore[reportArgumentType]
 
 
 def read_learned(path: Path) -> LearnedTip:
@@ -252,187 +218,72 @@ def read_learned(path: Path) -> LearnedTip:
     mend = "make it again with `endopilot train --logs`"
     if not regular(path).exists():
         raise InputError(f"{path}: no such file; {mend}")
-    with reading(path, mend), np.load(path, allow_pickle=False) as file:
-        arrays = {each.name: file[each.name] for each in fields(LearnedTip)}
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {each.name: file[each.name] for each in fields(LearnedTip)}
+    except (BadZipFile, KeyError, ValueError, OSError, EOFError) as error:
+        raise InputError(f"{path}: damaged, or not what was learned from logs ({error}); {mend}") from error
     return LearnedTip(**arrays | {"sessions": tuple(arrays["sessions"].tolist()), "vessel": str(arrays["vessel"])})
 
 
-def _evenly(count: int, most: int) -> Int[np.ndarray, "rows"]:
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
-
-
-def learn(episodes: Sequence[LoggedEpisode], tree: VesselTree, vessel: str) -> LearnedTip:
+def learn(episodes: Sequence[LoggedEpisode], vessel: str) -> LearnedTip:
     """Learn from episodes of some sessions in one vessel.
 
     Spreads, and both regressions, are fitted to what the others say of each session.
 
     Args:
         episodes: in the order of each log.
-        tree: the vessel.
         vessel: its SHA-256.
     """
-    by_session = {name: [each for each in episodes if each.session == name] for name in _names(episodes)}
-    scales = np.stack([_scales(list(by_session.values()), axis) for axis in range(AXES)])
-    lines = [
-        _evenly(len(b.centerline.points), int(np.ptp(b.centerline.abscissa) / _PLACE_MM) + 2) for b in tree.branches
-    ]
-    places = np.concatenate([b.centerline.points[rows] for b, rows in zip(tree.branches, lines, strict=True)])
-    nothing = np.zeros((3, 3))
-
-    def of(names: Sequence[str]) -> LearnedTip:
-        parts = [_map([by_session[name] for name in names], places, scales[k], k) for k in range(AXES)]
-        shared, mean, covariance = (np.stack(each) for each in zip(*parts, strict=True))
-        return LearnedTip(
-            tuple(names), vessel, scales, shared, np.ones(AXES), places, mean, covariance, nothing, nothing
-        )
-
+    names = _names(episodes)
+    rows = [each.rows(names.index(each.session), k) for k, each in enumerate(episodes)]
+    tips, apart = np.concatenate(rows), np.concatenate([each.apart[0] for each in episodes])
+    of = [np.flatnonzero(tips[:, 5] == k) for k in range(len(names))]
+    taught = np.concatenate([each[_evenly(len(each), _TAUGHT // len(names))] for each in of])
+    scales, nothing = np.stack([_scales(tips, apart[:, k]) for k in (0, 1)]), np.zeros((3, 3))
+    made = LearnedTip(tuple(names), vessel, scales, np.ones(2), tips[taught], apart[taught], nothing, nothing)
     z, branches, jumps = [], [], []
-    for name, own in by_session.items():
-        model = of([other for other in by_session if other != name])
-        for k in _evenly(len(own), 2 * _EPISODES):
-            episode, rest = own[k], ~own[k].given
-            apart, sd = model._krige(episode, own[:k])
-            z.append(np.abs(apart - episode.apart[1, rest])[episode.right[rest]] / sd[episode.right[rest]])
-            branches.append((_branch_features(episode, own[:k])[rest], episode.right[rest]))
-            jumps.append((_jump_features(episode, apart), episode.jumps[rest]))
-    spread = np.quantile(np.concatenate(z), _LEVEL, axis=0) / _NORMAL
-    branch, jump = (_logistic(*map(np.concatenate, zip(*pairs, strict=True))) for pairs in (branches, jumps))
-    return replace(of(list(by_session)), spread=spread, branch=branch, jump=jump)
-
-
-def left_out(episodes: Sequence[LoggedEpisode], tree: VesselTree, vessel: str, sessions: int) -> dict[str, LearnedTip]:
-    """Return what so many other sessions teach of each: those that follow it, in a circle."""
-    names, found = _names(episodes), {}
     for k, name in enumerate(names):
-        others = [names[(k + 1 + j) % len(names)] for j in range(sessions)]
-        found[name] = learn([each for each in episodes if each.session in others], tree, vessel)
-    return found
+        other, own = made.rows[:, 5] != k, [each for each in episodes if each.session == name]
+        model = replace(made, rows=made.rows[other], apart=made.apart[other])
+        for j in _evenly(len(own), _JUDGED):
+            each, rest, said = own[j], ~own[j].given, model.predict(own[j], own[:j])
+            z.append((np.abs(said.apart - each.apart[1, rest]) / said.sd)[each.right[rest]])
+            branches.append((_branch_features(each, own[:j])[rest], each.right[rest]))
+            jumps.append((_jump_features(each)[rest], each.jumps[rest]))
+    spread = np.quantile(np.concatenate([*z, np.full((1, 2), _NORMAL)]), _LEVEL, axis=0) / _NORMAL
+    branch, jump = (_logistic(*map(np.concatenate, zip(*pairs, strict=True))) for pairs in (branches, jumps))
+    return replace(made, spread=spread, branch=branch, jump=jump)
 
 
-def predicted(
-    models: Mapping[str, LearnedTip], episodes: Sequence[LoggedEpisode], *, before: bool = True
-) -> list[Learned]:
-    """Return what each session's model says of its episodes, in the order of each log.
+def _scales(tips: Rows, apart: Float[np.ndarray, "n"]) -> Float[np.ndarray, "7"]:
+    """Return the likeliest scales of one axis: of tips of some episodes of all sessions, and of others."""
+    some = []
+    for first in (0, 1):
+        episodes = np.unique(tips[:, 6])[first::2]
+        chosen = np.isin(tips[:, 6], episodes[_evenly(len(episodes), _FITTED // 20)]).nonzero()[0]
+        chosen = chosen[_evenly(len(chosen), _FITTED)]
+        some += [(_alike(tips[chosen], tips[chosen]), apart[chosen])] if len(chosen) else []
 
-    Args:
-        models: by session.
-        episodes: what is predicted.
-        before: whether the same log's episodes before are known.
-    """
-    past: dict[str, list[LoggedEpisode]] = {name: [] for name in models}
-    found = []
-    for each in episodes:
-        found.append(models[each.session].predict(each, past[each.session] if before else ()))
-        past[each.session].append(each)
-    return found
+    def cost(logs: Float[np.ndarray, "7"]) -> float:
+        total = 0.0
+        for alike, y in some:
+            factor = cho_factor(_covariance(alike, np.exp(logs)) + np.exp(2 * logs[-1]) * np.eye(len(y)))
+            total += np.log(np.diag(factor[0])).sum() + 0.5 * y @ cho_solve(factor, y)
+        return float(total)
 
-
-def judged(
-    episodes: Sequence[LoggedEpisode], tree: VesselTree, vessel: str
-) -> list[dict[str, float | int | bool | None]]:
-    """Return `figures` of sessions that were left out, by how many others teach: 1, 2, 4 and all."""
-    most = len(_names(episodes)) - 1
-    rows = []
-    for count in [*(k for k in (1, 2, 4) if k < most), *([most] if most else [])]:
-        said = predicted(left_out(episodes, tree, vessel, count), episodes)
-        rows.append({"sessions": count} | figures(episodes, said))
-    return rows
-
-
-def figures(episodes: Sequence[LoggedEpisode], learned: Sequence[Learned]) -> dict[str, float | int | bool | None]:
-    """Return medians over episodes of errors in what was not given, and how well the stated uncertainty holds.
-
-    `gain` says whether sessions err less than by the better of kinematics, on the real branch, and the core, at 95 %.
-    """
-    pairs = [(each, ~each.given, said) for each, said in zip(episodes, learned, strict=True)]
-    errors = {
-        "kinematics": [np.median(np.linalg.norm(each.apart[0, rest], axis=1)) for each, rest, _ in pairs],
-        "core": [np.median(each.core[rest]) for each, rest, _ in pairs],
-        "learned": [np.median(np.linalg.norm(each.apart[1, rest] - said.apart, axis=1)) for each, rest, said in pairs],
-    }
-    found: dict[str, float | int | bool | None] = {
-        f"in_plane_of_{name}_mm": float(np.median(each)) for name, each in errors.items()
-    }
-    within = [
-        (np.abs(each.apart[1, rest] - said.apart) <= _NORMAL * said.sd)[each.right[rest]] for each, rest, said in pairs
-    ]
-    unit = np.unique([each.session for each in episodes], return_inverse=True)[1]
-    by_session = {name: np.bincount(unit, each) / np.bincount(unit) for name, each in errors.items()}
-    best = min(("kinematics", "core"), key=lambda name: float(np.median(errors[name])))
-    jumps, ends = np.concatenate([each.jumps[rest] for each, rest, _ in pairs]), [each.right[-1] for each in episodes]
-    return found | {
-        "gain": earns(by_session[best], by_session["learned"], _SURE) if len(by_session[best]) > 1 else None,
-        "bands_of_90_percent_hold_share": float(np.concatenate(within).mean()),
-        "jumps": int(jumps.sum()),
-        "jumps_expected": float(sum(said.jump.sum() for _, _, said in pairs)),
-        "jump_skill": skill(np.concatenate([said.jump for _, _, said in pairs]), jumps),
-        "ends_in_the_real_branch_share": float(np.mean(ends)),
-        "ends_expected_share": float(np.mean([said.right[-1] for _, _, said in pairs])),
-        "branch_skill": skill(np.array([said.right[-1] for _, _, said in pairs]), np.array(ends)),
-    }
-
-
-def skill(chance: Float[np.ndarray, "n"], truth: Bool[np.ndarray, "n"]) -> float:
-    """Return by what share the Brier score is better than that of the frequency alone."""
-    return float(1 - ((chance - truth) ** 2).mean() / max(float(truth.var()), 1e-9))
+    found = minimize(
+        cost, np.log(_FIRST), method="L-BFGS-B", bounds=np.log(_RANGES).tolist(), options={"maxiter": 12, "eps": 1e-3}
+    )
+    return np.exp(found.x)
 
 
 def _names(episodes: Sequence[LoggedEpisode]) -> list[str]:
     return list(dict.fromkeys(each.session for each in episodes))
 
 
-def _scales(sessions: Sequence[Sequence[LoggedEpisode]], axis: int) -> Float[np.ndarray, "6"]:
-    """Return the likeliest scales of one axis, each session by itself, places shared or not."""
-    some = []
-    for session in sessions:
-        chosen = [session[k] for k in _evenly(len(session), _EPISODES)]
-        some.append(_Tips.take(chosen, [_evenly(len(each.given), _TIPS) for each in chosen]))
-
-    def cost(logs: Float[np.ndarray, "6"]) -> float:
-        scales, total = np.exp(logs), 0.0
-        for tips in some:
-            places, own = _near(tips, tips, scales)
-            noise = scales[-1] ** 2 * np.eye(len(places))
-            factor = cholesky(scales[0] ** 2 * places + own + noise, lower=True, check_finite=False)
-            white = solve_triangular(factor, tips.apart[:, axis], lower=True, check_finite=False)
-            total += np.log(np.diag(factor)).sum() + 0.5 * (white**2).sum()
-        return float(total)
-
-    found = minimize(cost, _FIRST, method="L-BFGS-B", bounds=_RANGES.tolist(), options={"maxiter": 12, "eps": 1e-3})
-    return np.exp(found.x)
-
-
-def _map(
-    sessions: Sequence[Sequence[LoggedEpisode]],
-    places: Float[np.ndarray, "places 3"],
-    scales: Float[np.ndarray, "6"],
-    axis: int,
-) -> tuple[float, Float[np.ndarray, "places"], Float[np.ndarray, "places places"]]:
-    """Return the shared part of what places add, and what sessions say of it: its mean and covariance at places.
-
-    Of each session the mean over its episodes at a place counts, which is as sure as these are many.
-    """
-    at, of, mean, noise = [], [], [], []
-    for k, session in enumerate(sessions):
-        nearest = [((e.at[0][:, None] - places) ** 2).sum(axis=-1).argmin(axis=1) for e in session]
-        for place in np.unique(np.concatenate(nearest)):
-            own = [e.apart[0, n == place, axis] for e, n in zip(session, nearest, strict=True) if (n == place).any()]
-            at.append(place)
-            of.append(k)
-            mean.append(np.mean([each.mean() for each in own]))
-            noise.append(np.mean([scales[2] ** 2 + scales[-1] ** 2 / len(each) for each in own]) / len(own))
-    alike = np.exp(-((places[:, None] - places) ** 2).sum(axis=-1) / (2 * scales[1] ** 2))
-    between, session, y = alike[np.ix_(at, at)], np.array(of), np.array(mean)
-    best, chosen = np.inf, (0.0, np.zeros(len(places)), np.zeros_like(alike))
-    for share in _SHARES if len(at) else ():
-        whole = scales[0] ** 2 * (share + (1 - share) * (session[:, None] == session)) * between + np.diag(noise)
-        factor = cho_factor(whole, lower=True)
-        cost = np.log(np.diag(factor[0])).sum() + 0.5 * y @ cho_solve(factor, y)
-        if cost < best:
-            outer = share * scales[0] ** 2 * alike[:, at]
-            covariance = share * scales[0] ** 2 * alike - outer @ cho_solve(factor, outer.T)
-            best, chosen = cost, (float(share), outer @ cho_solve(factor, y), covariance)
-    return chosen
+def _evenly(count: int, most: int) -> Int[np.ndarray, "rows"]:
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
 def _branch_features(episode: LoggedEpisode, before: Sequence[LoggedEpisode]) -> Float[np.ndarray, "tips 2"]:
@@ -443,9 +294,9 @@ def _branch_features(episode: LoggedEpisode, before: Sequence[LoggedEpisode]) ->
     return np.column_stack([np.log(sure / (1 - sure)), np.full(len(sure), past)])
 
 
-def _jump_features(episode: LoggedEpisode, apart: Float[np.ndarray, "tips axes"]) -> Float[np.ndarray, "tips 2"]:
-    """Return logarithms of travel and turning in the step to each tip that is predicted."""
-    steps = [np.diff(each, prepend=each[0])[~episode.given] for each in (episode.travel, episode.turned)]
+def _jump_features(episode: LoggedEpisode) -> Float[np.ndarray, "tips 2"]:
+    """Return logarithms of travel and turning in the step to each tip, above 0.03 mm and rad."""
+    steps = [np.diff(each, prepend=each[0]) for each in (episode.travel, episode.turned)]
     return np.log(np.column_stack(steps) + 0.03)
 
 
@@ -456,11 +307,61 @@ def _logistic(features: Float[np.ndarray, "n k"], truth: Bool[np.ndarray, "n"]) 
     weight, penalty = np.zeros(x.shape[1]), _RIDGE * np.eye(x.shape[1])
     for _ in range(30):
         chance = 1 / (1 + np.exp(-x @ weight))
-        hessian = (x.T * (chance * (1 - chance))) @ x + penalty
-        weight -= np.linalg.solve(hessian, x.T @ (chance - truth) + penalty @ weight)
+        weight -= np.linalg.solve(
+            (x.T * (chance * (1 - chance))) @ x + penalty, x.T @ (chance - truth) + penalty @ weight
+        )
     return np.column_stack([weight, np.append(0.0, middle), np.append(1.0, deviation)])
 
 
 def _chance(regression: Float[np.ndarray, "features 3"], features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n"]:
     weight, middle, deviation = regression.T
-    return 1 / (1 + np.exp(-(weight[0] + ((features - middle[1:]) / deviation[1:]) @ weight[1:])))
+    return 1 / (1 + np.exp(-(weight[0] + ((features - middle[1:]) / np.maximum(deviation[1:], 1e-6)) @ weight[1:])))
+
+
+def left_out(episodes: Sequence[LoggedEpisode], vessel: str, *, sessions: int, before: bool = True) -> list[Learned]:
+    """Return what is predicted of each episode, in the order of each log, by what other sessions teach.
+
+    Args:
+        episodes: of all sessions.
+        vessel: its SHA-256.
+        sessions: how many teach: those that follow the one left out, in a circle.
+        before: whether the same log's episodes before are known.
+    """
+    names, found = _names(episodes), []
+    for k, name in enumerate(names):
+        others = [names[(k + 1 + j) % len(names)] for j in range(sessions)]
+        model = learn([each for each in episodes if each.session in others], vessel)
+        own = [each for each in episodes if each.session == name]
+        found += [model.predict(each, own[:j] if before else ()) for j, each in enumerate(own)]
+    return found
+
+
+def figures(episodes: Sequence[LoggedEpisode], learned: Sequence[Learned]) -> dict[str, float | int | bool | None]:
+    """Return medians over episodes of errors in what was not given, and how well the stated uncertainty holds.
+
+    `gain` says whether sessions err less than by the better of kinematics, on the real branch, and the core, at 95 %;
+    a skill is by what share the Brier score of probabilities is better than that of the frequency alone.
+    """
+    pairs = [(each, ~each.given, said) for each, said in zip(episodes, learned, strict=True)]
+    errors = {
+        "kinematics": [np.median(np.linalg.norm(each.apart[0, rest], axis=1)) for each, rest, _ in pairs],
+        "core": [np.median(each.core[rest]) for each, rest, _ in pairs],
+        "learned": [np.median(np.linalg.norm(each.apart[1, rest] - said.apart, axis=1)) for each, rest, said in pairs],
+    }
+    unit = np.unique([each.session for each in episodes], return_inverse=True)[1]
+    by_session = {name: np.bincount(unit, each) / np.bincount(unit) for name, each in errors.items()}
+    best = min(("kinematics", "core"), key=lambda name: float(np.median(errors[name])))
+    within = [
+        (np.abs(each.apart[1, rest] - said.apart) <= _NORMAL * said.sd)[each.right[rest]] for each, rest, said in pairs
+    ]
+    found: dict[str, float | int | bool | None] = {
+        f"in_plane_of_{name}_mm": float(np.median(each)) for name, each in errors.items()
+    }
+    found["gain"] = earns(by_session[best], by_session["learned"], _SURE) if unit.any() else None
+    found["bands_of_90_percent_hold_share"] = float(np.concatenate(within).mean())
+    jumps, jump = (np.concatenate(each) for each in zip(*((e.jumps[r], s.jump) for e, r, s in pairs), strict=True))
+    ends, end = np.array([(each.right[-1], said.right[-1]) for each, _, said in pairs]).T
+    for name, real, said in (("jumps", jumps, jump), ("real_branch_ends", ends, end)):
+        found |= {name: int(real.sum()), f"{name}_expected": float(said.sum())}
+        found[f"{name}_skill"] = float(1 - ((said - real) ** 2).mean() / max(float(real.var()), 1e-9))
+    return found
