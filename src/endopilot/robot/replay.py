@@ -220,7 +220,8 @@ def replay_prepared(
     best = _simulated(of, device, times, course, depth, angles[rows, first][:, None], simulator)
     sure = np.einsum("ew,ewt->et", likely, tried.branch == best.branch)
     return [
-        _episode(of, k, best, sure[k], driven[k], (float(angles[k, first[k]]), known[k]), times[k, 1:]) for k in rows
+        _episode(of, k, best, sure[k], driven[k], (float(angles[k, first[k]]), known[k]), times[k, 1:])
+        for k in range(len(rows))
     ]
 
 
