@@ -112,7 +112,9 @@ def _on_lines(
     found = np.empty((3, len(branch), 3))
     for one in np.unique(branch):
         line, here = tree.path(int(one)), branch == one
-        places = np.clip(abscissa[here] + _ALONG_MM * np.arange(-1, 2)[:, None], *line.abscissa[[0, -1]])
+        ends = line.abscissa[[0, -1]]
+        middle = np.clip(abscissa[here], ends[0] + _ALONG_MM, ends[1] - _ALONG_MM)  # a line has a direction to its ends
+        places = np.stack([middle - _ALONG_MM, np.clip(abscissa[here], *ends), middle + _ALONG_MM])
         found[:, here] = np.stack([np.interp(places, line.abscissa, column) for column in line.points.T], axis=-1)
     along = found[2] - found[0]
     return found[1], along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
