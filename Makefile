@@ -90,12 +90,11 @@ recipe-laptop: $(INSTALLED)
 FULL := runs/full
 FULL_PATIENTS := 100
 FULL_SEQUENCES := 1000
-FULL_PROCESSES := gpu
 FULL_TRAINING :=
 recipe-gpu: $(INSTALLED)
 	$(BIN)/endopilot atlas --count $(FULL_PATIENTS) --seed 52 -o $(FULL)/patients
 	$(BIN)/endopilot dataset $(FULL)/patients/* -o $(FULL)/dataset --sequences $(FULL_SEQUENCES) --seed 52
-	$(BIN)/torchrun --nproc-per-node $(FULL_PROCESSES) -m endopilot.cli train $(FULL)/dataset -o $(FULL)/paper \
+	$(BIN)/endopilot train $(FULL)/dataset -o $(FULL)/paper \
 	  --precision bfloat16 --batch-size 4096 $(FULL_TRAINING)
 	$(BIN)/endopilot evaluate $(FULL)/paper -o $(FULL)/evaluation-paper --sequences 96
 

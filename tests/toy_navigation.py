@@ -169,7 +169,7 @@ def make_untrained_run(dataset_folder, run_folder):
     """Write a run whose networks are their simple guesses: slack and offset stay; the drive moves as the tip is to."""
     from endopilot.models.checkpoint import write_network
     from endopilot.models.config import TransformerConfig
-    from endopilot.models.transformer import NETWORKS
+    from endopilot.models.paper import NETWORKS
 
     size = TransformerConfig(d_model=24, encoder_layers=1, decoder_layers=1)
     for name, network in NETWORKS.items():

@@ -1,4 +1,4 @@
-"""Predict each session of a real robot's logs by a calibration on all others, beside simpler models.
+"""Predict each session of a real robot's logs by what all others teach, beside simpler models.
 
     python examples/robot_phantom_logs.py FOLDER LOGS
     endopilot anatomy FOLDER/phantom2d-occupancy-dev-0.095mm-px.vtp --scale 1 -o PHANTOM
@@ -18,14 +18,17 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from benchmarks.figures import fill
+from benchmarks.robot.paper_pair import States, predict_left_out
 from benchmarks.robot.twist import Sides, correlation, passages
 from endopilot.anatomy.io import read_anatomy
 from endopilot.devices.device import Wire, read_wire
 from endopilot.devices.robot import RobotConfig, read_robot
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
+from endopilot.files import input_hash
 from endopilot.robot.calibrate import bands, worst
 from endopilot.robot.kinematics import NAMES, Tracks, fit_drive, led
+from endopilot.robot.learned import Learned, LoggedEpisode, figures, left_out, logged
 from endopilot.robot.log import RobotLog, read_log
 from endopilot.robot.replay import EpisodeReplay, Prepared, ReplayConfig, prepare, replay_prepared, usable_episodes
 from endopilot.types import Anatomy
@@ -33,7 +36,15 @@ from endopilot.types import Anatomy
 REVERSES_MM, TURNS_RAD = 1.0, np.pi
 """A half counts as one that reverses where the drive goes so far both ways, and as one that turns where it turns so
 far."""
-MODELS = ("an offset", "play alone", "kinematics", "rod core")
+MODELS = (
+    "an offset",
+    "play alone",
+    "kinematics",
+    "rod core",
+    "the paper's pair",
+    "learned, given half alone",
+    "learned",
+)
 _RESAMPLES = 2000
 
 
@@ -49,6 +60,8 @@ class LeftOut:
             the real branch.
         reverses: whether the drive reverses in that half.
         turns: whether it turns.
+        beside: the episode beside its replay.
+        states: of it, as the paper's pair takes them.
     """
 
     log: RobotLog
@@ -57,6 +70,8 @@ class LeftOut:
     in_plane: dict[str, Float[np.ndarray, "tips"]]
     reverses: bool
     turns: bool
+    beside: LoggedEpisode
+    states: States
 
 
 def calibrated(logs: Sequence[RobotLog], anatomy: Anatomy, known: RobotConfig, episodes: int) -> RobotConfig:
@@ -82,8 +97,10 @@ def predicted(of: Prepared, robot: RobotConfig, wire: Wire) -> list[LeftOut]:
     }
     tracks = Tracks(of.courses, np.where(of.given, of.abscissa, np.nan))
     simple = {name: led(tracks, each)[0] for name, each in robots.items()}
+    at_tips = {"at_s": of.courses.seen_s, "latency_s": np.zeros(1), "gain": np.ones(1), "play": np.zeros(1)}
+    drives = np.stack([of.courses.followed(axis, **at_tips)[0] for axis in (0, 1)], axis=-1)
     found = []
-    for k, (log, replay) in enumerate(zip(of.logs, replays, strict=True)):
+    for k, (log, replay, beside) in enumerate(zip(of.logs, replays, logged(of, replays), strict=True)):
         rest, count = ~replay.given, len(replay.given)
         lines = {branch: of.anatomy.tree.path(int(branch)) for branch in np.unique(replay.branch[:, 0])}
         along = {name: np.abs(replay.abscissa[:, 0] - each[k, :count])[rest] for name, each in simple.items()}
@@ -102,7 +119,10 @@ def predicted(of: Prepared, robot: RobotConfig, wire: Wire) -> list[LeftOut]:
         back = [(np.maximum.accumulate(drive[:, 0]) - drive[:, 0]).max(initial=0.0)]
         turned = float(np.ptp(drive[:, 1])) if len(drive) else 0.0
         reverses = min(there[0], back[0]) > REVERSES_MM
-        found.append(LeftOut(log, replay, along, in_plane, bool(reverses), turned > TURNS_RAD))
+        place = drives[k, :count] + [replay.abscissa[0, 0] - drives[k, 0, 0], log.command[log.commanded, 0, 1][0]]
+        tip = np.column_stack([replay.abscissa[:, 0], beside.apart[0, :, 1]])
+        states = States(log.name, tip, place, int(replay.given.sum()))
+        found.append(LeftOut(log, replay, along, in_plane, bool(reverses), turned > TURNS_RAD, beside, states))
     return found
 
 
@@ -114,9 +134,10 @@ def bench_left_out(
     device: str = "workhorse-014",
     episodes: int = 96,
     sessions: tuple[str, ...] = ("2D",),
+    epochs: int = 1,
     write: bool = False,
 ) -> list[dict[str, Any]]:
-    """Predict each session by a calibration on all others, beside an offset, play alone and kinematics alone.
+    """Predict each session by what all others teach, beside an offset, play alone and kinematics alone.
 
     Args:
         logs: folder of logs.
@@ -125,7 +146,8 @@ def bench_left_out(
         device: the wire, as it is shipped.
         episodes: that each calibration is fitted to at most.
         sessions: parts of the names of the logs to take.
-        write: write the table of docs/evidence/reality.md.
+        epochs: that the paper's forward network is trained for.
+        write: write the tables of docs/evidence/reality.md.
 
     Returns:
         A row for each session and model, and for all sessions.
@@ -139,6 +161,7 @@ def bench_left_out(
     for log in read:
         found = calibrated([each for each in read if each is not log], patient, known, episodes)
         of[log.name] = predicted(prepare(usable_episodes([log], patient), patient, 0.5, known), found, wire)
+    curve = _taught([one for each in of.values() for one in each], patient, input_hash(anatomy)[anatomy.name], epochs)
     tables = []
     for name, each in of.items():
         others = [(one, other) for other, some in of.items() if other != name for one in some]
@@ -149,12 +172,50 @@ def bench_left_out(
     tables.append(("all", np.concatenate([held for _, held, _ in tables]), _figures(everything, patient)))
     if write:
         fill("evidence/reality.md", "left-out", _table(tables))
+        fill("evidence/reality.md", "learned", _curve(curve))
     return [
         {"session": name, "model": model} | {key: cells[model] for key, cells in figures["errors"].items()}
         | {"band_holds": f"{held.mean():.2f} of {len(held)}"} | figures["of_the_core"]
         for name, held, figures in tables
         for model in MODELS
     ]  # fmt: skip
+
+
+def _taught(of: Sequence[LeftOut], anatomy: Anatomy, vessel: str, epochs: int) -> dict[str, dict[str, Any]]:
+    """Add what other sessions teach to episodes; return its figures by how many sessions teach, and what is known."""
+    for one, made in zip(of, predict_left_out([each.states for each in of], epochs=epochs), strict=True):
+        off = (made - one.states.tip)[~one.replay.given]
+        one.along["the paper's pair"], one.in_plane["the paper's pair"] = np.abs(off[:, 0]), np.linalg.norm(off, axis=1)
+    beside, found = [each.beside for each in of], {}
+    count = len({each.log.name for each in of}) - 1
+    for name, number, before in [
+        *((f"{k} of them", k, True) for k in (1, 2, 4) if k < count),
+        ("learned", count, True),
+        ("learned, given half alone", count, False),
+    ]:
+        made = left_out(beside, vessel, sessions=number, before=before)
+        found[name] = figures(beside, made) | {"side_r": _side_r(of, made, anatomy)}
+        for one, learned in zip(of, made, strict=True):
+            rest, driven = ~one.replay.given, one.replay.driven[~one.replay.given]
+            one.along[name] = np.abs(one.replay.abscissa[rest, 0] - driven - learned.apart[:, 0])
+            one.in_plane[name] = np.linalg.norm(one.beside.apart[1, rest] - learned.apart, axis=1)
+    return found
+
+
+def _side_r(of: Sequence[LeftOut], made: Sequence[Learned], anatomy: Anatomy) -> str:
+    """Return the correlation of the learned tip's side with the real one's, where both are in the same branch."""
+    pairs = []
+    for one, learned in zip(of, made, strict=True):
+        rest, right = ~one.replay.given, one.beside.right[~one.replay.given]
+        tip = one.beside.at[1, rest] + (learned.apart[..., None] * one.beside.axes[1, rest]).sum(axis=1)
+        if right.any():
+            side = Sides(anatomy, _ray(one.log))
+            pairs.append((side(one.replay.seen[rest][right]), side(tip[right])))
+    return "{:.2f} [{:.2f}, {:.2f}]".format(*correlation(pairs))
+
+
+def _ray(log: RobotLog) -> Float[np.ndarray, "3"]:
+    return log.camera.rays(np.zeros((1, 2)))[1][0] if log.camera else np.array([0.0, 0.0, 1.0])
 
 
 def _largest(of: Sequence[LeftOut]) -> Float[np.ndarray, "episodes"]:
@@ -180,8 +241,10 @@ def _figures(of: Sequence[LeftOut], anatomy: Anatomy) -> dict[str, Any]:
     ends = [each.replay.branch[-1, 0] == each.replay.branch[-1, 1] for each in of]
     pairs = []
     for each in of:
-        ray = each.log.camera.rays(np.zeros((1, 2)))[1][0] if each.log.camera else np.array([0.0, 0.0, 1.0])
-        side, used = Sides(anatomy, ray), ~each.replay.given & (each.replay.branch[:, 0] == each.replay.branch[:, 1])
+        side, used = (
+            Sides(anatomy, _ray(each.log)),
+            ~each.replay.given & (each.replay.branch[:, 0] == each.replay.branch[:, 1]),
+        )
         if used.any():
             pairs.append((side(each.replay.seen[used]), side(each.replay.simulated[used])))
     r, low, high = correlation(pairs) if pairs else (np.nan,) * 3
@@ -219,4 +282,22 @@ def _table(tables: list[tuple[str, Bool[np.ndarray, "episodes"], dict[str, Any]]
         f"| episodes that end in the real branch, rod core | | {core['ends_in_it']} of {len(held)} |",
         f"| side of the tip, correlation, rod core | | {core['side_r']} |",
     ]
+    return lines
+
+
+def _curve(of: dict[str, dict[str, Any]]) -> list[str]:
+    """Return what is learned by how many sessions teach, a row for each."""
+    lines = [
+        "| taught by | in the plane, mm | side of the tip, r | bands of 90 % hold, of tips | "
+        "jumps expected; real; skill | ends in the real branch expected; did; skill |",
+        "|---" * 6 + "|",
+    ]
+    for name, row in of.items():
+        title = name.replace("learned", "all others")
+        lines.append(
+            f"| {title} | {row['in_plane_of_learned_mm']:.2f} | {row['side_r']} | "
+            f"{row['bands_of_90_percent_hold_share']:.2f} | {row['jumps_expected']:.0f}; {row['jumps']}; "
+            f"{row['jumps_skill']:.2f} | {row['real_branch_ends_expected']:.0f}; {row['real_branch_ends']}; "
+            f"{row['real_branch_ends_skill']:.2f} |"
+        )
     return lines

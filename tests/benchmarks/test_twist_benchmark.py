@@ -118,6 +118,7 @@ def test_a_fork_is_passed_once_and_the_branch_compared(fork: Anatomy) -> None:
             in_view=tips,
             along=tips,
             branch=np.column_stack([real, simulated]).astype(float),
+            sure=np.ones(5),
             force=np.zeros((0, 2)),
             rotation_rad=0.0,
             rotation_known_rad=0.1,

@@ -14,8 +14,8 @@ from endopilot.errors import InputError
 from endopilot.models.checkpoint import load_model
 from endopilot.models.config import TrainConfig, TransformerConfig
 from endopilot.models.episodes import Episodes
+from endopilot.models.paper import ForwardNetwork, InverseNetwork, TransformerPredictor
 from endopilot.models.train import train
-from endopilot.models.transformer import ForwardNetwork, InverseNetwork, TransformerPredictor
 
 GIVEN = 30
 SMALL = TransformerConfig(d_model=24, heads=2, encoder_layers=1, decoder_layers=1, feedforward=32)
@@ -43,7 +43,7 @@ def untrained(limits=(1e9, 1e9)) -> TransformerPredictor:
     torch.manual_seed(1)
     networks = ForwardNetwork(SMALL).eval(), InverseNetwork(SMALL).eval()
     for network in networks:
-        torch.nn.init.normal_(network.transformer.head.weight, std=0.1)
+        torch.nn.init.normal_(network.head.weight, std=0.1)
     return TransformerPredictor(
         *networks, limits=DriveLimits(max_velocity_mm_s=limits[0], max_rotation_rad_s=limits[1])
     )

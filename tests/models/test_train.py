@@ -16,11 +16,11 @@ import torch
 from endopilot.dataset.loader import read_dataset
 from endopilot.errors import InputError
 from endopilot.files import read_json, sha256
-from endopilot.models.checkpoint import load_model, read_network, read_tensors
+from endopilot.models.checkpoint import load_model, read_tensors
 from endopilot.models.config import TrainConfig, TransformerConfig
 from endopilot.models.episodes import Episodes
-from endopilot.models.train import tensorboard_writer, train
-from endopilot.models.transformer import NETWORKS, Windows
+from endopilot.models.paper import NETWORKS, Windows
+from endopilot.models.train import train
 from toy_navigation import make_toy_dataset, toy_simulate
 
 SMALL = TransformerConfig(d_model=24, heads=2, encoder_layers=1, decoder_layers=1, feedforward=32)
@@ -69,7 +69,7 @@ def test_overfits_one_batch(toy_dataset, name):
 def test_writes_what_a_run_holds(short_run, toy_dataset):
     names = {path.name for path in short_run.iterdir()}
     networks = {"ff.safetensors", "if.safetensors"}
-    assert names == networks | {"run.json", "training.json", "manifest.json", "checkpoints", "tensorboard"}
+    assert names == networks | {"run.json", "training.json", "manifest.json", "checkpoints"}
     record = read_json(short_run / "manifest.json")
     assert (short_run / record["dataset"]).resolve() == toy_dataset.resolve()
     assert record["networks"]["ff"]["parameters"] == sum(p.numel() for p in NETWORKS["ff"](SMALL).parameters())
@@ -98,7 +98,7 @@ def test_killed_and_resumed_continues_the_same_curve(short_run, toy_dataset, tmp
     process = subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.DEVNULL)
     try:
         deadline = time.monotonic() + 120
-        while not (run / "ff.safetensors").exists():
+        while not (run / "checkpoints/ff.safetensors").exists():
             assert process.poll() is None and time.monotonic() < deadline
             time.sleep(0.01)
     finally:
@@ -111,37 +111,6 @@ def test_killed_and_resumed_continues_the_same_curve(short_run, toy_dataset, tmp
         curves = [read_json(folder / "training.json")[name]["curve"] for folder in (run, short_run)]
         losses = [[(entry["loss"], entry["validation_loss"]) for entry in curve] for curve in curves]
         assert losses[0] == losses[1]
-        shown = scalars(run / "tensorboard" / name, "loss")
-        assert list(shown) == [entry["epoch"] for entry in curves[0]]
-        assert list(shown.values()) == pytest.approx([entry["loss"] for entry in curves[0]], rel=1e-6)
-
-
-def scalars(folder, name):
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    events = EventAccumulator(str(folder)).Reload().Scalars(name)
-    assert len({event.step for event in events}) == len(events)
-    return {event.step: event.value for event in events}
-
-
-def test_an_epoch_that_was_shown_but_not_kept_is_shown_as_it_was_trained_again(tmp_path, monkeypatch):
-    from tensorboard.summary.writer import event_file_writer as files
-
-    monkeypatch.setattr(files, "_global_uid", files.AtomicCounter(9))  # in names, after the second: 10 sorts before 9
-
-    def epoch(number, loss):
-        return {"epoch": number, "loss": loss, "validation_loss": None, "learning_rate": 0.5, "samples_per_second": 9.0}
-
-    for losses in ({1: 1.0, 2: 0.9}, {2: 0.5, 3: 0.25}):
-        with tensorboard_writer(tmp_path / "ff") as write:
-            for number, loss in losses.items():
-                write(epoch(number, loss))
-    assert scalars(tmp_path / "ff", "loss") == {1: 1.0, 2: 0.5, 3: 0.25}
-    with tensorboard_writer(None) as write:
-        write(epoch(1, 1.0))
-    with tensorboard_writer(tmp_path / "none"):
-        pass
-    assert [path.name for path in tmp_path.iterdir()] == ["ff"]
 
 
 def test_a_finished_run_returns_at_once(short_run, toy_dataset):
@@ -184,10 +153,9 @@ def test_the_first_bad_loss_stops_and_the_last_good_checkpoint_stays(toy_dataset
     with pytest.raises(InputError, match=r"loss of ff became nan in epoch 2, batch 2 .* checkpoint of epoch 1 is kept"):
         train(toy_dataset, output=tmp_path / "run", config=config)
     monkeypatch.undo()
-    _, facts = read_tensors(tmp_path / "run/checkpoints/ff.safetensors")
-    assert [entry["epoch"] for entry in facts["curve"]] == [1]
-    network = read_network(tmp_path / "run/ff.safetensors")
-    assert all(torch.isfinite(tensor).all() for tensor in network.state_dict().values())
+    tensors, facts = read_tensors(tmp_path / "run/checkpoints/ff.safetensors")
+    assert [entry["epoch"] for entry in facts["curve"]] == [1] and not (tmp_path / "run/ff.safetensors").exists()
+    assert all(torch.isfinite(tensor).all() for tensor in tensors.values())
 
 
 def test_samples_that_are_not_finite_are_named(tmp_path):
@@ -220,3 +188,31 @@ def test_damaged_checkpoints_are_named(short_run, tmp_path):
     file.unlink()
     with pytest.raises(InputError, match=r"ff\.safetensors: no such checkpoint"):
         load_model(tmp_path / "run")
+
+
+def test_mixed_precision_multiplies_in_bfloat16_and_keeps_float32(short_run, toy_dataset, tmp_path):
+    dtypes = set()
+    real = torch.nn.functional.scaled_dot_product_attention
+
+    def watched(query, *others):
+        dtypes.add(query.dtype)
+        return real(query, *others)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch.nn.functional, "scaled_dot_product_attention", watched)
+        train(toy_dataset, output=tmp_path / "run", config=TrainConfig(**SHORT, network="ff", precision="bfloat16"))
+    assert torch.bfloat16 in dtypes
+    ours, theirs = (read_tensors(run / "ff.safetensors")[0] for run in (tmp_path / "run", short_run))
+    assert {weights.dtype for weights in ours.values()} == {torch.float32}
+    assert any(not torch.equal(ours[name], theirs[name]) for name in theirs)
+    losses = [
+        [e["loss"] for e in read_json(run / "training.json")["ff"]["curve"]] for run in (tmp_path / "run", short_run)
+    ]
+    np.testing.assert_allclose(*losses, rtol=0.03)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
+def test_a_gpu_that_is_not_there_is_refused(toy_dataset, tmp_path):
+    with pytest.raises(InputError, match="torch finds no GPU here"):
+        train(toy_dataset, output=tmp_path / "run", config=TrainConfig(processor="cuda"))
+    assert not (tmp_path / "run").exists()

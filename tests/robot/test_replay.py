@@ -63,7 +63,7 @@ def test_a_prediction_goes_on_from_where_the_tip_was_seen_last(fork, wire, robot
     """Tips that lie 0.8 mm beside the wire's, as of another camera: the prediction lies there too."""
     beside = dataclasses.replace(log, tip=log.tip + np.array([0.0, 0.8, 0.0]))
     for each in replay_log([beside], fork, Stack(wire), robot=robot, config=FEW):
-        assert np.abs(each.in_view[each.given, 1]).mean() > 0.4 and abs(each.in_view[each.given.sum(), 1]) < 0.25
+        assert np.abs(each.in_view[each.given, 1]).mean() > 0.25 > abs(each.in_view[each.given.sum(), 1])
 
 
 def test_a_wire_keeps_its_rotation_from_one_episode_to_the_next(fork, wire, robot, made) -> None:

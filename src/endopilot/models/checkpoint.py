@@ -19,11 +19,11 @@ from endopilot.errors import InputError
 from endopilot.files import json_text, reading, regular, writing
 from endopilot.models.config import WIRES, TransformerConfig, read_run
 from endopilot.models.episodes import Predictor
+from endopilot.models.paper import NETWORKS, Network, TransformerPredictor
 from endopilot.models.simulated_wires import SimulatedWires
-from endopilot.models.transformer import NETWORKS, Network, TransformerPredictor
 from endopilot.settings import from_record
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 """Counts changes of the tensors or of their meaning."""
 
 

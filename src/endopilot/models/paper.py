@@ -1,24 +1,15 @@
-"""The paper's two Transformers: FF predicts the tip from the drive's motion, IF the drive's motion from the tip.
+"""The paper's pair (Kim et al. 2023, arXiv 2304.09286): FF, IF and their rollouts; `train` trains them.
 
-Kim et al., "AI-based Agents for Automated Robotic Endovascular Guidewire Manipulation" (arXiv 2304.09286), state
+FF predicts the tip from the drive's motion, IF the drive's motion from the desired tip, each from the last 30 states
+by a Transformer of 4 + 4 layers with 12 heads. What the paper leaves open is decided as follows.
 
-    FF: (Δtip, γtip)_t, x^prox_{t+1}, π_{t+1}            ->  (Δtip, γtip)_{t+1}
-    IF: desired (Δtip, γtip)_{t+1}, x^prox_t, π_t        ->  x^prox_{t+1}, π_{t+1}
-
-with 30 states in and 1 out, 12 heads, 4 encoder and 4 decoder layers, feed-forward width 128 and dropout 0.1. What the
-paper leaves open is settled here:
-
-* x^prox = (Δ, φ) is the integral of π, so IF predicts π alone and the caller integrates: x_{t+1} = x_t + T·π_{t+1}.
-* The decoder's one query is the newest of the 30 tokens. It holds all that is given of the sample to predict: the
-  control for FF, the desired tip for IF.
-* Tokens hold Δtip as the slack s = Δ − Δtip, the length that the wire stores by bending, because slack changes little
-  while Δ and Δtip run over 150 mm. It is given absolutely and relative to the newest token; the difference of a few
-  tenths of a millimetre that the prediction turns on would drown in the first alone. φ is given as sin φ, cos φ and the
-  unwrapped angle relative to the newest token, so that a full turn of the whole history changes nothing.
-* Each network's output is the change against a simple guess, in units of that change's standard deviation: for FF the
+* d_model is 96, which 12 heads divide. The decoder's query is the newest token; layers normalise before each block.
+* A token holds nine numbers, each standardised over the training windows: the slack s = Δ − Δtip, absolute and relative
+  to the newest token; γtip; Δ; sin φ; cos φ; φ relative to the newest token; and π. Only sine, cosine and differences
+  of φ enter, so a full turn of the whole history changes nothing.
+* Each network's output is the change against a simple guess, in units of that change's root mean square: for FF the
   guess is that slack and offset stay as they are, for IF that the drive moves as the tip is to move, without turning.
 * The loss is the mean square error in these units, both components alike.
-* Layers normalise before each block (pre-norm) and once at the end of each stack.
 """
 
 from __future__ import annotations
@@ -28,7 +19,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
@@ -40,76 +30,6 @@ from endopilot.types import SAMPLE_PERIOD_S
 N_FEATURES = 9
 
 
-class Attention(nn.Module):
-    """Multi-head attention of queries to a memory."""
-
-    def __init__(self, config: TransformerConfig):
-        super().__init__()
-        self.heads = config.heads
-        self.query = nn.Linear(config.d_model, config.d_model)
-        self.key_value = nn.Linear(config.d_model, 2 * config.d_model)
-        self.output = nn.Linear(config.d_model, config.d_model)
-
-    def forward(self, x: Float[Tensor, "b q d"], memory: Float[Tensor, "b k d"]) -> Float[Tensor, "b q d"]:
-        """Return, for every query, the mixture of the memory that it attends to."""
-        query = self.query(x).unflatten(-1, (self.heads, -1)).transpose(1, 2)
-        key, value = self.key_value(memory).unflatten(-1, (2, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        mixed = F.scaled_dot_product_attention(query, key, value)
-        return self.output(mixed.transpose(1, 2).flatten(-2))
-
-
-class Layer(nn.Module):
-    """One layer: self-attention, attention to a memory if it is a decoder's, feed-forward; each added to its input."""
-
-    def __init__(self, config: TransformerConfig, *, decoder: bool):
-        super().__init__()
-        d = config.d_model
-        self.self_norm, self.self_attention = nn.LayerNorm(d), Attention(config)
-        if decoder:
-            self.cross_norm, self.cross_attention = nn.LayerNorm(d), Attention(config)
-        self.feedforward_norm = nn.LayerNorm(d)
-        self.feedforward = nn.Sequential(nn.Linear(d, config.feedforward), nn.ReLU(), nn.Linear(config.feedforward, d))
-        self.dropout = nn.Dropout(config.dropout)
-
-    def forward(
-        self, x: Float[Tensor, "b n d"], memory: Float[Tensor, "b k d"] | None = None
-    ) -> Float[Tensor, "b n d"]:
-        """Return the tokens after this layer; `memory` is the encoder's output, for a decoder's layer."""
-        normed = self.self_norm(x)
-        x = x + self.dropout(self.self_attention(normed, normed))
-        if memory is not None:
-            x = x + self.dropout(self.cross_attention(self.cross_norm(x), memory))
-        return x + self.dropout(self.feedforward(self.feedforward_norm(x)))
-
-
-class Transformer(nn.Module):
-    """Encoder and decoder: a window of tokens in, one vector out."""
-
-    def __init__(self, config: TransformerConfig, n_outputs: int):
-        super().__init__()
-        self.embedding = nn.Linear(N_FEATURES, config.d_model)
-        self.register_buffer("position", sinusoids(WINDOW, config.d_model), persistent=False)
-        self.encoder = nn.ModuleList(Layer(config, decoder=False) for _ in range(config.encoder_layers))
-        self.encoder_norm = nn.LayerNorm(config.d_model)
-        self.decoder = nn.ModuleList(Layer(config, decoder=True) for _ in range(config.decoder_layers))
-        self.decoder_norm = nn.LayerNorm(config.d_model)
-        self.head = nn.Linear(config.d_model, n_outputs)
-        self.dropout = nn.Dropout(config.dropout)
-        nn.init.zeros_(self.head.weight)  # an untrained network is the simple guess
-        nn.init.zeros_(self.head.bias)
-
-    def forward(self, features: Float[Tensor, "b window features"]) -> Float[Tensor, "b out"]:
-        """Return the output for the sample after the window; the newest token is the decoder's query."""
-        tokens = self.dropout(self.embedding(features) + self.position)
-        memory, query = tokens, tokens[:, -1:]
-        for layer in self.encoder:
-            memory = layer(memory)
-        memory = self.encoder_norm(memory)
-        for layer in self.decoder:
-            query = layer(query, memory)
-        return self.head(self.decoder_norm(query))[:, 0]
-
-
 class Network(nn.Module):
     """What FF and IF share: the Transformer, and the scales of what goes in and out.
 
@@ -119,33 +39,33 @@ class Network(nn.Module):
 
     def __init__(self, config: TransformerConfig):
         super().__init__()
-        self.transformer = Transformer(config, n_outputs=2)
+        self.embedding = nn.Linear(N_FEATURES, config.d_model)
+        self.register_buffer("position", sinusoids(WINDOW, config.d_model), persistent=False)
+        self.dropout = nn.Dropout(config.dropout)
+        size = config.d_model, config.heads
+        block = {"dim_feedforward": config.feedforward, "dropout": config.dropout, "batch_first": True}
+        layer, norm = nn.TransformerEncoderLayer(*size, **block, norm_first=True), nn.LayerNorm(config.d_model)
+        encoder = nn.TransformerEncoder(layer, config.encoder_layers, norm, enable_nested_tensor=False)
+        layers = config.encoder_layers, config.decoder_layers
+        self.transformer = nn.Transformer(*size, *layers, **block, norm_first=True, custom_encoder=encoder)
+        self.head = nn.Linear(config.d_model, 2)
+        nn.init.zeros_(self.head.weight)  # an untrained network is the simple guess
+        nn.init.zeros_(self.head.bias)
         self.register_buffer("feature_mean", torch.zeros(N_FEATURES))
         self.register_buffer("feature_scale", torch.ones(N_FEATURES))
         self.register_buffer("output_scale", torch.ones(2))
 
+    position: Tensor
     feature_mean: Tensor
     feature_scale: Tensor
     output_scale: Tensor
 
     def features(self, tip: Tensor, proximal: Tensor, control: Tensor) -> Tensor:
         """Return the window's tokens before scaling."""
-        slack = proximal[..., 0] - tip[..., 0]
-        angle = proximal[..., 1]
-        return torch.stack(
-            [
-                slack,
-                slack - slack[:, -1:],
-                tip[..., 1],
-                proximal[..., 0],
-                torch.sin(angle),
-                torch.cos(angle),
-                angle - angle[:, -1:],
-                control[..., 0],
-                control[..., 1],
-            ],
-            dim=-1,
-        )
+        slack, angle = proximal[..., 0] - tip[..., 0], proximal[..., 1]
+        turned = torch.sin(angle), torch.cos(angle), angle - angle[:, -1:]
+        of_drive = control[..., 0], control[..., 1]
+        return torch.stack([slack, slack - slack[:, -1:], tip[..., 1], proximal[..., 0], *turned, *of_drive], dim=-1)
 
     def guess(self, tip: Tensor, proximal: Tensor, control: Tensor) -> Tensor:
         """Return the simple guess of the output that the network corrects."""
@@ -165,7 +85,9 @@ class Network(nn.Module):
             control: π = (mm/s, rad/s).
         """
         features = (self.features(tip, proximal, control) - self.feature_mean) / self.feature_scale
-        return self.guess(tip, proximal, control) + self.output_scale * self.transformer(features)
+        tokens = self.dropout(self.embedding(features) + self.position)
+        output = self.head(self.transformer(tokens, tokens[:, -1:]))[:, 0]
+        return self.guess(tip, proximal, control) + self.output_scale * output
 
     def loss(self, prediction: Float[Tensor, "b 2"], truth: Float[Tensor, "b 2"]) -> Float[Tensor, ""]:
         """Return the mean square error in units of the simple guess's error."""
@@ -230,16 +152,16 @@ class Windows:
         return Windows(*(torch.as_tensor(signal, dtype=torch.float32) for signal in signals))
 
     def targets(self) -> Int[Tensor, "windows 2"]:
-        """Return (episode, sample) of every sample that has a whole window before it."""
-        episodes, samples = self.tip.shape[:2]
-        return torch.cartesian_prod(torch.arange(episodes), torch.arange(WINDOW, samples))
+        """Return (episode, sample) of every sample that has a whole window of finite states before it."""
+        whole = self.tip.isfinite().all(dim=-1).cumprod(dim=1).bool()
+        whole[:, :WINDOW] = False
+        return whole.nonzero()
 
     def window(self, network: str, target: Int[Tensor, "b 2"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return tip, proximal and control of the windows before some targets, and the truth there.
 
         FF is given tips up to the sample before the target and motions up to the target, and predicts the tip; IF is
-        given motions up to the sample before the target and tips up to the target, and predicts the control (see
-        `transformer`).
+        given motions up to the sample before the target and tips up to the target, and predicts the control.
         """
         episode, sample = target[:, :1], target[:, 1:]
         before = sample + torch.arange(-WINDOW, 0)

@@ -7,14 +7,14 @@ import torch
 
 from endopilot.errors import InputError
 from endopilot.models.config import WINDOW, TransformerConfig
-from endopilot.models.transformer import NETWORKS, ForwardNetwork, InverseNetwork, sinusoids
+from endopilot.models.paper import NETWORKS, ForwardNetwork, InverseNetwork, sinusoids
 
 
 @pytest.fixture(params=["ff", "if"])
 def network(request):
     torch.manual_seed(0)
     made = NETWORKS[request.param](TransformerConfig()).eval()
-    torch.nn.init.normal_(made.transformer.head.weight, std=0.1)  # a fresh network gives the simple guess alone
+    torch.nn.init.normal_(made.head.weight, std=0.1)  # a fresh network gives the simple guess alone
     return made
 
 
