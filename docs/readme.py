@@ -131,8 +131,7 @@ def stands() -> str:
     rows = [
         (
             "speed",
-            f"{float(speed):.0f} times real time on one core, tips err by {float(error):.3f} mm (median); the same "
-            "wire in MuJoCo takes some 3 s of a core for a second",
+            f"{float(speed):.0f} times real time on one core, tips err by {float(error):.3f} mm (median)",
             "beside simulators made for guidewires",
             [("performance", ""), ("worlds", "#another-engine")],
         ),

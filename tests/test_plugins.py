@@ -233,7 +233,6 @@ def test_each_library_belongs_to_an_extra() -> None:
     ("module", "extra"),
     [
         ("torch", "learn"),
-        ("torch.utils.tensorboard", "learn"),
         ("pyarrow", "learn"),
         ("gymnasium", "env"),
         ("pydicom", "imaging"),
