@@ -200,7 +200,7 @@ class Forks:
             many.still |= many.move(many.control(Move(WIRE, rotation=rotation)), force_n=limit_n)
         views = (ForkView.of(self._route, place, nodes, self._navigation.device) for nodes in many.simulator.position)
         azimuth = np.array([view.azimuth for view in views])
-        motions = Row(follow_mm=(0.0,) * TURNS).motions(place, 0.0, self._config, 1, self._random, 0)
+        motions = Row(follow_mm=(0.0,) * TURNS).motions(place, 0.0, self._config, 1, self._random)
         goal, limits = Goal(self._navigation, self._route, waypoint), Limits(limit_n, OFF_MM, SLACK_MM)
         return azimuth, Driver(many, motions, goal, limits, self._config).run(PERIODS)
 

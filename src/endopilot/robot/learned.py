@@ -100,8 +100,8 @@ def logged(of: Prepared, replays: Sequence[EpisodeReplay]) -> list[LoggedEpisode
         apart = ((replay.seen - at)[:, :, None] * axes).sum(axis=-1)
         steps = (np.abs(np.diff(each, prepend=each[0])) for each in (replay.driven, turn[: len(replay.given)]))
         right, core = replay.branch[:, 0] == replay.branch[:, 1], np.linalg.norm(replay.in_view, axis=1)
-        ways = (np.cumsum(each) for each in steps)
-        found.append(LoggedEpisode(log.name, replay.given, at, axes, apart, *ways, replay.sure, right, core))
+        travel, turned = (np.cumsum(each) for each in steps)
+        found.append(LoggedEpisode(log.name, replay.given, at, axes, apart, travel, turned, replay.sure, right, core))
     return found
 
 
