@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
+from endopilot.xray.carm import CArmGeometry, view_at
 from endopilot.xray.detector import CATHETER_MM, DetectorConfig, TipDetector
 from endopilot.xray.image import XrayImager
-from endopilot.xray.tip_posterior import Shifts, estimate_tip
+from endopilot.xray.tip_posterior import Shifts, estimate_tip, possible_shifts
 from endopilot.xray.vessel_grid import make_grid, with_catheter
 from endopilot.xray.wire_end import fit_end
 
@@ -202,3 +203,14 @@ def test_an_estimate_that_is_not_sure_is_ambiguous_and_its_region_holds_the_rest
     np.testing.assert_array_equal(sure.position, strict.position)
     np.testing.assert_allclose(strict.covariance, sure.covariance + sure.elsewhere)
     assert np.trace(sure.elsewhere) > 0
+
+
+def test_what_one_view_leaves_open_of_a_shift_is_what_the_covariance_says() -> None:
+    """Σ = K S Kᵀ + unseen: S is the covariance as it is seen, but for what lies beyond the largest shifts tried."""
+    views = [view_at((0.0, 0.0), np.zeros(3), CArmGeometry())]
+    covariance = np.array([[4.0, 1.5, 0.0], [1.5, 1.0, 0.2], [0.0, 0.2, 0.5]])
+    tried = possible_shifts(views, np.zeros(3), covariance, 0.5)
+    assert np.linalg.eigvalsh(tried.unseen)[0] > 0
+    weight = np.exp(tried.log[1:]) / np.exp(tried.log[1:]).sum()
+    spread = np.einsum("t,ti,tj->ij", weight, tried.mm[1:], tried.mm[1:]) + tried.unseen
+    np.testing.assert_allclose(spread, covariance, rtol=0.15, atol=0.05)

@@ -133,12 +133,13 @@ def possible_shifts(
     rows = np.concatenate([view.slope(ostium) for view in views])
     # Shifts that no view shows are none: with one view, those along its beam.
     seen = np.linalg.svd(rows)[2][: min(2 * len(views), 3)]
+    onto = covariance @ seen.T @ np.linalg.inv(seen @ covariance @ seen.T)  # the likeliest shift that is seen so
     spread = np.sqrt(np.einsum("ai,ij,aj->a", seen, covariance, seen))
     along = [_STEP_MM * np.arange(-np.ceil(_REACH * s / _STEP_MM), np.ceil(_REACH * s / _STEP_MM) + 1) for s in spread]
-    tried = np.stack(np.meshgrid(*along, indexing="ij"), axis=-1).reshape(-1, len(along)) @ seen
+    tried = np.stack(np.meshgrid(*along, indexing="ij"), axis=-1).reshape(-1, len(along)) @ onto.T
     prior = -0.5 * np.einsum("ti,ij,tj->t", tried, np.linalg.inv(covariance), tried)
     log = np.append(np.log(1 - share), np.log(share) + prior - np.logaddexp.reduce(prior))
-    left = covariance - seen.T @ (seen @ covariance @ seen.T) @ seen
+    left = covariance - onto @ seen @ covariance
     return Shifts(np.concatenate([np.zeros((1, 3)), tried]), log, left + _STEP_MM**2 / 12 * seen.T @ seen)
 
 

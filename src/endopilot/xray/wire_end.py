@@ -131,7 +131,8 @@ def refined(
         if error @ np.linalg.solve(expected, error) > _BELIEVABLE**2:
             return False
         gain = spread @ both.T @ np.linalg.inv(expected)
-        mean, spread = mean + gain @ error, (np.eye(6) - gain @ both) @ spread
+        rest = np.eye(6) - gain @ both
+        mean, spread = mean + gain @ error, rest @ spread @ rest.T + gain @ own @ gain.T  # stays positive
         return True
 
     for view, signal, image in zip(views, signals, evidence, strict=True):
@@ -180,8 +181,12 @@ def _ends(
     mean = np.einsum("ij,ijk->k", weight, off)
     posterior = np.einsum("ij,ijk,ijl->kl", weight, off - mean, off - mean) + _STRAIGHT_PX**2 * np.eye(2)
     # What the image alone says: the posterior without the prior.
-    own = np.linalg.inv(np.linalg.inv(posterior) - np.diag(0.9 / np.maximum(np.diag(expected), np.diag(posterior))))
-    return own @ np.linalg.solve(posterior, mean), own
+    precision = np.linalg.inv(posterior)
+    left = precision - np.diag(0.9 / np.maximum(np.diag(expected), np.diag(posterior)))
+    if np.linalg.eigvalsh(left)[0] <= 0:  # a slanted posterior says less than the prior on some axis
+        left = precision
+    own = np.linalg.inv(left)
+    return own @ precision @ mean, own
 
 
 class _Line:
