@@ -9,7 +9,7 @@ import pytest
 
 from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.drive import Driver, Goal, Limits, Motions, Outcome
-from endopilot.control.repertoire import Draws, Repertoire, Row, sides
+from endopilot.control.repertoire import Draws, Repertoire, Row, read_table, sides
 from endopilot.control.search_config import SearchConfig
 from endopilot.control.trials import CATHETER, WIRE, Trials
 from endopilot.devices.catheter import read_catheter
@@ -127,6 +127,16 @@ def test_later_rounds_are_drawn_near_the_best_and_some_anew() -> None:
     near = (abs(later.at_mm - 12.0) < 2.8) & (abs(later.back_mm - 5.0) < 1.4) & (abs(later.turn_rad - 1.0) < 0.88)
     assert near.mean() == pytest.approx(0.75 * 0.954**3, abs=0.05)
     assert np.isnan(later.at_mm).mean() == pytest.approx(0.3 * 0.25, abs=0.03)
+
+
+def test_rounds_near_the_best_ask_for_fewer_wires_and_others_always_for_as_many() -> None:
+    near = Row(at=(-2.0, 2.0), rounds=5, agree=0.5)
+    assert [near.agrees(number) for number in range(5)] == [1.0, 0.875, 0.75, 0.625, 0.5]
+    onward, once = Row(rounds=5, onward=True, agree=0.5), Row(agree=0.5)
+    assert onward.agrees(0) == onward.agrees(4) == once.agrees(0) == 0.5
+    for each in read_table().values():
+        for row in (*each.rows, *each.drawn):
+            assert all(0 < row.agrees(number) <= 1 for number in range(row.rounds))
 
 
 def test_velocities_are_drawn_as_the_row_says() -> None:

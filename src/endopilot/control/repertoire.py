@@ -95,8 +95,8 @@ class Row:
     onward: bool = False
     """Each round goes on where the best of the one before have led, instead of where the devices are."""
     agree: Share = 1.0
-    """Share of the wires, by weight, that is to pass the place in the last round; in the first all have to. The others
-    are no longer believed."""
+    """Share of the wires, by weight, that is to pass the place; the others are no longer believed. Of motions that are
+    drawn near the best all have to pass in the first round, and this share in the last."""
     force: Share = 1.0
     """Share of the force limit that a motion which is taken stays within, at most."""
 
@@ -105,6 +105,10 @@ class Row:
         """Number of motions."""
         grid = len(self.at or (0,)) * len(self.lead_mm) * len(self.back) * max(len(self.follow_mm), 1)
         return self.turns * (grid if self.rounds == 1 else 1)
+
+    def agrees(self, number: int) -> float:
+        """Return the share of the wires, by weight, that is to pass the place in a round, from 0 on."""
+        return self.agree if self.onward or self.rounds == 1 else 1 - (1 - self.agree) * number / (self.rounds - 1)
 
     def motions(
         self,
@@ -125,9 +129,9 @@ class Row:
             random: what is drawn from.
             best: of the rounds before; None in the first.
         """
-        lead, follow = np.zeros(self.turns), np.full(self.turns, _ALL_ALONG_MM)
         if self.rounds > 1:
             at, turn, back = self._drawn(obstacle_mm, step_mm, random, best)
+            lead, follow = np.zeros(self.turns), np.full(self.turns, _ALL_ALONG_MM)
         else:
             leads = [(lead, lead if lead < _WITHDRAWN_MM else _ALL_ALONG_MM) for lead in self.lead_mm]
             leads = list(product(self.lead_mm, self.follow_mm)) if self.follow_mm else leads

@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -195,8 +194,7 @@ class Search:
                     return None
         for row in repertoire.drawn:
             for number, outcome in enumerate(self._drive(row, goal)):
-                agree = row.agree if row.onward else 1 - (1 - row.agree) * number / (row.rounds - 1)
-                if self._follow(outcome, goal, replace(row, agree=agree), row.force * limit_n):
+                if self._follow(outcome, goal, row, row.force * limit_n, number):
                     return None
         course.restore(self._kept)
         straight = tried[repertoire.rows[0]]
@@ -229,18 +227,18 @@ class Search:
             kept = np.argsort(costs)[:_KEEP]
             best, costs, trials = Motions(*(each[kept] for each in tried)), costs[kept], self._trials_of(row)
 
-    def _follow(self, outcome: Outcome, goal: Goal, row: Row, force_n: float) -> bool:
-        """Let the course do what the cheapest trial did; return whether it has passed the place, or come on, then."""
-        course, limit_n = self._course, self._navigation.force_limit_n
+    def _follow(self, outcome: Outcome, goal: Goal, row: Row, force_n: float, number: int = 0) -> bool:
+        """Let the course do what the cheapest trial of a round did; return whether it has passed the place, or come on."""
+        course, limit_n, agree = self._course, self._navigation.force_limit_n, row.agrees(number)
         gentle = outcome.force <= force_n
-        passes = gentle & (outcome.share >= row.agree - ROUNDING)
+        passes = gentle & (outcome.share >= agree - ROUNDING)
         cost = outcome.expected_cost(limit_n)
         for trial in np.flatnonzero(passes)[np.argsort(cost[passes])][:_REPEATED].tolist():
             for pauses in (False, True):
                 self._repeat(outcome, trial, pauses=pauses)
                 there, done = goal.passed(course) * course.weight, course.rows[self._kept.periods :]
                 pressed = max((float(period.force[course.counted].max()) for period in done), default=0.0)
-                enough = there.sum() > 0 and (goal.agree < 1 or there.sum() >= row.agree - ROUNDING)
+                enough = there.sum() > 0 and (goal.agree < 1 or there.sum() >= agree - ROUNDING)
                 if enough and pressed <= force_n:
                     course.weight = there / there.sum()
                     return True

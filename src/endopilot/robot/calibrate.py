@@ -22,7 +22,7 @@ from endopilot.devices.stack import Stack, Transmission
 from endopilot.errors import InputError
 from endopilot.progress import Advance, progress
 from endopilot.robot.candidates import LEAST_EPISODES, Candidates, Estimate, search
-from endopilot.robot.kinematics import NAMES, RANGES, DriveFit, Tracks, earns, fit_drive
+from endopilot.robot.kinematics import NAMES, RANGES, DriveFit, Tracks, earns, evenly, fit_drive
 from endopilot.robot.log import Courses, RobotLog
 from endopilot.robot.replay import (
     FAR_MM,
@@ -143,7 +143,8 @@ def calibrate(
             f"{logs[0].name}: {len(episodes)} episodes that show the tip often enough; intervals need "
             f"{LEAST_EPISODES}: log more, or number them anew (`episode`) wherever the device was reset"
         )
-    of, layers = prepare(_evenly(episodes, config.episodes), anatomy, config.given, robot), {}
+    chosen = [episodes[k] for k in evenly(len(episodes), config.episodes)]
+    of, layers = prepare(chosen, anatomy, config.given, robot), {}
     tracks, drive = Tracks(of.courses, of.abscissa), fit_drive(Tracks(of.courses, of.abscissa), _units(of))
     if of.logs[0].by_velocity:  # what is lost as a drive speeds up, if it needs time for that, is never caught up
         at_once = replace(robot, wire=replace(robot.wire, max_acceleration_mm_s2=_AT_ONCE))
@@ -157,7 +158,8 @@ def calibrate(
     robot = replace(robot, encoders_at=where_encoders_sit(of.logs, robot) or robot.encoders_at)
     of_wire: dict[str, Estimate] = {}
     if config.wires:
-        some = prepare(_evenly(episodes, config.wire_episodes), anatomy, config.given, robot)
+        chosen = [episodes[k] for k in evenly(len(episodes), config.wire_episodes)]
+        some = prepare(chosen, anatomy, config.given, robot)
         check_clockwise(some, device, robot, config)
         tried, as_known = fit_wire(some, device, robot, config)
         layers["wire"] = gained(as_known, tried.left_out, _BETTER_WIRE)
@@ -227,11 +229,6 @@ def gained(without: Float[np.ndarray, "units"], costs: Float[np.ndarray, "units"
     if not earns(without, costs, level):
         return LEFT_OUT
     return f"{(without - costs).mean() / np.abs(without).mean():.0%} less cost on episodes left out"
-
-
-def _evenly(episodes: list[RobotLog], most: int) -> list[RobotLog]:
-    """Return so many of some episodes at most, evenly chosen."""
-    return [episodes[k] for k in np.unique(np.linspace(0, len(episodes) - 1, most).round().astype(int))]
 
 
 def _driven(robot: RobotConfig, fit: DriveFit) -> RobotConfig:

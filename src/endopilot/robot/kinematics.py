@@ -152,6 +152,11 @@ class DriveFit:
     left_out: Float[np.ndarray, "units"]
 
 
+def evenly(count: int, most: int) -> Int[np.ndarray, "chosen"]:
+    """Return places of so many things at most, evenly chosen among some."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+
+
 def earns(without: Float[np.ndarray, "units"], costs: Float[np.ndarray, "units"], level: float) -> bool:
     """Return whether units that were left out cost less by a model than without it, at a level (Student's t)."""
     less = without - costs

@@ -16,13 +16,13 @@ from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
 from endopilot.errors import InputError
 from endopilot.files import regular, writing
-from endopilot.robot.kinematics import earns
+from endopilot.robot.kinematics import earns, evenly
 from endopilot.robot.replay import EpisodeReplay, Prepared
 from endopilot.types import VesselTree
 
@@ -189,9 +189,9 @@ class LearnedTip:
         parts = [(self.rows, self.apart)]
         if before:
             rows = np.concatenate([each.rows(own, -1 - k) for k, each in enumerate(before)])
-            chosen = _evenly(len(rows), _BEFORE)
+            chosen = evenly(len(rows), _BEFORE)
             parts.append((rows[chosen], np.concatenate([each.apart[0] for each in before])[chosen]))
-        chosen = np.flatnonzero(given)[_evenly(int(given.sum()), _GIVEN)]
+        chosen = np.flatnonzero(given)[evenly(int(given.sum()), _GIVEN)]
         parts.append((episode.rows(own, -1 - len(before))[chosen], episode.apart[0, chosen]))
         known, y = (np.concatenate(each) for each in zip(*parts, strict=True))
         wanted = episode.rows(own, -1 - len(before), predicted=True)[~given]
@@ -241,14 +241,14 @@ def learn(episodes: Sequence[LoggedEpisode], vessel: str) -> LearnedTip:
     rows = [each.rows(names.index(each.session), k) for k, each in enumerate(episodes)]
     tips, apart = np.concatenate(rows), np.concatenate([each.apart[0] for each in episodes])
     of = [np.flatnonzero(tips[:, 5] == k) for k in range(len(names))]
-    taught = np.concatenate([each[_evenly(len(each), _TAUGHT // len(names))] for each in of])
+    taught = np.concatenate([each[evenly(len(each), _TAUGHT // len(names))] for each in of])
     scales, nothing = np.stack([_scales(tips, apart[:, k]) for k in (0, 1)]), np.zeros((3, 3))
     made = LearnedTip(tuple(names), vessel, scales, np.ones(2), tips[taught], apart[taught], nothing, nothing)
     z, branches, jumps = [], [], []
     for k, name in enumerate(names):
         other, own = made.rows[:, 5] != k, [each for each in episodes if each.session == name]
         model = replace(made, rows=made.rows[other], apart=made.apart[other])
-        for j in _evenly(len(own), _JUDGED):
+        for j in evenly(len(own), _JUDGED):
             each, rest, said = own[j], ~own[j].given, model.predict(own[j], own[:j])
             z.append((np.abs(said.apart - each.apart[1, rest]) / said.sd)[each.right[rest]])
             branches.append((_branch_features(each, own[:j])[rest], each.right[rest]))
@@ -263,8 +263,8 @@ def _scales(tips: Rows, apart: Float[np.ndarray, "n"]) -> Float[np.ndarray, "7"]
     some = []
     for first in (0, 1):
         episodes = np.unique(tips[:, 6])[first::2]
-        chosen = np.isin(tips[:, 6], episodes[_evenly(len(episodes), _FITTED // 20)]).nonzero()[0]
-        chosen = chosen[_evenly(len(chosen), _FITTED)]
+        chosen = np.isin(tips[:, 6], episodes[evenly(len(episodes), _FITTED // 20)]).nonzero()[0]
+        chosen = chosen[evenly(len(chosen), _FITTED)]
         some += [(_alike(tips[chosen], tips[chosen]), apart[chosen])] if len(chosen) else []
 
     def cost(logs: Float[np.ndarray, "7"]) -> float:
@@ -282,10 +282,6 @@ def _scales(tips: Rows, apart: Float[np.ndarray, "n"]) -> Float[np.ndarray, "7"]
 
 def _names(episodes: Sequence[LoggedEpisode]) -> list[str]:
     return list(dict.fromkeys(each.session for each in episodes))
-
-
-def _evenly(count: int, most: int) -> Int[np.ndarray, "rows"]:
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
 def _branch_features(episode: LoggedEpisode, before: Sequence[LoggedEpisode]) -> Float[np.ndarray, "tips 2"]:

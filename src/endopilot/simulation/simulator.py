@@ -35,9 +35,7 @@ from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 _DEEPEST_START = 0.8  # share of the longest path that a random start may lie at
 _LEAST_BYTES = 4000  # no world takes less memory; too many are refused before they are listed
-_AT_ONCE = ThreadPoolExecutor(
-    CORES
-)  # steps groups of worlds side by side, but for the main thread: Ctrl-C stops a step there
+_AT_ONCE = ThreadPoolExecutor(CORES)  # steps groups of worlds, but not the main thread's: Ctrl-C stops a step there
 
 
 class Simulator(Readout):
