@@ -228,7 +228,7 @@ class Search:
             best, costs, trials = Motions(*(each[kept] for each in tried)), costs[kept], self._trials_of(row)
 
     def _follow(self, outcome: Outcome, goal: Goal, row: Row, force_n: float, number: int = 0) -> bool:
-        """Let the course do what the cheapest trial of a round did; return whether it has passed the place, or come on."""
+        """Let the course do what the cheapest trial of a round did; return whether it passed the place or came on."""
         course, limit_n, agree = self._course, self._navigation.force_limit_n, row.agrees(number)
         gentle = outcome.force <= force_n
         passes = gentle & (outcome.share >= agree - ROUNDING)
