@@ -28,6 +28,7 @@ BARS = {
     "realtime_reserve": Bar(10.0, at_least=True),
     "latency_p95_ms": Bar(100.0),
     "frames_per_second": Bar(30.0, at_least=True),
+    "frames_per_second_thinking": Bar(30.0, at_least=True),
     "ready_seconds": Bar(3.0),
 }
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -42,6 +43,7 @@ BROWSER_FLAGS = (
 )
 """A headless browser that draws in software and asks nobody anything."""
 _SECONDS = 6.0
+_DISTAL = "8"  # the end of the anterior descending artery
 _PRESSES = 40
 _MOST_S = 60.0
 _WATCH = """() => {
@@ -82,8 +84,8 @@ def bench_cockpit(*, catheter: str | None = None) -> dict[str, Any]:
         `realtime_reserve`: simulated time over the time that simulating it takes, while the wire moves and both views
         change; `latency_p95_ms`: from a key's event to the end of the first frame that shows the wire moved, the
         simulated robot's latency of 50 ms included (and `latency_median_ms`); `frames_per_second`: the fewer of frames
-        of the 3-D view and of new X-ray images of 512 × 512 pixels; `ready_seconds`: from the command to the first
-        frame; `bars` and `passed`.
+        of the 3-D view and of new X-ray images of 512 × 512 pixels, and `frames_per_second_thinking` the same while the
+        agent searches and drives; `ready_seconds`: from the command to the first frame; `bars` and `passed`.
 
     Raises:
         InputError: there is no browser, or playwright is not installed; no such catheter.
@@ -113,6 +115,7 @@ def bench_cockpit(*, catheter: str | None = None) -> dict[str, Any]:
             figures |= _views(page)
             page.evaluate("() => cockpit.hands.hold(0)")
             figures |= _latency(page)
+            figures["frames_per_second_thinking"] = _thinking(page)
         browser.close()
     rounded = {name: round(float(value), 3) for name, value in figures.items()}
     return judged(rounded, BARS)
@@ -134,17 +137,43 @@ def _views(page: Any) -> dict[str, float]:
     for _ in range(round(_SECONDS / 0.5)):
         time.sleep(0.5)
         reserve.append(page.evaluate("() => cockpit.shown.reserve"))
-    counts = np.array(page.evaluate("() => window.counts.splice(0)"))
+    space, images = _frames_per_second(page)
     for key in ("KeyX", "KeyD", "KeyW"):
         page.keyboard.up(key)
-    # The slope of the counts: their difference from end to end would err by a frame at each end, 0.3 frames/s.
-    space, images = (round(1000 * np.polyfit(counts[:, 0], counts[:, view], 1)[0], 1) for view in (1, 2))
     return {
         "realtime_reserve": float(np.median(reserve)),
         "frames_per_second": min(space, images),
         "frames_per_second_space": space,
         "frames_per_second_xray": images,
     }
+
+
+def _frames_per_second(page: Any) -> tuple[float, float]:
+    """Return the frames per second of the 3-D view and of X-ray since they are counted.
+
+    That is the slope of the counts: their difference from end to end would err by a frame at each end, 0.3 frames/s.
+    """
+    counts = np.array(page.evaluate("() => window.counts.splice(0)"))
+    space, images = (round(1000 * np.polyfit(counts[:, 0], counts[:, view], 1)[0], 1) for view in (1, 2))
+    return space, images
+
+
+def _thinking(page: Any) -> float:
+    """Return the fewer frames per second of both views while the agent drives to a distal section."""
+    drives = "['drives', 'thinking'].includes(cockpit.shown.autopilot.status)"
+    page.keyboard.down("KeyX")
+    page.evaluate("section => cockpit.connection.send('target', {section})", _DISTAL)
+    page.select_option("#autopilot-policy", "agent")
+    page.click("#autopilot-start")
+    wait_for(page, drives)
+    page.evaluate("() => window.counts.splice(0)")
+    end = time.perf_counter() + _SECONDS
+    while time.perf_counter() < end and page.evaluate(f"() => {drives}"):
+        time.sleep(0.1)
+    frames = min(_frames_per_second(page))
+    page.keyboard.up("KeyX")
+    page.evaluate("() => cockpit.connection.send('autopilot', {action: 'stop'})")
+    return frames
 
 
 def _latency(page: Any) -> dict[str, float]:

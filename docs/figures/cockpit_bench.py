@@ -29,6 +29,7 @@ WHAT = {
     "realtime_reserve": "simulated time over the time that it takes",
     "latency_p95_ms": "from the key to the first frame with the wire moved, the robot's latency of 50 ms included",
     "frames_per_second": "the fewer of the two views, 512 × 512 pixels of X-ray at 30 pulses a second",
+    "frames_per_second_thinking": "the same while the agent searches and drives",
     "ready_seconds": "from the command to the first frame",
 }
 
