@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from endopilot.anatomy.projection import project_tip
-from endopilot.belief.adviser import astray_mm
+from endopilot.anatomy.projection import project_tip, safety_ratio
+from endopilot.belief.adviser import AdviserConfig
+from endopilot.belief.events import Counted, astray_mm, count_events
 from endopilot.navigation.policy import BelievedTip, Observation, Proximals
 from endopilot.robot.robot import SimulatedRobot
 from endopilot.simulation.simulator import Simulator
@@ -110,6 +111,23 @@ class NavigationRecord:
         half = self.half_width
         held = (np.less_equal(off, half) & np.isfinite(half)).all(axis=1)
         return np.asarray(held)[~np.isnan(half).any(axis=1)]
+
+    def events(self, navigation: Navigation, advice: AdviserConfig | None = None) -> dict[str, Counted]:
+        """Return what X-ray had to show, and what it missed (`belief.events`): contacts with the wall, tips that were
+        astray of where the policy believed them, and forces beyond the limit.
+
+        Args:
+            navigation: this one.
+            advice: τ and δ.
+        """
+        advice = advice or AdviserConfig()
+        ratio = safety_ratio(self.tip.offset[:, 0], self.tip.radius[:, 0], navigation.device.tip_radius_mm)
+        states = {
+            "contact": ratio >= advice.wall_ratio,
+            "astray": self.astray_mm >= advice.abscissa_mm,
+            "force": ~is_safe(self.contact_force_max, navigation.force_limit_n),
+        }
+        return {kind: count_events(state[:-1], self.exposed[:-1]) for kind, state in states.items()}
 
 
 class Track:
