@@ -7,7 +7,7 @@ be improved; `test` is for what is published. Both are the first four patients o
 `benchmarks.agent.ladder_patients.choose` takes, by the ladder's own rules; the atlas of a task has the seed 19000, or
 20000, and the task's level. Beside the shipped worlds, or in their place, some are drawn at random (`drawn_worlds`).
 
-Events are those of `NavigationRecord.events`: contacts, tips astray, in another branch too, and forces beyond the
+Events are those of `count_navigation_events`: contacts, tips astray, in another branch too, and forces beyond the
 limit. Decisions in both bands are those of `NavigationRecord.in_bands`; a decision that has no band, as of a wire that
 is lost, counts as outside.
 """
@@ -37,7 +37,7 @@ from endopilot.ladder.attempt import navigation_events
 from endopilot.ladder.terms import Terms
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Decision, Observation
-from endopilot.navigation.record import NavigationRecord
+from endopilot.navigation.record import NavigationRecord, count_navigation_events
 from endopilot.runs import claim, make_missing
 from endopilot.settings import Seed, Within
 from endopilot.simulation.controls import ControlConfig, random_controls
@@ -191,7 +191,7 @@ def driven_on(loop: NavigationLoop) -> NavigationRecord:
 def counted(record: NavigationRecord, navigation: Navigation) -> dict[str, Any]:
     """Return what is counted of a navigation."""
     assert record.believed is not None
-    radius_mm, kinds = navigation.device.tip_radius_mm, record.events(navigation)
+    radius_mm, kinds = navigation.device.tip_radius_mm, count_navigation_events(record, navigation)
     return {
         "reason": record.gives_up or record.reason,
         "success": record.success,

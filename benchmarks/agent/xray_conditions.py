@@ -22,6 +22,7 @@ from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import navigation_seed
 from endopilot.ladder.terms import Terms
 from endopilot.navigation.loop import LoopConfig, NavigationLoop, XrayKind
+from endopilot.navigation.record import count_navigation_events
 from endopilot.runs import claim, make_missing
 from endopilot.settings import Count
 from endopilot.simulation.motion import Motion, motion_named
@@ -70,7 +71,7 @@ def measure(path: Path) -> None:
             "seconds": record.seconds,
             "exposures": record.exposures,
             "peak_force_n": record.peak_force_n,
-            "events": {kind: list(each) for kind, each in record.events(navigation).items()},
+            "events": {kind: list(each) for kind, each in count_navigation_events(record, navigation).items()},
             "decisions": [int(record.in_bands.sum()), len(record.in_bands)],
         },
     )

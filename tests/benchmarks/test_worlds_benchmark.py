@@ -15,6 +15,7 @@ from benchmarks.agent.worlds import DrivenAtRandom, counted, drive_in_worlds, dr
 from endopilot.belief.identification import Identified
 from endopilot.errors import InputError
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
+from endopilot.navigation.record import count_navigation_events
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation, Target
@@ -77,18 +78,23 @@ def test_events_are_contacts_wrong_branches_and_forces_from_their_onset_on(at_ra
     nothing = np.zeros(17)
     tip = replace(record.tip, offset=np.zeros((17, 1)), radius=np.full((17, 1), 2.0))
     still = replace(record, tip=tip, astray_mm=nothing, contact_force_max=nothing, exposed=nothing > 0)
-    assert all(each == (0, 0, 0.0) for each in still.events(navigation).values())
+    assert all(each == (0, 0, 0.0) for each in count_navigation_events(still, navigation).values())
     touches, strays, presses = tip.offset.copy(), nothing.copy(), nothing.copy()
     touches[5:8], strays[9:12], presses[13] = 1.9, 30.0, 2 * navigation.force_limit_n  # 30 mm astray: another branch
     course = replace(still, tip=replace(tip, offset=touches), astray_mm=strays, contact_force_max=presses)
     before = np.isin(np.arange(17), [0, 4, 8, 12])
-    found = replace(course, exposed=before).events(navigation)  # each 0.5 s too early
+    found = count_navigation_events(replace(course, exposed=before), navigation)  # each 0.5 s too early
     assert {kind: each[:2] for kind, each in found.items()} == {"contact": (1, 1), "astray": (1, 1), "force": (1, 1)}
     assert found["contact"].missed_evenly == pytest.approx(1 - 2 * 3 / 15)
     for later in (1, 2):  # then, and 0.5 s after
         shown = np.roll(before, later)
-        assert all(each.missed == 0 for each in replace(course, exposed=shown).events(navigation).values())
-    assert all(each.missed for each in replace(course, exposed=np.roll(before, 3)).events(navigation).values())
+        assert all(
+            each.missed == 0 for each in count_navigation_events(replace(course, exposed=shown), navigation).values()
+        )
+    assert all(
+        each.missed
+        for each in count_navigation_events(replace(course, exposed=np.roll(before, 3)), navigation).values()
+    )
     whole = counted(replace(course, exposed=before), navigation)
     assert row("wide", "random", [whole | identified(None, World(), None)])["missed"] == 3
 

@@ -112,22 +112,23 @@ class NavigationRecord:
         held = (np.less_equal(off, half) & np.isfinite(half)).all(axis=1)
         return np.asarray(held)[~np.isnan(half).any(axis=1)]
 
-    def events(self, navigation: Navigation, advice: AdviserConfig | None = None) -> dict[str, Counted]:
-        """Return what X-ray had to show, and what it missed (`belief.events`): contacts with the wall, tips that were
-        astray of where the policy believed them, and forces beyond the limit.
 
-        Args:
-            navigation: this one.
-            advice: τ and δ.
-        """
-        advice = advice or AdviserConfig()
-        ratio = safety_ratio(self.tip.offset[:, 0], self.tip.radius[:, 0], navigation.device.tip_radius_mm)
-        states = {
-            "contact": ratio >= advice.wall_ratio,
-            "astray": self.astray_mm >= advice.abscissa_mm,
-            "force": ~is_safe(self.contact_force_max, navigation.force_limit_n),
-        }
-        return {kind: count_events(state[:-1], self.exposed[:-1]) for kind, state in states.items()}
+def count_navigation_events(
+    record: NavigationRecord, navigation: Navigation, advice: AdviserConfig | None = None
+) -> dict[str, Counted]:
+    """Return what X-ray had to show in a navigation, and what it missed (`belief.events`): contacts with the wall, tips
+    that were astray of where the policy believed them, and forces beyond the limit.
+
+    Args:
+        advice: τ and δ.
+    """
+    advice, tip = advice or AdviserConfig(), record.tip[:, 0]
+    states = {
+        "contact": safety_ratio(tip.offset, tip.radius, navigation.device.tip_radius_mm) >= advice.wall_ratio,
+        "astray": record.astray_mm >= advice.abscissa_mm,
+        "force": ~is_safe(record.contact_force_max, navigation.force_limit_n),
+    }
+    return {kind: count_events(state[:-1], record.exposed[:-1]) for kind, state in states.items()}
 
 
 class Track:
