@@ -42,6 +42,7 @@ FIGURES = {
     "contacts_missed_share": "contacts with the wall missed",
     "contacts_missed_share_evenly": "the same with as many exposures at even times",
     "intervals_held_share": "stated intervals of 80 % that hold",
+    "intervals_missed_share": "and that do not",
     "false_alarms_share": "navigations in the nominal world with a false alarm",
     "alarms_share": "navigations in other worlds with an alarm",
     "ostium_error_mm": "error of an ostium that is off, after 5 exposures, median, mm",
@@ -55,6 +56,7 @@ LEAST = (
     "safe_share_worst",
     "wall_right_share",
     "intervals_held_share",
+    "intervals_missed_share",
 )
 """Figures that are to be at least as large as their bar."""
 

@@ -47,7 +47,7 @@ UNITS = re.compile(r"(^|_)(mm2?|s2?|n|hu|rad|deg|px|ugy|seconds|pixel_sd|along_s
 WITHOUT_UNIT = {
     "calcium", "dose", "efficiency", "friction", "friction_along", "gain_rotation", "gain_sd_rotation",
     "gain_sd_translation", "gain_translation", "largest_jump", "learning_rate", "right_heart", "scale",
-    "scatter", "temperature", "wall_along", "window", "zoom",
+    "scatter", "temperature", "wall_along", "wall_around", "window", "zoom",
 }  # fmt: skip
 
 

@@ -53,9 +53,11 @@ def _ostium_aside(random: np.random.Generator) -> dict[str, Any]:
 
 def _wall(random: np.random.Generator) -> dict[str, Any]:
     found = _factors(compliant_wall_n_mm2=(0.01, 0.04))(random)
-    if random.random() < 0.5:
-        along = np.exp(random.uniform(np.log(0.3), np.log(3.0), 3))
-        found["wall_along"] = tuple((along / min(along.min(), 1.0)).tolist())  # nowhere softer than a wall can be
+    draws = {"wall_along": random, "wall_around": random.spawn(1)[0]}  # what else is drawn stays as it was
+    for name, own in draws.items():
+        if own.random() < 0.5:
+            factors = np.exp(own.uniform(np.log(0.3), np.log(3.0), 3))
+            found[name] = tuple((factors / min(factors.min(), 1.0)).tolist())  # nowhere softer than a wall can be
     return found
 
 

@@ -7,10 +7,9 @@ be improved; `test` is for what is published. Both are the first four patients o
 `benchmarks.agent.ladder_patients.choose` takes, by the ladder's own rules; the atlas of a task has the seed 19000, or
 20000, and the task's level. Beside the shipped worlds, or in their place, some are drawn at random (`drawn_worlds`).
 
-An event begins where the tip reaches the wall, lies 2 mm astray of where it is believed, by way of the fork where it is
-in another branch, or the wall presses with more than the limit. It is missed without an exposure then or 0.5 s later.
-Decisions in both bands are those of `NavigationRecord.in_bands`; a decision that has no band, as of a wire that is
-lost, counts as outside.
+Events are those of `count_navigation_events`: contacts, tips astray, in another branch too, and forces beyond the
+limit. Decisions in both bands are those of `NavigationRecord.in_bands`; a decision that has no band, as of a wire that
+is lost, counts as outside.
 """
 
 from __future__ import annotations
@@ -27,8 +26,6 @@ from jaxtyping import Float
 
 from benchmarks.agent.drawn_worlds import drawn_world
 from benchmarks.figures import Bar, judged
-from endopilot.anatomy.projection import safety_ratio
-from endopilot.belief.adviser import AdviserConfig, count_events, near_exposures
 from endopilot.belief.identification import Identified
 from endopilot.belief.monitor import BelievedTip, Monitor
 from endopilot.belief.watch import MISMATCH
@@ -40,7 +37,7 @@ from endopilot.ladder.attempt import navigation_events
 from endopilot.ladder.terms import Terms
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Decision, Observation
-from endopilot.navigation.record import NavigationRecord
+from endopilot.navigation.record import NavigationRecord, count_navigation_events
 from endopilot.runs import claim, make_missing
 from endopilot.settings import Seed, Within
 from endopilot.simulation.controls import ControlConfig, random_controls
@@ -82,6 +79,10 @@ SECONDS = 60.0
 """Length of a navigation at random, s."""
 MOST_EXPOSURES = 40
 """No planned navigation shall take more."""
+SIDES = ("left", "back", "head")
+"""Axes of LPS, as the parameters of a registration name them."""
+DEVIATE = 1.96
+"""Normal deviate of an interval of 95 %."""
 BARS = {
     "missed_share": Bar(0.06),
     "exposures_per_minute_nominal": Bar(17),
@@ -96,6 +97,7 @@ BARS = {
     "unsafe_by_force_share": Bar(0.01),
     "false_alarms_share": Bar(0.1),
     "intervals_held_share": Bar(0.75, at_least=True),
+    "intervals_missed_share": Bar(0.15, at_least=True),
     "ostium_error_mm": Bar(0.25),
     "wall_right_share": Bar(0.85, at_least=True),
 }
@@ -189,17 +191,7 @@ def driven_on(loop: NavigationLoop) -> NavigationRecord:
 def counted(record: NavigationRecord, navigation: Navigation) -> dict[str, Any]:
     """Return what is counted of a navigation."""
     assert record.believed is not None
-    radius_mm, advice = navigation.device.tip_radius_mm, AdviserConfig()
-    tip, near = record.tip[:-1, 0], near_exposures(record.exposed)
-    at_wall = safety_ratio(tip.offset, tip.radius, radius_mm) >= advice.wall_ratio
-    states = (
-        at_wall,
-        record.astray_mm[:-1] >= advice.abscissa_mm,
-        record.contact_force_max[:-1] > navigation.force_limit_n,
-    )
-    kinds = [count_events(state, near[:-1]) for state in states]
-    samples = len(record.exposed) - 1
-    even = max(0.0, 1.0 - 2 * int(record.exposed[1:].sum()) / samples)
+    radius_mm, kinds = navigation.device.tip_radius_mm, count_navigation_events(record, navigation)
     return {
         "reason": record.gives_up or record.reason,
         "success": record.success,
@@ -207,11 +199,9 @@ def counted(record: NavigationRecord, navigation: Navigation) -> dict[str, Any]:
         "seconds": record.seconds,
         "exposures": record.exposures,
         "peak_force_n": record.peak_force_n,
-        "events": np.sum(kinds, axis=0).tolist(),
-        "events_of_kinds": kinds,
-        "metronome": [kinds[0][0], kinds[0][1], even * kinds[0][0]],
+        "events": {kind: list(each) for kind, each in kinds.items()},
         "events_before": navigation_events(record.tip[:, 0], record.exposed, record.believed[:-1, 0], radius_mm),
-        "decisions": [int(record.in_bands.sum()), samples],
+        "decisions": [int(record.in_bands.sum()), len(record.exposed) - 1],
         "alarms": sum(MISMATCH in asks for asks in record.asks),
         "found": record.found,
     }
@@ -226,21 +216,29 @@ def identified(found: Identified | None, world: World, ostium_mm: float | None) 
     """
     compliant = "rigid" if world.compliant_wall_n_mm2 is None else "compliant"
     interval = {} if found is None else found.interval
-    stated = {name: ends for name, ends in interval.items() if ends is not None and hasattr(world, name)}
+    stated = {name: ends for name, ends in interval.items() if ends is not None}
     wall = "unknown" if found is None else found.wall
     return {
         "ostium_error_mm": None if ostium_mm is None or not world.ostium_mm else abs(ostium_mm - world.ostium_mm),
         "wall_right": None if wall == "unknown" else wall == compliant,
-        "intervals": {name: low <= getattr(world, name) <= high for name, (low, high) in stated.items()},
+        "intervals": {name: low <= true_value(world, name) <= high for name, (low, high) in stated.items()},
     }
+
+
+def true_value(world: World, name: str) -> float:
+    """Return what a parameter of the hypotheses truly is in a world."""
+    field, _, side = name.partition(" ")
+    value = getattr(world, field)
+    return value[SIDES.index(side)] if side else value
 
 
 def row(world: str, drive: Drive, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the row of one world and drive."""
-    (happened, missed), (held, decisions), before, metronome = (
-        np.sum([result[name] for result in results], axis=0).tolist()
-        for name in ("events", "decisions", "events_before", "metronome")
+    (held, decisions), before = (
+        np.sum([result[name] for result in results], axis=0).tolist() for name in ("decisions", "events_before")
     )
+    contacts = np.sum([result["events"]["contact"] for result in results], axis=0).tolist()
+    happened, missed, _ = np.sum([each for result in results for each in result["events"].values()], axis=0).tolist()
     intervals = [holds for result in results for holds in result["intervals"].values()]
     seconds, exposures = (sum(result[name] for result in results) for name in ("seconds", "exposures"))
     return {
@@ -253,9 +251,9 @@ def row(world: str, drive: Drive, results: Sequence[Mapping[str, Any]]) -> dict[
         "missed": missed,
         "events_before": before[0],
         "missed_before": before[1],
-        "contacts": metronome[0],
-        "contacts_missed": metronome[1],
-        "contacts_missed_evenly": metronome[2],
+        "contacts": contacts[0],
+        "contacts_missed": contacts[1],
+        "contacts_missed_evenly": contacts[2],
         "intervals": len(intervals),
         "intervals_held": sum(intervals),
         "decisions": decisions,
@@ -281,8 +279,16 @@ def share(rows: Sequence[Mapping[str, Any]], part: str, whole: str) -> float | N
     return sum(each[part] for each in rows) / total if total else None
 
 
-def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Return the figures of the rows of all worlds; those without navigations are left out.
+def sure(part: float, whole: int) -> tuple[float, float]:
+    """Return the interval in which a share is with 95 %, as Wilson has it."""
+    spread = DEVIATE * float(np.sqrt(part * (whole - part) / whole + DEVIATE**2 / 4))
+    middle, size = part + DEVIATE**2 / 2, whole + DEVIATE**2
+    return (middle - spread) / size, (middle + spread) / size
+
+
+def figures(rows: Sequence[Mapping[str, Any]]) -> tuple[dict[str, float], list[dict[str, Any]]]:
+    """Return the figures of the rows of all worlds, and those that are shares with the interval in which each is with
+    95 %; those without navigations are left out.
 
     They are of the worlds other than the nominal one where their names do not say so. `in_bands_share` is that of
     planned or of random navigations, whichever is smaller; `worst` is the mean of the tenth of the worlds in which a
@@ -305,36 +311,46 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
         return None if a_second is None else 60 * a_second
 
     ostia = [error for each in rows for error in each["ostium_errors_mm"]]
-    bands = {drive: share(of(drive), "in_bands", "decisions") for drive in ("random", "planned")}
+    shares: dict[str, tuple[Sequence[Mapping[str, Any]], str, str]] = {
+        "missed_share": (of("random"), "missed", "events"),
+        "missed_share_planned": (of("planned"), "missed", "events"),
+        "in_bands_share_random": (of("random"), "in_bands", "decisions"),
+        "in_bands_share_planned": (of("planned"), "in_bands", "decisions"),
+        "safe_share": (of("planned"), "safe", "navigations"),
+        "unsafe_by_force_share": (of("planned"), "unsafe_by_force", "navigations"),
+        "false_alarms_share": (nominal, "alarmed", "navigations"),
+        "alarms_share": (other, "alarmed", "navigations"),
+        "missed_share_before": (of("random"), "missed_before", "events_before"),
+        "missed_share_planned_before": (of("planned"), "missed_before", "events_before"),
+        "contacts_missed_share": (other, "contacts_missed", "contacts"),
+        "contacts_missed_share_evenly": (other, "contacts_missed_evenly", "contacts"),
+        "intervals_held_share": (rows, "intervals_held", "intervals"),
+        "wall_right_share": (of("random", rows), "walls_right", "walls"),
+    }
+    known = {name: found for name, each in shares.items() if (found := share(*each)) is not None}
+    bands = [value for name, value in known.items() if name.startswith("in_bands_share_")]
     found = {
-        "missed_share": share(of("random"), "missed", "events"),
+        **known,
         "missed_share_worst": worst(of("random"), "missed", "events", most=True),
         "exposures_per_minute_nominal": a_minute(of("random", nominal)),
         "exposures_per_minute_other": a_minute(of("random")),
-        "in_bands_share": min((value for value in bands.values() if value is not None), default=None),
+        "in_bands_share": min(bands, default=None),
         "in_bands_share_worst": worst(other, "in_bands", "decisions"),
-        "in_bands_share_random": bands["random"],
-        "in_bands_share_planned": bands["planned"],
-        "missed_share_planned": share(of("planned"), "missed", "events"),
-        "safe_share": share(of("planned"), "safe", "navigations"),
         "safe_share_worst": worst(of("planned"), "safe", "navigations"),
         "exposures_planned": share(of("planned"), "exposures", "navigations"),
         "exposures_planned_nominal": share(of("planned", nominal), "exposures", "navigations"),
-        "unsafe_by_force_share": share(of("planned"), "unsafe_by_force", "navigations"),
         "navigations_above_40_exposures": sum(each["above_40"] for each in rows if each["drive"] == "planned"),
-        "false_alarms_share": share(nominal, "alarmed", "navigations"),
-        "alarms_share": share(other, "alarmed", "navigations"),
         "events": sum(each["events"] for each in rows),
-        "missed_share_before": share(of("random"), "missed_before", "events_before"),
-        "missed_share_planned_before": share(of("planned"), "missed_before", "events_before"),
-        "contacts_missed_share": share(other, "contacts_missed", "contacts"),
-        "contacts_missed_share_evenly": share(other, "contacts_missed_evenly", "contacts"),
-        "intervals_held_share": share(rows, "intervals_held", "intervals"),
+        "intervals_missed_share": 1 - known["intervals_held_share"] if "intervals_held_share" in known else None,
         "intervals": sum(each["intervals"] for each in rows),
-        "wall_right_share": share(of("random", rows), "walls_right", "walls"),
         "ostium_error_mm": float(np.median(ostia)) if ostia else None,
     }
-    return {name: round(value, 4) for name, value in found.items() if value is not None}
+    within = []
+    for name, value in known.items():
+        whole = int(sum(each[shares[name][2]] for each in shares[name][0]))
+        low, high = sure(value * whole, whole)
+        within.append({"share": name, "is": round(value, 4), "from": round(low, 4), "to": round(high, 4), "of": whole})
+    return {name: round(value, 4) for name, value in found.items() if value is not None}, within
 
 
 def drive_in_worlds(
@@ -363,7 +379,8 @@ def drive_in_worlds(
         patients: set of the patients.
 
     Returns:
-        The figures with their bars, and a row for each world and drive.
+        The figures with their bars, shares with the intervals in which they are with 95 %, and a row for each world and
+        drive.
 
     Raises:
         InputError: no such world, or the folder belongs to another run.
@@ -384,5 +401,6 @@ def drive_in_worlds(
     in_turns = [some[turn] for turn in range(PLACES) for some in paths.values() if turn < len(some)]
     make_missing("The agent in other worlds", in_turns, make)
     rows = [row(*key, [read_json(path) for path in some]) for key, some in paths.items() if some]
-    found = figures(rows)
-    return judged(found, {name: bar for name, bar in BARS.items() if name in found}) | {"worlds": rows}
+    found, within = figures(rows)
+    bars = {name: bar for name, bar in BARS.items() if name in found}
+    return judged(found, bars) | {"shares": within, "worlds": rows}

@@ -67,12 +67,14 @@ def measured(folder: Path, model: str) -> dict[str, Any]:
         cover = monitoring.coverage(test, bands)
         advised = monitoring.adviser_policy(test, bands, config.adviser)
         policy = monitoring.measure_policy(test, advised, config.adviser)
+        even = monitoring.measure_metronome(test, policy["exposures_per_minute"], config.adviser)
         found[world] = {
             "cover": cover["simultaneous"],
             "samplewise": cover["samplewise"],
             "half": cover["median_half_width_mm"],
             "mae": cover["error_mae_mm"],
             "missed": policy["missed_share"],
+            "evenly": even["missed_share"],
             "exposures": policy["exposures_per_minute"],
             "n": cover["intervals"],
         }
@@ -95,8 +97,11 @@ def p1_rows(folder: Path, models: dict[str, dict[str, Any]]) -> Iterator[str]:
 
 def advice_rows(models: dict[str, dict[str, Any]]) -> Iterator[str]:
     """Yield the rows of the advice in worlds."""
-    yield "| patients | model | bands hold throughout | at samples | error of Δtip, γtip, mm | missed | a minute |"
-    yield "|---|---|---|---|---|---|---|"
+    yield (
+        "| patients | model | bands hold throughout | at samples | error of Δtip, γtip, mm | missed "
+        "| by as many at even times | a minute |"
+    )
+    yield "|---|---|---|---|---|---|---|---|"
     for world, title in WORLDS.items():
         for name, found in models.items():
             if world not in found:
@@ -104,7 +109,8 @@ def advice_rows(models: dict[str, dict[str, Any]]) -> Iterator[str]:
             at = found[world]
             yield (
                 f"| {title} | {MODELS[name]} | {at['cover']:.0%} of {at['n']} | {at['samplewise']:.0%} | "
-                f"{at['mae'][0]:.2f}, {at['mae'][1]:.3f} | {at['missed']:.1%} | {at['exposures']:.1f} |"
+                f"{at['mae'][0]:.2f}, {at['mae'][1]:.3f} | {at['missed']:.1%} | {at.get('evenly', np.nan):.1%} "
+                f"| {at['exposures']:.1f} |"
             )
 
 

@@ -127,7 +127,7 @@ def test_an_image_in_which_no_wire_is_found_shows_nothing_and_is_taken_again(spl
     parts = monitoring.follow_policy(unseen, monitoring.periodic_policy(unseen, 4), EVENTS)
     assert np.flatnonzero(parts.exposed[0] & ~whole.exposed[0]).tolist() == [at + 1]
     assert parts.exposed[0, at]  # it counts all the same
-    assert whole.near[0, at - 1] and not parts.near[0, at - 1] and parts.near[0, at]
+    assert whole.shown[0, at] and not parts.shown[0, at] and parts.shown[0, at + 1]
     np.testing.assert_array_equal(parts.exposed[1:], whole.exposed[1:])
 
 

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endopilot.belief.adviser import AdviserConfig, Predicted, XrayAdviser, astray_mm, count_events, near_exposures
+from endopilot.belief.adviser import AdviserConfig, Predicted, XrayAdviser
 from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of, surely_missed
+from endopilot.belief.events import astray_mm, count_events
 from endopilot.errors import InputError
 
 
@@ -46,11 +47,20 @@ def test_bands_hold_over_whole_intervals_of_new_patients(unlike) -> None:
 def test_an_event_is_where_a_state_begins_and_an_exposure_then_or_soon_after_shows_it() -> None:
     state = np.array([[1, 1, 0, 1, 1, 0, 0, 1, 0, 1], [0, 0, 0, 0, 1, 0, 0, 0, 0, 0]], dtype=bool)
     exposed = np.zeros((2, 10), dtype=bool)
-    assert count_events(state, near_exposures(exposed)) == (3, 3)  # not what was so at first, nor the last sample
+    assert count_events(state, exposed) == (3, 3, 3.0)  # not what was so at first, nor the last sample
     exposed[0, [2, 9]] = True  # one period before the first; two after the second
     exposed[1, 5] = True
-    assert count_events(state, near_exposures(exposed)) == (3, 2)
-    assert count_events(state, near_exposures(exposed, before=True)) == (3, 1)  # as the ladder's second version has it
+    assert count_events(state, exposed)[:2] == (3, 2)
+    assert count_events(state, exposed, before=True)[:2] == (3, 1)  # as the ladder's second version has it
+
+
+def test_as_many_exposures_at_even_times_miss_what_they_would_whenever_the_first_is() -> None:
+    state = np.random.default_rng(1).random(401) < 0.3
+    every_fifth = [(np.arange(401) % 5 == first) | (np.arange(401) == 0) for first in range(5)]
+    counted = [count_events(state, exposed) for exposed in every_fifth]
+    assert counted[0].happened > 50 and len({each.missed for each in counted}) > 1
+    assert np.mean([each.missed for each in counted]) == pytest.approx(counted[0].missed_evenly)
+    assert counted[0].missed_evenly == pytest.approx(0.6 * counted[0].happened)
 
 
 def test_a_tip_in_another_branch_is_astray_by_way_of_the_fork(fork) -> None:

@@ -15,6 +15,7 @@ from benchmarks.agent.worlds import DrivenAtRandom, counted, drive_in_worlds, dr
 from endopilot.belief.identification import Identified
 from endopilot.errors import InputError
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
+from endopilot.navigation.record import count_navigation_events
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation, Target
@@ -22,7 +23,8 @@ from endopilot.tasks.task import list_tasks
 
 CORE = SimulatorConfig(element_mm=1.5, time_step_s=0.05, threads=1)
 GOOD = {"reason": "reached", "success": True, "safe": True, "seconds": 30.0, "exposures": 4, "peak_force_n": 0.1}
-GOOD |= {"events": [4, 1], "decisions": [18, 20], "alarms": 0, "events_before": [4, 0], "metronome": [3, 1, 2.0]}
+GOOD |= {"events": {"contact": [3, 1, 2.0], "astray": [1, 0, 0.7], "force": [0, 0, 0.0]}, "events_before": [4, 0]}
+GOOD |= {"decisions": [18, 20], "alarms": 0}
 GOOD |= {"intervals": {"lumen_factor": True}}
 
 
@@ -71,16 +73,49 @@ def test_decisions_without_bands_count_as_outside(at_random, monkeypatch):
     assert part["decisions"][1] == 8 and part["decisions"][0] <= 2 and part["alarms"] == 1
 
 
+def test_events_are_contacts_wrong_branches_and_forces_from_their_onset_on(at_random, monkeypatch):
+    record, navigation = at_random(8.0, monkeypatch)
+    nothing = np.zeros(17)
+    tip = replace(record.tip, offset=np.zeros((17, 1)), radius=np.full((17, 1), 2.0))
+    still = replace(record, tip=tip, astray_mm=nothing, contact_force_max=nothing, exposed=nothing > 0)
+    assert all(each == (0, 0, 0.0) for each in count_navigation_events(still, navigation).values())
+    touches, strays, presses = tip.offset.copy(), nothing.copy(), nothing.copy()
+    touches[5:8], strays[9:12], presses[13] = 1.9, 30.0, 2 * navigation.force_limit_n  # 30 mm astray: another branch
+    course = replace(still, tip=replace(tip, offset=touches), astray_mm=strays, contact_force_max=presses)
+    before = np.isin(np.arange(17), [0, 4, 8, 12])
+    found = count_navigation_events(replace(course, exposed=before), navigation)  # each 0.5 s too early
+    assert {kind: each[:2] for kind, each in found.items()} == {"contact": (1, 1), "astray": (1, 1), "force": (1, 1)}
+    assert found["contact"].missed_evenly == pytest.approx(1 - 2 * 3 / 15)
+    for later in (1, 2):  # then, and 0.5 s after
+        shown = np.roll(before, later)
+        assert all(
+            each.missed == 0 for each in count_navigation_events(replace(course, exposed=shown), navigation).values()
+        )
+    assert all(
+        each.missed
+        for each in count_navigation_events(replace(course, exposed=np.roll(before, 3)), navigation).values()
+    )
+    whole = counted(replace(course, exposed=before), navigation)
+    assert row("wide", "random", [whole | identified(None, World(), None)])["missed"] == 3
+
+
 def test_figures_are_those_of_other_worlds_and_of_the_worst():
+
+    def missing(happened: int, missed: int) -> dict:
+        none = [0, 0, 0.0]
+        return GOOD | {"events": {"contact": [happened, missed, happened * 2 / 3], "astray": none, "force": none}}
+
     rows = [
         row("nominal", "planned", [GOOD | {"alarms": 2}, GOOD]),
         row("nominal", "random", [GOOD]),
         row("wide", "planned", [GOOD, GOOD | {"success": False, "exposures": 50, "decisions": [0, 20]}]),
-        row("wide", "random", [GOOD | {"events": [10, 0]}]),
+        row("wide", "random", [missing(10, 0)]),
         row("rough", "planned", [GOOD | {"safe": False, "peak_force_n": 0.9}, GOOD]),
-        row("rough", "random", [GOOD | {"events": [10, 4], "exposures": 10}]),
+        row("rough", "random", [missing(10, 4) | {"exposures": 10}]),
     ]
-    found = figures(rows)
+    found, within = figures(rows)
+    assert within[0]["share"] == "missed_share" and within[0]["of"] == 20
+    assert (within[0]["from"], within[0]["to"]) == pytest.approx((0.0807, 0.416), abs=1e-4)  # Wilson, 4 of 20
     assert found["missed_share"] == 0.2 and found["missed_share_worst"] == 0.4
     assert found["exposures_per_minute_nominal"] == 8 and found["exposures_per_minute_other"] == 14
     assert found["safe_share"] == 0.5 and found["unsafe_by_force_share"] == 0.25
@@ -91,7 +126,7 @@ def test_figures_are_those_of_other_worlds_and_of_the_worst():
     assert found["in_bands_share_random"] == 0.9 and found["in_bands_share_planned"] == 0.675
     assert found["in_bands_share"] == 0.675 and found["in_bands_share_worst"] == 0.6
     assert found["false_alarms_share"] == pytest.approx(1 / 3, abs=1e-4) and found["alarms_share"] == 0
-    assert "exposures_planned" not in figures([each for each in rows if each["drive"] == "random"])
+    assert "exposures_planned" not in figures([each for each in rows if each["drive"] == "random"])[0]
 
 
 def test_an_ostium_that_is_off_and_stated_walls_are_compared_with_the_truth():
@@ -101,17 +136,18 @@ def test_an_ostium_that_is_off_and_stated_walls_are_compared_with_the_truth():
         row("deeper", "random", [GOOD | each for each in found]),
         row("deeper", "planned", [GOOD]),
     ]
-    assert figures(rows)["ostium_error_mm"] == 0.35 and figures(rows)["wall_right_share"] == 0.5
+    assert figures(rows)[0]["ostium_error_mm"] == 0.35 and figures(rows)[0]["wall_right_share"] == 0.5
     stated = {
         "lumen_factor": (1.0, 1.2),
         "friction_factor": (0.5, 0.8),
         "tip_bend_factor": None,
-        "drift_mm_min left": (0, 1),
+        "drift_mm_min back": (0.5, 1),
     }
     said = Identified(stated, "compliant", explains=True, words="")
     wide = identified(said, World(ostium_mm=2.0, lumen_factor=1.1), 1.7)
     assert wide["ostium_error_mm"] == pytest.approx(0.3) and wide["wall_right"] is False
-    assert wide["intervals"] == {"lumen_factor": True, "friction_factor": False}
+    assert wide["intervals"] == {"lumen_factor": True, "friction_factor": False, "drift_mm_min back": False}
+    assert identified(said, World(drift_mm_min=(0.0, 0.7, 0.0)), None)["intervals"]["drift_mm_min back"]
     soft = identified(said, World(compliant_wall_n_mm2=0.01), 1.7)
     assert soft["ostium_error_mm"] is None and soft["wall_right"] is True
     nothing = identified(None, World(), None)

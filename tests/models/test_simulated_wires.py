@@ -148,6 +148,9 @@ def test_none_of_the_hypotheses_wins_where_none_explains_the_images(moved_tips):
     family, members, tips, shown, scale = moved_tips
     elsewhere = np.random.default_rng(1).normal(0, 0.6, shown.shape)
     assert family.update(members, tips, elsewhere, scale).none > 0.9
+    beside = shown + np.array([0.0, 0.4, 0.0]) * np.resize([1.0, -1.0], 20)[:, None]  # to and fro, which no member does
+    assert family.update(members, tips, beside, scale).none > 0.9
+    assert family.update(members, tips, tips[5] + (beside - shown)[::-1] / 8, scale).none < 0.5  # by half a deviation
     assert family.update(members, np.full_like(tips, np.nan), shown, scale).none == 1.0
 
 

@@ -90,6 +90,26 @@ def test_the_wall_yields_where_it_is_soft(bend):
     assert graded[at < 25].max() > 2 * grew[at < 25].max() and graded[at > 40].max() < grew[at > 40].max()
 
 
+def test_the_wall_yields_to_the_side_where_it_is_soft(bend):
+    """Factors begin at the normals, which here stand across the plane of the bend: its outer wall is a quarter away."""
+    line = bend.tree.branches[0].centerline
+    tangent = np.gradient(line.points, axis=0)
+    outwards = np.cross(tangent, line.normals)  # a quarter turn on from the normals
+    middle = len(line.points) // 2
+    outer = outwards[middle] @ (line.points[[0, -1]].mean(axis=0) - line.points[middle]) < 0
+
+    def dent(around):
+        config = replace(CORE, compliant_wall_n_mm2=0.04, wall_around=around)
+        made = simulate(bend, WIRE, PUSH, initial=START, config=config, record_shape=True)
+        assert made.valid.all() and made.shape is not None
+        return (WIRE.tip_radius_mm - sample(bend.distance_map, made.shape[0, -1])).max()
+
+    one, other = dent((1.0, 0.25, 1.0, 4.0)), dent((1.0, 4.0, 1.0, 0.25))
+    soft, stiff = (one, other) if outer else (other, one)
+    assert soft > 2 * stiff  # the wire lies on the outer wall
+    assert dent((4.0,)) == pytest.approx(dent((4.0, 4.0, 4.0)), rel=1e-6)
+
+
 def test_walls_that_vary_otherwise_are_not_shared(bend):
     soft = replace(CORE, compliant_wall_n_mm2=0.04)
     graded = replace(soft, wall_along=(0.25, 4.0))
@@ -109,5 +129,7 @@ def test_a_factor_is_linear_between_its_places(bend):
     assert factor_at(np.array([5.0]), bend.tree, (3.0,)) == pytest.approx([3.0])
     with pytest.raises(InputError, match="wall_along: the wall is not compliant"):
         SimulatorConfig(wall_along=(1.0, 2.0))
+    with pytest.raises(InputError, match="wall_around: the wall is not compliant"):
+        SimulatorConfig(wall_around=(1.0, 2.0))
     with pytest.raises(InputError, match=r"wall_along: the wall has 0\.0025 N/mm² at least"):
         SimulatorConfig(compliant_wall_n_mm2=0.01, wall_along=(1.0, 0.25))

@@ -12,7 +12,6 @@ from endopilot.anatomy.projection import safety_ratio
 from endopilot.belief.bands import Calibration
 from endopilot.settings import OpenShare, Positive, settings
 from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM
-from endopilot.types import VesselTree
 
 _SPACING, _ALWAYS = 2, 3
 """Periods from one exposure to the next, at least: one shows what began within a period before it. And where a model is
@@ -33,53 +32,6 @@ class AdviserConfig:
     """δ: an event begins where Δtip errs by this much, mm; as near as a target counts as reached if not given."""
     missed: OpenShare = 0.05
     """Share of the events that may be missed: the calibration finds how much of γtip's band the adviser must use."""
-
-
-def near_exposures(exposed: Bool[np.ndarray, "*n samples"], *, before: bool = False) -> Bool[np.ndarray, "*n samples"]:
-    """Return which samples have an exposure then or 0.5 s, a sample, later, given which were exposed.
-
-    Args:
-        before: whether one that comes a sample earlier counts too, as in version 2 of the ladder.
-    """
-    near = exposed.copy()
-    near[..., :-1] |= exposed[..., 1:]
-    if before:
-        near[..., 1:] |= exposed[..., :-1]
-    return near
-
-
-def astray_mm(
-    tree: VesselTree, believed: tuple[np.ndarray, np.ndarray], true: tuple[np.ndarray, np.ndarray]
-) -> Float[np.ndarray, "n"]:
-    """Return how far tips lie from where they are believed, along the vessel, mm: by way of the fork between the two.
-
-    Within the mouth of a branch, as far from the fork as the lumen there is wide, a tip counts as in both.
-
-    Args:
-        believed: branch and Δtip, mm, of each.
-        true: the same.
-    """
-    fork = np.full(len(true[0]), np.inf)
-    for k, (one, other) in enumerate(zip(believed[0].tolist(), true[0].tolist(), strict=True)):
-        if one >= 0 and np.isfinite(leaves := tree.departures(one)[other]):
-            line = tree.path(one)
-            fork[k] = leaves + np.interp(leaves, line.abscissa, line.radius)
-    at, there = believed[1], true[1]
-    return at + there - 2 * np.minimum(fork, np.minimum(at, there))  # the nearer of two on one route is their fork
-
-
-def count_events(state: Bool[np.ndarray, "*n samples"], near: Bool[np.ndarray, "*n samples"]) -> tuple[int, int]:
-    """Return how many events there are, and how many of them are missed.
-
-    One begins at a sample in the state that follows one which is not; it is missed if no exposure is near. The last
-    sample is left out: the exposure that would show it may come after the end.
-
-    Args:
-        state: whether the tip is at the wall, or Δtip errs by δ.
-        near: which samples have an exposure near, see `near_exposures`.
-    """
-    begins = state[..., 1:-1] & ~state[..., :-2]
-    return int(begins.sum()), int((begins & ~near[..., 1:-1]).sum())
 
 
 class Predicted(NamedTuple):

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from endopilot.anatomy.projection import TipProjector
-from endopilot.belief.drives import Drives
+from endopilot.belief.drives import Drives, force_sd_n
 from endopilot.belief.moved_copies import Fans, MovedCopies, shifted, turned
 from endopilot.belief.thought import Budget
 from endopilot.belief.vessels import SharedVessels
@@ -149,6 +149,7 @@ class Belief:
             share.
         shown: at each measurement that was replayed, every member's tip and the direction of its wire there, in the
             vessel as CT shows it, LPS mm.
+        pushed: at each period that was replayed, the force that every member ahead of the valve takes of its drive, N.
         force: largest force of the wall on a node of each member at the end of the last period, N.
     """
 
@@ -186,6 +187,7 @@ class Belief:
         self._score, self._coaxial = np.zeros(len(self.members)), bool(navigation.catheters)
         self.evidence = 0.0
         self.shown: list[tuple[Float[np.ndarray, "members 3"], Float[np.ndarray, "members 3"]]] = []
+        self.pushed: list[Float[np.ndarray, "members"]] = []
         self.tip = self.simulator.project()[:, 0]
 
     def like(self, members: Sequence[World], **changed: Any) -> Belief:
@@ -312,6 +314,12 @@ class Belief:
         return float(self.simulator.base_load[self.best, 0, 0])
 
     @property
+    def pushed_sd_n(self) -> float:
+        """How surely that is known, a standard deviation, N: wires err, and differ."""
+        pushed, weight = self.simulator.base_load[:, 0, 0], self.weight
+        return float(np.hypot(force_sd_n(self.pushed_n), np.sqrt(weight @ (pushed - weight @ pushed) ** 2)))
+
+    @property
     def valve(self) -> tuple[float, float]:
         """Friction of the introducer's valve, N, and its drag, N·s/mm."""
         return self.simulator.config.introducer_friction_n, self.simulator.config.introducer_drag_n_s_mm
@@ -379,6 +387,7 @@ class Belief:
         for period, proximal in enumerate(past.proximal[begun:], begun):
             if period:
                 self._move(proximal)
+            self.pushed.append(self.simulator.base_load[:, 0, 0].copy())
             if period in past.exposures:
                 self.shown.append((self.simulator.tip_position[:, 0].copy(), self.simulator.tip_direction[:, 0].copy()))
                 self._weigh(

@@ -35,6 +35,13 @@ _STRAY_SHARE, _STRAYS = 0.03, np.array([0.7, 1.0])
 """Share of the samples that may be where none of the others is, and how far from these, mm and rad."""
 _FORCE_SD_N, _FORCE_SHARE = 0.02, 0.2
 """Standard deviation of the force that a simulated device predicts, N, and as a share of it."""
+
+
+def force_sd_n(predicted_n: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"] | float:
+    """Return the standard deviation of a force that a simulated device predicts of its drive, N."""
+    return np.hypot(_FORCE_SD_N, _FORCE_SHARE * np.abs(predicted_n))
+
+
 _LEAST_LIKELY = 0.02
 """No force makes a sample less likely than this, as a share of the most likely: simulated devices may be elsewhere."""
 _MOVES_MM_S, _TURNS_RAD_S = 0.5, 0.1
@@ -214,7 +221,7 @@ class Drives:
         left = self._gap[:, device, 0] / 2 - np.sign(speed) * self._ahead[:, device, 0]
         error = force_n - pushed_n - np.where(left < _TAKEN_UP[0], np.sign(speed) * valve[0] + speed * valve[1], 0.0)
         read_sd = self._robot.of_drives(len(self._sent), "load_sd_n")[device, 0]
-        sd = np.hypot(read_sd, _FORCE_SD_N + _FORCE_SHARE * abs(pushed_n))
+        sd = np.hypot(read_sd, force_sd_n(pushed_n))
         score = np.log(np.exp(-0.5 * (error / sd) ** 2) + _LEAST_LIKELY)
         if np.ptp(score) > 0:
             self._draw(device, score)

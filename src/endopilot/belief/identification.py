@@ -1,8 +1,8 @@
 """Which hypotheses explain what X-ray showed: `identify`.
 
 Members that differ in the parameters of all hypotheses replay the way of the devices so far. What they show at each
-exposure is compared with what X-ray did (`models.hypotheses`). Members of the next generation are drawn around what is
-then believed.
+exposure is compared with what X-ray did, and what they take of their drive since the one before with what it read
+(`models.hypotheses`). Members of the next generation are drawn around what is then believed.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.belief.belief import Belief, Past
+from endopilot.belief.drives import force_sd_n
 from endopilot.errors import InputError
 from endopilot.models.hypotheses import HEART, HYPOTHESES, LUMEN, Family, Posterior
 from endopilot.simulation.world import World
@@ -22,6 +23,8 @@ from endopilot.tasks.navigation import DECISION_PERIOD_S
 
 _LARGEST_MAP = 50_000_000
 """Points of a distance map beyond which no other lumen is tried: it would take gigabytes."""
+_ADVANCES_MM_S = 0.5
+"""A slower advance says nothing by its force: the valve's friction hides it."""
 _MODEL_MM = np.array([0.5, 0.3])
 """Standard deviations of a good member's errors along and across its wire, mm."""
 _DEVIATIONS = 1.28
@@ -67,7 +70,7 @@ def identify(belief: Belief, past: Past) -> tuple[Belief, Identified]:
     lumens = len(past.exposures) > 1 and belief.navigation.anatomy.distance_map.values.size <= _LARGEST_MAP
     family = Family([each for each in HYPOTHESES if each.name != HEART and (lumens or each.name != LUMEN)])
     shown = np.array([belief.unmoved(each, period) for period, each in past.exposures.items()])
-    found = family.as_given()
+    read_n, found = np.array([read for _, read in _advances(belief, past)]), family.as_given()
     drawn = first = family.drawn(found.mean, np.eye(len(found.mean)), _KINDS, _EACH, vessels=_VESSELS)
     for generation in range(_GENERATIONS):
         if generation:
@@ -76,20 +79,38 @@ def identify(belief: Belief, past: Past) -> tuple[Belief, Identified]:
             spread = np.diag(np.clip(2 * found.sd, _NARROWEST, 1.0))
             drawn = family.drawn(found.mean, spread, _KINDS, _EACH, vessels=_VESSELS, seed=generation)
             drawn[:, family.costly] = first[:, family.costly]
-        tips, scale = _replayed(belief, past, [family.world(each) for each in drawn])
-        found = family.update(drawn, tips, shown, scale)
+        seen, scale = _replayed(belief, past, [family.world(each) for each in drawn])
+        found = family.update(drawn, seen, np.column_stack([shown, read_n]), scale)
     belief.vessels.keep([family.world(each) for each in first])
     made = belief.like(_members(family, found, belief))
     made.replay(past)
     return made, _stated(family, found)
 
 
+def _advances(belief: Belief, past: Past) -> list[tuple[list[int], float]]:
+    """Return the periods before each exposure, since the last one, in which the wire advanced, and with what force in
+    the mean, N, less the valve's; none where drives lose their motion, or measure no force: it is 0 then."""
+    friction_n, drag_n_s_mm = belief.valve
+    found, begun = [], 1
+    for exposed in past.exposures:
+        periods, read = [], []
+        for period in range(begun, exposed + 1):
+            _, load, commanded = past.measured[period]
+            if load and commanded and commanded[0][0] > _ADVANCES_MM_S and not belief.drives.lose:
+                periods.append(period)
+                read.append(load[0][0] - friction_n - drag_n_s_mm * commanded[0][0])
+        found.append((periods, float(np.mean(read)) if read else 0.0))
+        begun = exposed + 1
+    return found
+
+
 def _replayed(
     belief: Belief, past: Past, members: list[World]
-) -> tuple[Float[np.ndarray, "members exposures 3"], Float[np.ndarray, "exposures 3"]]:
-    """Return where members show their tips at each exposure, LPS mm; and how well these are known, beside the image."""
+) -> tuple[Float[np.ndarray, "members exposures 4"], Float[np.ndarray, "exposures 4"]]:
+    """Return where members show their tips at each exposure, LPS mm, and the force that they took of their drive since
+    the one before, N; and how well these are known, beside the image."""
     tips = np.full((len(members), len(past.exposures), 3), np.nan)
-    directions = tips.copy()
+    directions, forces, advances = tips.copy(), np.zeros(tips.shape[:2]), _advances(belief, past)
     walls = [each.compliant_wall_n_mm2 for each in members]
     for wall in dict.fromkeys(walls):
         rows = np.array([k for k, each in enumerate(walls) if each == wall])
@@ -103,11 +124,15 @@ def _replayed(
         beside = np.array([[members[k].registered_mm(time_s) for time_s in times_s.tolist()] for k in rows])
         tips[rows] = np.where(tried.simulator.valid[:, None, None], position + beside, np.nan)
         directions[rows] = direction
+        pushed, rest = np.array(tried.pushed), np.zeros(len(rows))
+        forces[rows] = np.stack([pushed[at].mean(axis=0) if at else rest for at, _ in advances], axis=1)
     along = np.nanmedian(directions, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
     measured = np.array([np.diag(each.covariance) for each in past.exposures.values()])
     own = _MODEL_MM[1] ** 2 + (_MODEL_MM[0] ** 2 - _MODEL_MM[1] ** 2) * along**2
-    return tips, np.sqrt(measured + own)
+    unread = [not at for at, _ in advances]
+    force_sd = np.where(unread, 1.0, force_sd_n(np.median(forces, axis=0)))
+    return np.dstack([tips, forces]), np.column_stack([np.sqrt(measured + own), force_sd])
 
 
 def _members(family: Family, found: Posterior, belief: Belief) -> list[World]:

@@ -34,6 +34,11 @@ _MARGIN = 0.25
 patients to improve agents on."""
 
 
+_ADVANCES, _OUTSIDE_SDS = 5, 1.645
+"""A drive pushes otherwise than predicted where the mean of so many readings is outside a band of 90 %: in worlds drawn
+to improve agents on, docs/evidence/worlds.md."""
+
+
 class LoadRatio:
     """The force of a drive over the predicted one, by least squares with forgetting, while the wire advances.
 
@@ -43,8 +48,17 @@ class LoadRatio:
     def __init__(self) -> None:
         """Begin with a drive that pushes as predicted."""
         self._read = self._predicted = _PRIOR_N**2
+        self._off = list[float]()
 
-    def take(self, read_n: float, predicted_n: float, *, speed_mm_s: float, valve: tuple[float, float]) -> None:
+    def take(
+        self,
+        read_n: float,
+        predicted_n: float,
+        *,
+        speed_mm_s: float,
+        valve: tuple[float, float],
+        sd_n: float = np.inf,
+    ) -> None:
         """Take a reading.
 
         Args:
@@ -52,12 +66,22 @@ class LoadRatio:
             predicted_n: what the wire ahead of the valve takes of it by the model, N.
             speed_mm_s: at which the drive advanced, mm/s.
             valve: friction of the introducer's valve, N, and its drag, N·s/mm.
+            sd_n: standard deviation of that prediction, N; nothing lies outside its band if not given.
         """
-        if predicted_n < _LEAST_N or speed_mm_s < _LEAST_MM_S:
+        if speed_mm_s < _LEAST_MM_S:
             return
         pushed_n, prior = read_n - valve[0] - valve[1] * speed_mm_s, (1 - _FORGETS) * _PRIOR_N**2
+        self._off.append((pushed_n - predicted_n) / sd_n)
+        if predicted_n < _LEAST_N:
+            return
         self._read = _FORGETS * self._read + predicted_n * pushed_n + prior
         self._predicted = _FORGETS * self._predicted + predicted_n**2 + prior
+
+    @property
+    def outside(self) -> bool:
+        """Whether the drive pushes otherwise than the model predicts: it warns before a wire that is held snaps."""
+        last = self._off[-_ADVANCES:]
+        return len(last) == _ADVANCES and abs(float(np.mean(last))) > _OUTSIDE_SDS
 
     @property
     def value(self) -> float:
@@ -182,7 +206,9 @@ class Monitor:
             self.belief.follow(encoders, load)
             if load and commanded and self._tests:
                 read_n, pushed_n, speed_mm_s = load[0][0], self.belief.pushed_n, commanded[0][0]
-                self._loads.take(read_n, pushed_n, speed_mm_s=speed_mm_s, valve=self.belief.valve)
+                sd_n, before = np.inf if self.belief.drives.lose else self.belief.pushed_sd_n, self._loads.outside
+                self._loads.take(read_n, pushed_n, speed_mm_s=speed_mm_s, valve=self.belief.valve, sd_n=sd_n)
+                self._innovations.alarm |= self._loads.outside and not before
         else:
             self.belief.drives.begin(encoders)
         self.past.proximal.append(self.belief.drives.proximal.copy())
@@ -305,7 +331,9 @@ class Monitor:
         if not (self.alarm and self._tests) or len(self.past.exposures) < _LEAST_EXPOSURES:
             return False
         if self.moves is None:
-            return self._navigation.known_motion is not None or self._farthest_outside_mm() >= _OUTSIDE_MM
+            unknown = self.identified is not None and not self.identified.explains
+            known = self._navigation.known_motion is not None
+            return known or unknown or self._farthest_outside_mm() >= _OUTSIDE_MM
         return not self.belief.explains or self._innovations.outside or self._since >= _EVERY
 
     def _farthest_outside_mm(self) -> float:

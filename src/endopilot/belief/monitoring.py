@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.belief.adviser import AdviserConfig, Predicted, count_events, near_exposures
+from endopilot.belief.adviser import AdviserConfig, Predicted
 from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of, surely_missed
+from endopilot.belief.events import Counted, count_events, near_exposures
 from endopilot.belief.image_exposures import Exposures, ImageSettings, deeper_ostium_mm, image_exposures
 from endopilot.belief.online_predictors import OnlinePredictor, online_predictor
 from endopilot.belief.watch import Watch
@@ -260,26 +261,22 @@ class Followed:
     """Navigations in which a policy decided when X-ray is on, from the last given sample on.
 
     Attributes:
-        near: which have an exposure within 0.5 s that shows the tip.
+        shown: which have one that shows the tip.
         astray: whether the predicted Δtip errs by δ.
     """
 
     exposed: Bool[np.ndarray, "episodes samples"]
-    near: Bool[np.ndarray, "episodes samples"]
+    shown: Bool[np.ndarray, "episodes samples"]
     wall: Bool[np.ndarray, "episodes samples"]
     astray: Bool[np.ndarray, "episodes samples"]
 
-    def count(self, episodes: Bool[np.ndarray, "episodes"] | slice = slice(None)) -> list[tuple[int, int]]:
-        """Return how many events there are at the wall and of Δtip, each with how many of them are missed."""
-        return [count_events(state[episodes], self.near[episodes]) for state in (self.wall, self.astray)]
+    def count(self, episodes: Bool[np.ndarray, "episodes"] | slice = slice(None)) -> list[Counted]:
+        """Return the events at the wall and of Δtip."""
+        return [count_events(state[episodes], self.shown[episodes]) for state in (self.wall, self.astray)]
 
 
 def follow_policy(monitored: Monitored, policy: ExposurePolicy, config: AdviserConfig) -> Followed:
-    """Let a policy decide when X-ray is on, and let the model observe what it shows.
-
-    An event begins where the true ratio reaches τ, or the error of the predicted Δtip reaches δ, after a sample at
-    which it had not. It is missed where no exposure that shows the tip is within 0.5 s, a sample, of its beginning.
-    """
+    """Let a policy decide when X-ray is on, and let the model observe what it shows."""
     model, truth = monitored.model, monitored.truth
     model.reset()
     exposed = np.zeros(truth.shape[:2], dtype=bool)
@@ -290,18 +287,18 @@ def follow_policy(monitored: Monitored, policy: ExposurePolicy, config: AdviserC
         if len(on):
             seen = episodes.tip[on, sample], episodes.branch[on, sample], episodes.tip_sd[on, sample]
             model.observe(on, sample, *seen)
-    near = near_exposures(exposed & monitored.found)
     wall = monitored.ratio >= config.wall_ratio
     astray = np.abs(model.tip[..., 0] - truth[..., 0]) >= config.abscissa_mm
     astray[:, WINDOW - 1] = False
-    return Followed(*(part[:, WINDOW - 1 :] for part in (exposed, near, wall, astray)))
+    return Followed(*(part[:, WINDOW - 1 :] for part in (exposed, exposed & monitored.found, wall, astray)))
 
 
 def measure_policy(monitored: Monitored, policy: ExposurePolicy, config: AdviserConfig) -> dict[str, float]:
     """Return what a policy costs and misses: see `follow_policy`."""
     found = follow_policy(monitored, policy, config)
-    (wall_events, missed_wall), (abscissa_events, missed_abscissa) = found.count()
-    exposed, unseen, wall = (part[:, 1:] for part in (found.exposed, found.wall & ~found.near, found.wall))
+    (wall_events, missed_wall, _), (abscissa_events, missed_abscissa, _) = found.count()
+    unseen = found.wall & ~near_exposures(found.shown)
+    exposed, unseen, wall = (part[:, 1:] for part in (found.exposed, unseen, found.wall))
     minutes = exposed.size * SAMPLE_PERIOD_S / 60
     events = wall_events + abscissa_events
     rate = float(exposed.sum() / minutes)

@@ -150,9 +150,9 @@ class Allowance:
         return np.hypot(_HELD_SHARE * max(self.held_mm - free_mm, 0.0), _TIP_MM) * self._alone
 
 
-_PRESSES = 0.8
-"""Share of the largest force that the wall may press with, by simulated wires and the drive's load, from which it is
-looked at: they err by a fifth, as wires do."""
+_PRESSES = np.array([0.8, 1.0, 1.25])
+"""Shares of the largest force that the wall may press with, by simulated wires and the drive's load, at which it is
+looked at: both ends of the band, for they err by a fifth, as wires do, and its middle."""
 MISMATCH = "model mismatch"
 """Why X-ray is asked for while the model is taken to be wrong."""
 
@@ -175,7 +175,7 @@ class Watch:
         self.innovations = Innovations()
         self._adviser = XrayAdviser(calibration, config, tip_radius_mm, at)
         self._allowance = Allowance(at.proximal[0], at.tip[0], alone=alone)
-        self._half, self._presses = self.half_width, False
+        self._half, self._presses = self.half_width, 0
 
     def move(self, at: Predicted) -> None:
         """Take what is predicted a period later."""
@@ -206,7 +206,7 @@ class Watch:
             changed: whether the model is another than the given one, which erred.
             pressed: force of the wall as a share of what it may be.
         """
-        self._presses, pressed_before = pressed >= _PRESSES, self._presses
+        self._presses, pressed_before = int((pressed >= _PRESSES).sum()), self._presses
         due = self._adviser.advise(
             at,
             np.sqrt(variance_mm2 + self._allowance.sd_mm**2),
@@ -214,7 +214,7 @@ class Watch:
             always=self.innovations.alarm,
             erred=changed or bool((self.innovations.factor > 1).any()),
             wall_mm=self._allowance.wall_mm(at.radius_mm),
-            presses=self._presses and not pressed_before,
+            presses=self._presses > pressed_before,
         )
         self._half = self.half_width / self.innovations.factor
         return due

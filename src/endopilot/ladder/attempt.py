@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.belief.adviser import AdviserConfig, count_events, near_exposures
+from endopilot.belief.adviser import AdviserConfig
+from endopilot.belief.events import count_events
 from endopilot.control.agent import AgentPolicy
 from endopilot.errors import InputError
 from endopilot.ladder.apart import Apart
@@ -193,15 +194,15 @@ def navigation_events(
     believed_mm: Float[np.ndarray, "decisions"],
     wire_radius_mm: float,
 ) -> tuple[int, int]:
-    """Return how many events a navigation had, as `AdviserConfig` defines them, and how many X-ray did not show.
+    """Return how many events a navigation had by version 2 of the ladder, and how many X-ray did not show.
 
     `tip` is as it truly was at the start and after each decision period, `believed_mm` Δtip as the policy believed it.
     """
     count, advice = len(believed_mm), AdviserConfig()
     at_wall = safety_ratio(tip.offset, tip.radius, wire_radius_mm)[:count] >= advice.wall_ratio
     errs = np.abs(believed_mm - tip.abscissa[:count]) >= advice.abscissa_mm
-    found = np.array([count_events(state, near_exposures(exposed[:count], before=True)) for state in (at_wall, errs)])
-    return int(found[:, 0].sum()), int(found[:, 1].sum())
+    found = [count_events(state, exposed[:count], before=True) for state in (at_wall, errs)]
+    return sum(each.happened for each in found), sum(each.missed for each in found)
 
 
 def _pack(values: np.ndarray, kind: str) -> str:

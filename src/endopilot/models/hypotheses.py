@@ -3,8 +3,9 @@
 Members of an ensemble differ in the parameters of all hypotheses at once. A regression over them says how what X-ray
 shows depends on each parameter, and how badly a line describes that: snaps count little. Each hypothesis, each two of
 them, and that all is as given, is then a linear model of the innovations with a Gaussian prior of its own. What no
-hypothesis frees is as sure as it usually is. "None of these" takes innovations to be larger, and explains nothing. An
-innovation has a Cauchy density, with heavy tails: a tip that snapped a moment too early says little.
+hypothesis frees is as sure as it usually is. "None of these" takes innovations to be larger, and explains nothing; it
+wins, too, where all hypotheses together leave more of the innovations than of nearly all members', had these been seen.
+An innovation has a Cauchy density, with heavy tails: a tip that snapped a moment too early says little.
 """
 
 from __future__ import annotations
@@ -154,6 +155,9 @@ _PRIOR = 0.3
 """How likely any one hypothesis is before, against that all is as given: an assumption."""
 _NONE_SCALE, _NONE_PRIOR = 4.0, 0.05
 """By how much larger innovations are where none of these explains them, and how likely that is before: assumptions."""
+_REFUTED, _WRONG = 0.05, 0.1
+"""The whole family is refuted where no more than this share of its own members would be explained as badly; a share of
+the images, the worst, which may have gone wrong, is left out."""
 _FAR_MM = 4.0
 """Differences between tips are cut off here, mm: beyond, a wire has snapped, or lies in another branch."""
 MEDIAN_SQUARE = 0.455
@@ -186,7 +190,7 @@ class Posterior:
         center: the mean of the likeliest explanation.
         factor: its covariance is this times its transpose.
         probability: of each hypothesis.
-        none: of none of these.
+        none: of none of these; near 1 where a test of misfit refutes the whole family.
     """
 
     mean: Float[np.ndarray, "p"]
@@ -306,7 +310,8 @@ class Family:
         lines = np.column_stack([np.ones(len(unit)), unit])
         slope = np.linalg.solve(lines.T @ lines + _RIDGE * np.eye(size + 1), lines.T @ y)
         left = ((y - lines @ slope) ** 2).mean(axis=0)
-        variance, away, slope = scale.ravel() ** 2 + left, away - slope[0], slope[1:]
+        variance, away, y, slope = scale.ravel() ** 2 + left, away - slope[0], y - slope[0], slope[1:]
+        as_badly = 1.0 if noisy else self._as_badly(slope, away, y, variance, scale)
         if noisy:
             for _ in range(_REFITS):
                 misfit = (away - self._fit(slope, away, variance, np.ones(size))[0] @ slope) ** 2
@@ -327,7 +332,28 @@ class Family:
         _, best, covariance = fits[int(np.argmax(weight))]
         within = range(len(self.hypotheses))
         probability = np.array([weight[[k in some for some in self._sets]].sum() for k in within])
-        return Posterior(mean, sd, best, np.linalg.cholesky(covariance), probability, float(share[-1]))
+        none = float(share[-1]) if as_badly > _REFUTED else 1.0 - as_badly
+        return Posterior(mean, sd, best, np.linalg.cholesky(covariance), probability, none)
+
+    def _as_badly(
+        self,
+        slope: Float[np.ndarray, "p n"],
+        away: Float[np.ndarray, "n"],
+        members: Float[np.ndarray, "members n"],
+        variance: Float[np.ndarray, "n"],
+        scale: Float[np.ndarray, "images axes"],
+    ) -> float:
+        """Return the share of members that all hypotheses together would explain as badly as what was seen, summed over
+        all images, had these been seen in its place, with errors of the same size."""
+        noise = scale.ravel() * np.random.default_rng(0).standard_normal(members.shape)
+
+        def explained(seen: Float[np.ndarray, "n"]) -> float:
+            found, _ = self._fit(slope, seen, variance, np.ones(len(slope)))
+            each = log_likelihood(seen - found @ slope, np.sqrt(variance)).reshape(scale.shape).sum(axis=1)
+            return float(np.sort(each)[int(np.ceil(_WRONG * len(each))) :].sum())
+
+        least = explained(away)
+        return float(np.mean([explained(each) <= least for each in members + noise]))
 
     @staticmethod
     def _fit(

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from endopilot.anatomy.projection import project_tip
-from endopilot.belief.adviser import astray_mm
+from endopilot.anatomy.projection import project_tip, safety_ratio
+from endopilot.belief.adviser import AdviserConfig
+from endopilot.belief.events import Counted, astray_mm, count_events
 from endopilot.navigation.policy import BelievedTip, Observation, Proximals
 from endopilot.robot.robot import SimulatedRobot
 from endopilot.simulation.simulator import Simulator
@@ -110,6 +111,24 @@ class NavigationRecord:
         half = self.half_width
         held = (np.less_equal(off, half) & np.isfinite(half)).all(axis=1)
         return np.asarray(held)[~np.isnan(half).any(axis=1)]
+
+
+def count_navigation_events(
+    record: NavigationRecord, navigation: Navigation, advice: AdviserConfig | None = None
+) -> dict[str, Counted]:
+    """Return what X-ray had to show in a navigation, and what it missed (`belief.events`): contacts with the wall, tips
+    that were astray of where the policy believed them, and forces beyond the limit.
+
+    Args:
+        advice: τ and δ.
+    """
+    advice, tip = advice or AdviserConfig(), record.tip[:, 0]
+    states = {
+        "contact": safety_ratio(tip.offset, tip.radius, navigation.device.tip_radius_mm) >= advice.wall_ratio,
+        "astray": record.astray_mm >= advice.abscissa_mm,
+        "force": ~is_safe(record.contact_force_max, navigation.force_limit_n),
+    }
+    return {kind: count_events(state[:-1], record.exposed[:-1]) for kind, state in states.items()}
 
 
 class Track:

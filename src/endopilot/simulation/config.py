@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from types import MappingProxyType
@@ -97,6 +97,9 @@ class SimulatorConfig:
     between. It is the same everywhere if none is given."""
     wall_along: tuple[Annotated[float, Within(0.1, 10)], ...] = ()
     """The same on the stiffness of a compliant wall."""
+    wall_around: tuple[Annotated[float, Within(0.1, 10)], ...] = ()
+    """Further factors on that around the vessel: at even angles about the centerline from its normals on, linear
+    between."""
     stick_velocity_mm_s: Annotated[float, Within(1e-9, 1000)] = 0.05
     """Slip velocity under which smoothed Coulomb friction falls off, mm/s; a wire at rest creeps more slowly."""
     approach_velocity_mm_s: Annotated[float, Within(0.1, 1000)] = 20.0
@@ -119,12 +122,17 @@ class SimulatorConfig:
         steps = SAMPLE_PERIOD_S / self.time_step_s
         if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
             raise ValueError(f"time_step_s: {self.time_step_s} does not divide {SAMPLE_PERIOD_S} s; give e.g. 0.0125")
-        if self.wall_along and self.compliant_wall_n_mm2 is None:
-            raise ValueError("wall_along: the wall is not compliant; give compliant_wall_n_mm2 too, such as 0.01")
-        softest = (self.compliant_wall_n_mm2 or 0.0) * min(self.wall_along, default=1.0)
-        if self.wall_along and softest < _SOFTEST_N_MM2:
-            raise ValueError(f"wall_along: the wall has {softest:g} N/mm² at least; give factors by which it has 0.01")
+        varies = "wall_along" if self.wall_along else "wall_around" if self.wall_around else ""
+        if varies and self.compliant_wall_n_mm2 is None:
+            raise ValueError(f"{varies}: the wall is not compliant; give compliant_wall_n_mm2 too, such as 0.01")
+        softest = (self.compliant_wall_n_mm2 or 0.0) * self.wall_factors(min)
+        if varies and softest < _SOFTEST_N_MM2:
+            raise ValueError(f"{varies}: the wall has {softest:g} N/mm² at least; give factors by which it has 0.01")
         return self
+
+    def wall_factors(self, end: Callable[..., float]) -> float:
+        """Return the least (`min`) or largest (`max`) factor on the stiffness of a compliant wall."""
+        return end(self.wall_along, default=1.0) * end(self.wall_around, default=1.0)
 
     @property
     def steps_per_sample(self) -> int:

@@ -168,7 +168,7 @@ def core_options(
     options = core_for(config.processor).Options()
     options.stick_velocity = config.stick_velocity_mm_s
     options.wall_stiffness = wall_stiffness(config, push_limit_n)
-    options.foundation = (config.compliant_wall_n_mm2 or 0.0) * max(config.wall_along, default=1.0)
+    options.foundation = (config.compliant_wall_n_mm2 or 0.0) * config.wall_factors(max)
     options.foundation_stiffening = COMPLIANT_WALL_STIFFENING_MM2
     options.foundation_at_tip = COMPLIANT_WALL_AT_TIP_MM
     options.tolerance = config.tolerance_mm

@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 
 from endopilot.anatomy.distance import CATHETER_LENGTH_MM
 from endopilot.anatomy.projection import TipProjector
+from endopilot.anatomy.tree import tangents
 from endopilot.devices.drive_limits import far_end_mm
 from endopilot.devices.stack import Stack
 from endopilot.simulation.checks import check_distance_map, check_memory
@@ -21,7 +22,7 @@ from endopilot.simulation.core import make_lumen, make_simulation
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.rod import LONGEST_ELEMENTS, RodLayout, lay_out
 from endopilot.simulation.tubes import lay_out_transmission, lay_out_tubes
-from endopilot.types import Anatomy, DistanceMap, VesselTree
+from endopilot.types import Anatomy, Centerline, DistanceMap, VesselTree
 
 FINE_MM = 0.2  # spacing of a finer grid, mm, at most: a tube's axis then reads at most 0.1 mm too near to the wall
 
@@ -33,7 +34,8 @@ def make_wall(anatomy: Anatomy, stack: Stack, config: SimulatorConfig) -> Lumen:
     to half the map's spacing; for catheters hardly narrower than the vessel its grid is finer, and the inscribed
     spheres make it sharp."""
     radius_mm = stack.outer_radius_mm
-    field = _stiffened(anatomy, radius_mm, config.wall_along) if config.wall_along else anatomy.distance_map
+    varies = config.wall_along or config.wall_around
+    field = _stiffened(anatomy, radius_mm, config) if varies else anatomy.distance_map
     wall = make_lumen(field, radius_mm, config.processor, far_mm=config.wall_reach_mm)
     if not stack.catheters or _leaves_room(wall, anatomy, radius_mm):
         return wall
@@ -55,17 +57,23 @@ def factor_at(
     return np.interp(abscissa_mm, ends, factors)
 
 
-def _stiffened(anatomy: Anatomy, radius_mm: float, factors: Sequence[float]) -> DistanceMap:
-    """Return a map by which the wall is softer than where it is stiffest, as `factor_at` has it: a spring K d²/2 is c²
-    times as stiff where the map gives c d. So none grows, for the core takes a wall to be as far as the map says; the
-    largest factor is the core's own stiffness (`core_options`)."""
+def _stiffened(anatomy: Anatomy, radius_mm: float, config: SimulatorConfig) -> DistanceMap:
+    """Return a map by which the wall is softer than where it is stiffest, along the vessel and around it: a spring
+    K d²/2 is c² times as stiff where the map gives c d. So none grows, for the core takes a wall to be as far as the
+    map says; the largest factor is the core's own stiffness (`core_options`)."""
     field, tree = anatomy.distance_map, anatomy.tree
     lines = [branch.centerline for branch in tree.branches]
-    nearest = KDTree(np.concatenate([line.points for line in lines]))
-    abscissa, values = np.concatenate([line.abscissa for line in lines]), field.values.copy()
+    line, values = Centerline.joined(lines), field.values.copy()
     where = np.argwhere(values > values.min())
-    _, at = nearest.query(field.origin_mm + field.spacing_mm * where[:, ::-1])
-    root, place = np.sqrt(factor_at(abscissa[at], tree, factors) / max(factors)), tuple(where.T)
+    points, place = field.origin_mm + field.spacing_mm * where[:, ::-1], tuple(where.T)
+    _, at = KDTree(line.points).query(points)
+    factor = factor_at(line.abscissa[at], tree, config.wall_along or (1.0,))
+    if around := config.wall_around:
+        side, normal = points - line.points[at], line.normals[at]
+        other = np.cross(np.concatenate([tangents(each.points) for each in lines])[at], normal)
+        turn = np.arctan2((side * other).sum(axis=1), (side * normal).sum(axis=1)) / (2 * np.pi)
+        factor = factor * np.interp(turn, np.arange(len(around)) / len(around), around, period=1.0)
+    root = np.sqrt(factor / config.wall_factors(max))
     values[place] = np.maximum(radius_mm + root * (values[place] - radius_mm), values.min())
     return replace(field, values=values)
 
@@ -103,7 +111,7 @@ class Group:
     """The worlds with an equal anatomy and equal devices; `anatomy` and `stack` are those of the first.
 
     Attributes:
-        wall: how far outside the wall the lumen goes, mm, and how its stiffness varies along the vessel.
+        wall: how far outside the wall the lumen goes, mm, and how its stiffness varies along the vessel and around.
         motion: of the vessel, None if it lies still; as the core has it, as are `lumen` and `simulation`.
         index: the worlds' numbers, ascending.
         path_mm: length of the vessel's longest path; `longest_mm`: inserted length that the wire is laid out for.
@@ -113,7 +121,7 @@ class Group:
     stack: Stack
     rod: RodLayout
     lumen: Lumen
-    wall: tuple[float, tuple[float, ...]]
+    wall: tuple[Any, ...]
     motion: CoreMotion | None
     simulation: Simulation
     index: Integer[np.ndarray, "members"]
@@ -131,6 +139,10 @@ def _wall_key(anatomy: Anatomy, stack: Stack) -> tuple[str, float, bool]:
     return anatomy.identity, stack.outer_radius_mm, bool(stack.catheters)
 
 
+def _varies(config: SimulatorConfig) -> tuple[Any, ...]:
+    return config.wall_reach_mm, config.wall_along, config.wall_around
+
+
 def _wall(anatomy: Anatomy, stack: Stack, config: SimulatorConfig) -> Lumen:
     """Return a vessel's wall, as it was made where it is one of the last few: that takes longer than a short run."""
 
@@ -138,7 +150,7 @@ def _wall(anatomy: Anatomy, stack: Stack, config: SimulatorConfig) -> Lumen:
         check_distance_map(anatomy)
         return make_wall(anatomy, stack, config)
 
-    key = (*_wall_key(anatomy, stack), config.wall_reach_mm, config.wall_along, config.processor)
+    key = (*_wall_key(anatomy, stack), *_varies(config), config.processor)
     return kept(key, make)
 
 
@@ -162,7 +174,7 @@ def make_groups(
     """Return the groups of worlds, with wires laid out (`reach_mm`, or to the vessel's far end if deeper) at the
     ostium, about which vessels move by `motion`; `sharing`'s lumens are taken over. Raises InputError as `Simulator`.
     """
-    core, wall = core_for(config.processor), (config.wall_reach_mm, config.wall_along)
+    core, wall = core_for(config.processor), _varies(config)
     prepared = [group for group in sharing if isinstance(group.lumen, core.Lumen) and group.wall == wall]
     lumens = {_wall_key(group.anatomy, group.stack): group.lumen for group in prepared}
     projectors = {group.anatomy.identity: group.project for group in sharing}

@@ -104,6 +104,8 @@ class World:
     linear between. In the guiding catheter the first counts."""
     wall_along: tuple[Annotated[float, Within(0.1, 10)], ...] = ()
     """The same on the stiffness of a compliant wall."""
+    wall_around: tuple[Annotated[float, Within(0.1, 10)], ...] = ()
+    """Further factors on that around the vessel: at even angles about the centerline, linear between."""
     ostium_mm: Finite = 0.0
     """The wire is inserted this much deeper than the encoder says, mm: the ostium lies elsewhere along the catheter."""
     axis_deg: Annotated[float, Within(0, 45)] = 0.0
@@ -209,7 +211,7 @@ class World:
 
     def core(self, given: SimulatorConfig) -> SimulatorConfig:
         """Return the settings of the rod core that plays reality."""
-        names = ("compliant_wall_n_mm2", "friction_along", "wall_along", "element_mm", "time_step_s")
+        names = ("compliant_wall_n_mm2", "friction_along", "wall_along", "wall_around", "element_mm", "time_step_s")
         own = {name: getattr(self, name) for name in names}
         changed = {name: value for name, value in own.items() if value not in (None, ())}
         return replace(given, **changed) if changed else given
