@@ -107,10 +107,9 @@ def test_both_safety_ratios_are_drawn_with_their_95_percent_quantile(results):
     assert axes[3].get_ylabel().endswith("γ / r")
 
 
-@pytest.mark.parametrize("name", ["control_error", "drive_difference"])
-def test_the_histograms_of_few_sequences_do_not_cover_one_another(results, name):
-    table = getattr(tables, f"{name}_table")(results)
-    figure = getattr(figures, f"{name}_figure")(table, TITLES)
+def test_the_histograms_of_few_sequences_do_not_cover_one_another(results):
+    table = tables.control_error_table(results)
+    figure = figures.control_error_figure(table, TITLES)
     series = tables.distinct(table, "series")
     assert len(series) >= 4
     for ax in figure.axes:
@@ -159,7 +158,7 @@ def reported(evaluated, tmp_path_factory):
     return copy, folder / "run", metrics
 
 
-@pytest.mark.parametrize("name", ["tip_error", "safety_ratio", "control_error", "drive_difference"])
+@pytest.mark.parametrize("name", ["tip_error", "safety_ratio", "control_error"])
 def test_every_figure_has_its_table(reported, name):
     folder = reported[0] / "figures"
     assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")

@@ -3,7 +3,7 @@ split."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from textwrap import fill
 from typing import Any
 
@@ -91,20 +91,10 @@ def safety_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
 
 
 def control_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
-    """Draw histograms of the control RMSE of each sequence, one row a split (`tables.control_error_table`)."""
+    """Draw histograms of the control RMSE of each sequence (`tables.control_error_table`), a row a split, a series
+    above another, medians as ticks, with numbers; what lies beyond the second-widest series' 98 % quantile is in the
+    last bar."""
     panels = (("translation_rmse_mm_s", "Translation RMSE, mm/s"), ("rotation_rmse_deg_s", "Rotation RMSE, deg/s"))
-    return _histograms(table, titles, panels)
-
-
-def drive_difference_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
-    """Draw histograms of RMSEs of the drive's force and torque where controls are simulated, a row a split."""
-    panels = (("force_rmse_n", "Difference in proximal force (RMSE), N"),)
-    return _histograms(table, titles, (*panels, ("torque_rmse_nmm", "Difference in proximal torque (RMSE), N mm")))
-
-
-def _histograms(table: pd.DataFrame, titles: Mapping[str, str], panels: Sequence[tuple[str, str]]) -> Figure:
-    """Draw histograms of columns with one value a sequence, a row a split, a series above another, medians as ticks,
-    with numbers; what lies beyond the second-widest series' 98 % quantile is in the last bar."""
     splits, series = distinct(table, "split"), distinct(table, "series")
     with matplotlib.rc_context(STYLE):
         figure, axes = _grid(len(splits), len(panels), height=0.9 + 0.55 * len(series))
