@@ -198,9 +198,7 @@ def label_table() -> str:
         "| --- | --- | --- | --- | --- |",
     ]
     for one, two in zip(measure_labels(count=40, seed=0), measure_labels(count=40, seed=7), strict=True):
-        dominance = ", ".join(
-            f"{row['dominance_right']:.1%}" for row in (one, two) if row["dominance_right"] is not None
-        )
+        dominance = ", ".join(f"{row['dominance_right']:.1%}" for row in (one, two))
         worst = min(one["worst_patient"], two["worst_patient"])
         rows.append(f"| {one['anatomy']} | {one['right']:.1%} | {two['right']:.1%} | {dominance} | {worst:.1%} |")
     return "\n".join(rows)

@@ -21,7 +21,6 @@ from endopilot.atlas.atlas import AtlasConfig, make_atlas
 
 ATLAS = {
     "patients": AtlasConfig(count=30),
-    "seen through a CT": AtlasConfig(count=8, seen_through_ct=True),
     "textbook": AtlasConfig(count=30, population="textbook"),
 }
 NINETEEN = {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bz2
 import gzip
 import zlib
 
@@ -155,8 +154,9 @@ def test_the_space_of_an_nrrd(tmp_path, space, signs):
         ({"type": "block"}, "type 'block'"),
         ({"endian": None}, "endian"),
         ({"encoding": "zrl"}, "encoding 'zrl'"),
-        ({"byte_skip": "-2"}, "byte skip"),
-        ({"line_skip": "many"}, "line skip"),
+        ({"encoding": "ascii"}, "encoding 'ascii'"),
+        ({"byte_skip": "-1"}, "byte skip"),
+        ({"line_skip": "1"}, "line skip"),
     ],
 )
 def test_an_nrrd_header_that_cannot_be_meant_is_refused(tmp_path, fields, reason):
@@ -177,20 +177,15 @@ def test_the_encodings_of_an_nrrd(tmp_path):
     whole = nrrd(tmp_path / "raw.nrrd", space_units='"mm" "mm" "mm"', measurement_frame="(0,1,0) (1,0,0) (0,0,1)")
     _read(whole)
     raw = RAMP.tobytes()
-    text = " ".join(map(str, RAMP.ravel())).encode()
-    for encoding, data in {"gzip": gzip.compress(raw), "bzip2": bz2.compress(raw), "ascii": text}.items():
-        path = nrrd(tmp_path / f"{encoding}.nrrd", encoding=encoding)
-        path.write_bytes(path.read_bytes().replace(raw, data))
-        _read(path)
-        path.write_bytes(path.read_bytes()[:-20])
-        _refused(path, "truncated|incomplete|numbers")
-    skipping = nrrd(tmp_path / "skip.nrrd", line_skip=1, byte_skip=3)
-    skipping.write_bytes(skipping.read_bytes().replace(raw, b"a line\nabc" + raw))
-    _read(skipping)
-    last = nrrd(tmp_path / "last.nhdr", data_file="last.raw", byte_skip=-1)
-    last.write_bytes(last.read_bytes().replace(raw, b""))
-    (tmp_path / "last.raw").write_bytes(b"some header" + raw)
-    _read(last)
+    path = nrrd(tmp_path / "packed.nrrd", encoding="gzip")
+    path.write_bytes(path.read_bytes().replace(raw, gzip.compress(raw)))
+    _read(path)
+    path.write_bytes(path.read_bytes()[:-20])
+    _refused(path, "truncated|incomplete")
+    beside = nrrd(tmp_path / "ct.nhdr", data_file="ct.raw")
+    beside.write_bytes(beside.read_bytes().replace(raw, b""))
+    (tmp_path / "ct.raw").write_bytes(raw)
+    _read(beside)
 
 
 def test_voxels_in_several_files_are_refused(tmp_path):
@@ -211,7 +206,9 @@ def test_voxels_in_several_files_are_refused(tmp_path):
         ({"ElementNumberOfChannels": 3}, "3 values in every voxel"),
         ({"ElementType": "MET_ASCII_CHAR"}, "ElementType"),
         ({"CompressedData": "maybe"}, "CompressedData 'maybe'"),
-        ({"HeaderSize": "-5"}, "HeaderSize"),
+        ({"HeaderSize": "-1"}, "HeaderSize"),
+        ({"BinaryData": "False"}, "BinaryData"),
+        ({"AnatomicalOrientation": "LPI", "TransformMatrix": None}, "AnatomicalOrientation LPI"),
         ({"DistanceUnits": "furlong"}, "DistanceUnits 'furlong'"),
     ],
 )
@@ -224,15 +221,6 @@ def test_what_a_metaimage_leaves_open_is_noted(tmp_path):
         _read(metaimage(tmp_path / "a.mha", TransformMatrix=None), "no TransformMatrix").direction, np.eye(3)
     )
     assert np.allclose(_read(metaimage(tmp_path / "b.mha", Offset=None), "no Offset").origin_mm, 0.0)
-    assert np.allclose(_read(metaimage(tmp_path / "c.mha", ElementSize="1 1 1"), "ElementSize").spacing_mm, SPACING)
-    mirrored = _read(
-        metaimage(tmp_path / "d.mha", AnatomicalOrientation="LPI"), "AnatomicalOrientation LPI contradicts"
-    )
-    np.testing.assert_allclose(mirrored.index_to_world(CORNERS), places(TURN), atol=1e-6)
-    named = metaimage(tmp_path / "e.mha", AnatomicalOrientation="LPI", TransformMatrix=None)
-    np.testing.assert_allclose(_read(named, "those of AnatomicalOrientation").direction, np.diag([-1.0, -1.0, 1.0]))
-    _read(metaimage(tmp_path / "f.mha", AnatomicalOrientation="RAI"))
-    _read(metaimage(tmp_path / "g.mha", AnatomicalOrientation="???"))
     cm = {"ElementSpacing": "0.04 0.05 0.125", "Offset": "1 2 3", "DistanceUnits": "cm"}
     volume = _read(metaimage(tmp_path / "h.mha", **cm), "DistanceUnits says cm")
     np.testing.assert_allclose(volume.index_to_world(CORNERS), places(TURN), atol=1e-6)
@@ -242,7 +230,6 @@ def test_the_encodings_of_a_metaimage(tmp_path):
     _read(metaimage(tmp_path / "packed.mha", data=zlib.compress(RAMP.tobytes()), CompressedData=True))
     big = RAMP.astype(">i2").tobytes()
     _read(metaimage(tmp_path / "big.mha", data=big, BinaryDataByteOrderMSB=True))
-    _read(metaimage(tmp_path / "text.mha", data=" ".join(map(str, RAMP.ravel())).encode(), BinaryData=False))
     cut = metaimage(tmp_path / "cut.mha", data=zlib.compress(RAMP.tobytes())[:-9], CompressedData=True)
     _refused(cut, "truncated or damaged|incomplete")
 

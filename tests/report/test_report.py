@@ -146,12 +146,6 @@ def test_the_generalisation_gap_is_shown_for_every_protocol_and_span(page, mater
     assert "Generalisation gap, P1: mean error in new patients against known ones" in page.words
 
 
-def test_the_drives_force_and_torque_are_shown(page, material):
-    drive = read_json(material / "evaluation" / "metrics.json")["splits"]["test"]["drive"]["P4"]
-    force, torque = (drive[key]["rmse_of_sequences"]["median"] for key in ("force_n", "torque_nmm"))
-    assert f"P4 {force:.3f} N and {torque:.3f} N mm" in page.words
-
-
 def test_the_papers_errors_stand_beside_ours(page):
     assert page.cells["paper/30-45/abscissa/mae"] == "0.62 ± 0.60"
     assert page.cells["paper/0-10/offset/mae"] == "0.09 ± 0.10"

@@ -263,7 +263,7 @@ def test_it_stops_when_asked_and_when_the_connection_is_gone() -> None:
 
 def test_it_obeys_one_client_at_a_time() -> None:
     drive, client = moving()
-    assert drive.open() is None
+    assert drive.owner is client.session
     client.session.close(1.0)
     later = Client(drive)
     client.session.close(1.0)  # once more

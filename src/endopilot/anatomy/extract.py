@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import re
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -58,14 +56,6 @@ _OTHER_SIDE_DEG = 5.0
 atlas and 2 real ones its own is the nearer one by 16° at least."""
 
 SHORTEST_IN_DIAMETERS = 1.5  # a lumen whose longest path is shorter than so many mean diameters is no vessel
-
-_DONE = {
-    "joined": r"bridged|united|capped|closed by filling|joined by|joined to one",
-    "parted": r"parted|is cut|cut at|cut there|are cut",
-    "widened": r"was widened|were widened",
-    "left out": r"left out|not in the tree|not part of this|apart and|were not joined",
-}
-"""What a remark says was done, by its words."""
 
 _KNOWN = {ASSUMED: " (not stated)", BY_ARRAYS: " (SimVascular's arrays)", ANSWERED: " (--scale)"}
 
@@ -179,7 +169,7 @@ def extract_anatomy(
         "catheter_tilt_deg": round(catheter_tilt_deg(ostium_radius, radius), 1),
         "dominance": _dominance(tree, inlet, short),
         "coverage": balance,
-        "notes": [_understood(tree, wrapped, config.coordinates, notes), *doubts, *notes],
+        "notes": [_understood(tree, wrapped, config.coordinates), *doubts, *notes],
     }
     return Anatomy(name, tree, distance_map, insertion, radius, provenance)
 
@@ -343,30 +333,17 @@ def _insertion(tree: VesselTree, given: Insertion | None) -> Insertion:
     return Insertion(position=line.points[0].copy(), direction=direction)
 
 
-def _understood(tree: VesselTree, source: AnatomySource, coordinates: str | None, remarks: Sequence[str]) -> str:
-    """Return what was understood: inlet, extent and narrowest place, unit and axes as taken, and what was done."""
+def _understood(tree: VesselTree, source: AnatomySource, coordinates: str | None) -> str:
+    """Return what was understood: inlet, extent and narrowest place, unit and axes as taken."""
     lines = [branch.centerline for branch in tree.branches]
-    farthest = max(float(line.abscissa[-1]) for line in lines)
-    narrowest = min((line for line in lines), key=lambda line: float(line.radius.min()))
+    farthest, narrowest = max(float(line.abscissa[-1]) for line in lines), min(line.radius.min() for line in lines)
     if isinstance(source.content, LumenMask) or not source.file:
         read = "mm in LPS"
     else:
         axes = source.coordinates or coordinates
         stated = " (--coordinates)" if coordinates and not source.coordinates else "" if axes else " (not stated)"
         read = f"{unit_name(source.factor)}{_KNOWN.get(source.odds, '')} in {(axes or 'lps').upper()}{stated}"
-    done = [_done(verb, [text for text in remarks if re.search(words, text)]) for verb, words in _DONE.items()]
-    wall = [text for text in remarks if text.startswith("what is given is a wall")]
     return (
         f"Understood: enters at {place_text(lines[0].points[0])}, {2 * lines[0].radius[0]:.1f} mm wide; "
-        f"{farthest:.0f} mm to the farthest end, {2 * narrowest.radius.min():.1f} mm wide at the narrowest; "
-        + "; ".join([f"read as {read}", *wall, *filter(None, done)])
+        f"{farthest:.0f} mm to the farthest end, {2 * narrowest:.1f} mm wide at the narrowest; read as {read}"
     )
-
-
-def _done(verb: str, remarks: list[str]) -> str:
-    """Return how many things were done, and the largest length that their remarks name beside places."""
-    if not remarks:
-        return ""
-    bare = re.sub(r"\([^()]*\) mm", "", " ".join(remarks))
-    sizes = [float(size) for size in re.findall(r"(\d+(?:\.\d+)?) mm", bare)]
-    return f"{verb}: {len(remarks)}" + (f" (up to {max(sizes):.0f} mm)" if sizes else "")

@@ -68,14 +68,6 @@ class Labeller:
         behind = [i for i in range(len(self.tree.branches)) if branch in self.tree.route(i)]
         return max(float((self.tree.branches[i].centerline.points @ direction).max()) for i in behind)
 
-    def own(self, leaf: int) -> int:
-        """The first branch on the path to a distal end that leads to no other."""
-        return next(branch for branch in self.tree.route(leaf) if self.tree.leaves(branch) == (leaf,))
-
-    def leftward(self, leaf: int) -> float:
-        """How far to the patient's left an end lies, mm."""
-        return float(self.tree.branches[leaf].centerline.points[-1, 0])
-
     def major(self, branch: int, length_mm: float) -> list[int]:
         """Children of a branch with at least this much length behind their start, mm."""
         return [child for child in self.tree.children(branch) if self.length_behind(child) >= length_mm]

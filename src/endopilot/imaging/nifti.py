@@ -1,9 +1,8 @@
-"""NIfTI-1 and NIfTI-2 files (https://nifti.nimh.nih.gov), read as their standard says, placed by anatomical
+"""NIfTI-1 files (https://nifti.nimh.nih.gov), read as their standard says, placed by anatomical
 coordinates."""
 
 from __future__ import annotations
 
-import itertools
 import struct
 import zlib
 from contextlib import suppress
@@ -18,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from endopilot.errors import InputError
 from endopilot.imaging.geometry import Fields, Geometry, converted, farthest_apart_mm, geometry, lengths_text, parted
 from endopilot.imaging.segments import ImageFile, Segment
-from endopilot.imaging.voxels import Encoding, opened, read_voxels, rescaled
+from endopilot.imaging.voxels import opened, read_voxels, rescaled
 
 _SPACING_TOLERANCE = 0.01  # voxel sizes given twice may differ by this share: they have few digits
 _RAS_TO_LPS = np.array([-1.0, -1.0, 1.0])
@@ -29,37 +28,22 @@ _XML_EXTENSION = 30  # code of an extension of Caret, whose XML may name labels 
 _UNITS = {0: "mm", 1: "m", 2: "mm", 3: "µm"}
 _INTENTS = (0, 1001, 1002, 1003)  # a grey-level image or a mask: nothing, an estimate, labels, names of regions
 
-_HEADERS = {
-    348: {
-        "dim": ("8h", 40),
-        "intent_code": ("h", 68),
-        "datatype": ("h", 70),
-        "bitpix": ("h", 72),
-        "pixdim": ("8f", 76),
-        "vox_offset": ("f", 108),
-        "scl": ("2f", 112),
-        "xyzt_units": ("B", 123),
-        "codes": ("2h", 252),
-        "quatern": ("6f", 256),
-        "srow": ("12f", 280),
-        "magic": ("4s", 344),
-    },
-    540: {
-        "magic": ("4s", 4),
-        "datatype": ("h", 12),
-        "bitpix": ("h", 14),
-        "dim": ("8q", 16),
-        "pixdim": ("8d", 104),
-        "vox_offset": ("q", 168),
-        "scl": ("2d", 176),
-        "codes": ("2i", 344),
-        "quatern": ("6d", 352),
-        "srow": ("12d", 400),
-        "xyzt_units": ("i", 500),
-        "intent_code": ("i", 504),
-    },
+_HEADER_BYTES = 348
+_FIELDS = {
+    "dim": ("8h", 40),
+    "intent_code": ("h", 68),
+    "datatype": ("h", 70),
+    "bitpix": ("h", 72),
+    "pixdim": ("8f", 76),
+    "vox_offset": ("f", 108),
+    "scl": ("2f", 112),
+    "xyzt_units": ("B", 123),
+    "codes": ("2h", 252),
+    "quatern": ("6f", 256),
+    "srow": ("12f", 280),
+    "magic": ("4s", 344),
 }
-"""Of each version, by the size of its header: field: (format, offset)."""
+"""Field: (format, offset)."""
 
 _TYPES = {2: "u1", 4: "i2", 8: "i4", 16: "f4", 64: "f8", 256: "i1", 512: "u2", 768: "u4", 1024: "i8", 1280: "u8"}
 """Grey levels, by their code `datatype`."""
@@ -71,12 +55,11 @@ def read_nifti(path: Path) -> ImageFile:
     stream = opened(path)
     try:
         with stream:
-            header = _header(stream.read(540), path)
+            header = _header(stream.read(_HEADER_BYTES), path)
             size, dtype, offset = _size(header, path), _type(header, path), _offset(header, path)
-            stream.seek(header["size"])
-            segments = _named_labels(stream.read(min(offset - header["size"], _LONGEST_EXTENSION)), header["order"])
+            segments = _named_labels(stream.read(min(offset - _HEADER_BYTES, _LONGEST_EXTENSION)), header["order"])
             stream.seek(offset)
-            stored = read_voxels(stream, Encoding(dtype), size[::-1], path=path)
+            stored = read_voxels(stream, dtype, size[::-1], path=path)
     except (EOFError, OSError, zlib.error):
         raise InputError(f"{path}: truncated or damaged; copy or export it again") from None
     place = _geometry(header, size, path)
@@ -88,21 +71,19 @@ def read_nifti(path: Path) -> ImageFile:
 
 
 def _header(content: bytes, path: Path) -> dict[str, Any]:
-    for order, size in itertools.product("<>", _HEADERS):
-        if content[:4] == struct.pack(f"{order}i", size):
-            break
-    else:
+    order = next((order for order in "<>" if content[:4] == struct.pack(f"{order}i", _HEADER_BYTES)), None)
+    if order is None:
         raise InputError(f"{path}: its content does not match its suffix, or its header is damaged; export it again")
-    if len(content) < size:
+    if len(content) < _HEADER_BYTES:
         raise InputError(f"{path}: truncated or damaged (its header is incomplete); copy or export it again")
-    fields: dict[str, Any] = {"size": size, "order": order}
-    for name, (kind, at) in _HEADERS[size].items():
+    fields: dict[str, Any] = {"order": order}
+    for name, (kind, at) in _FIELDS.items():
         values = struct.unpack_from(order + kind, content, at)
         fields[name] = values if values[1:] else next(iter(values))
     magic = fields["magic"]
-    if magic[:3] in (b"ni1", b"ni2"):
+    if magic[:3] == b"ni1":
         raise InputError(f"{path}: magic {magic!r}: its voxels are in a file of their own (.img); save it as .nii.gz")
-    if magic != (b"n+1\0" if size == 348 else b"n+2\0"):
+    if magic != b"n+1\0":
         raise InputError(f"{path}: magic {magic!r} is not that of NIfTI (Analyze has no orientation); export it again")
     return fields
 
@@ -137,7 +118,7 @@ def _type(header: dict[str, Any], path: Path) -> np.dtype:
 
 def _offset(header: dict[str, Any], path: Path) -> int:
     """Return where the voxels begin: behind the header and the four bytes that say whether it is extended."""
-    offset, least = header["vox_offset"], header["size"] + 4
+    offset, least = header["vox_offset"], _HEADER_BYTES + 4
     if not np.isfinite(offset) or offset != int(offset) or not least <= offset < _LARGEST_OFFSET:
         raise InputError(
             f"{path}: vox_offset {offset:g}: voxels begin behind the header, at {least} or later; export it again"

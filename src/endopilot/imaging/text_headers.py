@@ -16,7 +16,7 @@ from jaxtyping import Float, Shaped
 from endopilot.errors import InputError
 from endopilot.imaging.geometry import Fields, Geometry, converted, geometry, parted
 from endopilot.imaging.segments import ImageFile, Segment
-from endopilot.imaging.voxels import Encoding, read_voxels_beside
+from endopilot.imaging.voxels import read_voxels_beside
 
 _LONGEST_HEADER = 1 << 20
 _TO_LPS = {"right": -1.0, "left": 1.0, "anterior": -1.0, "posterior": 1.0, "superior": 1.0, "inferior": -1.0}
@@ -37,12 +37,7 @@ _NRRD_TYPES = {
     "float": "f4",
     "double": "f8",
 }
-_PACKINGS = {
-    **dict.fromkeys(("raw",), "raw"),
-    **dict.fromkeys(("gzip", "gz"), "gzip"),
-    **dict.fromkeys(("bzip2", "bz2"), "bzip2"),
-    **dict.fromkeys(("txt", "text", "ascii"), "ascii"),
-}
+_PACKED = {"raw": False, "gzip": True, "gz": True}
 _NRRD_SYNONYMS = {"datafile": "data file", "lineskip": "line skip", "byteskip": "byte skip"}
 _NRRD_FIELDS = Fields("space directions", "space directions", "space origin")
 
@@ -68,7 +63,6 @@ _META_SYNONYMS = {
     "ElementByteOrderMSB": "BinaryDataByteOrderMSB",
 }
 _META_FIELDS = Fields("TransformMatrix", "ElementSpacing", "Offset")
-_FROM = ("RL", "AP", "IS")  # letters of `AnatomicalOrientation` where an axis along x, y, z begins, or one against it
 
 
 def read_nrrd(path: Path) -> ImageFile:
@@ -186,24 +180,19 @@ def _to_lps(space: str, path: Path) -> np.ndarray:
 def _values(
     fields: dict[str, str], sizes: list[int], stream: BufferedIOBase, path: Path
 ) -> tuple[Shaped[np.ndarray, "..."], tuple[Path, ...]]:
-    kind, packing = fields.get("type", "").lower(), _PACKINGS.get(fields.get("encoding", "").lower())
+    kind, packed = fields.get("type", "").lower(), _PACKED.get(fields.get("encoding", "").lower())
     if kind not in _NRRD_TYPES:
         raise InputError(f"{path}: type {kind!r} holds no grey levels; export it as short or float")
-    if packing is None:
+    if packed is None:
         raise InputError(f"{path}: encoding {fields.get('encoding', '')!r} is not read; export it as raw or gzip")
+    for name in ("line skip", "byte skip"):
+        if fields.get(name, "0") != "0":
+            raise InputError(f"{path}: {name} {fields[name][:20]!r} is not read; export it again")
     endian = fields.get("endian", "").lower()
-    if endian not in ("little", "big") and _NRRD_TYPES[kind][1] != "1" and packing != "ascii":
+    if endian not in ("little", "big") and _NRRD_TYPES[kind][1] != "1":
         raise InputError(f"{path}: endian {endian!r} is neither little nor big; export it again")
     dtype = np.dtype((">" if endian == "big" else "<") + _NRRD_TYPES[kind])
-    encoding = Encoding(dtype, packing, _skip(fields, "line skip", 0, path), _skip(fields, "byte skip", -1, path))
-    return read_voxels_beside(fields.get("data file"), stream, encoding, sizes[::-1], header=path)
-
-
-def _skip(fields: dict[str, str], name: str, least: int, path: Path) -> int:
-    text = fields.get(name, "0")
-    if not re.fullmatch(r"-?\d{1,12}", text) or int(text) < least:
-        raise InputError(f"{path}: {name} {text[:20]!r} is no whole number from {least}; export it again")
-    return int(text)
+    return read_voxels_beside(fields.get("data file"), stream, dtype, sizes[::-1], packed=packed, header=path)
 
 
 def _segments(keys: dict[str, str], path: Path) -> tuple[Segment, ...]:
@@ -226,10 +215,10 @@ def read_metaimage(path: Path) -> ImageFile:
         fields = _meta_header(stream, path)
         size = _meta_size(fields, path)
         place = _meta_geometry(fields, size, path)
-        encoding = _meta_encoding(fields, path)
+        dtype, packed = _meta_encoding(fields, path)
         source = fields["ElementDataFile"]
         beside = None if source.upper() == "LOCAL" else source
-        voxels, files = read_voxels_beside(beside, stream, encoding, size[::-1], header=path)
+        voxels, files = read_voxels_beside(beside, stream, dtype, size[::-1], packed=packed, header=path)
     return ImageFile(place.volume(voxels, files), voxels[None])
 
 
@@ -272,18 +261,15 @@ def _meta_size(fields: dict[str, str], path: Path) -> tuple[int, int, int]:
     return extents[0], extents[1], extents[2]
 
 
-def _meta_encoding(fields: dict[str, str], path: Path) -> Encoding:
+def _meta_encoding(fields: dict[str, str], path: Path) -> tuple[np.dtype, bool]:
+    """Return the voxels' type, and whether they are packed."""
     kind = fields.get("ElementType", "")
     if kind not in _META_TYPES:
         raise InputError(f"{path}: ElementType {kind[:40]!r} holds no grey levels; export it as MET_SHORT or MET_FLOAT")
-    binary, packed = _truth(fields, "BinaryData", True, path), _truth(fields, "CompressedData", False, path)
+    if fields.get("HeaderSize", "0") != "0" or not _truth(fields, "BinaryData", True, path):
+        raise InputError(f"{path}: HeaderSize, or text in place of BinaryData, is not read; export it again")
     big = _truth(fields, "BinaryDataByteOrderMSB", False, path)
-    packing = "ascii" if not binary else "zlib" if packed else "raw"
-    return Encoding(
-        np.dtype((">" if big else "<") + _META_TYPES[kind]),
-        packing,
-        skipped_bytes=_skip(fields, "HeaderSize", -1, path),
-    )
+    return np.dtype((">" if big else "<") + _META_TYPES[kind]), _truth(fields, "CompressedData", False, path)
 
 
 def _truth(fields: dict[str, str], name: str, default: bool, path: Path) -> bool:
@@ -299,42 +285,22 @@ def _meta_geometry(fields: dict[str, str], size: tuple[int, int, int], path: Pat
         raise InputError(f"{path}: has no ElementSpacing, so that its voxels have no size; export it again")
     spacing = _named_numbers(fields, "ElementSpacing", count, path)[:3]
     factor, notes = converted(fields.get("DistanceUnits", "mm"), spacing, path=path, field="DistanceUnits")
-    sizes = _named_numbers(fields, "ElementSize", count, path)[:3] if "ElementSize" in fields else spacing
-    if not np.allclose(sizes, spacing, rtol=1e-2):
-        notes += (f"{path.name}: ElementSize differs from ElementSpacing; voxels lie where ElementSpacing puts them",)
     origin = np.zeros(3)
     if "Offset" in fields:
         origin = _named_numbers(fields, "Offset", count, path)[:3]
     else:
         notes += (f"{path.name}: has no Offset; its first voxel was put at 0 0 0",)
-    words = fields.get("AnatomicalOrientation", "").strip().upper()
-    named = _named_axes(words)
+    words = fields.get("AnatomicalOrientation", "RAI").strip().upper()
     if "TransformMatrix" in fields:
         # Its rows are the directions of i, j and k.
         direction = _named_numbers(fields, "TransformMatrix", count * count, path).reshape(count, count)[:3, :3].T
-    elif named is not None:
-        direction = named
-        notes += (f"{path.name}: has no TransformMatrix; its axes are those of AnatomicalOrientation {words}",)
-    else:
+    elif words in ("RAI", "???"):
         direction = np.eye(3)
         notes += (f"{path.name}: has no TransformMatrix; its axes were taken as left, posterior and superior",)
+    else:
+        raise InputError(f"{path}: AnatomicalOrientation {words[:20]} without a TransformMatrix; export it again")
     place = geometry(direction, spacing * factor, origin * factor, size, path=path, fields=_META_FIELDS)
-    if named is not None and np.any(np.sum(named * place.direction, axis=0) < 0.5):
-        notes += (
-            f"{path.name}: AnatomicalOrientation {words} contradicts TransformMatrix; voxels lie where TransformMatrix "
-            "puts them",
-        )
     return replace(place, notes=(*notes, *place.notes))
-
-
-def _named_axes(words: str) -> Float[np.ndarray, "3 3"] | None:
-    """Return the axes that three letters name, as columns; None where they name none."""
-    axes = np.zeros((3, 3))
-    for column, letter in enumerate(words[:3]):
-        for row, pair in enumerate(_FROM):
-            if letter in pair:
-                axes[row, column] = 1.0 if letter == pair[0] else -1.0
-    return axes if len(words) == 3 and abs(np.linalg.det(axes)) > 0.5 else None
 
 
 def _numbers(words: Sequence[str], count: int, field: str, path: Path) -> Float[np.ndarray, "_"]:

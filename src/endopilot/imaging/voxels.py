@@ -3,12 +3,10 @@ names beside the one given. A file holds exactly the bytes that its header descr
 
 from __future__ import annotations
 
-import bz2
 import gzip
 import math
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from io import BufferedIOBase
 from pathlib import Path
 
@@ -27,39 +25,16 @@ def opened(path: Path) -> BufferedIOBase:
     return gzip.open(path, "rb") if packed else path.open("rb")
 
 
-@dataclass(frozen=True)
-class Encoding:
-    """How a file stores voxels.
-
-    Attributes:
-        packing: raw, gzip, zlib, bzip2, or ascii: numbers with blanks between them.
-        skipped_lines: before the voxels, to be left out.
-        skipped_bytes: then, once unpacked, to be left out; −1 if raw voxels are the last bytes of the file.
-    """
-
-    dtype: np.dtype
-    packing: str = "raw"
-    skipped_lines: int = 0
-    skipped_bytes: int = 0
-
-
 def read_voxels(
-    stream: BufferedIOBase, encoding: Encoding, shape: Sequence[int], *, path: Path
+    stream: BufferedIOBase, dtype: np.dtype, shape: Sequence[int], *, packed: bool = False, path: Path
 ) -> Shaped[np.ndarray, "..."]:
-    """Return the array of a shape, the last axis the fastest, that a stream (or bytes) holds from here to its end;
-    `path` is for messages. Raises InputError for fewer or more bytes, or damaged ones."""
-    dtype, count = encoding.dtype, math.prod(int(extent) for extent in shape)
-    size, skipped = count * dtype.itemsize, encoding.skipped_bytes
+    """Return the array of a shape, the last axis the fastest, that a stream holds from here to its end, raw or `packed`
+    by gzip or zlib; `path` is for messages. Raises InputError for fewer or more bytes, or damaged ones."""
+    size = math.prod(int(extent) for extent in shape) * dtype.itemsize
     try:
-        for _ in range(encoding.skipped_lines):
-            stream.readline()
-        if encoding.packing == "ascii":
-            stream.read(skipped)
-            return _numbers(stream.read(), dtype, count, path).reshape(tuple(shape))
-        content = memoryview(_unpacked(stream, encoding.packing, -1 if skipped < 0 else skipped + size + 1))
+        content = _unpacked(stream, size + 1) if packed else _read(stream, size + 1)
     except (EOFError, OSError, ValueError, OverflowError, MemoryError, zlib.error):
         raise InputError(f"{path}: truncated or damaged (its voxels); copy or export it again") from None
-    content = content[max(len(content) - size, 0) if skipped < 0 else skipped :]
     if len(content) < size:
         raise InputError(f"{path}: truncated or damaged (its voxels are incomplete); copy or export it again")
     if len(content) > size:
@@ -69,17 +44,18 @@ def read_voxels(
     return np.frombuffer(content, dtype=dtype).reshape(tuple(shape)).astype(dtype.newbyteorder("="))
 
 
-def _unpacked(stream: BufferedIOBase, packing: str, most: int) -> bytearray:
-    """Return the rest of a stream, unpacked, or its first `most` bytes: a header's size alone allocates nothing."""
+def _read(stream: BufferedIOBase, most: int) -> bytearray:
+    """Return the rest of a stream, or its first `most` bytes: a header's size alone allocates nothing."""
     content = bytearray()
-    if packing == "raw":
-        while (most < 0 or len(content) < most) and (part := stream.read(1 << 24)):
-            content += part
-        return content if most < 0 else content[:most]
-    packed = stream.read()
+    while len(content) < most and (part := stream.read(1 << 24)):
+        content += part
+    return content[:most]
+
+
+def _unpacked(stream: BufferedIOBase, most: int) -> bytearray:
+    packed, content = stream.read(), bytearray()
     while packed and len(content) < most:  # gzip's members follow one another
-        # 32: a header of gzip or of zlib
-        unpacker = bz2.BZ2Decompressor() if packing == "bzip2" else zlib.decompressobj(zlib.MAX_WBITS | 32)
+        unpacker = zlib.decompressobj(zlib.MAX_WBITS | 32)  # 32: a header of gzip or of zlib
         content += unpacker.decompress(packed, most - len(content))
         if not unpacker.eof and len(content) < most:
             raise EOFError("cut short")
@@ -88,29 +64,19 @@ def _unpacked(stream: BufferedIOBase, packing: str, most: int) -> bytearray:
 
 
 def read_voxels_beside(
-    spec: str | None, stream: BufferedIOBase, encoding: Encoding, shape: Sequence[int], *, header: Path
+    spec: str | None, stream: BufferedIOBase, dtype: np.dtype, shape: Sequence[int], *, packed: bool, header: Path
 ) -> tuple[Shaped[np.ndarray, "..."], tuple[Path, ...]]:
     """Return the array (last axis fastest) of a text header, at its stream's end (`spec` None) or in the file beside
     it that `spec` names, and all files. Raises InputError where that is missing or damaged."""
     if spec is None:
-        return read_voxels(stream, encoding, shape, path=header), (header,)
+        return read_voxels(stream, dtype, shape, packed=packed, path=header), (header,)
     if "%" in spec or spec.split()[:1] == ["LIST"]:
         raise InputError(f"{header}: its voxels are in several files; export it as one file")
     file = header.parent / spec
     if not file.is_file():
         raise InputError(f"{header}: the file of voxels that it names is missing ({file.name}); put it beside it")
     with file.open("rb") as content:
-        return read_voxels(content, encoding, shape, path=file), (header, file)
-
-
-def _numbers(content: bytes, dtype: np.dtype, count: int, path: Path) -> np.ndarray:
-    values = np.array(content.split(), dtype=float)
-    if len(values) != count:
-        raise InputError(f"{path}: holds {len(values)} numbers, and its header describes {count}; export it again")
-    limits = np.iinfo(dtype) if dtype.kind in "iu" else None
-    if limits is not None and count and not (limits.min <= values.min() and values.max() <= limits.max):
-        raise InputError(f"{path}: holds numbers that are no {dtype.name}; export it again")
-    return values.astype(dtype)
+        return read_voxels(content, dtype, shape, packed=packed, path=file), (header, file)
 
 
 def rescaled(values: Shaped[np.ndarray, "..."], slope: float, intercept: float) -> Shaped[np.ndarray, "..."]:

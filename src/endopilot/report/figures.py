@@ -3,18 +3,19 @@ split."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from textwrap import fill
 from typing import Any
 
 import matplotlib
 import numpy as np
 import pandas as pd
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Float, Shaped
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from endopilot.evaluation.results import SERIES_TITLES
+from endopilot.imaging.overlay_picture import draw_slices
 from endopilot.plotting import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, STYLE, VERMILLION
 from endopilot.report.tables import distinct, rows, values
 from endopilot.types import Anatomy, LumenMask, Volume
@@ -32,10 +33,6 @@ SERIES_STYLE: dict[str, dict] = {
     "hold_control": {"color": "#5d4a3a", "linestyle": "-."},
     "follow_slack": {"color": GREEN, "linestyle": "--"},
 }
-
-
-WINDOW_HU = (-150.0, 650.0)  # grey window of CTA pictures, HU: from fat to well-filled lumen
-CROP_MARGIN_MM = 18.0  # what is shown of the volume around the vessel, mm
 
 
 def tip_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
@@ -94,20 +91,10 @@ def safety_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
 
 
 def control_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
-    """Draw histograms of the control RMSE of each sequence, one row a split (`tables.control_error_table`)."""
+    """Draw histograms of the control RMSE of each sequence (`tables.control_error_table`), a row a split, a series
+    above another, medians as ticks, with numbers; what lies beyond the second-widest series' 98 % quantile is in the
+    last bar."""
     panels = (("translation_rmse_mm_s", "Translation RMSE, mm/s"), ("rotation_rmse_deg_s", "Rotation RMSE, deg/s"))
-    return _histograms(table, titles, panels)
-
-
-def drive_difference_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
-    """Draw histograms of RMSEs of the drive's force and torque where controls are simulated, a row a split."""
-    panels = (("force_rmse_n", "Difference in proximal force (RMSE), N"),)
-    return _histograms(table, titles, (*panels, ("torque_rmse_nmm", "Difference in proximal torque (RMSE), N mm")))
-
-
-def _histograms(table: pd.DataFrame, titles: Mapping[str, str], panels: Sequence[tuple[str, str]]) -> Figure:
-    """Draw histograms of columns with one value a sequence, a row a split, a series above another, medians as ticks,
-    with numbers; what lies beyond the second-widest series' 98 % quantile is in the last bar."""
     splits, series = distinct(table, "split"), distinct(table, "series")
     with matplotlib.rc_context(STYLE):
         figure, axes = _grid(len(splits), len(panels), height=0.9 + 0.55 * len(series))
@@ -173,29 +160,16 @@ def stage_figure(table: pd.DataFrame) -> Figure:
     return figure
 
 
-def volume_figure(volume: Volume, mask: LumenMask, anatomy: Anatomy | None = None) -> Figure:
-    """Draw the CTA with the outline of a mask on its grid and, if given, the extracted tree, cropped, as radiologists
-    read: axial through the ostium, coronal the maximum over a slab as deep as the vessel."""
-    ostium = mask.ostium or (anatomy.insertion if anatomy is not None else None)
-    voxels, lumen = _along_lps(volume, volume.voxels), _along_lps(volume, mask.volume.voxels).astype(bool)
-    spacing = volume.spacing_mm[_lps_axes(volume)]  # along x, y and z
-    inside = [np.flatnonzero(np.any(lumen, axis=others)) for others in ((1, 2), (0, 2), (0, 1))]
-    margin = np.ceil(CROP_MARGIN_MM / spacing[::-1]).astype(int)
-    crop = tuple(slice(max(0, at[0] - m), at[-1] + m + 1) for at, m in zip(inside, margin, strict=True))
-    level = int(np.median(inside[0])) if ostium is None else _level(volume, ostium.position, voxels.shape[0])
+def volume_figure(volume: Volume, mask: LumenMask, anatomy: Anatomy) -> Figure:
+    """Draw the CTA around a vessel with the outline of its mask, in slices through the ostium, and the extracted
+    tree."""
+    ostium = mask.ostium or anatomy.insertion
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11.5, 3.9), layout="constrained")
-        axes = figure.subplots(1, 2 if anatomy is None else 3)
-        _picture(
-            axes[0], voxels[level, crop[1], crop[2]], lumen[level, crop[1], crop[2]], spacing[[0, 1]], origin="upper"
-        )
-        axes[0].set_title("Axial slice at the ostium" if ostium is not None else "Axial slice")
-        slab = voxels[crop[0], inside[1][0] : inside[1][-1] + 1, crop[2]].max(axis=1)
-        _picture(axes[1], slab, np.any(lumen, axis=1)[crop[0], crop[2]], spacing[[0, 2]], origin="lower")
-        axes[1].set_title("Coronal maximum projection")
-        if anatomy is not None:
-            anatomy.plot(axes=axes[2], view="front")
-            axes[2].set_title("Extracted centerline")
+        axes = figure.subplots(1, 3)
+        draw_slices(axes[:2], volume, [(mask, VERMILLION)], through=ostium.position)
+        anatomy.plot(axes=axes[2], view="front")
+        axes[2].set_title("Extracted centerline")
     return figure
 
 
@@ -229,47 +203,3 @@ def _legend_below(figure: Figure, axes: Shaped[np.ndarray, "rows columns"]) -> N
     entries = {label: handle for ax in axes.flat for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     columns = min(len(entries), 3)
     figure.legend(list(entries.values()), list(entries), loc="outside lower center", ncols=max(columns, 1))
-
-
-def _along_lps(volume: Volume, voxels: Shaped[np.ndarray, "nz ny nx"]) -> Shaped[np.ndarray, "a b c"]:
-    """Return voxels with their axes ordered and turned so that [k, j, i] grow to the head, the back and the left."""
-    axes = _lps_axes(volume)
-    turned = voxels.transpose([2 - axis for axis in axes[::-1]])
-    flips = [volume.direction[world, axes[world]] < 0 for world in (2, 1, 0)]
-    return turned[tuple(slice(None, None, -1 if flip else 1) for flip in flips)]
-
-
-def _lps_axes(volume: Volume) -> list[int]:
-    """Return for x, y and z the voxel axis (0 for i, 1 for j, 2 for k) that runs most along it."""
-    remaining = [0, 1, 2]
-    axes = []
-    for world in range(3):
-        axes.append(max(remaining, key=lambda axis: abs(volume.direction[world, axis])))
-        remaining.remove(axes[-1])
-    return axes
-
-
-def _level(volume: Volume, point: Float[np.ndarray, "3"], levels: int) -> int:
-    axis = _lps_axes(volume)[2]
-    level = round(float(volume.world_to_index(point)[axis]))
-    level = levels - 1 - level if volume.direction[2, axis] < 0 else level
-    return int(np.clip(level, 0, levels - 1))
-
-
-def _picture(
-    ax: Axes,
-    picture: Shaped[np.ndarray, "rows columns"],
-    lumen: Bool[np.ndarray, "rows columns"],
-    spacing: Float[np.ndarray, "2"],
-    *,
-    origin: Any,
-) -> None:
-    rows, columns = picture.shape
-    extent = (0.0, columns * spacing[0], rows * spacing[1], 0.0)
-    if origin == "lower":
-        extent = (0.0, columns * spacing[0], 0.0, rows * spacing[1])
-    ax.imshow(picture, cmap="gray", vmin=WINDOW_HU[0], vmax=WINDOW_HU[1], origin=origin, extent=extent)
-    if np.any(lumen):
-        ax.contour(lumen.astype(float), [0.5], colors=[VERMILLION], linewidths=1.1, origin=origin, extent=extent)
-    ax.set(xlabel="mm", ylabel="mm")
-    ax.grid(False)

@@ -220,7 +220,6 @@ def _write_figures(results: Mapping[str, SplitResult], titles: Mapping[str, str]
         "tip_error": (tables.tip_error_table(results), figures.tip_error_figure),
         "safety_ratio": (tables.safety_table(results), figures.safety_figure),
         "control_error": (tables.control_error_table(results), figures.control_error_figure),
-        "drive_difference": (tables.drive_difference_table(results), figures.drive_difference_figure),
     }
     for name, (table, draw) in drawn.items():
         with writing(folder / f"{name}.csv") as partial:

@@ -16,7 +16,6 @@ EVALUATION_FIGURES: Mapping[str, str] = {
     "tip_error": "Mean tip error against time, networks beside baselines",
     "safety_ratio": "Safety ratio against time: recorded, predicted and simulated",
     "control_error": "Histograms of the control error of each navigation",
-    "drive_difference": "Histograms of the difference in the drive's force and torque of each navigation",
 }
 """Figures of an evaluation that the report shows, and what each is to someone who cannot see it."""
 
@@ -201,19 +200,6 @@ def control_remark(metrics: Mapping[str, Any], split: str) -> str:
         if record["translation_mm_s"]["rmse_of_sequences"]["median"] is not None
     ]
     return f"{metrics['splits'][split]['title']}: median RMSE of a navigation: {'; '.join(parts)}."
-
-
-def drive_remark(metrics: Mapping[str, Any], split: str) -> str:
-    """Return the median difference of a navigation's drive force and torque, by simulated series, as a sentence."""
-    drive = metrics["splits"][split]["drive"]
-    names = {"P4": "P4", "P4_replanned": "P4 replanned", "follow_slack": "drive by the held slack"}
-    parts = [
-        f"{title} {drive[name]['force_n']['rmse_of_sequences']['median']:.3f} N and "
-        f"{drive[name]['torque_nmm']['rmse_of_sequences']['median']:.3f} N mm"
-        for name, title in names.items()
-        if name in drive and drive[name]["force_n"]["rmse_of_sequences"]["median"] is not None
-    ]
-    return f"{metrics['splits'][split]['title']}: median of a navigation: {'; '.join(parts)}."
 
 
 def anatomy_facts(anatomy: Anatomy) -> list[tuple[str, str]]:

@@ -9,12 +9,10 @@ import numpy as np
 import pandas as pd
 
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.evaluation.metrics import control_rmse, mean_over_time, quantiles_over_time, rmse_of_sequences
+from endopilot.evaluation.metrics import control_rmse, mean_over_time, quantiles_over_time
 from endopilot.evaluation.results import CONTROL_BASELINES, TIP_BASELINES, SplitResult
 
 SAFETY_SERIES = ("true", "P3", "P4")
-DRIVEN_SERIES = ("P4", "P4_replanned", "P2_replayed", "hold_control", "follow_slack")
-"""Series whose controls are simulated; the recorded controls, simulated again, differ from them by nothing."""
 
 
 def tip_error_table(results: Mapping[str, SplitResult]) -> pd.DataFrame:
@@ -50,26 +48,10 @@ def control_error_table(results: Mapping[str, SplitResult]) -> pd.DataFrame:
         for series in _ordered(result.controls, ("P2", *CONTROL_BASELINES)):
             rmse = control_rmse(result.controls[series], result.true_control)
             columns = {"translation_rmse_mm_s": rmse[:, 0], "rotation_rmse_deg_s": rmse[:, 1]}
-            pieces.append(pd.DataFrame(_of_sequences(split, series, result) | columns))
+            anatomy = [result.anatomies[index] for index in result.anatomy]
+            keys = {"split": split, "series": series, "anatomy": anatomy, "sequence": result.sequence}
+            pieces.append(pd.DataFrame(keys | columns))
     return pd.concat(pieces, ignore_index=True)
-
-
-def drive_difference_table(results: Mapping[str, SplitResult]) -> pd.DataFrame:
-    """Return RMSEs of drive force (N) and torque (N·mm) of each split and series of `DRIVEN_SERIES`."""
-    pieces = []
-    for split, result in results.items():
-        for series in _ordered(result.base_force, DRIVEN_SERIES):
-            columns = {
-                "force_rmse_n": rmse_of_sequences(result.drive_difference(series, "force")),
-                "torque_rmse_nmm": rmse_of_sequences(result.drive_difference(series, "torque")),
-            }
-            pieces.append(pd.DataFrame(_of_sequences(split, series, result) | columns))
-    return pd.concat(pieces, ignore_index=True)
-
-
-def _of_sequences(split: str, series: str, result: SplitResult) -> dict[str, Any]:
-    anatomy = [result.anatomies[index] for index in result.anatomy]
-    return {"split": split, "series": series, "anatomy": anatomy, "sequence": result.sequence}
 
 
 def stage_table(seconds: Mapping[str, float]) -> pd.DataFrame:

@@ -146,10 +146,9 @@ class Drive:
             self._state = f"STATE {read} {status} {self._ticket()}\n"
         return self._state
 
-    def open(self) -> Session | None:
-        """Return the drive's side of a new connection; None while another client commands."""
-        if self.owner is not None:
-            return None
+    def open(self) -> Session:
+        """Return the drive's side of a new connection; there is one at a time, the `owner`."""
+        assert self.owner is None
         self.owner = Session(self)
         self.news.append("a client is connected")
         return self.owner
@@ -159,12 +158,6 @@ class Drive:
         """The first line to a client: protocol and limits."""
         numbers = (self._limits.max_velocity_mm_s, self._limits.max_rotation_rad_s, *self._limits.travel_mm)
         return " ".join([PROTOCOL, *(repr(float(value)) for value in numbers)]) + "\n"
-
-    def lose_owner(self) -> None:
-        """Stop, because the connection of the owner is closed."""
-        self.stop("connection")
-        self.owner = None
-        self.news.append("the client has disconnected")
 
     def _ticket(self) -> str:
         """Return a new ticket, and forget those that are too old to move anything."""
@@ -226,7 +219,9 @@ class Session:
         self._drive.tick(now)
         self.closed, self._held = True, b""
         if self._drive.owner is self:
-            self._drive.lose_owner()
+            self._drive.stop("connection")
+            self._drive.owner = None
+            self._drive.news.append("the client has disconnected")
 
     def _answer(self, line: bytes) -> str:
         """Do what a line asks and return the answer; a line that is not of the protocol stops the drive."""
@@ -272,11 +267,10 @@ def tls_context(folder: Path, *, of_drive: bool) -> ssl.SSLContext:
     """
     side, other = ("drive", "client") if of_drive else ("client", "drive")
     key, own, trusted = folder / f"{side}.key", folder / f"{side}.crt", folder / f"{other}.crt"
+    mend = f"copy it there, or make both sides' with `{_recipe(folder)}`"
     for path in (key, own, trusted):
         if not path.is_file():
-            raise InputError(
-                f"certificates: {path}: no such file; copy it there, or make both sides' with `{_recipe(folder)}`"
-            )
+            raise InputError(f"certificates: {path}: no such file; {mend}")
     if key.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
         raise InputError(f"certificates: {key} is open to other users; close it with `chmod 600 {key}`")
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if of_drive else ssl.PROTOCOL_TLS_CLIENT)
@@ -284,19 +278,14 @@ def tls_context(folder: Path, *, of_drive: bool) -> ssl.SSLContext:
     context.check_hostname = False  # the certificate itself is known, whatever name it bears
     context.verify_mode = ssl.CERT_REQUIRED
     context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
+    what = f"{own} and {key} are no certificate and its unencrypted key"
     try:
         context.load_cert_chain(own, key, password=lambda: "")  # an encrypted key would ask at the terminal
-    except OSError as error:
-        raise InputError(
-            f"certificates: {own} and {key} are no certificate and its unencrypted key ({_reason(error)}); "
-            f"make both sides' with `{_recipe(folder)}`"
-        ) from error
-    try:
+        what = f"{trusted} holds no certificate"
         context.load_verify_locations(trusted)
     except OSError as error:
-        raise InputError(
-            f"certificates: {trusted} holds no certificate ({_reason(error)}); copy the {other}'s there"
-        ) from error
+        reason = getattr(error, "reason", None) or error.strerror or error
+        raise InputError(f"certificates: {what} ({reason}); {mend}") from error
     return context
 
 
@@ -308,7 +297,3 @@ def _recipe(folder: Path) -> str:
         f"-keyout {place}/$side.key -out {place}/$side.crt"
     )
     return f"mkdir -p {place}; for side in drive client; do {request}; done"
-
-
-def _reason(error: OSError) -> str:
-    return str(getattr(error, "reason", None) or error.strerror or error)

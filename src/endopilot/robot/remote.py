@@ -29,6 +29,7 @@ ANSWER_S = 2.0
 
 class RemoteRobot:
     """Commands a drive process, and reads its encoders, which sit at the motor, and its load. Any thread may call it.
+    A call raises InputError once the connection is lost.
 
     Attributes:
         limits: of the drive, as it reported them; no command beyond them is ever sent.
@@ -74,9 +75,6 @@ class RemoteRobot:
         """Move on for 200 ms at most, and return what is made of it, as `Robot` says; the drive moves a wire alone.
 
         A drive that stopped because it heard no command in time is armed again; after any other stop `arm` must.
-
-        Raises:
-            InputError: the connection is lost.
         """
         translation, rotation = devices[0] if devices else (0.0, 0.0)
         with self._lock:
@@ -85,41 +83,25 @@ class RemoteRobot:
             return (self._wanted,)
 
     def run(self, duration: float) -> None:
-        """Hold the last command for some time, s, at the end of which this returns.
-
-        Raises:
-            InputError: the connection is lost.
-        """
+        """Hold the last command for some time, s, at the end of which this returns."""
         until = time.monotonic() + duration
         while (left := until - time.monotonic()) > 0:
             self._move()
             time.sleep(min(REPEAT_S, left))
 
     def proximal_state(self) -> ProximalState:
-        """Return what the drive measures now.
-
-        Raises:
-            InputError: the connection is lost.
-        """
+        """Return what the drive measures now."""
         return self._ask("STATE")
 
     def arm(self) -> None:
-        """Let a drive that stopped move again, at the next command.
-
-        Raises:
-            InputError: the connection is lost.
-        """
+        """Let a drive that stopped move again, at the next command."""
         with self._lock:
             self._wanted = (0.0, 0.0)
             self._ask("STATE")  # a stop that this client has not heard of made its ticket void
             self._ask("ARM", self._ticket)
 
     def stop(self) -> None:
-        """Stop the drive until it is armed again.
-
-        Raises:
-            InputError: the connection is lost.
-        """
+        """Stop the drive until it is armed again."""
         with self._lock:
             self._wanted = (0.0, 0.0)
             self._ask("STOP")

@@ -13,12 +13,11 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
-from pydantic import model_validator
 
 from endopilot.devices.drive_limits import within_travel
 from endopilot.devices.stack import column_prefixes
 from endopilot.errors import InputError, Remark
-from endopilot.settings import LONGEST_S, Share, Within, settings
+from endopilot.settings import Share, Within, settings
 from endopilot.simulation.checks import check_memory
 from endopilot.simulation.csv_file import Columns, read_columns
 from endopilot.types import SAMPLE_PERIOD_S
@@ -27,7 +26,9 @@ _COLUMNS = ("time_s", "translation_mm_s", "rotation_rad_s")
 PERIODS_S = (1e-3, 4.0)
 """How long a control of a file may hold, s: drives take a command a millisecond at best, and nobody drives blindly for
 longer."""
-_KINDS = ("insertion", "retraction", "spin", "pause")
+_KINDS, _SHARES = ("insertion", "retraction", "spin", "pause"), (0.45, 0.3, 0.15)  # the rest of the manoeuvres pauses
+_ROTATES = 0.6  # share of the pushing and pulling manoeuvres that rotate too
+_LASTS_S = (1.0, 6.0)  # a manoeuvre, s
 _DRIVE = 2**32  # from the key of a navigation's wire to that of its catheter; no study has that many navigations
 
 
@@ -39,31 +40,10 @@ class ControlConfig:
     """Fastest translation, mm/s."""
     max_rotation_rad_s: Annotated[float, Within(0, 1000)] = 3.0
     """Fastest rotation, rad/s."""
-    insertion_share: Share = 0.45
-    """Share of the manoeuvres that push."""
-    retraction_share: Share = 0.3
-    """Share of the manoeuvres that pull."""
-    spin_share: Share = 0.15
-    """Share of the manoeuvres that only rotate; what is left over are pauses."""
-    rotation_share: Share = 0.6
-    """Share of the pushing and pulling manoeuvres that rotate too."""
-    shortest_s: Annotated[float, Within(SAMPLE_PERIOD_S, LONGEST_S)] = 1.0
-    """Shortest manoeuvre, s."""
-    longest_s: Annotated[float, Within(SAMPLE_PERIOD_S, LONGEST_S)] = 6.0
-    """Longest manoeuvre, s."""
     first_inserted_length_mm: Annotated[float, Within(0, 5000)] = 5.0
     """Least inserted length that a navigation starts with, mm."""
     start_spread: Share = 0.6
     """Starts are spread from there over this share of the largest inserted length."""
-
-    @model_validator(mode="after")
-    def _consistent(self) -> ControlConfig:
-        total = self.insertion_share + self.retraction_share + self.spin_share
-        if total > 1 + 1e-9:
-            raise ValueError(f"insertion_share + retraction_share + spin_share: {total:g}; keep their sum at 1 or less")
-        if self.shortest_s > self.longest_s:
-            raise ValueError(f"shortest_s, longest_s: {self.shortest_s}, {self.longest_s}; give the shorter time first")
-        return self
 
 
 def random_controls(
@@ -124,7 +104,7 @@ def _navigation(
     wanted = np.zeros((n_samples + 2, 2))
     at = 0
     while at < len(wanted):
-        samples = max(1, round(generator.uniform(config.shortest_s, config.longest_s) / SAMPLE_PERIOD_S))
+        samples = max(1, round(generator.uniform(*_LASTS_S) / SAMPLE_PERIOD_S))
         wanted[at : at + samples] = _manoeuvre(config, generator)
         at += samples
     smooth = 0.25 * wanted[:-2] + 0.5 * wanted[1:-1] + 0.25 * wanted[2:]  # ramps of one period between manoeuvres
@@ -133,9 +113,8 @@ def _navigation(
 
 def _manoeuvre(config: ControlConfig, generator: np.random.Generator) -> Float[np.ndarray, "2"]:
     """Return the mean velocities of one manoeuvre; always draws the same number of random numbers."""
-    shares = np.array([config.insertion_share, config.retraction_share, config.spin_share])
-    kind = _KINDS[int(np.searchsorted(np.cumsum(shares), generator.random(), side="right"))]
-    speed, turns, spin = generator.random(), generator.random() < config.rotation_share, generator.uniform(-1, 1)
+    kind = _KINDS[int(np.searchsorted(np.cumsum(_SHARES), generator.random(), side="right"))]
+    speed, turns, spin = generator.random(), generator.random() < _ROTATES, generator.uniform(-1, 1)
     translation = {"insertion": 1.0, "retraction": -1.0}.get(kind, 0.0) * (0.15 + 0.85 * speed)
     rotation = spin if kind == "spin" or (turns and kind != "pause") else 0.0
     return np.array([translation * config.max_velocity_mm_s, rotation * config.max_rotation_rad_s])
