@@ -154,7 +154,7 @@ class Seat:
         near = (behind > -_SEAT_MM) & (np.linalg.norm(points - ostium, axis=1) < _SEAT_MM + anatomy.catheter_radius_mm)
         part, behind = points[near], behind[near]
         self._points = np.concatenate([part, part - 2 * behind[:, None] * heading])
-        self._size = size * CATHETER_MM * np.repeat([1.0, -_AHEAD], len(part))
+        self._size = np.tile(size[near], 2) * CATHETER_MM * np.repeat([1.0, -_AHEAD], len(part))
 
     def __call__(self, view: View, image: Evidence, shifts_px: Float[np.ndarray, "t 2"]) -> Float[np.ndarray, "t"]:
         """Return how likely an image makes some shifts of the vessel, pixels to the right and up, a logarithm.
