@@ -26,7 +26,8 @@ from endopilot.xray.locate_images import locate_in_images
 VIEW = (-20.0, 25.0)
 CONFIG = AngiogramsConfig(
     cines=1, seconds=1.5, frames_per_second=4, injected_share=1.0, device_share=1.0, dose=(4.0, 6.0), seed=3,
-    motion="still", view_angles_deg=(VIEW,), image=ImageConfig(pixels=256, geometry=CArmGeometry(pixel_mm=0.45)),
+    injection_ml_s=(0.5, 1.0), motion="still", view_angles_deg=(VIEW,),
+    image=ImageConfig(pixels=256, geometry=CArmGeometry(pixel_mm=0.45)),
 )  # fmt: skip
 
 
