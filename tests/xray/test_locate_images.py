@@ -78,6 +78,15 @@ def test_a_cine_of_ones_own_is_read_back_and_the_tip_is_found(made, fork, tmp_pa
     assert "data:image/png" in (tmp_path / "tips.html").read_text()
 
 
+def test_nothing_is_seen_behind_the_collimator(made) -> None:
+    cine, header = read_cine(made / "cine.dcm"), pydicom.dcmread(made / "cine.dcm")
+    rows, columns = (np.flatnonzero(cine.field().any(axis=axis)) for axis in (1, 0))
+    upper, lower = header.ShutterUpperHorizontalEdge, header.ShutterLowerHorizontalEdge
+    edges = np.array([upper, lower, header.ShutterLeftVerticalEdge, header.ShutterRightVerticalEdge])
+    inside = np.array([rows[0], rows[-1], columns[0], columns[-1]])
+    assert ((inside - edges) * [1, -1, 1, -1] >= 2).all() and np.abs(inside - edges).max() <= 10
+
+
 def test_what_another_c_arm_stores_is_read_alike(made, fork, wire, tmp_path) -> None:
     own, other = read_cine(made / "cine.dcm"), read_cine(otherwise(made, tmp_path / "other.dcm"))
     assert other.camera.geometry.source_to_isocenter_mm == pytest.approx(765, abs=0.1)
