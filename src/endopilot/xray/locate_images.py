@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
+from scipy.ndimage import gaussian_filter
 
 from endopilot.anatomy.projection import TipProjector
 from endopilot.devices.device import Wire
@@ -22,7 +23,7 @@ from endopilot.progress import progress
 from endopilot.types import Anatomy
 from endopilot.xray.carm import Pose, View, view_of
 from endopilot.xray.cine import XrayCine
-from endopilot.xray.detector import TipDetector
+from endopilot.xray.detector import Signal, TipDetector
 from endopilot.xray.image import isocenter_of
 from endopilot.xray.line_observations import shift_onto
 from endopilot.xray.registration import Registration, lay, observed_contrast, register
@@ -34,6 +35,8 @@ _EMPTY_SHARE = 0.9
 """A pixel's light where no contrast passes is this quantile of the frames': contrast and wire darken fewer."""
 _DARKEST_SHARE = 0.05
 """This share of an image, the darkest, tells how much contrast a frame shows: vessels cover no less."""
+_SURROUNDINGS_PX = 6.0
+"""Contrast is seen in the mean around a pixel, standard deviation, pixels."""
 _LESS = 0.06
 """They do where image and vessel agree within this of the best frame's correlation."""
 _SOME = 0.4
@@ -99,12 +102,14 @@ def locate_in_images(
     isocenter = isocenter_of(anatomy)
     views = [[view_of(one.view(isocenter), pose, isocenter) for one in cines] for pose in poses]
     detector, photons = TipDetector(anatomy, device), [one.photons() for one in cines]
+    empty, fields = [_empty(one) for one in cines], [one.field() for one in cines]
     found: list[TipEstimate] = []
 
     def look(frame: int, expected: Float[np.ndarray, "places"] | None) -> TipEstimate:
         shown = [one.signals[frame] for one in cines]
         spread = _STIRS_MM**2 * np.eye(3) if moves[frame] is None else moves[frame]
-        return detector.estimate(views[frame], shown, photons, None, expected=expected, displaced=spread)
+        dark = [_darkened(*each) for each in zip(shown, empty, fields, strict=True)]
+        return detector.estimate(views[frame], shown, photons, None, None, expected, spread, dark)
 
     with progress(f"locate {anatomy.name}", count) as advance:
         for frame in range(count):
@@ -112,7 +117,7 @@ def locate_in_images(
             advance()
     track = _Track(detector.grid, config, cines[0].times_s, found)
     for frame, one in enumerate(found):
-        if one.status != "not found" and track.elsewhere(frame, one):
+        if one.status == "not found" or track.elsewhere(frame, one):
             found[frame] = look(frame, track.expected(frame))
         # Where heart and breath have taken the vessel is a guess in frames without contrast: no tip is sure there.
         if found[frame].status == "found" and (moves[frame] is not None or track.elsewhere(frame, found[frame])):
@@ -165,7 +170,7 @@ def _registered(
         pixel = (np.array(config.landmark_px) - (cines[0].signals.shape[1] - 1) / 2) * [1, -1]
         shift = shift_onto(cines[0].view(isocenter), np.array(config.landmark_mm), pixel)
         return cines, [Pose(translation_mm=shift)] * count, [_MOVES_MM**2 * np.eye(3)] * count, None, 0, notes
-    before = [np.quantile(one.signals, _EMPTY_SHARE, axis=0).astype(np.float32) for one in cines]
+    before = [_empty(one) for one in cines]
     contrast = np.sum([_contrast(one, empty) for one, empty in zip(cines, before, strict=True)], axis=0)
     best = int(contrast.argmax())
     tried: list[tuple[Registration, tuple[XrayCine, ...], list[np.ndarray], str]] = []
@@ -202,6 +207,20 @@ def _registered(
     best = max(known, key=lambda one: known[one].correlation)
     poses = [poses.get(frame, mean) for frame in range(count)]
     return cines, poses, moves, known[best], best, (*notes, *([said] if said else []))
+
+
+def _empty(cine: XrayCine) -> Signal:
+    """Return the light without contrast."""
+    return np.quantile(cine.signals, _EMPTY_SHARE, axis=0).astype(np.float32)
+
+
+def _darkened(shown: Signal, empty: Signal, field: Bool[np.ndarray, "rows rows"]) -> Signal:
+    """Return how much darker than without contrast the surroundings of each pixel are: a wire darkens them little.
+
+    Where nothing is seen anything may be, contrast without bound.
+    """
+    dark = gaussian_filter(empty - shown, _SURROUNDINGS_PX)
+    return np.where(field, np.maximum(dark - np.median(dark[field]), 0), np.float32(np.inf))
 
 
 def _contrast(cine: XrayCine, before: Float32[np.ndarray, "rows rows"]) -> Float[np.ndarray, "frames"]:
@@ -245,6 +264,7 @@ class _Track:
         later = told_by_later(seen, lambda k: flows[k])
         before = told_by_later(seen[::-1], lambda k: flows[-1 - k].T)[::-1]
         self._others = [a + b for a, b in zip(later, before, strict=True)]
+        self._odds = np.array([one.log_odds for one in found])
         self._mode = [int((log + one).argmax()) for log, one in zip(seen, self._others, strict=True)]
 
     def elsewhere(self, frame: int, one: TipEstimate) -> bool:
@@ -252,8 +272,12 @@ class _Track:
         return float(np.linalg.norm(one.position - self._middle[self._mode[frame]])) > _ELSEWHERE_MM
 
     def expected(self, frame: int) -> Float[np.ndarray, "places"]:
-        """Return what the other frames say of the tip's place in a frame, a logarithm."""
-        return self._others[frame] - np.logaddexp.reduce(self._others[frame])
+        """Return what the other frames say of the tip's place in a frame, and of whether there is one, a logarithm.
+
+        What looks like a wire and is none does so in all frames: they say no more than the clearest.
+        """
+        odds = np.delete(self._odds, frame).max(initial=0.0)
+        return self._others[frame] - np.logaddexp.reduce(self._others[frame]) + odds
 
 
 _FRAME_S = 0.133

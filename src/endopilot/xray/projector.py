@@ -6,13 +6,18 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, zoom
 
 from endopilot.types import Volume
 from endopilot.xray.absorbers import WATER_MM
 from endopilot.xray.carm import View
 
 _RAY_STEP_MM = 1.5
+_COARSE_MM, _COARSE_RAYS, _SIDES_MM = 8.0, 64, 15.0
+"""What lies beyond a CT's sides: its voxels, mm, the rays along a side of the image, and how far is averaged, mm."""
+_BODY_MM = (161.0, 122.0)
+"""Half the breadth and depth of a chest about the CT's middle, mm: 322 and 243 mm, means of men in ANSUR 1988."""
+_AIR_HU = -1000.0
 _SHARP_PX = 0.17
 """A Gaussian of a standard deviation below this leaves all of a pixel in it, to a part in 10⁷."""
 
@@ -22,7 +27,7 @@ compete for the same lines of the processor's cache, which doubles the time."""
 
 
 def cast(ct: Volume, view: View, pixels: int, rays: int) -> Float32[np.ndarray, "rays rays"]:
-    """Return the attenuation along rays through a CT; beyond its sides it goes on as at its edge.
+    """Return the attenuation along rays through a CT, and through the body beyond its sides.
 
     Args:
         ct: of the patient, HU.
@@ -30,20 +35,55 @@ def cast(ct: Volume, view: View, pixels: int, rays: int) -> Float32[np.ndarray, 
         pixels: of the image along a side.
         rays: along a side.
     """
+    # A layer of air ends the volume half a voxel beyond its last middles.
+    aired = np.pad(ct.voxels, 1, constant_values=_AIR_HU)
+    inside = Volume(aired, ct.spacing_mm, ct.index_to_world(-np.ones(3)), ct.direction)
+    beyond = _march(_beyond(ct), view, pixels, _COARSE_RAYS, _COARSE_MM / 2)
+    wide = zoom(beyond, rays / _COARSE_RAYS, order=1, grid_mode=True, mode="nearest")
+    return _march(inside, view, pixels, rays, _RAY_STEP_MM) + wide
+
+
+def _beyond(ct: Volume) -> Volume:
+    """Return the body around a CT, HU, with air where the CT is.
+
+    The body goes on as the CT's sides do on average, as far as a chest reaches, and to head and feet without end. So a
+    CT that holds the body whole, with air at its sides, has none around.
+    """
+    size = np.array(ct.voxels.shape[::-1])
+    count = np.maximum(np.rint(size * ct.spacing_mm / _COARSE_MM), 2).astype(int)
+    index = np.stack(np.meshgrid(*(np.linspace(0, n - 1, k) for n, k in zip(size, count, strict=True)), indexing="ij"))
+    sampled = _between(ct.voxels.astype(np.float32), index.reshape(3, -1).astype(np.float32)).reshape(count).T
+    spacing = size * ct.spacing_mm / count
+    around = np.ceil(max(_BODY_MM) / spacing).astype(int)
+    body = np.pad(sampled, around[::-1, None], mode="edge")
+    inner = tuple(slice(a + 1, a + n - 1) for a, n in zip(around[::-1], count[::-1], strict=True))
+    weight = np.ones_like(body)
+    weight[inner] = 1e-6  # the sides alone count
+    body, weight = (gaussian_filter(part, _SIDES_MM / spacing[::-1]) for part in (body * weight, weight))
+    body /= weight
+    body[tuple(slice(a, a + n) for a, n in zip(around[::-1], count[::-1], strict=True))] = _AIR_HU
+    grown = Volume(body, spacing, ct.index_to_world((0.5 - around) * size / count - 0.5), ct.direction)
+    places = grown.index_to_world(np.stack(np.meshgrid(*map(np.arange, body.shape[::-1]), indexing="ij"), axis=-1))
+    across = (places - ct.index_to_world((size - 1) / 2))[..., :2] / _BODY_MM
+    body[((across**2).sum(axis=-1) > 1).T] = _AIR_HU
+    return grown
+
+
+def _march(ct: Volume, view: View, pixels: int, rays: int, step_mm: float) -> Float32[np.ndarray, "rays rays"]:
+    """Return the attenuation along rays through a volume, HU, that goes on beyond its sides as at its edge."""
     step = pixels / rays
     offset = ((np.arange(rays) + 0.5) * step - pixels / 2) / view.scale
     side, up = np.meshgrid(offset, -offset)
     direction = view.axes[2] + side[..., None] * view.axes[0] + up[..., None] * view.axes[1]
-    size = np.array(ct.voxels.shape[::-1])
-    corners = np.array(np.meshgrid(*([0, n - 1] for n in size))).reshape(3, -1).T
+    corners = np.array(np.meshgrid(*([0, n - 1] for n in ct.voxels.shape[::-1]))).reshape(3, -1).T
     depths = (ct.index_to_world(corners) - view.source) @ view.axes[2]
     into = ((direction.reshape(-1, 3) @ ct.direction) / ct.spacing_mm).T.astype(np.float32, order="C")
     begin = (((view.source - ct.origin_mm) @ ct.direction) / ct.spacing_mm)[:, None].astype(np.float32)
     voxels, total = ct.voxels.astype(np.float32, copy=False), np.zeros(rays * rays, dtype=np.float32)
-    for depth in np.arange(depths.min(), depths.max(), _RAY_STEP_MM, dtype=np.float32):
+    for depth in np.arange(depths.min(), depths.max(), step_mm, dtype=np.float32):
         total += np.maximum(1 + _between(voxels, begin + depth * into) / 1000, 0)
     slope = np.linalg.norm(direction, axis=-1).astype(np.float32)
-    return total.reshape(rays, rays) * np.float32(WATER_MM * _RAY_STEP_MM) * slope
+    return total.reshape(rays, rays) * np.float32(WATER_MM * step_mm) * slope
 
 
 def _between(voxels: Float32[np.ndarray, "nz ny nx"], index: Float32[np.ndarray, "3 n"]) -> Float32[np.ndarray, "n"]:

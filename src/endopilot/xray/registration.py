@@ -403,7 +403,7 @@ def sampled_lumen(
     """
     points, size = lumen_points(anatomy)
     behind, size_behind = catheter_lumen_points(anatomy)
-    near = np.linalg.norm(behind - anatomy.insertion.position, axis=1) < 10.0
+    near = np.linalg.norm(behind - anatomy.insertion.position, axis=1) < (10.0 if alike else 30.0)
     random = np.random.default_rng(0)
     chosen = random.permutation(len(points))[:_POINTS]
     inside = np.flatnonzero(near)

@@ -154,7 +154,7 @@ class Seat:
         near = (behind > -_SEAT_MM) & (np.linalg.norm(points - ostium, axis=1) < _SEAT_MM + anatomy.catheter_radius_mm)
         part, behind = points[near], behind[near]
         self._points = np.concatenate([part, part - 2 * behind[:, None] * heading])
-        self._size = size * CATHETER_MM * np.repeat([1.0, -_AHEAD], len(part))
+        self._size = np.tile(size[near], 2) * CATHETER_MM * np.repeat([1.0, -_AHEAD], len(part))
 
     def __call__(self, view: View, image: Evidence, shifts_px: Float[np.ndarray, "t 2"]) -> Float[np.ndarray, "t"]:
         """Return how likely an image makes some shifts of the vessel, pixels to the right and up, a logarithm.
@@ -221,7 +221,8 @@ def estimate_tip(
         evidence: how much likelier each pixel is on a wire than off it, a logarithm.
         shifts: of the vessel.
         inserted_length: Δ by the robot's encoder, mm; None where there is none.
-        expected: how likely the tip is at each place before the images are seen, a logarithm, by other times.
+        expected: how likely the tip is at each place before the images are seen, a logarithm, by other times; together,
+            how much likelier there is a wire than none.
     """
     way = _way(grid, room_mm, views, evidence, shifts.mm)
     by_time = np.zeros(len(way)) if expected is None else expected
@@ -231,7 +232,8 @@ def estimate_tip(
     # What lies in the catheter alone is a poor sign of a wire: the catheter is a dark line too.
     most = _MOST_OF_CATHETER if inserted_length is not None else 0.0
     catheter = max(float(way[np.flatnonzero(grid.branch < 0)[-1]].max()) - most, 0.0)
-    log_odds = float(logsumexp(shifts.log + by_shift)) - catheter
+    told = 0.0 if expected is None else float(logsumexp(expected))
+    log_odds = float(logsumexp(shifts.log + by_shift)) + told - catheter
     level = shifts.log + _ALIKE * by_shift
     level -= logsumexp(level)
     kept = level > np.log(_NOTHING)
@@ -385,6 +387,7 @@ def _read(
     middle = (len(image) - 1) / 2
     row = np.rint(middle - shown[:, 1:] - shifts_px[:, 1]).astype(np.int32)
     column = np.rint(middle + shown[:, :1] + shifts_px[:, 0]).astype(np.int32)
+    seen = (np.minimum(row, column) >= 0) & (np.maximum(row, column) < len(image))
     np.clip(row, 0, len(image) - 1, out=row)
     np.clip(column, 0, len(image) - 1, out=column)
     low, high = (row.min(), column.min()), (row.max() + 1, column.max() + 1)
@@ -395,7 +398,7 @@ def _read(
         if len(of):
             mean = np.log(np.maximum(uniform_filter(likelier, 2 * half + 1), 1e-6))
             found[of] = mean[row[of] - low[0], column[of] - low[1]]
-    return found * _new_mm(grid, shown, per_mm)[:, None].astype(np.float32)
+    return seen * found * _new_mm(grid, shown, per_mm)[:, None].astype(np.float32)
 
 
 def _new_mm(
