@@ -18,7 +18,6 @@ import numpy as np
 from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.cockpit.world import LiveWorld
-from endopilot.dataset.generate import write_episode
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire
 from endopilot.devices.stack import Proximals
