@@ -1,29 +1,33 @@
-"""Write the list of commands and their options in docs/commands.md: `python docs/commands.py`."""
+"""Write the list of commands in docs/commands.md and a page of each group in docs/commands: `python docs/commands.py`."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from endopilot.cli import COMMANDS, command_of
+from endopilot.cli import COMMANDS, GROUPS, command_of
 from endopilot.cli.options import Command, Option
 
 PAGE = Path(__file__).with_suffix(".md")
 BEGIN, END = "<!-- commands:begin -->", "<!-- commands:end -->"
 
 
-def page() -> str:
-    """Return the page as it is to be: what stands between the markers is made of the commands themselves."""
+def pages() -> dict[Path, str]:
+    """Return the pages as they are to be: a list of all commands between the markers, and a page of each group."""
     head, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-    rows = (f"| [`endopilot {name}`](#endopilot-{name}) | {summary} |" for name, summary in COMMANDS.items())
-    table = "\n".join(["| command | what it does |", "| --- | --- |", *rows])
-    sections = [_section(name) for name in COMMANDS]
-    return f"{head}{BEGIN}\n" + "\n\n".join([table, *sections]) + f"\n{END}{rest.split(END)[1]}"
-
-
-def _section(name: str) -> str:
-    """Return the section about a command."""
-    return "\n\n".join([f"## endopilot {name}", *_described(command_of(name))])
+    places, sections, rows = {}, dict[Path, list[str]](), ["| command | what it does |", "| --- | --- |"]
+    for name, summary in COMMANDS.items():
+        if name in GROUPS:
+            places[name] = PAGE.with_suffix("") / (re.sub(r"\W+", "-", GROUPS[name].lower()) + ".md")
+            sections[places[name]] = [f"# Commands: {GROUPS[name]}"]
+        place = [*places.values()][-1]
+        rows.append(f"| [`endopilot {name}`](commands/{place.name}#endopilot-{name}) | {summary} |")
+        sections[place] += [f"## endopilot {name}", *_described(command_of(name))]
+    contents = ["", "```{toctree}", ":hidden:", *(f"commands/{place.stem}" for place in places.values()), "```"]
+    table = "\n".join([*rows, *contents])
+    made = {place: "\n\n".join(parts) + "\n" for place, parts in sections.items()}
+    return {PAGE: f"{head}{BEGIN}\n{table}\n{END}{rest.split(END)[1]}"} | made
 
 
 def _described(command: Command) -> Iterable[str]:
@@ -50,4 +54,6 @@ def _row(one: Option) -> str:
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    PAGE.with_suffix("").mkdir(exist_ok=True)
+    for path, text in pages().items():
+        path.write_text(text, encoding="utf-8")

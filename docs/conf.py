@@ -1,8 +1,10 @@
 """Configuration of the documentation: `make docs` builds it into docs/_build and runs every tutorial and example."""
 
+import contextlib
 import os
 import re
 import sys
+import tempfile
 from pathlib import Path
 
 from endopilot import __version__
@@ -49,6 +51,16 @@ sphinx_gallery_conf = {
 def setup(app):
     """Have docstrings read as they were meant: shapes such as `*each 3`, and the tables of the environments."""
     app.connect("autodoc-process-docstring", _read_as_meant, priority=900)  # after napoleon
+    app.connect("build-finished", _run_the_start_page)
+
+
+def _run_the_start_page(app, failure):
+    """Run the Python of the start page, which shows the replay that its lines write."""
+    if failure is None and app.builder.format == "html":
+        code = re.search(r"```python\n(.*?)```", (ROOT / "docs" / "index.md").read_text(encoding="utf-8"), re.DOTALL)
+        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+            exec(code[1], {})
+            Path(app.outdir, "replay.html").write_bytes(Path("navigation/navigation.html").read_bytes())
 
 
 def _read_as_meant(app, what, name, obj, options, lines):

@@ -302,13 +302,15 @@ def test_a_file_can_be_started_from_flags(tmp_path, capsys, monkeypatch) -> None
     assert again.cost.tip_weight == 0.3 and again.target == "4"
 
 
-def test_the_page_is_made_of_the_commands() -> None:
+def test_the_pages_are_made_of_the_commands() -> None:
     spec = importlib.util.spec_from_file_location("commands_page", ROOT / "docs" / "commands.py")
     assert spec and spec.loader
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
-    page = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
-    assert script.page() == page, "run `python docs/commands.py`"
+    pages = script.pages()
+    assert {path: path.read_text(encoding="utf-8") for path in pages} == pages, "run `python docs/commands.py`"
+    assert {*(ROOT / "docs" / "commands").glob("*.md")} < pages.keys() and len(pages) > 5
+    page = "".join(pages.values())
     for command in EVERY:
         assert f"## {command.name}\n" in page
         for one in documented(command):

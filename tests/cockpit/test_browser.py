@@ -209,3 +209,44 @@ def test_the_hand_takes_the_catheter_and_both(context, vessel, tmp_path):
         page.evaluate("() => { pad.buttons[3].pressed = false; pad.axes[1] = -0.5; }")
         until(page, "cockpit.shown.velocity[2] > 0 && cockpit.shown.velocity[0] === 0")
     assert not errors
+
+
+def finger(page, kind, *points):
+    """Put fingers onto the page's glass, move them, or lift them all."""
+    touches = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(points)]
+    page.touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": touches})
+
+
+def test_a_phone_shows_all_panels_and_a_finger_drives(chromium, vessel, tmp_path):
+    phone = chromium.new_context(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
+    with serving(vessel, "--output", tmp_path) as server:
+        page = opened(phone, server)
+        page.touch = phone.new_cdp_session(page)
+        assert value(page, "document.documentElement.scrollWidth") == 390
+        boxes = {
+            name: page.locator(name).bounding_box() for name in ("#space", "#xray", "#autopilot", "#pad", "#pedal")
+        }
+        assert all(box["x"] >= 0 and box["x"] + box["width"] <= 390 for box in boxes.values())
+        assert boxes["#space"]["y"] + boxes["#space"]["height"] <= boxes["#xray"]["y"]
+        small = value(
+            page,
+            """[...document.querySelectorAll('button, select, input[type=number], summary, label, #pad')]
+            .filter((one) => one.offsetParent !== null || one.id === 'pad')
+            .map((one) => [one.textContent, one.getBoundingClientRect()])
+            .filter(([, box]) => box.width < 44 || box.height < 44).map(([text]) => text)""",
+        )
+        assert small == []
+        pad, pedal = boxes["#pad"], boxes["#pedal"]
+        x, y = pad["x"] + pad["width"] / 2, pad["y"] + pad["height"] / 2
+        began = value(page, "cockpit.shown.inserted_length_mm")
+        finger(page, "touchStart", (x, y))
+        finger(page, "touchMove", (x, y - 50))
+        until(page, f"cockpit.shown.inserted_length_mm > {began + 2}")
+        finger(page, "touchMove", (x + 50, y))
+        until(page, "cockpit.shown.rotation_deg > 20")
+        press = (pedal["x"] + 20, pedal["y"] + 20)
+        finger(page, "touchStart", (x + 50, y), press)  # a second finger exposes meanwhile
+        until(page, "cockpit.shown.xray.frames >= 2 && cockpit.shown.xray.on")
+        finger(page, "touchEnd")
+        until(page, "cockpit.shown.velocity.every((v) => v === 0) && !cockpit.shown.xray.on")
+    phone.close()

@@ -13,10 +13,10 @@ import pytest
 ROOT = Path(__file__).parents[2]
 CLAIMS = runpy.run_path(str(ROOT / "docs/claims.py"))
 WORDS = runpy.run_path(str(ROOT / "docs/words.py"))
-PAGES = sorted((ROOT / "docs").glob("*.md")) + [
+PAGES = sorted([*(ROOT / "docs").glob("*.md"), *(ROOT / "docs").glob("commands/*.md")]) + [
     page for shelf in WORDS["BOUNDS"] for page in sorted((ROOT / "docs" / shelf).glob("*.md"))
 ]
-AROUND = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md", "src/core/README.md")]
+AROUND = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md", "AGENTS.md", "src/core/README.md")]
 LINK = re.compile(r"\]\(((?!https?:|mailto:)[^)#\s]*)(?:#([^)\s]*))?\)")
 
 
@@ -82,6 +82,16 @@ def test_pages_that_code_and_messages_name_exist() -> None:
             named |= set(re.findall(r"(?<![\w/])docs/[\w/-]+\.md", path.read_text(encoding="utf-8")))
     assert len(named) > 10
     assert sorted(page for page in named if not (ROOT / page).exists()) == []
+
+
+def test_the_lines_of_the_start_page_write_the_replay_below_them(tmp_path, monkeypatch) -> None:
+    pytest.importorskip("jinja2", reason="the extra `report` is not installed")
+    code = re.search(r"```python\n(.*?)```", (ROOT / "docs/index.md").read_text(encoding="utf-8"), re.DOTALL)
+    assert code
+    monkeypatch.chdir(tmp_path)
+    told = {}
+    exec(code[1], told)
+    assert told["figures"]["reached"] and (tmp_path / "navigation/navigation.html").stat().st_size > 100_000
 
 
 def test_generators_find_the_marks_that_they_fill() -> None:

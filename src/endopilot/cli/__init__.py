@@ -44,6 +44,7 @@ COMMANDS = {
     "calibrate": "robot's logs -> gain, lag, plays, tip shape and friction, each with an interval",
     "cockpit": "a wire in the browser: watched, driven by hand, or left to a policy",
     "ladder": "a policy on twelve tasks in unseen patients -> scores, a page and a submission",
+    "mcp": "a folder -> ten tools for assistants, with files inside it alone",
     "verify": "the rod core compared with closed forms",
     "devices": "the known guidewires and their properties",
     "sample": "download a real CT angiogram to try",
@@ -51,7 +52,13 @@ COMMANDS = {
 }
 """Name of each command: what it takes -> what it makes. `module_of` names its module."""
 GROUPS = {"demo": "All stages", "segment": "Patients", "simulate": "Simulation, data, models", "plan": "Navigation"}
-GROUPS |= {"xray": "X-ray", "drive": "Robots", "cockpit": "By hand, and scored", "verify": "Checks and samples"}
+GROUPS |= {
+    "xray": "X-ray",
+    "drive": "Robots",
+    "cockpit": "By hand, and scored",
+    "mcp": "Assistants",
+    "verify": "Checks and samples",
+}
 """The heading above a group's first command in `endopilot --help`."""
 
 

@@ -30,6 +30,7 @@ def command(
     output: OutputFile,
     device: str = "workhorse-014",
     robot: str = "assumed",
+    topics: tuple[str, ...] = (),
     overwrite: bool = False,
     config: CalibrateConfig = CalibrateConfig(),
 ) -> Answer:
@@ -39,16 +40,17 @@ def command(
     `navigate`, `ladder` and `replay` take the files.
 
     Args:
-        logs: CSV files of commands and tips, driven through one vessel with one wire; docs/concepts/calibration.md
-            describes them.
+        logs: CSV files of commands and tips, or ROS bags, driven through one vessel with one wire;
+            docs/concepts/calibration.md describes them.
         anatomy: folder made by `endopilot anatomy` of what the wire was driven through.
         output: robot.yaml; beside it robot.device.yaml, the wire, and robot.json, all intervals.
         device: name of a device (`endopilot devices`) or a YAML file, as the wire is known.
         robot: name of a robot or a YAML file, as the robot is known.
+        topics: of ROS bags: command=TOPIC, encoder=, load=, tip=, episode=; joints by name as TOPIC:JOINT,JOINT.
     """
     for path in (_beside(output), output.with_suffix(".json")):
         check_new(path, (*logs, anatomy), overwrite=overwrite)
-    read, patient = [read_log(path) for path in logs], read_anatomy(anatomy)
+    read, patient = [read_log(path, topics=topics) for path in logs], read_anatomy(anatomy)
     found = calibrate(read, patient, read_wire(device), robot=read_robot(robot), config=config)
     names = ", ".join(log.name for log in read)
     _write(found, output, names)

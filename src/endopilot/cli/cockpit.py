@@ -54,7 +54,7 @@ def command(
     if episode is not None:
         _write_episode(replay, episode)
         return
-    require_extras("cockpit", "learn")
+    require_extras("cockpit")
     from endopilot.cockpit.open import open_replay, open_session, open_task, resume_session
     from endopilot.cockpit.server import serve
 

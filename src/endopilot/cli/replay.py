@@ -29,6 +29,7 @@ def command(
     output: OutputFolder,
     device: str = "workhorse-014",
     robot: str = "assumed",
+    topics: tuple[str, ...] = (),
     config: ReplayConfig = ReplayConfig(),
 ) -> Figures:
     """Simulate a log's commands, and compare the simulated tip with the one that was seen.
@@ -36,15 +37,17 @@ def command(
     The first part of each episode says how deep the wire lies and to which side it is turned; the rest is predicted.
 
     Args:
-        log: CSV file of commands and tips; docs/concepts/calibration.md describes its columns.
+        log: CSV file of commands and tips, or a ROS bag; docs/concepts/calibration.md describes them.
         anatomy: folder made by `endopilot anatomy` of what the wire was driven through.
         output: folder of replay.png, replay.csv (both tips at each time), errors.csv (each episode's) and
             manifest.json.
         robot: name of a robot or a YAML file, such as `endopilot calibrate` writes.
+        topics: of a ROS bag: command=TOPIC, encoder=, load=, tip=, episode=; joints by name as TOPIC:JOINT,JOINT.
     """
     from endopilot.report.replay_figure import replay_figure  # matplotlib is slow to import
 
-    patient, read, wire, drives = read_anatomy(anatomy), read_log(log), read_wire(device), read_robot(robot)
+    patient, read = read_anatomy(anatomy), read_log(log, topics=topics)
+    wire, drives = read_wire(device), read_robot(robot)
     inputs = input_hash(log) | input_hash(anatomy)
     claim(output, "endopilot replay", inputs=inputs, device=wire, robot=drives, config=config, version=__version__)
     found = replay_log([read], patient, Stack(wire), robot=drives, config=config)

@@ -16,6 +16,7 @@ from endopilot.control.plan_file import read_plan
 from endopilot.dataset.navigations import simulate_navigations
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
+from endopilot.extras import require_extras
 from endopilot.progress import progress
 from endopilot.settings import LONGEST_S, Seed, Within, settings
 from endopilot.simulation.config import SimulatorConfig
@@ -73,6 +74,8 @@ def command(
         picture: PNG of the vessel with the first navigation's wire and catheters at its end.
         random: the random controls, if no others are given.
     """
+    if picture is not None:
+        require_extras("report")
     patient = read_anatomy(anatomy)
     stack = Stack.of(device or "workhorse-014", *catheter)
     moves, period_s = motion_named(motion, motion_seed), SAMPLE_PERIOD_S

@@ -18,7 +18,6 @@ import numpy as np
 from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.cockpit.world import LiveWorld
-from endopilot.dataset.generate import write_episode
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire
 from endopilot.devices.stack import Proximals
@@ -240,6 +239,8 @@ def write_session_episode(session: str | Path, *, output: str | Path) -> None:
     """Write a recorded session, driven again and sampled every 0.5 s, as a data set of one episode, and a task's vessel
     beside it, into `OUTPUT-anatomy`. Raises InputError for no such session, one shorter than a sample, or an output
     folder that holds something else."""
+    from endopilot.dataset.generate import write_episode  # an extra brings its libraries
+
     session, output = Path(session), Path(output)
     recording = read_session(session)
     per_sample = round(DECISION_PERIOD_S / recording.config.cycle_s)

@@ -23,6 +23,7 @@ from endopilot.devices.robot import DriveConfig
 from endopilot.devices.stack import column_prefixes
 from endopilot.errors import InputError, box_text
 from endopilot.files import writing
+from endopilot.robot.bag import is_bag, read_bag
 from endopilot.simulation.csv_file import Columns, read_columns
 from endopilot.types import VesselTree
 from endopilot.xray.camera import CAMERA_FILE, Camera, points_in_vessel, read_camera
@@ -150,12 +151,13 @@ class RobotLog:
             table.to_csv(partial, index=False)
 
 
-def read_log(path: Path | str, *, camera: Camera | None = None) -> RobotLog:
+def read_log(path: Path | str, *, camera: Camera | None = None, topics: Sequence[str] = ()) -> RobotLog:
     """Read a robot's log.
 
     Args:
-        path: the CSV file.
+        path: the CSV file, or a ROS bag.
         camera: what its pixels belong to; that of `camera.yaml` beside it if not given.
+        topics: of a bag, PART=TOPIC (`robot.bag.read_bag`).
 
     Raises:
         InputError: no such table, or no camera for its pixels; the line names file, row, column and mend.
@@ -163,7 +165,10 @@ def read_log(path: Path | str, *, camera: Camera | None = None) -> RobotLog:
     path = Path(path)
     prefixes = column_prefixes(_MOST_DEVICES)
     of_devices = [p + name for p in prefixes for name in (*_POSITION, *_VELOCITY, *_ENCODER, *_LOAD)]
-    table = read_columns(path, ["time_s"], ["episode", "flag"], sparse=[*of_devices, *_TIP, *_PIXEL])
+    if is_bag(path):
+        table = read_bag(path, topics)
+    else:
+        table = read_columns(path, ["time_s"], ["episode", "flag"], sparse=[*of_devices, *_TIP, *_PIXEL])
     devices = max(k + 1 for k, p in enumerate(prefixes) if k == 0 or p + _POSITION[0] in table.values
                   or p + _VELOCITY[0] in table.values)  # fmt: skip
     if not {_POSITION[0], _VELOCITY[0]} & table.values.keys():

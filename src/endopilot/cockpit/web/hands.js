@@ -1,4 +1,4 @@
-// Keyboard and gamepad: what is held becomes a velocity, sent at every change and every 50 ms while anything is held.
+// Keyboard, gamepad and a pad for touch: what is held becomes a velocity, sent at every change and every 50 ms while anything is held.
 
 const HEARTBEAT_MS = 50;
 const SPEEDS = { fine: [1, 0.4], usual: [8, 2.5], fast: [30, 9] }; // mm/s, rad/s
@@ -29,8 +29,30 @@ export class Hands {
     document.addEventListener("visibilitychange", () => document.hidden && this.release());
     this.button("pedal", "pointerdown", () => this.pedal("mouse", true));
     for (const end of ["pointerup", "pointerleave", "pointercancel"]) this.button("pedal", end, () => this.pedal("mouse", false));
+    this.touchPad(document.getElementById("pad"));
     this.button("contrast", "click", () => this.connection.send("contrast"));
     setInterval(() => this.beat(), HEARTBEAT_MS);
+  }
+
+  /** Let a pad drive: a finger's way from its middle, up to push and sideways to turn, is a share of the usual speed. */
+  touchPad(pad) {
+    this.pad = [0, 0];
+    const knob = pad.querySelector("i");
+    const set = (along, turn) => {
+      this.pad = [along, turn];
+      pad.classList.toggle("held", along !== 0 || turn !== 0);
+      knob.style.transform = `translate(${turn * 44}px, ${-along * 44}px)`;
+      this.update();
+    };
+    const share = (way) => (Math.abs(way) < DEAD ? 0 : Math.max(-1, Math.min(1, way)));
+    const move = (event) => {
+      const box = pad.getBoundingClientRect();
+      set(share(1 - 2 * (event.clientY - box.top) / box.height), share(2 * (event.clientX - box.left) / box.width - 1));
+    };
+    pad.addEventListener("pointerdown", (event) => { event.preventDefault(); pad.setPointerCapture(event.pointerId); move(event); });
+    pad.addEventListener("pointermove", (event) => pad.hasPointerCapture(event.pointerId) && move(event));
+    for (const end of ["pointerup", "pointercancel", "lostpointercapture"]) pad.addEventListener(end, () => set(0, 0));
+    this.letGo = () => set(0, 0);
   }
 
   rest() {
@@ -99,12 +121,14 @@ export class Hands {
 
   stop() {
     this.held.clear();
+    this.letGo();
     this.connection.send("autopilot", { action: "stop" });
     this.send(this.rest());
   }
 
   release() {
     this.held.clear();
+    this.letGo();
     for (const name of [...this.pedalHeld]) this.pedal(name, false);
     this.update();
   }
@@ -119,7 +143,7 @@ export class Hands {
   }
 
   wanted() {
-    let along = 0, turn = 0;
+    let [along, turn] = this.pad;
     for (const code of this.held) {
       along += KEYS[code][0];
       turn += KEYS[code][1];

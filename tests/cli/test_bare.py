@@ -1,0 +1,114 @@
+"""What a page's install line brings is enough for the commands below it: no other library can be found here."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from endopilot.extras import extras_present, requirements_of_extras
+
+README = Path(__file__).parents[2] / "README.md"
+NEEDS = {
+    "cockpit": {"cockpit"},
+    "run": {"learn", "report"},
+    "dataset": {"learn"},
+    "train": {"learn"},
+    "evaluate": {"learn", "report"},
+    "angiograms": {"imaging"},
+}
+"""Extras that commands cannot do without; all others write what they can."""
+ONLY = """
+import json, sys
+from importlib.machinery import PathFinder
+
+kept, commands = json.loads(sys.argv[1])
+from endopilot.extras import requirements_of_extras
+
+libraries = {extra: {one.replace("-", "_") for one in of} for extra, of in requirements_of_extras().items()}
+hidden = set().union(*libraries.values()) - set().union(*(libraries[extra] for extra in kept))
+
+
+class Finder(PathFinder):
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        return None if name.partition(".")[0] in hidden else super().find_spec(name, path, target)
+
+
+sys.meta_path[sys.meta_path.index(PathFinder)] = Finder
+from endopilot.cli import main
+
+for command in commands:
+    if command[0] == "cockpit" and "cockpit" in kept:
+        import endopilot.cockpit.server
+        endopilot.cockpit.server.serve = lambda *_, listening, **__: listening("http://here")
+    try:
+        main(command)
+    except SystemExit as leaving:
+        assert leaving.code == 0, command
+"""
+"""Runs commands where only the libraries of some extras are installed, beside those of the package itself."""
+
+
+def run(tmp_path: Path, extras: list[str], *commands: list[str]) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", ONLY, json.dumps([extras, commands])], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_navigate_needs_no_extra_and_names_what_it_left_out(tmp_path, vessel) -> None:
+    told = run(
+        tmp_path, [], ["navigate", str(vessel), "--target=vessel", "--tip", "own", "--seconds", "20", "-o", "drive"]
+    )
+    (line,) = (line for line in told.splitlines() if line.startswith("left_out"))
+    assert line.endswith("pip install 'endopilot[learn,report]'")
+    made = {path.name for path in (tmp_path / "drive").iterdir()}
+    assert made == {"manifest.json", "navigation.csv", "run.json", "trajectory.npz"}
+
+
+def test_a_plan_and_what_it_simulates_need_no_extra(tmp_path, vessel) -> None:
+    plan = ["plan", str(vessel), "--target=vessel", "--seconds", "20", "-o", "plan"]
+    run(tmp_path, [], plan, ["simulate", str(vessel), "--controls", "plan", "-o", "rollout.csv"], ["devices"])
+    assert (tmp_path / "rollout.csv").stat().st_size > 1000
+
+
+def test_the_cockpit_needs_its_own_extra_alone(tmp_path, vessel) -> None:
+    if not extras_present()["cockpit"]:
+        pytest.skip("the extra `cockpit` is not installed")
+    assert "page       http://here" in run(tmp_path, ["cockpit"], ["cockpit", str(vessel), "--no-browser"])
+
+
+def test_commands_that_need_an_extra_name_it(tmp_path, vessel) -> None:
+    (tmp_path / "ct.nii.gz").touch()
+    (tmp_path / "x").mkdir()
+    asked = {"run": ["ct.nii.gz", "--target=4", "-o", "a"], "dataset": [str(vessel), "-o", "b"]}
+    asked |= {"train": ["x", "-o", "c"], "angiograms": [str(vessel), "-o", "d"], "cockpit": []}
+    for name, arguments in asked.items():
+        with pytest.raises(AssertionError) as refused:
+            run(tmp_path, [], [name, *arguments])
+        named = re.search(rf"endopilot {name}: needs .*'endopilot\[([a-z,]+)\]'", str(refused.value))
+        assert named, refused.value
+        assert set(named[1].split(",")) == NEEDS[name]
+
+
+def test_the_readme_installs_what_its_commands_need() -> None:
+    text = README.read_text(encoding="utf-8")
+    for heading, part in re.findall(r"^(#+ .*)\n(.*?)(?=^#|\Z)", text, re.MULTILINE | re.DOTALL):
+        brought: set[str] = set()
+        for line in part.splitlines():
+            if extras := re.search(r"pip install 'endopilot\[([a-z,-]+)\]'", line):
+                brought |= set(extras[1].split(","))
+            command = re.match(r"    endopilot ([a-z-]+)", line)
+            assert not command or NEEDS.get(command[1], set()) <= brought, f"{heading}: {line}"
+    forms = set(re.findall(r"pip install (?:-\S+ )*'?([^\s'\[`]+)\[", text))
+    assert forms == {"endopilot"}  # one form in all lines
+
+
+def test_some_libraries_are_hidden() -> None:
+    assert {"torch", "plotly", "starlette"} <= set().union(*requirements_of_extras().values())

@@ -1,0 +1,74 @@
+"""`endopilot mcp`, by the SDK's own client over standard input and output."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import sys
+
+import pytest
+
+pytest.importorskip("mcp", reason="the extra `mcp` is not installed")
+from mcp import Client, StdioServerParameters, stdio_client
+
+from endopilot.cli.mcp import server
+
+
+def asked(folder, *calls, over=None):
+    """Return what a client is told: its tools, and a result for each call (a tool's name and arguments)."""
+
+    async def talk():
+        async with Client(over or server(folder)) as client:
+            tools = (await client.list_tools()).tools
+            return tools, [await client.call_tool(name, given) for name, given in calls]
+
+    return asyncio.run(talk())
+
+
+@pytest.fixture
+def folder(vessel, tmp_path):
+    shutil.copytree(vessel, tmp_path / "open" / "patient")
+    shutil.copytree(vessel, tmp_path / "secret")
+    (tmp_path / "open" / "link").symlink_to(tmp_path / "secret")
+    return tmp_path / "open"
+
+
+def test_ten_tools_have_typed_answers(folder) -> None:
+    tools, (vessel, devices) = asked(folder, ("describe_vessel", {"patient": "patient"}), ("list_devices", {}))
+    assert len(tools) == 10 and all(tool.description and tool.output_schema for tool in tools)
+    planned = next(tool for tool in tools if tool.name == "plan").output_schema["properties"]
+    assert planned["reached"]["type"] == "boolean" and planned["peak_force_n"]["type"] == "number"
+    assert vessel.structured_content["sections"] == ["vessel"] and vessel.structured_content["branches"] == 3
+    assert "workhorse-014" in str(devices.structured_content)
+
+
+def test_an_assistant_plans_and_simulates_over_standard_streams(folder) -> None:
+    line = StdioServerParameters(command=sys.executable, args=["-m", "endopilot.cli", "mcp", str(folder)])
+    plan = {"patient": "patient", "target": "0,0,35", "output": "plan"}
+    rollout = {"patient": "patient", "controls": "plan", "output": "rollout.csv"}
+    _, (planned, driven) = asked(folder, ("plan", plan), ("simulate", rollout), over=stdio_client(line))
+    assert planned.structured_content["reached"] and planned.structured_content["plan"] == "plan"
+    assert driven.structured_content["deepest_tip_mm"] == pytest.approx(35.0, abs=3.0)
+    assert (folder / "rollout.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "said"),
+    [
+        ("describe_vessel", {"patient": "../secret"}, "leads out of the folder"),
+        ("describe_vessel", {"patient": "link"}, "leads out of the folder"),
+        ("describe_vessel", {"patient": "/etc"}, "leads out of the folder"),
+        ("plan", {"patient": "patient", "target": "vessel", "output": "../p"}, "leads out of the folder"),
+        ("plan", {"patient": "patient", "target": "vessel", "output": "p", "device": "/etc/passwd"}, "leads out"),
+        ("plan", {"patient": "patient", "target": "LAD", "output": "p"}, "the vessel has no such section"),
+        ("navigate", {"patient": "patient", "target": "vessel", "output": "p", "policy": "os:system"}, "choose from"),
+        ("segment_ct", {"ct": "none.nii.gz", "output": "m.nii.gz", "method": "os:system"}, "choose from"),
+        ("draw_patient", {"output": "patient"}, "is there already"),
+    ],
+)
+def test_bad_input_is_answered_in_a_line_and_writes_nothing(folder, name, given, said) -> None:
+    before = sorted(folder.parent.rglob("*"))
+    _, (result,) = asked(folder, (name, given))
+    assert result.is_error and said in result.content[0].text
+    assert str(folder) not in result.content[0].text
+    assert sorted(folder.parent.rglob("*")) == before
