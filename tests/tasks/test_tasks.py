@@ -156,7 +156,7 @@ def test_a_folder_of_tasks_has_its_own_anatomies_targets_and_wire(tmp_path):
         ({"anatomies": None}, "vessel: None; choose from"),
         ({"section": "G0"}, "section: 'G0'; give either the target's section or targets_mm"),
         ({"device": "no-such-wire"}, "no-such-wire"),
-        ({"ladder": {"seed": 1 << 62, "numbers": [7, 3]}}, "seed: from 4611686018427387904 on seeds are of test patients"),
+        ({"ladder": {"seed": 1 << 62, "numbers": [7, 3]}}, "seed: from 4611686018427387904 on seeds are of test"),
     ],
 )
 def test_what_is_wrong_in_a_task_of_ones_own_is_named(tmp_path, change, line):
