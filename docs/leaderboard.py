@@ -65,19 +65,21 @@ def page() -> str:
 
 
 def _tables() -> Iterator[str]:
-    """Return a table for each key, those of the shipped versions on usual terms first."""
+    """Return a table for each key, those of the shipped versions on usual terms first, with most tasks."""
     links = yaml.safe_load((FOLDER / LINKS_FILE).read_text(encoding="utf-8"))
     tables: dict[tuple[int, str], list] = {}
     for path in files():
         submission = read_submission(path)
-        key, known = submission.terms.key(), list(TITLES)
-        place = known.index(submission.version) if submission.version in known else len(known)
+        key, known = submission.key, list(TITLES)
+        place = known.index(submission.ladder) if submission.ladder in known else len(known)
         row = _row(path, submission, links[path.stem])
         tables.setdefault((place, json_text(key)), []).append((key, row))
-    for _, rows in sorted(tables.items(), key=lambda item: (item[0][0], '"drawn"' in item[0][1], len(item[0][1]))):
+    for _, rows in sorted(tables.items(), key=lambda item: (item[0][0], '"test"' in item[0][1], len(item[0][1]))):
         key = rows[0][0]
-        drawn = ", drawn patients" * (key["patients"] == "drawn")
-        yield from (f"### {TITLES.get(key['ladder'], key['ladder'])}{drawn}", "", f"Key: {terms_in_words(key)}.", "")
+        drawn = ", test patients" * (key["split"] == "test")
+        some = f", {len(key['done'])} tasks" * (len(key["done"]) < len(list_tasks(key["ladder"])))
+        title = TITLES.get(key["ladder"], key["ladder"])
+        yield from (f"### {title}{drawn}{some}", "", f"Key: {terms_in_words(key)}.", "")
         yield from (_line(*HEAD), "|" + "---|" * len(HEAD))
         yield from (line for _, line in sorted((row for _, row in rows), reverse=True))
         yield ""
@@ -93,11 +95,11 @@ def _row(path: Path, submission: Submission, link: str) -> tuple[tuple[int, floa
     cells = (
         f"[{submission.policy}]({link})",
         called,
-        f"{tasks} of {len(list_tasks(submission.version))}" if tasks > 2 else ", ".join(submission.tasks),
+        f"{tasks} of {len(list_tasks(submission.ladder))}" if tasks > 2 else ", ".join(submission.tasks),
         f"[{count}](../../{path.relative_to(FOLDER.parent)})",
         f"{100 * safe:.0f}",
         f"{100 * low:.0f}–{100 * high:.0f}",
-        f"({scores['exposures']})" if called == "replayed" else scores["exposures"],
+        "–" if called == "replayed" else scores["exposures"],
         scores["peak_force_n"],
         "–" if scores["seconds"] is None else scores["seconds"],
         (submission.blas or "").partition(" ")[2],
@@ -113,7 +115,7 @@ def climb_again(path: Path) -> None:
     """Make the file of a shipped policy again."""
     was = read_submission(path)
     patients = max(map(len, was.navigations.values()))
-    config = LadderConfig(policy=was.policy, tasks=tuple(was.tasks), patients=patients, version=was.version)
+    config = LadderConfig(policy=was.policy, tasks=tuple(was.tasks), patients=patients, version=was.ladder)
     with tempfile.TemporaryDirectory() as folder:
         climb(output=folder, config=config)
         path.write_bytes((Path(folder) / SUBMISSION_FILE).read_bytes())

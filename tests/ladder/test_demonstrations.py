@@ -5,9 +5,12 @@ from __future__ import annotations
 import io
 import itertools
 import json
+import runpy
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow.dataset
 import pytest
 from PIL import Image
 
@@ -116,6 +119,33 @@ def test_lerobot_reads_navigations_with_images(made):
     brightest = _image(samples["observation.images.view_1"][3]).max() / 255
     assert read["images"]["observation.images.view_1"] == [[3, PIXELS, PIXELS], pytest.approx(brightest)]
     assert set(map(tuple, read["of_images"].values())) == {(3, 1, 1)}
+
+
+def test_minari_s_layout_holds_what_an_environment_would_have_observed(made, tmp_path):
+    folder, content, found = made
+    sets = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "offline_sets.py"))
+    sets["write_minari"](folder.parent / "run/submission.json", tmp_path, "looks")
+    about = json.loads((tmp_path / "metadata.json").read_text(encoding="utf-8"))
+    assert (about["total_episodes"], about["total_steps"]) == (2, found["samples"])
+    wide = {of: json.loads(about[f"{of}_space"])["shape"][0] for of in ("observation", "action")}
+    assert wide == {"observation": 32, "action": 3}  # as `observation="xray"` has them
+    for place, samples in enumerate(_samples(folder)):
+        # as `minari`'s storage reads an episode: its folder as one table, whose last row is the end
+        rows = pyarrow.dataset.dataset(tmp_path / str(place), format="arrow", ignore_prefixes=["metadata.json"])
+        read = {name: np.array(values) for name, values in rows.to_table().to_pydict().items() if name != "infos"}
+        entry, state = content["navigations"]["along"][place], np.stack(samples["observation.state"])
+        assert {len(values) for values in read.values()} == {len(samples) + 1}
+        assert np.isfinite(read["observations"]).all()
+        np.testing.assert_allclose(read["observations"][:-1, 0], state[:, 0] / 100, rtol=1e-6)
+        np.testing.assert_allclose(read["observations"][:-1, 6], state[:, 4] / 10, atol=1e-6)  # age of the exposure
+        assert read["observations"][-1, 5] == pytest.approx(entry["seconds"] / 8.0)  # share of the time
+        np.testing.assert_allclose(read["actions"][:-1, 0], 5 / 12, rtol=1e-6)
+        np.testing.assert_array_equal(read["actions"][:-2, 2] > 0, samples["exposed"][1:])
+        np.testing.assert_array_equal(read["rewards"][:-1], samples["next.reward"])
+        ends = read["terminations"][:-1], read["truncations"][:-1]
+        assert [end.sum() for end in ends] == [entry["reason"] == "reached", entry["reason"] == "time"]
+        to_go = read["observations"][:-1, 11] * 100  # path length to the target at the last exposure
+        assert to_go[0] > 15 and to_go[-1] < to_go[0] - 5
 
 
 def test_mismatch_and_a_dataset_exclude_each_other(tmp_path, capsys):

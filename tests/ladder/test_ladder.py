@@ -234,9 +234,7 @@ def test_the_table_is_made_of_what_was_driven_and_says_what_only_a_file_says(cli
     folder, (scores,) = climbed
     (row,) = tabulate(folder.parent)
     assert {name: row[name] for name in scores if name != "level"} == {k: v for k, v in scores.items() if k != "level"}
-    assert (row["source"], row["navigations"], row["late"]) == ("run", 1, 0.0) and 0 < row["decision_ms"] <= row[
-        "p99_ms"
-    ]
+    assert (row["source"], row["navigations"]) == ("run", 1) and 0 < row["decision_ms"] <= row["p99_ms"]
     shutil.copytree(folder, tmp_path / "run")
     content = json.loads((tmp_path / "run" / "ladder.json").read_text(encoding="utf-8"))
     content["scores"][0]["safe_success"] = 0.5  # what is written by hand does not count
@@ -244,13 +242,17 @@ def test_the_table_is_made_of_what_was_driven_and_says_what_only_a_file_says(cli
     shutil.copy(folder / "submission.json", tmp_path / "mine.json")
     with pytest.raises(SystemExit) as left:
         main(["ladder", "--table", "--json", "-o", str(tmp_path)])
-    file, run = sorted(json.loads(capsys.readouterr().out), key=lambda each: each["source"])
+    file, *none, run = sorted(json.loads(capsys.readouterr().out), key=lambda each: each["source"])
     assert left.value.code == 0 and run["safe_success"] == file["safe_success"] == 1.0
-    assert (file["source"], file["decision_ms"], file["terms"]) == ("file", None, run["terms"])
+    assert (file["source"], file["decision_ms"], file["terms"]) == ("file", row["decision_ms"], run["terms"])
+    tasks = [task.name for version in (2, "coaxial") for task in list_tasks(version)] + ["archvariety", "dualdevicenav"]
+    assert [(each["policy"], each["source"]) for each in none] == [("forward", "none")] * 17
+    assert sorted([*(each["task"] for each in none), "straight"]) == sorted(tasks)
     with pytest.raises(SystemExit) as left:
         main(["ladder", "--table", "-o", str(tmp_path)])
     printed = capsys.readouterr().out
     assert left.value.code == 0 and "\nas submissions say\n" in printed
-    assert max(map(len, printed.splitlines())) <= 80
-    with pytest.raises(InputError, match="holds no run of `endopilot ladder` and no submission"):
+    assert "\nNo row of forward, Public benchmark: archvariety, dualdevicenav\n" in printed
+    assert max(len(line) for line in printed.splitlines() if not line.startswith("No row")) <= 80
+    with pytest.raises(InputError, match="no run of `endopilot ladder` and no submission"):
         tabulate(tmp_path / "run" / "straight")

@@ -75,7 +75,7 @@ def test_a_policy_from_a_file_is_run_in_patients_that_its_request_draws(spies, t
     assert [entry["seed"] for entry in done] == [drawn.seed, drawn.seed + 1] and drawn.seed != usual.seed
     assert len({entry["patient"] for entry in done}) == 2
     found = check_submission(tmp_path / "run" / "submission.json")
-    assert found.verdict == "replayed" and found.key["patients"] == "drawn" and found.key != Terms().key()
+    assert found.verdict == "replayed" and found.key["split"] == "test" and found.key != Terms().key()
     checked = runpy.run_path(str(LEADERBOARD))["checked"]
     by_us = shutil.copy(tmp_path / "run" / "submission.json", spies.parent)
     assert checked(Path(by_us), spies.parent) == (True, "decided again; ")  # by the file that lies beside it

@@ -18,10 +18,10 @@ from endopilot.devices.robot import read_robot
 from endopilot.errors import InputError
 from endopilot.files import json_text
 from endopilot.ladder import submission
-from endopilot.ladder.attempt import Recording, attempt, repeat
-from endopilot.ladder.ladder import LadderConfig, climb
+from endopilot.ladder.attempt import Recording, attempt, begun, repeat, scored
+from endopilot.ladder.ladder import LadderConfig, climb, terms_of
 from endopilot.ladder.scores import score, submitted
-from endopilot.ladder.submission import check_submission
+from endopilot.ladder.submission import check_submission, key_of
 from endopilot.ladder.terms import Terms, task_digest
 from endopilot.simulation.world import World
 from endopilot.tasks.task import find_task, list_tasks
@@ -87,6 +87,16 @@ def _swap_exposures(control, exposed):
     return control, exposed
 
 
+def _too_fast(content: dict) -> dict:
+    """Return a navigation whose drive is commanded more than it does, with the hash of that."""
+    was, navigation = Recording.unpacked(_first(content)["recording"]), find_task("straight").ladder_navigation(0)
+    fast = was.control * np.where(np.arange(len(was.control)) == 2, 100.0, 1.0)[:, None, None]
+    record = begun(replace(was, control=fast), navigation, seed=100).run()
+    fast = np.vstack([fast, np.zeros_like(fast)])[: len(record.control)]
+    forged = scored(navigation, replace(record, control=fast))
+    return {name: value for name, value in forged.items() if name != "course"}
+
+
 def test_a_submission_is_confirmed_in_other_processes(written, tmp_path, in_processes):
     path = tmp_path / "submission.json"
     path.write_text(json.dumps(written), encoding="utf-8")
@@ -101,8 +111,6 @@ def test_a_file_of_version_1_is_driven_again_in_the_textbook_s_patients(tmp_path
     climb(output=tmp_path, config=LadderConfig(policy="forward", tasks=("straight",), patients=1, version=1))
     path = tmp_path / "submission.json"
     content = json.loads(path.read_text(encoding="utf-8"))
-    del content["ladder"]  # as files were before there was a version 2
-    path.write_text(json.dumps(content), encoding="utf-8")
     assert check_submission(path).difference is None
     path.write_text(json.dumps(content | {"ladder": 2}), encoding="utf-8")
     with pytest.raises(InputError, match="task 'straight' of ladder 2 is not the one here"):
@@ -135,6 +143,7 @@ def test_a_version_1_task_has_the_hash_of_its_file_before_there_were_versions():
         (lambda c: _record(c, lambda v, x: (v[:-1], x[:-1])), "decisions, and the navigation goes on"),
         (lambda c: _record(c, lambda v, x: (np.vstack([v, v]), np.hstack([x, x]))), "and the navigation ends after"),
         (lambda c: _record(c, lambda v, x: (v, ~x)), "X-ray is off at the first decision"),
+        (lambda c: _first(c).update(_too_fast(c)), "control: decision 2 is beyond the drives' limits"),
         (lambda c: _first(c)["recording"].update(control="AAAA"), "control: no recorded array"),
     ],
 )
@@ -210,6 +219,12 @@ def _score(content: dict) -> None:
     content["scores"] = [submitted(row) for row in score([t for t in list_tasks() if t.name in results], results)]
 
 
+def _on_terms(content: dict, **changed) -> None:
+    """Say that all was done on other terms."""
+    content["key"] = key_of(Terms(**changed), content["key"]["done"])
+    content |= json.loads(json_text(changed))
+
+
 def _made_up(content: dict) -> None:
     content["versions"]["endopilot"], content["core"] = "0.0.1", "another"
     _first(content).update(seconds=0.5, exposures=0, peak_force_n=1e-6)
@@ -241,6 +256,19 @@ def _of_another_version(content: dict) -> None:
     _without_exposures(content)
 
 
+def _left_out(content: dict) -> None:
+    for of in (content["tasks"], content["navigations"]):
+        del of["descending"]
+    _score(content)
+
+
+def _twice(content: dict) -> None:
+    content["key"]["done"] = dict.fromkeys(sorted(content["tasks"]), 2)
+    for done in content["navigations"].values():
+        done.append(done[0] | {"seed": done[0]["seed"] + 1})
+    _score(content)
+
+
 def _in_another_patient(content: dict) -> None:
     _first(content).update({k: v for k, v in content["navigations"]["descending"][0].items() if k != "seed"})
     _score(content)
@@ -266,11 +294,16 @@ def looking(tmp_path_factory) -> dict:
         (_of_a_better_hand, "retract-rotate decides otherwise"),
         (_in_another_patient, "task straight, patient 0: "),
         (lambda c: c["scores"][0].update(safe_success=0.999), "scores, straight: safe_success is 0.999 in the file"),
-        (lambda c: c.update(world=asdict(World(friction_factor=0.2))), "in the file and"),
-        (lambda c: c.update(robot=asdict(read_robot("kweon-2021-2d"))), "in the file and"),
+        (_left_out, "key.done: "),
+        (_twice, "task straight, patient 1: patient is "),
+        (lambda c: c.update(world=asdict(World(friction_factor=0.2))), "key.world: {}; from all else follows {"),
+        (lambda c: _on_terms(c, world=World(friction_factor=0.2)), "in the file and"),
+        (lambda c: c.update(robot=asdict(read_robot("kweon-2021-2d"))), "key.robot: {}; from all else follows {"),
+        (lambda c: _on_terms(c, robot=read_robot("kweon-2021-2d")), "in the file and"),
+        (lambda c: _on_terms(c, thinking_s=0.5), "decisions, and the navigation goes on"),
         (lambda c: c.update(drawn="mine"), "straight, patient 0: seed 100; the ladder's is"),
-        (lambda c: c.update(settings={"element_mm": 5.0}), "settings: no such field"),
-        (lambda c: c.update(decision_period_s=0.1), "decision_period_s: no such field"),
+        (lambda c: c["key"].update(settings="0" * 64), "key.settings: "),
+        (lambda c: c["key"].update(decision_period_s=0.1), "key.decision_period_s: 0.1; from all else follows 0.5"),
     ],
 )
 def test_a_forgery_is_never_confirmed(looking, tmp_path, forge, said):
@@ -293,7 +326,7 @@ def test_exposures_that_nobody_decided_again_are_not_confirmed(looking, tmp_path
     path.write_text(json.dumps(content | {"policy": "of-mine"}), encoding="utf-8")
     found = check_submission(path)
     assert found.verdict == "replayed"
-    assert "exposures" not in found.scores[0] and found.scores[0]["exposures_as_recorded"] == 1.0
+    assert "exposures" not in found.scores[0] and found.remarks[-1].startswith("exposures are not counted")
 
 
 def test_the_folder_alone_makes_nothing_run_by_us(written, tmp_path):
@@ -301,6 +334,17 @@ def test_the_folder_alone_makes_nothing_run_by_us(written, tmp_path):
     path.write_text(json.dumps(written), encoding="utf-8")
     leaderboard = runpy.run_path(str(Path(__file__).parents[2] / "docs" / "leaderboard.py"))
     assert leaderboard["checked"](path, tmp_path) == (False, "not run by us: drawn None, decided again; ")
+
+
+def test_thinking_is_charged_told_and_a_term_of_its_own(tmp_path):
+    (tmp_path / "world.yaml").write_text("robot: {latency_s: 0.2}\n", encoding="utf-8")
+    config = LadderConfig(policy="forward", tasks=("straight",), patients=1, world=str(tmp_path / "world.yaml"))
+    at_once = attempt("forward", find_task("straight").ladder_navigation(0), seed=100, terms=terms_of(config))
+    climb(output=tmp_path / "run", config=replace(config, thinking_s=0.5))
+    found = check_submission(tmp_path / "run" / "submission.json")
+    assert found.verdict == "decided again" and found.key["thinking_s"] == 0.5
+    assert found.decision_ms is not None and found.scores[0]["seconds"] == at_once["seconds"] + 0.5
+    assert Terms(thinking_s=0.5).loop.robot.latency_s == pytest.approx(0.55)  # as `NavigationLoop` tells policies
 
 
 def test_a_kernel_that_this_machine_lacks_is_not_judged(looking, tmp_path, monkeypatch):
@@ -348,7 +392,7 @@ def test_a_policy_of_one_s_own_climbs_and_its_submission_is_confirmed(tmp_path, 
     assert leaving.value.code == 0
     checked = json.loads(capsys.readouterr().out)
     assert (checked["confirmed"], checked["verdict"]) == (True, "replayed")
-    assert "exposures_as_recorded" in checked["scores"][0]  # nobody can decide again
+    assert "exposures" not in checked["scores"][0]  # nobody can decide again
     _first(content)["seconds"] += 0.5
     file.write_text(json.dumps(content), encoding="utf-8")
     with pytest.raises(SystemExit) as leaving:
@@ -392,9 +436,9 @@ def test_a_ladder_in_another_world_is_confirmed_in_it(written, tmp_path):
     assert scores["world"] == {"name": str(world)} | differs
     assert _first(content)["sha256"] != _first(written)["sha256"]
     found = check_submission(path)
-    assert found.difference is None and found.key == scores["key"]
-    assert found.key["world"] == differs and found.key != Terms().key() | {"world": {}}
-    content["world"]["lumen_factor"] = 1.05
+    assert found.difference is None and found.key == scores["key"] | {"done": {"straight": 1}}
+    assert found.key["world"] == differs != Terms().key()["world"]
+    content["world"]["lumen_factor"] = content["key"]["world"]["lumen_factor"] = 1.05
     path.write_text(json.dumps(content), encoding="utf-8")
     assert check_submission(path).difference is not None
     with pytest.raises(InputError, match="was begun with world"):

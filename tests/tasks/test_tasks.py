@@ -113,6 +113,7 @@ def test_a_ladder_navigation_is_the_same_every_time():
         ("device: workhorse-014", "device: rope", "device: 'rope'; choose from"),
         ("level: 6", "level: 6\nlength: 3", "length: no such field; the fields are name, level,"),
         ("name: crux", "name: [", "line 4: not valid YAML"),
+        ("seed: 8006", "seed: 7006", "training: patient 4 is of ladder too, which nobody trains on; leave it out"),
     ],
 )
 def test_what_is_wrong_in_a_file_is_named(tmp_path, old, new, line):
@@ -155,6 +156,7 @@ def test_a_folder_of_tasks_has_its_own_anatomies_targets_and_wire(tmp_path):
         ({"anatomies": None}, "vessel: None; choose from"),
         ({"section": "G0"}, "section: 'G0'; give either the target's section or targets_mm"),
         ({"device": "no-such-wire"}, "no-such-wire"),
+        ({"ladder": {"seed": 1 << 62, "numbers": [7, 3]}}, "seed: from 4611686018427387904 on seeds are of test"),
     ],
 )
 def test_what_is_wrong_in_a_task_of_ones_own_is_named(tmp_path, change, line):

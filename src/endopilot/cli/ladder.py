@@ -37,14 +37,15 @@ def command(
             judged here. No policy climbs then.
         dataset: folder of a LeRobot data set of the navigations, with X-ray images, their recordings being driven again
             (docs/concepts/dataset.md).
-        table: print what lies on disk, and let no policy climb: a row for each task and policy of the runs in and below
-            the output folder, or runs if not given, and of the submissions in it, with the time that decisions took.
+        table: print what lies on disk, and let no policy climb: a row for each task and policy of the submissions in
+            the output folder, or in submissions and runs if not given, and of the runs in and below it, with the time
+            that decisions took; then which tasks a policy has no row of.
         page: write index.html with pictures and replays; --no-page leaves it out.
     """
     if dataset is not None and mismatch:
         raise InputError("dataset: with --mismatch, which writes no submission; leave one of them out")
     if table:
-        return _tabulated(output or Path("runs"))
+        return _tabulated(output)
     if check is not None:
         return _confirmed(check, dataset, config.policy)
     if dataset is not None:
@@ -72,14 +73,19 @@ def _page(folder: Path) -> dict[str, Any]:
     return {"page": write_page(folder)}
 
 
-def _tabulated(folder: Path) -> Answer:
-    from endopilot.ladder.table import shown_row, tabulate, terms_in_words
+def _tabulated(folder: Path | None) -> Answer:
+    from endopilot.ladder.table import PLACES, missing, shown_row, tabulate, terms_in_words
 
-    rows, shown = tabulate(folder), dict[str, list[dict[str, Any]]]()
+    rows = tabulate(*([folder] if folder else filter(Path.is_dir, map(Path, PLACES))))
+    shown, none = dict[str, list[dict[str, Any]]](), dict[tuple[str, str], list[str]]()
+    for cell in missing(rows):
+        none.setdefault((cell["policy"], cell["terms"]["ladder"]), []).append(cell["task"])
     for row in rows:
         title = terms_in_words(row["terms"]) + ("\nas submissions say" if row["source"] == "file" else "")
         shown.setdefault(title, []).append(shown_row(row))
-    return Answer(rows, [part for title, some in shown.items() for part in (title, some, "")])
+    parts = [part for title, some in shown.items() for part in (title, some, "")]
+    parts += [f"No row of {policy}, {ladder}: {', '.join(tasks)}" for (policy, ladder), tasks in none.items()]
+    return Answer(rows + missing(rows), parts)
 
 
 def _confirmed(file: Path, dataset: Path | None, policy: str) -> Answer:

@@ -19,13 +19,13 @@ from endopilot.belief.events import count_events
 from endopilot.control.agent import AgentPolicy
 from endopilot.errors import InputError
 from endopilot.ladder.apart import Apart
-from endopilot.ladder.terms import DRAWN, Terms
+from endopilot.ladder.terms import Terms
 from endopilot.navigation.loop import NavigationLoop
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import Decision, Observation
 from endopilot.navigation.record import NavigationRecord
 from endopilot.tasks.navigation import Navigation
-from endopilot.tasks.task import Task
+from endopilot.tasks.task import DRAWN, Task
 from endopilot.types import TipProjection
 
 _MOST_BYTES = 1 << 20
@@ -94,7 +94,7 @@ def attempt(policy: str, navigation: Navigation, *, seed: int, terms: Terms | No
     """
     terms = terms or Terms()
     with Apart(policy) if terms.request else nullcontext(make_policy(policy)) as driver:
-        loop = NavigationLoop(navigation, driver, config=terms.loop, seed=seed, world=terms.world)
+        loop = NavigationLoop(navigation, driver, config=terms.loop, seed=seed, world=terms.reality)
         record = loop.run()
     result: dict[str, Any] = {"seed": seed, "decision_s": np.round(loop.decision_s, 5).tolist()}
     result |= scored(navigation, record, tells=isinstance(driver, AgentPolicy))
@@ -123,19 +123,21 @@ def repeat(recording: Recording, navigation: Navigation, *, seed: int) -> dict[s
     """Drive the recorded velocities through the same robot and simulator, and return the figures, as `attempt` did.
 
     Raises:
-        InputError: the recording is longer or shorter than the navigation.
+        InputError: the recording is longer or shorter than the navigation, or holds what the drives do not do.
     """
     record = begun(recording, navigation, seed=seed).run()
     given, needed = len(recording.control), len(record.control) - 1
     if given != needed:
         raise InputError(f"control: holds {given} decisions, and the navigation ends after {needed}")
+    if beyond := np.flatnonzero((recording.control != record.control[:-1]).any(axis=(1, 2))).tolist():
+        raise InputError(f"control: decision {beyond[0]} is beyond the drives' limits, within which policies are kept")
     return _figures(navigation, record, recording)
 
 
 def begun(recording: Recording, navigation: Navigation, *, seed: int) -> NavigationLoop:
     """Return the loop that drives a navigation as it was recorded, to the bit; too short a recording is refused."""
     terms = recording.terms
-    return NavigationLoop(navigation, Repeated(recording), config=terms.loop, seed=seed, world=terms.world)
+    return NavigationLoop(navigation, Repeated(recording), config=terms.loop, seed=seed, world=terms.reality)
 
 
 class Repeated:

@@ -56,6 +56,9 @@ class LadderConfig:
     drawn: Text | None = None
     """A word, such as the commit that brings a policy: patients that nobody has seen are drawn from the hash of word,
     policy and terms, and the policy runs in a process of its own that is handed observations alone."""
+    thinking_s: Annotated[float, Within(0, 10)] = 0.0
+    """Time that each decision is taken to take, s: what it decides is done so much later; 0.5 is real time for whoever
+    decides within it."""
 
     @model_validator(mode="after")
     def _consistent(self) -> LadderConfig:
@@ -89,7 +92,8 @@ class LadderConfig:
 
 def terms_of(config: LadderConfig) -> Terms:
     """Return on what terms a policy climbs, or raise `InputError` where there is no such robot or world."""
-    terms = Terms(config.version, read_robot(config.robot), read_world(config.world))
+    robot, world = read_robot(config.robot), read_world(config.world)
+    terms = Terms(config.version, robot, world, thinking_s=config.thinking_s)
     if config.drawn is None:
         return terms
     return terms.drawn(config.policy, POLICIES.origin(config.policy), config.drawn, config.patients_done)

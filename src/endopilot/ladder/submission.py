@@ -25,11 +25,11 @@ from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, write_json
 from endopilot.ladder.attempt import Recording, attempt, navigation_seed, repeat
-from endopilot.ladder.scores import score, submitted
+from endopilot.ladder.scores import decision_ms, score, submitted
 from endopilot.ladder.terms import Terms, task_digest
 from endopilot.navigation.policies import POLICIES
 from endopilot.parallel import Workers, each
-from endopilot.settings import CountOrZero, Seed, read_settings, settings
+from endopilot.settings import CountOrZero, NonNegative, Seed, read_settings, settings
 from endopilot.simulation.world import World
 from endopilot.tasks.task import LadderVersion, Task, find_task
 
@@ -81,17 +81,22 @@ class Submission:
     """What a policy did on the ladder, and how that can be done again.
 
     Attributes:
-        ladder: its version; a file without it is one of version 1.
+        ladder: its version.
+        key: what must be equal for two files to be compared (`key_of`); it follows from all else here.
         origin: package and version that the policy comes from, or its file and the SHA-256 of that.
         core: processor level that the rod core was built for.
         blas: kernel of linear algebra of numpy and SciPy, such as openblas Haswell.
         tasks: name of each task and the SHA-256 of its definition with its device.
         navigations: by the task's name, in the order of the task's patients.
         drawn: the word with which patients were drawn, where they were (`Terms.drawn`).
+        thinking_s: how long each decision was taken to take, s (`Terms`).
+        decision_ms: how long decisions truly took where the file was made, ms, median and 99th percentile; another
+            machine takes another time, so that nothing confirms it.
     """
 
     format: Literal[1] = 1
-    ladder: LadderVersion | None = None
+    ladder: LadderVersion
+    key: dict[str, Any]
     policy: str
     origin: str
     versions: dict[str, str | None]
@@ -103,16 +108,13 @@ class Submission:
     robot: RobotConfig = RobotConfig()
     world: World = World()
     drawn: str | None = None
-
-    @property
-    def version(self) -> LadderVersion:
-        """Version of the ladder."""
-        return self.ladder or 1
+    thinking_s: NonNegative = 0.0
+    decision_ms: tuple[NonNegative, NonNegative] | None = None
 
     @property
     def terms(self) -> Terms:
         """On what terms the policy climbed; patients follow from the file, nobody chooses them."""
-        terms = Terms(self.version, self.robot, self.world)
+        terms = Terms(self.ladder, self.robot, self.world, thinking_s=self.thinking_s)
         if self.drawn is None:
             return terms
         return terms.drawn(self.policy, self.origin, self.drawn, max(map(len, self.navigations.values()), default=0))
@@ -123,6 +125,11 @@ Verdict = Literal["decided again", "replayed", "failed", "not judged"]
 exposures are; something is not as the file says; or this machine cannot tell."""
 
 
+def key_of(terms: Terms, counts: Mapping[str, int]) -> dict[str, Any]:
+    """Return what must be equal for two submissions to be compared: terms, tasks, and the patients done of each."""
+    return terms.key() | {"done": dict(sorted(counts.items()))}
+
+
 @dataclass(frozen=True)
 class SubmissionCheck:
     """What came of the check of a submission.
@@ -131,13 +138,14 @@ class SubmissionCheck:
         verdict: one of `Verdict`.
         policy: name of the policy, as the file says.
         origin: where the policy comes from, as the file says.
-        key: scores under equal keys may be compared (`endopilot.ladder.terms.Terms.key`).
+        key: scores under equal keys may be compared (`key_of`).
         kernel: of linear algebra, that all was driven again with.
         navigations: their number.
         difference: the first that differs from the file, in words; None where nothing does.
         scores: of what was driven again. A recording says when X-ray was on, and velocities do not tell whether that is
-            true: unless a policy decided again, exposures and missed events are named `..._as_recorded`.
+            true: unless a policy decided again, there are no exposures and no missed events.
         remarks: what else is to be known.
+        decision_ms: how long its decisions took here, ms, median and 99th percentile; None where it did not decide.
     """
 
     verdict: Verdict
@@ -149,6 +157,7 @@ class SubmissionCheck:
     difference: str | None
     scores: Sequence[Mapping[str, Any]]
     remarks: tuple[str, ...]
+    decision_ms: tuple[float, float] | None = None
 
     @property
     def confirmed(self) -> bool:
@@ -176,6 +185,7 @@ def write_submission(
     known = {each.name for each in fields(NavigationEntry)}
     submission = Submission(
         ladder=terms.version,
+        key=key_of(terms, {name: len(done) for name, done in results.items()}),
         policy=policy,
         origin=POLICIES.origin(policy),
         versions=manifest(config=None)["versions"],
@@ -190,6 +200,8 @@ def write_submission(
         robot=terms.robot,
         world=terms.world,
         drawn=drawn,
+        thinking_s=terms.thinking_s,
+        decision_ms=decision_ms([one for done in results.values() for one in done]),
     )
     write_json(path, submission)
 
@@ -215,15 +227,23 @@ def read_submission(path: str | Path) -> Submission:
     if not counts or not whole:
         raise InputError(f"{path}: navigations: {counts}; each task needs the same first 1 to {known} patients")
     for name, entries in submission.navigations.items():
-        if submission.tasks[name] != task_digest(find_task(name, version=submission.version)):
+        if submission.tasks[name] != task_digest(find_task(name, version=submission.ladder)):
             raise InputError(
-                f"{path}: task {name!r} of ladder {submission.version} is not the one here: its definition, a device "
+                f"{path}: task {name!r} of ladder {submission.ladder} is not the one here: its definition, a device "
                 "or an anatomy is another; check it with the folder as it was, or with endopilot "
                 f"{submission.versions.get('endopilot')}"
             )
         for place, entry in enumerate(entries):
             if entry.seed != (seed := navigation_seed(tasks[name], place)):
                 raise InputError(f"{path}: task {name}, patient {place}: seed {entry.seed}; the ladder's is {seed}")
+    own = key_of(submission.terms, counts)
+    for name in dict.fromkeys([*own, *submission.key]):
+        said, follows = (json_text(key.get(name)) for key in (submission.key, own))
+        if said != follows:
+            raise InputError(
+                f"{path}: key.{name}: {said}; from all else follows {follows}: give the file as it was written, or "
+                f"check it with endopilot {submission.versions.get('endopilot')}"
+            )
     return submission
 
 
@@ -256,7 +276,7 @@ def check_submission(path: str | Path, *, policy: str = "") -> SubmissionCheck:
     return SubmissionCheck(
         policy=submission.policy,
         origin=submission.origin,
-        key=submission.terms.key(),
+        key=submission.key,
         kernel=kernel,
         navigations=sum(map(len, submission.navigations.values())),
         **found,
@@ -301,6 +321,7 @@ def _driven_again(submission: Submission, folder: Path, pool: Workers | None, at
     bad = each(f"Checking {policy}", list(entries), work, pool)
     again = {path: {} if path in bad else read_json(path) for path in entries}
     otherwise = {path for path, figures in again.items() if not figures.pop("decided", False)} if at_hand else ()
+    took_ms = decision_ms([{"decision_s": figures.pop("decision_s", ())} for figures in again.values()])
     found = {
         path: str(bad[path])
         if path in bad
@@ -318,13 +339,15 @@ def _driven_again(submission: Submission, folder: Path, pool: Workers | None, at
         said = [(row.get("task") or given.get("task"), _difference(given, submitted(row))) for given, row in pairs]
         differing = [f"scores, {task}: {remark}" for task, remark in said if remark]
     if not at_hand:
-        claimed = {name: f"{name}_as_recorded" for name in ("exposures", "missed_events")}
-        rows = [{claimed.get(name, name): value for name, value in row.items()} for row in rows]
+        uncounted = ("exposures", "missed_events")
+        rows = [{name: value for name, value in row.items() if name not in uncounted} for row in rows]
+        remarks.append("exposures are not counted: the policy is not at hand")
     return {
         "verdict": "failed" if differing else "decided again" if at_hand else "replayed",
         "difference": differing[0] if differing else None,
         "scores": () if differing else rows,
         "remarks": tuple(remarks),
+        "decision_ms": took_ms,
     }
 
 
@@ -360,7 +383,8 @@ def _repeat(path: Path, *, terms: Terms, policy: str | None) -> None:
     recording = Recording.unpacked(read_json(path), len(navigation.devices), terms)
     figures = {"patient": navigation.anatomy.name} | repeat(recording, navigation, seed=seed)
     if policy is not None:
-        figures["decided"] = attempt(policy, navigation, seed=seed, terms=terms)["sha256"] == figures["sha256"]
+        done = attempt(policy, navigation, seed=seed, terms=terms)
+        figures |= {"decided": done["sha256"] == figures["sha256"], "decision_s": done["decision_s"]}
     write_json(path, figures)
 
 

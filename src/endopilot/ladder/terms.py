@@ -23,10 +23,7 @@ from endopilot.navigation.policies import POLICIES
 from endopilot.settings import from_record
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S
-from endopilot.tasks.task import CORE, NEWEST, LadderVersion, Patients, Task, find_task, list_tasks
-
-DRAWN = 1 << 62
-"""Seeds of drawn patients begin here: no task that lies in a file has such a seed."""
+from endopilot.tasks.task import CORE, DRAWN, NEWEST, LadderVersion, Patients, Task, find_task, list_tasks
 
 
 @dataclass(frozen=True)
@@ -34,6 +31,7 @@ class Terms:
     """On what terms a policy climbs; nothing else than these, the policy and the kernel of linear algebra counts.
 
     `request` is the SHA-256 that so many `patients` of each task are drawn from; empty where the tasks' own are done.
+    A decision is commanded `thinking_s` after what it was made from was observed; policies are told.
     """
 
     version: LadderVersion = NEWEST
@@ -41,6 +39,7 @@ class Terms:
     world: World = field(default_factory=World)
     request: str = ""
     patients: int = 0
+    thinking_s: float = 0.0
 
     def task(self, name: str) -> Task:
         """Return a task by its name with the patients that are done, or raise `InputError` where there is none."""
@@ -50,7 +49,16 @@ class Terms:
     @property
     def loop(self) -> LoopConfig:
         """Robot, C-arm and rod core of every navigation."""
-        return LoopConfig(robot=self.robot, simulator=replace(CORE, threads=1))
+        return LoopConfig(robot=self._late(self.robot), simulator=replace(CORE, threads=1))
+
+    @property
+    def reality(self) -> World:
+        """World of every navigation."""
+        own = self.world.robot
+        return self.world if own is None else replace(self.world, robot=self._late(own))
+
+    def _late(self, robot: RobotConfig) -> RobotConfig:
+        return replace(robot, latency_s=robot.latency_s + self.thinking_s)
 
     def drawn(self, policy: str, origin: str, word: str, patients: int) -> Terms:
         """Return the terms with patients that are drawn from the hash of a request to run a policy of some origin.
@@ -63,6 +71,7 @@ class Terms:
     def about(self) -> dict[str, Any]:
         """Return what `of` makes the terms of again."""
         drawn = {"request": self.request, "drawn": self.patients} if self.request else {}
+        drawn |= {"thinking_s": self.thinking_s}
         return {"ladder": self.version, "robot": self.robot, "world": self.world} | drawn
 
     @staticmethod
@@ -70,7 +79,8 @@ class Terms:
         """Return the terms that the content of a file names; what it leaves out is as it was in older files."""
         robot = from_record(RobotConfig, content["robot"]) if "robot" in content else RobotConfig()
         world = from_record(World, content["world"]) if "world" in content else World()
-        return Terms(content.get("ladder") or 1, robot, world, content.get("request", ""), content.get("drawn", 0))
+        drawn = content.get("request", ""), content.get("drawn", 0), content.get("thinking_s", 0.0)
+        return Terms(content.get("ladder") or 1, robot, world, *drawn)
 
     def key(self) -> dict[str, Any]:
         """Return what must be equal for two scores to be compared, and what differs from the ladder's own terms."""
@@ -78,17 +88,19 @@ class Terms:
         return {
             "ladder": self.version,
             "tasks": _digest(self._tasks),
-            "patients": "drawn" if self.request else "the ladder's",
+            "split": "test" if self.request else "validation",
             "robot": {name: value for name, value in robot.items() if value != usual[name]},
             "world": self.world.differences(),
             "settings": _digest(self.loop),
             "decision_period_s": DECISION_PERIOD_S,
+            "thinking_s": self.thinking_s,
         }
 
     def identity(self, policy: str) -> dict[str, Any]:
         """Return what a policy's results follow from: its source, tasks, their devices, robot, world and version."""
         found = {"policy": policy, "origin": POLICIES.origin(policy), "tasks": self._tasks, "robot": self.robot}
         found |= {"request": self.request} if self.request else {}
+        found |= {"thinking_s": self.thinking_s} if self.thinking_s else {}
         return found | {"world": self.world.differences(), "version": __version__}
 
     @property

@@ -40,6 +40,8 @@ from endopilot.types import Anatomy, VesselTree
 CORE = SimulatorConfig(element_mm=1.25, time_step_s=1 / 14, sample_tolerance_mm=1e-4)
 """Settings of the rod core on the ladder and in the environments: longer elements, two time steps a control period,
 and forces that are exact to a micronewton; docs/concepts/environments.md states the accuracy that they keep."""
+DRAWN = 1 << 62
+"""Seeds of test patients, which are drawn when asked, begin here: no task that lies in a file has such a seed."""
 ShippedVersion = Literal[1, 2, "coaxial"]
 LadderVersion = ShippedVersion | str
 NEWEST: LadderVersion = 2
@@ -79,8 +81,8 @@ class Task:
         force_limit_n: largest force of the wall on one node that is safe, N.
         stenosis_share: share of the atlas' patients that have a stenosis; 0 if not given.
         chosen_for: what makes the patients of the atlas eligible; the first eligible ones are taken.
-        ladder: the patients that the ladder is scored on.
-        training: patients of the atlas to learn on, if there are any.
+        ladder: the patients that the ladder is scored on, which are for validation.
+        training: patients of the atlas to learn on, none of them of `ladder`, if there are any.
         version: of the ladder that the task belongs to; it says which population the patients come from.
         catheter: catheter around the wire, if any, named as the device.
         arrives: whose tip is to go to the target, "wire" or "catheter"; the wire's if not given.
@@ -129,6 +131,10 @@ class Task:
                 raise ValueError(f"{name}: {len(given)} values; give one for each of ladder.numbers, {count}")
         if self.targets_mm is not None and self.anatomies is None:
             raise ValueError("targets_mm: patients of an atlas have no points of their own; give anatomies too")
+        learnt = self.training if self.anatomies is None else None
+        of_both = set(learnt.numbers) & set(self.ladder.numbers) if learnt else set[int]()
+        if of_both and learnt and learnt.seed == self.ladder.seed:
+            raise ValueError(f"training: patient {min(of_both)} is of ladder too, which nobody trains on; leave it out")
         if (self.section is None) == (self.targets_mm is None):
             raise ValueError(f"section: {self.section!r}; give either the target's section or targets_mm")
         return self
@@ -219,6 +225,8 @@ def list_tasks(version: LadderVersion = NEWEST) -> tuple[Task, ...]:
 def _read_task(path: Path) -> Task:
     """Return the task of a file, with the paths of its devices and anatomies."""
     task = read_settings(path, Task)
+    if any(patients is not None and patients.seed >= DRAWN for patients in (task.ladder, task.training)):
+        raise InputError(f"{path}: seed: from {DRAWN} on seeds are of test patients, drawn when asked; give a smaller")
     if task.anatomies is None:
         return task
     devices = {name: path.parent / (getattr(task, name) or "") for name in ("device", "catheter")}
