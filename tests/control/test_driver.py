@@ -68,6 +68,12 @@ def test_a_trial_that_presses_too_hard_passes_nothing(side_branch) -> None:
     assert pressed.share[0] == 0.0 and pressed.halt == ["pressed"] and pressed.periods[0] <= free.periods[0]
 
 
+def test_a_wire_that_folds_on_its_way_to_its_place_is_given_up(side_branch) -> None:
+    """The place lies beyond the vessel's end."""
+    outcome = drive(side_branch, Row(at=(50.0,)), 22.5)
+    assert outcome.halt == ["stalled"] and outcome.slack[0] > 15.0 and outcome.periods[0] < 60
+
+
 def test_a_wire_slows_down_before_the_target_and_stops_there(side_branch) -> None:
     straight = replace(side_branch, target=replace(side_branch.target, branch=0, abscissa=14.0))
     outcome = drive(straight, Row(), 14.0)

@@ -238,8 +238,9 @@ class Driver:
             self._stop(trials.move(control, force_n=limits.force_n), "pressed")
             took[going] = len(trials.rows)
             progress, inserted = trials.progress(goal.route), trials.deepest
-            inserted_there = np.where((progress > farthest + REST_MM) | ~pushing, inserted, inserted_there)
-            farthest = np.where(pushing, np.maximum(farthest, progress), progress)
+            ahead = pushing | (self._alone & (control[:, WIRE, 0] > 0))
+            inserted_there = np.where((progress > farthest + REST_MM) | ~ahead, inserted, inserted_there)
+            farthest = np.where(ahead, np.maximum(farthest, progress), progress)
             been = goal.passed(trials) | (been & goal.last)
             self._stop(pushing & _slips(trials, before) & self._alone, "slipped")
             ends = pushing & (self._alone | np.isnan(self._motions.follow_mm))  # others pass once they rest
@@ -249,7 +250,7 @@ class Driver:
             if passed.any():
                 end = min(end, begun + _LATE * (int(took[passed].min()) - begun))
             self._stop(pushing & ~trials.all(goal.route.off_route(trials.foremost) <= limits.off_mm), "off")
-            self._stop(pushing & (inserted - inserted_there > limits.slack_mm), "stalled")
+            self._stop(ahead & (inserted - inserted_there > limits.slack_mm), "stalled")
         trials.still[:] = False
         share = np.where(passed, 1.0, trials.mean(goal.passed(trials)))
         return Outcome(
