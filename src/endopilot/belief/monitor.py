@@ -15,8 +15,7 @@ import numpy as np
 from endopilot.belief.adviser import AdviserConfig, Predicted
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig, Past
-from endopilot.belief.explanation import BETTER, Explanation, explain
-from endopilot.belief.identification import Identified
+from endopilot.belief.identification import BETTER, Explanation, Identified, explain
 from endopilot.belief.patient_motion import FoundMotion
 from endopilot.belief.states import SEEKS, Event, States
 from endopilot.belief.thought import Budget, Pace, Thought
