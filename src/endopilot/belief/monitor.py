@@ -34,8 +34,8 @@ patients to improve agents on."""
 
 
 _ADVANCES, _OUTSIDE_SDS = 5, 1.645
-"""A drive pushes otherwise than predicted where the mean of so many readings is outside a band of 90 %: in worlds drawn
-to improve agents on, docs/evidence/worlds.md."""
+"""A drive pushes otherwise than predicted where the mean of so many readings is outside a band of 90 %, in standard
+deviations; it was 1.4 at most in 16 drives in worlds drawn to improve agents on, in which no stiff wire came far."""
 
 
 class LoadRatio:
