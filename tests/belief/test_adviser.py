@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endopilot.belief.adviser import AdviserConfig, Predicted, XrayAdviser
+from endopilot.belief.adviser import AdviserConfig, Predicted
 from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of, surely_missed
 from endopilot.belief.events import astray_mm, count_events
+from endopilot.belief.watch import Watch
 from endopilot.errors import InputError
 
 
@@ -147,8 +148,8 @@ def predicted(offset_mm: float = 0.0, *, inserted_mm: float = 0.0, radius_mm: fl
     return Predicted(ends[0], ends[1], np.zeros(2), radius_mm)
 
 
-def adviser_at(at: Predicted, config: AdviserConfig | None = None, **bands: float) -> XrayAdviser:
-    return XrayAdviser(calibration(**bands), config or AdviserConfig(), wire_radius_mm=0.2, at=at)
+def adviser_at(at: Predicted, config: AdviserConfig | None = None, **bands: float) -> Watch:
+    return Watch(calibration(**bands), config or AdviserConfig(), 0.2, at, alone=False)
 
 
 def advices(at: list[float], inserted: list[float], *, config: AdviserConfig, **bands: float) -> list[int]:
@@ -196,9 +197,9 @@ def test_what_a_play_adds_widens_both_bands_at_once() -> None:
     adviser = adviser_at(at, abscissa=0.0, offset=0.3)
     adviser.advise(at)
     known = adviser.half_width
-    adviser.advise(at, np.zeros(2))
+    adviser.advise(at, 0.0)
     assert np.array_equal(adviser.half_width, known)
-    due = adviser.advise(at, np.array([1.5, 0.2]))
+    due = adviser.advise(at, np.array([1.5, 0.2]) ** 2)
     np.testing.assert_allclose(adviser.half_width, [1.645 * 1.5, np.hypot(0.3, 1.645 * 0.2)], rtol=1e-3)
     assert due  # Δtip is known to no more than 2 mm
 
@@ -209,13 +210,15 @@ def test_exposures_keep_their_distance() -> None:
     assert np.diff(due).min() == 2
     assert due[0] == 2
     adviser = adviser_at(predicted(), abscissa=0.0, offset=0.0)
-    assert [adviser.advise(predicted(), always=True) for _ in range(6)] == [False, False, True] * 2
+    adviser.innovations.alarm = True
+    assert [adviser.advise(predicted()) for _ in range(6)] == [False, False, True] * 2
 
 
 def test_an_exposure_is_due_where_the_wall_begins_to_press() -> None:
     adviser = adviser_at(predicted(), abscissa=0.0, offset=0.0)
-    due = [adviser.advise(predicted(), presses=each) for each in (False, False, True, True, False)]
-    assert due == [False, False, True, False, False]
+    share = (0.5, 0.7, 0.85, 0.9, 0.7, 0.7, 0.9, 0.9, 1.1, 1.2, 1.3, 1.3, 0.7)  # of what it may press with, ±20 %
+    due = [adviser.advise(predicted(), pressed=each) for each in share]
+    assert np.flatnonzero(due).tolist() == [2, 6, 8, 10]  # either end of the band reaches the limit, and its middle
 
 
 def test_refuses_bad_settings() -> None:
@@ -233,9 +236,9 @@ def test_an_exposure_follows_another_as_long_as_that_showed_the_tip_on_the_other
         return [adviser.advise(at) for _ in range(count)]
 
     assert not any(due(6))  # predicted at the wall since the start
-    adviser.exposed(0.5, 1.2)
+    adviser.exposed(0.5, at)
     assert due(6) == [False, True, False, True, False, True]
-    adviser.exposed(0.8, 1.2)
+    adviser.exposed(0.8, at)
     assert not any(due(6))
 
 
@@ -249,13 +252,13 @@ def test_a_model_that_erred_is_looked_at_as_long_as_its_band_lies_across_the_wal
             (0.1, inserted, AdviserConfig(abscissa_mm=1.0)),
         ):
             adviser = adviser_at(predicted(inserted_mm=moved[0]), config, abscissa=0.1 * (offset < 0.5))
-            due = [adviser.advise(predicted(offset, inserted_mm=mm), erred=erred) for mm in moved[1:]]
+            due = [adviser.advise(predicted(offset, inserted_mm=mm), changed=erred) for mm in moved[1:]]
             found.append([i for i, each in enumerate(due, 1) if each])
         assert found == [across, along]
 
 
 def test_an_exposure_is_due_after_as_long_as_was_calibrated_on() -> None:
     bands = replace(calibration(abscissa=0.0), longest_s=4.0)
-    adviser = XrayAdviser(bands, AdviserConfig(), wire_radius_mm=0.2, at=predicted())
+    adviser = Watch(bands, AdviserConfig(), 0.2, predicted(), alone=False)
     due = [adviser.advise(predicted()) for _ in range(20)]
     assert [i for i, each in enumerate(due, 1) if each] == [8, 16]  # periods of 0.5 s

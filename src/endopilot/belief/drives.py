@@ -221,7 +221,7 @@ class Drives:
         left = self._gap[:, device, 0] / 2 - np.sign(speed) * self._ahead[:, device, 0]
         error = force_n - pushed_n - np.where(left < _TAKEN_UP[0], np.sign(speed) * valve[0] + speed * valve[1], 0.0)
         read_sd = self._robot.of_drives(len(self._sent), "load_sd_n")[device, 0]
-        sd = np.hypot(read_sd, force_sd_n(pushed_n))
+        sd = np.hypot(read_sd, _FORCE_SD_N + _FORCE_SHARE * abs(pushed_n))
         score = np.log(np.exp(-0.5 * (error / sd) ** 2) + _LEAST_LIKELY)
         if np.ptp(score) > 0:
             self._draw(device, score)

@@ -15,8 +15,7 @@ import numpy as np
 from endopilot.belief.adviser import AdviserConfig, Predicted
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig, Past
-from endopilot.belief.explanation import BETTER, Explanation, explain
-from endopilot.belief.identification import Identified
+from endopilot.belief.identification import BETTER, Explanation, Identified, explain
 from endopilot.belief.patient_motion import FoundMotion
 from endopilot.belief.states import SEEKS, Event, States
 from endopilot.belief.thought import Budget, Pace, Thought
@@ -35,8 +34,8 @@ patients to improve agents on."""
 
 
 _ADVANCES, _OUTSIDE_SDS = 5, 1.645
-"""A drive pushes otherwise than predicted where the mean of so many readings is outside a band of 90 %: in worlds drawn
-to improve agents on, docs/evidence/worlds.md."""
+"""A drive pushes otherwise than predicted where the mean of so many readings is outside a band of 90 %, in standard
+deviations; it was 1.4 at most in 16 drives in worlds drawn to improve agents on, in which no stiff wire came far."""
 
 
 class LoadRatio:

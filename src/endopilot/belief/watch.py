@@ -3,20 +3,19 @@
 `Innovations` says whether a model is wrong. An innovation is what an exposure shows less what was predicted. Its
 covariance is that of the prediction plus that of the measurement. Where the innovations are larger, the bands are
 widened until both agree (covariance matching).
-
-`Allowance` is what no calibration knows. A wire that is pushed while its tip rests buckles, and then snaps or folds,
-which no two wires do alike. In a wide lumen it lies down on the outer walls of bends before, which simulated wires
-predict.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.special import ndtri
 
-from endopilot.belief.adviser import AdviserConfig, Predicted, XrayAdviser
+from endopilot.anatomy.projection import safety_ratio
+from endopilot.belief.adviser import AdviserConfig, Predicted
 from endopilot.belief.bands import Calibration
 from endopilot.devices.drive_limits import SLACK_WIDTHS, WIDE_MM
+from endopilot.tasks.navigation import DECISION_PERIOD_S
 
 ASSUMED_SD_MM = (0.5, 0.3)
 """Standard deviations of (Δtip, γtip) of an exposure that states none, mm."""
@@ -108,48 +107,11 @@ _TIP_MM = np.array([0.2, 0.0])
 have the given one agree better than they are right; found with other tips, on patients to improve agents on."""
 
 
-class Allowance:
-    """What a wire's bands allow for that no calibration knows.
-
-    The lumen may be another than CT shows it, and the tip another than it is given. A wire that is pushed while its tip
-    rests buckles, and then snaps or folds, which no two wires do alike. In a wide lumen it lies down on the outer walls
-    of bends before, which simulated wires predict.
-
-    Attributes:
-        held_mm: by how much the wire was moved while its tip rested, since the last exposure, mm.
-    """
-
-    def __init__(self, inserted_mm: float, abscissa_mm: float, *, alone: bool) -> None:
-        """Begin at an exposure.
-
-        Args:
-            alone: whether no catheter is around the wire; nothing is allowed for where one is.
-        """
-        self._at, self._alone, self.held_mm = np.array([inserted_mm, abscissa_mm]), alone, 0.0
-        self._width_mm = 0.0
-
-    def move(self, inserted_mm: float, abscissa_mm: float, radius_mm: float) -> None:
-        """Take where the wire's ends are a period later, and the lumen's radius at its tip, mm."""
-        self._width_mm = max(self._width_mm, 2 * radius_mm)
-        now = np.array([inserted_mm, abscissa_mm])
-        moved, tip_moved = np.abs(now - self._at).tolist()
-        self._at, self.held_mm = now, self.held_mm + max(moved - tip_moved, 0.0)
-
-    def exposed(self) -> None:
-        """Begin anew at an exposure."""
-        self.held_mm = 0.0
-
-    def wall_mm(self, radius_mm: float) -> float:
-        """Return by how much the lumen's radius may be another, mm, where it is given as this, mm."""
-        return min(_LUMEN_SHARE * radius_mm, _LUMEN_MM) * self._alone
-
-    @property
-    def sd_mm(self) -> Float[np.ndarray, "2"]:
-        """Standard deviations of (Δtip, γtip), mm."""
-        free_mm = SLACK_WIDTHS * self._width_mm if self._width_mm > WIDE_MM else _FREE_MM
-        return np.hypot(_HELD_SHARE * max(self.held_mm - free_mm, 0.0), _TIP_MM) * self._alone
-
-
+_SPACING, _ALWAYS = 2, 3
+"""Periods from one exposure to the next, at least: one shows what began within a period before it. And where a model is
+taken to be wrong, and each image is to test it."""
+_ERRED_SHARE = 0.6
+"""Share of δ at which Δtip's band asks for X-ray once the model has erred, found on patients to improve agents on."""
 _PRESSES = np.array([0.8, 1.0, 1.25])
 """Shares of the largest force that the wall may press with, by simulated wires and the drive's load, at which it is
 looked at: both ends of the band, for they err by a fifth, as wires do, and its middle."""
@@ -158,10 +120,25 @@ MISMATCH = "model mismatch"
 
 
 class Watch:
-    """Watches where a model predicts one tip: its adviser, what the bands allow for beside, and the innovations.
+    """Says when to switch X-ray on where a model predicts one tip, and how wide the bands around it are.
+
+    Where the band of Δtip is as wide as δ, an exposure is due. Of the band of γtip the share is used that the
+    calibration found. This, over the clearance of the lumen there, lies below τ, above it, or across it. Below, nothing
+    threatens; above, the tip is known to be at the wall; across, either may be. An exposure is due where the band
+    reaches τ, where the predicted tip crosses it, and where the band has left it below; as long as the last exposure
+    showed the tip on the other side of τ than it is predicted; where the wall begins to press; and after an interval as
+    long as any that was calibrated on. It shows what began within the last 0.5 s, so none follows another sooner than
+    after 1 s.
+
+    A model that has erred is trusted less: an exposure is due as long as the band lies across τ, and where the band of
+    Δtip is 0.6 δ wide. Bands allow for what no calibration knows, too: the lumen may be another than CT shows it, the
+    tip another than it is given. A wire that is pushed while its tip rests buckles, and then snaps or folds, which no
+    two wires do alike. In a wide lumen it lies down on the outer walls of bends before, which simulated wires predict.
 
     Attributes:
         innovations: what exposures showed of the predictions.
+        half_width: of the whole bands of Δtip and γtip at the last call of `advise`, mm.
+        held_mm: by how much the wire was moved while its tip rested, since the last exposure, mm.
     """
 
     def __init__(
@@ -170,16 +147,24 @@ class Watch:
         """Begin at an exposure.
 
         Args:
+            config: τ and δ.
             alone: whether the model is of a wire that no catheter is around; else nothing is allowed for.
         """
-        self.innovations = Innovations()
-        self._adviser = XrayAdviser(calibration, config, tip_radius_mm, at)
-        self._allowance = Allowance(at.proximal[0], at.tip[0], alone=alone)
-        self._half, self._presses = self.half_width, 0
+        self.innovations, self._alone = Innovations(), alone
+        self._calibration, self._config, self._tip_radius_mm = calibration, config, tip_radius_mm
+        self._inserted_mm, self._travel_mm, self._periods = float(at.proximal[0]), 0.0, 0
+        self._ends_mm, self._width_mm, self.held_mm = np.array([at.proximal[0], at.tip[0]]), 0.0, 0.0
+        self._beyond = self._is_beyond(np.full(5, at.tip[1]), at.radius_mm)
+        self._shown: bool | None = None
+        self._wide, self._late, self._presses = False, False, 0
+        self.half_width = self._half = self._widths(at.spread, np.zeros(2))
 
     def move(self, at: Predicted) -> None:
         """Take what is predicted a period later."""
-        self._allowance.move(at.proximal[0], at.tip[0], at.radius_mm)
+        self._width_mm = max(self._width_mm, 2 * at.radius_mm)
+        now = np.array([at.proximal[0], at.tip[0]])
+        moved, tip_moved = np.abs(now - self._ends_mm).tolist()
+        self._ends_mm, self.held_mm = now, self.held_mm + max(moved - tip_moved, 0.0)
 
     def compare(self, innovation: Float[np.ndarray, "2"], sd_mm: tuple[float, float]) -> None:
         """Take measured less predicted (Δtip, γtip), and the standard deviations that the measurement states, mm."""
@@ -187,8 +172,8 @@ class Watch:
 
     def exposed(self, offset_mm: float, at: Predicted) -> None:
         """Begin anew at an exposure that shows γtip, mm, with what the model then predicts."""
-        self._adviser.exposed(offset_mm, at.radius_mm)
-        self._allowance.exposed()
+        self._periods, self._travel_mm, self.held_mm = 0, 0.0, 0.0
+        self._shown = bool(self._is_beyond(np.array([offset_mm]), at.radius_mm)[0])
 
     def advise(
         self,
@@ -206,31 +191,57 @@ class Watch:
             changed: whether the model is another than the given one, which erred.
             pressed: force of the wall as a share of what it may be.
         """
+        inserted_mm, offset_mm, factor = float(at.proximal[0]), float(at.tip[1]), self.innovations.factor
+        self._periods, self._travel_mm = self._periods + 1, self._travel_mm + abs(inserted_mm - self._inserted_mm)
+        self._inserted_mm = inserted_mm
+        erred, wall_mm = changed or bool((factor > 1).any()), self.wall_mm(at.radius_mm)
+        half = factor * self._widths(at.spread, np.sqrt(variance_mm2 + self.sd_mm**2))
+        used = self._calibration.offset_share * half[1]
+        beyond = self._is_beyond(offset_mm + np.array([used, 0.0, -used, wall_mm, -wall_mm]), at.radius_mm)
+        self.half_width = np.array([half[0], np.hypot(half[1], wall_mm)])
+        self._half = self.half_width / factor
+        crossed = bool((beyond & ~self._beyond).any())
+        across = bool(beyond.any() and not beyond.all())
+        disagrees = self._shown is not None and bool(beyond[1]) != self._shown
+        self._wide = bool(half[0] >= self._config.abscissa_mm * (_ERRED_SHARE if erred else 1.0))
+        self._late = self._periods * DECISION_PERIOD_S >= self._calibration.longest_s
         self._presses, pressed_before = int((pressed >= _PRESSES).sum()), self._presses
-        due = self._adviser.advise(
-            at,
-            np.sqrt(variance_mm2 + self._allowance.sd_mm**2),
-            factor=self.innovations.factor,
-            always=self.innovations.alarm,
-            erred=changed or bool((self.innovations.factor > 1).any()),
-            wall_mm=self._allowance.wall_mm(at.radius_mm),
-            presses=self._presses > pressed_before,
-        )
-        self._half = self.half_width / self.innovations.factor
+        due = crossed or disagrees or self._wide or (across and erred) or self._late or self._presses > pressed_before
+        due = (due and self._periods >= _SPACING) or (self.innovations.alarm and self._periods >= _ALWAYS)
+        if due or not crossed:
+            self._beyond = beyond
+        if due:
+            self._periods, self._travel_mm = 0, 0.0
         return due
+
+    def _widths(self, spread: Float[np.ndarray, "2"], beside_mm: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
+        """Return the half-widths of the bands for a spread and for standard deviations beside it, mm."""
+        seconds, travel_mm = np.array([self._periods * DECISION_PERIOD_S]), np.array([self._travel_mm])
+        half = self._calibration.half_width(seconds, travel_mm, spread[None])[0]
+        return np.hypot(half, ndtri(0.5 + 0.5 * self._calibration.level) * beside_mm)
+
+    def _is_beyond(self, offset_mm: Float[np.ndarray, "n"], radius_mm: float) -> Bool[np.ndarray, "n"]:
+        ratio = safety_ratio(offset_mm, np.full(len(offset_mm), radius_mm), self._tip_radius_mm)
+        return ratio >= self._config.wall_ratio
+
+    def wall_mm(self, radius_mm: float) -> float:
+        """Return by how much the lumen's radius may be another, mm, where it is given as this, mm: a tip on the wall is
+        then off by as much, and the edges of that band count too."""
+        return min(_LUMEN_SHARE * radius_mm, _LUMEN_MM) * self._alone
+
+    @property
+    def sd_mm(self) -> Float[np.ndarray, "2"]:
+        """Standard deviations of (Δtip, γtip) that no calibration knows, mm."""
+        free_mm = SLACK_WIDTHS * self._width_mm if self._width_mm > WIDE_MM else _FREE_MM
+        return np.hypot(_HELD_SHARE * max(self.held_mm - free_mm, 0.0), _TIP_MM) * self._alone
 
     @property
     def reason(self) -> str:
         """Why X-ray is due if it was at the last call of `advise`."""
         if self.innovations.alarm:
             return MISMATCH
-        if self._adviser.late:
+        if self._late:
             return "the last exposure is long ago"
-        if self._adviser.wide:
+        if self._wide:
             return f"Δtip is known to ±{self.half_width[0]:.1f} mm only"
         return "the wall presses hard" if self._presses else "the tip may be reaching the wall"
-
-    @property
-    def half_width(self) -> Float[np.ndarray, "2"]:
-        """Half-widths of the bands of Δtip and γtip at the last call of `advise`, mm."""
-        return self._adviser.half_width

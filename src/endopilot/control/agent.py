@@ -333,7 +333,7 @@ class AgentPolicy(_PlanningPolicy):
 
         Args:
             config: search and belief; if not given, those for the navigation's devices.
-            calibration: of the bands around what the simulated wires predict, by which `XrayAdviser` asks for
+            calibration: of the bands around what the simulated wires predict, by which `Watch` asks for
                 X-ray; if not given, the package's own for the navigation's X-ray and devices, which
                 `python -m benchmarks agent-calibration` makes.
             advice: which events the adviser watches for.

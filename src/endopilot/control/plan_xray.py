@@ -2,7 +2,7 @@
 
 The adviser monitors the ensemble of simulated wires of the ladder's agent, as it does during a navigation, whatever
 made the plan: they follow the plan's proximal end, and each exposure shows the tip where the plan has it. What their
-bands allow for beside (`Allowance`) is as in a navigation.
+bands allow for beside is as in a navigation.
 """
 
 from __future__ import annotations

@@ -157,7 +157,8 @@ _NONE_SCALE, _NONE_PRIOR = 4.0, 0.05
 """By how much larger innovations are where none of these explains them, and how likely that is before: assumptions."""
 _REFUTED, _WRONG = 0.05, 0.1
 """The whole family is refuted where no more than this share of its own members would be explained as badly; a share of
-the images, the worst, which may have gone wrong, is left out."""
+the images, the worst, which may have gone wrong, is left out. Of 34 worlds drawn to improve agents on that refuted 5 of
+5 with a motion, and 0 of 19 whose kinds are hypotheses."""
 _FAR_MM = 4.0
 """Differences between tips are cut off here, mm: beyond, a wire has snapped, or lies in another branch."""
 MEDIAN_SQUARE = 0.455
