@@ -1,4 +1,4 @@
-"""Write the list of commands in docs/commands.md and a page of each group in docs/commands: `python docs/commands.py`."""
+"""Write docs/commands.md and a page of each group of commands in docs/commands: `python docs/commands.py`."""
 
 from __future__ import annotations
 

@@ -42,6 +42,7 @@ sphinx_gallery_conf = {
     "within_subsection_order": "FileNameSortKey",
     "capture_repr": (),
     "download_all_examples": False,
+    "first_notebook_cell": "%pip install -q 'endopilot[all] @ git+https://github.com/endopilot/endopilot'",
     "show_signature": False,
     "min_reported_time": 1000,
     "write_computation_times": False,

@@ -34,18 +34,24 @@ def folder(vessel, tmp_path):
 
 
 def test_ten_tools_have_typed_answers(folder) -> None:
-    tools, (vessel, devices) = asked(folder, ("describe_vessel", {"patient": "patient"}), ("list_devices", {}))
+    tools, (devices, vessels) = asked(
+        folder, ("devices", {}), ("atlas", {"output": "drawn", "vessel": "rca", "count": 1})
+    )
     assert len(tools) == 10 and all(tool.description and tool.output_schema for tool in tools)
-    planned = next(tool for tool in tools if tool.name == "plan").output_schema["properties"]
-    assert planned["reached"]["type"] == "boolean" and planned["peak_force_n"]["type"] == "number"
-    assert vessel.structured_content["sections"] == ["vessel"] and vessel.structured_content["branches"] == 3
-    assert "workhorse-014" in str(devices.structured_content)
+    plan = next(tool for tool in tools if tool.name == "plan")
+    assert plan.output_schema["properties"]["reached"]["type"] == "boolean"
+    assert plan.input_schema["required"] == ["anatomy", "target", "output"]
+    assert "X,Y,Z in LPS mm" in plan.input_schema["properties"]["target"]["description"]
+    (rows,) = devices.structured_content.values()
+    assert {"workhorse-014"} < {row["name"] for row in rows}
+    ((row,),) = vessels.structured_content.values()
+    assert (folder / "drawn" / row["patient"] / "anatomy.json").exists()
 
 
 def test_an_assistant_plans_and_simulates_over_standard_streams(folder) -> None:
     line = StdioServerParameters(command=sys.executable, args=["-m", "endopilot.cli", "mcp", str(folder)])
-    plan = {"patient": "patient", "target": "0,0,35", "output": "plan"}
-    rollout = {"patient": "patient", "controls": "plan", "output": "rollout.csv"}
+    plan = {"anatomy": "patient", "target": "0,0,35", "output": "plan"}
+    rollout = {"anatomy": "patient", "controls": "plan", "output": "rollout.csv"}
     _, (planned, driven) = asked(folder, ("plan", plan), ("simulate", rollout), over=stdio_client(line))
     assert planned.structured_content["reached"] and planned.structured_content["plan"] == "plan"
     assert driven.structured_content["deepest_tip_mm"] == pytest.approx(35.0, abs=3.0)
@@ -55,15 +61,15 @@ def test_an_assistant_plans_and_simulates_over_standard_streams(folder) -> None:
 @pytest.mark.parametrize(
     ("name", "given", "said"),
     [
-        ("describe_vessel", {"patient": "../secret"}, "leads out of the folder"),
-        ("describe_vessel", {"patient": "link"}, "leads out of the folder"),
-        ("describe_vessel", {"patient": "/etc"}, "leads out of the folder"),
-        ("plan", {"patient": "patient", "target": "vessel", "output": "../p"}, "leads out of the folder"),
-        ("plan", {"patient": "patient", "target": "vessel", "output": "p", "device": "/etc/passwd"}, "leads out"),
-        ("plan", {"patient": "patient", "target": "LAD", "output": "p"}, "the vessel has no such section"),
-        ("navigate", {"patient": "patient", "target": "vessel", "output": "p", "policy": "os:system"}, "choose from"),
-        ("segment_ct", {"ct": "none.nii.gz", "output": "m.nii.gz", "method": "os:system"}, "choose from"),
-        ("draw_patient", {"output": "patient"}, "is there already"),
+        ("xray", {"anatomy": "../secret", "output": "x.png"}, "leads out of the folder"),
+        ("xray", {"anatomy": "link", "output": "x.png"}, "leads out of the folder"),
+        ("xray", {"anatomy": "/etc", "output": "x.png"}, "leads out of the folder"),
+        ("replay", {"log": "/etc/passwd", "anatomy": "patient", "output": "r"}, "leads out of the folder"),
+        ("plan", {"anatomy": "patient", "target": "vessel", "output": "../p"}, "leads out of the folder"),
+        ("plan", {"anatomy": "patient", "target": "vessel", "output": "p", "device": "/etc/passwd"}, "leads out"),
+        ("plan", {"anatomy": "patient", "target": "LAD", "output": "p"}, "the vessel has no such section"),
+        ("navigate", {"anatomy": "patient", "target": "vessel", "output": "p", "policy": "os:system"}, "choose from"),
+        ("segment", {"volume": "none.nii.gz", "output": "m.nii.gz", "method": "os:system"}, "choose from"),
     ],
 )
 def test_bad_input_is_answered_in_a_line_and_writes_nothing(folder, name, given, said) -> None:

@@ -16,7 +16,18 @@ WORDS = runpy.run_path(str(ROOT / "docs/words.py"))
 PAGES = sorted([*(ROOT / "docs").glob("*.md"), *(ROOT / "docs").glob("commands/*.md")]) + [
     page for shelf in WORDS["BOUNDS"] for page in sorted((ROOT / "docs" / shelf).glob("*.md"))
 ]
-AROUND = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md", "AGENTS.md", "src/core/README.md")]
+AROUND = [
+    ROOT / name
+    for name in (
+        "README.md",
+        "CONTRIBUTING.md",
+        "CHANGELOG.md",
+        "SECURITY.md",
+        "AGENTS.md",
+        "CODE_OF_CONDUCT.md",
+        "src/core/README.md",
+    )
+]
 LINK = re.compile(r"\]\(((?!https?:|mailto:)[^)#\s]*)(?:#([^)\s]*))?\)")
 
 

@@ -27,7 +27,6 @@ def command(
     Args:
         patients: folders made by `endopilot anatomy` or `endopilot atlas`, or CT angiograms, which are segmented.
         output: folder of the data set.
-        catheter: up to two catheters around it, from the inside out: names (docs/concepts/devices.md) or YAML files.
     """
     from endopilot.angiograms.config import MANIFEST_FILE, SAMPLES_FILE  # slow to import; --help needs none
     from endopilot.angiograms.make import make_angiograms

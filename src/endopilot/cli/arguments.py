@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,9 +34,9 @@ def existing(path: Path) -> Path:
     return regular(path)
 
 
-def _named_png(path: Path) -> Path:
-    if path.suffix.lower() != ".png":
-        raise InputError(f"{path}: a picture is written as PNG; name it with .png")
+def _named(path: Path, what: str, suffix: str) -> Path:
+    if path.suffix.lower() != suffix:
+        raise InputError(f"{path}: a {what} is written as {suffix[1:].upper()}; name it with {suffix}")
     return path
 
 
@@ -53,7 +54,8 @@ class ListenConfig:
 MUST_EXIST = "must exist"
 Existing = Annotated[Path, MUST_EXIST]  # a file or folder that must be there when the command begins
 IS_FOLDER, IS_FILE = "folder that is written", "file that is written"
-Picture = Annotated[Path, AfterValidator(_named_png), IS_FILE]  # a picture to be written
+Picture = Annotated[Path, AfterValidator(partial(_named, what="picture", suffix=".png")), IS_FILE]
+Page = Annotated[Path, AfterValidator(partial(_named, what="page", suffix=".html")), IS_FILE]
 OutputFolder = Annotated[Path, arg(aliases=("-o",), metavar="DIR"), IS_FOLDER]
 OutputFile = Annotated[Path, arg(aliases=("-o",), metavar="FILE"), IS_FILE]
 

@@ -46,7 +46,6 @@ def command(
         output: robot.yaml; beside it robot.device.yaml, the wire, and robot.json, all intervals.
         device: name of a device (`endopilot devices`) or a YAML file, as the wire is known.
         robot: name of a robot or a YAML file, as the robot is known.
-        topics: of ROS bags: command=TOPIC, encoder=, load=, tip=, episode=; joints by name as TOPIC:JOINT,JOINT.
     """
     for path in (_beside(output), output.with_suffix(".json")):
         check_new(path, (*logs, anatomy), overwrite=overwrite)

@@ -37,7 +37,6 @@ def command(
 
     Args:
         patient: folder made by `endopilot anatomy` or `endopilot atlas`; a synthetic one if nothing is given.
-        catheter: up to two catheters around it, from the inside out: names such as microcatheter-1.7f, or YAML files.
         robot: name of a robot (docs/concepts/robot.md) or a YAML file that drives them; `assumed` if not given.
         task: task of the ladder to drive by hand, with X-ray as the only sight until the end.
         world: which patient of the task, world of the trajectory, or episode of the data set.

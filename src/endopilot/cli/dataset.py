@@ -26,13 +26,12 @@ def command(
 ) -> Figures:
     """Simulate random navigations of many patients and store them as a LeRobot v3 dataset.
 
-    An interrupted run goes on where it stopped when the same command is given again.
+    Each catheter is driven at random and independently. An interrupted run goes on where it stopped when the same
+    command is given again.
 
     Args:
         anatomies: folders made by `endopilot anatomy` or `endopilot atlas`.
         output: folder of the dataset.
-        catheter: up to two catheters around it, from the inside out: names (docs/concepts/devices.md) or YAML files;
-            each is driven at random and independently, by velocity.
         robot: name of a robot (docs/concepts/robot.md) or a YAML file that makes the motions, and measures them; if not
             given, they are made as drawn.
         world: name of the world that reality is (docs/concepts/worlds.md), or a YAML file.

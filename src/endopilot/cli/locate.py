@@ -6,14 +6,13 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
-from typing import Annotated, Any
+from typing import Any
 
-from pydantic import AfterValidator
 from tyro.conf import Positional
 
 from endopilot.anatomy.extract import extract_anatomy
 from endopilot.anatomy.io import read_anatomy
-from endopilot.cli.arguments import IS_FILE, Existing, Figures, OutputFile, Picture
+from endopilot.cli.arguments import Existing, Figures, OutputFile, Page, Picture
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.types import Anatomy
@@ -21,12 +20,6 @@ from endopilot.xray.camera import read_camera
 from endopilot.xray.frames import read_frames, write_locations
 from endopilot.xray.locate import locate
 from endopilot.xray.tip_filter import LocateConfig, TipLocation
-
-
-def _named_html(path: Path) -> Path:
-    if path.suffix.lower() != ".html":
-        raise InputError(f"{path}: a page is written as HTML; name it with .html")
-    return path
 
 
 def command(
@@ -37,7 +30,7 @@ def command(
     camera: tuple[Existing, ...] = (),
     output: OutputFile,
     picture: Picture | None = None,
-    page: Annotated[Path, AfterValidator(_named_html), IS_FILE] | None = None,
+    page: Page | None = None,
     device: str = "workhorse-014",
     config: LocateConfig = LocateConfig(),
 ) -> Figures:

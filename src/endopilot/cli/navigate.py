@@ -27,11 +27,8 @@ def command(
     is the first line that is printed; the exit code is 0 either way.
 
     Args:
-        target: section label such as 4 or LAD, or point X,Y,Z in LPS mm (--target=-1.5,2,3 where it begins with a
-            minus).
         output: folder of the results.
         policy: what decides: agent, cloned, oracle (which is given the truth), open-loop, forward, spin,
             retract-rotate, with a catheter in-turn or catheter-alone, or MODULE:OBJECT of your own.
-        catheter: up to two catheters around it, from the inside out: names such as microcatheter-1.7f, or YAML files.
     """
     return navigate_into(anatomy, target, output=output, policy=policy, device=device, catheter=catheter, config=config)

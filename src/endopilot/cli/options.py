@@ -56,6 +56,7 @@ LISTED: Mapping[str, str] = MappingProxyType(
 """What `--help` lists of commands that have more than `LISTED_AT_MOST` flags: those that are set most often."""
 _USUAL = {
     "anatomy": "folder made by `endopilot anatomy` or `endopilot atlas`.",
+    "catheter": "up to two catheters around it, from the inside out: names (docs/concepts/devices.md) or YAML files.",
     "device": "name of a device (`endopilot devices`) or a YAML file.",
     "json": "print the figures as JSON.",
     "overwrite": "replace files that lie where this command writes.",
@@ -63,6 +64,8 @@ _USUAL = {
     "scheduler": "address of a Dask scheduler (tcp://host:8786) whose workers simulate and share these folders; the "
     "cores of this machine if not given.",
     "series": "number or instance UID of the series, where a DICOM folder holds several.",
+    "target": "section label such as 4 or LAD, or point X,Y,Z in LPS mm (--target=-1.5,2,3 if it begins with a minus).",
+    "topics": "of a ROS bag: command=TOPIC, encoder=, load=, tip=, episode=; joints by name as TOPIC:JOINT,JOINT.",
     "volume": "DICOM folder or file, NIfTI, NRRD or MHA, in HU.",
 }
 """What options of several commands mean where a command says nothing else."""

@@ -42,7 +42,6 @@ def command(
         output: folder of replay.png, replay.csv (both tips at each time), errors.csv (each episode's) and
             manifest.json.
         robot: name of a robot or a YAML file, such as `endopilot calibrate` writes.
-        topics: of a ROS bag: command=TOPIC, encoder=, load=, tip=, episode=; joints by name as TOPIC:JOINT,JOINT.
     """
     from endopilot.report.replay_figure import replay_figure  # matplotlib is slow to import
 

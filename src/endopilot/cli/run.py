@@ -28,6 +28,5 @@ def command(
 
     Args:
         output: folder of all results; the report is report.html.
-        target: section label such as 4 or LAD, or point X,Y,Z in LPS mm, to which the agent drives the wire.
     """
     return run_volume(volume, output, config, series=series, phase=phase, target=target)

@@ -62,8 +62,6 @@ def command(
     Args:
         output: .parquet or .csv with a row for each sample, or .npz with all arrays.
         device: name of a device (`endopilot devices`) or a YAML file; workhorse-014 if not given.
-        catheter: up to two catheters around it, from the inside out: names (`microcatheter-1.7f`, `microcatheter-2.4f`,
-            `straight-5f`, `multipurpose-5f`, `vertebral-5f`, `jr4-5f`, `jl4-5f`, `simmons-2-5f`) or YAML files.
         controls: CSV of scripted proximal velocities (time_s, translation_mm_s, rotation_rad_s, those of catheters as
             catheter_1_translation_mm_s, ...), or what is driven again to the bit with its own devices, motion and
             settings: a trajectory (.npz), such as `endopilot navigate` writes, or a folder made by `endopilot plan`;

@@ -74,18 +74,18 @@ def tiles(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     return [
         (
             _mm(tip["P1"], "abscissa"),
-            "forward network's mean error of Δtip (P1)",
+            "mean error of the tip's predicted place along the vessel",
             f"baseline {_mm(tip['hold_slack'], 'abscissa')}",
         ),
         (
             _mm(tip["P4"], "abscissa"),
-            "error of the desired Δtip, controls simulated (P4)",
+            "from the desired tip, where the controls that a network chose are simulated",
             f"baseline {_mm(tip['follow_slack'], 'abscissa')}",
         ),
-        (_signed(skill), "skill for Δtip over holding the slack (P1)", "1 is perfect, 0 no better, below 0 worse"),
+        (_signed(skill), "skill of that prediction over holding the slack", "1 is perfect, 0 no better, below 0 worse"),
         (
             f"{100 * tip['P4']['diverged_share']:.0f} %",
-            f"of simulated navigations err by over {DIVERGED_MM:g} mm at some time (P4)",
+            f"of these simulated navigations err by over {DIVERGED_MM:g} mm at some time",
             f"baseline {100 * tip['follow_slack']['diverged_share']:.0f} %",
         ),
     ]
