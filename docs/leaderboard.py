@@ -121,7 +121,8 @@ def climb_again(path: Path) -> None:
     """Make the file of a shipped policy again."""
     was = read_submission(path)
     patients = max(map(len, was.navigations.values()))
-    config = LadderConfig(policy=was.policy, tasks=tuple(was.tasks), patients=patients, version=was.ladder)
+    given = {"policy": was.policy, "tasks": tuple(was.tasks), "version": was.ladder, "thinking_s": was.thinking_s}
+    config = LadderConfig(patients=patients, **given)
     with tempfile.TemporaryDirectory() as folder:
         climb(output=folder, config=config)
         path.write_bytes((Path(folder) / SUBMISSION_FILE).read_bytes())
