@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -20,6 +21,7 @@ from endopilot.ladder.ladder import LadderConfig, climb
 from endopilot.ladder.scores import score_navigations
 from endopilot.ladder.submission import SUBMISSION_FILE, Submission, check_submission, read_submission
 from endopilot.ladder.table import TITLES, terms_in_words
+from endopilot.ladder.terms import Terms
 from endopilot.navigation.policies import POLICIES
 from endopilot.tasks.task import list_tasks
 
@@ -67,14 +69,12 @@ def page() -> str:
 def _tables() -> Iterator[str]:
     """Return a table for each key, those of the shipped versions on usual terms first, with most tasks."""
     links = yaml.safe_load((FOLDER / LINKS_FILE).read_text(encoding="utf-8"))
-    tables: dict[tuple[int, str], list] = {}
+    tables: dict[str, list] = {}
     for path in files():
         submission = read_submission(path)
-        key, known = submission.key, list(TITLES)
-        place = known.index(submission.ladder) if submission.ladder in known else len(known)
         row = _row(path, submission, links[path.stem])
-        tables.setdefault((place, json_text(key)), []).append((key, row))
-    for _, rows in sorted(tables.items(), key=lambda item: (item[0][0], '"test"' in item[0][1], len(item[0][1]))):
+        tables.setdefault(json_text(submission.key), []).append((submission.key, row))
+    for rows in sorted(tables.values(), key=lambda rows: _place(rows[0][0])):
         key = rows[0][0]
         drawn = ", test patients" * (key["split"] == "test")
         some = f", {len(key['done'])} tasks" * (len(key["done"]) < len(list_tasks(key["ladder"])))
@@ -83,6 +83,12 @@ def _tables() -> Iterator[str]:
         yield from (_line(*HEAD), "|" + "---|" * len(HEAD))
         yield from (line for _, line in sorted((row for _, row in rows), reverse=True))
         yield ""
+
+
+def _place(key: Mapping[str, Any]) -> tuple:
+    known, usual = list(TITLES), Terms(key["ladder"]).key()
+    unusual = sum(key[name] != usual[name] for name in usual)
+    return known.index(key["ladder"]) if key["ladder"] in known else len(known), unusual, -len(key["done"])
 
 
 def _row(path: Path, submission: Submission, link: str) -> tuple[tuple[int, float, int], str]:
@@ -115,7 +121,8 @@ def climb_again(path: Path) -> None:
     """Make the file of a shipped policy again."""
     was = read_submission(path)
     patients = max(map(len, was.navigations.values()))
-    config = LadderConfig(policy=was.policy, tasks=tuple(was.tasks), patients=patients, version=was.ladder)
+    given = {"policy": was.policy, "tasks": tuple(was.tasks), "version": was.ladder, "thinking_s": was.thinking_s}
+    config = LadderConfig(patients=patients, **given)
     with tempfile.TemporaryDirectory() as folder:
         climb(output=folder, config=config)
         path.write_bytes((Path(folder) / SUBMISSION_FILE).read_bytes())

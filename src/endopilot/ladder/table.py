@@ -52,21 +52,22 @@ def tabulate(*folders: Path) -> list[dict[str, Any]]:
 def missing(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return a row, of the source "none", for each task of the ladder and of the public benchmark that a policy of a
     table has no row of, on whatever terms."""
-    done = {(row["policy"], row["task"]) for row in rows}
-    named = {TITLES[version]: [task.name for task in list_tasks(version)] for version in (2, "coaxial")}
+    public = "Public benchmark"
+    wanted = {TITLES[version]: [task.name for task in list_tasks(version)] for version in (2, "coaxial")}
+    done = {(row["policy"], TITLES.get(row["terms"]["ladder"], public), row["task"]) for row in rows}
     return [
         {"terms": {"ladder": title}, "task": task, "policy": policy, "source": "none", "navigations": 0}
         for policy in sorted({row["policy"] for row in rows})
-        for title, tasks in {**named, "Public benchmark": PUBLIC}.items()
+        for title, tasks in {**wanted, public: PUBLIC}.items()
         for task in tasks
-        if (policy, task) not in done
+        if (policy, title, task) not in done
     ]
 
 
 def _runs(folder: Path) -> Iterator[_Run]:
     for path in sorted(folder.rglob(SCORES_FILE)):
         content = read_json(path)
-        if "key" not in content:
+        if "thinking_s" not in content.get("key", ()):
             raise InputError(f"{path}: key: missing; the run is of an older version, climb again into another folder")
         names = [row["task"] for row in content["scores"] if row["level"] is not None]
         files = {name: sorted((path.parent / name).glob("*.json"))[: content["patients"]] for name in names}
