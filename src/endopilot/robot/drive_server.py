@@ -51,8 +51,10 @@ async def serve(drive: Drive, context: ssl.SSLContext, host: str, port: int, say
     terminated = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, terminated.set)
     listener = _listen(host, port)
-    times = {"ssl_handshake_timeout": AUTHENTICATE_S, "ssl_shutdown_timeout": AUTHENTICATE_S}
-    server = await asyncio.start_server(admit, sock=listener, ssl=context, limit=READ_BYTES, **times)
+    server = await asyncio.start_server(
+        admit, sock=listener, ssl=context, limit=READ_BYTES,
+        ssl_handshake_timeout=AUTHENTICATE_S, ssl_shutdown_timeout=AUTHENTICATE_S,
+    )  # fmt: skip
     say(f"listening on {host}:{listener.getsockname()[1]}")
     try:
         while not terminated.is_set():
