@@ -249,17 +249,12 @@ class TipDetector:
         return self._judged(found, there, hidden=hidden)
 
     def _look(self, view: View, signal: Signal, photons: float, dark: Signal) -> tuple[Signal, Signal]:
-        """Return an image without contrast, and how likely its pixels are on a wire, none far from the vessel.
-
-        Noise differs from mm to mm; a ridge of contrast that the CT lacks goes on, and says the same again and again.
-        """
+        """Return an image without contrast, and how likely its pixels are on a wire, none far from the vessel."""
         evidence = np.zeros_like(signal)
         box = _box_around(view, self.grid.middle, len(signal), around_px=_AROUND_PX)
         plain = self.without_contrast(view, signal, box)
-        seen = np.isfinite(dark[box])
-        rough = np.where(seen, _SHAPE * dark[box], 0).astype(np.float32)
-        alone = seen * (1 + photons * rough**2) / (1 + _ALONG_MM * photons * rough**2)
-        evidence[box] = alone * self._saturated(self._evidence(plain[box], photons, rough))
+        rough = np.where(np.isfinite(dark[box]), _SHAPE * dark[box], 0).astype(np.float32)
+        evidence[box] = own_share(dark[box], photons) * self._saturated(self._evidence(plain[box], photons, rough))
         return plain, evidence
 
     def _lines(self, view: View, before: Signal, photons: float) -> Bool[np.ndarray, "rows columns"]:
@@ -320,6 +315,15 @@ class TipDetector:
         edges, dark = (one - gaussian_filter(one, _HIGH_PASS_PX / 2, truncate=_TRUNCATE) for one in (path, -part))
         strength = float(dark[filled] @ edges[filled] / (edges[filled] @ edges[filled]))
         return signal + np.float32(strength) * path_mm if strength > _LEAST_CONTRAST else signal
+
+
+def own_share(dark: Float[np.ndarray, "*n"], photons: float) -> Float[np.ndarray, "*n"]:
+    """Return the share of what is seen that no neighbour has told, given by how much contrast darkens each pixel.
+
+    Noise differs from mm to mm; a ridge of contrast that the CT lacks goes on, and says the same again and again.
+    """
+    ridges = photons * (_SHAPE * np.where(np.isfinite(dark), dark, 0)) ** 2
+    return np.isfinite(dark) * (1 + ridges) / (1 + _ALONG_MM * ridges)
 
 
 def _halved(image: Signal) -> Float32[np.ndarray, "half_rows half_columns"]:

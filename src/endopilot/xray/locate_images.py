@@ -23,7 +23,7 @@ from endopilot.progress import progress
 from endopilot.types import Anatomy
 from endopilot.xray.carm import Pose, View, view_of
 from endopilot.xray.cine import XrayCine
-from endopilot.xray.detector import Signal, TipDetector
+from endopilot.xray.detector import Signal, TipDetector, own_share
 from endopilot.xray.image import isocenter_of
 from endopilot.xray.line_observations import shift_onto
 from endopilot.xray.registration import Registration, lay, observed_contrast, register
@@ -37,6 +37,8 @@ _DARKEST_SHARE = 0.05
 """This share of an image, the darkest, tells how much contrast a frame shows: vessels cover no less."""
 _SURROUNDINGS_PX = 6.0
 """Contrast is seen in the mean around a pixel, standard deviation, pixels."""
+_CLEAR = 0.2
+"""Ridges are as large as the noise where this is the own share of what is seen (2 / 11)."""
 _LESS = 0.06
 """They do where image and vessel agree within this of the best frame's correlation."""
 _SOME = 0.4
@@ -104,18 +106,23 @@ def locate_in_images(
     detector, photons = TipDetector(anatomy, device), [one.photons() for one in cines]
     empty, fields = [_empty(one) for one in cines], [one.field() for one in cines]
     found: list[TipEstimate] = []
+    planes = [
+        [_darkened(one, light, field) for one in cine.signals]
+        for cine, light, field in zip(cines, empty, fields, strict=True)
+    ]
+    dark = list(zip(*planes, strict=True))
 
     def look(frame: int, expected: Float[np.ndarray, "places"] | None) -> TipEstimate:
         shown = [one.signals[frame] for one in cines]
         spread = _STIRS_MM**2 * np.eye(3) if moves[frame] is None else moves[frame]
-        dark = [_darkened(*each) for each in zip(shown, empty, fields, strict=True)]
-        return detector.estimate(views[frame], shown, photons, None, None, expected, spread, dark)
+        return detector.estimate(views[frame], shown, photons, None, None, expected, spread, dark[frame])
 
     with progress(f"locate {anatomy.name}", count) as advance:
         for frame in range(count):
             found.append(look(frame, None))
             advance()
-    track = _Track(detector.grid, config, cines[0].times_s, found)
+    clear = [_is_clear(detector.grid, *each, photons) for each in zip(views, dark, strict=True)]
+    track = _Track(detector.grid, config, cines[0].times_s, found, clear)
     for frame, one in enumerate(found):
         if one.status == "not found" or track.elsewhere(frame, one):
             found[frame] = look(frame, track.expected(frame))
@@ -223,6 +230,17 @@ def _darkened(shown: Signal, empty: Signal, field: Bool[np.ndarray, "rows rows"]
     return np.where(field, np.maximum(dark - np.median(dark[field]), 0), np.float32(np.inf))
 
 
+def _is_clear(grid: VesselGrid, views: Sequence[View], dark: Sequence[Signal], photons: Sequence[float]) -> bool:
+    """Return whether nearly no part of the vessel has contrast whose ridges are as large as the noise."""
+    own = []
+    for view, each, count in zip(views, dark, photons, strict=True):
+        row, column = np.rint((len(each) - 1) / 2 + view.project(grid.middle)[:, ::-1] * [-1, 1]).astype(int).T
+        seen = (np.minimum(row, column) >= 0) & (np.maximum(row, column) < len(each))
+        own.append(own_share(each[row[seen], column[seen]], count))
+    told = np.concatenate(own)
+    return bool((told[told > 0] < _CLEAR).mean() < _DARKEST_SHARE) if (told > 0).any() else False
+
+
 def _contrast(cine: XrayCine, before: Float32[np.ndarray, "rows rows"]) -> Float[np.ndarray, "frames"]:
     """Return how much contrast each frame shows, in powers of e."""
     seen = [observed_contrast([one], [before], 8, 3.0, cine.image)[0].ravel() for one in cine.signals]
@@ -255,16 +273,25 @@ class _Track:
     """Where the tip is at each time, by all frames together."""
 
     def __init__(
-        self, grid: VesselGrid, config: LocateConfig, times_s: Float[np.ndarray, "frames"], found: Sequence[TipEstimate]
+        self,
+        grid: VesselGrid,
+        config: LocateConfig,
+        times_s: Float[np.ndarray, "frames"],
+        found: Sequence[TipEstimate],
+        clear: Sequence[bool],
     ) -> None:
-        """Take what each frame shows at the places of the detector's grid."""
+        """Take what each frame shows at the places of the detector's grid, and whether no contrast may look so.
+
+        Contrast looks alike in all frames that show it, however many there are: they say nothing of the others.
+        """
         self._middle, catheter = grid.middle, grid.branch < 0
-        seen = [np.where(catheter, -np.inf, 0.0 if one.status == "not found" else one.ends) for one in found]
+        tells = [sees and one.status != "not found" for sees, one in zip(clear, found, strict=True)]
+        seen = [np.where(catheter, -np.inf, one.ends if own else 0.0) for own, one in zip(tells, found, strict=True)]
         flows = [goes(grid, config, float(step)) for step in np.maximum(np.diff(times_s), 1e-3) / _FRAME_S]
         later = told_by_later(seen, lambda k: flows[k])
         before = told_by_later(seen[::-1], lambda k: flows[-1 - k].T)[::-1]
         self._others = [a + b for a, b in zip(later, before, strict=True)]
-        self._odds = np.array([one.log_odds for one in found])
+        self._odds = np.where(tells, [one.log_odds for one in found], 0.0)
         self._mode = [int((log + one).argmax()) for log, one in zip(seen, self._others, strict=True)]
 
     def elsewhere(self, frame: int, one: TipEstimate) -> bool:
