@@ -55,7 +55,7 @@ def test_all_pages_are_walked() -> None:
 
 
 FOLDER = Path(__file__).parents[2] / "examples"
-NEEDS_MORE = {"recurrent_ppo.py", "robot_bag.py", "segment_wire.py", "train_sb3.py"}
+NEEDS_MORE = {"offline_sets.py", "recurrent_ppo.py", "robot_bag.py", "segment_wire.py", "train_sb3.py"}
 """Examples that train for minutes, or need data or a library of their own."""
 EXAMPLES = sorted(path.name for path in FOLDER.glob("*.py") if path.name not in NEEDS_MORE)
 
