@@ -91,7 +91,7 @@ class Terms:
             "split": "test" if self.request else "validation",
             "robot": {name: value for name, value in robot.items() if value != usual[name]},
             "world": self.world.differences(),
-            "settings": _digest(self.loop),
+            "settings": _digest(_given(asdict(self.loop))),
             "decision_period_s": DECISION_PERIOD_S,
             "thinking_s": self.thinking_s,
         }
@@ -140,6 +140,13 @@ def _drawn(task: Task, wanted: str, patients: int) -> Task:
         if len(numbers) == patients:
             break
     return replace(task, ladder=Patients(seed=seed, numbers=tuple(numbers)))
+
+
+def _given(settings: Any) -> Any:
+    """Return settings less what is empty: one that comes later then changes no older key."""
+    if isinstance(settings, Mapping):
+        return {name: _given(value) for name, value in settings.items() if value not in (None, (), {})}
+    return [_given(value) for value in settings] if isinstance(settings, (list, tuple)) else settings
 
 
 def _digest(content: Any) -> str:
