@@ -407,7 +407,7 @@ def sampled_lumen(
     random = np.random.default_rng(0)
     chosen = random.permutation(len(points))[:_POINTS]
     inside = np.flatnonzero(near)
-    inside = inside[random.permutation(len(inside))[: _POINTS // 20]]
+    inside = inside[random.permutation(len(inside))[: _POINTS // 10]]
     line = anatomy.tree.line
     share = 0.0 if alike else 1 / line.abscissa.max()
     along = share * line.abscissa[KDTree(line.points).query(points[chosen])[1]]
