@@ -403,11 +403,12 @@ def sampled_lumen(
     """
     points, size = lumen_points(anatomy)
     behind, size_behind = catheter_lumen_points(anatomy)
-    near = np.linalg.norm(behind - anatomy.insertion.position, axis=1) < (10.0 if alike else 30.0)
+    reach_mm, count = (10.0, _POINTS // 10) if alike else (30.0, _POINTS // 20)
+    near = np.linalg.norm(behind - anatomy.insertion.position, axis=1) < reach_mm
     random = np.random.default_rng(0)
     chosen = random.permutation(len(points))[:_POINTS]
     inside = np.flatnonzero(near)
-    inside = inside[random.permutation(len(inside))[: _POINTS // 10]]
+    inside = inside[random.permutation(len(inside))[:count]]
     line = anatomy.tree.line
     share = 0.0 if alike else 1 / line.abscissa.max()
     along = share * line.abscissa[KDTree(line.points).query(points[chosen])[1]]
