@@ -75,7 +75,7 @@ def identify(belief: Belief, past: Past) -> tuple[Belief, Identified]:
     lumens = len(past.exposures) > 1 and belief.navigation.anatomy.distance_map.values.size <= _LARGEST_MAP
     family = Family([each for each in HYPOTHESES if each.name != HEART and (lumens or each.name != LUMEN)])
     shown = np.array([belief.unmoved(each, period) for period, each in past.exposures.items()])
-    read_n, found = np.array([read for _, read in _advances(belief, past)]), family.as_given()
+    advances, found = _advances(belief, past), family.as_given()
     drawn = first = family.drawn(found.mean, np.eye(len(found.mean)), _KINDS, _EACH, vessels=_VESSELS)
     for generation in range(_GENERATIONS):
         if generation:
@@ -84,8 +84,8 @@ def identify(belief: Belief, past: Past) -> tuple[Belief, Identified]:
             spread = np.diag(np.clip(2 * found.sd, _NARROWEST, 1.0))
             drawn = family.drawn(found.mean, spread, _KINDS, _EACH, vessels=_VESSELS, seed=generation)
             drawn[:, family.costly] = first[:, family.costly]
-        seen, scale = _replayed(belief, past, [family.world(each) for each in drawn])
-        found = family.update(drawn, seen, np.column_stack([shown, read_n]), scale)
+        seen, scale = _replayed(belief, past, advances, [family.world(each) for each in drawn])
+        found = family.update(drawn, seen, np.column_stack([shown, [read for _, read in advances]]), scale)
     belief.vessels.keep([family.world(each) for each in first])
     made = belief.like(_members(family, found, belief))
     made.replay(past)
@@ -110,12 +110,12 @@ def _advances(belief: Belief, past: Past) -> list[tuple[list[int], float]]:
 
 
 def _replayed(
-    belief: Belief, past: Past, members: list[World]
+    belief: Belief, past: Past, advances: list[tuple[list[int], float]], members: list[World]
 ) -> tuple[Float[np.ndarray, "members exposures 4"], Float[np.ndarray, "exposures 4"]]:
     """Return where members show their tips at each exposure, LPS mm, and the force that they took of their drive since
     the one before, N; and how well these are known, beside the image."""
     tips = np.full((len(members), len(past.exposures), 3), np.nan)
-    directions, forces, advances = tips.copy(), np.zeros(tips.shape[:2]), _advances(belief, past)
+    directions, forces = tips.copy(), np.zeros(tips.shape[:2])
     walls = [each.compliant_wall_n_mm2 for each in members]
     for wall in dict.fromkeys(walls):
         rows = np.array([k for k, each in enumerate(walls) if each == wall])
