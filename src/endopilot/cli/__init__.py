@@ -33,6 +33,7 @@ COMMANDS = {
     "dataset-info": "dataset -> its content in figures and pictures",
     "train": "dataset -> the paper's forward and inverse network",
     "evaluate": "trained run -> errors beside the paper's and the baselines'",
+    "difficulty": "anatomy -> exposures and seconds that each of its sections will take, before a procedure",
     "plan": "anatomy and target -> controls that bring the tip there",
     "navigate": "anatomy and target -> a wire driven there by a policy, in closed loop, and its page",
     "xray": "anatomy -> X-ray image of a wire in it: fluoroscopy, contrast, DSA or roadmap",
@@ -51,8 +52,9 @@ COMMANDS = {
     "info": "versions and machine",
 }
 """Name of each command: what it takes -> what it makes. `module_of` names its module."""
-GROUPS = {"demo": "All stages", "segment": "Patients", "simulate": "Simulation, data, models", "plan": "Navigation"}
+GROUPS = {"demo": "All stages", "segment": "Patients", "simulate": "Simulation, data, models"}
 GROUPS |= {
+    "difficulty": "Navigation",
     "xray": "X-ray",
     "drive": "Robots",
     "cockpit": "By hand, and scored",
