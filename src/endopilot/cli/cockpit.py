@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import webbrowser
 from pathlib import Path
+from typing import Annotated
 
 from tyro.conf import Positional
 
@@ -11,7 +12,7 @@ from endopilot.cli.arguments import Existing, ListenConfig
 from endopilot.devices.robot import ASSUMED, read_robot
 from endopilot.errors import InputError
 from endopilot.extras import require_extras
-from endopilot.settings import CountOrZero
+from endopilot.settings import CountOrZero, Within
 
 
 def command(
@@ -27,6 +28,7 @@ def command(
     episode: Path | None = None,
     resume: Existing | None = None,
     ct: Existing | None = None,
+    igtl: Annotated[int, Within(0, 65535)] | None = None,
     output: Path = Path("runs/cockpit"),
     browser: bool = True,
     listen: ListenConfig = ListenConfig(),
@@ -46,6 +48,8 @@ def command(
             leave.
         resume: go on with the session in this file, which a killed server left.
         ct: CT angiogram of the patient, for the X-ray's background; a phantom's if not given.
+        igtl: TCP port of this machine at which 3D Slicer (OpenIGTLink) gets wire, tip, target and vessel, 18944 as a
+            rule; 0 for a free one.
         output: folder of the sessions' recordings.
         browser: open the page in a browser; --no-browser only prints its address.
         listen: the page's address; whoever is given it, token included, can then drive.
@@ -71,6 +75,14 @@ def command(
     else:
         opened = open_session(patient, device=device, catheters=catheter, robot=drives, ct=ct, output=output)
 
+    stage = opened.stage
+    if igtl is not None:
+        require_extras("slicer")
+        from endopilot.cockpit.igtl import Streamed
+
+        stage = Streamed(opened.stage, opened.scene, igtl)
+        print(f"slicer     127.0.0.1:{stage.port} (OpenIGTLink)", flush=True)
+
     def listening(address: str) -> None:
         print(f"page       {address}", flush=True)
         if opened.recording is not None:
@@ -78,7 +90,7 @@ def command(
         if browser:
             webbrowser.open(address)
 
-    serve(opened.stage, opened.scene, cycle_s=opened.cycle_s, host=listen.host, port=listen.port, listening=listening)
+    serve(stage, opened.scene, cycle_s=opened.cycle_s, host=listen.host, port=listen.port, listening=listening)
 
 
 def _write_episode(session: Path | None, output: Path) -> None:

@@ -1,0 +1,48 @@
+"""Run inside Slicer's environment: `python slicer_nodes.py FILES.json NODES.json` opens files as 3D Slicer does.
+
+FILES lists paths; NODES gets for each what its node holds in Slicer's world, turned to LPS mm: the points of a model,
+or the places and values of an image's first, middle and last voxel.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import slicer  # pyright: ignore[reportMissingImports]
+import vtk  # pyright: ignore[reportMissingImports]
+from vtk.util.numpy_support import vtk_to_numpy  # pyright: ignore[reportMissingImports]
+
+LPS = np.array([-1.0, -1.0, 1.0])
+KINDS = {
+    ".vtp": ("vtkMRMLModelNode", "vtkMRMLModelStorageNode"),
+    ".nrrd": ("vtkMRMLScalarVolumeNode", "vtkMRMLNRRDStorageNode"),
+    ".gz": ("vtkMRMLScalarVolumeNode", "vtkMRMLVolumeArchetypeStorageNode"),
+}
+
+
+def opened(path: str) -> dict[str, list]:
+    """Return what a file holds."""
+    node, storage = (getattr(slicer, kind)() for kind in KINDS[path[path.rindex(".") :]])
+    storage.SetFileName(path)
+    if not storage.ReadData(node):
+        sys.exit(f"{path}: Slicer does not read it")
+    if node.IsA("vtkMRMLModelNode"):
+        return {"points": (LPS * vtk_to_numpy(node.GetPolyData().GetPoints().GetData())).tolist(), "values": []}
+    image, matrix = node.GetImageData(), vtk.vtkMatrix4x4()
+    node.GetIJKToRASMatrix(matrix)
+    size = np.array(image.GetDimensions())
+    indices = [np.zeros(3, int), size // 2, size - 1]
+    points = [LPS * np.array(matrix.MultiplyPoint([*map(float, index), 1.0])[:3]) for index in indices]
+    values = [image.GetScalarComponentAsDouble(*map(int, index), 0) for index in indices]
+    return {"points": [point.tolist() for point in points], "values": values}
+
+
+def main(asked: str, answer: str) -> None:
+    """Open the files, and write what they hold."""
+    found = [opened(path) for path in json.loads(Path(asked).read_text(encoding="utf-8"))]
+    Path(answer).write_text(json.dumps(found), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
