@@ -49,6 +49,7 @@ def test_slicer_is_sent_the_vessel_and_what_moves_in_it(streamed, session):
     place = RAS * session.target.position(session.world.navigation.anatomy)
     np.testing.assert_allclose(np.frombuffer(bodies["Target"][100:112], ">f4"), place, atol=1e-3)
     vertices, _, triangles = polydata(bodies["Vessel"])
+    np.testing.assert_allclose(vertices, RAS * decode(streamed._scene())[1]["vertices"], atol=1e-4)
     assert triangles[0] == 3 and triangles.reshape(-1, 4)[:, 1:].max() == len(vertices) - 1
 
 
