@@ -1,4 +1,4 @@
-"""Draws a card for each task, with the agent on its way, into docs/concepts/tasks.md: `python docs/figures/cards.py`."""
+"""Draws cards of all tasks, with the agent on its way, for docs/concepts/tasks.md: `python docs/figures/cards.py`."""
 
 from __future__ import annotations
 
