@@ -60,8 +60,9 @@ class Streamed:
                 peer.settimeout(FRAME_S)
                 self._peers.append(peer)
                 self._send([peer], _vessel(self._scene()))
-            if self._peers:
-                self._send(self._peers, _devices(dict(sent)["state"]))
+            state = dict(sent).get("state")
+            if self._peers and state is not None:
+                self._send(self._peers, _devices(state))
         return sent
 
     def close(self) -> None:
