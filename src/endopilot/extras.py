@@ -46,7 +46,7 @@ def what_is_missing(error: ModuleNotFoundError) -> str | None:
 def require_extras(*extras: str) -> None:
     """Raise InputError, which names what is missing, unless some extras are installed: before long work."""
     present = extras_present()
-    missing = [extra for extra in extras if not present[extra]]
+    missing = [extra for extra in extras if not present.get(extra, True)]  # metadata may be older than the sources
     if missing:
         raise InputError(f"needs more libraries; install them with: pip install 'endopilot[{','.join(missing)}]'")
 
