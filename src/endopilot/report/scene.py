@@ -193,26 +193,15 @@ def _moving(rollout: Trajectory, sample: int, devices: Sequence[Device]) -> list
     trail = np.round(rollout.tip_position[0, begin : sample + 1, 0], 2).astype(np.float32)
     tip = trail[-1:]
     time = f"<extra>{(sample + 1) * rollout.period_s:g} s</extra>"
-    hover = (
-        f"Δ = {rollout.inserted_length[0, sample, 0]:.1f} mm<br>"
-        f"φ = {np.rad2deg(rollout.rotation[0, sample, 0]):.0f}°<br>"
-        f"Δtip = {rollout.tip.abscissa[0, sample, 0]:.1f} mm<br>"
-        f"γtip = {rollout.tip.offset[0, sample, 0]:.2f} mm<br>"
-        f"lumen radius = {rollout.tip.radius[0, sample, 0]:.2f} mm<br>"
-        f"largest wall force = {rollout.contact_force_max[0, sample]:.3f} N"
-    )
-    name = "Guidewire"
-    if around:
-        name += f" {devices[0].name}"
-        hover += f"<br>push of its drive = {rollout.drive_force[0, sample, 0]:.2f} N"
-    hover += time
+    hover = f"{_state(rollout, sample, 0)}<br>largest wall force = {rollout.contact_force_max[0, sample]:.3f} N{time}"
+    name = f"Guidewire {devices[0].name}" if around else "Guidewire"
     tubes = [
         _line(
             line,
             color=CATHETER_COLORS[k],
             width=round(_WIRE_WIDTH * devices[k + 1].diameter_mm / devices[0].diameter_mm, 1),
             name=f"Catheter {devices[k + 1].name}",
-            hovertemplate=_catheter_state(rollout, sample, k + 1) + time,
+            hovertemplate=_state(rollout, sample, k + 1) + time,
         )
         for k, line in enumerate(around)
     ]
@@ -242,10 +231,13 @@ def _uncovered(rollout: Trajectory, sample: int) -> list[Float[np.ndarray, "_ 3"
     return found
 
 
-def _catheter_state(rollout: Trajectory, sample: int, k: int) -> str:
+def _state(rollout: Trajectory, sample: int, k: int) -> str:
+    tip = rollout.tip
     return (
         f"Δ = {rollout.inserted_length[0, sample, k]:.1f} mm<br>"
         f"φ = {np.rad2deg(rollout.rotation[0, sample, k]):.0f}°<br>"
+        f"Δtip = {tip.abscissa[0, sample, k]:.1f} mm<br>"
+        f"γtip = {tip.offset[0, sample, k]:.2f} mm, lumen radius = {tip.radius[0, sample, k]:.2f} mm<br>"
         f"push of its drive = {rollout.drive_force[0, sample, k]:.2f} N"
     )
 

@@ -10,10 +10,10 @@ view. docs/concepts/exposure.md says where the numbers come from.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from endopilot.anatomy.projection import TipProjector
 from endopilot.anatomy.tree import tangents
@@ -127,15 +127,8 @@ class FluoroscopeConfig:
     """Standard deviation along the wire, pixels: where a thin tip ends is harder to see than where it runs."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Detection:
-    """A tip found in an image.
-
-    Attributes:
-        view: of the image.
-        pixel: where it was found.
-        whiten: turns an error, pixels, into its parts along and across the wire, in standard deviations.
-    """
+class _Detection(NamedTuple):
+    """A tip found at a pixel; `whiten` turns an error into parts along and across the wire, standard deviations."""
 
     view: View
     pixel: Float[np.ndarray, "2"]
@@ -179,12 +172,6 @@ def measurement_at(
     return TipMeasurement(
         places[0], abscissa, float(tips.offset[0]), branch, covariance, (tip_sd[0], tip_sd[1]), around
     )
-
-
-def _valleys(cost: Float[np.ndarray, "vertices"], most: float) -> Int[np.ndarray, "valleys"]:
-    """Return the vertices of a line that cost less than their neighbours, and no more than `most`."""
-    fence = np.pad(cost, 1, constant_values=np.inf)
-    return np.flatnonzero((cost <= most) & (cost < fence[:-2]) & (cost <= fence[2:]))
 
 
 class Fluoroscope:
@@ -251,9 +238,16 @@ class Fluoroscope:
         inserted_length: float,
         random: np.random.Generator,
     ) -> TipMeasurement:
-        """Take one exposure of every view and say where the tip is. The arguments are those of `locate`."""
-        detections = [self._detect(view, tip_position, tip_direction, random) for view in self._views]
-        return measurement_at(self._project, self._anatomy, *self._likeliest(detections, inserted_length))
+        """Take one exposure of every view and say where the tip is.
+
+        Args:
+            tip_position: where the tip truly is, LPS mm.
+            tip_direction: unit vector along the wire at its tip.
+            inserted_length: Δ by the robot's encoder, mm.
+            random: where the errors are drawn from.
+        """
+        found = self._likeliest(tip_position, tip_direction, inserted_length, random)
+        return measurement_at(self._project, self._anatomy, *found)
 
     def catheter_axis(self, axis: Float[np.ndarray, "3"], random: np.random.Generator) -> Float[np.ndarray, "3"]:
         """Take one exposure of every view and return the guiding catheter's axis as it shows, a unit vector.
@@ -285,16 +279,8 @@ class Fluoroscope:
         inserted_length: float,
         random: np.random.Generator,
     ) -> Float[np.ndarray, "3"]:
-        """Take one exposure of every view and return where the tip is found to be, LPS mm.
-
-        Args:
-            tip_position: where the tip truly is, LPS mm.
-            tip_direction: unit vector along the wire at its tip.
-            inserted_length: Δ by the robot's encoder, mm.
-            random: where the errors are drawn from.
-        """
-        detections = [self._detect(view, tip_position, tip_direction, random) for view in self._views]
-        return self._likeliest(detections, inserted_length)[0][0]
+        """Return the position, LPS mm, that `measure` finds."""
+        return self._likeliest(tip_position, tip_direction, inserted_length, random)[0][0]
 
     def expose_episodes(
         self, episodes: Dataset, inserted_length: Float[np.ndarray, "episodes samples"], seed: int
@@ -340,26 +326,30 @@ class Fluoroscope:
         return _Detection(view, view.project(position) + error @ axes, axes / sd[:, None])
 
     def _likeliest(
-        self, detections: list[_Detection], inserted_length: float
+        self,
+        position: Float[np.ndarray, "3"],
+        direction: Float[np.ndarray, "3"],
+        inserted_length: float,
+        random: np.random.Generator,
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n"]]:
         """Return where the tip may be, LPS mm, the likeliest place first, with covariances and weights.
 
         A view may show several parts of the vessel at one place: the likeliest place of every such part is returned.
         """
+        detections = [self._detect(view, position, direction, random) for view in self._views]
         length_sd = 2.0 + _NEAR_SHARE * max(inserted_length, 0.0)
         prior = [((abscissa - inserted_length) / length_sd) ** 2 for abscissa in self._abscissa]
         magnified = self._views[0].scale / self._config.geometry.source_to_isocenter_mm
-        first = []
+        seen, first = list(zip(self._shown, detections, strict=True)), []
         for branch, (sd, unlikely) in enumerate(zip(self._lateral_sd, prior, strict=True)):
-            squared = sum(
-                ((shown[branch] - one.pixel) ** 2).sum(axis=1)
-                for shown, one in zip(self._shown, detections, strict=True)
-            )
+            squared = sum(((shown[branch] - one.pixel) ** 2).sum(axis=1) for shown, one in seen)
             first.append(squared / (self._config.along_sd**2 + (magnified * sd) ** 2) + unlikely)
         least = min(float(cost.min()) for cost in first)
         found = list[tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]]()
         for branch, guess in enumerate(first):
-            for vertex in _valleys(guess, least + _HOPELESS).tolist():
+            fence = np.pad(guess, 1, constant_values=np.inf)
+            valleys = (guess <= least + _HOPELESS) & (guess < fence[:-2]) & (guess <= fence[2:])
+            for vertex in np.flatnonzero(valleys).tolist():
                 place, cost_there, nearest, covariance = self._refine(detections, branch, vertex)
                 found.append((cost_there + float(prior[branch][nearest]), place, covariance))
         cost, places, covariances = (

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -122,16 +122,11 @@ class TipLocation:
         return cls(frame, "not found", nothing, np.full((3, 3), np.nan), 0.0, np.nan, -1, "", nothing, np.nan)
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """What observations say, for each of some places of the tip.
+class _Fit(NamedTuple):
+    """What observations say of some places of the tip: their logarithm, and the pose with its covariance.
 
-    Attributes:
-        log_density: of the observations.
-        mean, covariance: of the pose.
-        moved: how far each observation's place is moved beyond the mean pose, without what lies aside of the way, mm.
-        aside: how far the device lies off its way at the first observation, mm.
-        aside_covariance: of that, mm².
+    And how far the vessel is moved at each observation beyond the mean pose, mm, and how far the device lies aside of
+    its way at the first one, mm, with its covariance, mm².
     """
 
     log_density: Float[np.ndarray, "m"]
@@ -165,27 +160,16 @@ def told_by_later(
     return told[::-1]
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """What a frame says of some places of the tip.
+class _Seen(NamedTuple):
+    """What a frame says of some places of the grid: the odds of its line, a logarithm, and what they were made of.
 
-    Attributes:
-        frame: its number.
-        places: of the grid.
-        odds: of its line, a logarithm.
-        log: posterior by this frame and those before.
-        tips: where the tip is if it is at that place, LPS mm.
-        covariance: of that, mm².
-        moved: how far the vessel lies there from where the cameras have the CT, LPS mm.
-        residual_mm: mean distance of the line from the moved way; NaN without a line.
+    And how far the vessel lies there from where the cameras have the CT, LPS mm, and the line's residual, mm.
     """
 
     frame: int
     places: Int[np.ndarray, "m"]
     odds: Float[np.ndarray, "m"]
-    log: Float[np.ndarray, "m"]
-    tips: Float[np.ndarray, "m 3"]
-    covariance: Float[np.ndarray, "m 3 3"]
+    fit: _Fit
     moved: Float[np.ndarray, "m 3"]
     residual_mm: Float[np.ndarray, "m"]
 
@@ -251,18 +235,9 @@ class TipFilter:
         self._mean[places], self._covariance[places] = fit.mean, fit.covariance
         left = np.abs(rows.value - np.einsum("mri,mri->mr", rows.towards, fit.moved))
         of_line = rows.used & (rows.place != places[:, None])
-        self._seen.append(
-            _Seen(
-                frame=frame,
-                places=places,
-                odds=odds,
-                log=log,
-                tips=self.grid.middle[places] + fit.aside,
-                covariance=fit.aside_covariance,
-                moved=(self._moved(base) - self._way)[places] + fit.moved[:, 0],
-                residual_mm=np.where(of_line, left, 0.0).sum(axis=1) / np.where(of_line.any(1), of_line.sum(1), np.nan),
-            )
-        )
+        moved = (self._moved(base) - self._way)[places] + fit.moved[:, 0]
+        residual = np.where(of_line, left, 0.0).sum(axis=1) / np.where(of_line.any(1), of_line.sum(1), np.nan)
+        self._seen.append(_Seen(frame, places, odds, fit, moved, residual))
         return self._answer(self._seen[-1], log)
 
     def smooth(self) -> dict[int, TipLocation]:
@@ -367,14 +342,9 @@ class TipFilter:
         across = np.cross(pose[:, None, 3:6], arm)
         moved = pose[:, None, :3] + across + smooth @ (weight[..., None] * towards)
         own = gains[..., 7:]
-        return _Fit(
-            log_density=log_density,
-            mean=base + pose,
-            covariance=covariance - gains[..., 1:7].swapaxes(1, 2) @ solved[..., 1:7],
-            moved=moved,
-            aside=np.einsum("mri,mr->mi", own, weight),
-            aside_covariance=aside[:, :1, :1] * np.eye(3) - own.swapaxes(1, 2) @ solved[..., 7:],
-        )
+        left = covariance - gains[..., 1:7].swapaxes(1, 2) @ solved[..., 1:7]
+        beside = aside[:, :1, :1] * np.eye(3) - own.swapaxes(1, 2) @ solved[..., 7:]
+        return _Fit(log_density, base + pose, left, moved, np.einsum("mri,mr->mi", own, weight), beside)
 
     def _answer(self, seen: _Seen, log: Float[np.ndarray, "m"]) -> TipLocation:
         """Return mean and covariance around the mode of the posterior."""
@@ -382,9 +352,9 @@ class TipFilter:
         best = int(weight.argmax())
         near = np.linalg.norm(grid.middle[places] - grid.middle[places[best]], axis=1) <= _NEAR_MM
         close = places[near]
-        share, mean, covariance = around_mode(seen.tips, weight, near, grid.step_mm)
+        share, mean, covariance = around_mode(grid.middle[places] + seen.fit.aside, weight, near, grid.step_mm)
         weight = weight[near] / share
-        covariance = covariance + np.einsum("m,mij->ij", weight, seen.covariance[near])
+        covariance = covariance + np.einsum("m,mij->ij", weight, seen.fit.aside_covariance[near])
         place = int(close[np.linalg.norm(grid.middle[close] - weight @ grid.middle[close], axis=1).argmin()])
         return TipLocation.at(
             self._tree,
