@@ -144,13 +144,6 @@ def test_evidence_and_encoder_both_count(fork, planes):
     assert ends_in(fork, view, uphill, 12.0).log_odds < -2.0
 
 
-def test_a_detector_needs_sensible_shares():
-    from endopilot.errors import InputError
-
-    with pytest.raises(InputError, match="hidden: 0"):
-        DetectorConfig(hidden=0.0)
-
-
 @pytest.mark.parametrize("back_mm", [3.0, 8.0])
 def test_a_wire_that_folds_back_ends_behind_its_fold(imager, planes, fork, back_mm):
     straight = wire_to(fork, 0)

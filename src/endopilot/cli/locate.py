@@ -18,8 +18,7 @@ from endopilot.errors import InputError
 from endopilot.types import Anatomy
 from endopilot.xray.camera import read_camera
 from endopilot.xray.frames import read_frames, write_locations
-from endopilot.xray.locate import locate
-from endopilot.xray.tip_filter import LocateConfig, TipLocation
+from endopilot.xray.tip_filter import LocateConfig, TipLocation, locate
 
 
 def command(

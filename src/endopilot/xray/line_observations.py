@@ -7,6 +7,7 @@ its distance across the line is an observation. So are both coordinates of the l
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +33,20 @@ _LENGTH_SD_MM, _LENGTH_SHARE = 2.0, 0.01
 _WINDOW, _SLACK_MM, _SLACK_SHARE = 30, 3.0, 0.25
 """A point of the line belongs to the way within so many places, and this length and share of the line, of where it
 should be by its length."""
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceFrame:
+    """What the cameras show of a device at one time.
+
+    Attributes:
+        number: of the frame.
+        lines: for each camera the device's line, pixels (column, row), from its tip backwards; a single point is the
+            tip alone; None where that camera does not show it.
+    """
+
+    number: int
+    lines: tuple[Line | None, ...]
 
 
 class SeenLine(NamedTuple):

@@ -1,4 +1,4 @@
-"""The tip of a device in a vessel tree, followed over time through lines in images: a pose for each place of a grid.
+"""★ The tip of a device in a vessel tree, followed over time through lines in images: a pose for each place of a grid.
 
 The state is the place of the tip, one of a grid along all branches, and for each place a normal distribution of the
 patient's pose: three shifts and three rotations. From frame to frame the tip travels a little, or, in a small share of
@@ -18,11 +18,23 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from endopilot.settings import Finite, NonNegative, OpenShare, Positive, Within, settings
-from endopilot.types import VesselTree
+from endopilot.errors import InputError
+from endopilot.progress import progress
+from endopilot.settings import Finite, NonNegative, OpenShare, Positive, Within, public, settings
+from endopilot.types import Anatomy, VesselTree
 from endopilot.xray.camera import Camera
 from endopilot.xray.carm import Pose, View
-from endopilot.xray.line_observations import Line, Observations, SeenLine, joined, observe, see, shift_onto, shown_by
+from endopilot.xray.line_observations import (
+    DeviceFrame,
+    Line,
+    Observations,
+    SeenLine,
+    joined,
+    observe,
+    see,
+    shift_onto,
+    shown_by,
+)
 from endopilot.xray.tip_posterior import Status, around_mode
 from endopilot.xray.vessel_grid import VesselGrid, make_grid
 
@@ -161,7 +173,7 @@ def told_by_later(
 
 
 class _Seen(NamedTuple):
-    """What a frame says of some places of the grid: the odds of its line, a logarithm, and what they were made of.
+    """What a frame says of some places of the grid: the odds of its line, and with those before it, logarithms.
 
     And how far the vessel lies there from where the cameras have the CT, LPS mm, and the line's residual, mm.
     """
@@ -169,6 +181,7 @@ class _Seen(NamedTuple):
     frame: int
     places: Int[np.ndarray, "m"]
     odds: Float[np.ndarray, "m"]
+    log: Float[np.ndarray, "m"]
     fit: _Fit
     moved: Float[np.ndarray, "m 3"]
     residual_mm: Float[np.ndarray, "m"]
@@ -237,7 +250,7 @@ class TipFilter:
         of_line = rows.used & (rows.place != places[:, None])
         moved = (self._moved(base) - self._way)[places] + fit.moved[:, 0]
         residual = np.where(of_line, left, 0.0).sum(axis=1) / np.where(of_line.any(1), of_line.sum(1), np.nan)
-        self._seen.append(_Seen(frame, places, odds, fit, moved, residual))
+        self._seen.append(_Seen(frame, places, odds, log, fit, moved, residual))
         return self._answer(self._seen[-1], log)
 
     def smooth(self) -> dict[int, TipLocation]:
@@ -372,3 +385,36 @@ class TipFilter:
 def _alike(apart: np.ndarray, length: float) -> np.ndarray:
     """Return the correlation of what lies so far apart along the vessel, mm."""
     return np.exp(-0.5 * (apart / length) ** 2)
+
+
+@public
+def locate(
+    anatomy: Anatomy,
+    *,
+    frames: Sequence[DeviceFrame],
+    cameras: Sequence[Camera | View],
+    config: LocateConfig | None = None,
+) -> tuple[TipLocation, ...]:
+    """Find the tip of a device in each frame of a sequence, by all frames.
+
+    Args:
+        anatomy: the vessel; only its tree is used.
+        frames: what the cameras show, in the order of time.
+        cameras: one or two, or views, whose pixels count from the image's middle; their coordinates are those of the CT
+            as far as the patient is registered.
+        config: what is known of patient and device before the first frame.
+
+    Raises:
+        InputError: a frame has another number of lines than there are cameras.
+    """
+    for frame in frames:
+        if len(frame.lines) != len(cameras):
+            raise InputError(
+                f"frame {frame.number}: {len(frame.lines)} lines for {len(cameras)} cameras; give one for each, or None"
+            )
+    follow, found = TipFilter(anatomy.tree, cameras, config), []
+    with progress(f"locate {anatomy.name}", len(frames)) as advance:
+        for frame in frames:
+            found.append(follow.update(frame.number, frame.lines))
+            advance()
+    return tuple(({one.frame: one for one in found} | follow.smooth()).values())

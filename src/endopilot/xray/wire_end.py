@@ -76,7 +76,7 @@ def fit_end(
     dark = dark - flat @ (flat.T @ dark)
 
     def errors(x: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "k n"]:
-        """Return the errors of bent lines that end, each as dark as fits best: ends, angles and curvatures are given."""
+        """Return the errors of bent lines that end, each as dark as fits best, of ends, angles and bends."""
         cos, sin = np.cos(x[:, 2:3]), np.sin(x[:, 2:3])
         behind = cos * (x[:, :1] - right) + sin * (x[:, 1:2] - up)
         aside = cos * (up - x[:, 1:2]) - sin * (right - x[:, :1]) - 0.5 * x[:, 3:] * np.maximum(behind, 0.0) ** 2
