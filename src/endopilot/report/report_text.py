@@ -105,19 +105,6 @@ def _tip_cells(tip: Mapping[str, Any], split: str, series: str) -> tuple[Cell, .
     return tuple(cells)
 
 
-def gap_rows(metrics: Mapping[str, Any]) -> list[Row]:
-    """Return the table of the generalisation gap, by protocol; empty where there is none."""
-    rows = []
-    for series, gap in metrics.get("generalisation_gap", {}).items():
-        cells = tuple(
-            Cell(_gap(gap[coordinate].get(span, {})), f"generalisation_gap/{series}/{coordinate}/{span}/difference")
-            for coordinate in COORDINATES
-            for span in (*SPANS, "all")
-        )
-        rows.append(Row(SERIES_TITLES[series], "network", cells))
-    return rows
-
-
 def mean_errors(metrics: Mapping[str, Any], split: str) -> list[dict[str, str]]:
     """Return the mean absolute errors of one split, mm: a row a series, a column a coordinate and span."""
     tip = metrics["splits"][split]["tip"]
@@ -202,13 +189,6 @@ def _mean_sd(statistics: Mapping[str, Any]) -> str:
     if statistics.get("mae") is None:
         return "–"
     return f"{statistics['mae']:.2f} ± {statistics['sd']:.2f}"
-
-
-def _gap(gap: Mapping[str, float | None]) -> str:
-    difference, ratio = gap.get("difference"), gap.get("ratio")
-    if difference is None:
-        return "–"
-    return _signed(round(difference, 2) + 0.0) + ("" if ratio is None else f" ×{ratio:.2f}")  # no −0.00
 
 
 def _signed(value: float | None) -> str:

@@ -17,7 +17,7 @@ from endopilot.plotting import CATHETER_COLORS, section_colors
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import Anatomy
 
-BACKGROUND, INK, FAINT = "#0d1424", "#dfe6f2", "#31405c"
+BACKGROUND, INK = "#0d1424", "#dfe6f2"
 WALL, WIRE, TIP, BELIEVED = "#d98a8a", "#f6f7fb", "#ffd34d", "#5fb8ff"
 Wires = Float[np.ndarray, "wires nodes 3"]
 
@@ -156,9 +156,6 @@ def _add_navigation(
                 "y": 0.0,
                 "yanchor": "top",
                 "pad": {"t": 32, "l": 12},
-                "bgcolor": "#1d2a44",
-                "bordercolor": FAINT,
-                "font": {"color": INK},
                 "buttons": [
                     {"label": "▶ Play", "method": "animate", "args": [None, animate]},
                     {"label": "❚❚ Pause", "method": "animate", "args": [[None], stop]},
@@ -171,12 +168,7 @@ def _add_navigation(
                 "len": 0.74,
                 "y": 0.0,
                 "pad": {"t": 18, "b": 6},
-                "bgcolor": FAINT,
-                "bordercolor": FAINT,
-                "tickcolor": FAINT,
-                "activebgcolor": TIP,
-                "font": {"color": INK, "size": 11},
-                "currentvalue": {"prefix": "Time ", "suffix": " s", "font": {"color": INK, "size": 13}},
+                "currentvalue": {"prefix": "Time ", "suffix": " s"},
                 "steps": [
                     {"label": f"{(sample + 1) * period:g}", "method": "animate", "args": [[str(sample)], stop]}
                     for sample in samples
@@ -259,23 +251,15 @@ def _layout(size_mm: Float[np.ndarray, "3"]) -> dict:
     # plotly's box keeps its volume, so that of a tall vessel is longer than the usual view is high
     farther = max(1.0, float(size_mm.max() / size_mm.prod() ** (1 / 3)) / _VIEWED)
     eye = {name: farther * at for name, at in zip("xyz", (0.4, -2.0, 0.5), strict=True)}
-    axis = {
-        "backgroundcolor": BACKGROUND,
-        "gridcolor": FAINT,
-        "zerolinecolor": FAINT,
-        "color": INK,
-        "showspikes": False,
-        "title": {"font": {"size": 11}},
-        "tickfont": {"size": 10},
-    }
+    axis = {"backgroundcolor": BACKGROUND, "showspikes": False}
     titles = ("x (left), mm", "y (back), mm", "z (head), mm")
     axes = {f"{name}axis": axis | {"title": {"text": title}} for name, title in zip("xyz", titles, strict=True)}
     return {
         # View from the front, as a surgeon stands before the patient: the patient's left is on the right.
         "scene": {"aspectmode": "data", **axes, "camera": {"eye": eye, "center": {"x": 0, "y": 0, "z": -0.12}}},
+        "template": "plotly_dark",
         "paper_bgcolor": BACKGROUND,
-        "font": {"color": INK, "family": "system-ui, sans-serif"},
-        "legend": {"font": {"size": 11}, "x": 0.99, "xanchor": "right", "y": 0.93, "bgcolor": BACKGROUND},
+        "legend": {"x": 0.99, "xanchor": "right", "y": 0.93, "bgcolor": BACKGROUND},
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
         "height": 680,
         "uirevision": "keep",

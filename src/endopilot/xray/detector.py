@@ -179,14 +179,7 @@ class TipDetector:
         config: DetectorConfig | None = None,
         evidence: RidgeEvidence | None = None,
     ) -> None:
-        """Take the vessel and the wire.
-
-        Args:
-            anatomy: the vessel.
-            device: the wire.
-            config: how far an image is trusted.
-            evidence: for a wire in a pixel; the package's if not given.
-        """
+        """Take the vessel and the wire; `evidence` is for a wire in a pixel, the package's if not given."""
         self._anatomy, self._radius_mm = anatomy, device.tip_radius_mm
         self.config, self._evidence = config or DetectorConfig(), evidence or RidgeEvidence.read()
         self.grid: VesselGrid = with_catheter(make_grid(anatomy.tree, step_mm=_PLACES_MM), anatomy, CATHETER_MM)
@@ -251,7 +244,7 @@ class TipDetector:
     def _look(self, view: View, signal: Signal, photons: float, dark: Signal) -> tuple[Signal, Signal]:
         """Return an image without contrast, and how likely its pixels are on a wire, none far from the vessel."""
         evidence = np.zeros_like(signal)
-        box = _box_around(view, self.grid.middle, len(signal), around_px=_AROUND_PX)
+        box = _box_around(view, self.grid.middle, len(signal))
         plain = self.without_contrast(view, signal, box)
         rough = np.where(np.isfinite(dark[box]), _SHAPE * dark[box], 0).astype(np.float32)
         evidence[box] = own_share(dark[box], photons) * self._saturated(self._evidence(plain[box], photons, rough))
@@ -265,13 +258,9 @@ class TipDetector:
         for image, count, near in self._known_lines:
             if image is before and count == photons:
                 return near
-        box, near = (
-            _box_around(view, self._vessel, len(before), _AROUND_MM, _AROUND_PX),
-            np.zeros(before.shape, dtype=bool),
-        )
+        box, near = _box_around(view, self._vessel, len(before), _AROUND_MM), np.zeros(before.shape, dtype=bool)
         line = self._saturated(self._evidence(before[box], photons)) > _LINE
-        parts: Any = connected_parts(line, np.ones((3, 3)))
-        label = parts[0]
+        label: Any = connected_parts(line, np.ones((3, 3)))[0]
         large = np.bincount(label.ravel()) >= _LINE_PX
         large[0] = False
         near[box] = binary_dilation(large[label], iterations=_MOVED_PX)
@@ -279,12 +268,10 @@ class TipDetector:
         return near
 
     def _judged(self, found: TipEstimate, views: Sequence[View], *, hidden: bool) -> TipEstimate:
-        """Return an estimate with its status; an ambiguous one is as uncertain as the places are far apart.
+        """Return an estimate with its status, seen in views of the CT's frame where the vessel lies.
 
-        Args:
-            found: the tip.
-            views: of the images, in the CT's frame where the vessel lies.
-            hidden: whether it lies on a line from before: the wire may end elsewhere on it.
+        An ambiguous one is as uncertain as the places are far apart; on a line from before (`hidden`) the wire may end
+        elsewhere.
         """
         if found.log_odds < self.config.least_log_odds:
             return replace(found, status="not found")
@@ -332,12 +319,10 @@ def _halved(image: Signal) -> Float32[np.ndarray, "half_rows half_columns"]:
     return image[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2).mean(axis=(1, 3))
 
 
-def _box_around(
-    view: View, points: Float[np.ndarray, "n 3"], rows: int, around_mm: float = 0.0, around_px: int = 0
-) -> tuple[slice, slice]:
+def _box_around(view: View, points: Float[np.ndarray, "n 3"], rows: int, around_mm: float = 0.0) -> tuple[slice, slice]:
     """Return the rows and columns of an image that show points, LPS mm, and what lies around them in space or image."""
     right_up, middle = view.project(points), (rows - 1) / 2
-    around = around_px + around_mm * float(np.linalg.norm(view.slope(points.mean(axis=0)), 2)) + 1
+    around = _AROUND_PX + around_mm * float(np.linalg.norm(view.slope(points.mean(axis=0)), 2)) + 1
     at = np.stack([middle - right_up[:, 1], middle + right_up[:, 0]])
     low = np.clip(at.min(axis=1) - around, 0, rows - 1).astype(int)
     high = np.clip(at.max(axis=1) + around + 1, low + 1, rows).astype(int)

@@ -22,6 +22,7 @@ from endopilot.errors import InputError
 from endopilot.settings import Finite, Positive, settings
 from endopilot.simulation.motion import Motion, place, published_mean
 from endopilot.simulation.simulator import Simulator
+from endopilot.tasks.navigation import Navigation
 from endopilot.types import Anatomy, TipProjection
 from endopilot.xray.carm import CArmGeometry, View, view_at
 from endopilot.xray.moving_patient import seen_in_episodes, seen_wire, turned
@@ -186,15 +187,7 @@ class Fluoroscope:
         known_motion: Motion | None = None,
         registration_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
-        """Bring the middle of the vessel to the isocenter.
-
-        Args:
-            anatomy: the vessel.
-            wire_radius_mm: radius of the wire at its tip, mm.
-            config: geometry and errors.
-            known_motion: what is known of how the patient moves.
-            registration_mm: the wire shows displaced by this, mm LPS.
-        """
+        """Bring the middle of the vessel to the isocenter; `wire_radius_mm` is the tip's, the rest as `CArm` says."""
         self._anatomy, self._config = anatomy, config or FluoroscopeConfig()
         self.known_motion, self.registration_mm = known_motion, registration_mm
         lines = [branch.centerline for branch in anatomy.tree.branches]
@@ -387,3 +380,38 @@ class Fluoroscope:
             beyond = 1 - np.sqrt(2) * sd[nearest] / max(float(np.linalg.norm(lateral)), 1e-9)
             place = place - max(beyond, 0.0) * lateral
         return place, cost, nearest, np.linalg.inv(jacobian.T @ jacobian)
+
+
+def make_c_arm(
+    navigation: Navigation,
+    *,
+    config: FluoroscopeConfig | None = None,
+    seed: int = 0,
+    registration_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> CArm:
+    """Return the C-arm of a navigation, whose exposures are what `Navigation.xray` says.
+
+    Args:
+        navigation: vessel, wire and what is known of its motion.
+        config: geometry and errors.
+        seed: of the pose that a patient lies in whose images are taken, and of these images' noise.
+        registration_mm: the wire shows displaced by this, mm LPS.
+
+    Raises:
+        InputError: images of a wire in a catheter, or of a vessel that is not recognised in them.
+    """
+    anatomy, device, known = navigation.anatomy, navigation.device, navigation.known_motion
+    if navigation.xray == "assumed":
+        return Fluoroscope(
+            anatomy, device.tip_radius_mm, config=config, known_motion=known, registration_mm=registration_mm
+        )
+    from endopilot.xray.image_fluoroscope import ImageFluoroscope  # slow to import
+
+    if navigation.catheters:
+        names = ", ".join(catheter.name for catheter in navigation.catheters)
+        raise InputError(
+            f"xray: images: the detector takes a wire alone, and there is {names} around it; leave the catheter out"
+        )
+    return ImageFluoroscope(
+        anatomy, device, config=config, seed=seed, known_motion=known, registration_mm=registration_mm
+    )

@@ -32,8 +32,6 @@ _NO_WIRE = np.zeros((0, 3))
 _MOVES_MM = 2.0
 """Standard deviation of the vessel's place along each axis in a patient who moves, mm: their motion is not quite the
 known one."""
-
-
 _DRIFTS_MM = 0.3
 """A vessel that lies shifted drifts by this from exposure to exposure, mm: an assumption."""
 
@@ -92,13 +90,8 @@ class ImageFluoroscope:
     ) -> None:
         """Lay the patient on the table, inject contrast and register.
 
-        Args:
-            anatomy: the vessel; a coronary artery lies in a synthetic chest, any other in water.
-            device: the wire.
-            config: geometry and views; its errors of detection are not used.
-            seed: of the pose, up to 5 mm and 3° along and about each axis, and of these images' noise.
-            known_motion: what is known of how the patient moves.
-            registration_mm: the wire shows displaced by this, mm LPS, besides what the registration errs.
+        A coronary artery lies in a synthetic chest, any other vessel in water. The seed draws the pose, up to 5 mm and
+        3° along and about each axis, and these images' noise; the errors of detection of `config` are not used.
 
         Raises:
             NotRegistered: the vessel is not recognised in the images.

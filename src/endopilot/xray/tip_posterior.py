@@ -157,13 +157,7 @@ class Seat:
         self._size = np.tile(size[near], 2) * CATHETER_MM * np.repeat([1.0, -_AHEAD], len(part))
 
     def __call__(self, view: View, image: Evidence, shifts_px: Float[np.ndarray, "t 2"]) -> Float[np.ndarray, "t"]:
-        """Return how likely an image makes some shifts of the vessel, pixels to the right and up, a logarithm.
-
-        Args:
-            view: of the image.
-            image: logarithm of the light, contrast taken off.
-            shifts_px: of the vessel.
-        """
+        """Return how likely an image without contrast makes some shifts of the vessel, right and up, a logarithm."""
         reach = int(np.ceil(np.abs(shifts_px).max())) + 1
         model = splat(view, len(image), self._points, self._size)
         rows, columns = np.nonzero(model)
@@ -183,12 +177,6 @@ class Seat:
         return map_coordinates(likely, reach + shifts_px[:, ::-1].T * [[-1], [1]], order=1, mode="nearest")
 
 
-def _spread(inserted_length: float) -> tuple[float, float]:
-    """Return by how much the way to the tip is shorter and longer than the inserted length: standard deviations, mm."""
-    wire_mm = max(inserted_length, 0.0)
-    return _NEAR_MM + _SHORTER_SHARE * wire_mm, _NEAR_MM + _LONGER_SHARE * wire_mm
-
-
 def end_log(length: Float[np.ndarray, "n"], inserted_length: float | None) -> Float[np.ndarray, "n"]:
     """Return how likely a wire ends at some places by the encoder, a logarithm; unnormalised.
 
@@ -198,9 +186,9 @@ def end_log(length: Float[np.ndarray, "n"], inserted_length: float | None) -> Fl
     """
     if inserted_length is None:
         return np.where(length < 0, -np.inf, 0.0)
-    shorter, longer = _spread(inserted_length)
     excess = length - inserted_length
-    return -0.5 * (excess / np.where(excess > 0, longer, shorter)) ** 2
+    share = np.where(excess > 0, _LONGER_SHARE, _SHORTER_SHARE)
+    return -0.5 * (excess / (_NEAR_MM + share * max(inserted_length, 0.0))) ** 2
 
 
 def estimate_tip(
