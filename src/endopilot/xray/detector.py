@@ -238,7 +238,8 @@ class TipDetector:
         found = estimate_tip(self.grid, self._room_mm, views, evidence, shifts, inserted_length, expected)
         found = refined(found, views, plain, evidence, self._radius_mm)
         there = [replace(view, source=view.source - found.shift) for view in views]
-        hidden = any(_lies_on(line, view, found.position) for line, view in zip(lines, there, strict=False))
+        at = [np.clip(np.rint(view.pixel(found.position, len(signals[0]))), 0, len(signals[0]) - 1) for view in there]
+        hidden = any(line[tuple(pixel.astype(int))] for line, pixel in zip(lines, at, strict=False))
         return self._judged(found, there, hidden=hidden)
 
     def _look(self, view: View, signal: Signal, photons: float, dark: Signal) -> tuple[Signal, Signal]:
@@ -321,16 +322,8 @@ def _halved(image: Signal) -> Float32[np.ndarray, "half_rows half_columns"]:
 
 def _box_around(view: View, points: Float[np.ndarray, "n 3"], rows: int, around_mm: float = 0.0) -> tuple[slice, slice]:
     """Return the rows and columns of an image that show points, LPS mm, and what lies around them in space or image."""
-    right_up, middle = view.project(points), (rows - 1) / 2
     around = _AROUND_PX + around_mm * float(np.linalg.norm(view.slope(points.mean(axis=0)), 2)) + 1
-    at = np.stack([middle - right_up[:, 1], middle + right_up[:, 0]])
-    low = np.clip(at.min(axis=1) - around, 0, rows - 1).astype(int)
-    high = np.clip(at.max(axis=1) + around + 1, low + 1, rows).astype(int)
+    at = view.pixel(points, rows)
+    low = np.clip(at.min(axis=0) - around, 0, rows - 1).astype(int)
+    high = np.clip(at.max(axis=0) + around + 1, low + 1, rows).astype(int)
     return slice(low[0], high[0]), slice(low[1], high[1])
-
-
-def _lies_on(line: Bool[np.ndarray, "rows columns"], view: View, point: Float[np.ndarray, "3"]) -> bool:
-    """Return whether a view shows a point, LPS mm, on a line."""
-    (right, up), middle = view.project(point), (len(line) - 1) / 2
-    row, column = np.clip(np.rint([middle - up, middle + right]), 0, len(line) - 1).astype(int)
-    return bool(line[row, column])

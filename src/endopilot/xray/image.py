@@ -124,9 +124,7 @@ class Plane:
 
     def pixel(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
         """Return row and column of points of the vessel or in it, LPS mm of the CT."""
-        right_up = self.view.project(place(self.placed, points))
-        middle = (len(self.background) - 1) / 2
-        return middle + np.stack([-right_up[..., 1], right_up[..., 0]], axis=-1)
+        return self.view.pixel(place(self.placed, points), len(self.background))
 
 
 class XrayImager:

@@ -78,8 +78,7 @@ class ImagesLocated:
 
     def pixels(self, frame: int, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
         """Return column and row, pixels of the first plane, of points of the vessel or in it, LPS mm of the CT."""
-        middle = (self.cines[0].signals.shape[1] - 1) / 2
-        return middle + self.views[frame][0].project(points) * [1.0, -1.0]
+        return self.views[frame][0].pixel(points, self.cines[0].signals.shape[1])[:, ::-1]
 
 
 def locate_in_images(
@@ -237,7 +236,7 @@ def _is_clear(grid: VesselGrid, views: Sequence[View], dark: Sequence[Signal], p
     """Return whether nearly no part of the vessel has contrast whose ridges are as large as the noise."""
     own = []
     for view, each, count in zip(views, dark, photons, strict=True):
-        row, column = np.rint((len(each) - 1) / 2 + view.project(grid.middle)[:, ::-1] * [-1, 1]).astype(int).T
+        row, column = np.rint(view.pixel(grid.middle, len(each))).astype(int).T
         seen = (np.minimum(row, column) >= 0) & (np.maximum(row, column) < len(each))
         own.append(own_share(each[row[seen], column[seen]], count))
     told = np.concatenate(own)

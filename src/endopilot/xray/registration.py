@@ -311,16 +311,12 @@ class _Comparison:
     def covariance(self, sought: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k k"]:
         """Return the covariance of what fits: what the pixels leave open, with the prior.
 
-        Neighbouring pixels that were blurred together err together.
+        Neighbouring pixels that were blurred together err together; the misfit is that near the vessel.
         """
-        slope, misfit = self.slope(sought)[: -len(sought)], self.misfit_of(sought)
-        return np.linalg.inv(slope.T @ slope / misfit**2 + np.diag(self.sought.sd**-2.0))
-
-    def misfit_of(self, sought: Float[np.ndarray, "k"]) -> float:
-        """Return how large the differences near the vessel are, in units of the usual misfit, as if none were alike."""
         slope, residual = self.slope(sought)[: -len(sought)], self.residuals(sought)[: -len(sought)]
         near = np.abs(slope).max(axis=1) >= _FELT * np.abs(slope).max()
-        return float(np.sqrt(np.mean(residual[near] ** 2) * 4 * np.pi)) * self.blur
+        misfit = float(np.sqrt(np.mean(residual[near] ** 2) * 4 * np.pi)) * self.blur
+        return np.linalg.inv(slope.T @ slope / misfit**2 + np.diag(self.sought.sd**-2.0))
 
     def correlation(self, sought: Float[np.ndarray, "k"]) -> float:
         """Return the correlation of what was expected and observed around the vessel, at the worst moment."""
