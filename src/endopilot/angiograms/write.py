@@ -303,7 +303,7 @@ def _truth(cine: Cine, frames: Sequence[dict[str, np.ndarray]]) -> dict[str, np.
         "centerline_contrast": cine.contrast.astype(np.float32),
         **{name: _padded([frame[name] for frame in frames]) for name in frames[0]},
     }
-    if cine.driven is not None:
+    if cine.draw.devices:
         truth |= {"inserted_length_mm": cine.driven.proximal[..., 0], "rotation_rad": cine.driven.proximal[..., 1]}
     return truth
 
@@ -338,7 +338,7 @@ def _record(cine: Cine, layout: Layout, patient: int, number: int) -> dict[str, 
         "motion": None if motion is None else asdict(motion),
         "motion_begins_s": -draw.lead / cine.config.frames_per_second,
         "devices": [device.name for device in layout.stack.devices] if draw.devices else [],
-        "motions_redrawn": 0 if cine.driven is None else cine.driven.redrawn,
+        "motions_redrawn": cine.driven.redrawn,
         "section_names": list(anatomy.tree.section_names),
         "masks": dict(CLASSES),
     }

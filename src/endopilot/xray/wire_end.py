@@ -109,12 +109,12 @@ def _fitted(
         square[np.diag_indices(4)] += damping * np.diag(square) + _SINGULAR
         tried = np.clip(x - np.linalg.solve(square, slope.T @ error), -bounds, bounds)
         new, *its = errors(tried + steps)
-        gained = (error @ error - new @ new) / (error @ error)
+        cost, gained = error @ error, error @ error - new @ new
         if gained > 0:
             x, error, around, damping = tried, new, its, 0.2 * damping
         else:
             damping *= 8.0
-        if 0 < gained < _CONVERGED:
+        if 0 < gained < _CONVERGED * cost:
             break
     return x, error, (np.array(around) - error).T / _DIFFERENCE
 
