@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.imaging.xray import motion_error_mm
-from endopilot.errors import InputError
 from endopilot.simulation.motion import draw_motion, motion_named, published_mean
-from endopilot.xray.image import XrayImager
 from endopilot.xray.image_fluoroscope import ImageFluoroscope
 
 
@@ -37,12 +35,3 @@ def test_what_lies_still_stays_still(arm, fork):
     still = replace(motion_named("breathing"), breathing_caudal_mm=0.0, breathing_anterior_mm=0.0)
     still = replace(still, breathing_dorsal_deg=0.0, breathing_dextral_deg=0.0)
     assert arm.measure_motion(still, np.random.default_rng(0)) is None
-
-
-def test_a_run_without_contrast_is_told(arm, monkeypatch):
-    signal = XrayImager.signal
-    monkeypatch.setattr(
-        XrayImager, "signal", lambda self, plane, nodes, **more: signal(self, plane, nodes, seed=more["seed"])
-    )
-    with pytest.raises(InputError, match=r"the motion of fork cannot be measured: .* inject contrast"):
-        arm.measure_motion(draw_motion(2), np.random.default_rng(0))

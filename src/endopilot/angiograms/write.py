@@ -38,11 +38,7 @@ patient: an assumption."""
 
 
 def stored(signal: Float32[np.ndarray, "rows columns"], window: float) -> UInt16[np.ndarray, "rows columns"]:
-    """Return a frame as its file holds it: the logarithm of the light, 12 bits, wider than what a monitor shows.
-
-    Args:
-        window: half-width of the monitor's grey scale, powers of e.
-    """
+    """Return a frame as its file holds it: the logarithm of the light, 12 bits, wider than a monitor's half-window."""
     value = np.float32(_LARGEST / 2) * (1 + signal / np.float32(_WIDER * window))
     return np.clip(np.rint(value), 0, _LARGEST).astype("<u2")
 
@@ -50,11 +46,9 @@ def stored(signal: Float32[np.ndarray, "rows columns"], window: float) -> UInt16
 def write_xa(
     path: Path, cine: Cine, frames: UInt16[np.ndarray, "frames rows columns"], *, number: int, identity: str
 ) -> None:
-    """Write the frames of a cine. The same cine gives the same bytes.
+    """Write the frames of a cine, of this number among those of the patient, of whose identity UIDs are made.
 
-    Args:
-        number: of the cine among the patient's.
-        identity: of the patient in this data set; UIDs are made of it.
+    The same cine gives the same bytes.
     """
     header = _header(cine, number, identity)
     header.NumberOfFrames, header.Rows, header.Columns = frames.shape

@@ -47,7 +47,6 @@ def write_page(output: Path) -> Path:
         patients=content["patients"],
         scores=content["scores"],
         sections=sections,
-        outcomes=OUTCOMES,
     )
     with writing(output / PAGE_FILE) as partial:
         partial.write_text(page, encoding="utf-8")

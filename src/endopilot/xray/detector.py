@@ -70,10 +70,8 @@ class RidgeEvidence:
 def features(signal: Signal, photons: float, rough: Signal | float = 0.0) -> Float32[np.ndarray, "f n"]:
     """Return the features of the flat image's pixels: ridges and darkness over the noise, and that.
 
-    Args:
-        signal: from `XrayImager.signal`.
-        photons: that a pixel of usual brightness counts.
-        rough: standard deviation of the coarsest ridges that are neither wire nor noise, powers of e.
+    A pixel of usual brightness counts so many photons; `rough` is the standard deviation of the coarsest ridges that
+    are neither wire nor noise, powers of e.
     """
     smooth = [gaussian_filter(signal, scale, mode="nearest") for scale in SCALES_PX]
     around = _smoother(smooth[-1], SCALES_PX[-1], _BESIDE_PX).ravel()

@@ -102,10 +102,6 @@ class CArm(Protocol):
     def measure_motion(self, motion: Motion | None, random: np.random.Generator) -> Motion | None:
         """Inject contrast and return how the patient moves by a run of images; None where that is nothing known.
 
-        Args:
-            motion: how the patient truly moves.
-            random: where the noise is drawn from.
-
         Raises:
             InputError: this C-arm's exposures cannot show it.
         """
@@ -143,14 +139,9 @@ def measurement_at(
     covariances: Float[np.ndarray, "n 3 3"],
     weight: Float[np.ndarray, "n"] | None = None,
 ) -> TipMeasurement:
-    """Return the measurement of a tip at one of some places.
+    """Return the measurement of a tip at one of some places, LPS mm, the likeliest first.
 
-    Args:
-        project: onto the vessel's tree.
-        anatomy: the vessel.
-        places: LPS mm, the likeliest first.
-        covariances: of the tip around each place, if it is there, mm².
-        weight: how likely each place is; equally if not given.
+    It has a covariance around each place, if it is there, mm², and each is as likely as its weight says, or equally.
     """
     share = np.full(len(places), 1.0 / len(places)) if weight is None else weight / weight.sum()
     tips = project(places)
@@ -246,11 +237,8 @@ class Fluoroscope:
         """Take one exposure of every view and return the guiding catheter's axis as it shows, a unit vector.
 
         In a view the catheter is a line, and spans a plane with the source. The likeliest axis is returned, given these
-        planes, each known as well as two points of the line, and how a catheter may lie before it is seen.
-
-        Args:
-            axis: unit vector along the catheter as it truly lies, into the vessel.
-            random: where the errors of detection are drawn from.
+        planes, each known as well as two points of the line, and how a catheter may lie before it is seen. The true
+        axis points into the vessel.
         """
         insertion, pixel_sd = self._anatomy.insertion, self._config.pixel_sd
         ends = insertion.position - np.array([[0.0], [_CATHETER_MM]]) * axis
@@ -280,12 +268,8 @@ class Fluoroscope:
     ) -> TipProjection:
         """Return where an exposure would show the tip, at every sample of episodes of this patient.
 
-        Where the patient moves, it shows the tip where it is then, less the published mean of that motion.
-
-        Args:
-            episodes: navigations, with the tip as it truly is.
-            inserted_length: Δ by the robot's encoder, mm, which helps to find the tip.
-            seed: of the errors; those of a navigation depend on it, the patient and the sequence alone.
+        Where the patient moves, it shows the tip where it is then, less the published mean of that motion. Δ by the
+        encoder, mm, helps to find the tip. A navigation's errors depend on seed, patient and sequence alone.
         """
         tip, heading = (each[:, :, 0].astype(float) for each in (episodes.tip_position, episodes.tip_direction))
         tip = tip + self.registration_mm
@@ -391,11 +375,7 @@ def make_c_arm(
 ) -> CArm:
     """Return the C-arm of a navigation, whose exposures are what `Navigation.xray` says.
 
-    Args:
-        navigation: vessel, wire and what is known of its motion.
-        config: geometry and errors.
-        seed: of the pose that a patient lies in whose images are taken, and of these images' noise.
-        registration_mm: the wire shows displaced by this, mm LPS.
+    The seed is that of the pose in which a patient lies whose images are taken, and of these images' noise.
 
     Raises:
         InputError: images of a wire in a catheter, or of a vessel that is not recognised in them.

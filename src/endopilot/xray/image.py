@@ -218,12 +218,7 @@ class XrayImager:
         return Plane(view, zoom_factor, background, scatter, vessel, usual, placed)
 
     def patient(self, view: View, *, rays: int = 256) -> Float32[np.ndarray, "rows columns"]:
-        """Return the attenuation of the patient along each ray, without vessel, catheters and wire.
-
-        Args:
-            view: source and detector.
-            rays: cast through the CT, along each side of the image; their result is interpolated.
-        """
+        """Return the attenuation along each ray without vessel, catheters and wire, `rays` a side interpolated."""
         pixels = self.config.pixels
         if self.ct is None:
             return np.full((pixels, pixels), WATER_MM * _PLAIN_MM, dtype=np.float32)
@@ -313,10 +308,7 @@ class XrayImager:
     ) -> UInt8[np.ndarray, "rows columns"]:
         """Return a signal as grey values from 0 (black) to 255.
 
-        Args:
-            signal: from `signal`.
-            mask: signal of an image without contrast, which is subtracted (DSA).
-            roadmap: path through the contrasted vessel, mm, which is laid under the image in white.
+        That of a mask without contrast is subtracted (DSA), a path through the vessel, mm, laid under it in white.
         """
         per_e = np.float32(127.5 / self.config.window)
         value = 127.5 + per_e * signal if mask is None else 200.0 + per_e * (signal - mask)
@@ -329,10 +321,7 @@ class XrayImager:
     ) -> Float32[np.ndarray, "rows columns"]:
         """Return the attenuation of the wire, or of a catheter around it, along each ray, mean over some places of it.
 
-        Args:
-            plane: the view.
-            lines: nodes of the device from its tip on at each place, LPS mm.
-            number: 0 for the wire, then the catheters from the inside out.
+        At each its nodes begin at the tip, LPS mm. The wire's number is 0, then come the catheters from the inside out.
         """
         config, radius = self.config, self.stack.wire.tip_radius_mm
         if number == 0:

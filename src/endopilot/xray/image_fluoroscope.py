@@ -125,10 +125,6 @@ class ImageFluoroscope:
     def measure_motion(self, motion: Motion | None, random: np.random.Generator) -> Motion | None:
         """Inject contrast once more, take a run of images over a breath, and return how the patient moves by them.
 
-        Args:
-            motion: how the patient truly moves.
-            random: where the noise is drawn from.
-
         Raises:
             NotRegistered: the vessel is not recognised in the images.
         """
@@ -157,14 +153,10 @@ class ImageFluoroscope:
         *,
         refine: bool = True,
     ) -> TipMeasurement | None:
-        """Take one exposure of every view and say where the tip is; None where no wire is found.
+        """Take one exposure of every view and say where the tip of a wire with these nodes, LPS mm, is found to be.
 
-        Args:
-            nodes: of the wire as it truly is, from its tip on, LPS mm.
-            inserted_length: Δ by the robot's encoder, mm.
-            random: where the noise is drawn from.
-            refine: whether a wire whose tip is not ambiguous refines the pose that later exposures take the patient to
-                lie in.
+        None where no wire is found. One whose tip is not ambiguous refines, or not, the pose that later exposures take
+        the patient to lie in.
         """
         signals = [self._signal(plane, nodes, random) for plane in self._planes]
         photons = [self._imager.photons(plane) for plane in self._planes]

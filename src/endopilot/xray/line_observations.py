@@ -97,11 +97,7 @@ def smooth_line(line: Line, width: float) -> tuple[Line, float, float]:
 
     A rough line is longer than it should be, so that the blur is too narrow: each round measures the length anew, on
     what the round before has blurred. What the blur takes from bends, a second one of the difference gives back
-    (twicing: Tukey, Exploratory Data Analysis, 1977).
-
-    Args:
-        line: pixels.
-        width: standard deviation of the Gaussian, pixels.
+    (twicing: Tukey, Exploratory Data Analysis, 1977). The width is the Gaussian's standard deviation, pixels.
     """
     if len(line) < 3:
         return line, 0.0, 0.0

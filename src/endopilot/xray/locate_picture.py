@@ -29,15 +29,9 @@ def draw_locations(
     project: Callable[[int, Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 2"]],
     images: Float32[np.ndarray, "frames rows columns"] | None = None,
 ) -> None:
-    """Draw some frames of the first camera as PNG: the device, and the vessel where it lies.
+    """Draw some frames of the first camera as PNG: the device's line, pixels, and the vessel where it lies.
 
-    Args:
-        anatomy: the vessel.
-        locations: of each frame.
-        output: the picture, .png.
-        lines: the device in each frame, pixels; None where it is not seen.
-        project: turns places of the vessel, LPS mm, into the pixels of a frame, given its index.
-        images: of the frames, drawn beneath; none if not given.
+    `project` turns places of the vessel, LPS mm, into the pixels of a frame, given its index; images lie beneath.
     """
     seen = [i for i, line in enumerate(lines) if line is not None and locations[i].status != "not found"]
     chosen = [seen[i] for i in np.unique(np.linspace(0, len(seen) - 1, min(_SHOWN, len(seen))).astype(int))]

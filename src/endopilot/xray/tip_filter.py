@@ -159,11 +159,9 @@ def goes(grid: VesselGrid, config: LocateConfig, frames: float) -> Float[np.ndar
 def told_by_later(
     seen: Sequence[Float[np.ndarray, "_"]], going: Callable[[int], Float[np.ndarray, "_ _"]]
 ) -> list[Float[np.ndarray, "_"]]:
-    """Return what all later frames say of the tip's place in each, a logarithm.
+    """Return what all later frames say of the tip's place in each, a logarithm, as `seen` says of each by itself.
 
-    Args:
-        seen: what each frame says of some places by itself, a logarithm.
-        going: how likely the tip goes from each place of a frame to each of the next one, given the frame's index.
+    `going` returns how likely the tip goes from each place of a frame to each of the next one, given the frame's index.
     """
     told = [np.zeros(len(seen[-1]))] if len(seen) else []
     for k in range(len(seen) - 1, 0, -1):

@@ -122,14 +122,7 @@ def possible_shifts(
     covariance: Float[np.ndarray, "3 3"],
     share: float,
 ) -> Shifts:
-    """Return the shifts that are tried.
-
-    Args:
-        views: of the images.
-        ostium: LPS mm.
-        covariance: of the shift of a displaced vessel, mm².
-        share: how likely the vessel is displaced.
-    """
+    """Return the shifts that are tried of a vessel that is displaced with this share and covariance, mm²."""
     rows = np.concatenate([view.slope(ostium) for view in views])
     # Shifts that no view shows are none: with one view, those along its beam.
     seen = np.linalg.svd(rows)[2][: min(2 * len(views), 3)]
@@ -178,11 +171,9 @@ class Seat:
 
 
 def end_log(length: Float[np.ndarray, "n"], inserted_length: float | None) -> Float[np.ndarray, "n"]:
-    """Return how likely a wire ends at some places by the encoder, a logarithm; unnormalised.
+    """Return how likely a wire ends so many mm from the ostium by the encoder, mm, a logarithm; unnormalised.
 
-    Args:
-        length: of the wire up to them, mm; negative in the catheter, where none ends that no encoder tells of.
-        inserted_length: by the encoder, mm; None where there is none.
+    Where there is no encoder none ends in the catheter, whose lengths are negative.
     """
     if inserted_length is None:
         return np.where(length < 0, -np.inf, 0.0)
@@ -408,11 +399,7 @@ def around_mode(
 ) -> tuple[float, Float[np.ndarray, "d"], Float[np.ndarray, "d d"]]:
     """Return the share of a posterior that lies near its mode, its mean there, and its covariance.
 
-    Args:
-        places: LPS mm.
-        weight: of each.
-        near: which lie near the mode.
-        cell_mm: distance of neighbouring places, mm.
+    Neighbouring places lie `cell_mm` apart.
     """
     share = float(weight[near].sum())
     weight = weight[near] / share

@@ -128,12 +128,7 @@ def refined(
 ) -> TipEstimate:
     """Return a tip after each image's fit of the wire's end: a Kalman update of its place and the vessel's shift.
 
-    Args:
-        found: the tip.
-        views: of the images, in the CT's frame as the vessel is registered.
-        signals: the images, without contrast.
-        evidence: how much likelier each pixel is on a wire than off it, a logarithm.
-        radius_mm: of the wire.
+    Signals are without contrast; views, evidence and shift are as `estimate_tip` takes them.
     """
     mean, spread = found.mean, found.spread
     wire = found.wire[-_END_PLACES:] - found.position
