@@ -259,7 +259,8 @@ class TipDetector:
                 return near
         box, near = _box_around(view, self._vessel, len(before), _AROUND_MM), np.zeros(before.shape, dtype=bool)
         line = self._saturated(self._evidence(before[box], photons)) > _LINE
-        label: Any = connected_parts(line, np.ones((3, 3)))[0]
+        parts: Any = connected_parts(line, np.ones((3, 3)))
+        label = parts[0]
         large = np.bincount(label.ravel()) >= _LINE_PX
         large[0] = False
         near[box] = binary_dilation(large[label], iterations=_MOVED_PX)
