@@ -5,9 +5,10 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -19,8 +20,7 @@ from endopilot.types import Anatomy
 from endopilot.xray.camera import CArmCamera, read_camera
 from endopilot.xray.carm import CArmGeometry
 from endopilot.xray.frames import DeviceFrame, read_frames
-from endopilot.xray.locate import locate
-from endopilot.xray.tip_filter import LocateConfig, TipLocation
+from endopilot.xray.tip_filter import LocateConfig, TipLocation, locate
 
 sys.path.append(str(Path(__file__).parents[2] / "examples"))
 
@@ -155,7 +155,9 @@ def wire_into_catheter(
     return tuple(frames), np.array(tips)
 
 
-def bench_lines(*, liver: Existing | None = None, trees: tuple[Existing, ...] = (), seed: Seed = 1) -> list[Judged]:
+def bench_lines(
+    *, liver: Existing | None = None, trees: tuple[Existing, ...] = (), seed: Seed = 1
+) -> list[dict[str, Any]]:
     """Measure `locate` on chains of pixels, noise, lines cut away or into a catheter, and geometry that is off.
 
     Args:
@@ -191,7 +193,7 @@ def bench_lines(*, liver: Existing | None = None, trees: tuple[Existing, ...] = 
             for kind, (some, views) in kinds(frames, cameras, random).items():
                 found = locate(tree, frames=some, cameras=views)
                 judged.append(judge(f"{tree.name}, {name}, {kind}", found, tips[[one.frame for one in found]]))
-    return judged
+    return [asdict(one) for one in judged]
 
 
 def _before(found: Sequence[TipLocation]) -> int:

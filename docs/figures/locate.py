@@ -23,9 +23,8 @@ from endopilot.anatomy.extract import extract_anatomy
 from endopilot.types import Anatomy
 from endopilot.xray.camera import Camera, read_camera
 from endopilot.xray.frames import DeviceFrame, read_frames
-from endopilot.xray.locate import locate
 from endopilot.xray.locate_picture import draw_locations
-from endopilot.xray.tip_filter import LocateConfig, TipLocation
+from endopilot.xray.tip_filter import LocateConfig, TipLocation, locate
 
 TRAINED = 37
 """Frames on which the filter's constants were chosen; the others are the test."""

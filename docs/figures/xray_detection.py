@@ -1,6 +1,6 @@
 """Write the figures of detection and registration into docs/evidence/detection.md.
 
-`python -m benchmarks xray --patients 4 --json > FILE`, then `python docs/figures/xray_detection.py FILE`.
+`python -m benchmarks xray --json > FILE`, then `python docs/figures/xray_detection.py FILE`.
 """
 
 from __future__ import annotations

@@ -131,11 +131,11 @@ from .xray.frames import write_locations as write_locations
 from .xray.image import ImageConfig as ImageConfig
 from .xray.image import Plane as Plane
 from .xray.image import XrayImager as XrayImager
-from .xray.locate import locate as locate
 from .xray.take_image import TakeImageConfig as TakeImageConfig
 from .xray.take_image import XrayImage as XrayImage
 from .xray.take_image import take_image as take_image
 from .xray.tip_filter import LocateConfig as LocateConfig
 from .xray.tip_filter import TipLocation as TipLocation
+from .xray.tip_filter import locate as locate
 
 __version__: str

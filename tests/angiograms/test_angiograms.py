@@ -208,10 +208,10 @@ def test_a_cluster_gives_the_same_bits(made, patient, tmp_path, monkeypatch):
     assert hashes(tmp_path / "there") == hashes(made)
 
 
-def test_the_patient_and_the_card_are_part_of_it(made, fork):
+def test_the_patient_and_a_picture_are_part_of_it(made, fork):
     assert read_anatomy(made / "patients" / "fork").identity == fork.identity
-    card = (made / "README.md").read_text()
-    assert f"| train | 1 | {CINES} | {CINES * FRAMES} |" in card and card.startswith("---\n")
+    splits = json.loads((made / "manifest.json").read_text())["splits"]
+    assert splits == {"train": {"patients": 1, "cines": CINES, "frames": CINES * FRAMES}}
     assert (made / "samples.png").stat().st_size > 1000
 
 

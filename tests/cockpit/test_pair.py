@@ -95,7 +95,7 @@ def test_x_ray_shows_the_catheters_marker(session):
     plane = unit._planes[unit.settings.planes[0]]
     grey = images[-1][1]["grey"].astype(float)
     imager = unit._imager
-    marker = imager.catheter(plane, snapshot.catheters[0].nodes) > 0.2
+    marker = imager.wire(plane, snapshot.catheters[0].nodes, number=1) > 0.2
     wire = imager.wire(plane, snapshot.nodes) > 0.6
     assert 2 < marker.sum() < 40
     assert grey[marker & wire].mean() < grey[wire & ~marker].mean() - 5

@@ -12,8 +12,7 @@ from endopilot.errors import InputError
 from endopilot.types import Anatomy, DistanceMap, Insertion
 from endopilot.xray.camera import CArmCamera, PlanarCamera, read_camera
 from endopilot.xray.frames import DeviceFrame, read_frames, write_locations
-from endopilot.xray.locate import locate
-from endopilot.xray.tip_filter import LocateConfig, TipFilter
+from endopilot.xray.tip_filter import LocateConfig, TipFilter, locate
 
 LIVER = Path(__file__).parents[3] / "shared" / "data" / "liver_tace"
 CAMERAS = [

@@ -107,8 +107,3 @@ def test_a_catheter_is_shown_up_to_its_own_tip(fork, monkeypatch):
         (line,) = seen["catheters"]
         assert line[0, 2] == pytest.approx(deep, abs=0.3)
         assert np.linalg.norm(image.tip_pixel - shown(fork).tip_pixel) * image.mm_per_pixel < 1.0
-
-
-def test_refuses_what_is_no_png(fork, tmp_path):
-    with pytest.raises(InputError, match=r"image.jpg: an image is written as PNG"):
-        shown(fork).write(tmp_path / "image.jpg")

@@ -69,7 +69,7 @@ class Cine:
         placed: affine map of the vessel, and of what lies in it, from where CT shows it to where heart and breath have
             moved it at each frame, LPS mm of the CT.
         contrast: share of contrast in the blood at each frame and point of `flow`; 0 where none is injected.
-        driven: the devices; None where none are shown.
+        driven: the devices, or none.
         air_kerma_ugy: of a frame, at the patient's entrance reference point, µGy; 0 before the first is made.
         beam: collimator, wedge filter and cables, and `reference`, the logarithm of the usual light, from then on.
     """
@@ -107,7 +107,8 @@ class Cine:
             self._reflux_mm3 = self.flow.reflux_ml(draw.injection, times) * 1000
         self.air_kerma_ugy = 0.0
         self._guide = catheter_line(anatomy)
-        self.driven: Driven | None = drive_devices(config, draw, anatomy, imager.stack) if draw.devices else None
+        none = Driven([[]] * config.frames, np.zeros((config.frames, 0, 2)))
+        self.driven = drive_devices(config, draw, anatomy, imager.stack) if draw.devices else none
 
     @cached_property
     def projection(self) -> Float[np.ndarray, "3 4"]:
@@ -137,8 +138,7 @@ class Cine:
         blur, period_s = imager.blur_px(1.0), 1 / config.frames_per_second
         reflux = imager.anatomy.insertion.position + random.normal(0, _REFLUX_MM, size=(_REFLUX, 3))
         signal: Float32[np.ndarray, "rows columns"] | None = None
-        devices = range(len(imager.stack) if self.driven is not None else 0)
-        speeds = [self.driven.velocity(device, period_s) for device in devices] if self.driven is not None else []
+        speeds = [self.driven.velocity(device, period_s) for device in range(self.driven.proximal.shape[1])]
         width_mm, (points, sizes) = imager.anatomy.distance_map.spacing_mm / 2, self._lumen
         for number, placed in enumerate(self.placed):
             shadow = Shadow(self.view, config.image.pixels, points, placed)
@@ -156,8 +156,7 @@ class Cine:
                 path += splat(self.view, config.image.pixels, reflux, volume, placed=placed, width_mm=_REFLUX_MM / 2)
             background = patient + GUIDE * imager.guide(self.view, 1.0, placed)
             plane = replace(first, background=background, vessel_mm=path, placed=placed)
-            lines = [self.driven.nodes[number][device] for device in devices] if self.driven is not None else []
-            was = relative(self._before[number], placed)
+            lines, was = self.driven.nodes[number], relative(self._before[number], placed)
             moving = [
                 speed[number] + (nodes - place(was, nodes)) / max(config.image.pulse_s, 1e-9)
                 for speed, nodes in zip(speeds, lines, strict=True)

@@ -90,7 +90,7 @@ FORMAT_VERSION = 2
 ANATOMY_FILE = "anatomy.json"
 CT_FILE = "ct.nii.gz"
 """The CT in a patient's folder, HU."""
-SAMPLES_FILE, MANIFEST_FILE, CARD_FILE = "samples.png", "manifest.json", "README.md"
+SAMPLES_FILE, MANIFEST_FILE = "samples.png", "manifest.json"
 _SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha", ".mhd")
 
 

@@ -52,11 +52,7 @@ OTHER: dict[str, tuple[Range, Range]] = {
 
 
 def draw_view(random: np.random.Generator, anatomy: Anatomy) -> tuple[str, tuple[float, float]]:
-    """Draw a view of a vessel: each of its kind's is as likely, and each angle within its range.
-
-    Returns:
-        The view's name, and LAO (positive) or RAO, and cranial (positive) or caudal angle, degrees.
-    """
+    """Draw a view, each of the vessel's kind as likely: its name, and LAO and cranial angle in its range, degrees."""
     views = OTHER if not is_coronary(anatomy) else LEFT if is_left(anatomy.tree) else RIGHT
     name = list(views)[int(random.integers(len(views)))]
     lao, cranial = (round(float(random.uniform(*bounds)), 1) for bounds in views[name])
@@ -107,12 +103,7 @@ class CineDraw:
 
 
 def draw_cine(config: AngiogramsConfig, anatomy: Anatomy, number: int) -> CineDraw:
-    """Draw a cine of a patient; it is the same whatever the others are.
-
-    Args:
-        anatomy: the patient's vessel.
-        number: of the cine among the patient's.
-    """
+    """Draw a cine of a patient, of this number among theirs; it is the same whatever the others are."""
     random = np.random.default_rng([config.seed, _name_number(anatomy.name), 1, number])
     view, angles = draw_view(random, anatomy)
     if config.view_angles_deg:

@@ -64,11 +64,7 @@ class Flow:
     """
 
     def __init__(self, tree: VesselTree, velocity_mm_s: float) -> None:
-        """Share the blood among the branches.
-
-        Args:
-            velocity_mm_s: of the blood behind the ostium, mean over the section, mm/s.
-        """
+        """Share the blood among the branches; its velocity is that behind the ostium, mean over the section, mm/s."""
         lines = [branch.centerline for branch in tree.branches]
         first = lines[0]
         near = first.abscissa <= first.abscissa[0] + _INLET_MM

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from endopilot.angiograms.config import CARD_FILE, MANIFEST_FILE, SAMPLES_FILE, AngiogramsConfig, Layout, lay_out
+from endopilot.angiograms.config import MANIFEST_FILE, SAMPLES_FILE, AngiogramsConfig, Layout, lay_out
 from endopilot.angiograms.masks import CLASSES
 from endopilot.angiograms.write import COCO_FILE, RECORD_FILE, coco, write_cine, write_patient
 from endopilot.dataset.layout import SPLITS
@@ -37,30 +37,6 @@ _COLOURS = {
     "wire": (213, 94, 0),
 }
 
-_CARD = """---
-pretty_name: Angiograms with the truth in them
-task_categories: [image-segmentation, keypoint-detection]
-tags: [x-ray, angiography, guidewire, simulated]
----
-
-# Angiograms with the truth in them
-
-{cines} cines of {frames} frames at {rate} frames a second, {pixels} × {pixels} pixels. Patients: {patients}.
-Seed {seed}. Simulated by {version}; no patient was exposed. Devices: {devices}. `manifest.json` holds all settings.
-
-![Frames, and their masks](samples.png)
-
-| split | patients | cines | frames |
-| --- | --- | --- | --- |
-{splits}
-
-Splits are by patient. `annotations/SPLIT.json` is COCO; `cines/NAME/` holds `cine.dcm` (DICOM XA, 12 bits), `frames`
-(as a monitor shows them), `masks` (as bits: {bits}), `truth.npz` and `cine.json`; `patients/NAME/` the vessel and
-the CT. The documentation of `endopilot angiograms` says what they hold, and what the images lack.
-
-For research and teaching. Who may use them depends on the CTs that they were made of.
-"""
-
 
 def describe(layout: Layout) -> None:
     """Write what describes a data set whose cines are there; the manifest comes last."""
@@ -75,21 +51,6 @@ def describe(layout: Layout) -> None:
             counts[split] = {"patients": layout.splits.count(split), "cines": len(folders), "frames": frames}
     with writing(layout.output / SAMPLES_FILE) as partial:
         _samples(layout, records).save(partial, format="png")
-    config = layout.config
-    card = _CARD.format(
-        cines=len(records),
-        frames=config.frames,
-        rate=config.frames_per_second,
-        pixels=config.image.pixels,
-        patients=len(layout.names),
-        version=layout.settings["version"],
-        devices=layout.stack.name,
-        splits="\n".join(f"| {s} | {n['patients']} | {n['cines']} | {n['frames']} |" for s, n in counts.items()),
-        seed=config.seed,
-        bits=", ".join(f"{bit} {name}" for name, bit in CLASSES.items()),
-    )
-    with writing(layout.output / CARD_FILE) as partial:
-        partial.write_text(card, encoding="utf-8")
     record = manifest(
         config=layout.config,
         seed=layout.config.seed,
@@ -151,7 +112,7 @@ def make_angiograms(
     require_extras("imaging")
     layout = lay_out([Path(path) for path in anatomies], Path(output), Stack.of(device), config or AngiogramsConfig())
     claim(layout.output, "endopilot angiograms", **layout.settings)
-    described = [layout.output / name for name in (MANIFEST_FILE, CARD_FILE, SAMPLES_FILE)]
+    described = [layout.output / name for name in (MANIFEST_FILE, SAMPLES_FILE)]
     if all(path.exists() for path in (*described, *layout.patients, *layout.cines)):
         return
     (layout.output / MANIFEST_FILE).unlink(missing_ok=True)

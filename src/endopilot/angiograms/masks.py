@@ -24,12 +24,7 @@ _THINNEST_PX = 0.75
 def stroke(
     line: Float[np.ndarray, "n 2"], radius: Float[np.ndarray, "n"], pixels: int
 ) -> Bool[np.ndarray, "pixels pixels"]:
-    """Return the pixels whose middle lies on a line of some width.
-
-    Args:
-        line: column and row, pixels.
-        radius: half the width at each point, pixels.
-    """
+    """Return the pixels whose middle lies on a line (column, row) with a radius at each point, pixels."""
     mask = np.zeros((pixels, pixels), dtype=bool)
     if len(line) < 2:
         return mask

@@ -38,11 +38,7 @@ patient: an assumption."""
 
 
 def stored(signal: Float32[np.ndarray, "rows columns"], window: float) -> UInt16[np.ndarray, "rows columns"]:
-    """Return a frame as its file holds it: the logarithm of the light, 12 bits, wider than what a monitor shows.
-
-    Args:
-        window: half-width of the monitor's grey scale, powers of e.
-    """
+    """Return a frame as its file holds it: the logarithm of the light, 12 bits, wider than a monitor's half-window."""
     value = np.float32(_LARGEST / 2) * (1 + signal / np.float32(_WIDER * window))
     return np.clip(np.rint(value), 0, _LARGEST).astype("<u2")
 
@@ -50,11 +46,9 @@ def stored(signal: Float32[np.ndarray, "rows columns"], window: float) -> UInt16
 def write_xa(
     path: Path, cine: Cine, frames: UInt16[np.ndarray, "frames rows columns"], *, number: int, identity: str
 ) -> None:
-    """Write the frames of a cine. The same cine gives the same bytes.
+    """Write the frames of a cine, of this number among those of the patient, of whose identity UIDs are made.
 
-    Args:
-        number: of the cine among the patient's.
-        identity: of the patient in this data set; UIDs are made of it.
+    The same cine gives the same bytes.
     """
     header = _header(cine, number, identity)
     header.NumberOfFrames, header.Rows, header.Columns = frames.shape
@@ -303,7 +297,7 @@ def _truth(cine: Cine, frames: Sequence[dict[str, np.ndarray]]) -> dict[str, np.
         "centerline_contrast": cine.contrast.astype(np.float32),
         **{name: _padded([frame[name] for frame in frames]) for name in frames[0]},
     }
-    if cine.driven is not None:
+    if cine.draw.devices:
         truth |= {"inserted_length_mm": cine.driven.proximal[..., 0], "rotation_rad": cine.driven.proximal[..., 1]}
     return truth
 
@@ -338,7 +332,7 @@ def _record(cine: Cine, layout: Layout, patient: int, number: int) -> dict[str, 
         "motion": None if motion is None else asdict(motion),
         "motion_begins_s": -draw.lead / cine.config.frames_per_second,
         "devices": [device.name for device in layout.stack.devices] if draw.devices else [],
-        "motions_redrawn": 0 if cine.driven is None else cine.driven.redrawn,
+        "motions_redrawn": cine.driven.redrawn,
         "section_names": list(anatomy.tree.section_names),
         "masks": dict(CLASSES),
     }

@@ -18,8 +18,7 @@ from endopilot.errors import InputError
 from endopilot.types import Anatomy
 from endopilot.xray.camera import read_camera
 from endopilot.xray.frames import read_frames, write_locations
-from endopilot.xray.locate import locate
-from endopilot.xray.tip_filter import LocateConfig, TipLocation
+from endopilot.xray.tip_filter import LocateConfig, TipLocation, locate
 
 
 def command(
@@ -57,6 +56,8 @@ def command(
     find = _in_lines if seen[0].suffix.lower() == ".csv" else _in_images
     found, drawn, figures, said = find(vessel, seen, camera, device, config)
     write_locations(found, output=output)
+    count = {status: sum(one.status == status for one in found) for status in ("found", "ambiguous", "not found")}
+    counted = ", ".join(f"{number} {status}" for status, number in count.items())
     if picture is not None or page is not None:
         from endopilot.xray.locate_picture import draw_locations, write_page  # matplotlib is slow to import
 
@@ -65,8 +66,7 @@ def command(
             draw_locations(vessel, found, path, **drawn)
             if page is not None:
                 title = f"{vessel.name}: tips in {', '.join(one.name for one in seen)}"
-                write_page(found, page, title=title, said=said, picture=path)
-    count = {status: sum(one.status == status for one in found) for status in ("found", "ambiguous", "not found")}
+                write_page(page, title=title, said=[*said, counted], picture=path)
     return {
         "tips": output,
         "frames": len(found),

@@ -27,8 +27,7 @@ from endopilot.simulation.robots import in_grip
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM, Navigation, Target, XrayKind
-from endopilot.xray.fluoroscope import FluoroscopeConfig
-from endopilot.xray.make_c_arm import make_c_arm
+from endopilot.xray.fluoroscope import FluoroscopeConfig, make_c_arm
 
 
 @settings

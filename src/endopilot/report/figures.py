@@ -129,37 +129,6 @@ def _histogram(ax: Axes, of: Float[np.ndarray, "n"], edges: Float[np.ndarray, "m
     ax.plot([min(float(np.median(of)), edges[-1])] * 2, [bottom, bottom - 0.12], color=BLACK)
 
 
-def loss_figure(table: pd.DataFrame) -> Figure:
-    """Draw the loss curves, one panel a network; columns `network`, `epoch`, `curve` and `loss`."""
-    networks = distinct(table, "network")
-    with matplotlib.rc_context(STYLE):
-        figure, axes = _grid(1, len(networks), height=2.8)
-        for ax, network in zip(axes[0], networks, strict=True):
-            part = rows(table, network=network)
-            for curve, color in zip(distinct(part, "curve"), (BLUE, ORANGE, GREEN), strict=False):
-                line = rows(part, curve=curve)
-                ax.plot(values(line, "epoch"), values(line, "loss"), color=color, label=curve)
-            positive = min(values(part, "loss")) > 0  # a likelihood's is not
-            ax.set(xlabel="Epoch", ylabel="Loss", yscale="log" if positive else "linear")
-            ax.set_title(network)
-        _legend_below(figure, axes)
-    return figure
-
-
-def stage_figure(table: pd.DataFrame) -> Figure:
-    """Draw the seconds that each stage took as bars (`tables.stage_table`)."""
-    seconds = values(table, "seconds")
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(9.0, 0.6 + 0.34 * len(table)), layout="constrained")
-        ax = figure.subplots()
-        bars = ax.barh(list(table["stage"]), seconds, color=BLUE, height=0.68)
-        ax.bar_label(bars, labels=[f"{value:.1f} s" for value in seconds], padding=4, fontsize=8.5)
-        ax.set(xlabel="Wall time, s", xlim=(0, 1.12 * max(float(seconds.max()), 1e-3)))
-        ax.invert_yaxis()
-        ax.grid(False, axis="y")
-    return figure
-
-
 def volume_figure(volume: Volume, mask: LumenMask, anatomy: Anatomy) -> Figure:
     """Draw the CTA around a vessel with the outline of its mask, in slices through the ostium, and the extracted
     tree."""

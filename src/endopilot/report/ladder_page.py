@@ -8,18 +8,17 @@ from typing import Any
 import matplotlib
 import numpy as np
 import plotly.graph_objects as go
-from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from plotly.offline import get_plotlyjs
 
+from endopilot.control.plan_picture import draw_route
 from endopilot.files import read_json, writing
 from endopilot.ladder.attempt import begun, navigation_seed
 from endopilot.ladder.ladder import SCORES_FILE
 from endopilot.ladder.submission import recorded_navigation
 from endopilot.ladder.terms import Terms
-from endopilot.plotting import BLACK, BLUE, GREEN, ORANGE, STYLE, VERMILLION, png
+from endopilot.plotting import GREEN, ORANGE, STYLE, VERMILLION, png
+from endopilot.report.navigation_page import mark_exposures
 from endopilot.report.report import image, render
 from endopilot.report.scene import mark_target, navigation_scene
 from endopilot.tasks.navigation import Navigation
@@ -28,8 +27,6 @@ from endopilot.tasks.task import Task, list_tasks
 PAGE_FILE = "index.html"
 SHOWN = 5  # patients of each task that the pictures show
 OUTCOMES = {"safe success": GREEN, "success, but too large a force": ORANGE, "not reached": VERMILLION}
-
-XRAY = {"color": BLACK, "marker": "o", "ms": 4.5, "mfc": "none", "mew": 0.8, "ls": "none"}  # how an exposure is drawn
 
 
 def write_page(output: Path) -> Path:
@@ -50,7 +47,6 @@ def write_page(output: Path) -> Path:
         patients=content["patients"],
         scores=content["scores"],
         sections=sections,
-        outcomes=OUTCOMES,
     )
     with writing(output / PAGE_FILE) as partial:
         partial.write_text(page, encoding="utf-8")
@@ -98,45 +94,16 @@ def _outcome(result: dict[str, Any]) -> str:
 
 def _courses(navigations: list[Navigation], results: list[dict[str, Any]]) -> Figure:
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(2.4 * SHOWN, 2.9), layout="constrained")
-        for ax, navigation, result in zip(
-            figure.subplots(1, SHOWN, squeeze=False)[0], navigations, results, strict=False
-        ):
-            _draw(ax, navigation, result)
-        for ax in figure.axes:
+        figure = Figure(figsize=(2.4 * SHOWN, 3.2), layout="constrained")
+        panels = figure.subplots(1, SHOWN, squeeze=False)[0]
+        for ax, navigation, result in zip(panels, navigations, results, strict=False):
+            path = np.array(result["course"]["tip_position"])
+            reached = f"{_outcome(result)}\n{result['seconds']:g} s, {result['peak_force_n']:.2f} N"
+            draw_route(ax, navigation, path, f"{navigation.anatomy.name}\n{reached}")
+            mark_exposures(ax, path[np.array(result["course"]["exposed"])])
+            ax.set_title(ax.get_title(), fontsize=8, color=OUTCOMES[_outcome(result)])
+            ax.get_legend().remove()
+        for ax in panels:
             ax.set_axis_off()
-        marks = [Line2D([], [], color=color, lw=2, label=name) for name, color in OUTCOMES.items()]
-        marks.append(Line2D([], [], color=BLUE, lw=4, alpha=0.35, label="route"))
-        marks.append(Line2D([], [], color=BLACK, marker="*", ms=9, ls="none", label="target"))
-        marks.append(Line2D([], [], **XRAY, label="tip under X-ray"))
-        figure.legend(handles=marks, loc="outside lower center", ncols=len(marks))
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure
-
-
-def _draw(ax: Axes, navigation: Navigation, result: dict[str, Any]) -> None:
-    tree = navigation.anatomy.tree
-    everything = tree.line.points
-    centre = everything.mean(axis=0)
-    axes = np.linalg.svd(everything - centre, full_matrices=False)[2][:2]
-    axes *= np.where(np.abs(axes).max(axis=1) == axes.max(axis=1), 1.0, -1.0)[:, None]
-
-    def projected(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 n"]:
-        return axes @ (points - centre).T
-
-    route = tree.route(navigation.target.branch)
-    for index, branch in enumerate(tree.branches):
-        line, chosen = branch.centerline, index in route
-        width = max(1.2, 1.1 * float(line.radius.mean()))
-        ax.plot(
-            *projected(line.points),
-            color=BLUE if chosen else "#c9ced6",
-            lw=width,
-            alpha=0.35 if chosen else 1,
-            zorder=1,
-        )
-    path = projected(np.array(result["course"]["tip_position"]))
-    ax.plot(*path, color=OUTCOMES[_outcome(result)], lw=1.3, zorder=2)
-    ax.plot(*path[:, np.array(result["course"]["exposed"])], **XRAY, zorder=3)
-    ax.plot(*projected(navigation.target.position(navigation.anatomy)[None]), color=BLACK, marker="*", ms=9, zorder=4)
-    ax.set_aspect("equal", adjustable="datalim")
-    ax.set_title(f"{navigation.anatomy.name}\n{result['seconds']:g} s, {result['peak_force_n']:.2f} N", fontsize=8)

@@ -9,6 +9,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from jaxtyping import Float
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -174,9 +175,13 @@ def _mark_sections(axes: Axes, found: PatientNavigation) -> None:
     for name, piece in longest.items():
         x, _, z = piece[len(piece) // 2]
         axes.annotate(name, (x, z), textcoords="offset points", xytext=(5, 4), fontsize=9, color="0.35")
-    shown = found.record.tip_position[found.record.exposed, 0]
-    axes.plot(shown[:, 0], shown[:, 2], "o", mfc="none", color=BLACK, markersize=6, label="tip under X-ray")
+    mark_exposures(axes, found.record.tip_position[found.record.exposed, 0])
     axes.legend(loc="best", fontsize=9)
+
+
+def mark_exposures(axes: Axes, tips: Float[np.ndarray, "n 3"]) -> None:
+    """Mark where the tip was when X-ray was on, LPS mm, in a picture of the route from the front."""
+    axes.plot(tips[:, 0], tips[:, 2], "o", mfc="none", color=BLACK, markersize=6, label="tip under X-ray")
 
 
 def _draw_tip(axes: Axes, found: PatientNavigation) -> None:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
@@ -32,7 +31,6 @@ from endopilot.plotting import png
 from endopilot.report import figures, report_text, tables
 from endopilot.report.scene import navigation_scene, scene_html, visible_devices
 from endopilot.report.still import render_still
-from endopilot.report.tables import stage_table
 from endopilot.simulation.trajectory import Trajectory
 
 STILL_FILE = "scene.png"
@@ -90,8 +88,7 @@ def write_report(output_html: Path, content: ReportContent) -> list[str]:
         "driven": _driven(content.navigation, output_html.parent),
         "scene": _scene(content, output_html.with_name(STILL_FILE), remarks),
         "figures": {name: _stored_figure(content.evaluation, name) for name in report_text.EVALUATION_FIGURES},
-        "training": _training(content.run),
-        "stages": _stages(content.stage_seconds),
+        "budget": _budget(content.run),
         "manifest": json_text(content.manifest) if content.manifest else "",
         "remarks": remarks,
     }
@@ -176,28 +173,10 @@ def _stored_figure(evaluation: Path | None, name: str) -> Markup | None:
     return image(path.read_bytes(), report_text.EVALUATION_FIGURES[name])
 
 
-def _training(run: Path | None) -> dict[str, Any] | None:
+def _budget(run: Path | None) -> str:
     if run is None or str(run) == WIRES:
-        return None  # simulated wires are not trained
-    record = read_json(run / "training.json")
-    curves = [
-        {"network": report_text.NETWORK_TITLES[network], "epoch": point["epoch"], "curve": title, "loss": point[key]}
-        for network, result in record.items()
-        for key, title in (("loss", "training"), ("validation_loss", "held-out navigations"))
-        for point in result["curve"]
-        if point[key] is not None
-    ]
-    return {
-        "picture": image(png(figures.loss_figure(pd.DataFrame(curves))), "Loss of both networks by epoch"),
-        "budget": report_text.training_budget(record),
-    }
-
-
-def _stages(seconds: Mapping[str, float]) -> dict[str, Any] | None:
-    if not seconds:
-        return None
-    picture = image(png(figures.stage_figure(stage_table(seconds))), "Wall time of each stage")
-    return {"picture": picture, "rows": list(seconds.items()), "total": sum(seconds.values())}
+        return ""  # simulated wires are not trained
+    return report_text.training_budget(read_json(run / "training.json"))
 
 
 def image(png: bytes, description: str) -> Markup:

@@ -47,25 +47,6 @@ def headline_split(metrics: Mapping[str, Any]) -> str:
     return "test" if "test" in metrics["splits"] else next(iter(metrics["splits"]))
 
 
-def opening(metrics: Mapping[str, Any]) -> str:
-    """Return the key result as a paragraph."""
-    split = metrics["splits"][headline_split(metrics)]
-    tip = split["tip"]
-    patients = _count(len(split["anatomies"]), "patient")
-    whose = "that the run was trained on" if split["known_patients"] else "that the run was not trained on"
-    parts = [
-        f"On {_count(split['episodes'], 'new navigation')} in {patients} {whose}, after 15 s of given states:",
-        f"given the drive's motion, the forward network predicts the tip's position along the vessel with a mean error "
-        f"of {_mm(tip['P1'], 'abscissa')} over the rest, at most 45 s ({_mm(tip['P1'], 'offset')} across the vessel);",
-        f"holding the slack, which needs no learning, errs by {_mm(tip['hold_slack'], 'abscissa')} "
-        f"({_mm(tip['hold_slack'], 'offset')}).",
-        f"When the inverse network chooses the controls and they are simulated, the tip errs by "
-        f"{_mm(tip['P4'], 'abscissa')} on average; driving by the held slack, by "
-        f"{_mm(tip['follow_slack'], 'abscissa')}.",
-    ]
-    return " ".join(parts)
-
-
 def tiles(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Return the key numbers: value, what it is, and what to compare it with."""
     split = metrics["splits"][headline_split(metrics)]
@@ -124,19 +105,6 @@ def _tip_cells(tip: Mapping[str, Any], split: str, series: str) -> tuple[Cell, .
     return tuple(cells)
 
 
-def gap_rows(metrics: Mapping[str, Any]) -> list[Row]:
-    """Return the table of the generalisation gap, by protocol; empty where there is none."""
-    rows = []
-    for series, gap in metrics.get("generalisation_gap", {}).items():
-        cells = tuple(
-            Cell(_gap(gap[coordinate].get(span, {})), f"generalisation_gap/{series}/{coordinate}/{span}/difference")
-            for coordinate in COORDINATES
-            for span in (*SPANS, "all")
-        )
-        rows.append(Row(SERIES_TITLES[series], "network", cells))
-    return rows
-
-
 def mean_errors(metrics: Mapping[str, Any], split: str) -> list[dict[str, str]]:
     """Return the mean absolute errors of one split, mm: a row a series, a column a coordinate and span."""
     tip = metrics["splits"][split]["tip"]
@@ -153,17 +121,6 @@ def mean_errors(metrics: Mapping[str, Any], split: str) -> list[dict[str, str]]:
     ]
 
 
-def replay_remark(metrics: Mapping[str, Any], split: str) -> str:
-    """Return how far the recorded navigations repeat when they are simulated again; P4 cannot err by less."""
-    distance = metrics["splits"][split]["tip"].get("true_replay", {}).get("distance_3d", {})
-    if distance.get("mae") is None:
-        return ""
-    return (
-        f"Simulated again with the recorded controls, the tips return to where they were recorded within "
-        f"{distance['mae']:.2g} mm on average. P4 cannot err by less."
-    )
-
-
 def interval_remark(metrics: Mapping[str, Any], split: str) -> str:
     """Return the interval of the headline error over patients, or why there is none."""
     record = metrics["splits"][split]
@@ -175,31 +132,6 @@ def interval_remark(metrics: Mapping[str, Any], split: str) -> str:
         f"Drawing the {len(record['anatomies'])} patients again (bootstrap), the mean error of Δtip in P1 lies between "
         f"{low:.2f} and {high:.2f} mm in 95 % of draws; so few patients bound it only roughly."
     )
-
-
-def safety_remark(metrics: Mapping[str, Any], split: str) -> str:
-    """Return median and 95 % quantile of the safety ratio γ/(r − r_w), by series, as a sentence."""
-    safety = metrics["splits"][split]["safety"]
-    names = {"true": "recorded", "P3": "predicted (P3)", "P4": "simulated (P4)"}
-    parts = [
-        f"{title} {safety[key]['over_clearance']['median']:.2f} ({safety[key]['over_clearance']['p95']:.2f})"
-        for key, title in names.items()
-        if key in safety and safety[key]["over_clearance"]["median"] is not None
-    ]
-    return f"{metrics['splits'][split]['title']}: median (95 % quantile) {', '.join(parts)}."
-
-
-def control_remark(metrics: Mapping[str, Any], split: str) -> str:
-    """Return the median control error of a navigation, the network's beside the baselines', as a sentence."""
-    control = metrics["splits"][split]["control"]
-    parts = [
-        f"{SERIES_TITLES[name].removeprefix('Baseline: ').lower().replace('(p2)', '(P2)')} "
-        f"{record['translation_mm_s']['rmse_of_sequences']['median']:.2f} mm/s and "
-        f"{record['rotation_deg_s']['rmse_of_sequences']['median']:.0f} deg/s"
-        for name, record in control.items()
-        if record["translation_mm_s"]["rmse_of_sequences"]["median"] is not None
-    ]
-    return f"{metrics['splits'][split]['title']}: median RMSE of a navigation: {'; '.join(parts)}."
 
 
 def anatomy_facts(anatomy: Anatomy) -> list[tuple[str, str]]:
@@ -257,13 +189,6 @@ def _mean_sd(statistics: Mapping[str, Any]) -> str:
     if statistics.get("mae") is None:
         return "–"
     return f"{statistics['mae']:.2f} ± {statistics['sd']:.2f}"
-
-
-def _gap(gap: Mapping[str, float | None]) -> str:
-    difference, ratio = gap.get("difference"), gap.get("ratio")
-    if difference is None:
-        return "–"
-    return _signed(round(difference, 2) + 0.0) + ("" if ratio is None else f" ×{ratio:.2f}")  # no −0.00
 
 
 def _signed(value: float | None) -> str:

@@ -17,7 +17,7 @@ from endopilot.plotting import CATHETER_COLORS, section_colors
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import Anatomy
 
-BACKGROUND, INK, FAINT = "#0d1424", "#dfe6f2", "#31405c"
+BACKGROUND, INK = "#0d1424", "#dfe6f2"
 WALL, WIRE, TIP, BELIEVED = "#d98a8a", "#f6f7fb", "#ffd34d", "#5fb8ff"
 Wires = Float[np.ndarray, "wires nodes 3"]
 
@@ -156,9 +156,6 @@ def _add_navigation(
                 "y": 0.0,
                 "yanchor": "top",
                 "pad": {"t": 32, "l": 12},
-                "bgcolor": "#1d2a44",
-                "bordercolor": FAINT,
-                "font": {"color": INK},
                 "buttons": [
                     {"label": "▶ Play", "method": "animate", "args": [None, animate]},
                     {"label": "❚❚ Pause", "method": "animate", "args": [[None], stop]},
@@ -171,12 +168,7 @@ def _add_navigation(
                 "len": 0.74,
                 "y": 0.0,
                 "pad": {"t": 18, "b": 6},
-                "bgcolor": FAINT,
-                "bordercolor": FAINT,
-                "tickcolor": FAINT,
-                "activebgcolor": TIP,
-                "font": {"color": INK, "size": 11},
-                "currentvalue": {"prefix": "Time ", "suffix": " s", "font": {"color": INK, "size": 13}},
+                "currentvalue": {"prefix": "Time ", "suffix": " s"},
                 "steps": [
                     {"label": f"{(sample + 1) * period:g}", "method": "animate", "args": [[str(sample)], stop]}
                     for sample in samples
@@ -193,26 +185,15 @@ def _moving(rollout: Trajectory, sample: int, devices: Sequence[Device]) -> list
     trail = np.round(rollout.tip_position[0, begin : sample + 1, 0], 2).astype(np.float32)
     tip = trail[-1:]
     time = f"<extra>{(sample + 1) * rollout.period_s:g} s</extra>"
-    hover = (
-        f"Δ = {rollout.inserted_length[0, sample, 0]:.1f} mm<br>"
-        f"φ = {np.rad2deg(rollout.rotation[0, sample, 0]):.0f}°<br>"
-        f"Δtip = {rollout.tip.abscissa[0, sample, 0]:.1f} mm<br>"
-        f"γtip = {rollout.tip.offset[0, sample, 0]:.2f} mm<br>"
-        f"lumen radius = {rollout.tip.radius[0, sample, 0]:.2f} mm<br>"
-        f"largest wall force = {rollout.contact_force_max[0, sample]:.3f} N"
-    )
-    name = "Guidewire"
-    if around:
-        name += f" {devices[0].name}"
-        hover += f"<br>push of its drive = {rollout.drive_force[0, sample, 0]:.2f} N"
-    hover += time
+    hover = f"{_state(rollout, sample, 0)}<br>largest wall force = {rollout.contact_force_max[0, sample]:.3f} N{time}"
+    name = f"Guidewire {devices[0].name}" if around else "Guidewire"
     tubes = [
         _line(
             line,
             color=CATHETER_COLORS[k],
             width=round(_WIRE_WIDTH * devices[k + 1].diameter_mm / devices[0].diameter_mm, 1),
             name=f"Catheter {devices[k + 1].name}",
-            hovertemplate=_catheter_state(rollout, sample, k + 1) + time,
+            hovertemplate=_state(rollout, sample, k + 1) + time,
         )
         for k, line in enumerate(around)
     ]
@@ -242,10 +223,13 @@ def _uncovered(rollout: Trajectory, sample: int) -> list[Float[np.ndarray, "_ 3"
     return found
 
 
-def _catheter_state(rollout: Trajectory, sample: int, k: int) -> str:
+def _state(rollout: Trajectory, sample: int, k: int) -> str:
+    tip = rollout.tip
     return (
         f"Δ = {rollout.inserted_length[0, sample, k]:.1f} mm<br>"
         f"φ = {np.rad2deg(rollout.rotation[0, sample, k]):.0f}°<br>"
+        f"Δtip = {tip.abscissa[0, sample, k]:.1f} mm<br>"
+        f"γtip = {tip.offset[0, sample, k]:.2f} mm, lumen radius = {tip.radius[0, sample, k]:.2f} mm<br>"
         f"push of its drive = {rollout.drive_force[0, sample, k]:.2f} N"
     )
 
@@ -267,23 +251,15 @@ def _layout(size_mm: Float[np.ndarray, "3"]) -> dict:
     # plotly's box keeps its volume, so that of a tall vessel is longer than the usual view is high
     farther = max(1.0, float(size_mm.max() / size_mm.prod() ** (1 / 3)) / _VIEWED)
     eye = {name: farther * at for name, at in zip("xyz", (0.4, -2.0, 0.5), strict=True)}
-    axis = {
-        "backgroundcolor": BACKGROUND,
-        "gridcolor": FAINT,
-        "zerolinecolor": FAINT,
-        "color": INK,
-        "showspikes": False,
-        "title": {"font": {"size": 11}},
-        "tickfont": {"size": 10},
-    }
+    axis = {"backgroundcolor": BACKGROUND, "showspikes": False}
     titles = ("x (left), mm", "y (back), mm", "z (head), mm")
     axes = {f"{name}axis": axis | {"title": {"text": title}} for name, title in zip("xyz", titles, strict=True)}
     return {
         # View from the front, as a surgeon stands before the patient: the patient's left is on the right.
         "scene": {"aspectmode": "data", **axes, "camera": {"eye": eye, "center": {"x": 0, "y": 0, "z": -0.12}}},
+        "template": "plotly_dark",
         "paper_bgcolor": BACKGROUND,
-        "font": {"color": INK, "family": "system-ui, sans-serif"},
-        "legend": {"font": {"size": 11}, "x": 0.99, "xanchor": "right", "y": 0.93, "bgcolor": BACKGROUND},
+        "legend": {"x": 0.99, "xanchor": "right", "y": 0.93, "bgcolor": BACKGROUND},
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
         "height": 680,
         "uirevision": "keep",

@@ -54,11 +54,6 @@ def control_error_table(results: Mapping[str, SplitResult]) -> pd.DataFrame:
     return pd.concat(pieces, ignore_index=True)
 
 
-def stage_table(seconds: Mapping[str, float]) -> pd.DataFrame:
-    """Return the stages of a run in their order and the seconds that each took."""
-    return pd.DataFrame({"stage": list(seconds), "seconds": list(seconds.values())})
-
-
 def rows(table: pd.DataFrame, **equal: str) -> pd.DataFrame:
     """Return the rows in which each named column has the given value."""
     chosen = np.ones(len(table), dtype=bool)

@@ -134,12 +134,8 @@ def in_catheter(
     """Return the nodes of a wire, LPS mm, with those behind the ostium laid along the guiding catheter's bend.
 
     The rod core's catheter is straight; nothing that it computes depends on what lies behind. Behind the ostium are the
-    nodes after the last one in front of its plane: vessels pass that plane too, farther on.
-
-    Args:
-        anatomy: the vessel.
-        nodes: of the wire, from its tip on.
-        line: the guiding catheter's axis (`catheter_line`), where it is known already.
+    nodes after the last one in front of its plane: vessels pass that plane too, farther on. `line` is the guiding
+    catheter's axis (`catheter_line`), where it is known already.
     """
     start = anatomy.insertion
     behind = -((nodes - start.position) @ start.direction)
@@ -177,14 +173,9 @@ def across(axis: Places) -> tuple[Places, Places]:
 def wire_points(
     nodes: Places, radius_mm: float, opaque_tip_mm: float, step_mm: float = 0.1, coil_mm: float = COIL_MM
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
-    """Return a wire as small volumes: their places, LPS mm, and sizes times their attenuation, mm².
+    """Return a wire as small volumes: their places, so far apart, LPS mm, and sizes times their attenuation, mm².
 
-    Args:
-        nodes: from the tip on, LPS mm.
-        radius_mm: of the wire.
-        opaque_tip_mm: length of the radiopaque coil.
-        step_mm: distance of the places.
-        coil_mm: attenuation of the coil, 1/mm.
+    Its nodes begin at the tip; the radiopaque coil over it is `opaque_tip_mm` long and takes away `coil_mm`, 1/mm.
     """
     along = length_along(nodes)
     at = np.arange(step_mm / 2, along[-1], step_mm)
@@ -198,11 +189,8 @@ def driven_catheter_points(
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
     """Return a driven catheter as small volumes: their places, LPS mm, and sizes times their attenuation, mm².
 
-    Its wall is that of the guiding catheter's kind. A microcatheter has a ring of platinum in the wall at its tip.
-
-    Args:
-        catheter: its diameters.
-        nodes: of its axis from the tip on, LPS mm.
+    Its wall is that of the guiding catheter's kind. A microcatheter has a ring of platinum in the wall at its tip. The
+    nodes are those of its axis from the tip on.
     """
     outer, inner = catheter.tip_radius_mm, catheter.inner_diameter_mm / 2
     radius = (outer + inner) / 2

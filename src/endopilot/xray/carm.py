@@ -94,6 +94,10 @@ class View:
         in_view = (points - self.source) @ self.axes.T
         return self.scale * in_view[..., :2] / in_view[..., 2:]
 
+    def pixel(self, points: Float[np.ndarray, "*n 3"], side: int) -> Float[np.ndarray, "*n 2"]:
+        """Return row and column of points, LPS mm, in an image of so many pixels along a side."""
+        return (side - 1) / 2 + self.project(points)[..., ::-1] * [-1.0, 1.0]
+
     def magnified(self, factor: float) -> View:
         """Return the view with an image that is magnified by a factor."""
         return replace(self, scale=self.scale * factor)

@@ -70,10 +70,8 @@ class RidgeEvidence:
 def features(signal: Signal, photons: float, rough: Signal | float = 0.0) -> Float32[np.ndarray, "f n"]:
     """Return the features of the flat image's pixels: ridges and darkness over the noise, and that.
 
-    Args:
-        signal: from `XrayImager.signal`.
-        photons: that a pixel of usual brightness counts.
-        rough: standard deviation of the coarsest ridges that are neither wire nor noise, powers of e.
+    A pixel of usual brightness counts so many photons; `rough` is the standard deviation of the coarsest ridges that
+    are neither wire nor noise, powers of e.
     """
     smooth = [gaussian_filter(signal, scale, mode="nearest") for scale in SCALES_PX]
     around = _smoother(smooth[-1], SCALES_PX[-1], _BESIDE_PX).ravel()
@@ -179,14 +177,7 @@ class TipDetector:
         config: DetectorConfig | None = None,
         evidence: RidgeEvidence | None = None,
     ) -> None:
-        """Take the vessel and the wire.
-
-        Args:
-            anatomy: the vessel.
-            device: the wire.
-            config: how far an image is trusted.
-            evidence: for a wire in a pixel; the package's if not given.
-        """
+        """Take the vessel and the wire; `evidence` is for a wire in a pixel, the package's if not given."""
         self._anatomy, self._radius_mm = anatomy, device.tip_radius_mm
         self.config, self._evidence = config or DetectorConfig(), evidence or RidgeEvidence.read()
         self.grid: VesselGrid = with_catheter(make_grid(anatomy.tree, step_mm=_PLACES_MM), anatomy, CATHETER_MM)
@@ -245,13 +236,14 @@ class TipDetector:
         found = estimate_tip(self.grid, self._room_mm, views, evidence, shifts, inserted_length, expected)
         found = refined(found, views, plain, evidence, self._radius_mm)
         there = [replace(view, source=view.source - found.shift) for view in views]
-        hidden = any(_lies_on(line, view, found.position) for line, view in zip(lines, there, strict=False))
+        at = [np.clip(np.rint(view.pixel(found.position, len(signals[0]))), 0, len(signals[0]) - 1) for view in there]
+        hidden = any(line[tuple(pixel.astype(int))] for line, pixel in zip(lines, at, strict=False))
         return self._judged(found, there, hidden=hidden)
 
     def _look(self, view: View, signal: Signal, photons: float, dark: Signal) -> tuple[Signal, Signal]:
         """Return an image without contrast, and how likely its pixels are on a wire, none far from the vessel."""
         evidence = np.zeros_like(signal)
-        box = _box_around(view, self.grid.middle, len(signal), around_px=_AROUND_PX)
+        box = _box_around(view, self.grid.middle, len(signal))
         plain = self.without_contrast(view, signal, box)
         rough = np.where(np.isfinite(dark[box]), _SHAPE * dark[box], 0).astype(np.float32)
         evidence[box] = own_share(dark[box], photons) * self._saturated(self._evidence(plain[box], photons, rough))
@@ -265,10 +257,7 @@ class TipDetector:
         for image, count, near in self._known_lines:
             if image is before and count == photons:
                 return near
-        box, near = (
-            _box_around(view, self._vessel, len(before), _AROUND_MM, _AROUND_PX),
-            np.zeros(before.shape, dtype=bool),
-        )
+        box, near = _box_around(view, self._vessel, len(before), _AROUND_MM), np.zeros(before.shape, dtype=bool)
         line = self._saturated(self._evidence(before[box], photons)) > _LINE
         parts: Any = connected_parts(line, np.ones((3, 3)))
         label = parts[0]
@@ -279,12 +268,10 @@ class TipDetector:
         return near
 
     def _judged(self, found: TipEstimate, views: Sequence[View], *, hidden: bool) -> TipEstimate:
-        """Return an estimate with its status; an ambiguous one is as uncertain as the places are far apart.
+        """Return an estimate with its status, seen in views of the CT's frame where the vessel lies.
 
-        Args:
-            found: the tip.
-            views: of the images, in the CT's frame where the vessel lies.
-            hidden: whether it lies on a line from before: the wire may end elsewhere on it.
+        An ambiguous one is as uncertain as the places are far apart; on a line from before (`hidden`) the wire may end
+        elsewhere.
         """
         if found.log_odds < self.config.least_log_odds:
             return replace(found, status="not found")
@@ -332,20 +319,10 @@ def _halved(image: Signal) -> Float32[np.ndarray, "half_rows half_columns"]:
     return image[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2).mean(axis=(1, 3))
 
 
-def _box_around(
-    view: View, points: Float[np.ndarray, "n 3"], rows: int, around_mm: float = 0.0, around_px: int = 0
-) -> tuple[slice, slice]:
+def _box_around(view: View, points: Float[np.ndarray, "n 3"], rows: int, around_mm: float = 0.0) -> tuple[slice, slice]:
     """Return the rows and columns of an image that show points, LPS mm, and what lies around them in space or image."""
-    right_up, middle = view.project(points), (rows - 1) / 2
-    around = around_px + around_mm * float(np.linalg.norm(view.slope(points.mean(axis=0)), 2)) + 1
-    at = np.stack([middle - right_up[:, 1], middle + right_up[:, 0]])
-    low = np.clip(at.min(axis=1) - around, 0, rows - 1).astype(int)
-    high = np.clip(at.max(axis=1) + around + 1, low + 1, rows).astype(int)
+    around = _AROUND_PX + around_mm * float(np.linalg.norm(view.slope(points.mean(axis=0)), 2)) + 1
+    at = view.pixel(points, rows)
+    low = np.clip(at.min(axis=0) - around, 0, rows - 1).astype(int)
+    high = np.clip(at.max(axis=0) + around + 1, low + 1, rows).astype(int)
     return slice(low[0], high[0]), slice(low[1], high[1])
-
-
-def _lies_on(line: Bool[np.ndarray, "rows columns"], view: View, point: Float[np.ndarray, "3"]) -> bool:
-    """Return whether a view shows a point, LPS mm, on a line."""
-    (right, up), middle = view.project(point), (len(line) - 1) / 2
-    row, column = np.clip(np.rint([middle - up, middle + right]), 0, len(line) - 1).astype(int)
-    return bool(line[row, column])

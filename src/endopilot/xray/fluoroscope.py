@@ -10,10 +10,10 @@ view. docs/concepts/exposure.md says where the numbers come from.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from endopilot.anatomy.projection import TipProjector
 from endopilot.anatomy.tree import tangents
@@ -22,6 +22,7 @@ from endopilot.errors import InputError
 from endopilot.settings import Finite, Positive, settings
 from endopilot.simulation.motion import Motion, place, published_mean
 from endopilot.simulation.simulator import Simulator
+from endopilot.tasks.navigation import Navigation
 from endopilot.types import Anatomy, TipProjection
 from endopilot.xray.carm import CArmGeometry, View, view_at
 from endopilot.xray.moving_patient import seen_in_episodes, seen_wire, turned
@@ -101,10 +102,6 @@ class CArm(Protocol):
     def measure_motion(self, motion: Motion | None, random: np.random.Generator) -> Motion | None:
         """Inject contrast and return how the patient moves by a run of images; None where that is nothing known.
 
-        Args:
-            motion: how the patient truly moves.
-            random: where the noise is drawn from.
-
         Raises:
             InputError: this C-arm's exposures cannot show it.
         """
@@ -127,15 +124,8 @@ class FluoroscopeConfig:
     """Standard deviation along the wire, pixels: where a thin tip ends is harder to see than where it runs."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Detection:
-    """A tip found in an image.
-
-    Attributes:
-        view: of the image.
-        pixel: where it was found.
-        whiten: turns an error, pixels, into its parts along and across the wire, in standard deviations.
-    """
+class _Detection(NamedTuple):
+    """A tip found at a pixel; `whiten` turns an error into parts along and across the wire, standard deviations."""
 
     view: View
     pixel: Float[np.ndarray, "2"]
@@ -149,14 +139,9 @@ def measurement_at(
     covariances: Float[np.ndarray, "n 3 3"],
     weight: Float[np.ndarray, "n"] | None = None,
 ) -> TipMeasurement:
-    """Return the measurement of a tip at one of some places.
+    """Return the measurement of a tip at one of some places, LPS mm, the likeliest first.
 
-    Args:
-        project: onto the vessel's tree.
-        anatomy: the vessel.
-        places: LPS mm, the likeliest first.
-        covariances: of the tip around each place, if it is there, mm².
-        weight: how likely each place is; equally if not given.
+    It has a covariance around each place, if it is there, mm², and each is as likely as its weight says, or equally.
     """
     share = np.full(len(places), 1.0 / len(places)) if weight is None else weight / weight.sum()
     tips = project(places)
@@ -181,12 +166,6 @@ def measurement_at(
     )
 
 
-def _valleys(cost: Float[np.ndarray, "vertices"], most: float) -> Int[np.ndarray, "valleys"]:
-    """Return the vertices of a line that cost less than their neighbours, and no more than `most`."""
-    fence = np.pad(cost, 1, constant_values=np.inf)
-    return np.flatnonzero((cost <= most) & (cost < fence[:-2]) & (cost <= fence[2:]))
-
-
 class Fluoroscope:
     """A C-arm around one patient, whose vessel is known from the CT and registered to it."""
 
@@ -199,15 +178,7 @@ class Fluoroscope:
         known_motion: Motion | None = None,
         registration_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
-        """Bring the middle of the vessel to the isocenter.
-
-        Args:
-            anatomy: the vessel.
-            wire_radius_mm: radius of the wire at its tip, mm.
-            config: geometry and errors.
-            known_motion: what is known of how the patient moves.
-            registration_mm: the wire shows displaced by this, mm LPS.
-        """
+        """Bring the middle of the vessel to the isocenter; `wire_radius_mm` is the tip's, the rest as `CArm` says."""
         self._anatomy, self._config = anatomy, config or FluoroscopeConfig()
         self.known_motion, self.registration_mm = known_motion, registration_mm
         lines = [branch.centerline for branch in anatomy.tree.branches]
@@ -251,19 +222,23 @@ class Fluoroscope:
         inserted_length: float,
         random: np.random.Generator,
     ) -> TipMeasurement:
-        """Take one exposure of every view and say where the tip is. The arguments are those of `locate`."""
-        detections = [self._detect(view, tip_position, tip_direction, random) for view in self._views]
-        return measurement_at(self._project, self._anatomy, *self._likeliest(detections, inserted_length))
+        """Take one exposure of every view and say where the tip is.
+
+        Args:
+            tip_position: where the tip truly is, LPS mm.
+            tip_direction: unit vector along the wire at its tip.
+            inserted_length: Δ by the robot's encoder, mm.
+            random: where the errors are drawn from.
+        """
+        found = self._likeliest(tip_position, tip_direction, inserted_length, random)
+        return measurement_at(self._project, self._anatomy, *found)
 
     def catheter_axis(self, axis: Float[np.ndarray, "3"], random: np.random.Generator) -> Float[np.ndarray, "3"]:
         """Take one exposure of every view and return the guiding catheter's axis as it shows, a unit vector.
 
         In a view the catheter is a line, and spans a plane with the source. The likeliest axis is returned, given these
-        planes, each known as well as two points of the line, and how a catheter may lie before it is seen.
-
-        Args:
-            axis: unit vector along the catheter as it truly lies, into the vessel.
-            random: where the errors of detection are drawn from.
+        planes, each known as well as two points of the line, and how a catheter may lie before it is seen. The true
+        axis points into the vessel.
         """
         insertion, pixel_sd = self._anatomy.insertion, self._config.pixel_sd
         ends = insertion.position - np.array([[0.0], [_CATHETER_MM]]) * axis
@@ -285,28 +260,16 @@ class Fluoroscope:
         inserted_length: float,
         random: np.random.Generator,
     ) -> Float[np.ndarray, "3"]:
-        """Take one exposure of every view and return where the tip is found to be, LPS mm.
-
-        Args:
-            tip_position: where the tip truly is, LPS mm.
-            tip_direction: unit vector along the wire at its tip.
-            inserted_length: Δ by the robot's encoder, mm.
-            random: where the errors are drawn from.
-        """
-        detections = [self._detect(view, tip_position, tip_direction, random) for view in self._views]
-        return self._likeliest(detections, inserted_length)[0][0]
+        """Return the position, LPS mm, that `measure` finds."""
+        return self._likeliest(tip_position, tip_direction, inserted_length, random)[0][0]
 
     def expose_episodes(
         self, episodes: Dataset, inserted_length: Float[np.ndarray, "episodes samples"], seed: int
     ) -> TipProjection:
         """Return where an exposure would show the tip, at every sample of episodes of this patient.
 
-        Where the patient moves, it shows the tip where it is then, less the published mean of that motion.
-
-        Args:
-            episodes: navigations, with the tip as it truly is.
-            inserted_length: Δ by the robot's encoder, mm, which helps to find the tip.
-            seed: of the errors; those of a navigation depend on it, the patient and the sequence alone.
+        Where the patient moves, it shows the tip where it is then, less the published mean of that motion. Δ by the
+        encoder, mm, helps to find the tip. A navigation's errors depend on seed, patient and sequence alone.
         """
         tip, heading = (each[:, :, 0].astype(float) for each in (episodes.tip_position, episodes.tip_direction))
         tip = tip + self.registration_mm
@@ -340,26 +303,30 @@ class Fluoroscope:
         return _Detection(view, view.project(position) + error @ axes, axes / sd[:, None])
 
     def _likeliest(
-        self, detections: list[_Detection], inserted_length: float
+        self,
+        position: Float[np.ndarray, "3"],
+        direction: Float[np.ndarray, "3"],
+        inserted_length: float,
+        random: np.random.Generator,
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n"]]:
         """Return where the tip may be, LPS mm, the likeliest place first, with covariances and weights.
 
         A view may show several parts of the vessel at one place: the likeliest place of every such part is returned.
         """
+        detections = [self._detect(view, position, direction, random) for view in self._views]
         length_sd = 2.0 + _NEAR_SHARE * max(inserted_length, 0.0)
         prior = [((abscissa - inserted_length) / length_sd) ** 2 for abscissa in self._abscissa]
         magnified = self._views[0].scale / self._config.geometry.source_to_isocenter_mm
-        first = []
+        seen, first = list(zip(self._shown, detections, strict=True)), []
         for branch, (sd, unlikely) in enumerate(zip(self._lateral_sd, prior, strict=True)):
-            squared = sum(
-                ((shown[branch] - one.pixel) ** 2).sum(axis=1)
-                for shown, one in zip(self._shown, detections, strict=True)
-            )
+            squared = sum(((shown[branch] - one.pixel) ** 2).sum(axis=1) for shown, one in seen)
             first.append(squared / (self._config.along_sd**2 + (magnified * sd) ** 2) + unlikely)
         least = min(float(cost.min()) for cost in first)
         found = list[tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]]()
         for branch, guess in enumerate(first):
-            for vertex in _valleys(guess, least + _HOPELESS).tolist():
+            fence = np.pad(guess, 1, constant_values=np.inf)
+            valleys = (guess <= least + _HOPELESS) & (guess < fence[:-2]) & (guess <= fence[2:])
+            for vertex in np.flatnonzero(valleys).tolist():
                 place, cost_there, nearest, covariance = self._refine(detections, branch, vertex)
                 found.append((cost_there + float(prior[branch][nearest]), place, covariance))
         cost, places, covariances = (
@@ -397,3 +364,34 @@ class Fluoroscope:
             beyond = 1 - np.sqrt(2) * sd[nearest] / max(float(np.linalg.norm(lateral)), 1e-9)
             place = place - max(beyond, 0.0) * lateral
         return place, cost, nearest, np.linalg.inv(jacobian.T @ jacobian)
+
+
+def make_c_arm(
+    navigation: Navigation,
+    *,
+    config: FluoroscopeConfig | None = None,
+    seed: int = 0,
+    registration_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> CArm:
+    """Return the C-arm of a navigation, whose exposures are what `Navigation.xray` says.
+
+    The seed is that of the pose in which a patient lies whose images are taken, and of these images' noise.
+
+    Raises:
+        InputError: images of a wire in a catheter, or of a vessel that is not recognised in them.
+    """
+    anatomy, device, known = navigation.anatomy, navigation.device, navigation.known_motion
+    if navigation.xray == "assumed":
+        return Fluoroscope(
+            anatomy, device.tip_radius_mm, config=config, known_motion=known, registration_mm=registration_mm
+        )
+    from endopilot.xray.image_fluoroscope import ImageFluoroscope  # slow to import
+
+    if navigation.catheters:
+        names = ", ".join(catheter.name for catheter in navigation.catheters)
+        raise InputError(
+            f"xray: images: the detector takes a wire alone, and there is {names} around it; leave the catheter out"
+        )
+    return ImageFluoroscope(
+        anatomy, device, config=config, seed=seed, known_motion=known, registration_mm=registration_mm
+    )

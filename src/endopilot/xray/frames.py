@@ -16,30 +16,15 @@ Frames whose number is left out show nothing.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from endopilot.errors import InputError
 from endopilot.files import writing
 from endopilot.simulation.csv_file import read_columns
+from endopilot.xray.line_observations import DeviceFrame, Line
 from endopilot.xray.tip_filter import TipLocation
-
-
-@dataclass(frozen=True, eq=False)
-class DeviceFrame:
-    """What the cameras show of a device at one time.
-
-    Attributes:
-        number: of the frame.
-        lines: for each camera the device's line, pixels (column, row), from its tip backwards; a single point is the
-            tip alone; None where that camera does not show it.
-    """
-
-    number: int
-    lines: tuple[Float[np.ndarray, "_ 2"] | None, ...]
 
 
 def read_frames(path: str | Path, *, views: int = 1) -> tuple[DeviceFrame, ...]:
@@ -66,7 +51,7 @@ def read_frames(path: str | Path, *, views: int = 1) -> tuple[DeviceFrame, ...]:
         raise table.fault(int(odd[0]), "view", f"; give 1 to {views}, or a camera for each view")
     found = []
     for number in np.unique(frame):
-        lines: list[Float[np.ndarray, "_ 2"] | None] = []
+        lines: list[Line | None] = []
         for k in range(1, views + 1):
             line = pixels[(frame == number) & (view == k)]
             lines.append(line if len(line) else None)

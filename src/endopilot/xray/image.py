@@ -8,7 +8,7 @@ attenuations are physical; docs/concepts/images.md says where the constants come
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -124,9 +124,7 @@ class Plane:
 
     def pixel(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
         """Return row and column of points of the vessel or in it, LPS mm of the CT."""
-        right_up = self.view.project(place(self.placed, points))
-        middle = (len(self.background) - 1) / 2
-        return middle + np.stack([-right_up[..., 1], right_up[..., 0]], axis=-1)
+        return self.view.pixel(place(self.placed, points), len(self.background))
 
 
 class XrayImager:
@@ -220,12 +218,7 @@ class XrayImager:
         return Plane(view, zoom_factor, background, scatter, vessel, usual, placed)
 
     def patient(self, view: View, *, rays: int = 256) -> Float32[np.ndarray, "rows columns"]:
-        """Return the attenuation of the patient along each ray, without vessel, catheters and wire.
-
-        Args:
-            view: source and detector.
-            rays: cast through the CT, along each side of the image; their result is interpolated.
-        """
+        """Return the attenuation along each ray without vessel, catheters and wire, `rays` a side interpolated."""
         pixels = self.config.pixels
         if self.ct is None:
             return np.full((pixels, pixels), WATER_MM * _PLAIN_MM, dtype=np.float32)
@@ -281,11 +274,10 @@ class XrayImager:
         """
         config = self.config
         attenuation = plane.background.copy()
-        if len(nodes):
-            attenuation += self._moving(plane, self.wire, nodes, velocity)
-        moving = catheter_velocities or [None] * len(catheters)
-        for number, (line, its_velocity) in enumerate(zip(catheters, moving, strict=True)):
-            attenuation += self._moving(plane, partial(self.catheter, number=number), line, its_velocity)
+        moving = [velocity, *(catheter_velocities or [None] * len(catheters))]
+        for number, (line, its_velocity) in enumerate(zip([nodes, *catheters], moving, strict=True)):
+            if len(line):
+                attenuation += self._moving(plane, number, line, its_velocity)
         if contrast > 0:
             attenuation += np.float32(contrast * config.iodine_mm) * plane.vessel_mm
         light = np.exp(np.negative(attenuation, out=attenuation), out=attenuation)
@@ -316,10 +308,7 @@ class XrayImager:
     ) -> UInt8[np.ndarray, "rows columns"]:
         """Return a signal as grey values from 0 (black) to 255.
 
-        Args:
-            signal: from `signal`.
-            mask: signal of an image without contrast, which is subtracted (DSA).
-            roadmap: path through the contrasted vessel, mm, which is laid under the image in white.
+        That of a mask without contrast is subtracted (DSA), a path through the vessel, mm, laid under it in white.
         """
         per_e = np.float32(127.5 / self.config.window)
         value = 127.5 + per_e * signal if mask is None else 200.0 + per_e * (signal - mask)
@@ -327,52 +316,26 @@ class XrayImager:
             value = value + _ROADMAP_GREY * (1 - np.exp(-np.float32(self.config.iodine_mm) * roadmap))
         return np.clip(value, 0, 255).astype(np.uint8)
 
-    def wire(self, plane: Plane, *lines: Float[np.ndarray, "_ 3"]) -> Float32[np.ndarray, "rows columns"]:
-        """Return the attenuation of a wire along each ray, mean over some places of it.
-
-        Args:
-            plane: the view.
-            lines: nodes of the wire from its tip on at each place, LPS mm.
-        """
-        radius = self.stack.wire.tip_radius_mm
-        step_mm = _WIRE_STEP_MM * max(1.0, self.config.geometry.pixel_mm / CArmGeometry().pixel_mm)
-        draw = partial(wire_points, radius_mm=radius, opaque_tip_mm=self.config.opaque_tip_mm, step_mm=step_mm)
-        draw = partial(draw, coil_mm=self.config.coil_mm)
-        return self._device(plane, draw, lines, radius / 2)
-
-    def catheter(
+    def wire(
         self, plane: Plane, *lines: Float[np.ndarray, "_ 3"], number: int = 0
     ) -> Float32[np.ndarray, "rows columns"]:
-        """Return the attenuation of a catheter that is driven around the wire along each ray, as `wire` does.
+        """Return the attenuation of the wire, or of a catheter around it, along each ray, mean over some places of it.
 
-        Args:
-            plane: the view.
-            lines: nodes of its axis from its tip on at each place, LPS mm.
-            number: which one, from the inside out.
+        At each its nodes begin at the tip, LPS mm. The wire's number is 0, then come the catheters from the inside out.
         """
-        catheter = self.stack.catheters[number]
-        wall_mm = catheter.tip_radius_mm - catheter.inner_diameter_mm / 2
-        return self._device(plane, partial(driven_catheter_points, catheter), lines, wall_mm / np.sqrt(12))
-
-    def _device(
-        self,
-        plane: Plane,
-        draw: Callable[[Float[np.ndarray, "n 3"]], tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]],
-        lines: Sequence[Float[np.ndarray, "_ 3"]],
-        width_mm: float,
-    ) -> Float32[np.ndarray, "rows columns"]:
-        """Return the attenuation of a device, of which `draw` makes small volumes of `width_mm`, as `wire` does."""
+        config, radius = self.config, self.stack.wire.tip_radius_mm
+        if number == 0:
+            step_mm = _WIRE_STEP_MM * max(1.0, config.geometry.pixel_mm / CArmGeometry().pixel_mm)
+            how = {"opaque_tip_mm": config.opaque_tip_mm, "step_mm": step_mm, "coil_mm": config.coil_mm}
+            draw, width_mm = partial(wire_points, radius_mm=radius, **how), radius / 2
+        else:
+            catheter = self.stack.catheters[number - 1]
+            draw = partial(driven_catheter_points, catheter)
+            width_mm = (catheter.tip_radius_mm - catheter.inner_diameter_mm / 2) / np.sqrt(12)
         drawn = [draw(in_catheter(self.anatomy, nodes, self._guide)) for nodes in lines]
         points, sizes = (np.concatenate(each) for each in zip(*drawn, strict=True))
-        return splat(
-            plane.view,
-            self.config.pixels,
-            points,
-            sizes / len(lines),
-            placed=plane.placed,
-            width_mm=width_mm,
-            blur_px=self.blur_px(plane.zoom),
-        )
+        how = {"placed": plane.placed, "width_mm": width_mm, "blur_px": self.blur_px(plane.zoom)}
+        return splat(plane.view, config.pixels, points, sizes / len(lines), **how)
 
     def air_kerma_ugy(self, plane: Plane, dose: float) -> float:
         """Return the air kerma of a frame at the patient's entrance reference point, µGy."""
@@ -387,19 +350,15 @@ class XrayImager:
         return PHOTONS_MM2_UGY * config.efficiency * config.detector_ugy * dose * side**2
 
     def _moving(
-        self,
-        plane: Plane,
-        draw: Callable[..., Float32[np.ndarray, "rows columns"]],
-        nodes: Float[np.ndarray, "n 3"],
-        velocity: Float[np.ndarray, "n 3"] | None,
+        self, plane: Plane, number: int, nodes: Float[np.ndarray, "n 3"], velocity: Float[np.ndarray, "n 3"] | None
     ) -> Float32[np.ndarray, "rows columns"]:
         """Return the mean attenuation of a device over the pulse, which ends with the device at its nodes."""
         if velocity is None:
-            return draw(plane, nodes)
+            return self.wire(plane, nodes, number=number)
         path_px = float(np.linalg.norm(velocity, axis=1).max()) * self.config.pulse_s
         path_px *= plane.view.scale / self.config.geometry.source_to_isocenter_mm
         times = self.config.pulse_s * (np.arange(count := min(1 + int(2 * path_px), _MOST_PULSES)) + 0.5) / count
-        return draw(plane, *(nodes - time * velocity for time in times))
+        return self.wire(plane, *(nodes - time * velocity for time in times), number=number)
 
     def blur_px(self, zoom_factor: float) -> float:
         """Return the blur of focal spot and scintillator, standard deviation, pixels of the image."""

@@ -32,8 +32,6 @@ _NO_WIRE = np.zeros((0, 3))
 _MOVES_MM = 2.0
 """Standard deviation of the vessel's place along each axis in a patient who moves, mm: their motion is not quite the
 known one."""
-
-
 _DRIFTS_MM = 0.3
 """A vessel that lies shifted drifts by this from exposure to exposure, mm: an assumption."""
 
@@ -92,13 +90,8 @@ class ImageFluoroscope:
     ) -> None:
         """Lay the patient on the table, inject contrast and register.
 
-        Args:
-            anatomy: the vessel; a coronary artery lies in a synthetic chest, any other in water.
-            device: the wire.
-            config: geometry and views; its errors of detection are not used.
-            seed: of the pose, up to 5 mm and 3° along and about each axis, and of these images' noise.
-            known_motion: what is known of how the patient moves.
-            registration_mm: the wire shows displaced by this, mm LPS, besides what the registration errs.
+        A coronary artery lies in a synthetic chest, any other vessel in water. The seed draws the pose, up to 5 mm and
+        3° along and about each axis, and these images' noise; the errors of detection of `config` are not used.
 
         Raises:
             NotRegistered: the vessel is not recognised in the images.
@@ -132,10 +125,6 @@ class ImageFluoroscope:
     def measure_motion(self, motion: Motion | None, random: np.random.Generator) -> Motion | None:
         """Inject contrast once more, take a run of images over a breath, and return how the patient moves by them.
 
-        Args:
-            motion: how the patient truly moves.
-            random: where the noise is drawn from.
-
         Raises:
             NotRegistered: the vessel is not recognised in the images.
         """
@@ -164,14 +153,10 @@ class ImageFluoroscope:
         *,
         refine: bool = True,
     ) -> TipMeasurement | None:
-        """Take one exposure of every view and say where the tip is; None where no wire is found.
+        """Take one exposure of every view and say where the tip of a wire with these nodes, LPS mm, is found to be.
 
-        Args:
-            nodes: of the wire as it truly is, from its tip on, LPS mm.
-            inserted_length: Δ by the robot's encoder, mm.
-            random: where the noise is drawn from.
-            refine: whether a wire whose tip is not ambiguous refines the pose that later exposures take the patient to
-                lie in.
+        None where no wire is found. One whose tip is not ambiguous refines, or not, the pose that later exposures take
+        the patient to lie in.
         """
         signals = [self._signal(plane, nodes, random) for plane in self._planes]
         photons = [self._imager.photons(plane) for plane in self._planes]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -35,50 +36,52 @@ should be by its length."""
 
 
 @dataclass(frozen=True, eq=False)
-class SeenLine:
-    """One view of a frame: the line's points, and the grid as this camera shows it.
+class DeviceFrame:
+    """What the cameras show of a device at one time.
 
     Attributes:
-        tip: pixel of the line's end.
-        at: length from there to each of its points, mm in the patient.
-        points: of the line behind its end, pixels.
-        across: unit vectors across the line at each.
-        shown: pixels of the grid's places.
-        slope: derivative of these by the place, pixels/mm.
-        scale: pixels in a mm there.
-        along: length from the root to each place in the image, mm in the patient.
-        end_mm, rough_mm: standard deviations of the line's end and of its blurred points by its roughness, mm.
+        number: of the frame.
+        lines: for each camera the device's line, pixels (column, row), from its tip backwards; a single point is the
+            tip alone; None where that camera does not show it.
     """
 
+    number: int
+    lines: tuple[Line | None, ...]
+
+
+class SeenLine(NamedTuple):
+    """One view of a frame: the line, and the grid as this camera shows it."""
+
     tip: Float[np.ndarray, "2"]
+    """Pixel of the line's end."""
     at: Float[np.ndarray, "k"]
+    """Length from there to each of its points, mm in the patient."""
     points: Float[np.ndarray, "k 2"]
     across: Float[np.ndarray, "k 2"]
+    """Of the line behind its end, pixels, and unit vectors across it there."""
     shown: Float[np.ndarray, "n 2"]
     slope: Float[np.ndarray, "n 2 3"]
     scale: Float[np.ndarray, "n"]
+    """Pixels of the grid's places, their derivative by the place, pixels/mm, and pixels in a mm there."""
     along: Float[np.ndarray, "n"]
+    """Length from the root to each place in the image, mm in the patient."""
     end_mm: float
     rough_mm: float
+    """Standard deviations of the line's end and of its blurred points by its roughness, mm."""
 
 
-@dataclass(frozen=True, eq=False)
-class Observations:
-    """Observations, for each of some places of the tip.
-
-    Attributes:
-        place: of the grid that an observation is of.
-        towards: unit vector of the displacement that it observes; 0 where it observes a length.
-        value: observed, mm.
-        variance: of its own noise, mm².
-        used: whether it was made.
-    """
+class Observations(NamedTuple):
+    """Observations, for each of some places of the tip."""
 
     place: Int[np.ndarray, "m r"]
+    """Of the grid that an observation is of."""
     towards: Float[np.ndarray, "m r 3"]
+    """Unit vector of the displacement that it observes; 0 where it observes a length."""
     value: Float[np.ndarray, "m r"]
     variance: Float[np.ndarray, "r"]
+    """Observed, mm, and of its own noise, mm²."""
     used: Bool[np.ndarray, "m r"]
+    """Whether it was made."""
 
 
 def shown_by(
@@ -94,11 +97,7 @@ def smooth_line(line: Line, width: float) -> tuple[Line, float, float]:
 
     A rough line is longer than it should be, so that the blur is too narrow: each round measures the length anew, on
     what the round before has blurred. What the blur takes from bends, a second one of the difference gives back
-    (twicing: Tukey, Exploratory Data Analysis, 1977).
-
-    Args:
-        line: pixels.
-        width: standard deviation of the Gaussian, pixels.
+    (twicing: Tukey, Exploratory Data Analysis, 1977). The width is the Gaussian's standard deviation, pixels.
     """
     if len(line) < 3:
         return line, 0.0, 0.0
@@ -195,7 +194,7 @@ def observe(
 
 def joined(parts: Sequence[Observations]) -> Observations:
     """Return several observations of the same places of the tip as one."""
-    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    columns = zip(*parts, strict=True)
     return Observations(*(np.concatenate(one, axis=min(1, one[0].ndim - 1)) for one in columns))
 
 

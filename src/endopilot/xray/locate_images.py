@@ -50,6 +50,8 @@ _FEWEST, _STIRS_MM = 4, 1.0
 """From so many frames on, how far their vessels lie apart says how far it moves; and by how much more at least, mm."""
 _ELSEWHERE_MM = 4.0
 """A tip this far from where all frames together have it is sought anew."""
+_FRAME_S = 0.133
+"""Time of a frame at which `LocateConfig.travel_mm` is meant, s: 7.5 frames a second, usual in fluoroscopy."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +78,7 @@ class ImagesLocated:
 
     def pixels(self, frame: int, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
         """Return column and row, pixels of the first plane, of points of the vessel or in it, LPS mm of the CT."""
-        middle = (self.cines[0].signals.shape[1] - 1) / 2
-        return middle + self.views[frame][0].project(points) * [1.0, -1.0]
+        return self.views[frame][0].pixel(points, self.cines[0].signals.shape[1])[:, ::-1]
 
 
 def locate_in_images(
@@ -122,12 +123,13 @@ def locate_in_images(
             found.append(look(frame, None))
             advance()
     clear = [_is_clear(detector.grid, *each, photons) for each in zip(views, dark, strict=True)]
-    track = _Track(detector.grid, config, cines[0].times_s, found, clear)
-    for frame, one in enumerate(found):
-        if one.status == "not found" or track.elsewhere(frame, one):
-            found[frame] = look(frame, track.expected(frame))
+    expected, likeliest = _by_other_times(detector.grid, config, cines[0].times_s, found, clear)
+    for frame, place in enumerate(likeliest):
+        if found[frame].status == "not found" or np.linalg.norm(found[frame].position - place) > _ELSEWHERE_MM:
+            found[frame] = look(frame, expected[frame])
         # Where heart and breath have taken the vessel is a guess in frames without contrast: no tip is sure there.
-        if found[frame].status == "found" and (moves[frame] is not None or track.elsewhere(frame, found[frame])):
+        elsewhere = moves[frame] is not None or np.linalg.norm(found[frame].position - place) > _ELSEWHERE_MM
+        if found[frame].status == "found" and elsewhere:
             found[frame] = replace(found[frame], status="ambiguous")
     project, tips = TipProjector(anatomy.tree, anatomy.insertion), []
     for frame, one in enumerate(found):
@@ -234,7 +236,7 @@ def _is_clear(grid: VesselGrid, views: Sequence[View], dark: Sequence[Signal], p
     """Return whether nearly no part of the vessel has contrast whose ridges are as large as the noise."""
     own = []
     for view, each, count in zip(views, dark, photons, strict=True):
-        row, column = np.rint((len(each) - 1) / 2 + view.project(grid.middle)[:, ::-1] * [-1, 1]).astype(int).T
+        row, column = np.rint(view.pixel(grid.middle, len(each))).astype(int).T
         seen = (np.minimum(row, column) >= 0) & (np.maximum(row, column) < len(each))
         own.append(own_share(each[row[seen], column[seen]], count))
     told = np.concatenate(own)
@@ -269,43 +271,26 @@ def _read_otherwise(
         yield tuple(seen), [empty[:, ::-1] if mirrored else empty for empty in before], said
 
 
-class _Track:
-    """Where the tip is at each time, by all frames together."""
+def _by_other_times(
+    grid: VesselGrid,
+    travel: LocateConfig,
+    times_s: Float[np.ndarray, "frames"],
+    found: Sequence[TipEstimate],
+    clear: Sequence[bool],
+) -> tuple[list[Float[np.ndarray, "places"]], Float[np.ndarray, "frames 3"]]:
+    """Return what the other frames say of the tip's place in each, and of whether there is one, a logarithm.
 
-    def __init__(
-        self,
-        grid: VesselGrid,
-        config: LocateConfig,
-        times_s: Float[np.ndarray, "frames"],
-        found: Sequence[TipEstimate],
-        clear: Sequence[bool],
-    ) -> None:
-        """Take what each frame shows at the places of the detector's grid, and whether no contrast may look so.
-
-        Contrast looks alike in all frames that show it, however many there are: they say nothing of the others.
-        """
-        self._middle, catheter = grid.middle, grid.branch < 0
-        tells = [sees and one.status != "not found" for sees, one in zip(clear, found, strict=True)]
-        seen = [np.where(catheter, -np.inf, one.ends if own else 0.0) for own, one in zip(tells, found, strict=True)]
-        flows = [goes(grid, config, float(step)) for step in np.maximum(np.diff(times_s), 1e-3) / _FRAME_S]
-        later = told_by_later(seen, lambda k: flows[k])
-        before = told_by_later(seen[::-1], lambda k: flows[-1 - k].T)[::-1]
-        self._others = [a + b for a, b in zip(later, before, strict=True)]
-        self._odds = np.where(tells, [one.log_odds for one in found], 0.0)
-        self._mode = [int((log + one).argmax()) for log, one in zip(seen, self._others, strict=True)]
-
-    def elsewhere(self, frame: int, one: TipEstimate) -> bool:
-        """Return whether all frames together have the tip elsewhere than a frame by itself."""
-        return float(np.linalg.norm(one.position - self._middle[self._mode[frame]])) > _ELSEWHERE_MM
-
-    def expected(self, frame: int) -> Float[np.ndarray, "places"]:
-        """Return what the other frames say of the tip's place in a frame, and of whether there is one, a logarithm.
-
-        What looks like a wire and is none does so in all frames: they say no more than the clearest.
-        """
-        odds = np.delete(self._odds, frame).max(initial=0.0)
-        return self._others[frame] - np.logaddexp.reduce(self._others[frame]) + odds
-
-
-_FRAME_S = 0.133
-"""Time of a frame at which `LocateConfig.travel_mm` is meant, s: 7.5 frames a second, usual in fluoroscopy."""
+    And the likeliest place by all frames, LPS mm. Contrast looks alike in all frames that show it, however many there
+    are: those that are not `clear` of it say nothing of others. What looks like a wire and is none does so in all
+    frames: of whether there is one, they say no more than the clearest.
+    """
+    tells = [sees and one.status != "not found" for sees, one in zip(clear, found, strict=True)]
+    seen = [np.where(grid.branch < 0, -np.inf, one.ends if own else 0.0) for own, one in zip(tells, found, strict=True)]
+    flows = [goes(grid, travel, float(step)) for step in np.maximum(np.diff(times_s), 1e-3) / _FRAME_S]
+    later = told_by_later(seen, lambda k: flows[k])
+    before = told_by_later(seen[::-1], lambda k: flows[-1 - k].T)[::-1]
+    others = [a + b for a, b in zip(later, before, strict=True)]
+    likeliest = [int((log + one).argmax()) for log, one in zip(seen, others, strict=True)]
+    odds = np.where(tells, [one.log_odds for one in found], 0.0)
+    expected = [one - np.logaddexp.reduce(one) + np.delete(odds, k).max(initial=0.0) for k, one in enumerate(others)]
+    return expected, grid.middle[likeliest]

@@ -29,15 +29,9 @@ def draw_locations(
     project: Callable[[int, Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 2"]],
     images: Float32[np.ndarray, "frames rows columns"] | None = None,
 ) -> None:
-    """Draw some frames of the first camera as PNG: the device, and the vessel where it lies.
+    """Draw some frames of the first camera as PNG: the device's line, pixels, and the vessel where it lies.
 
-    Args:
-        anatomy: the vessel.
-        locations: of each frame.
-        output: the picture, .png.
-        lines: the device in each frame, pixels; None where it is not seen.
-        project: turns places of the vessel, LPS mm, into the pixels of a frame, given its index.
-        images: of the frames, drawn beneath; none if not given.
+    `project` turns places of the vessel, LPS mm, into the pixels of a frame, given its index; images lie beneath.
     """
     seen = [i for i, line in enumerate(lines) if line is not None and locations[i].status != "not found"]
     chosen = [seen[i] for i in np.unique(np.linspace(0, len(seen) - 1, min(_SHOWN, len(seen))).astype(int))]
@@ -75,29 +69,13 @@ def draw_locations(
         plt.close(figure)
 
 
-def write_page(
-    locations: Sequence[TipLocation], output: Path, *, title: str, said: Sequence[str], picture: Path
-) -> None:
-    """Write one HTML file that needs nothing beside it: what was found, the picture, and the tip of each frame."""
-    head = ("frame", "status", "section", "abscissa, mm", "tip, LPS mm", "standard deviation, mm")
-    rows = [
-        (
-            one.frame,
-            one.status,
-            one.section,
-            f"{one.abscissa:.1f}",
-            ", ".join(f"{value:.1f}" for value in one.position),
-            f"{np.sqrt(np.trace(one.covariance)):.1f}",
-        )
-        for one in locations
-    ]
-    table = "".join(f"<tr>{''.join(f'<td>{escape(str(cell))}</td>' for cell in row)}</tr>" for row in (head, *rows))
+def write_page(output: Path, *, title: str, said: Sequence[str], picture: Path) -> None:
+    """Write one HTML file that needs nothing beside it: what was found, in words and in the picture."""
     png = base64.b64encode(picture.read_bytes()).decode()
     page = f"""<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>{escape(title)}</title>
-<style>body{{font-family:sans-serif;margin:2em}}img{{max-width:100%}}td{{padding:0 1em 0 0}}</style>
+<style>body{{font-family:sans-serif;margin:2em}}img{{max-width:100%}}</style>
 <h1>{escape(title)}</h1><ul>{"".join(f"<li>{escape(line)}</li>" for line in said)}</ul>
-<img alt="frames with vessel, device and tip" src="data:image/png;base64,{png}">
-<table>{table}</table></html>
+<img alt="frames with vessel, device and tip" src="data:image/png;base64,{png}"></html>
 """
     with writing(output) as partial:
         partial.write_text(page, encoding="utf-8")

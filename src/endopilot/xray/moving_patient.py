@@ -15,10 +15,7 @@ def seen(
 ) -> Float[np.ndarray, "n 3 4"]:
     """Return the affine maps by which the C-arm sees points of the moving vessel displaced, mm in the vessel of the CT.
 
-    Args:
-        placed: from the vessel as CT shows it to where it truly lies.
-        known: motion that the C-arm takes off; none if not given.
-        times_s: of these moments, s.
+    The vessel is truly placed so at these times, s; the C-arm takes the known motion off.
     """
     return placed if known is None else relative(placed, known.placements(times_s)[0])
 
@@ -30,14 +27,7 @@ def seen_wire(
     time_s: float,
     registration_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Return where a C-arm sees the wire of one world, in the vessel as CT shows it.
-
-    Args:
-        simulator: of one world.
-        known: motion that the C-arm takes off; none if not given.
-        ostium: LPS mm.
-        time_s: of this moment, s.
-        registration_mm: the wire shows displaced by this, mm LPS.
+    """Return where a C-arm that takes known motion off sees the wire of one world, in the vessel as CT shows it.
 
     Returns:
         The nodes from the foremost tip on, the wire's tip, LPS mm, and the unit vector along the wire there.
@@ -57,12 +47,7 @@ def seen_in_episodes(
 ) -> Float[np.ndarray, "samples 3 4"] | None:
     """Return `seen` at each sample of a dataset's navigations in one patient; None if the patient lies still.
 
-    Args:
-        motion: the patient's own.
-        known: what is known of it, with the phase of heart and breath; nothing if not given.
-        ostium: LPS mm.
-        samples: of a navigation.
-        period_s: time between them, s.
+    Of the patient's own motion the C-arm takes off what is known, with the phase of heart and breath.
     """
     if motion is None:
         return None

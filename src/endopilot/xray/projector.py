@@ -27,14 +27,7 @@ compete for the same lines of the processor's cache, which doubles the time."""
 
 
 def cast(ct: Volume, view: View, pixels: int, rays: int) -> Float32[np.ndarray, "rays rays"]:
-    """Return the attenuation along rays through a CT, and through the body beyond its sides.
-
-    Args:
-        ct: of the patient, HU.
-        view: source and detector.
-        pixels: of the image along a side.
-        rays: along a side.
-    """
+    """Return the attenuation along so many rays a side through a CT, HU, and through the body beyond its sides."""
     # A layer of air ends the volume half a voxel beyond its last middles.
     aired = np.pad(ct.voxels, 1, constant_values=_AIR_HU)
     inside = Volume(aired, ct.spacing_mm, ct.index_to_world(-np.ones(3)), ct.direction)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -161,14 +161,9 @@ def take_run(
     motion: Motion,
     random: np.random.Generator,
 ) -> list[list[Float32[np.ndarray, "rows columns"]]]:
-    """Inject contrast, and return an image for each of `RUN_TIMES_S` and view, as `register_motion` takes them.
+    """Inject contrast into a patient who lies and moves so; return an image for each of `RUN_TIMES_S` and view.
 
-    Args:
-        imager: of the patient.
-        angles_deg: of the views: LAO (positive) or RAO, and cranial (positive) or caudal, degrees.
-        pose: in which the patient lies.
-        motion: how the patient moves.
-        random: where the noise is drawn from.
+    Angles are LAO (positive) or RAO, and cranial (positive) or caudal, degrees.
     """
     run, none = [], np.zeros((0, 3))
     for placed in motion.core(np.asarray(imager.anatomy.insertion.position)).placements(np.array(RUN_TIMES_S))[0]:
@@ -200,15 +195,10 @@ def lay(anatomy: Anatomy, views: Sequence[View], contrasted: Images, before: Ima
     return Pose(translation_mm=shift)
 
 
-@dataclass(frozen=True, eq=False)
-class _Sought:
-    """What is sought: numbers, and where they place the vessel.
+class _Sought(NamedTuple):
+    """Numbers that are sought, laid so with these standard deviations before any image, and the maps that they make.
 
-    Attributes:
-        maps: return the affine map of the CT's points at each moment, LPS mm, given the numbers.
-        laid: the likeliest numbers before any image.
-        sd: their standard deviations then.
-        bounds: within which they are sought.
+    The maps are affine, of the CT's points at each moment, LPS mm.
     """
 
     maps: Callable[[Float[np.ndarray, "k"]], Float[np.ndarray, "moments 3 4"]]
@@ -258,16 +248,9 @@ def _fit(
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """The comparison of images and projected vessel at one resolution.
+    """The comparison of the projected lumen with what contrast added to each image at each moment, averaged, blurred.
 
-    Attributes:
-        sought: what places the vessel.
-        lumen: from `sampled_lumen`.
-        views: of the images.
-        observed: what contrast added to each image at each moment, pixels averaged and blurred.
-        averaged: pixels along a side that are averaged.
-        blur: of what is left, in averaged pixels.
-        config: detector and beam.
+    `averaged` pixels along a side are one, and the blur is in these.
     """
 
     sought: _Sought
@@ -328,16 +311,12 @@ class _Comparison:
     def covariance(self, sought: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k k"]:
         """Return the covariance of what fits: what the pixels leave open, with the prior.
 
-        Neighbouring pixels that were blurred together err together.
+        Neighbouring pixels that were blurred together err together; the misfit is that near the vessel.
         """
-        slope, misfit = self.slope(sought)[: -len(sought)], self.misfit_of(sought)
-        return np.linalg.inv(slope.T @ slope / misfit**2 + np.diag(self.sought.sd**-2.0))
-
-    def misfit_of(self, sought: Float[np.ndarray, "k"]) -> float:
-        """Return how large the differences near the vessel are, in units of the usual misfit, as if none were alike."""
         slope, residual = self.slope(sought)[: -len(sought)], self.residuals(sought)[: -len(sought)]
         near = np.abs(slope).max(axis=1) >= _FELT * np.abs(slope).max()
-        return float(np.sqrt(np.mean(residual[near] ** 2) * 4 * np.pi)) * self.blur
+        misfit = float(np.sqrt(np.mean(residual[near] ** 2) * 4 * np.pi)) * self.blur
+        return np.linalg.inv(slope.T @ slope / misfit**2 + np.diag(self.sought.sd**-2.0))
 
     def correlation(self, sought: Float[np.ndarray, "k"]) -> float:
         """Return the correlation of what was expected and observed around the vessel, at the worst moment."""
@@ -355,37 +334,18 @@ def _correlation(images: Sequence[tuple[np.ndarray, np.ndarray, float]]) -> floa
 
 
 def observed_contrast(
-    contrasted: Images,
-    before: Images,
-    averaged: int,
-    blur: float,
-    config: ImageConfig,
+    contrasted: Images, before: Images, averaged: int, blur: float, config: ImageConfig
 ) -> list[np.ndarray]:
-    """Return what contrast added to each image, as `_Comparison` takes it.
-
-    Args:
-        contrasted: an image of the filled vessel for each view.
-        before: the image before the injection, likewise.
-        averaged: pixels along a side that are averaged.
-        blur: of what is left, in averaged pixels.
-        config: detector and beam.
-    """
-    pairs = zip(contrasted, before, strict=True)
-    return [gaussian_filter(_added(lit, mask, averaged, config), blur) for lit, mask in pairs]
-
-
-def _added(
-    lit: Float32[np.ndarray, "rows columns"],
-    mask: Float32[np.ndarray, "rows columns"],
-    averaged: int,
-    config: ImageConfig,
-) -> Float32[np.ndarray, "r c"]:
-    """Return the attenuation that contrast added, pixels averaged; scatter is estimated as the mask, spread out."""
-    light, before = (downscale_local_mean(np.exp(image), (averaged, averaged)) for image in (lit, mask))
-    reach = config.scatter_mm / config.geometry.pixel_mm / averaged
-    scatter = config.scatter / (1 + config.scatter) * gaussian_filter(before, reach, mode="constant")
-    least = _DARKEST * before
-    return np.log(np.maximum(before - scatter, least) / np.maximum(light - scatter, least)).astype(np.float32)
+    """Return what contrast added to each image, as `_Comparison` takes it; arguments as `register` has."""
+    reach, added = config.scatter_mm / config.geometry.pixel_mm / averaged, []
+    for pair in zip(contrasted, before, strict=True):
+        light, empty = (downscale_local_mean(np.exp(image), (averaged, averaged)) for image in pair)
+        # Scatter is estimated as the image before, spread out.
+        scatter = config.scatter / (1 + config.scatter) * gaussian_filter(empty, reach, mode="constant")
+        least = _DARKEST * empty
+        ratio = np.maximum(empty - scatter, least) / np.maximum(light - scatter, least)
+        added.append(gaussian_filter(np.log(ratio).astype(np.float32), blur))
+    return added
 
 
 def sampled_lumen(

@@ -110,7 +110,8 @@ def take_image(anatomy: Anatomy, *, config: TakeImageConfig | None = None, ct: V
     config = config or TakeImageConfig()
     stack = Stack.of(config.device, *config.catheter)
     motion = motion_named(config.motion, config.motion_seed)
-    nodes, *catheters = _pushed(anatomy, stack, config, motion)
+    lines = _pushed(anatomy, stack, config, motion)
+    nodes = lines[0]
     patient = surroundings(anatomy) if ct is None else ct
     imager = XrayImager(anatomy, stack, ct=patient, config=config.image)
     placed, before = np.eye(3, 4), np.eye(3, 4)  # at the end of the pulse and at its start
@@ -118,14 +119,13 @@ def take_image(anatomy: Anatomy, *, config: TakeImageConfig | None = None, ct: V
         times = np.array([config.time_s, config.time_s - config.image.pulse_s])
         placed, before = motion.core(np.asarray(anatomy.insertion.position)).placements(times)[0]
     plane = imager.plane(config.view_deg, config.zoom, placed=placed)
-    velocity, catheter_velocities = nodes, [np.zeros_like(line) for line in catheters]
+    speeds = [np.zeros_like(line) for line in lines]
     if len(nodes):
         forwards = -np.gradient(nodes, axis=0)
-        velocity = config.speed_mm_s * forwards / np.linalg.norm(forwards, axis=1, keepdims=True)
+        speeds[0] = config.speed_mm_s * forwards / np.linalg.norm(forwards, axis=1, keepdims=True)
         if motion is not None:
             was, pulse_s = relative(before, placed), max(config.image.pulse_s, 1e-9)
-            velocity = velocity + (nodes - place(was, nodes)) / pulse_s
-            catheter_velocities = [(line - place(was, line)) / pulse_s for line in catheters]
+            speeds = [speed + (line - place(was, line)) / pulse_s for speed, line in zip(speeds, lines, strict=True)]
     share = config.contrast if config.show in ("contrast", "dsa") else 0.0
     signal = imager.signal(
         plane,
@@ -133,9 +133,9 @@ def take_image(anatomy: Anatomy, *, config: TakeImageConfig | None = None, ct: V
         contrast=share,
         dose=config.dose,
         seed=config.seed,
-        velocity=velocity,
-        catheters=catheters,
-        catheter_velocities=catheter_velocities,
+        velocity=speeds[0],
+        catheters=lines[1:],
+        catheter_velocities=speeds[1:],
     )
     mask = None
     if config.show == "dsa":

@@ -1,4 +1,4 @@
-"""The tip of a device in a vessel tree, followed over time through lines in images: a pose for each place of a grid.
+"""★ The tip of a device in a vessel tree, followed over time through lines in images: a pose for each place of a grid.
 
 The state is the place of the tip, one of a grid along all branches, and for each place a normal distribution of the
 patient's pose: three shifts and three rotations. From frame to frame the tip travels a little, or, in a small share of
@@ -13,16 +13,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from endopilot.settings import Finite, NonNegative, OpenShare, Positive, Within, settings
-from endopilot.types import VesselTree
+from endopilot.errors import InputError
+from endopilot.progress import progress
+from endopilot.settings import Finite, NonNegative, OpenShare, Positive, Within, public, settings
+from endopilot.types import Anatomy, VesselTree
 from endopilot.xray.camera import Camera
 from endopilot.xray.carm import Pose, View
-from endopilot.xray.line_observations import Line, Observations, SeenLine, joined, observe, see, shift_onto, shown_by
+from endopilot.xray.line_observations import (
+    DeviceFrame,
+    Line,
+    Observations,
+    SeenLine,
+    joined,
+    observe,
+    see,
+    shift_onto,
+    shown_by,
+)
 from endopilot.xray.tip_posterior import Status, around_mode
 from endopilot.xray.vessel_grid import VesselGrid, make_grid
 
@@ -122,16 +134,11 @@ class TipLocation:
         return cls(frame, "not found", nothing, np.full((3, 3), np.nan), 0.0, np.nan, -1, "", nothing, np.nan)
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """What observations say, for each of some places of the tip.
+class _Fit(NamedTuple):
+    """What observations say of some places of the tip: their logarithm, and the pose with its covariance.
 
-    Attributes:
-        log_density: of the observations.
-        mean, covariance: of the pose.
-        moved: how far each observation's place is moved beyond the mean pose, without what lies aside of the way, mm.
-        aside: how far the device lies off its way at the first observation, mm.
-        aside_covariance: of that, mm².
+    And how far the vessel is moved at each observation beyond the mean pose, mm, and how far the device lies aside of
+    its way at the first one, mm, with its covariance, mm².
     """
 
     log_density: Float[np.ndarray, "m"]
@@ -152,11 +159,9 @@ def goes(grid: VesselGrid, config: LocateConfig, frames: float) -> Float[np.ndar
 def told_by_later(
     seen: Sequence[Float[np.ndarray, "_"]], going: Callable[[int], Float[np.ndarray, "_ _"]]
 ) -> list[Float[np.ndarray, "_"]]:
-    """Return what all later frames say of the tip's place in each, a logarithm.
+    """Return what all later frames say of the tip's place in each, a logarithm, as `seen` says of each by itself.
 
-    Args:
-        seen: what each frame says of some places by itself, a logarithm.
-        going: how likely the tip goes from each place of a frame to each of the next one, given the frame's index.
+    `going` returns how likely the tip goes from each place of a frame to each of the next one, given the frame's index.
     """
     told = [np.zeros(len(seen[-1]))] if len(seen) else []
     for k in range(len(seen) - 1, 0, -1):
@@ -165,27 +170,17 @@ def told_by_later(
     return told[::-1]
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """What a frame says of some places of the tip.
+class _Seen(NamedTuple):
+    """What a frame says of some places of the grid: the odds of its line, and with those before it, logarithms.
 
-    Attributes:
-        frame: its number.
-        places: of the grid.
-        odds: of its line, a logarithm.
-        log: posterior by this frame and those before.
-        tips: where the tip is if it is at that place, LPS mm.
-        covariance: of that, mm².
-        moved: how far the vessel lies there from where the cameras have the CT, LPS mm.
-        residual_mm: mean distance of the line from the moved way; NaN without a line.
+    And how far the vessel lies there from where the cameras have the CT, LPS mm, and the line's residual, mm.
     """
 
     frame: int
     places: Int[np.ndarray, "m"]
     odds: Float[np.ndarray, "m"]
     log: Float[np.ndarray, "m"]
-    tips: Float[np.ndarray, "m 3"]
-    covariance: Float[np.ndarray, "m 3 3"]
+    fit: _Fit
     moved: Float[np.ndarray, "m 3"]
     residual_mm: Float[np.ndarray, "m"]
 
@@ -251,18 +246,9 @@ class TipFilter:
         self._mean[places], self._covariance[places] = fit.mean, fit.covariance
         left = np.abs(rows.value - np.einsum("mri,mri->mr", rows.towards, fit.moved))
         of_line = rows.used & (rows.place != places[:, None])
-        self._seen.append(
-            _Seen(
-                frame=frame,
-                places=places,
-                odds=odds,
-                log=log,
-                tips=self.grid.middle[places] + fit.aside,
-                covariance=fit.aside_covariance,
-                moved=(self._moved(base) - self._way)[places] + fit.moved[:, 0],
-                residual_mm=np.where(of_line, left, 0.0).sum(axis=1) / np.where(of_line.any(1), of_line.sum(1), np.nan),
-            )
-        )
+        moved = (self._moved(base) - self._way)[places] + fit.moved[:, 0]
+        residual = np.where(of_line, left, 0.0).sum(axis=1) / np.where(of_line.any(1), of_line.sum(1), np.nan)
+        self._seen.append(_Seen(frame, places, odds, log, fit, moved, residual))
         return self._answer(self._seen[-1], log)
 
     def smooth(self) -> dict[int, TipLocation]:
@@ -367,14 +353,9 @@ class TipFilter:
         across = np.cross(pose[:, None, 3:6], arm)
         moved = pose[:, None, :3] + across + smooth @ (weight[..., None] * towards)
         own = gains[..., 7:]
-        return _Fit(
-            log_density=log_density,
-            mean=base + pose,
-            covariance=covariance - gains[..., 1:7].swapaxes(1, 2) @ solved[..., 1:7],
-            moved=moved,
-            aside=np.einsum("mri,mr->mi", own, weight),
-            aside_covariance=aside[:, :1, :1] * np.eye(3) - own.swapaxes(1, 2) @ solved[..., 7:],
-        )
+        left = covariance - gains[..., 1:7].swapaxes(1, 2) @ solved[..., 1:7]
+        beside = aside[:, :1, :1] * np.eye(3) - own.swapaxes(1, 2) @ solved[..., 7:]
+        return _Fit(log_density, base + pose, left, moved, np.einsum("mri,mr->mi", own, weight), beside)
 
     def _answer(self, seen: _Seen, log: Float[np.ndarray, "m"]) -> TipLocation:
         """Return mean and covariance around the mode of the posterior."""
@@ -382,9 +363,9 @@ class TipFilter:
         best = int(weight.argmax())
         near = np.linalg.norm(grid.middle[places] - grid.middle[places[best]], axis=1) <= _NEAR_MM
         close = places[near]
-        share, mean, covariance = around_mode(seen.tips, weight, near, grid.step_mm)
+        share, mean, covariance = around_mode(grid.middle[places] + seen.fit.aside, weight, near, grid.step_mm)
         weight = weight[near] / share
-        covariance = covariance + np.einsum("m,mij->ij", weight, seen.covariance[near])
+        covariance = covariance + np.einsum("m,mij->ij", weight, seen.fit.aside_covariance[near])
         place = int(close[np.linalg.norm(grid.middle[close] - weight @ grid.middle[close], axis=1).argmin()])
         return TipLocation.at(
             self._tree,
@@ -402,3 +383,36 @@ class TipFilter:
 def _alike(apart: np.ndarray, length: float) -> np.ndarray:
     """Return the correlation of what lies so far apart along the vessel, mm."""
     return np.exp(-0.5 * (apart / length) ** 2)
+
+
+@public
+def locate(
+    anatomy: Anatomy,
+    *,
+    frames: Sequence[DeviceFrame],
+    cameras: Sequence[Camera | View],
+    config: LocateConfig | None = None,
+) -> tuple[TipLocation, ...]:
+    """Find the tip of a device in each frame of a sequence, by all frames.
+
+    Args:
+        anatomy: the vessel; only its tree is used.
+        frames: what the cameras show, in the order of time.
+        cameras: one or two, or views, whose pixels count from the image's middle; their coordinates are those of the CT
+            as far as the patient is registered.
+        config: what is known of patient and device before the first frame.
+
+    Raises:
+        InputError: a frame has another number of lines than there are cameras.
+    """
+    for frame in frames:
+        if len(frame.lines) != len(cameras):
+            raise InputError(
+                f"frame {frame.number}: {len(frame.lines)} lines for {len(cameras)} cameras; give one for each, or None"
+            )
+    follow, found = TipFilter(anatomy.tree, cameras, config), []
+    with progress(f"locate {anatomy.name}", len(frames)) as advance:
+        for frame in frames:
+            found.append(follow.update(frame.number, frame.lines))
+            advance()
+    return tuple(({one.frame: one for one in found} | follow.smooth()).values())

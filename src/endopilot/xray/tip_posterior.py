@@ -122,14 +122,7 @@ def possible_shifts(
     covariance: Float[np.ndarray, "3 3"],
     share: float,
 ) -> Shifts:
-    """Return the shifts that are tried.
-
-    Args:
-        views: of the images.
-        ostium: LPS mm.
-        covariance: of the shift of a displaced vessel, mm².
-        share: how likely the vessel is displaced.
-    """
+    """Return the shifts that are tried of a vessel that is displaced with this share and covariance, mm²."""
     rows = np.concatenate([view.slope(ostium) for view in views])
     # Shifts that no view shows are none: with one view, those along its beam.
     seen = np.linalg.svd(rows)[2][: min(2 * len(views), 3)]
@@ -157,13 +150,7 @@ class Seat:
         self._size = np.tile(size[near], 2) * CATHETER_MM * np.repeat([1.0, -_AHEAD], len(part))
 
     def __call__(self, view: View, image: Evidence, shifts_px: Float[np.ndarray, "t 2"]) -> Float[np.ndarray, "t"]:
-        """Return how likely an image makes some shifts of the vessel, pixels to the right and up, a logarithm.
-
-        Args:
-            view: of the image.
-            image: logarithm of the light, contrast taken off.
-            shifts_px: of the vessel.
-        """
+        """Return how likely an image without contrast makes some shifts of the vessel, right and up, a logarithm."""
         reach = int(np.ceil(np.abs(shifts_px).max())) + 1
         model = splat(view, len(image), self._points, self._size)
         rows, columns = np.nonzero(model)
@@ -183,24 +170,16 @@ class Seat:
         return map_coordinates(likely, reach + shifts_px[:, ::-1].T * [[-1], [1]], order=1, mode="nearest")
 
 
-def _spread(inserted_length: float) -> tuple[float, float]:
-    """Return by how much the way to the tip is shorter and longer than the inserted length: standard deviations, mm."""
-    wire_mm = max(inserted_length, 0.0)
-    return _NEAR_MM + _SHORTER_SHARE * wire_mm, _NEAR_MM + _LONGER_SHARE * wire_mm
-
-
 def end_log(length: Float[np.ndarray, "n"], inserted_length: float | None) -> Float[np.ndarray, "n"]:
-    """Return how likely a wire ends at some places by the encoder, a logarithm; unnormalised.
+    """Return how likely a wire ends so many mm from the ostium by the encoder, mm, a logarithm; unnormalised.
 
-    Args:
-        length: of the wire up to them, mm; negative in the catheter, where none ends that no encoder tells of.
-        inserted_length: by the encoder, mm; None where there is none.
+    Where there is no encoder none ends in the catheter, whose lengths are negative.
     """
     if inserted_length is None:
         return np.where(length < 0, -np.inf, 0.0)
-    shorter, longer = _spread(inserted_length)
     excess = length - inserted_length
-    return -0.5 * (excess / np.where(excess > 0, longer, shorter)) ** 2
+    share = np.where(excess > 0, _LONGER_SHARE, _SHORTER_SHARE)
+    return -0.5 * (excess / (_NEAR_MM + share * max(inserted_length, 0.0))) ** 2
 
 
 def estimate_tip(
@@ -420,11 +399,7 @@ def around_mode(
 ) -> tuple[float, Float[np.ndarray, "d"], Float[np.ndarray, "d d"]]:
     """Return the share of a posterior that lies near its mode, its mean there, and its covariance.
 
-    Args:
-        places: LPS mm.
-        weight: of each.
-        near: which lie near the mode.
-        cell_mm: distance of neighbouring places, mm.
+    Neighbouring places lie `cell_mm` apart.
     """
     share = float(weight[near].sum())
     weight = weight[near] / share

@@ -92,16 +92,10 @@ class VesselGrid:
         return way
 
 
-def make_grid(tree: VesselTree, *, step_mm: float, most: int = _MOST_PLACES) -> VesselGrid:
-    """Return the grid of a tree; coarse centerlines are resampled.
-
-    Args:
-        tree: centerlines with radii.
-        step_mm: distance of the places, mm; more in trees too long for it.
-        most: number of places.
-    """
+def make_grid(tree: VesselTree, *, step_mm: float) -> VesselGrid:
+    """Return the grid of a tree, its places `step_mm` apart, or farther where there would be too many."""
     lines = [branch.centerline for branch in tree.branches]
-    step_mm = max(step_mm, sum(float(np.ptp(line.abscissa)) for line in lines) / most)
+    step_mm = max(step_mm, sum(float(np.ptp(line.abscissa)) for line in lines) / _MOST_PLACES)
     points, radius, abscissa, parent, branch = [], [], [], [], []
     last: dict[int, int] = {-1: -1}
     for index, line in enumerate(lines):

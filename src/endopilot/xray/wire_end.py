@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -30,13 +30,14 @@ _BELIEVABLE = 3.0
 """An end farther than this many standard deviations from the posterior's is another line's."""
 BLUR_PX = 0.6
 """Standard deviation of the detector's blur, pixels."""
-_RADIUS_PX = 9
-"""Half a side of the square that the line is fitted in, pixels."""
+_RADIUS_PX, _NEAR_PX = 9, 5.4
+"""Half a side of the square that the line is fitted in, and the standard deviation by which its pixels count the less
+the farther they lie from the guess, pixels."""
 _TURNS = np.deg2rad([0.0, -40.0, 40.0, -90.0, 90.0])
 """The line is fitted from each of these angles to the first guess, rad: tips are bent."""
 _FITTED = 2
 """So many of these are fitted, those that the pixels fit best before."""
-_SINGULAR = 1e-9
+_DIFFERENCE, _SINGULAR = 1e-4, 1e-9
 _STEPS, _CONVERGED = 12, 1e-5
 """Steps of a fit at most; it ends where one lowers the errors by a smaller share."""
 _MOST_BEND = 0.12
@@ -49,35 +50,16 @@ _CLEAR = 6.0
 """Least contrast of the line, in its own standard deviations, for it to count."""
 
 
-@dataclass(frozen=True, eq=False)
-class WireEnd:
-    """An end that was found.
-
-    Attributes:
-        place: to the right of the image's middle and up from it, pixels.
-        covariance: of the place, pixels².
-    """
-
-    place: Float[np.ndarray, "2"]
-    covariance: Float[np.ndarray, "2 2"]
-
-
 def fit_end(
-    signal: Float32[np.ndarray, "rows columns"],
-    guess: Float[np.ndarray, "2"],
-    forwards: Float[np.ndarray, "2"],
-    width_px: float,
-) -> WireEnd | None:
-    """Fit the end of a dark line.
+    signal: Image, guess: Float[np.ndarray, "2"], forwards: Float[np.ndarray, "2"], width_px: float
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]] | None:
+    """Return where a dark line ends, and its covariance, pixels²; None if no line ends there, or the image does.
 
     Args:
         signal: the image.
-        guess: where the end should be: to the right of the image's middle and up from it, pixels.
+        guess: where the end should be: to the right of the image's middle and up from it, pixels; as what is returned.
         forwards: direction along the line to its end; any length.
         width_px: standard deviation of the line's profile, pixels.
-
-    Returns:
-        The end; None if no line ends there, or the image does.
     """
     middle = (len(signal) - 1) / 2
     column, row = np.rint([middle + guess[0], middle - guess[1]]).astype(int)
@@ -85,20 +67,56 @@ def fit_end(
         return None
     square = signal[row - _RADIUS_PX : row + _RADIUS_PX + 1, column - _RADIUS_PX : column + _RADIUS_PX + 1]
     side = np.arange(-_RADIUS_PX, _RADIUS_PX + 1)
-    right, up = (part.ravel().astype(float) for part in np.meshgrid(side + column - middle, middle - row - side))
-    near = np.exp(-0.5 * ((right - guess[0]) ** 2 + (up - guess[1]) ** 2) / (0.6 * _RADIUS_PX) ** 2)
-    line = _Line(right, up, near, -square.ravel().astype(float), width_px)
-    angle = float(np.arctan2(forwards[1], forwards[0]))
-    starts = [np.array([guess[0], guess[1], angle + turn, 0.0]) for turn in _TURNS]
-    starts.sort(key=lambda start: line.errors(start)[0])
-    low, high = guess - _FARTHEST_PX, guess + _FARTHEST_PX
-    best = min((line.fit(start, low, high) for start in starts[:_FITTED]), key=lambda x: line.errors(x)[0])
-    cost, amplitude, norm, slope, _ = line.errors(best)
-    variance = cost / max(float((near**2).sum()) - 8, 1.0)
-    if amplitude * norm < _CLEAR * np.sqrt(variance) or np.abs(best[:2] - guess).max() > 0.98 * _FARTHEST_PX:
+    right, up = (
+        each.ravel() for each in np.meshgrid(side + column - middle - guess[0], middle - row - side - guess[1])
+    )
+    near = np.exp(-0.5 * (right**2 + up**2) / _NEAR_PX**2)
+    flat = np.linalg.qr(near[:, None] * np.stack([np.ones_like(right), right, up], axis=-1))[0]
+    dark = -near * square.ravel()
+    dark = dark - flat @ (flat.T @ dark)
+
+    def errors(x: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "k n"]:
+        """Return the errors of bent lines that end, each as dark as fits best, of ends, angles and bends."""
+        cos, sin = np.cos(x[:, 2:3]), np.sin(x[:, 2:3])
+        behind = cos * (x[:, :1] - right) + sin * (x[:, 1:2] - up)
+        aside = cos * (up - x[:, 1:2]) - sin * (right - x[:, :1]) - 0.5 * x[:, 3:] * np.maximum(behind, 0.0) ** 2
+        lines = near * np.exp(-0.5 * (aside / width_px) ** 2) * ndtr(behind / width_px)
+        lines -= (lines @ flat) @ flat.T
+        return dark - lines * ((lines @ dark) / ((lines**2).sum(axis=1) + _SINGULAR))[:, None]
+
+    turned = np.arctan2(forwards[1], forwards[0]) + _TURNS
+    starts = np.stack([0 * turned, 0 * turned, turned, 0 * turned], axis=-1)
+    order = (errors(starts) ** 2).sum(axis=1).argsort(kind="stable")[:_FITTED]
+    end, error, slope = min((_fitted(errors, start) for start in starts[order]), key=lambda fit: fit[1] @ fit[1])
+    line, variance = dark - error, float(error @ error) / max(float(near @ near) - 8, 1.0)
+    faint = line @ dark <= 0 or np.linalg.norm(line) < _CLEAR * np.sqrt(variance)
+    if faint or np.abs(end[:2]).max() > 0.98 * _FARTHEST_PX:
         return None
     spread = variance * np.linalg.pinv(slope.T @ slope)[:2, :2]
-    return WireEnd(best[:2], spread + _OWN_PX**2 * np.eye(2))
+    return guess + end[:2], spread + _OWN_PX**2 * np.eye(2)
+
+
+def _fitted(
+    errors: Callable[[np.ndarray], np.ndarray], x: Float[np.ndarray, "4"]
+) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "n"], Float[np.ndarray, "n 4"]]:
+    """Return the numbers of the least errors near a start, by Levenberg and Marquardt's steps, errors and slope."""
+    bounds = np.array([_FARTHEST_PX, _FARTHEST_PX, np.inf, _MOST_BEND])
+    steps, damping = np.vstack([np.zeros(4), _DIFFERENCE * np.eye(4)]), 0.1
+    error, *around = errors(x + steps)
+    for _ in range(_STEPS):
+        slope = (np.array(around) - error).T / _DIFFERENCE
+        square = slope.T @ slope
+        square[np.diag_indices(4)] += damping * np.diag(square) + _SINGULAR
+        tried = np.clip(x - np.linalg.solve(square, slope.T @ error), -bounds, bounds)
+        new, *its = errors(tried + steps)
+        cost, gained = error @ error, error @ error - new @ new
+        if gained > 0:
+            x, error, around, damping = tried, new, its, 0.2 * damping
+        else:
+            damping *= 8.0
+        if 0 < gained < _CONVERGED * cost:
+            break
+    return x, error, (np.array(around) - error).T / _DIFFERENCE
 
 
 def refined(
@@ -110,12 +128,7 @@ def refined(
 ) -> TipEstimate:
     """Return a tip after each image's fit of the wire's end: a Kalman update of its place and the vessel's shift.
 
-    Args:
-        found: the tip.
-        views: of the images, in the CT's frame as the vessel is registered.
-        signals: the images, without contrast.
-        evidence: how much likelier each pixel is on a wire than off it, a logarithm.
-        radius_mm: of the wire.
+    Signals are without contrast; views, evidence and shift are as `estimate_tip` takes them.
     """
     mean, spread = found.mean, found.spread
     wire = found.wire[-_END_PLACES:] - found.position
@@ -149,7 +162,7 @@ def refined(
         guess, width_px = view.project(mean[:3] + mean[3:]), float(np.hypot(0.5 * radius_mm * per_mm, BLUR_PX))
         for aside in (0.0, -_BESIDE_STRAND_PX, _BESIDE_STRAND_PX)[: 3 if found.folded else 1]:
             end = fit_end(signal, guess + aside * axes[1], forwards, width_px)
-            if end is not None and seen(view, np.eye(2), end.place - guess, end.covariance + _FIT_PX**2 * np.eye(2)):
+            if end is not None and seen(view, np.eye(2), end[0] - guess, end[1] + _FIT_PX**2 * np.eye(2)):
                 break
     return replace(found, mean=mean, spread=spread)
 
@@ -187,72 +200,3 @@ def _ends(
         left = precision
     own = np.linalg.inv(left)
     return own @ precision @ mean, own
-
-
-class _Line:
-    """A bent line that ends, on a flat background: its errors in a square of pixels, and the parameters of the least.
-
-    Parameters are the end's place, pixels, its direction, rad, and its curvature, 1/pixel.
-    """
-
-    def __init__(self, right: np.ndarray, up: np.ndarray, near: np.ndarray, dark: np.ndarray, width_px: float) -> None:
-        self._right, self._up, self._near, self._width = right, up, near, width_px
-        flat = np.stack([np.ones_like(right), right - right.mean(), up - up.mean()], axis=-1)
-        self._flat = np.linalg.qr(near[:, None] * flat)[0]
-        self._dark = self._above(near * dark)
-
-    def _above(self, values: np.ndarray) -> np.ndarray:
-        """Return what no flat background explains."""
-        return values - self._flat @ (self._flat.T @ values)
-
-    def errors(self, x: np.ndarray) -> tuple[float, float, float, np.ndarray, np.ndarray]:
-        """Return the sum of squared errors, the line's darkness, its norm, the errors' slope, and the errors.
-
-        The darkness is the best one for these parameters; the slope is that by them, the darkness following.
-        """
-        cos, sin, w = np.cos(x[2]), np.sin(x[2]), self._width
-        right, up = self._right - x[0], self._up - x[1]
-        behind, left = -(cos * right + sin * up), cos * up - sin * right
-        bow = np.maximum(behind, 0.0)
-        aside = left - 0.5 * x[3] * bow**2
-        profile, end = np.exp(-0.5 * (aside / w) ** 2), ndtr(behind / w)
-        by_aside = -aside / w**2 * profile * end
-        by_behind = profile * np.exp(-0.5 * (behind / w) ** 2) / (w * np.sqrt(2 * np.pi)) - by_aside * x[3] * bow
-        slopes = [
-            by_behind * cos + by_aside * sin,
-            by_behind * sin - by_aside * cos,
-            -by_behind * left + by_aside * behind,
-            -0.5 * by_aside * bow**2,
-        ]
-        shape = self._above(self._near[:, None] * np.stack([profile * end, *slopes], axis=-1))
-        line, slope = shape[:, 0], shape[:, 1:]
-        square = float(line @ line) + _SINGULAR
-        amplitude = float(line @ self._dark) / square
-        error = amplitude * line - self._dark
-        darker = (self._dark @ slope - 2 * amplitude * (line @ slope)) / square
-        slope = amplitude * slope + np.outer(line, darker)
-        return float(error @ error), amplitude, float(np.sqrt(square)), slope, error
-
-    def fit(self, start: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return the parameters of the least errors near a start, by Levenberg and Marquardt's steps.
-
-        Args:
-            start: first parameters.
-            low, high: bounds of the end's place.
-        """
-        bounds = np.array([*low, -np.inf, -_MOST_BEND]), np.array([*high, np.inf, _MOST_BEND])
-        x, damping = start, 0.1
-        cost, *_, slope, error = self.errors(x)
-        for _ in range(_STEPS):
-            square = slope.T @ slope
-            square[np.diag_indices(4)] += damping * np.diag(square) + _SINGULAR
-            tried = np.clip(x - np.linalg.solve(square, slope.T @ error), *bounds)
-            new, *_, new_slope, new_error = self.errors(tried)
-            if new < cost:
-                done = cost - new < _CONVERGED * cost
-                x, cost, slope, error, damping = tried, new, new_slope, new_error, 0.2 * damping
-                if done:
-                    break
-            else:
-                damping *= 8.0
-        return x
