@@ -1,5 +1,4 @@
-"""`python -m benchmarks simulation` on a few short worlds, also with a catheter and a vessel that moves: its figures, its
-reference, and what it refuses."""
+"""`python -m benchmarks simulation` on a few short worlds, a catheter and a moving vessel too."""
 
 from __future__ import annotations
 
