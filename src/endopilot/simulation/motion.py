@@ -110,10 +110,10 @@ def contracted_share(phase: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     return course(np.mod(phase, 1.0))
 
 
-_STILL = {
-    "breathing": dict.fromkeys(("annulus_mm", "heart_volume_share", "heart_rotation_deg"), 0.0),
-    "heartbeat": {name: 0.0 for name in AMPLITUDES if name.startswith("breathing")},
-    "both": {},
+_STILL: dict[str, tuple[str, ...]] = {
+    "breathing": ("annulus_mm", "heart_volume_share", "heart_rotation_deg"),
+    "heartbeat": tuple(name for name in AMPLITUDES if name.startswith("breathing")),
+    "both": (),
 }
 """What does not move in motions, by their names."""
 
@@ -121,13 +121,15 @@ _STILL = {
 def motion_named(name: MotionName, seed: int | None = None) -> Motion | None:
     """Return a motion by its name; None for "still". The seed draws one patient's amplitudes from the published
     distributions, within the published ranges; without it they are the published means."""
-    return None if name == "still" else replace(Motion() if seed is None else draw_motion(seed), **_STILL[name])
+    if name == "still":
+        return None
+    return replace(Motion() if seed is None else draw_motion(seed), **dict.fromkeys(_STILL[name], 0.0))
 
 
 def published_mean(motion: Motion) -> Motion | None:
     """Return published mean amplitudes of what moves in a patient's motion, with the patient's periods, or None."""
     beats, breathes = (any(getattr(motion, each) for each in _STILL[name]) for name in ("breathing", "heartbeat"))
-    still = ({} if beats else _STILL["breathing"]) | ({} if breathes else _STILL["heartbeat"])
+    still = dict.fromkeys((() if beats else _STILL["breathing"]) + (() if breathes else _STILL["heartbeat"]), 0.0)
     periods = {"heart_period_s": motion.heart_period_s, "breathing_period_s": motion.breathing_period_s}
     return replace(Motion(), **still, **periods) if beats or breathes else None
 
